@@ -7,6 +7,7 @@ import sys
 import threading
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from importlib import import_module
 from importlib.metadata import version
 from typing import Annotated, Any
@@ -43,8 +44,7 @@ from cavmarl.cli.output import (
     flag,
     print_error,
 )
-from cavmarl.config.removed_keys import removed_option
-from cavmarl.core.errors import CavmarlError, ConfigError
+from cavmarl.core.errors import CavmarlError
 from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
@@ -54,23 +54,11 @@ START, TRAIN, MAPS = "Start here", "Train and evaluate", "Maps and demand"
 DIVIDE, COSIM = "Divide worlds", "Co-simulation"
 
 
-REMOVED = {"verify-determinism": "verify determinism"}  # command → its replacement
-
-
 class _Group(TyperGroup):
     """The group of all commands.
 
-    A removed command or option raises ConfigError with its replacement. `map` is imported on
-    demand, as its imports take longer than all others.
+    `map` is imported on demand, as its imports take longer than all others.
     """
-
-    def invoke(self, ctx: Any) -> Any:
-        try:
-            return super().invoke(ctx)
-        except Exception as error:
-            if refusal := removed_option(getattr(error, "option_name", None)):
-                raise ConfigError(refusal) from error
-            raise
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -78,8 +66,6 @@ class _Group(TyperGroup):
         return names
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
-        if cmd_name in REMOVED:
-            raise ConfigError(f"{cmd_name} was removed: use cavmarl {REMOVED[cmd_name]}")
         if cmd_name != "map":
             return super().get_command(ctx, cmd_name)
         found = typer.main.get_group(import_module("cavmarl.cli.map").app)
@@ -95,191 +81,93 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-
-add_command(
-    app,
-    "demo",
-    demo.demo,
-    "cavmarl demo",
-    "cavmarl demo --decisions 500000",
-    panel=START,
+_start, _train, _divide, _cosim, _service = (
+    partial(add_command, app, panel=panel) for panel in (START, TRAIN, DIVIDE, COSIM, SERVICE)
 )
-add_command(
-    app,
-    "list",
-    listing.list_entries,
-    "cavmarl list",
-    panel=START,
-)
-add_command(
-    app,
+
+_start("demo", demo.demo, "cavmarl demo", "cavmarl demo --decisions 500000")
+_start("list", listing.list_entries, "cavmarl list")
+_start(
     "view",
     view.view,
     "cavmarl view merge --web",
     "cavmarl view town --policy idm --video town.mp4 --seconds 60",
     "cavmarl view grid4x4 --agents 20 --zones 4 --backend processes:2 --web",
-    panel=START,
 )
-add_command(
-    app,
+_start(
     "replay",
     replay.replay,
     "cavmarl replay runs/recording --web",
     "cavmarl replay runs/recording --episode 2 --mcap episode.mcap",
-    panel=START,
 )
-add_command(
-    app,
+_train(
     "train",
     train.train,
     "cavmarl train",
     "cavmarl train ppo --config merge",
-    panel=TRAIN,
     ignore_unknown_options=True,
     allow_interspersed_args=False,
 )
-add_command(
-    app,
+_train(
     "evaluate",
     evaluate.evaluate,
     "cavmarl evaluate merge --policy idm --policy cities_ippo",
     "cavmarl evaluate grid4x4 --episodes 64 --repeats 3 --html report.html",
     "cavmarl evaluate merge --set sensors.lidar.rays=32 --json result.json",
-    panel=TRAIN,
 )
-add_command(
-    app,
-    "report",
-    evaluate.report,
-    "cavmarl report runs/evaluate/merge-1 --html report.html",
-    panel=TRAIN,
-)
-add_command(
-    app,
-    "suite",
-    suite.suite,
-    "cavmarl suite standard --maps maps --policy cities_ippo",
-    panel=TRAIN,
-)
-add_command(
-    app,
-    "baseline",
-    baseline.baseline,
-    "cavmarl baseline city.net.xml --agents 8 --episodes 6",
-    panel=TRAIN,
-)
-add_command(
-    app,
-    "manifest",
-    service.manifest,
-    "cavmarl manifest runs/evaluate/merge-1",
-    panel=TRAIN,
-)
+_train("report", evaluate.report, "cavmarl report runs/evaluate/merge-1 --html report.html")
+_train("suite", suite.suite, "cavmarl suite standard --maps maps --policy cities_ippo")
+_train("baseline", baseline.baseline, "cavmarl baseline city.net.xml --agents 8 --episodes 6")
+_train("manifest", service.manifest, "cavmarl manifest runs/evaluate/merge-1")
 app.add_typer(zoo.app, name="zoo", rich_help_panel=TRAIN)
 app.add_typer(scenario.app, name="scenario", rich_help_panel=TRAIN)
 app.add_typer(demand.app, name="demand", rich_help_panel=MAPS)
-add_command(
-    app,
+_divide(
     "plan",
     plan.plan,
     "cavmarl plan town --zones 9 --workers 3",
     "cavmarl plan town --snapshot idle --json plan.json",
-    panel=DIVIDE,
 )
-add_command(
-    app,
+_divide(
     "node",
     node.node,
     "cavmarl node --join 10.0.0.5:7000 --key-file node.key",
     "cavmarl node --service https://10.0.0.5:8700 --secret-file node.secret --slots 4",
     "mpirun -n 5 cavmarl node --mpi train.py",
-    panel=DIVIDE,
     allow_interspersed_args=False,
 )
-add_command(
-    app,
-    "journal",
-    journal.journal,
-    "cavmarl journal run.jsonl --at 1200",
-    panel=DIVIDE,
-)
+_divide("journal", journal.journal, "cavmarl journal run.jsonl --at 1200")
 app.add_typer(verify.app, name="verify", rich_help_panel=DIVIDE)
 app.add_typer(bench.app, name="bench", rich_help_panel=DIVIDE)
-add_command(
-    app,
-    "lead",
-    lead.lead,
-    "cavmarl lead town --at 7100 --secret-file world.secret --followers 1",
-    panel=COSIM,
-)
-add_command(
-    app,
+_cosim("lead", lead.lead, "cavmarl lead town --at 7100 --secret-file world.secret --followers 1")
+_cosim(
     "follow",
     follow.follow,
     "cavmarl follow town --at 7100 --secret-file world.secret --vehicles car_0,car_1",
-    panel=COSIM,
 )
-add_command(
-    app,
+_cosim(
     "carla",
     carla.carla,
     "cavmarl carla grid4x4 --port 2000",
     "cavmarl carla town --agents 20 --client-version 0.10.0",
-    panel=COSIM,
 )
-add_command(
-    app,
+_cosim(
     "ros2",
     ros2.ros2,
     "cavmarl ros2 town --rig ten_sensors --truth",
     "cavmarl ros2 town --vehicle car_0 --vehicle car_1 --domain 5 --wait newest --pace 1",
     "cavmarl ros2 --join town.sock --vehicle car_0",
-    panel=COSIM,
 )
-add_command(
-    app,
-    "serve",
-    service.serve,
-    "cavmarl serve --store runs/service.sqlite",
-    panel=SERVICE,
-)
-add_command(
-    app,
-    "grant",
-    service.grant,
-    "cavmarl grant alice --role client --secret-file admin.secret",
-    panel=SERVICE,
-)
-add_command(
-    app,
+_service("serve", service.serve, "cavmarl serve --store runs/service.sqlite")
+_service("grant", service.grant, "cavmarl grant alice --role client --secret-file admin.secret")
+_service(
     "submit",
     service.submit,
     "cavmarl submit merge --policy idm --episodes 32 --secret-file alice.secret",
-    panel=SERVICE,
 )
-add_command(
-    app,
-    "nodes",
-    service.nodes,
-    "cavmarl nodes",
-    "cavmarl nodes --drain node-1",
-    panel=SERVICE,
-)
-add_command(
-    app,
-    "sessions",
-    service.sessions,
-    "cavmarl sessions",
-    panel=SERVICE,
-)
-add_command(
-    app,
-    "events",
-    service.events,
-    "cavmarl events --follow",
-    panel=SERVICE,
-)
+_service("nodes", service.nodes, "cavmarl nodes", "cavmarl nodes --drain node-1")
+_service("sessions", service.sessions, "cavmarl sessions")
+_service("events", service.events, "cavmarl events --follow")
 
 
 def _print_version(wanted: bool) -> None:

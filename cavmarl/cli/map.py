@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import typer
 
 from cavmarl.cli import map_build, map_check, map_export, map_fidelity, map_survey, map_zones
@@ -11,44 +13,35 @@ app = typer.Typer(
     help="Build, check, export, compare and divide road networks.",
     no_args_is_help=True,
 )
+_add = partial(add_command, app)
 
-add_command(
-    app,
+_add(
     "build",
     map_build.build,
     "cavmarl map build city.osm.xml --dem heights.tif",
     "cavmarl map build road.xodr --out road.net.xml --tolerant",
 )
-add_command(
-    app,
+_add(
     "check",
     map_check.check,
     "cavmarl map check city.net.xml --page check.html",
     "cavmarl map check city.net.xml --fix repaired.net.xml",
     "cavmarl map check city.xodr --carla",
 )
-add_command(
-    app,
+_add(
     "export",
     map_export.export,
     "cavmarl map export city.net.xml --opendrive city.xodr --geojson lanes.geojson",
 )
-add_command(
-    app,
+_add(
     "zones",
     map_zones.zones,
     "cavmarl map zones town --count 9 --picture zones.png",
     "cavmarl map zones town --count 4 --avoid-junctions --out zones.json",
 )
-add_command(
-    app,
+_add(
     "fidelity",
     map_fidelity.fidelity,
     "cavmarl map fidelity city.net.xml scan.laz --frame projected --page fidelity.html",
 )
-add_command(
-    app,
-    "survey",
-    map_survey.survey,
-    "cavmarl map survey town --out cloud.ply --vehicles 4",
-)
+_add("survey", map_survey.survey, "cavmarl map survey town --out cloud.ply --vehicles 4")

@@ -15,7 +15,6 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
-from typer.core import TyperCommand
 
 from cavmarl.bench.harness import check_positive
 from cavmarl.config.driver_names import ONNX_FILE, SB3_FILE, TORCH_SCRIPT_FILES, drivers_in
@@ -111,14 +110,11 @@ def add_command(
     command: Callable[..., None],
     *examples: str,
     panel: str | None = None,
-    cls: type[TyperCommand] = TyperCommand,
     **settings: Any,
 ) -> None:
     """Add a command whose help ends with examples; `panel` is its group in the help of `app`."""
     end = "\n\n".join(("Examples:", *examples))
-    app.command(name, cls=cls, rich_help_panel=panel, epilog=end, context_settings=settings)(
-        command
-    )
+    app.command(name, rich_help_panel=panel, epilog=end, context_settings=settings)(command)
 
 
 Backend = Annotated[

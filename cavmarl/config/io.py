@@ -15,14 +15,13 @@ from copy import deepcopy
 from dataclasses import fields, is_dataclass
 from functools import cache, lru_cache
 from pathlib import Path
-from typing import Any, TypeVar, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, get_args, get_origin, get_type_hints
 
 import numpy as np
 import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
-from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 
 T = TypeVar("T")
@@ -115,13 +114,16 @@ def _parsed(text: str) -> object:
     return loaded
 
 
-def validate(kind: type[T], raw: object, where: str) -> T:
+def validate(
+    kind: type[T], raw: object, where: str, *, extra: Literal["forbid", "ignore"] = "forbid"
+) -> T:
     """Build the dataclass `kind` and its nested dataclasses from plain values.
 
     Args:
         kind: a frozen dataclass.
         raw: mappings, sequences, strings, numbers, bools, None.
         where: start of every message, such as the file of `raw`.
+        extra: what happens to unknown keys.
 
     Raises:
         ConfigError: a key is unknown or missing, a type is wrong, or `kind` refuses a value. Each
@@ -138,7 +140,7 @@ def validate(kind: type[T], raw: object, where: str) -> T:
     except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: has a value that is not allowed ({error})") from error
     try:
-        checked: T = _adapter(hashable).validate_json(text)
+        checked: T = _adapter(hashable, extra).validate_json(text)
     except ValidationError as error:
         lines = [_explain(kind, details) for details in error.errors(include_url=False)]
         raise ConfigError("\n".join(f"{where}: {line}" for line in lines)) from error
@@ -164,13 +166,13 @@ def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
 
 
 @cache  # building it takes longer than making a small world
-def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
-    """Return pydantic's strict adapter of `kind`, without additional keys.
+def _adapter(kind: type[Any], extra: Literal["forbid", "ignore"]) -> TypeAdapter[Any]:
+    """Return pydantic's strict adapter of `kind`.
 
     It adapts a union, because a dataclass by itself ignores a configuration from outside.
     """
     union: Any = kind | None
-    return TypeAdapter(union, config=ConfigDict(extra="forbid", strict=True))
+    return TypeAdapter(union, config=ConfigDict(extra=extra, strict=True))
 
 
 def _fields(kind: type[Any]) -> dict[str, Any]:
@@ -186,7 +188,7 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
     path = ".".join(keys)
     match details["type"]:
         case "unexpected_keyword_argument":
-            return removed_key(path) or f"{path}: unknown key; {_nearest(kind, location)}"
+            return f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
             return f"{path}: missing; this key has no default, add it"
         case "dataclass_type" | "dict_type":

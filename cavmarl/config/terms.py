@@ -6,7 +6,6 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from cavmarl.config.checks import Section, Within, check_finite
-from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import HOW, REGISTERED_TERMS
 
@@ -76,7 +75,7 @@ class TermsConfig(Section, key="terms"):
 
 
 def _unknown_term(name: str) -> str:
-    return removed_key(f"terms.weights.{name}") or (
+    return (
         f"terms.weights = {name!r}: no such term; must be one of "
         f"{', '.join((*TERMS, *REGISTERED_TERMS))}. If a module registers it with "
         f"cavmarl.register_term, {HOW}"

@@ -39,7 +39,8 @@ class ComponentContext(NamedTuple):
 class Component(Protocol):
     """A part of W worlds that acts in each tick.
 
-    A tick may be repeated: then `arrays` are restored to their state before the tick.
+    A method that a component does not define does nothing. A tick may be repeated: then `arrays`
+    are restored to their state before the tick.
 
     Attributes:
         reads_all: names of the methods, `reset`, `begin` or `end`, that read the vehicles of all
@@ -49,19 +50,20 @@ class Component(Protocol):
     """
 
     @property
-    def reads_all(self) -> tuple[str, ...]: ...
+    def reads_all(self) -> tuple[str, ...]:
+        return ()
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,), after vehicles and signals are placed."""
-        ...
+        return
 
     def begin(self, commands: Commands) -> None:
         """Begin a tick. The rows are those of tick t, and their owners are decided."""
-        ...
+        return
 
     def end(self) -> None:
         """End a tick. The rows and the signals are those of t + 1; agents sense afterwards."""
-        ...
+        return
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return all arrays (W, …) that outlive a tick. Each call returns the same arrays.
@@ -69,8 +71,8 @@ class Component(Protocol):
         The hash of the state covers them. They must not depend on the division of a world or on
         the places of its rows. Records must have no padding, because padding is not saved.
         """
-        ...
+        return iter(())
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return the fault of saved arrays with the shapes of `arrays`; empty if they are valid."""
-        ...
+        return ""

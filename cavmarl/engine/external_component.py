@@ -22,14 +22,14 @@ from cavmarl.core.records.external_records import (
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.outside_traffic import NoOutsideTraffic
+from cavmarl.engine.component import Component, ComponentContext
+from cavmarl.engine.outside_traffic import OutsideTraffic
 from cavmarl.engine.peers import Peers
 from cavmarl.shards.row_check import MOST_IDS, diagonals_m
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import add_external, move_external
 
 if TYPE_CHECKING:
-    from cavmarl.engine.component import ComponentContext
     from cavmarl.engine.tick import Tick
 
 _POSE = ("x", "y", "z", "heading", "pitch", "speed")
@@ -37,8 +37,8 @@ _CONTROLS = ("throttle", "steering")
 _LARGEST = 1e12
 
 
-class ExternalComponent:
-    """A `Component` with the slots of the vehicles that the caller poses or drives.
+class ExternalComponent(Component):
+    """The slots of the vehicles that the caller poses or drives.
 
     A slot keeps its last command. All processes of a world have the same slots.
 
@@ -48,8 +48,6 @@ class ExternalComponent:
         coming: (W, E) slots whose vehicles enter in this tick.
         has_news: whether this is the first tick of a step with new commands.
     """
-
-    reads_all: tuple[str, ...] = ()
 
     def __init__(self, host: ComponentContext) -> None:
         shape = (host.num_worlds, host.config.population.external)
@@ -98,9 +96,6 @@ class ExternalComponent:
                 held[name][changed] = told[name][changed]
         held[self.leaving] = np.zeros((), dtype=EXTERNAL)
 
-    def end(self) -> None:
-        """Do nothing: `ExternalPhases` moves the vehicles."""
-
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the commands and the ids of all slots."""
         return iter((self._held, self.ids))
@@ -128,7 +123,7 @@ class ExternalComponent:
         return ""
 
 
-class ExternalPhases(NoOutsideTraffic):
+class ExternalPhases(OutsideTraffic):
     """The phases of a tick in worlds with vehicles that the caller poses or drives."""
 
     def __init__(self, part: ExternalComponent, tick: Tick) -> None:

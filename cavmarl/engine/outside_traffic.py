@@ -5,7 +5,7 @@ SUMO moves them here, the caller of the environment in `ExternalPhases`.
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Protocol
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,82 +19,48 @@ if TYPE_CHECKING:
     from cavmarl.engine.tick import Tick
 
 
-class OutsideTraffic(Protocol):
+class OutsideTraffic:
     """The part of a tick that another simulator or the caller may take over.
+
+    By default there are no such vehicles, and signals follow their own programs.
 
     Attributes:
         sumo: SUMO, or None.
     """
 
-    @property
-    def sumo(self) -> SumoTraffic | None: ...
-
-    def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Begin an episode in the chosen worlds (W,)."""
-        ...
-
-    def catch_up(self, worlds: Worlds) -> None:
-        """Advance to the ticks of worlds whose state was loaded. Raises as `SumoTraffic` does."""
-        ...
-
-    def follow(self, tick: Tick) -> None:
-        """Move the vehicles of the other simulator, after cavmarl's own vehicles."""
-        ...
-
-    def let_in(self, tick: Tick) -> None:
-        """Add the vehicles that have entered in the other simulator."""
-        ...
-
-    def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return how many places (W,) of each world are taken or reserved."""
-        ...
-
-    def switch_signals(self, tick: Tick) -> None:
-        """Switch the signals to the present tick."""
-        ...
-
-    def close(self) -> None:
-        """End the other simulator."""
-        ...
-
-
-class NoOutsideTraffic:
-    """The phases without outside traffic: signals follow their own programs."""
-
     sumo: SumoTraffic | None = None
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
-        """Do nothing."""
+        """Begin an episode in the chosen worlds (W,)."""
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Do nothing."""
+        """Advance to the ticks of worlds whose state was loaded. Raises as `SumoTraffic` does."""
 
     def follow(self, tick: Tick) -> None:
-        """Do nothing: there are no other vehicles."""
+        """Move the vehicles of the other simulator, after cavmarl's own vehicles."""
 
     def let_in(self, tick: Tick) -> None:
-        """Do nothing: there are no other vehicles."""
+        """Add the vehicles that have entered in the other simulator."""
 
     def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return the number of vehicles of each world (W,)."""
+        """Return how many places (W,) of each world are taken or reserved."""
         return peers.running()
 
     def switch_signals(self, tick: Tick) -> None:
-        """Read the detectors of all zones, then switch the signals once."""
+        """Switch the signals to the present tick, once all zones have read their detectors."""
         tick.executor.detect()
         tick.peers.share_detections(tick.worlds)
         tick.shared.switch_signals(tick.common)
 
     def close(self) -> None:
-        """Do nothing."""
+        """End the other simulator."""
 
 
-class SumoPhases:
+class SumoPhases(OutsideTraffic):
     """The phases of a tick in worlds with SUMO."""
 
     def __init__(self, traffic: SumoTraffic) -> None:
-        self.sumo: SumoTraffic | None = traffic
-        self._sumo = traffic
+        self.sumo = self._sumo = traffic
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Restart SUMO in the chosen worlds (W,)."""
@@ -135,10 +101,6 @@ class SumoPhases:
             sumo.order(departures, worlds)
         elif sumo.let_in(departures, worlds, tick.peers.running()):
             tick.admit()
-
-    def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return the number of vehicles of each world (W,)."""
-        return peers.running()
 
     def switch_signals(self, tick: Tick) -> None:
         """Copy the states of SUMO's signals."""

@@ -2,27 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, Any
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ActionError
+from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.shards.shard import Commands
 
-if TYPE_CHECKING:
-    from cavmarl.engine.component import ComponentContext
 
-
-class OverrideComponent:
-    """A `Component` that writes the states of the caller to `Worlds.signal_phase`.
+class OverrideComponent(Component):
+    """Writes the states of the caller to `Worlds.signal_phase`.
 
     All processes of a world write the same states.
     """
-
-    reads_all: tuple[str, ...] = ()
 
     def __init__(self, host: ComponentContext) -> None:
         worlds = host.shards[0].worlds
@@ -45,17 +38,6 @@ class OverrideComponent:
         self._shown[:] = 0
         worlds, places = np.nonzero(told[..., 1])
         self._shown[worlds, told[worlds, places, 0]] = told[worlds, places, 1]
-
-    def end(self) -> None:
-        """Do nothing: the states stay until the next step."""
-
-    def arrays(self) -> Iterator[NDArray[Any]]:
-        """Return no arrays: the states are in `Worlds`."""
-        return iter(())
-
-    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return "", because there are no arrays."""
-        return ""
 
 
 def wrong_states(told: NDArray[np.int32], has_signal: NDArray[np.bool_]) -> str:

@@ -8,7 +8,6 @@ signals and outputs.
 from __future__ import annotations
 
 from contextlib import AbstractContextManager, nullcontext
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,70 +16,14 @@ from cavmarl.core.records.arrays import DepartureQueue, Outputs, Worlds
 from cavmarl.handoff.division import ZonedShards
 
 
-class Peers(Protocol):
+class Peers:
     """Collective operations: each call returns when all processes have called it in the same tick.
+
+    By default there are no other processes: this one has all zones, and nothing is exchanged.
 
     Attributes:
         are_none: whether this process runs all zones.
     """
-
-    are_none: bool
-
-    def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
-        """Drop other processes' vehicles, which a reset of the chosen worlds (W,) has made."""
-        ...
-
-    def resume_from(self, departures: DepartureQueue, side: int) -> None:
-        """Resume from the restored rows of the zones, which are on `side`."""
-        ...
-
-    def all_zones(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
-        """Return a context in which each process has the owned rows of all zones, on `side`.
-
-        Changes of rows are kept in the process that owns them. All processes must count the same in
-        `departures.counts` meanwhile.
-        """
-        ...
-
-    def share_rows(self, departures: DepartureQueue, side: int) -> None:
-        """Exchange ghosts of the next rows, which are on `side`, and vehicles that leave.
-
-        Afterwards, `departures.passing` has the leaving vehicles of all zones, and
-        `departures.counts` their changes of route.
-        """
-        ...
-
-    def running(self) -> NDArray[np.int64]:
-        """Return the number of vehicles of each world (W,) in all zones, after `share_rows`."""
-        ...
-
-    def clear_ranks(self, departures: DepartureQueue) -> None:
-        """Clear the ranks of lanes where departures may enter, before zones write them."""
-        ...
-
-    def share_ranks(self, departures: DepartureQueue) -> None:
-        """Exchange `departures.ranks` and `departures.last_s`, as the zones wrote them."""
-        ...
-
-    def share_proposals(self, departures: DepartureQueue) -> None:
-        """Exchange departures that found a gap: `departures.passing` and `departures.places`."""
-        ...
-
-    def share_leavers(self, departures: DepartureQueue) -> None:
-        """Exchange agents' vehicles whose trip has ended, in `departures.passing`."""
-        ...
-
-    def share_detections(self, worlds: Worlds) -> None:
-        """Exchange `worlds.detected_s`, the times of the latest detections of vehicles."""
-        ...
-
-    def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        """Exchange the outputs of agents in the chosen worlds (W,), except observations."""
-        ...
-
-
-class NoPeers:
-    """A replacement for peers where this process has all zones."""
 
     are_none = True
 
@@ -88,36 +31,44 @@ class NoPeers:
         self._division = division
 
     def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
-        """Do nothing: all vehicles belong to this process."""
+        """Drop other processes' vehicles, which a reset of the chosen worlds (W,) has made."""
 
     def resume_from(self, departures: DepartureQueue, side: int) -> None:
-        """Do nothing: there are no other processes."""
+        """Resume from the restored rows of the zones, which are on `side`."""
 
     def all_zones(self, departures: DepartureQueue, side: int) -> AbstractContextManager[None]:
-        """Return an empty context: this process has the rows of all zones."""
+        """Return a context in which each process has the owned rows of all zones, on `side`.
+
+        Changes of rows are kept in the process that owns them. All processes must count the same in
+        `departures.counts` meanwhile.
+        """
         return nullcontext()
 
     def share_rows(self, departures: DepartureQueue, side: int) -> None:
-        """Do nothing: this process has all ghosts."""
+        """Exchange ghosts of the next rows, which are on `side`, and vehicles that leave.
+
+        Afterwards, `departures.passing` has the leaving vehicles of all zones, and
+        `departures.counts` their changes of route.
+        """
 
     def running(self) -> NDArray[np.int64]:
-        """Return the number of vehicles of each world (W,) in all zones."""
+        """Return the number of vehicles of each world (W,) in all zones, after `share_rows`."""
         return self._division.running()
 
     def clear_ranks(self, departures: DepartureQueue) -> None:
-        """Do nothing: the zones of this process write all ranks."""
+        """Clear the ranks of lanes where departures may enter, before zones write them."""
 
     def share_ranks(self, departures: DepartureQueue) -> None:
-        """Do nothing: this process has all ranks."""
+        """Exchange `departures.ranks` and `departures.last_s`, as the zones wrote them."""
 
     def share_proposals(self, departures: DepartureQueue) -> None:
-        """Do nothing: this process has all proposals."""
+        """Exchange departures that found a gap: `departures.passing` and `departures.places`."""
 
     def share_leavers(self, departures: DepartureQueue) -> None:
-        """Do nothing: this process has all leaving vehicles."""
+        """Exchange agents' vehicles whose trip has ended, in `departures.passing`."""
 
     def share_detections(self, worlds: Worlds) -> None:
-        """Do nothing: this process has all detectors."""
+        """Exchange `worlds.detected_s`, the times of the latest detections of vehicles."""
 
     def share_outputs(self, outputs: Outputs, chosen: NDArray[np.bool_]) -> None:
-        """Do nothing: this process has all outputs."""
+        """Exchange the outputs of agents in the chosen worlds (W,), except observations."""

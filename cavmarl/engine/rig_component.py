@@ -2,28 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.driving.vehicle_types import generated_types
-from cavmarl.engine.component import ComponentContext
+from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.sensors.mounted.backdrop import make_backdrop
 from cavmarl.sensors.mounted.mounted_sensor import Platform, SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Rig
 from cavmarl.shards.shard import Commands
 
 
-class RigComponent:
-    """A `Component` that lets the rigs of all agents sense in each tick.
+class RigComponent(Component):
+    """Lets the rigs of all agents sense in each tick.
 
     Attributes:
         platform: the vehicles that carry the sensors.
     """
-
-    reads_all: tuple[str, ...] = ()
 
     def __init__(self, host: ComponentContext) -> None:
         config = host.config
@@ -54,10 +52,6 @@ class RigComponent:
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         return self.rig.arrays()
-
-    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return "", because the arrays hold no indices and any values are valid."""
-        return ""
 
     def scenes(self) -> list[SensedScene]:
         """Return the present surroundings of the agents of each zone."""

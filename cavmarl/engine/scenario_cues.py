@@ -2,25 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.driving.kernels.motion.scripted_rows import note_cues
+from cavmarl.engine.component import Component
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.shard import Commands, Shard
 
 
-class Cues:
-    """A `Component` that checks the agents of all zones at the beginning of each tick.
+class Cues(Component):
+    """Checks the agents of all zones at the beginning of each tick.
 
     The detected cues are in `Worlds.cues`, which all shards share.
     """
 
-    reads_all: tuple[str, ...] = ("begin",)
+    reads_all = ("begin",)
 
     def __init__(
         self, cues: NDArray[np.void], shards: Sequence[Shard], division: ZonedShards
@@ -30,22 +30,8 @@ class Cues:
         self._division = division
         self._note_cues = specialized(note_cues)
 
-    def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Do nothing: the new actors of an episode have reset the cues."""
-
     def begin(self, commands: Commands) -> None:
         """Record each cue whose time has come, or that has an agent nearby."""
         zoned, worlds = self._division.zoned, self._worlds
         rows = zoned.rows[self._division.side]
         self._note_cues(self._cues, rows, zoned.num_owned, worlds.ticks, worlds.cues)
-
-    def end(self) -> None:
-        """Do nothing: scripted vehicles move with all other vehicles."""
-
-    def arrays(self) -> Iterator[NDArray[Any]]:
-        """Return no arrays: the cues are in `Worlds`."""
-        return iter(())
-
-    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return "", because there are no arrays."""
-        return ""

@@ -7,10 +7,10 @@ that the simulator is to reach. The simulator's report then corrects the rows.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import Any, NamedTuple, TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,8 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
 from cavmarl.core.records.codes import EVENTS_THAT_END
 from cavmarl.driving.kernels.motion.reported_motion import find_aims, follow_reports
-from cavmarl.engine.outside_traffic import NoOutsideTraffic
+from cavmarl.engine.component import Component
+from cavmarl.engine.outside_traffic import OutsideTraffic
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.message_coordinator import MessageCoordinator
@@ -56,15 +57,13 @@ class _Run:
         self.before: NDArray[np.void]  # VEHICLE (n,), its vehicles before the tick
 
 
-class SimulatorComponent:
-    """A `Component` that runs the simulators of zones, and the gate of the coordinators.
+class SimulatorComponent(Component):
+    """Runs the simulators of zones, and the gate of the coordinators.
 
     Attributes:
         zones: the zones that simulators run.
         coordinators: the coordinators of the worlds; set after they are made.
     """
-
-    reads_all: tuple[str, ...] = ()
 
     def __init__(
         self, tick: Tick, config: EnvConfig, network: RoadNetwork, hosted: Sequence[HostedZone]
@@ -178,17 +177,6 @@ class SimulatorComponent:
         first = network.phases["first_state"].item(phase)
         num = network.signals["num_links"].item(signal)
         return "".join(SIGNAL_STATES[code] for code in network.phase_states[first : first + num])
-
-    def end(self) -> None:
-        """Do nothing: `SimulatorPhases` moves the vehicles."""
-
-    def arrays(self) -> Iterator[NDArray[Any]]:
-        """Return nothing: rows have the state of the vehicles."""
-        return iter(())
-
-    def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return no fault."""
-        return ""
 
     def move(self) -> None:
         """Let all simulators run a tick, and correct the rows that cavmarl has moved."""
@@ -331,7 +319,7 @@ class SimulatorComponent:
             self._end(place)
 
 
-class SimulatorPhases(NoOutsideTraffic):
+class SimulatorPhases(OutsideTraffic):
     """The phases of a tick in worlds in which other simulators run zones."""
 
     def __init__(self, hosted: SimulatorComponent) -> None:

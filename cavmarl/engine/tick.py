@@ -13,11 +13,11 @@ from cavmarl.core.compiled.bound_call import bind
 from cavmarl.core.math.counters import count_tick, occasions
 from cavmarl.core.records.arrays import DepartureQueue, Worlds
 from cavmarl.engine.component import Component
-from cavmarl.engine.outside_traffic import NoOutsideTraffic, OutsideTraffic, SumoPhases
-from cavmarl.engine.peers import NoPeers, Peers
+from cavmarl.engine.outside_traffic import OutsideTraffic, SumoPhases
+from cavmarl.engine.peers import Peers
 from cavmarl.engine.shared_outputs import SharedOutputs
 from cavmarl.engine.step_trace import Traced
-from cavmarl.handoff.coordinator.coordinators import NoOwnershipRuntime, OwnershipRuntime
+from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.shards.executor import Executor, TeamExecutor
 from cavmarl.shards.shard import Commands, Shard, common_of
@@ -53,9 +53,9 @@ class Tick:
         self.departures = departures
         self.attached = attached
         self.executor: Executor = ShardGroup(shards)
-        self.coordination: OwnershipRuntime = NoOwnershipRuntime()
-        self.peers: Peers = NoPeers(division)
-        self.outside: OutsideTraffic = NoOutsideTraffic()
+        self.coordination = OwnershipRuntime()
+        self.peers = Peers(division)
+        self.outside = OutsideTraffic()
         self.finish_phase: Callable[[], None] = _no_wait
         self.note_phase: Callable[[str], None] = _ignore
         self._shard = shards[0]

@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.shards.shard import Commands, common_of
 from cavmarl.v2x.bus import Bus
 
-if TYPE_CHECKING:
-    from cavmarl.engine.component import ComponentContext
 
-
-class V2xComponent:
-    """A `Component` that lets the stations of W worlds send and receive at the end of each tick.
+class V2xComponent(Component):
+    """Lets the stations of W worlds send and receive at the end of each tick.
 
     Messages that are received in a tick are in the inboxes when agents sense at its end.
     """
 
-    reads_all: tuple[str, ...] = ("end",)
+    reads_all = ("end",)
 
     def __init__(self, host: ComponentContext) -> None:
         worlds = host.shards[0].worlds

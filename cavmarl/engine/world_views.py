@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,6 +28,8 @@ from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 from cavmarl.v2x.bus import Bus
 from cavmarl.zones.partition.zone_partition import ZonePartition
+
+Part = TypeVar("Part")
 
 
 class WorldViews:
@@ -78,10 +80,8 @@ class WorldViews:
     @property
     def messages(self) -> Bus:
         """The bus of messages between vehicles and roadside units."""
-        for part in self._tick.attached:
-            if isinstance(part, V2xComponent):
-                return part.bus
-        raise ConfigError("v2x.enabled = false: there are no messages; set it to true")
+        missing = "v2x.enabled = false: there are no messages; set it to true"
+        return self._part(V2xComponent, missing).bus
 
     @property
     def departures(self) -> DepartureQueue:
@@ -106,20 +106,21 @@ class WorldViews:
     @property
     def external(self) -> ExternalComponent:
         """The slots of the vehicles that the caller poses or drives."""
-        for part in self._tick.attached:
-            if isinstance(part, ExternalComponent):
-                return part
-        raise ConfigError(
-            "population.external = 0: there is no room for vehicles of the caller; set it higher"
-        )
+        missing = "population.external = 0: there is no room for such vehicles; set it higher"
+        return self._part(ExternalComponent, missing)
 
     @property
     def signals(self) -> SignalComponent:
         """The signals that agents control."""
+        missing = "signals.agents = none: set it to all, or to a list of ids of signals"
+        return self._part(SignalComponent, missing)
+
+    def _part(self, kind: type[Part], missing: str) -> Part:
+        """Return the component of a kind. Raises ConfigError with the text if there is none."""
         for part in self._tick.attached:
-            if isinstance(part, SignalComponent):
+            if isinstance(part, kind):
                 return part
-        raise ConfigError("signals.agents = none: set it to all, or to a list of ids of signals")
+        raise ConfigError(missing)
 
     def signal_view(self) -> SignalView:
         """Return what controllers of signals know; its arrays follow the worlds."""

@@ -4,36 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import cached_property
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
+from cavmarl.core.compiled.bound_call import BoundCall, bind_by_name, bound, keep_last
 from cavmarl.core.records.arrays import Demand, DepartureQueue
 from cavmarl.core.records.codes import INSERT_OPEN
-from cavmarl.shards.kernels.group_phases import (
-    admit_each,
-    advance_each,
-    begin_step_each,
-    choose_goals_each,
-    commit,
-    credit_each,
-    detect_each,
-    dismiss_each,
-    drive_on_each,
-    fill_stacks_each,
-    forget_each,
-    gather_ghosts_each,
-    leave_background_each,
-    observe_messages_each,
-    observe_optional_each,
-    propose_each,
-    rank_lanes_each,
-    resolve_each,
-    retire_each,
-    sense_each,
-    turn,
-)
+from cavmarl.shards.kernels import group_phases
 from cavmarl.shards.kernels.zone_loop import FRAME, Members
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
@@ -212,213 +191,96 @@ class GroupCalls:
         """Whether there are sensors or terms from outside of the package."""
         return not self._first.registered.is_empty
 
-    @cached_property
-    def begin_step(self) -> BoundCall[None]:
-        return bind(
-            begin_step_each,
-            members=self.members,
-            roads=self._first.roads,
-            discrete=self._first.discrete,
-            meta_actions=self.meta_actions,
-            target_speeds=self._first.target_speeds,
-        )
+    @property
+    def values(self) -> dict[str, Any]:
+        """The arguments of the kernels by the names of their parameters."""
+        first, action, clock = self._first, self._config.action, self._config.clock
+        return {
+            "members": self.members,
+            "roads": first.roads,
+            "plans": first.plans,
+            "travel": first.travel,
+            "lane_grid": first.lane_grid,
+            "scratch": first.scratch,
+            "sensors": first.sensors,
+            "optional": first.optional,
+            "objects": first.no_reports if first.mail is None else first.mail.objects,
+            "outputs": first.outputs,
+            "observations": first.outputs.observations,
+            "rewards": first.outputs.rewards,
+            "lane_place": first.roads.lane_place,
+            "places": first.roads.places,
+            "commands": self.controls,
+            "meta_actions": self.meta_actions,
+            "chosen": self.chosen,
+            "inserted": self.inserted,
+            "discrete": first.discrete,
+            "target_speeds": first.target_speeds,
+            "accel_limit": action.acceleration_mps2,
+            "steering_limit": action.steering_rad,
+            "first_stop": len(first.travel.stops) - len(first.roads.lanes),
+            "dt": clock.sim_dt_s,
+            "tick_s": clock.sim_dt_s,
+            "ticks_per_step": clock.ticks_per_step,
+            "ticks_in_order": TICKS_IN_ORDER,
+            "stack": self._config.sensors.stack,
+        }
 
-    @cached_property
-    def drive_on(self) -> BoundCall[None]:
-        first = self._first
-        return bind(
-            drive_on_each,
-            members=self.members,
-            inserted=self.inserted,
-            first_stop=len(first.travel.stops) - len(first.roads.lanes),
-        )
-
-    @cached_property
-    def turn(self) -> BoundCall[None]:
-        return bind(turn, members=self.members, ticks_in_order=TICKS_IN_ORDER)
-
-    @cached_property
-    def commit(self) -> BoundCall[None]:
-        return bind(commit, members=self.members)
-
-    @cached_property
-    def advance(self) -> BoundCall[None]:
-        first, action = self._first, self._config.action
-        return bind(
-            advance_each,
-            members=self.members,
-            roads=first.roads,
-            plans=first.plans,
-            travel=first.travel,
-            lane_grid=first.lane_grid,
-            scratch=first.scratch,
-            commands=self.controls,
-            discrete=first.discrete,
-            accel_limit=action.acceleration_mps2,
-            steering_limit=action.steering_rad,
-            dt=self._config.clock.sim_dt_s,
-        )
+    begin_step = bound(group_phases.begin_step_each)
+    drive_on = bound(group_phases.drive_on_each)
+    turn = bound(group_phases.turn)
+    advance = bound(group_phases.advance_each)
+    resolve = bound(group_phases.resolve_each)
+    commit = bound(group_phases.commit)
+    detect = bound(group_phases.detect_each)
+    sense = bound(group_phases.sense_each)
+    observe_optional = bound(group_phases.observe_optional_each)
+    fill_stacks = bound(group_phases.fill_stacks_each)
+    credit = bound(group_phases.credit_each)
 
     def _bind_gather(self, touching_m: float, border_m: float) -> BoundCall[None]:
-        return bind(
-            gather_ghosts_each, members=self.members, touching_m=touching_m, border_m=border_m
-        )
-
-    @cached_property
-    def resolve(self) -> BoundCall[None]:
-        return bind(resolve_each, members=self.members, scratch=self._first.scratch)
-
-    @cached_property
-    def detect(self) -> BoundCall[None]:
-        roads = self._first.roads
-        return bind(
-            detect_each,
-            members=self.members,
-            lane_place=roads.lane_place,
-            places=roads.places,
-            dt=self._config.clock.sim_dt_s,
-        )
-
-    @cached_property
-    def sense(self) -> BoundCall[None]:
-        first, clock = self._first, self._config.clock
-        return bind(
-            sense_each,
-            members=self.members,
-            roads=first.roads,
-            plans=first.plans,
-            travel=first.travel,
-            sensors=first.sensors,
-            tick_s=clock.sim_dt_s,
-            ticks_per_step=clock.ticks_per_step,
-            chosen=self.chosen,
-            outputs=first.outputs,
-        )
-
-    @cached_property
-    def observe_optional(self) -> BoundCall[None]:
-        first, clock = self._first, self._config.clock
-        return bind(
-            observe_optional_each,
-            members=self.members,
-            roads=first.roads,
-            travel=first.travel,
-            lane_grid=first.lane_grid,
-            optional=first.optional,
-            objects=first.no_reports if first.mail is None else first.mail.objects,
-            tick_s=clock.sim_dt_s,
-            ticks_per_step=clock.ticks_per_step,
-            stack=self._config.sensors.stack,
-            chosen=self.chosen,
-            observations=first.outputs.observations,
-        )
+        own = {"members": self.members, "touching_m": touching_m, "border_m": border_m}
+        return bind_by_name(group_phases.gather_ghosts_each, own)
 
     @cached_property
     def observe_messages(self) -> BoundCall[None]:
         first, messages = self._first, self._config.sensors.messages
         assert first.messages_at is not None
-        return bind(
-            observe_messages_each,
-            members=self.members,
-            roads=first.roads,
-            plans=first.plans,
-            mail=first.mail,
-            at=first.messages_at.start,
-            objects=messages.objects,
-            events=messages.events,
-            signal=messages.signal,
-            scale_m=messages.range_m,
-            tick_s=self._config.clock.sim_dt_s,
-            stack=self._config.sensors.stack,
-            chosen=self.chosen,
-            observations=first.outputs.observations,
-        )
-
-    @cached_property
-    def fill_stacks(self) -> BoundCall[None]:
-        return bind(
-            fill_stacks_each,
-            members=self.members,
-            ticks_per_step=self._config.clock.ticks_per_step,
-            stack=self._config.sensors.stack,
-            chosen=self.chosen,
-            observations=self._first.outputs.observations,
-        )
-
-    @cached_property
-    def credit(self) -> BoundCall[None]:
-        return bind(
-            credit_each,
-            members=self.members,
-            rewards=self._first.outputs.rewards,
-            chosen=self.chosen,
-        )
+        own = {
+            "mail": first.mail,
+            "at": first.messages_at.start,
+            "objects": messages.objects,
+            "events": messages.events,
+            "signal": messages.signal,
+            "scale_m": messages.range_m,
+        }
+        return bind_by_name(group_phases.observe_messages_each, self.values | own)
 
 
 class DepartureCalls:
     """The kernel calls of a group that need the departure queue."""
 
     def __init__(self, calls: GroupCalls, departures: DepartureQueue) -> None:
-        self.departures = departures
-        self._members = calls.members
-        self._first = calls._first
-        self._clock = self._first.config.clock
+        self._calls = calls
+        self._departures = departures
         self.choose_goals = keep_last(self._bind_choose_goals)
         self.propose = keep_last(self._bind_propose)
 
+    @property
+    def values(self) -> dict[str, Any]:
+        """The arguments of the kernels by the names of their parameters."""
+        return {**self._calls.values, "departures": self._departures}
+
+    leave = bound(group_phases.leave_background_each)
+    dismiss = bound(group_phases.dismiss_each)
+    rank_lanes = bound(group_phases.rank_lanes_each)
+    admit = bound(group_phases.admit_each)
+    retire = bound(group_phases.retire_each)
+    forget = bound(group_phases.forget_each)
+
     def _bind_choose_goals(self, demand: Demand, num_goals: int) -> BoundCall[None]:
-        return bind(
-            choose_goals_each,
-            members=self._members,
-            demand=demand,
-            roads=self._first.roads,
-            travel=self._first.travel,
-            num_goals=num_goals,
-            departures=self.departures,
-            dt=self._clock.sim_dt_s,
-        )
-
-    @cached_property
-    def leave(self) -> BoundCall[None]:
-        return bind(leave_background_each, members=self._members, departures=self.departures)
-
-    @cached_property
-    def dismiss(self) -> BoundCall[None]:
-        return bind(dismiss_each, members=self._members, departures=self.departures)
-
-    @cached_property
-    def rank_lanes(self) -> BoundCall[None]:
-        return bind(
-            rank_lanes_each,
-            members=self._members,
-            roads=self._first.roads,
-            travel=self._first.travel,
-            departures=self.departures,
-            scratch=self._first.scratch,
-        )
+        own = {"demand": demand, "num_goals": num_goals}
+        return bind_by_name(group_phases.choose_goals_each, self.values | own)
 
     def _bind_propose(self, demand: Demand) -> BoundCall[None]:
-        return bind(
-            propose_each,
-            members=self._members,
-            demand=demand,
-            roads=self._first.roads,
-            travel=self._first.travel,
-            departures=self.departures,
-            scratch=self._first.scratch,
-        )
-
-    @cached_property
-    def admit(self) -> BoundCall[None]:
-        return bind(admit_each, members=self._members, departures=self.departures)
-
-    @cached_property
-    def retire(self) -> BoundCall[None]:
-        ticks = self._clock.ticks_per_step
-        return bind(
-            retire_each, members=self._members, departures=self.departures, ticks_per_step=ticks
-        )
-
-    @cached_property
-    def forget(self) -> BoundCall[None]:
-        return bind(forget_each, members=self._members, departures=self.departures)
+        return bind_by_name(group_phases.propose_each, self.values | {"demand": demand})

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass
 from functools import cached_property, partial
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.population import PopulationConfig
 from cavmarl.config.traffic import TrafficConfig
-from cavmarl.core.compiled.bound_call import BoundCall, bind, keep_last
+from cavmarl.core.compiled.bound_call import bound, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Demand, DepartureQueue, TripTables, Worlds
@@ -26,15 +27,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
-from cavmarl.traffic.kernels.admission import accept, assign_lanes
-from cavmarl.traffic.kernels.demand_generator import (
-    END_ROOM_M,
-    PLACE_GAP_M,
-    call_orders,
-    insert,
-    populate,
-    settle,
-)
+from cavmarl.traffic.kernels import admission, demand_generator
+from cavmarl.traffic.kernels.demand_generator import END_ROOM_M, PLACE_GAP_M, populate
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
@@ -73,54 +67,29 @@ class TrafficCalls:
         self.running = np.zeros(len(ticks), dtype=np.int64)
         self.inserted = np.zeros((len(ticks), traffic.population.insertions, 3))
 
-    @cached_property
-    def call_orders(self) -> BoundCall[None]:
-        return bind(call_orders, departures=self._departures, ticks=self._ticks)
-
-    @cached_property
-    def settle(self) -> BoundCall[None]:
+    @property
+    def values(self) -> dict[str, Any]:
+        """The arguments of the kernels by the names of their parameters."""
         traffic = self._traffic
-        return bind(
-            settle,
-            demand=traffic.demand,
-            roads=traffic.network.arrays,
-            travel=traffic.travel,
-            departures=self._departures,
-            ticks=self._ticks,
-            keys=self._keys,
-            dt=traffic.dt,
-        )
+        return {
+            "demand": traffic.demand,
+            "roads": traffic.network.arrays,
+            "travel": traffic.travel,
+            "departures": self._departures,
+            "ticks": self._ticks,
+            "keys": self._keys,
+            "dt": traffic.dt,
+            "num_goals": len(traffic.plans),
+            "inserted": self.inserted,
+            "running": self.running,
+            "capacity": traffic.capacity,
+        }
 
-    @cached_property
-    def insert(self) -> BoundCall[None]:
-        traffic = self._traffic
-        return bind(
-            insert,
-            demand=traffic.demand,
-            roads=traffic.network.arrays,
-            travel=traffic.travel,
-            num_goals=len(traffic.plans),
-            inserted=self.inserted,
-            departures=self._departures,
-            ticks=self._ticks,
-            keys=self._keys,
-        )
-
-    @cached_property
-    def assign_lanes(self) -> BoundCall[None]:
-        traffic = self._traffic
-        return bind(
-            assign_lanes,
-            roads=traffic.network.arrays,
-            travel=traffic.travel,
-            departures=self._departures,
-            keys=self._keys,
-        )
-
-    @cached_property
-    def accept(self) -> BoundCall[None]:
-        capacity = self._traffic.capacity
-        return bind(accept, departures=self._departures, running=self.running, capacity=capacity)
+    call_orders = bound(demand_generator.call_orders)
+    settle = bound(demand_generator.settle)
+    insert = bound(demand_generator.insert)
+    assign_lanes = bound(admission.assign_lanes)
+    accept = bound(admission.accept)
 
 
 @dataclass(frozen=True)

@@ -7,15 +7,22 @@ import signal
 import time
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.verify.determinism import MAX_STEPS
+from cavmarl.verify.fault_campaign import (
+    FaultCampaign,
+    FaultLine,
+    check_kinds,
+    check_nodes,
+    run_lines,
+)
 from cavmarl.verify.faulty_network import FaultyNetwork, NetworkFault
 from cavmarl.verify.node_losses import FIRST_STEPS, ComparedWorlds
 
@@ -28,69 +35,6 @@ APART = 4  # steps between two faults that may cost a node, and after the last s
 WAIT_S = 0.05  # between two steps, while a lost node is replaced
 REPLACED_S = 60.0  # limit for the replacement of a lost node
 TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
-
-
-@dataclass
-class FaultLine:
-    """The runs with one number of nodes and one kind of fault."""
-
-    nodes: int  # number of nodes at the beginning
-    fault: str  # the kind
-    runs: int = 0  # number of runs
-    injected: Counter[str] = field(default_factory=Counter)  # number of faults, by kind
-    lost: int = 0  # number of lost nodes
-    recoveries: int = 0  # number of rollbacks to a kept state
-    equal: int = 0  # runs that were equal to the undivided world to the end
-    ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
-    wrong_seeds: list[int] = field(default_factory=list)  # of runs with a difference
-
-    @property
-    def deaths(self) -> int:
-        """The number of processes that got SIGKILL."""
-        return self.injected[KILL]
-
-    def to_dict(self) -> dict[str, Any]:
-        return {**vars(self), "injected": dict(self.injected), "deaths": self.deaths}
-
-
-@dataclass(frozen=True)
-class NodeCampaign:
-    """The result of a campaign with real processes."""
-
-    env: str  # name of the environment
-    zones: int  # of each world
-    steps: int  # least number of steps of each run
-    lines: tuple[FaultLine, ...]  # one for each number of nodes and kind of fault
-
-    @property
-    def holds(self) -> bool:
-        return not any(line.wrong_seeds for line in self.lines)
-
-    @property
-    def injected(self) -> dict[str, int]:
-        """The number of faults in all runs, by kind."""
-        total: Counter[str] = Counter()
-        for line in self.lines:
-            total += line.injected
-        return {kind: total[kind] for kind in FAULTS if total[kind]}
-
-    def total(self, name: str) -> int:
-        """Return the sum of a number over all lines."""
-        return sum(getattr(line, name) for line in self.lines)
-
-    def to_dict(self) -> dict[str, Any]:
-        names = ("runs", "deaths", "lost", "recoveries", "equal", "ended")
-        return {
-            "env": self.env,
-            "zones": self.zones,
-            "steps": self.steps,
-            "faults": sum(self.injected.values()),
-            "injected": self.injected,
-            **{name: self.total(name) for name in names},
-            "wrong": sum(len(line.wrong_seeds) for line in self.lines),
-            "lines": [line.to_dict() for line in self.lines],
-            "holds": self.holds,
-        }
 
 
 def verify_node_faults(
@@ -106,7 +50,7 @@ def verify_node_faults(
     policy: str | Path = "idm",
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
-) -> NodeCampaign:
+) -> FaultCampaign[FaultLine]:
     """Compare worlds over nodes with undivided worlds, while connections and nodes fail.
 
     All connections, to the caller and between nodes, go through a network that delays, damages,
@@ -132,48 +76,44 @@ def verify_node_faults(
     """
     given = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
-    if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
-    if unknown := [fault for fault in faults if fault not in (*FAULTS, ANY)]:
-        raise ConfigError(f"faults = {unknown}: must be among {', '.join((*FAULTS, ANY))}")
+    check_nodes(nodes)
+    check_kinds("faults", faults, (*FAULTS, ANY))
     if steps <= FIRST_STEPS:
         raise ConfigError(f"steps = {steps}: must be at least {FIRST_STEPS + 1}")
     count = 2 * max(nodes) if zones is None else zones
     spec = replace(given, overrides={"workers.timeout_s": TIMEOUT_S, **given.overrides})
     lines = [FaultLine(number, fault) for number in nodes for fault in faults]
-    for n, line in enumerate(lines):
-        for k in range(seeds):
-            num = per_run or PER_RUN.get(line.fault, OTHERS)
-            _run(spec, line, first_seed + k, num, count, steps, policy)
-            if progress is not None:
-                progress(n * seeds + k + 1, len(lines) * seeds)
-    return NodeCampaign(given.env, count, steps, tuple(lines))
+    run = partial(_run, spec, per_run, count, steps, policy)
+    run_lines(lines, range(first_seed, first_seed + seeds), run, progress)
+    return FaultCampaign(given.env, count, steps, tuple(lines))
 
 
 def _run(
     spec: WorldSpec,
-    line: FaultLine,
-    seed: int,
-    num: int,  # number of faults
+    per_run: int | None,  # number of faults
     zones: int,
     steps: int,
     policy: str | Path,
+    line: FaultLine,
+    seed: int,
 ) -> None:
     network = FaultyNetwork(seed)
-    line.runs += 1
+    num = per_run or PER_RUN.get(line.kind, OTHERS)
     try:
         pair = ComparedWorlds(spec, line.nodes, zones, 1, policy, network.route)
-        drawn = random.Random(f"{line.nodes} {line.fault} {seed}")
+        drawn = random.Random(f"{line.nodes} {line.kind} {seed}")
         planned = _PlannedFaults(line, num, pair, network, drawn)
         try:
             found = pair.compare(steps, planned.due, lambda step: None, planned.are_left)
             if found.different is None:
                 line.equal += 1
             else:
+                line.wrong.append(f"different after step {found.different}")
                 line.wrong_seeds.append(seed)
         except WorkerDeathError:
             line.ended += 1
         line.injected += planned.signalled
+        line.deaths += planned.signalled[KILL]
         line.injected += Counter({str(fault): num for fault, num in network.done.items()})
         line.lost += pair.worlds.pool.losses
         line.recoveries += pair.worlds.pool.recoveries
@@ -194,9 +134,9 @@ class _PlannedFaults:
     ) -> None:
         self._pair, self._network, self._drawn = pair, network, drawn
         self._nodes = line.nodes
-        self._is_harmless = line.fault == NetworkFault.DELAY
+        self._is_harmless = line.kind == NetworkFault.DELAY
         num = 1 if line.nodes == 1 and not self._is_harmless else num
-        kinds = FAULTS if line.fault == ANY else (line.fault,)
+        kinds = FAULTS if line.kind == ANY else (line.kind,)
         self._kinds = drawn.choices(kinds, k=num)
         self._next_step = FIRST_STEPS + drawn.randrange(APART)
         self._waits_until_s = 0.0  # limit for the replacement of a lost node; 0: none is lost

@@ -26,6 +26,7 @@ from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.placement.backend_name import NODES, BackendName
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import DrivenRun, same_bytes
+from cavmarl.verify.fault_campaign import check_nodes
 
 FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
 LATEST = 1.5  # latest time of a kill, in durations of a step; some kills happen between two steps
@@ -92,8 +93,7 @@ def verify_nodes(
     """
     spec = WorldSpec.of(env, **keys)
     check_count("steps", steps, MAX_STEPS)
-    if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
+    check_nodes(nodes)
     most = max(steps - FIRST_STEPS, 0)
     if not 0 <= kills <= most:
         raise ConfigError(f"kills = {kills}: must be from 0 to {most} with {steps} steps")

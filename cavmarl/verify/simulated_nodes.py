@@ -9,13 +9,12 @@ from __future__ import annotations
 
 import logging
 import random
-from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any, Unpack
+from typing import Unpack
 
 from cavmarl.config.checks import check_count
 from cavmarl.config.registry import load_config
@@ -31,9 +30,15 @@ from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.placement.backend_name import NODES, BackendName
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.differences import Arrays, DrivenRun, first_results, same_bytes, step_results
+from cavmarl.verify.fault_campaign import (
+    FaultCampaign,
+    FaultLine,
+    check_kinds,
+    check_nodes,
+    run_lines,
+)
 from cavmarl.verify.simulated_faults import (
     CALLER_DEATHS,
-    DEATHS,
     FAULTS,
     SEVERE_RATES,
     TOLERATED,
@@ -80,13 +85,13 @@ BUSY = WorldSpec(
 )
 
 
-class SimulatedNodes:
-    """Starts nodes as processes of a simulated machine; a `NodeStarter`."""
+class SimulatedNodes(NodeStarter):
+    """Starts nodes as processes of a simulated machine, which end by themselves."""
 
     def __init__(
         self, machine: SimulatedMachine, drawn: random.Random, ghosts: bool, nodes: int
     ) -> None:
-        self.count = nodes
+        super().__init__(nodes)
         self._machine, self._drawn = machine, drawn
         self._ghosts = ghosts  # whether replaced processes may continue to run
         self.listener = SimulatedListener(machine, machine.caller)
@@ -103,94 +108,19 @@ class SimulatedNodes:
         process.not_before_s = self._machine.now_s + 10.0 ** self._drawn.uniform(*STARTED)
         return process
 
-    def trouble(self, begun: Collection[int]) -> str | None:
-        return None
-
-    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        self.replace(number, is_silent)
-        return None
-
     def replace(self, number: int, is_silent: bool) -> None:
         if not self._ghosts:
             self._machine.end(self._processes[number])
         self._processes[number] = self._start(number)
 
-    def stopped(self) -> set[int]:
-        return set()  # unknown, as on another machine
-
-    def close(self) -> None:
-        """Do nothing: simulated nodes end by themselves."""
-
 
 @dataclass
-class SimulatedLine:
-    """The runs with one number of nodes and one mix of faults."""
+class SimulatedLine(FaultLine):
+    """The runs on the simulated machine with one number of nodes and one mix of faults."""
 
-    nodes: int  # number of nodes at the beginning
-    mix: str  # of MIXES
-    runs: int = 0  # number of runs
-    injected: Counter[Fault] = field(default_factory=Counter)  # faults that have happened
-    lost: int = 0  # number of lost nodes
-    recoveries: int = 0  # number of rollbacks to a kept state
     replacements: int = 0  # number of nodes that replaced lost nodes during a run
     migrations: int = 0  # number of changes of owner
-    equal: int = 0  # runs that were equal to the undivided world to the end
-    ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
     caller_ended: int = 0  # runs in which the caller died, and all nodes ended by themselves
-    wrong: list[str] = field(default_factory=list)  # descriptions of all other runs
-    wrong_seeds: list[int] = field(default_factory=list)  # seeds of the runs in `wrong`
-
-    @property
-    def deaths(self) -> int:
-        """The number of processes that faults have ended."""
-        return sum(self.injected[fault] for fault in DEATHS)
-
-    def to_dict(self) -> dict[str, Any]:
-        injected = counts_by_name(self.injected.items())
-        return {**vars(self), "injected": injected, "deaths": self.deaths}
-
-
-@dataclass(frozen=True)
-class SimulatedCampaign:
-    """The result of a campaign on a simulated machine."""
-
-    env: str  # name of the environment
-    zones: int  # of each world
-    steps: int  # of each run
-    lines: tuple[SimulatedLine, ...]  # one for each number of nodes and mix of faults
-
-    @property
-    def holds(self) -> bool:
-        return not any(line.wrong for line in self.lines)
-
-    @property
-    def injected(self) -> dict[str, int]:
-        """The number of faults in all runs, by kind."""
-        total: Counter[Fault] = Counter()
-        for line in self.lines:
-            total += line.injected
-        return counts_by_name(total.items())
-
-    def total(self, name: str) -> int:
-        """Return the sum of a number over all lines."""
-        return sum(getattr(line, name) for line in self.lines)
-
-    def to_dict(self) -> dict[str, Any]:
-        names = (
-            "runs", "deaths", "lost", "recoveries", "replacements", "migrations", "equal", "ended",
-            "caller_ended",
-        )  # fmt: skip
-        return {
-            "env": self.env,
-            "zones": self.zones,
-            "steps": self.steps,
-            "faults": sum(self.injected.values()),
-            "injected": self.injected,
-            **{name: self.total(name) for name in names},
-            "wrong": sum(len(line.wrong) for line in self.lines),
-            "lines": [line.to_dict() for line in self.lines],
-            "holds": self.holds,
-        }
 
 
 class _Reference:
@@ -221,7 +151,7 @@ def verify_simulated_nodes(
     policy: str | Path = "idm",
     progress: Callable[[int, int], None] | None = None,
     **keys: Unpack[WorldKeys],
-) -> SimulatedCampaign:
+) -> FaultCampaign[SimulatedLine]:
     """Drive worlds over simulated nodes, and compare each run with an undivided world.
 
     A run is a function of the world, the number of nodes, the mix and the seed of its faults.
@@ -246,12 +176,10 @@ def verify_simulated_nodes(
     check_count("seeds", seeds, MAX_SEEDS)
     if first_seed < 0:
         raise ConfigError(f"first_seed = {first_seed}: must be a whole number from 0 on")
-    if not nodes or min(nodes) < 1:
-        raise ConfigError(f"nodes = {list(nodes)}: must be one or more numbers from 1 on")
+    check_nodes(nodes)
     if steps < 2 * FIRST_STEPS:
         raise ConfigError(f"steps = {steps}: must be at least {2 * FIRST_STEPS}")
-    if unknown := [mix for mix in mixes if mix not in MIXES]:
-        raise ConfigError(f"mixes = {unknown}: must be among {', '.join(MIXES)}")
+    check_kinds("mixes", mixes, MIXES)
     count = 2 * max(nodes) if zones is None else zones
     overrides = {"workers.timeout_s": TIMEOUT_S, **given.overrides}
     keywords = {**given.keywords, "overrides": overrides}
@@ -260,12 +188,12 @@ def verify_simulated_nodes(
     reference = _Reference(given, steps, policy)
     lines = [SimulatedLine(number, mix) for number in nodes for mix in mixes]
     with _quiet():
-        for n, line in enumerate(lines):
-            for k in range(seeds):
-                _Run(world, base_dir, reference, line, first_seed + k).execute()
-                if progress is not None:
-                    progress(n * seeds + k + 1, len(lines) * seeds)
-    return SimulatedCampaign(given.env, count, steps, tuple(lines))
+
+        def run(line: SimulatedLine, seed: int) -> None:
+            _Run(world, base_dir, reference, line, seed).execute()
+
+        run_lines(lines, range(first_seed, first_seed + seeds), run, progress)
+    return FaultCampaign(given.env, count, steps, tuple(lines))
 
 
 class _Run:
@@ -276,10 +204,10 @@ class _Run:
     ) -> None:
         self._world, self._base_dir = world, base_dir
         self._reference, self._line, self._seed = reference, line, seed
-        self._drawn = random.Random(f"{line.nodes} {line.mix} {seed}")
+        self._drawn = random.Random(f"{line.nodes} {line.kind} {seed}")
         self._machine = SimulatedMachine(self._drawn.randrange(1 << 32), world)
         self._machine.caller.clock = random_clock(self._drawn)
-        self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.mix, {}))
+        self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.kind, {}))
         self._losses = 0  # number of lost nodes
         # number of lost and of living nodes at the last state that all nodes have kept
         self._losses_before, self._living = 0, line.nodes
@@ -287,7 +215,6 @@ class _Run:
     def execute(self) -> None:
         """Do the run, and add its result to its line."""
         line, machine = self._line, self._machine
-        line.runs += 1
         wrong = ""
         try:
             result = self._result()
@@ -298,6 +225,7 @@ class _Run:
         finally:
             machine.close()
             line.injected += self._faults.injected
+            line.deaths += self._faults.deaths
         if not wrong and self._losses and self._must_lose_no_node:
             wrong = f"{self._losses} nodes were lost to faults that must be tolerated"
         if wrong:
@@ -328,11 +256,11 @@ class _Run:
     @property
     def _must_lose_no_node(self) -> bool:
         """Return whether no fault of this run may cost a node."""
-        return self._line.mix in (NONE, MANY_TOLERATED, *TOLERATED)
+        return self._line.kind in (NONE, MANY_TOLERATED, *TOLERATED)
 
     def _planned(self) -> dict[int, list[Fault]]:
         """Return the planned faults by step."""
-        drawn, mix, steps = self._drawn, self._line.mix, len(self._reference.results)
+        drawn, mix, steps = self._drawn, self._line.kind, len(self._reference.results)
         if mix == NONE or mix in RATES:
             return {}
         if mix == TWO:

@@ -125,5 +125,5 @@ def test_a_plan_in_a_row_is_read_as_it_was_written() -> None:
     assert "costs by number" in text
     assert "ms" not in text
     assert "  world 1: worker 1 → 0" in text
-    with pytest.raises(ConfigError, match="in_row is 3"):
+    with pytest.raises(ConfigError, match="in_row = 3: must be a valid boolean"):
         plan_from_dict(plan.to_dict() | {"in_row": 3})

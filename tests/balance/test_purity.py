@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 FILES = sorted((Path(__file__).resolve().parents[2] / "cavmarl/balance").glob("*.py"))
-MORE = {"probe": {"psutil"}, "repartition": {"cavmarl.roads"}}
+MORE = {"probe": {"psutil"}, "plan_file": {"cavmarl.config.io", "pydantic"}}
 IMPURE = {"datetime", "multiprocessing", "os", "random", "shutil", "socket", "subprocess", "time"}
 
 

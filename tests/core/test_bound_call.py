@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.core.compiled.bound_call import CallSequence, bind
+from cavmarl.core.compiled.bound_call import CallSequence, bind, bind_by_name, bound
 
 
 @kernel
@@ -34,6 +36,34 @@ def test_a_bound_call_sees_changes_of_its_arrays_and_takes_arguments_by_name() -
     call()
     assert numbers.tolist() == [12, 5, 6]
     assert bind(compare, numbers, 11)() == (True, False)
+
+
+class _Numbers:
+    """Numbers with a call that adds to them."""
+
+    def __init__(self) -> None:
+        self.numbers, self.amount = np.arange(3), 5
+
+    @property
+    def values(self) -> dict[str, Any]:
+        return {"amount": self.amount, "numbers": self.numbers, "unused": None}
+
+    add = bound(add)
+
+
+def test_a_call_takes_the_values_of_its_object_by_the_names_of_parameters() -> None:
+    one = _Numbers()
+    one.amount = 7
+    one.add()
+    assert one.numbers.tolist() == [7, 8, 9]
+    one.add()
+    assert one.numbers.tolist() == [14, 15, 16]
+    assert one.add is one.add, "it is bound once"
+
+
+def test_a_parameter_without_a_value_is_named() -> None:
+    with pytest.raises(KeyError, match="amount"):
+        bind_by_name(add, {"numbers": np.arange(3)})
 
 
 def test_an_argument_of_a_kind_that_kernels_do_not_take_is_refused() -> None:

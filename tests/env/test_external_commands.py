@@ -14,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
+from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, parallel_env
 from cavmarl.core.errors import EpisodeError
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_EXTERNAL
 from cavmarl.core.records.rows import LOST_M
+from tests.support.saved_midway import check_resumed
 
 ROOM = {"population.external": 4}
 
@@ -275,25 +276,7 @@ def test_invalid_commands_are_refused_with_a_fix() -> None:
 
 
 def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
-    def finished(first: int, saved: bytes | None, zones: int) -> tuple[str, bytes]:
-        with closing(
-            make_vec("grid4x4", agents=3, background=20, overrides=ROOM, zones=zones)
-        ) as vec:
-            vec.reset(seed=1)
-            if saved is not None:
-                vec.load_state(saved)
-            kept = b""
-            for step in range(first, 40):
-                if saved is None or step > first:
-                    act(vec, step)
-                if step == 24:
-                    kept = vec.save_state()
-                vec.step(vec.suggest_actions())
-            return vec.state_hash(0), kept
-
-    wanted, saved = finished(0, None, 1)
-    assert finished(24, saved, 1)[0] == wanted
-    assert finished(24, saved, 2)[0] == wanted
+    check_resumed(act, ROOM, at=24, steps=40)
 
 
 def test_sensors_messages_and_moving_borders_change_nothing() -> None:

@@ -19,7 +19,6 @@ from cavmarl import (
     CapacityError,
     ConfigError,
     EpisodeError,
-    make_vec,
     parallel_env,
 )
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED
@@ -27,6 +26,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.observed import feature_names
+from tests.support.saved_midway import check_resumed
 
 ROOM = {"signals.overrides": 40}
 TALKATIVE = {
@@ -93,25 +93,7 @@ def test_over_nodes_it_is_the_same_too() -> None:
 
 
 def test_saved_states_include_overridden_signals() -> None:
-    def finished(first: int, saved: bytes | None, zones: int) -> tuple[str, bytes]:
-        with closing(
-            make_vec("grid4x4", agents=3, background=20, overrides=ROOM, zones=zones)
-        ) as vec:
-            vec.reset(seed=1)
-            if saved is not None:
-                vec.load_state(saved)
-            kept = b""
-            for step in range(first, 30):
-                if saved is None or step > first:
-                    act(vec, step)
-                if step == 15:
-                    kept = vec.save_state()
-                vec.step(vec.suggest_actions())
-            return vec.state_hash(0), kept
-
-    wanted, saved = finished(0, None, 1)
-    assert finished(15, saved, 1)[0] == wanted
-    assert finished(15, saved, 2)[0] == wanted
+    check_resumed(act, ROOM, at=15, steps=30)
 
 
 def test_a_signal_shows_letters_until_it_is_released() -> None:

@@ -135,7 +135,7 @@ def test_worlds_run_through_the_faulty_network(fault: str) -> None:
     found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
     (line,) = found.lines
     assert found.holds
-    assert (line.fault, line.runs, line.equal, line.ended) == (fault, 1, 1, 0)
+    assert (line.kind, line.runs, line.equal, line.ended) == (fault, 1, 1, 0)
     assert line.injected == {fault: 2}
     assert 1 <= line.lost <= 2
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import typer
@@ -31,28 +32,17 @@ app = typer.Typer(
     help="Check bit for bit that results do not depend on how a world is run.",
     no_args_is_help=True,
 )
-add_command(
-    app,
-    "zones",
-    zones.verify_zones,
-    "cavmarl verify zones town --zones 1,4,9 --steps 200",
-)
-add_command(
-    app,
+_add = partial(add_command, app)
+_add("zones", zones.verify_zones, "cavmarl verify zones town --zones 1,4,9 --steps 200")
+_add(
     "nodes",
     nodes.verify_nodes,
     "cavmarl verify nodes grid4x4 --nodes 2,4 --kill 1",
     "cavmarl verify nodes --faults simulated --seeds 5",
 )
-add_command(
-    app,
+_add(
     "workers",
     workers.verify_workers,
     "cavmarl verify workers merge --kill 10 --backend processes:2",
 )
-add_command(
-    app,
-    "determinism",
-    determinism.verify_determinism,
-    "cavmarl verify determinism town --steps 300",
-)
+_add("determinism", determinism.verify_determinism, "cavmarl verify determinism town --steps 300")

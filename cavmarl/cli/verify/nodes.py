@@ -19,7 +19,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
-    from cavmarl.verify.simulated_nodes import SimulatedCampaign
+    from cavmarl.verify.fault_campaign import FaultCampaign, FaultLine
 
 SIMULATED, PROCESSES, CAMPAIGN = "simulated", "processes", "campaign"
 NODES = "2,3,4"
@@ -122,10 +122,7 @@ def verify_nodes(
         return _compare(Console(), world, counts, json_path, runs)
     _refuse({"--kill": kill, "--worlds": worlds}, "does not go with --faults")
     if faults not in (SIMULATED, PROCESSES, CAMPAIGN):
-        raise ConfigError(
-            f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}; plans of faults "
-            "were removed"
-        )
+        raise ConfigError(f"--faults {faults}: must be {SIMULATED}, {PROCESSES} or {CAMPAIGN}")
     if faults == SIMULATED:
         _refuse({"--process-runs": process_runs}, f"goes with {PROCESSES} or {CAMPAIGN}")
     if faults == PROCESSES:
@@ -201,44 +198,26 @@ def _compare(
 def _simulated(
     console: Console, world: WorldSpec, nodes: list[int], runs: dict[str, Any]
 ) -> dict[str, Any]:
-    """Inject faults on the simulated machine; print a table, figures and wrong runs."""
+    """Inject faults on the simulated machine; print the results and how to repeat wrong runs."""
     from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 
     with counting(console, f"faults between simulated nodes of {world.env}") as progress:
         found = verify_simulated_nodes(world, nodes, progress=progress, **runs)
-    rows = [
-        (
-            str(line.nodes),
-            line.mix,
-            f"{line.runs:,}",
-            f"{line.injected.total():,}",
-            f"{line.deaths:,}",
-            f"{line.recoveries:,}",
-            f"{line.ended:,}",
-            f"{len(line.wrong)} wrong" if line.wrong else "equal",
-        )
-        for line in found.lines
-    ]
-    heads = ("nodes", "kind", "runs", "faults", "deaths", "recoveries", "ended", "")
-    title = f"{escape(Path(found.env).name)}, simulated: {found.zones} zones, {found.steps} steps"
-    console.print(grid(heads, rows, title, lefts=2))
-    figures = found.to_dict()
-    _print_figures(console, figures)
+    figures = _shown(console, found, SIMULATED)
     for line in found.lines:
-        for seed, text in zip(line.wrong_seeds, line.wrong, strict=True):
-            where = f"{line.nodes} nodes, {line.mix}, seed {seed}"
-            console.print(f"{where}: {text}", markup=False, soft_wrap=True, style="red")
-            again = _again(world, found, line.nodes, line.mix, seed, str(runs["policy"]))
+        for seed in line.wrong_seeds:
+            again = _again(world, found, line, seed, str(runs["policy"]))
             console.print(f"to repeat this run: {again}", markup=False, soft_wrap=True)
     return figures
 
 
 def _again(
-    world: WorldSpec, found: SimulatedCampaign, nodes: int, mix: str, seed: int, policy: str
+    world: WorldSpec, found: FaultCampaign[Any], line: FaultLine, seed: int, policy: str
 ) -> str:
     """Return the command that repeats one run of a campaign."""
-    words = ["cavmarl", "verify", "nodes", world.env, "--faults", SIMULATED, "--nodes", str(nodes)]
-    words += ["--mix", mix, "--first-seed", str(seed), "--seeds", "1", "--policy", policy]
+    words = ["cavmarl", "verify", "nodes", world.env, "--faults", SIMULATED]
+    words += ["--nodes", str(line.nodes), "--mix", line.kind, "--policy", policy]
+    words += ["--first-seed", str(seed), "--seeds", "1"]
     words += ["--zones", str(found.zones), "--steps", str(found.steps), "--seed", str(world.seed)]
     for option, value in (("--agents", world.agents), ("--background", world.background)):
         words += [] if value is None else [option, str(value)]
@@ -250,29 +229,38 @@ def _again(
 def _processes(
     console: Console, world: WorldSpec, nodes: list[int], runs: dict[str, Any]
 ) -> dict[str, Any]:
-    """Inject faults with real processes; print a table and figures."""
+    """Inject faults with real processes; print the results."""
     from cavmarl.verify.node_faults import verify_node_faults
 
     with counting(console, f"faults between the nodes of {world.env}") as progress:
         found = verify_node_faults(world, nodes, progress=progress, **runs)
+    return _shown(console, found, PROCESSES)
+
+
+def _shown(console: Console, found: FaultCampaign[Any], place: str) -> dict[str, Any]:
+    """Print a table, figures and wrong runs of a campaign; return the figures."""
     rows = [
         (
             str(line.nodes),
-            line.fault,
+            line.kind,
             f"{line.runs:,}",
             f"{line.injected.total():,}",
             f"{line.deaths:,}",
             f"{line.recoveries:,}",
             f"{line.ended:,}",
-            f"different with seeds {line.wrong_seeds}" if line.wrong_seeds else "equal",
+            f"{len(line.wrong)} wrong" if line.wrong else "equal",
         )
         for line in found.lines
     ]
-    heads = ("nodes", "kind", "runs", "faults", "kills", "recoveries", "ended", "")
-    title = f"{escape(Path(found.env).name)}, processes: {found.zones} zones, {found.steps} steps"
+    heads = ("nodes", "kind", "runs", "faults", "deaths", "recoveries", "ended", "")
+    title = f"{escape(Path(found.env).name)}, {place}: {found.zones} zones, {found.steps} steps"
     console.print(grid(heads, rows, title, lefts=2))
     figures = found.to_dict()
     _print_figures(console, figures)
+    for line in found.lines:
+        for seed, text in zip(line.wrong_seeds, line.wrong, strict=True):
+            where = f"{line.nodes} nodes, {line.kind}, seed {seed}"
+            console.print(f"{where}: {text}", markup=False, soft_wrap=True, style="red")
     return figures
 
 

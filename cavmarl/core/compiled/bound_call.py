@@ -8,9 +8,11 @@ compiled loop, and can skip calls depending on earlier results.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from typing import Any, Generic, ParamSpec, TypeVar, cast
+from functools import cached_property
+from inspect import signature
+from typing import Any, Generic, ParamSpec, Protocol, TypeVar, cast
 
 import numpy as np
 
@@ -85,11 +87,39 @@ def bind(kernel: Callable[P, R], *arguments: P.args, **named: P.kwargs) -> Bound
     """
     if isinstance(kernel, Kernel):
         return BoundCall(kernel, kernel.in_order(arguments, named))
-    from inspect import signature
+    given = signature(kernel).bind(*arguments, **named)
+    given.apply_defaults()
+    return BoundCall(kernel, given.args)
 
-    bound = signature(kernel).bind(*arguments, **named)
-    bound.apply_defaults()
-    return BoundCall(kernel, bound.args)
+
+def bind_by_name(
+    kernel: Callable[..., R],
+    values: Mapping[str, Any],  # name of a parameter → its value; other names are ignored
+) -> BoundCall[R]:
+    """Return a call of a kernel with the values that have the names of its parameters.
+
+    Raises:
+        KeyError: a parameter has no value.
+    """
+    return bind(kernel, **{name: values[name] for name in signature(kernel).parameters})
+
+
+class HasValues(Protocol):
+    """An object with arguments for kernels."""
+
+    @property
+    def values(self) -> Mapping[str, Any]:
+        """Name of a parameter → its value."""
+        ...
+
+
+def bound(kernel: Callable[..., R]) -> cached_property[BoundCall[R]]:
+    """Return a property: the call of a kernel with the values of the object, by name."""
+
+    def call(owner: HasValues) -> BoundCall[R]:
+        return bind_by_name(kernel, owner.values)
+
+    return cached_property(call)
 
 
 def keep_last(make: Callable[P, R]) -> Callable[P, R]:

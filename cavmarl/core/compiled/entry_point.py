@@ -15,7 +15,6 @@ from numba.core import types as numba_types
 from numba.core.cgutils import alloca_once, gep_inbounds
 
 _WORD = ir.IntType(64)
-_BYTE = ir.IntType(8)
 _DOUBLE = ir.DoubleType()
 _allocate: Any = alloca_once
 _field: Any = gep_inbounds

@@ -27,6 +27,7 @@ from cavmarl.cosim.carla.call_table import (
     Returns,
     accept,
     answer_constant,
+    answer_from,
     call,
     refuse,
 )
@@ -55,11 +56,6 @@ walker_control = record_of(vector, number, flag)
 light_mask = record_of(whole)
 _DEFAULT_ACKERMANN = [0.15, 0.0, 0.25, 0.01, 0.0, 0.01]
 _WHEELS_CM = ((145.0, -80.0, 70.0), (145.0, 80.0, 70.0), (-145.0, -80.0, 0.0), (-145.0, 80.0, 0.0))
-
-
-@call("get_spectator")
-def get_spectator(caller: Caller, session: CarlaSession) -> list[Any]:
-    return packed_actor(session.actors.spectator, session.version)
 
 
 @call("get_actors_by_id", listed(actor_id))
@@ -353,12 +349,6 @@ def set_vehicle_light_state(
     session.actors.find(number, "set_vehicle_light_state").lights = mask[0] & 0xFFFFFFFF
 
 
-@call("get_vehicle_light_states")
-def get_vehicle_light_states(caller: Caller, session: CarlaSession) -> list[Any]:
-    vehicles = (actor for actor in session.actors.vehicles if actor.is_vehicle)
-    return [[actor.number, actor.lights] for actor in vehicles]
-
-
 @call("get_physics_control", actor_id, note="typical values, except the positions of the wheels")
 def get_physics_control(caller: Caller, session: CarlaSession, number: int) -> list[Any]:
     if not session.version.has_wheel_physics:
@@ -396,6 +386,13 @@ def _vehicle_state(session: CarlaSession, number: int, name: str) -> np.void:
     return state
 
 
+answer_from(
+    "get_spectator", lambda session: packed_actor(session.actors.spectator, session.version)
+)
+answer_from(
+    "get_vehicle_light_states",
+    lambda session: [[one.number, one.lights] for one in session.actors.vehicles if one.is_vehicle],
+)
 answer_constant(
     [],
     "get_actor_bone_names",

@@ -129,6 +129,11 @@ def answer_constant(
         )
 
 
+def answer_from(name: str, read: Callable[[CarlaSession], Any], note: str = "") -> None:
+    """Add a call without arguments that returns a value of the session."""
+    call(name, note=note)(lambda caller, session: read(session))
+
+
 def refuse(
     *names: str, checks: tuple[Check, ...], because: str, returns: Returns = Returns.NOTHING
 ) -> None:

@@ -17,7 +17,6 @@ class ClientVersion(NamedTuple):
     snapshot_kind: int  # number of a snapshot among the kinds of frames
     first_attribute_kind: int  # number of the attribute kind `bool`
     box_has_actor: bool  # a bounding box has a fourth field
-    spawn_has_socket: bool  # a spawn command has an attachment and a socket
     has_wheel_physics: bool  # the layout of `VehiclePhysicsControl` is that of 0.9
     is_mercator: bool  # how places are projected; see `carla_geodesy`
 
@@ -25,9 +24,9 @@ class ClientVersion(NamedTuple):
 CLIENT_VERSIONS = {
     version.name: version
     for version in (
-        ClientVersion("0.9.15", 16, 0, False, False, True, True),
-        ClientVersion("0.9.16", 17, 1, True, True, True, False),
-        ClientVersion("0.10.0", 16, 0, False, False, False, True),
+        ClientVersion("0.9.15", 16, 0, False, True, True),
+        ClientVersion("0.9.16", 17, 1, True, True, False),
+        ClientVersion("0.10.0", 16, 0, False, False, True),
     )
 }
 DEFAULT_VERSION = "0.9.16"

@@ -26,6 +26,7 @@ from cavmarl.cosim.carla.call_table import (
     Returns,
     accept,
     answer_constant,
+    answer_from,
     call,
     refuse,
 )
@@ -53,24 +54,9 @@ def port(value: Any) -> int:
     return int(value)
 
 
-@call("version")
-def version(caller: Caller, session: CarlaSession) -> str:
-    return session.version.name
-
-
-@call("get_episode_info")
-def get_episode_info(caller: Caller, session: CarlaSession) -> list[Any]:
-    return [session.episode, [session.streams.token(EPISODE_STREAM)]]
-
-
 @call("get_sensor_token", actor_id)
 def get_sensor_token(caller: Caller, session: CarlaSession, stream: int) -> list[Any]:
     return [session.streams.token(stream)]
-
-
-@call("get_episode_settings")
-def get_episode_settings(caller: Caller, session: CarlaSession) -> list[Any]:
-    return session.settings.packed()
 
 
 @call(
@@ -98,21 +84,6 @@ def set_episode_settings(caller: Caller, session: CarlaSession, given: tuple[Any
 )
 def tick_cue(caller: Caller, session: CarlaSession) -> int:
     return session.tick_for(caller) if session.settings.synchronous else session.frame + 1
-
-
-@call("get_map_info")
-def get_map_info(caller: Caller, session: CarlaSession) -> list[Any]:
-    return [session.map.path, [pose.packed() for pose in session.map.spawn_points]]
-
-
-@call("get_map_data")
-def get_map_data(caller: Caller, session: CarlaSession) -> str:
-    return session.map.document
-
-
-@call("get_available_maps")
-def get_available_maps(caller: Caller, session: CarlaSession) -> list[str]:
-    return [f"/Game/Carla/Maps/{name}" for name in session.source.map_names]
 
 
 @call(
@@ -144,11 +115,6 @@ def copy_opendrive_to_file(
     session.source.take_map(document)
 
 
-@call("get_weather_parameters")
-def get_weather_parameters(caller: Caller, session: CarlaSession) -> list[float]:
-    return session.weather
-
-
 @call(
     "set_weather_parameters",
     _weather,
@@ -158,11 +124,6 @@ def get_weather_parameters(caller: Caller, session: CarlaSession) -> list[float]
 )
 def set_weather_parameters(caller: Caller, session: CarlaSession, given: tuple[float, ...]) -> None:
     session.weather = [*given, *session.weather[len(given) :]]
-
-
-@call("get_imui_gravity")
-def get_imui_gravity(caller: Caller, session: CarlaSession) -> float:
-    return session.gravity
 
 
 @call(
@@ -242,6 +203,28 @@ def _on_ground(
     return [start[0] + share * way[0], start[1] + share * way[1], 0.0]
 
 
+answer_from("version", lambda session: session.version.name)
+answer_from(
+    "get_episode_info", lambda session: [session.episode, [session.streams.token(EPISODE_STREAM)]]
+)
+answer_from("get_episode_settings", lambda session: session.settings.packed())
+answer_from(
+    "get_map_info",
+    lambda session: [session.map.path, [pose.packed() for pose in session.map.spawn_points]],
+)
+answer_from("get_map_data", lambda session: session.map.document)
+answer_from(
+    "get_available_maps",
+    lambda session: [f"/Game/Carla/Maps/{name}" for name in session.source.map_names],
+)
+answer_from("get_weather_parameters", lambda session: session.weather)
+answer_from("get_imui_gravity", lambda session: session.gravity)
+answer_from(
+    "get_navigation_mesh",
+    lambda session: (
+        b"" if session.map.navigation_mesh is None else session.map.navigation_mesh.content
+    ),
+)
 accept(
     "draw_debug_shape",
     checks=(anything,),
@@ -289,9 +272,3 @@ def request_file(caller: Caller, session: CarlaSession, name: str) -> bytes:
     if mesh is None or name != mesh.name:
         raise CallRefused(f"this server has no file {shown(name)}")
     return mesh.content
-
-
-@call("get_navigation_mesh")
-def get_navigation_mesh(caller: Caller, session: CarlaSession) -> bytes:
-    mesh = session.map.navigation_mesh
-    return b"" if mesh is None else mesh.content

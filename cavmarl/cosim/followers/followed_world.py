@@ -202,7 +202,7 @@ class FollowedWorld:
             try:
                 self._seat(line, hello)
             except FollowerError as error:
-                self._reception.turn_away(line, str(error))
+                refuse(line, str(error))
 
     def _seat(self, line: FollowerConnection, hello: Hello) -> None:
         agents = self._indices(hello.vehicles)

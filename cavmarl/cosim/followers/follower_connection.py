@@ -326,7 +326,6 @@ class Reception:
 
     Attributes:
         address: where it listens; the chosen port if the given one was 0.
-        turned_away: number of callers that were refused.
 
     Raises:
         ConfigError: the socket cannot be opened.
@@ -343,7 +342,6 @@ class Reception:
         self._listener.setblocking(False)
         name = self._listener.getsockname()
         self.address: Address = name[1] if isinstance(name, tuple) else name
-        self.turned_away = 0
         self._selector = selectors.DefaultSelector()
         self._selector.register(self._listener, selectors.EVENT_READ)
         self._since: dict[FollowerConnection, float] = {}
@@ -368,15 +366,11 @@ class Reception:
                 hello = self._greeting(line)
             except FollowerError as error:
                 self._forget(line)
-                self.turn_away(line, str(error))
+                refuse(line, str(error))
                 continue
             self._forget(line)
             yield line, hello
         self._drop_silent_callers()
-
-    def turn_away(self, line: FollowerConnection, reason: str) -> None:
-        self.turned_away += 1
-        refuse(line, reason)
 
     def close(self) -> None:
         """Stop listening."""
@@ -411,7 +405,7 @@ class Reception:
     def _drop_oldest_caller(self, reason: str) -> None:
         line = next(iter(self._since))
         self._forget(line)
-        self.turn_away(line, reason)
+        refuse(line, reason)
 
     def _greeting(self, line: FollowerConnection) -> Hello:
         frame = line.hear()
@@ -434,7 +428,7 @@ class Reception:
         for line, since in list(self._since.items()):
             if time.monotonic() - since > GREETING_S:
                 self._forget(line)
-                self.turn_away(line, f"has not introduced itself within {GREETING_S:g} s")
+                refuse(line, f"has not introduced itself within {GREETING_S:g} s")
 
     def _forget(self, line: FollowerConnection) -> None:
         del self._since[line]

@@ -24,7 +24,6 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.mounted.frames import SensorFrames
 
-NO_SIGNAL = 255
 # Columns of the array `truth`: those of `engine.world_frame.SEEN`, one row for each vehicle.
 TRUTH = (
     "id", "agent", "vclass", "x", "y", "z", "heading", "pitch", "speed", "accel", "steering",

@@ -13,6 +13,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping
 from typing import TYPE_CHECKING, NamedTuple, Protocol
 
+from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.messages import Birth, Record, Removed
@@ -138,6 +139,16 @@ class Coordinator(ABC):
         """Close the journal."""
         if self.journal is not None:
             self.journal.close()
+
+    def _check(self, births: Iterable[Birth], counts: list[int]) -> None:
+        """Compare the numbers of vehicles in the up-to-date table with those of the zones' rows."""
+        owned = list(self._directory.table.counts.values())
+        for birth in births:
+            owned[birth.zone] += 1
+        if counts != owned:
+            raise ProtocolError(
+                f"tick {self.tick}: the zones own {counts} vehicles, but {owned} are expected"
+            )
 
     def _record(self, *records: Record) -> None:
         if self.journal is not None:

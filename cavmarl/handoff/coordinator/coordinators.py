@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from hashlib import blake2b
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,80 +19,48 @@ from cavmarl.shards.shard import Commands
 from cavmarl.zones.kernels.zone_lookup import zones_of
 
 
-class OwnershipRuntime(Protocol):
+class OwnershipRuntime:
     """The decisions about ownership in W worlds that a tick needs.
+
+    By default, one zone owns all vehicles: no vehicle changes its owner, and nothing is recorded.
 
     Attributes:
         coordinators: one per world, if they are in this process.
         needs_ghosts: whether each tick must find ghosts and vehicles near borders.
     """
 
-    coordinators: tuple[Coordinator, ...]
-    needs_ghosts: bool
-
-    def reset(self, chosen: NDArray[np.bool_]) -> None: ...
-
-    def save(self, w: int) -> SavedOwnership | None:
-        """Return the state that the next changes of owner depend on; None: unknown here."""
-        ...
-
-    def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Resume after worlds were loaded; None: ownership begins anew."""
-        ...
-
-    def begin(self, commands: Commands) -> None:
-        """Change owners of vehicles before a tick, by the committed rows."""
-        ...
-
-    def left(self, departures: DepartureQueue) -> None:
-        """Record that the vehicles in `departures.passing` have left the world."""
-        ...
-
-    def entered(self, departures: DepartureQueue) -> None:
-        """Record that the vehicles in `departures.passing` have entered the world."""
-        ...
-
-    def end(self) -> None:
-        """End the tick, after all zones of this process have computed it."""
-        ...
-
-    def in_flight(self, w: int) -> list[TransferInFlight]: ...
-
-
-class NoOwnershipRuntime:
-    """The `OwnershipRuntime` where one zone owns all vehicles."""
-
     coordinators: tuple[Coordinator, ...] = ()
     needs_ghosts = False
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Do nothing."""
+        """Begin an episode in the chosen worlds (W,)."""
 
-    def save(self, w: int) -> None:
-        """Return None: there is no state."""
+    def save(self, w: int) -> SavedOwnership | None:
+        """Return the state that the next changes of owner depend on; None: unknown here."""
+        return None
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Do nothing."""
+        """Resume after worlds were loaded; None: ownership begins anew."""
 
     def begin(self, commands: Commands) -> None:
-        """Do nothing: no vehicle changes its owner."""
+        """Change owners of vehicles before a tick, by the committed rows."""
 
     def left(self, departures: DepartureQueue) -> None:
-        """Do nothing: nothing is recorded."""
+        """Record that the vehicles in `departures.passing` have left the world."""
 
     def entered(self, departures: DepartureQueue) -> None:
-        """Do nothing: nothing is recorded."""
+        """Record that the vehicles in `departures.passing` have entered the world."""
 
     def end(self) -> None:
-        """Do nothing: nothing is committed."""
+        """End the tick, after all zones of this process have computed it."""
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Return no transfers."""
+        """Return the vehicles whose next zone has their state already."""
         return []
 
 
-class WorldCoordinators:
-    """The coordinators of W worlds in this process; an `OwnershipRuntime`."""
+class WorldCoordinators(OwnershipRuntime):
+    """The coordinators of W worlds in this process."""
 
     needs_ghosts = True
 

@@ -79,6 +79,22 @@ class NodeFrame(NamedTuple):
     number: int  # its meaning depends on the kind
     data: memoryview
 
+    def is_of(self, generation: int, is_known: bool) -> bool:
+        """Return whether the frame is of this generation of nodes, and not of an earlier one.
+
+        `is_known`: whether its sender has sent a frame of this generation before.
+
+        Raises:
+            MessageError: the node cannot have sent the frame in an earlier generation.
+        """
+        if self.number == generation:
+            return True
+        if self.number > generation or is_known:
+            raise MessageError(
+                f"a frame of kind {self.kind.name} is of generation {self.number}, not {generation}"
+            )
+        return False
+
 
 _KINDS = {int(kind): kind for kind in FrameKind}
 URGENT = frozenset(

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.core.errors import ConfigError
-from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
 from cavmarl.handoff.zone_view import TransferInFlight
@@ -129,13 +128,6 @@ class NodeGroups(CommandedWorlds):
         for group, part in zip(self.groups, parts, strict=True):
             group.check_worlds(part)
         self._command(Task.LOAD, parts)
-
-    @property
-    def simulation(self) -> Simulation:
-        """Not available: the worlds are in nodes."""
-        raise ConfigError(
-            "the worlds are in nodes: use backend='local' for access to the simulation"
-        )
 
     @property
     def transfers(self) -> tuple[TransferLog, ...]:

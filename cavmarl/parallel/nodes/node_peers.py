@@ -20,6 +20,7 @@ from cavmarl.core.records.codes import (
     LANE_RANDOM,
     POS_LAST,
 )
+from cavmarl.engine.peers import Peers
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.network.transport import Bytes
 from cavmarl.parallel.nodes.agent_stream import AgentStream
@@ -37,7 +38,7 @@ SHARE_BITS = 32  # the number of a share has the generation above them
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
-class NodePeers:
+class NodePeers(Peers):
     """Exchanges shares: each share is one frame to every other node, and one frame from it.
 
     Attributes:
@@ -57,6 +58,7 @@ class NodePeers:
         number: int,  # of this node
         generation: int = 0,  # number of changes of nodes
     ) -> None:
+        super().__init__(simulation.division)
         shard = simulation.shards[0]
         self._zoned = shard.zoned
         self._of_rows = (self._zoned.step, self._zoned.step_at, self._zoned.outer)

@@ -243,27 +243,12 @@ class NodePool:
             wait = partial(self._links.receive, missing)
             for number, frame in self._wait(wait).items():
                 with reading(number):
-                    if self._is_present(number, frame):
+                    if frame.is_of(self.generation, number in self._present):
                         if frame.kind is not kind:
                             raise MessageError(f"{frame.kind.name}, not {kind.name}")
                         found[number] = frame
         self._present.update(found)
         return dict(sorted(found.items()))
-
-    def _is_present(self, number: int, frame: NodeFrame) -> bool:
-        """Return whether a frame is of the present generation of nodes, and not an earlier one.
-
-        Raises:
-            MessageError: the node cannot have sent the frame in an earlier generation.
-        """
-        if frame.number == self.generation:
-            return True
-        if frame.number > self.generation or number in self._present:
-            raise MessageError(
-                f"a frame of kind {frame.kind.name} is of generation {frame.number}, not "
-                f"{self.generation}"
-            )
-        return False
 
     def _wait(self, wait: Callable[[float], Found]) -> Found:
         """Wait until `wait` succeeds. Raises the errors of `NodeWatch.wait`."""
@@ -416,7 +401,7 @@ class NodePool:
             case FrameKind.KEEP if self._living == [number]:
                 self._keep(frame)
                 return None
-        is_present = self._is_present(number, frame)
+        is_present = frame.is_of(self.generation, number in self._present)
         match frame.kind:
             case FrameKind.FAILED:
                 name, text, trace = map(str, read_list(frame))

@@ -203,15 +203,15 @@ class NodeProgram:
         is_caller = number == COORDINATOR
         match frame.kind:
             case FrameKind.MESSAGES if not is_caller:
-                if self._is_present(number, frame):
+                if frame.is_of(self._generation, number in self._synchronized):
                     self._endpoints.receive(number, frame)
             case FrameKind.KEEP if not is_caller:
                 self._replicas.receive(number, frame)
             case FrameKind.AGENT if not is_caller:
-                if self._is_present(number, frame):
+                if frame.is_of(self._generation, number in self._synchronized):
                     self._endpoints.receive_agent(number, frame)
             case FrameKind.GIVE if not is_caller:
-                if self._is_present(number, frame):
+                if frame.is_of(self._generation, number in self._synchronized):
                     self._replicas.receive_given(number, frame)
             case FrameKind.ACTIONS if is_caller:
                 self._actions.append(frame)
@@ -221,21 +221,6 @@ class NodeProgram:
                 self._answer_ping(frame)
             case _:
                 raise MessageError(f"it must not send frames of kind {frame.kind.name}")
-
-    def _is_present(self, number: int, frame: NodeFrame) -> bool:
-        """Return whether a frame of another node is of this generation, and not an earlier one.
-
-        Raises:
-            MessageError: the node cannot have sent the frame in an earlier generation.
-        """
-        if frame.number == self._generation:
-            return True
-        if frame.number > self._generation or number in self._synchronized:
-            raise MessageError(
-                f"a frame of kind {frame.kind.name} is of generation {frame.number}, not "
-                f"{self._generation}"
-            )
-        return False
 
     def _answer_ping(self, frame: NodeFrame) -> None:
         """Report the frames and actions that this node awaits."""

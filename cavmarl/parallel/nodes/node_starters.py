@@ -6,7 +6,7 @@ import subprocess
 from collections.abc import Callable, Collection
 from contextlib import suppress
 from pathlib import Path
-from typing import Any, Protocol, TypeAlias
+from typing import Any, TypeAlias
 
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
@@ -36,13 +36,11 @@ def straight(place: Place) -> Place:
     return place
 
 
-class NodeStarter(Protocol):
-    """Starts nodes, and replaces lost ones."""
+class NodeStarter:
+    """Starts nodes, and replaces lost ones; by default, nodes that are started by hand."""
 
-    @property
-    def count(self) -> int:
-        """The number of nodes."""
-        ...
+    def __init__(self, count: int) -> None:
+        self.count = count  # number of nodes
 
     def trouble(self, begun: Collection[int]) -> str | None:
         """Return why a node will not come; restart nodes that were killed before they began.
@@ -50,24 +48,28 @@ class NodeStarter(Protocol):
         Args:
             begun: processes of nodes that have begun, which are not checked.
         """
-        ...
+        return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         """Restart a node that was lost before it had begun; return why that is impossible."""
-        ...
+        self.replace(number, is_silent)
+        return None
 
     def replace(self, number: int, is_silent: bool) -> None:
-        """Replace a node that is lost, or silent and may still run."""
-        ...
+        """Replace a node that is lost, or silent and may still run.
+
+        By default, do nothing: the pool waits for another node, which may be started by hand.
+        """
 
     def stopped(self) -> set[int]:
         """Return the nodes whose processes are known to be stopped (SIGSTOP)."""
-        ...
+        return set()  # unknown on other machines
 
-    def close(self) -> None: ...
+    def close(self) -> None:
+        """End the nodes; by default, they end with their connections."""
 
 
-class LocalNodes:
+class LocalNodes(NodeStarter):
     """Nodes as processes of this machine, which end with this process."""
 
     def __init__(
@@ -77,7 +79,7 @@ class LocalNodes:
         place: Place,
         max_retries: int,  # for nodes that are killed or stopped before they have begun
     ) -> None:
-        self.count = nodes
+        super().__init__(nodes)
         self._listener, self._place = listener, place
         self._retries = max_retries
         self._seen_stopped: set[int] = set()
@@ -152,7 +154,7 @@ class LocalNodes:
         self._processes = []
 
 
-class RayNodes:
+class RayNodes(NodeStarter):
     """Nodes as actors of a Ray cluster."""
 
     def __init__(
@@ -161,8 +163,8 @@ class RayNodes:
         listener: TcpListener,
         max_retries: int,  # for nodes that are lost before they have begun
     ) -> None:
+        super().__init__(actors.workers)
         self._actors = actors
-        self.count = actors.workers
         self._retries = max_retries
         actors.start(listener.place, listener.secret)
 
@@ -186,14 +188,11 @@ class RayNodes:
         else:  # Ray restarts it
             self._actors.trouble()
 
-    def stopped(self) -> set[int]:
-        return set()  # Ray does not report it
-
     def close(self) -> None:
         self._actors.close()
 
 
-class MpiNodes:
+class MpiNodes(NodeStarter):
     """Nodes as the other ranks of an MPI run, which has no failover.
 
     Raises:
@@ -201,11 +200,8 @@ class MpiNodes:
     """
 
     def __init__(self, nodes: int) -> None:
-        self.count = nodes
+        super().__init__(nodes)
         mpi_transport().check_caller(nodes)
-
-    def trouble(self, begun: Collection[int]) -> str | None:
-        return None
 
     def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
         mpi_transport().is_broken = True
@@ -217,35 +213,6 @@ class MpiNodes:
         cause = "it does not answer" if is_silent else "its connection has ended"
         part = f"rank {number + 1} of MPI, which has no failover"
         raise WorkerDeathError(number, part, 0, "step", [cause], MPI_CURE)
-
-    def stopped(self) -> set[int]:
-        return set()  # they may be on other machines
-
-    def close(self) -> None:
-        """They end with the connection."""
-
-
-class JoinedNodes:
-    """Nodes started by hand with `cavmarl node --join`."""
-
-    def __init__(self, count: int) -> None:
-        self.count = count
-
-    def trouble(self, begun: Collection[int]) -> str | None:
-        return None
-
-    def retry(self, number: int, pid: int, is_silent: bool) -> str | None:
-        """Return None: the pool waits for another node."""
-        return None
-
-    def replace(self, number: int, is_silent: bool) -> None:
-        """Do nothing: another node may be started by hand."""
-
-    def stopped(self) -> set[int]:
-        return set()  # they are on other machines
-
-    def close(self) -> None:
-        """They end with the connection."""
 
 
 Start: TypeAlias = Callable[
@@ -285,7 +252,7 @@ def start_nodes(
             f"backend = '{backend}' without workers.key_file: set it to the file with the key that "
             "nodes have to know"
         )
-    return JoinedNodes(nodes), TcpListener(host, read_key(base_dir / settings.key_file), port)
+    return NodeStarter(nodes), TcpListener(host, read_key(base_dir / settings.key_file), port)
 
 
 def system_of(backend: BackendName) -> NodeSystem:

@@ -18,7 +18,6 @@ from cavmarl.balance.load_score import Candidate, Utilisation
 from cavmarl.balance.load_snapshot import NO_GPU, LoadSnapshot, idle_snapshot
 from cavmarl.balance.probe import MEASURED
 from cavmarl.core.errors import ConfigError, MessageError
-from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.handoff.repartitioning import Repartition, is_due
@@ -366,13 +365,6 @@ class NodeWorlds(CommandedWorlds):
     def partition(self) -> ZonePartition:
         """The present zones, which repartitioning changes."""
         return read_zones(self.pool.partition)
-
-    @property
-    def simulation(self) -> Simulation:
-        """Not available: the worlds are in nodes."""
-        raise ConfigError(
-            "the worlds are in nodes: use backend='local' for access to the simulation"
-        )
 
     def _pids(self) -> dict[int, int]:
         """Return node → process on this machine; `node_snapshot` covers other machines."""

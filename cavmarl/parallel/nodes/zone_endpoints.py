@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import DepartureQueue
-from cavmarl.handoff.coordinator.coordinator import Coordinator
+from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
@@ -72,10 +72,9 @@ class Report(NamedTuple):
 NOTHING = Report([], [], False, [])
 
 
-class ZoneEndpoints:
+class ZoneEndpoints(OwnershipRuntime):
     """The endpoints of the zones of one node in W worlds."""
 
-    coordinators: tuple[Coordinator, ...] = ()  # the coordinator is in another process
     needs_ghosts = True
 
     def __init__(
@@ -188,9 +187,6 @@ class ZoneEndpoints:
                 self._leases[w] = {}
         self._is_open = True
 
-    def end(self) -> None:
-        """Do nothing: `report` informs the coordinator."""
-
     def entered(self, departures: DepartureQueue) -> None:
         division = self._division
         for w, births in enumerate(self._births):
@@ -216,9 +212,6 @@ class ZoneEndpoints:
             self._gone[w] = {}
             self._targets[w] = {}
             self._stirred[w] = True
-
-    def save(self, w: int) -> None:
-        """Do nothing: the coordinator, in another process, knows the owners."""
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
         """Start ownership anew, with the vehicles where they are."""

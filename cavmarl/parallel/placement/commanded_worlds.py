@@ -13,7 +13,8 @@ from numpy.typing import NDArray
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.balance.load_snapshot import LoadSnapshot
 from cavmarl.balance.plan_text import describe_plan
-from cavmarl.core.errors import WorkerDeathError, WorkerFailureError
+from cavmarl.core.errors import ConfigError, WorkerDeathError, WorkerFailureError
+from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.placement.mover import Mover
 from cavmarl.parallel.placement.step_placement import StepPlacement
@@ -57,6 +58,14 @@ class CommandedWorlds(ABC):
     mover: Mover | None = None
     pool: CommandedPool
     _steps = 0  # since the last reset of all worlds
+
+    @property
+    def simulation(self) -> Simulation:
+        """Not available: the worlds are in other processes."""
+        raise ConfigError(
+            "the worlds are in worker processes or nodes: use backend='local' for access to the "
+            "simulation"
+        )
 
     @property
     def plans(self) -> tuple[Plan, ...]:

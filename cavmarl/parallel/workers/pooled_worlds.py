@@ -11,7 +11,6 @@ from typing import Any
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerError, WorkerFailureError
 from cavmarl.engine.compilation import compiled_before
-from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import World
 from cavmarl.parallel.memory.shared_memory import Segment, arrays_in, size_of
 from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
@@ -124,13 +123,6 @@ class PooledWorlds(CommandedWorlds):
         memory = MovingMemory(num_worlds, *((1, workers) if in_row else (num_zones, 0)))
         self.mover = Mover(self.placement, num_zones, every, memory.spent_s)
         return memory
-
-    @property
-    def simulation(self) -> Simulation:
-        """Not available: the worlds are in other processes."""
-        raise ConfigError(
-            "the worlds are in worker processes: use backend='local' for access to the simulation"
-        )
 
     def save_worlds(self) -> list[bytes]:
         self._command(Task.SAVE, commits=False)

@@ -31,11 +31,9 @@ from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
     DRIVER_SCRIPTED,
     SIGNAL_GREEN_MAJOR,
-    SIGNAL_RED,
-    SIGNAL_RED_YELLOW,
 )
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import is_red, link_signal
 from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.observing_way import MOST_LANES
 
@@ -231,12 +229,6 @@ def _nearest_approach(
 
 
 @kernel
-def _is_held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
-    signal = link_signal(roads, link, phase)
-    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
-
-
-@kernel
 def _right_of_way(
     roads: RoadArrays, link: int, is_on: bool, other: np.void, phase: NDArray[np.int32]
 ) -> float:
@@ -247,7 +239,7 @@ def _right_of_way(
     if link < 0 or is_off_lanes(other):
         return 0.0
     there = roads.lanes[other["lane"]]
-    is_held = _is_held(roads, link, phase)
+    is_held = is_red(roads, link, phase)
     is_protected = link_signal(roads, link, phase) == SIGNAL_GREEN_MAJOR
     gives_way = False
     first = roads.links[link]["first_conflict"]
@@ -258,7 +250,7 @@ def _right_of_way(
             if foe == there["link"]:
                 return 0.0 if is_on else 1.0
         elif roads.links[foe]["from_lane"] == other["lane"]:
-            foe_is_held = _is_held(roads, foe, phase)
+            foe_is_held = is_red(roads, foe, phase)
             if is_on or foe_is_held:
                 gives_way = gives_way or is_on or not is_held
             elif is_held or (conflict["must_yield"] and not is_protected):

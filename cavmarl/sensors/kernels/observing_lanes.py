@@ -16,9 +16,8 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M, Grid, cell_columns, cell_rows
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Sensors, TripTables
-from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.core.records.rows import is_off_lanes
-from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import is_red
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.driving.kernels.lanes.route_following import next_step
 
@@ -177,12 +176,6 @@ def _observe_crossing(
 
 
 @kernel
-def _is_held(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
-    signal = link_signal(roads, link, phase)
-    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
-
-
-@kernel
 def observe_lanes(
     roads: RoadArrays,
     travel: TripTables,
@@ -231,7 +224,7 @@ def observe_lanes(
             if link >= 0:
                 foe_link, foe_distance = _next_link(roads, travel, other, range_m)
                 if foe_link >= 0:
-                    held = _is_held(roads, foe_link, phase)
+                    held = is_red(roads, foe_link, phase)
                     soonest = _observe_crossing(
                         roads,
                         row,

@@ -64,26 +64,3 @@ def transform(turn: Points, place: Points, points: Points) -> Points:
 def sensor_to_vehicle(mount: Mount, points: Points) -> Points:
     """Transform points (n, 3) from the sensor's frame to the vehicle's."""
     return transform(mount.turn, mount.place, points)
-
-
-def vehicle_to_sensor(mount: Mount, points: Points) -> Points:
-    """Transform points (n, 3) from the vehicle's frame to the sensor's."""
-    return (points - mount.place) @ mount.turn
-
-
-def vehicle_to_world(row: np.void, points: Points) -> Points:
-    """Transform points (n, 3) from the frame of a VEHICLE to the world's."""
-    turn, place = _pose(row)
-    return transform(turn, place, points)
-
-
-def world_to_vehicle(row: np.void, points: Points) -> Points:
-    """Transform points (n, 3) from the world's frame to that of a VEHICLE."""
-    turn, place = _pose(row)
-    return (points - place) @ turn
-
-
-def _pose(row: np.void) -> tuple[Points, Points]:
-    turn = np.zeros((3, 3))
-    rotation(row["heading"], row["pitch"], 0.0, turn)
-    return turn, np.array([row["x"], row["y"], row["z"]])

@@ -80,6 +80,13 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 
 @kernel
+def is_red(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
+    """Return whether a link's signal is red, or red and yellow."""
+    signal = link_signal(roads, link, phase)
+    return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+
+
+@kernel
 def earliest(distance: float, speed: float, limit: float, accel: float) -> float:
     """Return the time in s to drive `distance` m with an acceleration up to `limit` m/s."""
     if distance <= 0.0:
