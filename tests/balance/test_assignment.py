@@ -1,4 +1,4 @@
-"""Plans beside the best there are, under loads that mean no good, and round after round."""
+"""Plans compared with optimal plans, under adverse loads, and over several rounds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STRICT = BalanceRule(tolerance=0.0)
 
 
 def alone(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule | None = None) -> Problem:
-    """Shards without neighbours."""
+    """Return shards without neighbours."""
     return Problem(row(costs), ((),) * len(costs), snapshot, rule or BalanceRule())
 
 
@@ -83,7 +83,7 @@ def test_the_order_of_the_input_does_not_matter(
 @pytest.mark.parametrize(
     ("costs", "loads"),
     [
-        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a giant is alone
+        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a very expensive shard has a worker of its own
         ([1.0] * 6, [3.0, 3.0]),
         ([0.0, 0.0, 0.0, 5.0], [0.0, 5.0]),
         ([5e-324, 5e-324, 1.0, 1.0], [1.0, 1.0]),
@@ -121,7 +121,7 @@ def test_neighbours_stay_together() -> None:
     zones = grid(4, 4)
     plan = make_plan(Problem(row([1.0] * 16), zones, idle_snapshot(4)))
     assert plan.imbalance == 1.0
-    assert plan.placement.cut_pairs <= 12  # four rows; single shards by turns would cut 24
+    assert plan.placement.cut_pairs <= 12  # four rows; single shards in turn would cut 24
 
 
 @settings(deadline=None)

@@ -1,4 +1,4 @@
-"""A plan can be read, kept, and made again from what is kept."""
+"""Plans: their text, their file, and recomputing them from the file."""
 
 from __future__ import annotations
 

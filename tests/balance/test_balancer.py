@@ -1,4 +1,4 @@
-"""The plan of a run: what is measured goes in, a bounded round comes out."""
+"""The plan of a run: from measured costs to a bounded number of moves per round."""
 
 from __future__ import annotations
 

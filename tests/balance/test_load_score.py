@@ -1,4 +1,4 @@
-"""LoadScore and whom it chooses: the paper's figures, the thresholds to the last bit."""
+"""LoadScore and the worker that it selects: the paper's figures, and exact thresholds."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Table II with SUMO's traffic, cavmarl in place of CARLA, and two of CARLA's own clients."""
+"""Table II with SUMO's traffic, cavmarl in place of CARLA, and two official CARLA clients."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Each thing that `env.yaml` can get wrong: an error with the place, the value and the cure."""
+"""Each kind of mistake in `env.yaml` is an error with the place, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def load(folder: Path, text: str | bytes) -> EnvConfig:
 
 
 def refusal(folder: Path, text: str | bytes) -> str:
-    """The message that the file is refused with; it begins with the file's path."""
+    """Return the message with which the file is refused; it begins with the file's path."""
     with pytest.raises(ConfigError) as caught:
         load(folder, text)
     message = str(caught.value)

@@ -1,4 +1,4 @@
-"""The form of a trained driver: which keys it has, and what contradicts it."""
+"""The form of a trained driver (its sensors and actions): its keys, and contradictions to it."""
 
 from __future__ import annotations
 
