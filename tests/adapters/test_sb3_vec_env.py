@@ -33,7 +33,7 @@ def rows() -> Any:
 
 
 def wild(rows: Any, seed: int) -> list[Any]:
-    """Return 80 actions, full throttle and random steering: trips end off the road or at the horizon."""
+    """Return 80 actions with random steering: trips end off the road or at the horizon."""
     rows.seed(seed)
     found = [rows.reset()]
     random = np.random.default_rng(0)

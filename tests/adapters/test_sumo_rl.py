@@ -99,7 +99,7 @@ def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
 
 
 def test_greens_are_counted_as_in_sumo_rl(routes: str, tmp_path: Path) -> None:
-    """In sumo-rl's API, equal phases and phases with `Y` are greens; in other APIs, they are not."""
+    """In sumo-rl's API, equal phases and phases with `Y` are greens; elsewhere, they are not."""
     with closing(grid(routes)) as env:
         first, second = (phase.state for phase in env.traffic_signals["A0"].green_phases)
         size = len(first)

@@ -19,7 +19,7 @@ from cavmarl.cosim.followers.framed_socket import Dialect, FramedSocket
 
 
 class Kind(IntEnum):
-    """Kinds of frames of the dialect of these tests."""
+    """Kinds of frames in these tests."""
 
     COMMAND = 0
     DONE = 1

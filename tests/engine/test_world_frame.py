@@ -1,4 +1,4 @@
-"""Frames: what is seen of a world is the same however it is divided and wherever it runs."""
+"""Frames of a world do not depend on its zones or its backend."""
 
 from __future__ import annotations
 

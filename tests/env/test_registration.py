@@ -1,4 +1,4 @@
-"""The names under which Gymnasium and PettingZoo find the entries, and what they give."""
+"""The ids of environments in Gymnasium and PettingZoo, and what the ids create."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def test_a_horizon_is_a_whole_number_of_steps() -> None:
 
 
 def test_odd_folders_beside_fail_no_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They lie in the user's `envs`; what can be named can be used, and has an id if it can."""
+    """The user's `envs` has such folders; each can be used, and has an id if its name allows it."""
     odd = [b"a space", b"not\xffutf8", b"two\nlines", b"-dash", b"latin", b"fine"]
     for name in odd:
         folder = Path(os.fsdecode(bytes(tmp_path) + b"/envs/" + name))

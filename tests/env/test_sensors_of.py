@@ -53,7 +53,7 @@ def test_overrides_that_contradict_the_driver_are_refused(make: Any) -> None:
         make("merge", sensors_of="idm")
 
 
-def test_views_pass_it_on() -> None:
+def test_adapters_pass_sensors_of_on() -> None:
     ego = CavEgoEnv("ring", sensors_of="merge_ippo")
     lenient = parallel_env("ring", sensors_of="merge_ippo", lenient=True, **SMALL)
     (size,) = make_vec("merge").single_observation_space.shape

@@ -1,4 +1,4 @@
-"""Failed trips: causes, which are the worst, the clip of each, and the page in a browser."""
+"""Failed trips: causes, ranking, clips, and the page in a browser."""
 
 from __future__ import annotations
 

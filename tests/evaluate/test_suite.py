@@ -1,4 +1,4 @@
-"""Suites: what they name, what they drive, what they refuse."""
+"""Suites: their maps, their worlds, and refused files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_the_standard_suite_has_the_maps_and_numbers_that_it_should() -> None:
+def test_the_standard_suite_has_its_maps_and_numbers_of_agents() -> None:
     suite = load_suite(find_settings("suite", "standard"))
     assert len(suite.maps) >= 4
     assert suite.agents == (1, 25, 50, 100)

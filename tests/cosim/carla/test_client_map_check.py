@@ -1,4 +1,4 @@
-"""CARLA's own library reads the exports of the bundled maps as the world has them."""
+"""CARLA's own library reads the same roads from the exports of the bundled maps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.cosim.carla.conftest import client_python
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
-ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush: the map of town
+ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush has the map of town
 
 
 @pytest.fixture
