@@ -52,7 +52,7 @@ def record(driver: str | Path) -> str:
 
 
 def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return the part of a manifest that does not depend on time, machine or version of the code."""
+    """Return the part of a manifest that depends on neither time, machine nor code version."""
     keys = ("schema", "metrics_version", "episodes", "seeds")
     return {
         **{key: document.get(key) for key in keys},

@@ -1,4 +1,4 @@
-"""`ring22`: one agent among 21 human drivers, beside 22 human drivers."""
+"""`ring22`: one agent among 21 human drivers, compared with 22 human drivers."""
 
 from __future__ import annotations
 

@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
-SIZE = 105  # numbers of an observation of merge
+SIZE = 105  # size of an observation of merge
 
 
 def rows(**overrides: Any) -> CavSb3VecEnv:
@@ -36,7 +36,7 @@ def rows(**overrides: Any) -> CavSb3VecEnv:
 
 
 def act(policy: Any, vec: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Observations of acting agents after some steps, and the policy's actions of them."""
+    """Return observations of acting agents after some steps, and the policy's actions for them."""
     observations, infos = vec.reset(seed=2)
     for _ in range(3):
         actions = policy.act_batch(observations, infos["mask"])

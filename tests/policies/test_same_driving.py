@@ -1,4 +1,4 @@
-"""Trained drivers drive the same in any number of worlds, through each interface, without torch."""
+"""Trained drivers drive equally in any number of worlds, through each interface, without torch."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""When sensors take samples, against a list of them; and in worlds, over a minute."""
+"""Times of samples, compared with a list, and in worlds over a minute."""
 
 from __future__ import annotations
 
