@@ -74,7 +74,7 @@ def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) 
         check=True,
         capture_output=True,
     )
-    # The comment at the top has the date, the version and the options.
+    # The comment at the top has date, version and options.
     text = re.sub(
         r"\n<!-- generated on .*?\n-->\n", "", built.read_text(), count=1, flags=re.DOTALL
     )
@@ -95,7 +95,7 @@ def maps_or_skip(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def facts(config: EnvConfig, map_paths: list[Path]) -> str:
-    """The table of facts of a card."""
+    """Return the table of facts of a card."""
     reports = [check_map(path) for path in map_paths]
     people, clock = config.population, config.clock
     budget = f", {people.num_ids} in an episode" if people.mode == "open" else ""

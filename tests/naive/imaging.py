@@ -80,7 +80,7 @@ def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin:
 
 
 def ray_to_wall(start: Vector, ray: Vector, ego: np.void, wall: np.void, margin: float) -> float:
-    """Return the distance to a wall in lengths of the ray; inf: missed. Walls are on ego's ground."""
+    """Return the distance to a wall in lengths of the ray; inf: missed. Walls start at z = 0."""
     axes = turn(ego["heading"], 0.0, 0.0)[:2, :2]
     a = axes.T @ np.array([wall["ax"] - ego["x"], wall["ay"] - ego["y"]])
     b = axes.T @ np.array([wall["bx"] - ego["x"], wall["by"] - ego["y"]])

@@ -100,7 +100,7 @@ class Looks:
             self._see(lane, 0.0, EXIT_LOOK_M - way)
 
     def _own(self, rect: tuple[float, float, float, float]) -> dict[int, tuple[float, float]]:
-        """Return the zone's part of each lane with a margin; it is equal for all lanes of an edge."""
+        """Return the zone's part of each lane with a margin, equal for all lanes of an edge."""
         parts: dict[int, list[float]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             row = self.network.lanes[lane]

@@ -347,7 +347,7 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
 
 
 def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
-    """On 25 m of road, the change is not finished before the end; the vehicle must not get stuck."""
+    """On 25 m of road, the change does not end before the road; the vehicle must not get stuck."""
     vec = make_vec("cities_validation", num_envs=1, agents=1, background=0)
     driver = load_policy("idm", vec)
     observations, infos = vec.reset(seed=500, options={"first_world": 89})

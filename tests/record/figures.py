@@ -90,7 +90,7 @@ def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number with some decimals; with two if one decimal would show a non-zero value as 0."""
+    """Return a number with some decimals; with two if one would show a non-zero value as 0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 

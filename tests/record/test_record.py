@@ -33,7 +33,7 @@ each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.na
 
 
 def made_up(runs: int = 1, collisions: int = 1) -> EvaluationReport:
-    """Return a report with 40 trips per run on two maps, of which 38 minus the collisions arrive."""
+    """Return a report of 40 trips per run on two maps, of which 38 minus the collisions arrive."""
     rows, episodes = np.zeros(40 * runs, TRIP), np.zeros(2 * runs, EPISODE)
     number_in_run = np.arange(40 * runs) % 40
     rows["run"], episodes["run"] = np.arange(40 * runs) // 40, np.arange(2 * runs) // 2

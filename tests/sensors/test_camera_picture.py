@@ -58,7 +58,7 @@ def shoot(
 def test_rows_do_not_depend_on_bands(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
 ) -> None:
-    """Pictures that are too large for the cache are rendered in bands; a worker may get some bands."""
+    """Pictures too large for the cache are rendered in bands; a worker may get some bands."""
     camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
     depths, classes, _ = shoot(rows, camera, walls=walls)
     reach_m = camera_reach_m(camera, WIDTH, HEIGHT) + 1.0

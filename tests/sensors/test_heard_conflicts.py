@@ -44,7 +44,7 @@ def part(vec: Any) -> slice:
 
 
 def reported(vec: Any, me: np.void) -> dict[int, tuple[np.void, float]]:
-    """Return the vehicles in an agent's inbox: extrapolated rows, and the ages of the reports in s."""
+    """Return the vehicles in an agent's inbox: extrapolated rows, and ages of the reports in s."""
     found = {}
     for report in vec.simulation.messages.mail.objects[0, me["agent"]]:
         if report["sender"] < 0:

@@ -106,7 +106,7 @@ def test_the_imu_measures_the_centripetal_acceleration() -> None:
     assert y > 0.0  # inwards, which is to the left
     assert z == pytest.approx(GRAVITY_MPS2)
     assert rates == pytest.approx([0.0, 0.0, speed / radius], rel=1e-4)
-    # Two metres ahead of the centre, the acceleration along the car is larger by rate² · x.
+    # Two metres ahead of the centre, the acceleration along the car differs by -rate² · x.
     ahead = frames["front"].data[0, 0, -1].tolist()
     assert ahead[0] - x == pytest.approx(-2.0 * (speed / radius) ** 2, rel=1e-3)
     assert ahead[3:] == pytest.approx(rates)

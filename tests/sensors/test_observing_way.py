@@ -1,4 +1,4 @@
-"""The sensors `way` and `conflicts` equal their twins, and observe positions, lines and vehicles."""
+"""The sensors `way` and `conflicts` equal their twins, and observe positions and vehicles."""
 
 from __future__ import annotations
 

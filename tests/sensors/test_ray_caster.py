@@ -61,7 +61,7 @@ def begins_on_a_wall(walls: NDArray[np.void], start: Floats) -> bool:
 
 
 def runs_within_a_wall(walls: NDArray[np.void], start: Floats, ray: Floats) -> bool:
-    """Return whether a ray starts on the line of a wall and is parallel to it, within 1 µm per m."""
+    """Return whether a ray starts on a wall's line and is parallel to it, within 1 µm per m."""
     along = np.array([walls["bx"] - walls["ax"], walls["by"] - walls["ay"]])
     before = np.array([start[0] - walls["ax"], start[1] - walls["ay"]])
     least = 1e-6 * np.hypot(*along)
@@ -99,7 +99,7 @@ def test_rays_equal_twin(
         hit = hits[a, e]
         if runs_within_a_wall(walls, place, axes @ rays[a, e]):
             continue  # rounding decides whether and where the ray hits that wall
-        # Rounding decides whether a ray that grazes a side hits it, so sizes differ by a micrometre.
+        # Rounding decides whether a ray that grazes a side hits it, so sizes differ by 1 µm.
         nearer, further = (
             naive.trace(rows, 0, walls, start, rays[a, e], range_m, margin)
             for margin in (1e-6, -1e-6)

@@ -22,7 +22,7 @@ from tests.support.world import tick_of
 
 TERMS_ALONE = "none but ego"
 MOST = 30  # number of vehicles of a crowd
-RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # size of the largest vehicles
+RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # half the diagonal of the largest vehicles
 EVERYWHERE = np.ones(1, dtype=np.bool_)
 
 OFF: dict[str, Any] = {

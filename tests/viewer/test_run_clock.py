@@ -1,4 +1,4 @@
-"""When steps are due, by a clock that the test moves."""
+"""Times at which steps are due, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.viewer.run_clock import RunClock
 
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """The time, `now.s`, from 100 s on."""
+    """The time, `now.s`; it starts at 100 s."""
     found = SimpleNamespace(s=100.0)
     monkeypatch.setattr(run_clock, "time", SimpleNamespace(monotonic=lambda: found.s))
     return found
