@@ -42,17 +42,17 @@ def carla(
         ),
     ] = "obey",
     max_clients: Annotated[
-        int, about("Number of clients at a time.", metavar="N", panel=SERVICE)
+        int, about("Maximum number of clients at the same time.", metavar="N", panel=SERVICE)
     ] = 64,
     max_actors: Annotated[
-        int, about("Number of actors that clients may spawn.", metavar="N", panel=SERVICE)
+        int, about("Maximum number of actors that clients spawn.", metavar="N", panel=SERVICE)
     ] = 1024,
     max_message_mb: Annotated[
-        int, about("Size of a message of a client.", metavar="MB", panel=SERVICE)
+        int, about("Maximum size of a message of a client.", metavar="MB", panel=SERVICE)
     ] = 64,
     max_unsent_mb: Annotated[
         int,
-        about("Data that may wait for a client that does not read.", metavar="MB", panel=SERVICE),
+        about("Maximum data that wait for a slow client.", metavar="MB", panel=SERVICE),
     ] = 64,
 ) -> None:
     """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""

@@ -108,9 +108,7 @@ def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, st
         start(lambda: drive(address, ["car_1"]))
         world.wait_for(2, 10.0)
         world.step()
-        assert (
-            world.seats[0].answers == 2
-        )  # for the frame at which it joined, and for the next frame
+        assert world.seats[0].answers == 2  # for this frame and the next
     assert found == reference(8, {})
 
 

@@ -37,9 +37,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            subprocess_calls, "start_python", start_python
-        )  # a new interpreter, not a fork as in other tests
+        patch.setattr(subprocess_calls, "start_python", start_python)  # no fork, as in other tests
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 

@@ -56,9 +56,7 @@ class Looks:
         self.strays = make_strays(PARTITION.count, CAPACITY)
         self.found = np.zeros(1, dtype=FINDING)
         self.tallies = np.zeros(PARTITION.count, dtype=TALLY)
-        self.foreign = np.zeros(
-            PARTITION.count, dtype=np.uint64
-        )  # added to the expected sum of owners of each zone
+        self.foreign = np.zeros(PARTITION.count, dtype=np.uint64)  # added to expected sums
         self.before: dict[int, naive.Kept] = {}
 
     def put(self, zones: list[naive.Zone]) -> None:

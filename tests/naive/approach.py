@@ -9,9 +9,7 @@ from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
-Entry = tuple[
-    int, int, float
-]  # link, id of the vehicle, distance from its centre to the stop line in m
+Entry = tuple[int, int, float]  # link, vehicle's id, m from its centre to the line
 
 
 def link_into(roads: RoadNetwork, row: np.void) -> int:
@@ -64,9 +62,7 @@ def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[
         else:
             step = travel.steps[way + lane]
             if step["next"] < 0:
-                is_minded = (
-                    to_end < 15.0 or step["change"] == 0
-                )  # the distance, or the end of its trip
+                is_minded = to_end < 15.0 or step["change"] == 0  # or its trip ends
                 if not ahead and is_minded and here["num_links"]:
                     found.append((int(here["first_link"]), name, max(to_end, 0.0)))
                 break

@@ -102,9 +102,7 @@ def test_a_session_moves_from_a_drained_node(cluster: Cluster, client: Client) -
         admin.post(f"/nodes/{place}/drain")
         while remote.flows.assignment["assigned"] == place:
             assert_same(remote, local, range(1))
-        assert (
-            remote.flows.moves >= 1
-        )  # on a busy machine, another node may send its heartbeats late
+        assert remote.flows.moves >= 1  # other nodes may be slow
     remote.close()
 
 
@@ -203,9 +201,7 @@ def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None
             local.reset(seed=8)
             assert_same(remote, local, range(40))
             service.kill()
-            assert_same(
-                remote, local, range(40, 60)
-            )  # without a service, as long as the lease is valid
+            assert_same(remote, local, range(40, 60))  # the lease still holds
             service.start_again(*options)
             assert_same(remote, local, range(60, 90))
             nodes.processes[remote.flows.assignment["assigned"]].kill()
@@ -245,9 +241,7 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
                 message = page.recv(timeout=10)
                 told_of = json.loads(message) if isinstance(message, str) else {}
                 rows = told_of.get("rows", rows)
-                if (
-                    len(rows) > 1 and rows[-1]["score"] is not None
-                ):  # None while its heartbeat is late
+                if len(rows) > 1 and rows[-1]["score"] is not None:  # None: late heartbeat
                     break
             assert "node of the service" in rows[-1]["name"]
             assert rows[-1]["score"] is not None

@@ -77,9 +77,7 @@ class Package:
     def __init__(self) -> None:
         self.sources: dict[str, str] = {}
         self._classes: dict[str, list[_Members]] = defaultdict(list)
-        self._modules: dict[str, list[str]] = defaultdict(
-            list
-        )  # modules by the last part of their names
+        self._modules: dict[str, list[str]] = defaultdict(list)  # by the last part of names
         self._keys = dotted_keys(EnvConfig)
         trees: dict[str, ast.Module] = {}
         for path in sorted((ROOT / "cavmarl").rglob("*.py")):

@@ -129,9 +129,7 @@ def test_a_fault_is_injected_and_counted_and_the_run_is_equal(fault: Fault) -> N
     assert not line.wrong
     assert set(line.injected) == {fault}
     assert (line.runs, line.equal + line.ended) == (4, 4)
-    if (
-        fault is not Fault.KILL_IN_RECOVERY
-    ):  # two of three nodes may die, which may be the only ones with a state
+    if fault is not Fault.KILL_IN_RECOVERY:  # both nodes with the state may die
         assert (line.equal, line.injected[fault] <= 4) == (4, True)
     assert line.deaths == (line.injected[fault] if fault in DEATHS else 0)
     if fault in TOLERATED:

@@ -186,9 +186,7 @@ def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Ser
     page.uncheck("#sensors")
     until(page, "viewer.shapes && viewer.shapes.all.length === 0")
     until(page, f"{drawn} < 20000 && {drawn} > 0")
-    assert not [
-        one for one in problems if "getImageData" not in one
-    ]  # the request of the test itself
+    assert not [one for one in problems if "getImageData" not in one]  # of the test itself
 
 
 def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_path: Path) -> None:

@@ -63,9 +63,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
         ]
         expected = naive.near_borders(partition.reaching, zone, hysteresis_m, ahead_s, rows)
         margins = _margins(partition, zone, hysteresis_m, ahead_s, rows)
-        clear = {
-            i for i, margin in enumerate(margins) if margin > 1e-6
-        }  # squares are rounded differently
+        clear = {i for i, margin in enumerate(margins) if margin > 1e-6}  # squares round otherwise
         assert [e for e in told if e[0] in clear] == [e for e in expected if e[0] in clear]
     for entry in out[:found]:
         row = parts[entry["source"]][entry["row"]]
@@ -97,9 +95,7 @@ def _margins(
 
 def test_a_vehicle_near_a_corner_is_found_for_both_zones() -> None:
     partition = four()
-    row = vehicles(
-        [(13.0, 12.0, math.pi / 2)], speed=10.0
-    )  # owned by zone 0, 3 m to the east of it
+    row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # 3 m to the east of zone 0
     none = row[:0]
     zoned = exchanged(partition, 60.0, [row, none, none, none], borders=BORDERS)
     out = np.zeros(2, dtype=NEAR)

@@ -17,20 +17,7 @@ from tests.support.terrain import plane, write_geotiff, write_hgt
 
 PLACES = np.array([[11.001, 48.001], [11.012, 48.009], [11.0071, 48.0033]])
 GROUND = plane(0.03, 0.05)
-NEW_YORK = (
-    1024,
-    0,
-    1,
-    1,
-    1025,
-    0,
-    1,
-    2,
-    3072,
-    0,
-    1,
-    2263,
-)  # a state plane, whose code means US feet
+NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # state plane, in US feet
 FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
 
 
