@@ -32,7 +32,7 @@ MEMORY_MB = 3000
 
 
 def _mutate(content: bytes, limit: int, seed: int) -> bytes:
-    """Change an input: half of the changes keep pieces of the file whole; libFuzzer makes others."""
+    """Change an input: half of the changes keep pieces of a file whole; libFuzzer makes others."""
     rng = random.Random(seed)
     if content and rng.random() < 0.5:
         return mutated(content, rng)[:limit]

@@ -1,6 +1,7 @@
 """Make the picture of the viewer: its page in a headless Chromium, with a divided world.
 
-`python -m docs.pictures.viewer_picture docs/images` makes it again, with Chromium.
+`python -m docs.pictures.viewer_picture docs/images` makes it again.
+The program needs Chromium and Playwright.
 """
 
 from __future__ import annotations
