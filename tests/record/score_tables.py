@@ -220,7 +220,7 @@ WORLD_TEXTS = {
     "merge": "busy highway and an on-ramp whose lane ends",
     "grid4x4": "sixteen signalled crossings to cross in time",
     "town": "Berlin-Adlershof, 38 km of streets (extra `sumo`)",
-    "rush": "a quarter of it that all vehicles leave, in four zones (extra `sumo`)",
+    "rush": "the same map in four zones; all vehicles leave one quarter (extra `sumo`)",
 }
 LOSSES = {"none": "0", "10 %": "0.1", "20 %": "0.2", "30 %": "0.3", "40 %": "0.4", "50 %": "0.5"}
 LOSSES["all"] = "1"
