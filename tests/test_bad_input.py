@@ -214,7 +214,7 @@ def test_step_and_render_before_reset_are_refused() -> None:
         make_vec("ring").step(np.zeros((1, 4, 2)))
 
 
-def test_a_lenient_world_takes_what_libraries_give_and_counts_it() -> None:
+def test_a_lenient_world_accepts_and_counts_actions_of_libraries() -> None:
     """All leniencies at once, also for agents that have left, and when all have left."""
     env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3, lenient=True)
     strict = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3)
@@ -385,7 +385,7 @@ def test_more_agents_than_the_map_can_take_are_refused() -> None:
         env.step({})
 
 
-def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
+def test_the_error_for_an_unknown_environment_lists_environments() -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"mreg.*did you mean merge"):
         parallel_env("mreg")
 

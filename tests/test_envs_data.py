@@ -54,7 +54,7 @@ def test_the_card_agrees_with_the_configuration(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: "/".join(recipe.parts[-3::2]))
-def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) -> None:
+def test_a_generated_map_equals_the_result_of_its_options(recipe: Path, tmp_path: Path) -> None:
     pinned = re.search(
         r"^eclipse-sumo==(.*)$", (ROOT / "constraints/exact.txt").read_text(), re.MULTILINE
     )

@@ -31,7 +31,7 @@ def test_there_are_three_notebooks() -> None:
 
 
 @each
-def test_a_notebook_is_what_its_script_makes(script: Path) -> None:
+def test_a_notebook_equals_its_script(script: Path) -> None:
     made = script.with_suffix(".ipynb").read_text(encoding="utf-8")
     found = json.loads(made)["cells"]
     code = [cell for cell in found if cell["cell_type"] == "code"]

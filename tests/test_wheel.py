@@ -157,7 +157,7 @@ def test_a_read_only_installation_works_without_a_cache(elsewhere: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_damaged_library_is_compiled_anew_with_a_reason(site: Path, tmp_path: Path) -> None:
+def test_a_damaged_library_is_compiled_again_with_a_reason(site: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "site"
     shutil.copytree(site, damaged)
     library = damaged / "cavmarl/core/compiled/prebuilt/kernels.so"

@@ -107,7 +107,7 @@ def test_worlds_stay_whole_if_that_is_about_as_fast() -> None:
     assert plan.imbalance == 1.0
 
 
-def test_a_world_is_split_where_it_is_more_than_a_workers_share() -> None:
+def test_a_world_above_the_share_of_a_worker_is_split() -> None:
     costs = [4.0] * 4 + [1.0] * 8
     plan = make_plan(Problem(row(costs, worlds=3), grid(2, 2), idle_snapshot(2)))
     assert plan.imbalance <= 1.1

@@ -54,7 +54,7 @@ def problems(draw: st.DrawFn) -> Problem:
 
 
 @given(problems())
-def test_the_first_plan_is_a_row_about_as_long_as_it_should_be(problem: Problem) -> None:
+def test_the_first_plan_is_contiguous_and_nearly_optimal(problem: Problem) -> None:
     plan = make_plan(problem)
     check_row(plan, len(problem.snapshot.workers))
     slowest = min(plan.placement.workers.speeds)

@@ -106,7 +106,7 @@ def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
     assert watch.has_cause(rows, 0, green)
 
 
-def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
+def test_priority_and_a_full_road_are_causes_to_stand() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("town", agents=2, background=0), 1))
     vec.reset(seed=1)
     network, watch = vec.network, yardstick.StandingVehicles(vec)
@@ -129,7 +129,7 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
     assert not waits(behind, yardstick.NEAR_AHEAD_M + 1.0)
 
 
-def test_one_inside_a_junction_waits_for_room_behind_it_and_for_no_signal() -> None:
+def test_a_vehicle_inside_a_junction_waits_for_room_and_not_for_a_signal() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("grid4x4", agents=2, background=0), 1))
     vec.reset(seed=1)
     network, rows = vec.network, vec.simulation.vehicles(0)

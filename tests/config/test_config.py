@@ -53,7 +53,7 @@ terms: {weights: {progress: 1}, team_share: 1}
     assert config.terms.weights == {"progress": 1.0}
 
 
-def test_a_file_that_is_read_again_is_read_as_it_stands(tmp_path: Path) -> None:
+def test_reading_again_gives_the_present_file(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text("a: [1, 2]")
     first = read_yaml(path)

@@ -52,7 +52,7 @@ def test_received_signal_states_equal_the_signals() -> None:
     assert equal > 0.6 * len(found)
 
 
-def test_workers_send_what_their_vehicles_hear() -> None:
+def test_received_states_are_equal_on_workers() -> None:
     for (mine, *_), (theirs, *_) in zip(looks(), looks(workers=1), strict=True):
         assert (mine[SPAT].values == theirs[SPAT].values).all()
 

@@ -159,7 +159,7 @@ def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
     )
 
 
-def test_a_reset_in_the_middle_of_a_cycle_begins_it_again(grid: Path) -> None:
+def test_a_reset_restarts_the_cycle(grid: Path) -> None:
     simulation = make_traffic(grid, background=30, num_worlds=2)
     start(simulation, seed=5)
     first = simulation.state_hash(0)

@@ -49,7 +49,9 @@ def planned(program: Program, time: Fraction) -> str:
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])
 @pytest.mark.parametrize("offset", [None, "10"])
-def test_signals_show_what_the_map_plans(env: str, offset: str | None, tmp_path: Path) -> None:
+def test_signals_follow_the_programs_of_the_map(
+    env: str, offset: str | None, tmp_path: Path
+) -> None:
     source = resolve_map(*load_config(env))
     text = source.read_text(encoding="utf-8").replace('type="actuated"', 'type="static"')
     if offset is not None:

@@ -71,7 +71,7 @@ def test_every_view_has_a_space_of_choices() -> None:
     rows.close()
 
 
-def test_a_choice_does_what_the_continuous_action_does() -> None:
+def test_a_choice_has_the_effect_of_its_continuous_action() -> None:
     grid = worlds()
     fine = worlds(**{"action.kind": "continuous"})
     for vec in (grid, fine):

@@ -263,7 +263,7 @@ def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
         ("sensors.lanes.range_m", "lanes"),
     ],
 )
-def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sensor: str) -> None:
+def test_switching_a_sensor_off_does_not_change_other_sensors(key: str, sensor: str) -> None:
     on = {"sensors.lidar.rays": 16}
     full, reduced = make("merge", overrides=on), make("merge", overrides={**on, key: 0})
     places = layout(full.config.sensors)
@@ -406,7 +406,7 @@ def test_suggested_actions_are_valid_and_lead_to_the_goal(env_name: str, kind: s
 # Tools
 
 
-def test_traffic_stats_count_what_happened() -> None:
+def test_traffic_stats_count_events() -> None:
     env = make("merge", "respawn")
     env.reset()
     rng = np.random.default_rng(5)

@@ -20,7 +20,7 @@ SMALL: dict[str, Any] = {"agents": 2, "background": 2}
 
 
 @pytest.mark.parametrize("name", ["cities_residual", "u_turn_ippo"])
-def test_the_driver_fits_where_it_was_not_trained(name: str) -> None:
+def test_a_driver_fits_an_environment_without_training_there(name: str) -> None:
     pytest.importorskip("torch")
     one = parallel_env("merge", sensors_of=name, **SMALL)
     driver = load_policy(name, one)

@@ -112,7 +112,7 @@ def test_worlds_do_not_touch_each_other() -> None:
     assert len({calm.state_hash(w) for w in range(3)}) == 3
 
 
-def test_the_seed_decides_and_no_seed_goes_on() -> None:
+def test_a_seed_repeats_episodes_and_no_seed_continues() -> None:
     vec, again = make(2), make(2)
     hashes = []
     for seed in (3, None, 3, None):
@@ -126,7 +126,7 @@ def test_the_seed_decides_and_no_seed_goes_on() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
+def test_a_world_can_reset_in_the_same_step(mode: str) -> None:
     vec = make(2, mode)
     assert vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     observations, infos = vec.reset(seed=0)
@@ -165,7 +165,7 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
 
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("mode", MODES)
-def test_a_world_may_begin_anew_in_the_next_step(mode: str, copy: bool) -> None:
+def test_a_world_can_reset_in_the_next_step(mode: str, copy: bool) -> None:
     """The steps equal those of `SAME_STEP`, except for one more step between two episodes."""
     late, now = make(1, mode, autoreset_mode="NextStep", copy=copy), make(1, mode)
     assert late.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
@@ -196,7 +196,7 @@ def test_a_world_may_begin_anew_in_the_next_step(mode: str, copy: bool) -> None:
     assert episodes >= 3
 
 
-def test_chosen_worlds_begin_anew_and_the_others_go_on() -> None:
+def test_chosen_worlds_are_reset_and_other_worlds_continue() -> None:
     vec, alone = make(3), make(3)
     vec.reset(seed=3)
     alone.reset(seed=3)

@@ -104,7 +104,7 @@ def told(page: Path, browse: Browse) -> dict[str, Any]:
     return document
 
 
-def test_a_browser_shows_it_without_error_and_without_another_file(told: dict[str, Any]) -> None:
+def test_a_browser_shows_the_page_without_errors_and_other_files(told: dict[str, Any]) -> None:
     assert told["errors"] == []
     assert told["loaded"] == []
 

@@ -33,7 +33,7 @@ def test_students_quantile_equals_the_textbook(freedom: int, quantile: float) ->
 
 
 @pytest.mark.parametrize("runs", [2, 3, 5])
-def test_the_interval_between_runs_covers_as_often_as_it_says(runs: int) -> None:
+def test_the_interval_between_runs_has_its_stated_coverage(runs: int) -> None:
     random = np.random.default_rng(runs)
     hits = 0
     for _ in range(1000):

@@ -75,7 +75,7 @@ def test_a_suite_that_cannot_work_is_refused(tmp_path: Path, text: str, message:
         load_suite(file)
 
 
-def test_the_tasks_are_entries_as_they_are() -> None:
+def test_the_tasks_are_unchanged_environments() -> None:
     suite = load_suite(find_settings("suite", "tasks"))
     worlds = worlds_of(suite, ROOT / "envs")
     assert [world.env for world in worlds] == list(suite.maps)

@@ -135,7 +135,7 @@ def a_ghost_of_the_tick_before(world: Meddling) -> None:
     rows[owned]["tick"] -= 1
 
 
-def a_ghost_that_somebody_has_written(world: Meddling) -> None:
+def a_ghost_with_a_changed_field(world: Meddling) -> None:
     rows, owned, _ = world.zone(1)
     rows[owned]["speed"] += 0.5
 
@@ -155,7 +155,7 @@ VIOLATIONS = {
     a_row_that_is_with_another_zone_than_on_record: r"owner on record: zone \d owns vehicle \d+ at",
     a_clock_that_is_late: r"one clock: zone 2 is at tick \d+, not at \d+",
     a_ghost_of_the_tick_before: r"age of ghosts: zone 1 has a ghost of vehicle \d+ with tick = ",
-    a_ghost_that_somebody_has_written: r"age of ghosts: .* ghost of vehicle \d+ with speed",
+    a_ghost_with_a_changed_field: r"age of ghosts: .* ghost of vehicle \d+ with speed",
     a_ghost_that_is_not_there: r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: the vehicle",
 }
 

@@ -328,7 +328,7 @@ class Explorer:
             if tally(RUN, owned) != expected:
                 raise ProtocolError(f"I6: the ledger of zone {zone} is not that of its vehicles")
         if any(ticks > self.small.limits.deferral for ticks in table.deferred.values()):
-            raise ProtocolError(f"I5: somebody waits too long: {table.deferred}")
+            raise ProtocolError(f"I5: a vehicle waits too long: {table.deferred}")
 
     # Numbers for parties and messages
 

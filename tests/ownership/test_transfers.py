@@ -44,7 +44,7 @@ def test_a_forced_transfer_has_its_deferral() -> None:
     assert log.counts == {"forced": 1, "deferred": 2, "removed": 1}
 
 
-def test_an_approach_that_ends_is_counted_and_one_that_is_forgotten_takes_no_room() -> None:
+def test_ended_approaches_are_counted_and_forgotten_ones_take_no_memory() -> None:
     bench = Bench(3)
     bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1), (8, 2)])
     bench.tick(offers=[(8, 2)])

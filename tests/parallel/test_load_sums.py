@@ -10,7 +10,7 @@ import numpy as np
 from cavmarl.parallel.nodes.node_loads import NodeLoad, since, totals
 
 
-def test_a_load_is_what_has_been_added_since_the_report_before() -> None:
+def test_a_load_is_the_difference_to_the_previous_report() -> None:
     # Processor time, waiting time, bytes and frames are sums; memory, vehicles, ghosts are present
     # values.
     before = [10.0, 4.0, 1000, 20, 5000, 7, 3]

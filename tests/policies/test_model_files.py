@@ -46,7 +46,7 @@ def act(policy: Any, vec: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C, SAC])
-def test_a_model_of_stable_baselines3_acts_as_it_predicts(
+def test_the_actions_of_a_model_of_stable_baselines3_equal_its_predictions(
     kind: Callable[..., BaseAlgorithm], tmp_path: Path
 ) -> None:
     worlds = rows()

@@ -123,7 +123,7 @@ NEEDED = {
 }
 
 
-def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
+def test_each_bundled_driver_loads_in_its_environment() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
@@ -199,7 +199,7 @@ def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) 
     assert all(str(size) in str(caught.value) for size in sizes)
 
 
-def test_the_overrides_that_a_refusal_names_make_it_fit(checkpoint: Path) -> None:
+def test_overrides_of_the_error_message_make_a_driver_fit(checkpoint: Path) -> None:
     changed = {"sensors.lidar.rays": 32, "action.kind": "discrete", "sensors.route.points": 2}
     with pytest.raises(PolicyError) as caught:
         load_policy(checkpoint, make_vec("merge", overrides=changed))

@@ -160,7 +160,7 @@ def test_results_that_are_there_are_not_driven_again(tmp_path: Path) -> None:
     assert finish_all([job], 1, print, tmp_path) == {"failing": "failing"}
 
 
-def test_a_page_without_scores_is_refused_with_those_that_have_some() -> None:
+def test_the_error_for_a_page_without_scores_lists_pages_with_scores() -> None:
     page = "docs/guides/bring_a_map.md"
     with pytest.raises(CavmarlError, match=rf"{page}.*(?s:.*)docs/figures/tasks\.md:tasks"):
         tables_named([page])

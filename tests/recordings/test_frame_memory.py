@@ -35,7 +35,7 @@ def test_rows_that_are_returned_twice_are_reused_once() -> None:
     assert not np.shares_memory(memory.take(10), memory.take(10))
 
 
-def test_frames_in_memory_that_is_used_again_are_recorded_as_they_were(
+def test_reusing_memory_does_not_change_recorded_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 20_000)

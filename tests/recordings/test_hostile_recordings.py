@@ -185,7 +185,7 @@ def test_a_forged_recording_is_refused_in_one_line(
     assert ";" in str(caught.value)  # the fault, and the remedy
 
 
-def test_replay_says_what_is_wrong(bad: Path) -> None:
+def test_the_replay_command_reports_the_fault(bad: Path) -> None:
     changed(VEHICLES, "x", 1e300)(bad)
     result = CliRunner().invoke(app, ["replay", str(bad), "--csv", str(bad / "rows.csv")])
     assert isinstance(result.exception, CavmarlError | SystemExit)

@@ -111,7 +111,7 @@ def test_an_episode_without_a_step_is_one(tmp_path: Path) -> None:
     assert [len(recording.ticks(0, episode)) for episode in (0, 1)] == [1, 2]
 
 
-def test_an_end_in_the_step_that_begins_the_world_anew_is_an_event(tmp_path: Path) -> None:
+def test_an_end_in_the_step_of_an_autoreset_is_an_event(tmp_path: Path) -> None:
     """The last step before an autoreset has no frame, but the ends of trips in it are events."""
     arguments: dict[str, Any] = {"agents": 2, "background": 0, "max_cycles": 40}
     with closing(make_vec("ring", record=tmp_path / "run", **arguments)) as vec:

@@ -58,7 +58,7 @@ def test_the_projection_of_a_map_is_used(shared_maps: Path) -> None:
     assert 11.2 < found[0, 1] < 11.4
 
 
-def test_an_antenna_is_where_it_is_mounted() -> None:
+def test_an_antenna_is_at_its_mounting_position() -> None:
     gnss = {"type": "gnss", "rate_hz": 20, "x_m": -1.0, "y_m": 0.7, "z_m": 1.5}
     vec = make_vec("grid4x4", agents=5, background=10, overrides={"rig": {"gnss": gnss}})
     config = vec.config.rig["gnss"]

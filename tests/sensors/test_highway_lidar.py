@@ -37,7 +37,7 @@ def test_the_cells_are_highway_envs(name: str, num_cells: int, normalize: bool) 
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_bodies_in_any_place_are_drawn_alike(seed: int) -> None:
+def test_cells_are_equal_for_bodies_at_any_position(seed: int) -> None:
     env = highway.make("highway-v0", 0)
     env.road.objects.clear()
     rng = np.random.default_rng(seed)

@@ -118,7 +118,7 @@ def test_the_end_of_a_truck_is_seen_when_its_centre_is_out_of_range() -> None:
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-def test_the_rough_angle_is_as_good_as_it_claims(y: float, x: float) -> None:
+def test_the_approximate_angle_is_within_its_bound(y: float, x: float) -> None:
     if x == 0.0 and y == 0.0:
         return
     error = math.remainder(bearings.rough_atan2(y, x) - math.atan2(y, x), 2.0 * math.pi)

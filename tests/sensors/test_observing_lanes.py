@@ -78,7 +78,7 @@ def traffic(draw: st.DrawFn, name: str) -> NDArray[np.void]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(deadline=None)
 @given(data=st.data(), random=st.randoms(use_true_random=False))
-def test_lanes_equals_twin_whatever_the_order(
+def test_lanes_equals_twin_for_any_order_of_rows(
     name: str, data: st.DataObject, random: object
 ) -> None:
     rows = data.draw(traffic(name))

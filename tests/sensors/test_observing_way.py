@@ -89,7 +89,7 @@ def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(deadline=None, max_examples=25)
 @given(data=st.data(), random=st.randoms(use_true_random=False))
-def test_way_and_conflicts_equal_their_twins_whatever_the_order(
+def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
     name: str, data: st.DataObject, random: object
 ) -> None:
     rows = data.draw(traffic(name))
@@ -183,7 +183,7 @@ def made(env: str = "grid4x4", **overrides: Any) -> Any:
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
-def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None:
+def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
     observations, infos = vec.reset()

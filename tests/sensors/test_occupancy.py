@@ -88,7 +88,7 @@ def test_a_cell_shows_the_smallest_id_and_no_other_level() -> None:
 
 
 @pytest.mark.parametrize("name", ["ring", "grid4x4", "merge"])
-def test_near_lanes_draw_what_all_lanes_draw(name: str) -> None:
+def test_near_lanes_suffice_for_the_grid(name: str) -> None:
     roads = network(name)
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(features=("on_road",)))
     rng = np.random.default_rng(0)

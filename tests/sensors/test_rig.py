@@ -42,7 +42,7 @@ TEN: dict[str, Any] = {
     [{"rig": RIG}, TEN, {"rig": RIG, "zones.repartition_steps": 5}],
     ids=["rig", "ten", "repartition"],
 )
-def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -> None:
+def test_samples_of_divided_worlds_equal_the_undivided_world(rig: dict[str, Any]) -> None:
     modes = {"observation.mode": "sensors", "observation.kind": "dict"}
     overrides = {**BUSY, **modes, **rig}
     found = verify_zones("grid4x4", (2, 4, 9), overrides=overrides, steps=30, seed=3)

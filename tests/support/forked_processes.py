@@ -1,4 +1,4 @@
-"""Processes as forks of one that has loaded the kernels: each starts in milliseconds.
+"""Processes as forks of a process with loaded kernels: each starts in milliseconds.
 
 Outside of tests, each process is a new interpreter, which takes more than a second. Tests of that
 use the fixture `fresh_processes`.

@@ -125,7 +125,7 @@ class RunCount:
 
 
 def main() -> int:
-    """Run the affected tests in two processes; skip and report those that there is no time for."""
+    """Run the affected tests in two processes; skip and report tests for which there is no time."""
     tests = touched_tests(changed_files())
     print(f"{len(tests)} test files are affected")
     return run(tests, "not slow and not integration and not alone")

@@ -255,7 +255,7 @@ def test_the_driver_that_never_yields_steers() -> None:
         load_policy("never_yield", vec)
 
 
-OWN = '''"""Nobody is there."""
+OWN = '''"""The scene is empty."""
 from dataclasses import dataclass
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.scene import setting

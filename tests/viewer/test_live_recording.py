@@ -141,7 +141,7 @@ def test_an_agent_is_shown_with_its_observation(
     assert "observation" not in heard.told_of(int(others["id"][0]), tick)
 
 
-def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
+def test_a_recording_without_a_map_or_frames_is_refused(path: Path, tmp_path: Path) -> None:
     (path / "network.bin").rename(tmp_path / "network.bin")
     try:
         with pytest.raises(RecordingError, match="has no map"):

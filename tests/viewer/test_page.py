@@ -43,7 +43,7 @@ def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[st
     return page, problems, hosts
 
 
-def test_the_page_draws_follows_and_asks_no_other_host(browser: Any, serve: Serve) -> None:
+def test_the_page_draws_and_follows_without_other_hosts(browser: Any, serve: Serve) -> None:
     served = serve()
     page, problems, hosts = opened(browser, served)
     until(page, "viewer.firstPicture > 0")

@@ -56,7 +56,7 @@ def test_it_reads_the_exports_of_a_family_of_maps() -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_the_command_reads_files_and_names_what_is_missing(tmp_path: Path) -> None:
+def test_the_command_reads_files_and_names_missing_parts(tmp_path: Path) -> None:
     target, summary = tmp_path / "grid.xodr", tmp_path / "summary.json"
     write_opendrive(find_map("grid4x4"), target, for_carla=True)
     words = ["check", str(target), "--carla", "--json", str(summary)]
