@@ -114,7 +114,7 @@ def test_lines_are_short(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_pages_name_the_thing(page: Path) -> None:
+def test_pages_speak_of_things_and_not_of_persons(page: Path) -> None:
     """Pages say vehicle, zone or worker; generated blocks are not checked."""
     text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
     words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"

@@ -34,7 +34,7 @@ Make = Callable[..., Any]
 
 
 def worlds(*often: str, modes: tuple[str, ...] = MODES, bare: tuple[str, ...] = BARE_MAPS) -> Any:
-    """Parametrize a test by environment and population mode; `often`: entries that are never slow.
+    """Parametrize a test by environment and mode; modes of entries in `often` are never slow.
 
     Each environment is tested in its first mode in every run of the tests; other modes behave alike
     on all maps, which `test_parallel_api` shows for each mode.

@@ -36,9 +36,9 @@ def carla(
     other_ticks: Annotated[
         Literal["obey", "refuse", "follow"],
         about(
-            "What happens if a client ticks that is not the first one that ticks: the world "
-            "advances (obey), the client gets an error (refuse), or it waits for the next tick "
-            "of the first one (follow)."
+            "The first client that ticks leads. If another client ticks, the world advances "
+            "(obey), that client gets an error (refuse), or it waits for the next tick of the "
+            "leading one (follow)."
         ),
     ] = "obey",
     max_clients: Annotated[

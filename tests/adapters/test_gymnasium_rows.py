@@ -233,7 +233,7 @@ def test_rows_of_a_world_begin_anew_together() -> None:
 
 
 def test_a_world_may_end_while_none_of_its_rows_has_a_vehicle() -> None:
-    """Without autoreset, a loop that resets all ended rows never steps a world that is over."""
+    """Without autoreset, no finished world is stepped if all ended rows are reset each time."""
     rows = make(num_worlds=4, autoreset_mode="Disabled")
     rows.reset(seed=0)
     rng = np.random.default_rng(0)

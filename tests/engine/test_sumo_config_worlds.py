@@ -21,7 +21,7 @@ INPUT = '<net value="m.net.xml"/><r value="a%20b.xml"/><additional value="night.
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """Write a configuration of a crossing to a file without a telling suffix."""
+    """Write a configuration of a crossing to a file without a suffix."""
     (tmp_path / "m.net.xml").write_text(CROSSING, encoding="utf-8")
     (tmp_path / "a b.xml").write_text(TRIPS, encoding="utf-8")
     (tmp_path / "night.add.xml").write_text(NIGHT, encoding="utf-8")

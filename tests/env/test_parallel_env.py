@@ -429,7 +429,7 @@ def test_traffic_stats_count_events() -> None:
     assert env.traffic_stats()["departed"] == env.traffic_stats()["running"]
 
 
-def test_tools_that_look_change_nothing() -> None:
+def test_tools_that_read_a_world_do_not_change_it() -> None:
     env = make("grid4x4", "respawn")
     env.reset()
     env.step(env.suggest_actions())

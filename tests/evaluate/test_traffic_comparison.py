@@ -193,7 +193,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) ->
         ((*WORDS, "--speed", "--after", "0"), "after = 0"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_bad_input_is_reported_without_a_traceback(
     capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
 ) -> None:
     assert run(*words) == 2

@@ -142,7 +142,7 @@ def test_moving_vehicles_and_vehicles_off_the_line_do_not_wait(
     assert measure(network, [way] * 3).locks_s == {}
 
 
-def test_edge_minutes_follow_edie(network: RoadNetwork, link: int) -> None:
+def test_flow_and_density_are_those_defined_by_edie(network: RoadNetwork, link: int) -> None:
     lane = int(network.links["from_lane"][link])
     edge = network.edges[network.lanes["edge"][lane]]
     lane_km = edge["length_m"] * edge["num_lanes"] / 1000.0

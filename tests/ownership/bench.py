@@ -1,6 +1,6 @@
 """A coordinator and its hosts in one process; the test delivers each message itself.
 
-A vehicle's state is its version, (vehicle, tick). The class is its own committed store.
+A vehicle's state is its version, (vehicle, tick), so `Bench` is also the store of committed states.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class Bench:
         return (endpoint.complete(rows, gone),)
 
     def offer(self, zone: int, *approaches: tuple[int, int]) -> tuple[Message, ...]:
-        """Return the offers of a zone's host for (vehicle, target)."""
+        """Let a zone's host offer vehicles to targets, and return its messages."""
         endpoint = self.endpoints[zone]
         return endpoint.offer(
             Approach(vehicle, target, version(vehicle, endpoint.tick))
