@@ -71,7 +71,7 @@ def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
         assert all_rows(together) == all_rows(apart), f"step {step}"
         assert together.state_hash(1) == apart.state_hash(1)
     assert together.migrations > 10
-    assert together.traffic_stats().departed > 64, "no vehicle has left and was replaced"
+    assert together.traffic_stats().departed > 64, "no vehicle has left and been replaced"
 
 
 def test_a_shard_is_stepped_alone() -> None:
