@@ -26,11 +26,14 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 def measure(
     env: OptionalEnvironment = "town",
     vehicles: Annotated[int, about("Number of vehicles; one in ten is an agent.")] = 1000,
-    steps: Annotated[int, about("Steps per turn, which writes several parts.")] = 400,
+    steps: Annotated[
+        int, about("Steps per turn; 400 steps write several parts of a recording.")
+    ] = 400,
     turns: Annotated[int, about("Turns of each side.")] = 7,
     seed: Seed = 0,
     at_most: Annotated[
-        float | None, about("Exit with 1 if recording makes a step more times as long.")
+        float | None,
+        about("Exit with 1 if a recorded step takes more than this many times as long."),
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:

@@ -52,10 +52,10 @@ class SensorBench:
     background: int  # vehicles without sensors
     warmup: int  # unmeasured steps
     steps: int  # measured steps per run
-    seed: int  # of every run, and of their order
+    seed: int  # seed of every run, and of their order
     placement: str  # placement of sensors: by `cost` or `in_turn`
     turns: tuple[Turn, ...]  # all runs, in order
-    # for one independent program per worker, at most one per core; None: that is a single program
+    # limit by independent programs, one per worker, at most one per core; None: a single program
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:

@@ -1,9 +1,9 @@
-"""The notebooks of `examples/`, made of the scripts beside them.
+"""Make the notebooks of `examples/` from the scripts beside them.
 
     python -m docs.notebooks [NAME ...]
 
-A line `# %%` begins a cell of code, `# %% [markdown]` one of text. Each script is run, and its
-output is stored in the notebook; a training takes some minutes.
+A line `# %%` begins a cell of code, `# %% [markdown]` a cell of text. Each script is run, and its
+output is stored in the notebook; the script with a training takes some minutes.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ EXAMPLES = Path(__file__).resolve().parents[1] / "examples"
 
 
 def scripts() -> list[Path]:
-    """Of which there are notebooks."""
+    """Return the scripts that have notebooks."""
     return sorted(EXAMPLES.glob("*.py"))
 
 
 def cells(script: str) -> list[tuple[str, str]]:
-    """(kind, text) of each cell, `code` or `markdown`."""
+    """Return (kind, text) of each cell; kinds are `code` and `markdown`."""
     found: list[tuple[str, list[str]]] = []
     for line in script.splitlines():
         if line in ("# %%", "# %% [markdown]"):

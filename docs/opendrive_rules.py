@@ -1,8 +1,8 @@
-"""OpenDRIVE files asked for ASAM's 23 rules, by its own checker, under versions 1.7 and 1.8.
+"""Check OpenDRIVE files with ASAM's own checker: 23 rules of the versions 1.7 and 1.8.
 
-.venv-tools/bin/python -m docs.opendrive_rules FILE.xodr …   # `make rules` makes the environment
+.venv-tools/bin/python -m docs.opendrive_rules FILE.xodr …   # `make rules` creates the environment
 
-Each rule is asked under the version that it is defined for; a file passes if none is broken.
+Each rule is checked with the version for which it is defined; a file passes if it breaks no rule.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from qc_baselib import Configuration, Result
 from qc_opendrive import constants
 from qc_opendrive.main import run_checks
 
-MINOR_VERSIONS = (7, 8)  # one rule ends with 1.7, one begins with 1.8
+MINOR_VERSIONS = (7, 8)  # one rule exists up to 1.7, another one from 1.8 on
 
 
 def broken_rules(path: Path) -> dict[str, tuple[int, int]]:
-    """How often each rule was asked of a file, and how often it is broken."""
+    """Return how often each rule was checked for a file, and how often the file breaks it."""
     text = path.read_text(encoding="utf-8")
     found: dict[str, tuple[int, int]] = {}
     with tempfile.TemporaryDirectory() as folder:
@@ -46,7 +46,7 @@ def _result(path: Path) -> Result:
 
 
 def main(paths: list[str]) -> int:
-    """Print a line a file; exit code 1 if one breaks a rule, or one was not asked."""
+    """Print a line per file; exit with 1 if a file breaks a rule, or a rule was not checked."""
     sound = bool(paths)
     for path in map(Path, paths):
         found = broken_rules(path)

@@ -1,8 +1,8 @@
-"""Hooks of MkDocs: pages of the site that are made from files elsewhere in the repository.
+"""Hooks of MkDocs: pages of the site that are made from files outside of `docs/`.
 
 The README is the first page, cards of environments and drivers are pages, the gallery shows their
 pictures, and the reference has a part for each public name. Links that leave `docs/` lead to these
-pages; those to files of code become their names.
+pages; links to files of code become the names of the files.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _SOURCE = re.compile(r"(<img src=\")([^\"]+)")
 
 
 def sources() -> dict[str, Path]:
-    """Pages of the site that lie outside of `docs/`, by their address."""
+    """Return the pages of the site that are outside of `docs/`, by their address."""
     found = {"index.md": ROOT / "README.md"}
     found |= {f"{name.lower()}.md": ROOT / f"{name}.md" for name in ("CONTRIBUTING", "CHANGELOG")}
     for kind in ("envs", "agents"):
@@ -37,7 +37,7 @@ def sources() -> dict[str, Path]:
 
 
 def on_files(files: Files, config: Any) -> Files:
-    """Add the pages that are made."""
+    """Add the generated pages."""
     made = {address: path.read_text(encoding="utf-8") for address, path in sources().items()}
     made["gallery.md"] = gallery()
     made["reference/api.md"] = reference()
@@ -47,7 +47,7 @@ def on_files(files: Files, config: Any) -> Files:
 
 
 def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str:
-    """Lead links to pages of the site."""
+    """Redirect links to pages of the site."""
     address = page.file.src_uri
     source = sources().get(address, ROOT / "docs" / address)
     here = posixpath.dirname(address)
@@ -74,7 +74,7 @@ def on_page_markdown(markdown: str, page: Any, config: Any, files: Files) -> str
 
 
 def gallery() -> str:
-    """A picture of every environment, and of what sensors see."""
+    """Return the gallery: a picture of each environment, and of sensor data."""
     lines = ["# Gallery", "", "## Environments", ""]
     for card in sorted(ROOT.glob("envs/*/README.md")):
         name = card.parent.name
@@ -93,7 +93,7 @@ def gallery() -> str:
 
 
 def reference() -> str:
-    """A part for each public name, from its docstring."""
+    """Return the reference: a part for each public name, from its docstring."""
     lines = ["# Reference", "", "What the packages name in `__all__`; keys of environments are in"]
     lines += ["[environments](environments.md), commands in `cavmarl --help`.", ""]
     for module in PUBLIC:
@@ -104,7 +104,7 @@ def reference() -> str:
 
 
 def public_names(path: Path) -> list[str]:
-    """The names in `__all__`, read without importing."""
+    """Return the names in `__all__`, read without importing."""
     for one in ast.parse(path.read_text(encoding="utf-8")).body:
         if isinstance(one, ast.Assign) and ast.unparse(one.targets[0]) == "__all__":
             return [str(name) for name in ast.literal_eval(one.value)]

@@ -1,4 +1,4 @@
-"""What cavmarl pulls in: exact files with hashes, and licences.
+"""List the dependencies of cavmarl: exact files with hashes, and licences.
 
 python -m docs.supply_chain lock       # writes constraints/hashes.txt, by pip's own resolver
 python -m docs.supply_chain licences   # prints the table of docs/reference/licences.md
@@ -20,7 +20,7 @@ from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).resolve().parents[1]
-# torch's wheels differ by processor.
+# Wheels of torch depend on the processor.
 LOCKED = "compile,sumo,maps,nodes,report,render,record,followers,service"
 EXTRAS = (
     "",
@@ -48,7 +48,7 @@ HEAD = """\
 
 
 def write_lock(path: Path) -> None:
-    """Resolve and download as pip does, and write each file's hash."""
+    """Resolve and download dependencies with pip, and write the hash of each file."""
     words = [sys.executable, "-m", "pip", "install", "--dry-run", "--ignore-installed", "--quiet"]
     words += ["--report", "-", f".[{LOCKED}]", "--constraint", "constraints/exact.txt"]
     done = subprocess.run(words, cwd=ROOT, stdout=subprocess.PIPE, text=True, check=True)
@@ -62,9 +62,9 @@ def write_lock(path: Path) -> None:
 
 
 def licences() -> Iterator[tuple[str, str, str]]:
-    """(package, what needs it, licence) of all that an installation brings.
+    """Return (package, what needs it, licence) of all packages of an installation.
 
-    What is not installed here is left out.
+    Packages that are not installed here are left out.
     """
     needed: dict[str, list[str]] = defaultdict(list)
     for extra in EXTRAS:
@@ -76,7 +76,7 @@ def licences() -> Iterator[tuple[str, str, str]]:
 
 
 def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) -> set[str]:
-    """All packages that one needs, with one of its extras."""
+    """Return all packages that a package with an extra needs."""
     seen = set() if seen is None else seen
     found: set[str] = set()
     for line in _requirements(name, extra):
@@ -96,7 +96,7 @@ def _closure(name: str, extra: str, seen: set[tuple[str, str]] | None = None) ->
 
 
 def _requirements(name: str, extra: str) -> list[str]:
-    """What a package asks for; cavmarl's own list is that of this checkout."""
+    """Return the requirements of a package; those of cavmarl are read from this checkout."""
     if name != "cavmarl":
         return distribution(name).requires or []
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]

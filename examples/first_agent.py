@@ -1,10 +1,9 @@
-"""A first agent. `first_agent.ipynb` is the same as a notebook."""
+"""A first agent. `first_agent.ipynb` is the same program as a notebook."""
 
 # %% [markdown]
 # # A first agent
-#
-# A world is made by name. `parallel_env` is PettingZoo's interface: dicts from agent to
-# observation, action, reward.
+# Create a world by its name. `parallel_env` has PettingZoo's interface: dicts from agents to
+# observations, actions and rewards.
 
 # %%
 import os
@@ -13,7 +12,7 @@ import numpy as np
 
 import cavmarl
 
-SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # as the tests run it
+SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # a short run for the tests
 
 env = cavmarl.parallel_env(
     "merge", agents=4, background=10, seed=0, max_cycles=40 if SHORT else 400
@@ -22,16 +21,16 @@ observations, infos = env.reset()
 print(env.agents, env.observation_space("car_0").shape, env.action_space("car_0"))
 
 # %% [markdown]
-# What the numbers of an observation are stands in the [card](../envs/merge/README.md#observation)
-# of the entry. Here is a driver of one line: hold the lane with the wheel, and the speed below the
-# limit with the pedals.
+# The [card](../envs/merge/README.md#observation) of `merge` lists the numbers of an observation.
+# This driver uses a few of them. It steers to the middle of its lane, and keeps a speed below the
+# limit and a time gap of 2 s to the vehicle ahead.
 
 
 # %%
 def drive(observation: np.ndarray) -> np.ndarray:
-    """Throttle and steering; the card says where in an observation what stands."""
+    """Return throttle and steering; the indices are those of the card."""
     speed, offset, error, limit = observation[[0, 4, 5, 6]] * [40.0, 4.0, np.pi, 40.0]
-    gap_m = 10.0 / max(float(observation[91]), 1e-6) - 10.0  # to the vehicle ahead
+    gap_m = 10.0 / max(float(observation[91]), 1e-6) - 10.0  # gap to the vehicle ahead
     wanted = min(0.8 * limit, gap_m / 2.0)
     return np.clip([0.5 * (wanted - speed), -0.5 * offset - 4.0 * error], -1.0, 1.0).astype(
         np.float32
@@ -47,7 +46,7 @@ while env.agents:
 print({agent: round(total, 2) for agent, total in returns.items()})
 
 # %% [markdown]
-# The built-in driver is the yardstick. It reads the world's state and not observations.
+# Compare with the built-in driver. It reads the state of the world instead of observations.
 
 # %%
 observations, infos = env.reset(seed=0)

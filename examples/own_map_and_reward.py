@@ -1,10 +1,9 @@
-"""An own map and an own reward. `own_map_and_reward.ipynb` is the same as a notebook."""
+"""Your own map and reward. `own_map_and_reward.ipynb` is the same program as a notebook."""
 
 # %% [markdown]
-# # An own map and an own reward
-#
-# Any SUMO network is a world; so are files of OpenStreetMap and OpenDRIVE. Here a bend is made of
-# two small files with netconvert, which the extra `sumo` brings.
+# # Your own map and reward
+# You can drive on any SUMO network, and on files of OpenStreetMap and OpenDRIVE. Here, netconvert
+# builds a bend from two small files; the extra `sumo` installs it.
 
 # %%
 import os
@@ -17,7 +16,7 @@ import sumo
 
 import cavmarl
 
-SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # as the tests run it
+SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # a short run for the tests
 
 folder = Path(tempfile.mkdtemp(prefix="cavmarl-"))
 (folder / "bend.nod.xml").write_text(
@@ -40,12 +39,13 @@ subprocess.run(
 )
 
 # %% [markdown]
-# A term is a function of what an agent has around it. `reach_m` says how far it looks.
+# A reward term is a function of an agent's surroundings. `reach_m` is the distance within which it
+# uses other vehicles.
 
 
 # %%
 def smooth(view: cavmarl.AgentView) -> float:
-    """How hard the vehicle is pushed to the side, over 3 m/s²."""
+    """Return the lateral acceleration, divided by 3 m/s²."""
     return abs(float(view.own["speed"] * view.own["yaw_rate"])) / 3.0
 
 
@@ -62,7 +62,7 @@ env = cavmarl.parallel_env(
 )
 
 # %% [markdown]
-# The infos have each term of the step by its name, before it is weighed.
+# The infos contain each term of the step by name, before it is multiplied by its weight.
 
 # %%
 observations, infos = env.reset()

@@ -1,10 +1,9 @@
-"""Train a driver, and evaluate it. `train_and_evaluate.ipynb` is the same as a notebook."""
+"""Train a driver, and evaluate it. `train_and_evaluate.ipynb` is the same program as a notebook."""
 
 # %% [markdown]
 # # Train a driver, and evaluate it
-#
-# `cavmarl train ppo` runs [train/ppo.py](../train/ppo.py). A million decisions, about a minute on a
-# core, are enough to see it learn.
+# `cavmarl train ppo` runs [train/ppo.py](../train/ppo.py). After a million decisions, about a
+# minute on one core, the driver has improved visibly.
 
 # %%
 import os
@@ -15,7 +14,7 @@ from pathlib import Path
 
 from cavmarl.evaluate import evaluate
 
-SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # as the tests run it
+SHORT = bool(os.environ.get("CAVMARL_SHORT"))  # a short run for the tests
 
 runs = Path(tempfile.mkdtemp(prefix="cavmarl-")) if SHORT else Path("runs")
 few = ["--num-envs", "2", "--num-steps", "16", "--minibatches", "2", "--total-agent-steps", "600"]
@@ -35,8 +34,8 @@ subprocess.run([*command, "--name", "lesson", *size], check=True)
 print(sorted(path.name for path in (runs / "lesson").iterdir()))
 
 # %% [markdown]
-# A run leaves a driver, its curve and a manifest. Drivers are judged side by side on the same
-# episodes; independent runs give the interval.
+# The folder of the run has the driver, its learning curve and a manifest. The evaluation compares
+# drivers on the same episodes; independent runs give the intervals.
 
 # %%
 report = evaluate(

@@ -1,7 +1,7 @@
-"""`python -m fuzz TARGET SECONDS`: attack one parser, guided by which of its code is reached.
+"""`python -m fuzz TARGET SECONDS`: fuzz one parser, guided by code coverage.
 
-Inputs that reach new code are kept in `fuzz/corpus/TARGET`; one that crashes, hangs or takes too
-much memory is left in `fuzz/crashes` and makes the exit code 1 or more.
+Inputs that reach new code are kept in `fuzz/corpus/TARGET`. An input that crashes, hangs or takes
+too much memory is kept in `fuzz/crashes`, and the exit code is at least 1.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ HERE = Path(__file__).resolve().parent
 PACKAGE = HERE.parent / "cavmarl"
 KERNELS = [path for folder in PACKAGE.rglob("kernels") for path in folder.rglob("*.py")]
 
-# Kernels are left out: Numba compiles the bytecode of their functions as it is.
+# Kernels are not instrumented, because Numba compiles the bytecode of their functions.
 with atheris.instrument_imports(
     include=["cavmarl", "sumolib", "yaml"],
     exclude=[".".join(path.relative_to(PACKAGE.parent).with_suffix("").parts) for path in KERNELS],
@@ -32,7 +32,7 @@ MEMORY_MB = 3000
 
 
 def _mutate(content: bytes, limit: int, seed: int) -> bytes:
-    """Half of the changes keep the file's pieces whole, the others are libFuzzer's own."""
+    """Change an input: half of the changes keep pieces of a file whole; libFuzzer makes others."""
     rng = random.Random(seed)
     if content and rng.random() < 0.5:
         return mutated(content, rng)[:limit]
@@ -41,7 +41,7 @@ def _mutate(content: bytes, limit: int, seed: int) -> bytes:
 
 
 def main(name: str, seconds: int) -> None:
-    """Fuzz the target `name` for so many seconds."""
+    """Fuzz the target `name` for a number of seconds."""
     target = TARGETS[name]
     corpus, crashes = HERE / "corpus" / name, HERE / "crashes"
     corpus.mkdir(parents=True, exist_ok=True)

@@ -1,4 +1,4 @@
-"""What the targets share: a scratch file, and how one of them treats its input."""
+"""Shared parts of the targets: a scratch file, and the class of targets."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def _folder() -> tempfile.TemporaryDirectory[str]:
 
 
 def scratch(name: str, content: bytes) -> Path:
-    """A file of this process that holds `content`; it stays until another of that name."""
+    """Write `content` to a file of this process, which stays until the next file of that name."""
     path = Path(_folder().name) / name
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content)
@@ -29,16 +29,16 @@ def scratch(name: str, content: bytes) -> Path:
 
 
 def seed(name: str) -> bytes:
-    """The content of a file of `fuzz/seeds/`."""
+    """Return the content of a file of `fuzz/seeds/`."""
     return (ROOT / "fuzz" / "seeds" / name).read_bytes()
 
 
 @dataclass(frozen=True)
 class Target:
-    """One parser under attack.
+    """A parser that is fuzzed.
 
     Attributes:
-        parse: gives it the bytes of a file; whatever it raises but a `CavmarlError` is a bug.
+        parse: parses the bytes of a file; any error but a `CavmarlError` is a bug.
         seeds: makes small valid files to start from.
         slow: whether an input takes so long that only few can be tried.
     """
@@ -48,7 +48,7 @@ class Target:
     slow: bool = False
 
     def accepts(self, content: bytes) -> bool:
-        """Whether the parser takes it; False: it was refused on purpose."""
+        """Return whether the parser accepts the content; False: it raised a `CavmarlError`."""
         try:
             self.parse(content)
         except CavmarlError:

@@ -1,10 +1,10 @@
-"""The target that reads what followers and worlds say to each other, at both ends of a socket.
+"""The target for messages between followers and worlds, at both ends of a socket.
 
-An input is what one end says. Its first byte says which: `W` or `w`, a world that talks to a
-`Follower`; any other, a follower that calls a world and answers two of its snapshots. After a small
-letter come lines of JSON, `[kind, letter, bytes of data]`, which are packed to frames: so the
-fuzzer gets past lengths and msgpack to what is said. After another byte come the frames
-themselves, the checksums of which are made right, as those of the ownership protocol.
+An input has the messages of one end. Its first byte selects the end: `W` or `w`, a world that sends
+to a `Follower`; any other byte, a follower that calls a world and answers two of its snapshots.
+After a small letter, the input has lines of JSON, `[kind, payload, bytes of data]`, which are
+packed to frames, so that the fuzzer reaches the content of messages. After any other byte, it has
+the frames themselves, whose checksums are corrected as in the targets of the ownership protocol.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ AGENTS = ("car_0", "car_1")
 HEAD = struct.Struct("<4sHHQIQI")
 CRC_BYTES = 4
 WITHIN_S = 5.0
-MAX_BYTES = 1 << 15  # that a socket takes before anybody reads
+MAX_BYTES = 1 << 15  # bytes that a socket accepts before the other end reads
 
 
 def _sealed(content: bytes) -> bytes:
-    """The same frames with checksums that are right, up to where they are frames."""
+    """Return the frames with correct checksums, up to the first bytes that are not a frame."""
     raw, at = bytearray(content), 0
     while at + HEAD.size + CRC_BYTES <= len(raw):
         *start, letter_size, size, _ = HEAD.unpack_from(raw, at)
@@ -68,10 +68,10 @@ def _sealed(content: bytes) -> bytes:
 
 
 def _packed(content: bytes) -> bytes:
-    """The frames that lines of JSON say.
+    """Return the frames that lines of JSON describe.
 
     Raises:
-        FollowerError: they say none.
+        FollowerError: they describe no frames.
     """
     frames = []
     for line in content.splitlines():
@@ -109,7 +109,7 @@ def _env() -> CavEnv:
 
 
 def _a_world_hears(said: bytes) -> None:
-    """Take in a caller, and pass the barrier twice with it."""
+    """Accept a caller, and pass the barrier twice with it."""
     env, place = _env(), _place()[0]
     reception, master = Reception(place), TimeMaster(env, own_ticks="ignore")
     line = None
@@ -140,7 +140,7 @@ def _a_world_hears(said: bytes) -> None:
 
 
 def _a_follower_hears(said: bytes) -> None:
-    """Follow until the world says goodbye, and answer whatever comes."""
+    """Follow until the world sends GOODBYE, and answer each snapshot."""
     place = _place()[0]
     with listen(place) as listener:
         world = Thread(target=_talk, args=(listener, said))
@@ -152,9 +152,9 @@ def _a_follower_hears(said: bytes) -> None:
                     controls = {vehicle: [0.0, 0.0] for vehicle in sight.snapshot.vehicles}
                     follower.answer(controls)
         except ClockError:
-            pass  # understood
+            pass  # a valid refusal of the tick
         except FollowerError as error:
-            if type(error) is not FollowerError:  # else it was refused, and knows why
+            if type(error) is not FollowerError:  # else the world refused it with a reason
                 raise
         finally:
             world.join()
@@ -162,20 +162,20 @@ def _a_follower_hears(said: bytes) -> None:
 
 
 def _talk(listener: socket.socket, said: bytes) -> None:
-    """Say it to the first who calls, and hear whatever comes until it hangs up."""
+    """Send the bytes to the first caller, and read until it closes the connection."""
     connection, _ = listener.accept()
-    with connection, suppress(OSError):  # it may hang up before
+    with connection, suppress(OSError):  # the caller may close the connection earlier
         connection.sendall(said)
         connection.shutdown(socket.SHUT_WR)
         while connection.recv(MAX_BYTES):
             pass
 
 
-Words = tuple[Any, ...]  # what `FollowerConnection.say` takes
+Words = tuple[Any, ...]  # arguments of `FollowerConnection.say`
 
 
 def _lines(*said: Words) -> bytes:
-    """The same, to be packed."""
+    """Return lines of JSON for messages."""
     found = []
     for kind, message, arrays in ((*words, None, ())[:3] for words in said):
         letter = None if message is None else payload_of(message)
@@ -185,7 +185,7 @@ def _lines(*said: Words) -> bytes:
 
 
 def _frames(*said: Words) -> bytes:
-    """What a line would send."""
+    """Return the bytes that a connection sends for messages."""
     ours, theirs = socket.socketpair()
     line = FollowerConnection(ours, "nobody")
     for words in said:

@@ -1,4 +1,4 @@
-"""Changes that keep most of a file whole, so that they get past the tokens to what they mean."""
+"""Mutations that keep most of a file valid, so that the fuzzer reaches code behind tokenizers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ _ODD = (
 
 
 def mutated(content: bytes, rng: random.Random) -> bytes:
-    """`content` with some pieces dropped, doubled, exchanged or replaced by odd values."""
+    """Return `content` with some pieces dropped, doubled, exchanged or replaced by odd values."""
     pieces = _BORDER.split(content)
     for _ in range(rng.randint(1, MAX_CHANGES)):
         at, other = rng.randrange(len(pieces)), rng.randrange(len(pieces))

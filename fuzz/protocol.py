@@ -1,7 +1,7 @@
-"""Targets that read the ownership protocol: messages, and the coordinator's log.
+"""Targets for the ownership protocol: messages, and the coordinator's log.
 
-Checksums are made right before the parser sees the input; else the fuzzer would only ever learn
-that they are wrong.
+Checksums are corrected before the parser reads the input; otherwise, it would refuse each mutation
+for its checksum.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CRC_BYTES = 4
 
 
 class _OneState:
-    """The store of a world whose vehicles all have one state."""
+    """The store of a world whose vehicles all have the same state."""
 
     def state(self, vehicle: int) -> bytes:
         return b"state"
@@ -93,7 +93,7 @@ def _log(content: bytes) -> object:
 
 
 def _logs() -> tuple[bytes, ...]:
-    """The log of two zones, in which a vehicle begins, is forced across the border and leaves."""
+    """Return the log of two zones: a vehicle enters, changes its zone by force, and leaves."""
     log = list[Record]()
     directory = Directory(RUN, range(2), _OneState(), Limits(deferral=0))
     log += directory.reset().records

@@ -1,4 +1,4 @@
-"""Targets that read roads: networks, signal programs, buildings, other maps, caches, zones."""
+"""Targets for roads: networks, signal programs, buildings, other maps, caches, zones."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["BUILDINGS", "CACHED", "MAPS", "NETWORKS", "PROGRAMS", "ZONES", "grid"]
 
-NETCONVERT_S = 5.0  # longer is no crash, but nothing to wait for
+NETCONVERT_S = 5.0  # a longer time is no crash, but slows the fuzzer
 
 
 @cache
 def grid() -> RoadNetwork:
-    """The roads that programs and demand are read for."""
+    """Return the roads for reading programs and demand."""
     return load_network(ROOT / "envs" / "grid4x4" / "map" / "map.net.xml")
 
 
@@ -46,7 +46,7 @@ def _programs(content: bytes) -> RoadNetwork:
 
 @cache
 def _placed_grid() -> RoadNetwork:
-    """The roads that buildings are read for, at the place of the seeds."""
+    """Return the roads for reading buildings, at the position of the seeds."""
     projection = "+proj=utm +zone=32 +ellps=WGS84"
     x, y = pyproj.Proj(projparams=projection)(11.0, 49.0)
     return replace(grid(), geo=GeoReference(projection, -x, -y))
@@ -69,7 +69,7 @@ def _cached(content: bytes) -> RoadNetwork:
 
 @cache
 def _source_and_entry() -> tuple[Path, Path]:
-    # The comment gives it an entry of its own, which no other process reads.
+    # The comment makes the cache entry unique to this process.
     process = scratch("cached.net.xml", b"").parent.name
     source = scratch("cached.net.xml", seed("crossing.net.xml") + f"<!--{process}-->".encode())
     return source, _entry(source_hash(source))

@@ -1,4 +1,4 @@
-"""Targets that read settings and records: entries, overrides, drivers, checkpoints, plans."""
+"""Targets for settings and records: environments, overrides, drivers, checkpoints, plans."""
 
 from __future__ import annotations
 
@@ -36,10 +36,10 @@ from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["CHECKPOINTS", "DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]
 
-# Between the two files of a driver, in one input.
+# Separator between the two files of a driver in an input.
 _BORDER = b"\n----\n"
 
-# What lies beside the manifest.
+# Files beside the manifest.
 RESULT, RESULT_CONTENT = "trips.csv", b"policy,run\n"
 
 
@@ -112,7 +112,7 @@ def _drivers() -> tuple[bytes, ...]:
 
 
 def _checkpoint(content: bytes) -> None:
-    """Damage that no checksum tells."""
+    """Read a checkpoint whose damage the checksum does not reveal."""
     read_checkpoint(scratch(f"run/{CHECKPOINT_FILE}", sealed(content)).parent)
 
 

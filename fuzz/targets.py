@@ -1,4 +1,4 @@
-"""All targets by name: one for every kind of file that cavmarl reads, and for what sockets say."""
+"""All targets by name: one for each kind of file that cavmarl reads, and for bytes from sockets."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Targets that read demand: routes and types, and SUMO's configurations."""
+"""Targets for demand: routes and types, and SUMO's configurations."""
 
 from __future__ import annotations
 

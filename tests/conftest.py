@@ -31,13 +31,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
-    """Name the turn of the slow tests."""
+    """Print the number of the turn that selects slow tests."""
     turn = config.option.turn
     return None if turn is None else f"slow tests: part {turn % TURNS + 1} of {TURNS}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Count what the tests cost, and see that their tiers hold."""
+    """Measure the processor time of tests, and check their tiers."""
     config.pluginmanager.register(CpuTimes(), "cpu_times")
     config.pluginmanager.register(ProcessWatch(), "process_watch")
     if limit_s := os.environ.get("CAVMARL_QUICK_S"):
@@ -49,18 +49,18 @@ def pytest_configure(config: pytest.Config) -> None:
 
 
 def pytest_collection_finish() -> None:
-    """What all tests share stays: no search for garbage goes through it again."""
+    """Freeze the objects that all tests share, so that the garbage collector skips them."""
     gc.collect()
     gc.freeze()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Leave files unread that have no test of the tier which `-m` asks for."""
+    """Skip files that have no test of the tier that `-m` names."""
     return None if is_needed(collection_path, config.rootpath, config.option.markexpr) else True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark each test with its tier; of several processes none begins a long file at the end."""
+    """Mark each test with its tier, and put long files first: no process starts one late."""
     rare = rare_tests((item.nodeid for item in items), known_costs(), argued())
     for item in items:
         mark(item)
@@ -90,7 +90,7 @@ def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object], context:
 
 @pytest.fixture(scope="session", autouse=True)
 def forked_processes() -> Iterator[None]:
-    """Pools and evaluations get their processes as forks of one that has loaded the kernels."""
+    """Start the processes of pools and evaluations as forks of a process with loaded kernels."""
     from tests.support.forked_processes import FORKS, start_forked
 
     with pytest.MonkeyPatch.context() as patch:
@@ -100,7 +100,7 @@ def forked_processes() -> Iterator[None]:
 
 @pytest.fixture
 def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let Pythons of their own be started, as outside of the tests."""
+    """Start new interpreters instead of forks, as outside of the tests."""
     from cavmarl.core.processes import start_python
 
     _let_start(monkeypatch, start_python, get_context("spawn"))
@@ -108,7 +108,7 @@ def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture(scope="session")
 def shared_maps() -> Path:
-    """The folder of real maps, which is not part of the repository."""
+    """Return the folder of real maps, which is not part of the repository."""
     beside = Path(__file__).resolve().parents[2] / "shared" / "maps"
     folder = Path(os.environ.get("CAVMARL_SHARED_MAPS", beside))
     if not folder.is_dir():
@@ -118,7 +118,7 @@ def shared_maps() -> Path:
 
 @pytest.fixture(scope="session")
 def built_map(shared_maps: Path) -> Callable[[str], Path]:
-    """SUMO networks of the real maps, built tolerantly and kept: `built_map("osm/x.osm")`."""
+    """Return a function that builds a real map tolerantly, and caches it: `built_map("x.osm")`."""
     from tests.support.kept_maps import built
 
     return lambda name: built(shared_maps / name)

@@ -1,4 +1,4 @@
-"""Faults, one at a time: each has to fail the tests that guard its place.
+"""Mutation tests: each fault must make the tests of its place fail.
 
     python -m tests.mutations            # all rows of mutations.md
     python -m tests.mutations 3 14       # some of them
@@ -28,7 +28,7 @@ COPIED = (
     *("cavmarl", "tests", "envs", "agents", "configs", "train", "benchmarks", "docs", "examples"),
     "pyproject.toml",
 )
-LIMIT_S = 1800.0  # for the tests of a row
+LIMIT_S = 1800.0  # time limit of the tests of a row, in s
 # Random numbers are products that wrap around; of that Python warns where nothing is compiled.
 WRAPS = "ignore:overflow encountered:RuntimeWarning"
 
@@ -48,7 +48,7 @@ def read_table() -> list[Mutation]:
 
 
 def mutated(mutation: Mutation) -> str:
-    """The file's text with the fault in it."""
+    """Return the text of the file with the fault."""
     text = (ROOT / mutation.file).read_text()
     found = text.count(mutation.old)
     if found != 1:
@@ -57,7 +57,7 @@ def mutated(mutation: Mutation) -> str:
 
 
 def is_passed(tests: str, *, interpreted: bool, file: str = "", text: str = "") -> bool:
-    """Whether tests pass in a copy of the checkout, of which one file may have another text."""
+    """Return whether tests pass in a copy of the checkout, with one changed file if given."""
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         place = Path(folder) / "checkout"
         place.mkdir()

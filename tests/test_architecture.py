@@ -1,4 +1,4 @@
-"""`docs/explanation/architecture.md` says what the tree and the contract of imports say."""
+"""`docs/explanation/architecture.md` agrees with the folders and the contract of imports."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "cavmarl"
 MAX_WORDS = 1_500
-ELSEWHERE = {"cavmarl/data/", "kernels/"}  # in the wheel; in many folders
+ELSEWHERE = {"cavmarl/data/", "kernels/"}  # a folder of the wheel; a name in many folders
 QUESTIONS = re.findall(r"^\| ([^|]+\?) \| (.+) \|$", PAGE, re.MULTILINE)
 
 
 def test_the_page_is_short() -> None:
-    words = [word for word in PAGE.split() if re.search(r"\w", word)]  # no bars of tables
+    words = [word for word in PAGE.split() if re.search(r"\w", word)]  # without bars of tables
     assert len(words) <= MAX_WORDS
 
 
@@ -52,7 +52,7 @@ def test_every_place_that_the_page_names_exists() -> None:
 
 
 def layers() -> list[list[str]]:
-    """Names of each layer of the contract; "|" where siblings may not import each other."""
+    """Return the names of each layer of the contract; "|" if siblings may not import each other."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
     contract = next(contract for contract in contracts if contract["id"] == "layers")
@@ -60,5 +60,5 @@ def layers() -> list[list[str]]:
 
 
 def section(title: str) -> str:
-    """What stands under a heading of the page."""
+    """Return the text under a heading of the page."""
     return PAGE.split(f"\n## {title}\n")[1].split("\n## ")[0]

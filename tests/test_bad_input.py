@@ -1,4 +1,4 @@
-"""Wrong input: a typed error that names place and cure, and a world that has not changed."""
+"""Wrong input: a typed error with place and remedy, and an unchanged world."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def make(mode: str = "closed", **overrides: Any) -> CavEnv:
 
 
 def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> None:
-    """`actions` are refused by an `error` that holds `words`, and the step can be repeated."""
+    """Check that `actions` raise an `error` with `words`, and that the step can be repeated."""
     before, stats, agents = env.state_hash(), env.traffic_stats(), list(env.agents)
     with pytest.raises(error) as caught:
         env.step(actions)
@@ -121,7 +121,7 @@ def test_a_wrong_meta_action_is_refused(value: Any, words: tuple[str, ...]) -> N
     refused(env, {"car_0": 1, "car_1": value, "car_2": 1}, ActionError, *words)
 
 
-def test_missing_actions_are_named_all() -> None:
+def test_all_missing_actions_are_named() -> None:
     refused(make(), {"car_1": FINE}, ActionError, "car_0, car_2", "missing_action")
     refused(make(), {}, ActionError, "car_0, car_1, car_2")
 
@@ -214,8 +214,8 @@ def test_step_and_render_before_reset_are_refused() -> None:
         make_vec("ring").step(np.zeros((1, 4, 2)))
 
 
-def test_a_lenient_world_takes_what_libraries_give_and_counts_it() -> None:
-    """All at once, for agents that have left and when everybody has, too."""
+def test_a_lenient_world_accepts_and_counts_actions_of_libraries() -> None:
+    """All leniencies at once, also for agents that have left, and when all have left."""
     env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3, lenient=True)
     strict = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3)
     env.reset()
@@ -251,7 +251,7 @@ def test_render_without_a_mode_warns_as_other_environments_do() -> None:
 
 
 @pytest.mark.parametrize("seed", [-1, 2**63, 1.5, "0", True, np.nan, [1]])
-def test_seeds_that_are_none_are_refused(seed: Any) -> None:
+def test_invalid_seeds_are_refused(seed: Any) -> None:
     env, vec = make(), make_vec("ring")
     before = env.state_hash()
     for call in (env.reset, vec.reset):
@@ -385,7 +385,7 @@ def test_more_agents_than_the_map_can_take_are_refused() -> None:
         env.step({})
 
 
-def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
+def test_the_error_for_an_unknown_environment_lists_environments() -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"mreg.*did you mean merge"):
         parallel_env("mreg")
 
@@ -394,7 +394,7 @@ def test_an_unknown_environment_is_refused_with_what_there_is() -> None:
 def test_names_that_are_invalid_as_files_are_refused(name: str) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(name)
-    with pytest.raises(PolicyError):  # "" is the folder that one works in
+    with pytest.raises(PolicyError):  # "" is the working directory
         load_policy(name, parallel_env("ring"))
     with pytest.raises((MapError, ConfigError), match=r"map\.source|not allowed"):
         parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})

@@ -1,4 +1,4 @@
-"""Wrong maps and demand: what a user sees; what their readers refuse is tested beside them."""
+"""Wrong maps and demand, as a user sees them; tests of the readers are in their own folders."""
 
 from __future__ import annotations
 
@@ -174,7 +174,7 @@ def test_demand_without_vehicles_is_a_world_without_them(write: Write, body: str
 
 
 def test_times_out_of_order_are_put_in_order(write: Write) -> None:
-    # Draws go by the place in the file: here nothing is drawn.
+    # Random draws depend on the position in the file, so nothing is random here.
     alike = '<vType id="alike" speedDev="0"/>'
     vehicle = f'<vehicle id="{{}}" type="alike" depart="{{}}"><route edges="{AROUND}"/></vehicle>'
     one, other = vehicle.format("a", 3), vehicle.format("b", 1)

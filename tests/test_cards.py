@@ -29,10 +29,10 @@ OFF = SensorsConfig(
     neighbors=NeighborsConfig(count=0),
     signal=SignalAheadConfig(enabled=False),
     lidar=LidarConfig(rays=0),
-    kinematics=KinematicsConfig(vehicles_count=1),  # something has to be on
+    kinematics=KinematicsConfig(vehicles_count=1),  # at least one sensor must be on
 )
 
-# The sensors that entries leave off, with the settings that those who made them have as defaults.
+# The sensors that environments switch off, with the default settings of their authors.
 OPTIONAL = (
     replace(OFF, kinematics=KinematicsConfig(vehicles_count=5)),
     replace(
@@ -45,7 +45,7 @@ OPTIONAL = (
 
 
 def optional_table() -> str:
-    """The tables of `OPTIONAL` as one; each sensor's indices begin at 0."""
+    """Return one table of the sensors of `OPTIONAL`; the indices of each sensor begin at 0."""
     head, *rows = observation_table(OPTIONAL[0]).split("\n", 1)
     for config in OPTIONAL[1:]:
         rows.append(observation_table(config).split("\n", 2)[2])

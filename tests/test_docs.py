@@ -1,4 +1,4 @@
-"""The documentation says what the code does."""
+"""The documentation agrees with the code."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ UNITS = {
 def test_the_page_of_environments_lists_every_key() -> None:
     rows = key_rows(EnvConfig)
     assert [row[0].strip("`") for row in rows] == dotted_keys(EnvConfig)
-    assert all(row[-1] for row in rows), "a key without a word under Attributes:"
+    assert all(row[-1] for row in rows), "describe the key under Attributes:"
     header = ("key", "type", "unit", "default", "meaning")
     check_block(ROOT / "docs/reference/environments.md", "keys", table(header, rows))
 
@@ -114,8 +114,8 @@ def test_lines_are_short(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_pages_name_the_thing(page: Path) -> None:
-    """They say vehicle, zone or worker; what is generated from the code is its own matter."""
+def test_pages_speak_of_things_and_not_of_persons(page: Path) -> None:
+    """Pages say vehicle, zone or worker; generated blocks are not checked."""
     text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
     words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"
     assert not re.findall(words, text, re.IGNORECASE)
@@ -123,7 +123,7 @@ def test_pages_name_the_thing(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
-    """By their path from the root, from `cavmarl/` or from the page, or by their name alone."""
+    """Pages name files by path from the root, from `cavmarl/` or from the page, or by name."""
     for named in re.findall(r"`([\w./-]+\.py)`", page.read_text(encoding="utf-8")):
         if page.name == "CHANGELOG.md" or "NAME" in named or named.startswith("my_"):
             continue
@@ -145,14 +145,14 @@ def test_benchmarks_that_a_page_names_exist(page: Path) -> None:
 
 @cache
 def names_of_code() -> frozenset[str]:
-    """The names of all Python files of the repository."""
+    """Return the names of all Python files of the repository."""
     folders = ("agents", "benchmarks", "cavmarl", "docs", "fuzz", "tests", "train")
     return frozenset(path.name for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 
 @cache
 def anchors_of(page: Path) -> frozenset[str]:
-    """The anchors that a page's headings get, as GitHub makes them."""
+    """Return the anchors of a page's headings, as GitHub makes them."""
     text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.M | re.S)
     headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
     words = (re.sub(r"[^\w\- ]", "", heading.lower()) for heading in headings)
@@ -160,7 +160,7 @@ def anchors_of(page: Path) -> frozenset[str]:
 
 
 def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str, str]]:
-    """(key, type, unit, default, meaning) of every key of a configuration class."""
+    """Yield (key, type, unit, default, meaning) of each key of a configuration class."""
     hints, rows = get_type_hints(kind), []
     meanings = {"type": ""}
     for base in reversed(kind.__mro__[:-1]):
@@ -179,7 +179,7 @@ def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str
 
 
 def attribute_texts(kind: type[Any]) -> dict[str, str]:
-    """Field → its words under `Attributes:` of the class's docstring, on one line."""
+    """Return field → description under `Attributes:` in the class's docstring, on one line."""
     _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
     return {name: " ".join(text.split()).replace("|", "\\|") for name, text in items}
@@ -199,7 +199,7 @@ def type_text(hint: Any) -> str:
 
 
 def list_text(items: tuple[Any, ...]) -> str:
-    """A list as YAML writes it on one line."""
+    """Return a list as YAML writes it on one line."""
     texts = (
         list_text(item)
         if isinstance(item, tuple)
@@ -234,13 +234,13 @@ def default_text(value: object) -> str:
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
 def test_commands_of_pages_are_understood(page: Path) -> None:
-    """Each command is there, and has the options that it is given."""
+    """Each command exists, and has the options of the page."""
     for line in commands_of(page.read_text(encoding="utf-8")):
         check_command(line)
 
 
 def commands_of(text: str) -> list[str]:
-    """Calls of `cavmarl` in code; `[…]` around what can be left out goes, and what comes after."""
+    """Yield calls of `cavmarl` in code, without comments and brackets around optional parts."""
     blocks = re.findall(r"```(?:sh|bash|console)\n(.*?)```", text, re.DOTALL)
     lines = [line for block in blocks for line in re.sub(r"\\\n\s*", " ", block).splitlines()]
     lines += [re.sub(r"\s+", " ", inline) for inline in re.findall(r"`(cavmarl [^`]+)`", text)]

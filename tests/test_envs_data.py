@@ -54,7 +54,7 @@ def test_the_card_agrees_with_the_configuration(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("recipe", RECIPES, ids=lambda recipe: "/".join(recipe.parts[-3::2]))
-def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) -> None:
+def test_a_generated_map_equals_the_result_of_its_options(recipe: Path, tmp_path: Path) -> None:
     pinned = re.search(
         r"^eclipse-sumo==(.*)$", (ROOT / "constraints/exact.txt").read_text(), re.MULTILINE
     )
@@ -74,7 +74,7 @@ def test_a_generated_map_is_what_its_options_make(recipe: Path, tmp_path: Path) 
         check=True,
         capture_output=True,
     )
-    # The comment at the top has the date, the version and the options.
+    # The comment at the top has date, version and options.
     text = re.sub(
         r"\n<!-- generated on .*?\n-->\n", "", built.read_text(), count=1, flags=re.DOTALL
     )
@@ -95,7 +95,7 @@ def maps_or_skip(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def facts(config: EnvConfig, map_paths: list[Path]) -> str:
-    """The table of facts of a card."""
+    """Return the table of facts of a card."""
     reports = [check_map(path) for path in map_paths]
     people, clock = config.population, config.clock
     budget = f", {people.num_ids} in an episode" if people.mode == "open" else ""

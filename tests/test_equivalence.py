@@ -1,4 +1,4 @@
-"""A divided world is the undivided one, bit for bit: seen from outside, at every step."""
+"""A divided world equals the undivided one bit for bit at each step, as a user sees it."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, writ
 from tests.support.world import traffic_of
 
 ZONES = (2, 3, 4, 9)
-# The built-in driver with a trembling hand: some collide, leave the road, and are followed.
+# The built-in driver with noise: some vehicles collide or leave the road, and are replaced.
 TREMBLING = """
 import numpy as np
 from cavmarl.policies.policy import Policy
@@ -62,7 +62,7 @@ def trembling(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
-    """What `verify_zones` says; each division holds, and enough goes over all their borders."""
+    """Run `verify_zones`; check that all divisions are equal, with enough crossings of borders."""
     overrides = FAST | dict(settings.pop("overrides", {}))
     found = verify_zones(env, settings.pop("zones", ZONES), overrides=overrides, **settings)
     for result in found.results:
@@ -74,7 +74,7 @@ def equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
 
 @dataclass(frozen=True)
 class Case:
-    """Worlds to divide."""
+    """Settings of worlds to divide."""
 
     env: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -95,7 +95,7 @@ CASES = {
     "meta-actions": Case("merge", {"action.kind": "discrete"}),
     "grid of actions": Case("merge", {"action.kind": "grid"}),
     "team's rewards": Case("merge", {"terms.team_share": 0.4, "population.agents": 12}),
-    "rewards of those near": Case(
+    "rewards of nearby agents": Case(
         "merge", {"terms.team_share": 0.4, "terms.team_range_m": 40.0, "population.agents": 12}
     ),
     "stacked frames": Case("grid4x4", {"sensors.stack": 4}, worlds=2),
@@ -105,7 +105,7 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_what_agents_get_does_not_depend_on_zones(name: str, trembling: Path) -> None:
+def test_results_of_agents_do_not_depend_on_zones(name: str, trembling: Path) -> None:
     case = CASES[name]
     equal(
         case.env,
@@ -126,7 +126,7 @@ def test_cuts_may_lie_anywhere(layout: str, avoid: bool, trembling: Path) -> Non
     equal("grid4x4", crossings=10, layout=layout, policy=trembling, steps=40, overrides=overrides)
 
 
-def test_zones_of_a_file_as_narrow_as_cars(tmp_path: Path) -> None:
+def test_zones_of_a_file_can_be_as_narrow_as_cars(tmp_path: Path) -> None:
     # Cuts along a junction and through it, and zones that a car crosses in a second.
     low_x, low_y, high_x, high_y = load_network(find_map("grid4x4")).extent_m
     middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
@@ -168,7 +168,7 @@ def same(one: StepResult, other: StepResult) -> None:
         np.testing.assert_array_equal(array, other[4][key], err_msg=key)
 
 
-def test_one_world_begins_anew_while_others_go_on() -> None:
+def test_worlds_reset_independently() -> None:
     # Agents that are alone in their world leave the road at different times.
     settings: dict[str, Any] = {
         "num_envs": 4,
@@ -182,7 +182,7 @@ def test_one_world_begins_anew_while_others_go_on() -> None:
     for step in range(60):
         actions = whole.suggest_actions()
         np.testing.assert_array_equal(actions, divided.suggest_actions())
-        actions[step % 15 // 4 :, 0] = 1.0  # full throttle, full lock
+        actions[step % 15 // 4 :, 0] = 1.0  # full throttle, full steering
         results = [vec.step(actions) for vec in (whole, divided)]
         same(*results)
         over = results[0][4]["episode_over"]
@@ -193,7 +193,7 @@ def test_one_world_begins_anew_while_others_go_on() -> None:
     assert alone > 3
 
 
-def test_dicts_and_the_global_state_are_the_same() -> None:
+def test_dicts_and_the_global_state_are_equal() -> None:
     settings: dict[str, Any] = {"agents": 6, "overrides": {"population.mode": "respawn"} | FAST}
     whole, divided = (parallel_env("merge", zones=zones, **settings) for zones in (1, 4))
     (seen, infos), (other_seen, other_infos) = (env.reset(seed=4) for env in (whole, divided))
@@ -232,12 +232,12 @@ def hashes_agree(
 
 
 @pytest.mark.parametrize("env", ["merge", "grid4x4"])
-def test_whatever_a_demand_orders_enters_alike(env: str, tmp_path: Path) -> None:
+def test_departures_of_a_demand_do_not_depend_on_zones(env: str, tmp_path: Path) -> None:
     whole = hashes_agree(lambda zones: tiny(env, tmp_path, overrides=FAST | zones), 350)
     assert whole.traffic_stats().departed > 30
 
 
-def test_a_full_world_is_full_wherever_its_vehicles_are(tmp_path: Path) -> None:
+def test_the_capacity_of_a_world_does_not_depend_on_zones(tmp_path: Path) -> None:
     most = 9
 
     def build(zones: dict[str, Any]) -> Simulation:
@@ -250,7 +250,7 @@ def test_a_full_world_is_full_wherever_its_vehicles_are(tmp_path: Path) -> None:
     assert whole.traffic_stats().waiting > 5
 
 
-def test_vehicles_that_look_for_their_way_find_the_same(tmp_path: Path) -> None:
+def test_rerouted_vehicles_find_the_same_routes(tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(
         tmp_path, CARS.format(device=DEVICE) + FLOW, rerouter('<closingReroute id="narrow"/>')
@@ -281,7 +281,7 @@ BEHIND_THE_LAST = """<routes>
 
 
 def test_a_departure_behind_a_far_last_vehicle_enters_once(tmp_path: Path) -> None:
-    # The zone at the end of the road says where, another one sees the last that is far from there.
+    # The zone at the end of the road decides the position; another zone has the last vehicle.
     on_a_long_road(tmp_path, BEHIND_THE_LAST)
 
 
@@ -308,13 +308,13 @@ FROM_DEAD_ENDS = (
 @pytest.mark.parametrize(
     ("grid", "buses", "cars"),
     [
-        # Departures at the starts of lanes, in the middle of the map, ask about those on junctions.
+        # Departures at the starts of lanes in the middle of the map look at vehicles on junctions.
         ("--grid.number=3 -j=allway_stop", TURNS, (*TURNS, *BETWEEN)),
-        # At dead ends they enter where no link leads; before left turns they wait inside.
+        # At dead ends, vehicles enter where no link leads; before left turns, they wait inside.
         ("--grid.number=2 --grid.attach-length=90 -j=priority", AT_DEAD_ENDS, FROM_DEAD_ENDS),
     ],
 )
-def test_beside_buses_that_turn_round_all_drive_and_enter_alike(
+def test_turning_buses_have_the_same_effects_in_all_divisions(
     tmp_path: Path, grid: str, buses: tuple[str, ...], cars: tuple[str, ...]
 ) -> None:
     options = ("--grid", "--grid.length=110", "-L=2", *grid.split())
@@ -333,7 +333,7 @@ def test_beside_buses_that_turn_round_all_drive_and_enter_alike(
 
 
 @pytest.mark.parametrize("narrow", [zipper, signal_pair])
-def test_at_narrow_places_all_drive_alike(
+def test_narrow_places_have_the_same_traffic_in_all_divisions(
     narrow: Callable[[Path], tuple[Path, Path]], tmp_path: Path
 ) -> None:
     net, routes = narrow(tmp_path)
@@ -349,8 +349,10 @@ SLOW_AT_THE_START = """<routes>
 </routes>"""
 
 
-def test_the_mean_speed_behind_the_last_is_that_at_the_end_of_the_lane(tmp_path: Path) -> None:
-    # The zone there does not know the slow ones that enter at the start.
+def test_the_mean_speed_of_a_departure_behind_the_last_vehicle_does_not_depend_on_zones(
+    tmp_path: Path,
+) -> None:
+    # The zone at the end does not have the slow vehicles that enter at the start.
     assert on_a_long_road(tmp_path, SLOW_AT_THE_START).traffic_stats().departed > 5
 
 
@@ -362,7 +364,7 @@ def test_solid_lines_hold_in_every_zone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("halo_m", [0.0, 12.0])
-def test_a_halo_that_is_too_narrow_is_found_out(
+def test_a_halo_that_is_too_narrow_is_detected(
     halo_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: halo_m)

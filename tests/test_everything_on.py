@@ -1,4 +1,4 @@
-"""With every sensor and messages on, a divided world is the undivided one; in a scenario, too."""
+"""With all sensors and messages, a divided world equals the undivided one, also in a scenario."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_every_type_of_sensor_is_on() -> None:
     assert {type(sensor) for sensor in rig.values()} == set(TYPES)
 
 
-def test_what_is_kept_of_a_tick_has_no_gaps() -> None:
+def test_records_of_a_tick_have_no_padding() -> None:
     simulation = make_vec("grid4x4", overrides=EVERYTHING).simulation
     for part in simulation.attached:
         for array in part.arrays():
@@ -68,18 +68,18 @@ def check_zones(env: str | Path, overrides: dict[str, Any], steps: int, crossing
     assert sum(result.crossings for result in found.results) >= crossings
 
 
-def test_everything_in_native_traffic() -> None:
+def test_all_sensors_in_native_traffic() -> None:
     check_zones("grid4x4", EVERYTHING | CROWD, 20, 20)
 
 
 @pytest.mark.parametrize("name", ["pedestrian_crossing", "unprotected_left_turn"])
-def test_everything_in_a_scenario(name: str) -> None:
+def test_all_sensors_in_a_scenario(name: str) -> None:
     alone = {"population.agents": 1, "population.background": 20, "scenario.name": name}
     check_zones("grid4x4", EVERYTHING | alone, 20, 5)
 
 
 @pytest.mark.parametrize("worlds", [1, 2])
-def test_everything_over_two_workers(worlds: int) -> None:
+def test_all_sensors_over_two_workers(worlds: int) -> None:
     alone, shared = (
         make_vec("grid4x4", num_envs=worlds, zones=2, workers=workers, overrides=EVERYTHING | CROWD)
         for workers in (0, 2)

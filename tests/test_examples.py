@@ -1,4 +1,4 @@
-"""The notebooks of `examples/` are the scripts beside them, and run cell by cell."""
+"""The notebooks of `examples/` equal the scripts beside them, and run cell by cell."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCRIPTS = scripts()
 
 each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 
-# Runs the code cells of a notebook one after the other, as Jupyter's "run all" does.
+# Run the code cells of a notebook one after the other, like Jupyter's "run all".
 RUN = """\
 import json, sys
 shared = {"__name__": "__main__"}
@@ -31,7 +31,7 @@ def test_there_are_three_notebooks() -> None:
 
 
 @each
-def test_a_notebook_is_what_its_script_makes(script: Path) -> None:
+def test_a_notebook_equals_its_script(script: Path) -> None:
     made = script.with_suffix(".ipynb").read_text(encoding="utf-8")
     found = json.loads(made)["cells"]
     code = [cell for cell in found if cell["cell_type"] == "code"]

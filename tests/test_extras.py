@@ -1,4 +1,4 @@
-"""The extras of `pyproject.toml`: errors name those that there are, and `all` has the tasks."""
+"""The extras of `pyproject.toml`: errors name existing extras, and `all` includes all tasks."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.core.errors import MissingExtraError, missing, require_all
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-# Their packages fit no other versions of libraries, or not every machine.
+# The packages of these extras conflict with other libraries, or do not run on each machine.
 APART = {"benchmarl", "rllib", "lanelet2"}
 TOOLS = {"all", "bench", "dev", "fuzz"}
 
@@ -35,7 +35,7 @@ def named_extras() -> Iterator[tuple[str, str]]:
 
 
 def reached(extra: str) -> set[str]:
-    """Return an extra and those of cavmarl that it asks for."""
+    """Return an extra, and the extras of cavmarl that it includes."""
     found = {extra}
     for line in EXTRAS[extra]:
         need = Requirement(line)
@@ -72,7 +72,7 @@ def test_all_has_each_task_whose_packages_fit_together() -> None:
 
 
 @pytest.mark.parametrize("extra", ["all", "bench"])
-def test_a_developer_has_all_and_what_is_compared_with(extra: str) -> None:
+def test_the_extra_dev_includes_all_and_the_compared_libraries(extra: str) -> None:
     assert extra in reached("dev")
 
 

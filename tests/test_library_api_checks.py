@@ -1,4 +1,4 @@
-"""Every entry of `envs/` in every population, and bare maps, pass PettingZoo's tests and ours."""
+"""Each environment in each population mode, and bare maps, pass the tests of PettingZoo."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.config.registry import entries
 from cavmarl.env.parallel import CavEnv
 
 with warnings.catch_warnings():
-    # PettingZoo's tests import its own environments the way that it has deprecated.
+    # PettingZoo's tests import its own environments in a deprecated way.
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import (
         api_test,
@@ -34,10 +34,10 @@ Make = Callable[..., Any]
 
 
 def worlds(*often: str, modes: tuple[str, ...] = MODES, bare: tuple[str, ...] = BARE_MAPS) -> Any:
-    """A test of every entry in each population; `often`: entries whose others are in every run.
+    """Parametrize a test by environment and mode; modes of entries in `often` are never slow.
 
-    Every entry is in every run in its first population: the others behave alike on all maps, which
-    `test_parallel_api` shows on each.
+    Each environment is tested in its first mode in every run of the tests; other modes behave alike
+    on all maps, which `test_parallel_api` shows for each mode.
     """
     return pytest.mark.parametrize(
         "arguments",
@@ -59,13 +59,13 @@ in_few_worlds = worlds("grid4x4", "merge")
 
 @pytest.fixture
 def arguments(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """What `parallel_env` is called with: a small population of each kind, short episodes."""
+    """Return the arguments of `parallel_env`: a small population of each mode, short episodes."""
     source, mode = request.param
     if source in BARE_MAPS:
         source = request.getfixturevalue("shared_maps") / source
     return {
         "env": source,
-        "agents": 1 if source == "ring22" else 3,  # there is room for one among 21
+        "agents": 1 if source == "ring22" else 3,  # ring22 has room for one agent among 21 vehicles
         "background": 6,
         "seed": 0,
         "max_cycles": STEPS,
@@ -84,14 +84,14 @@ def make_aec(arguments: dict[str, Any]) -> Make:
     return partial(cavmarl.env, arguments.pop("env"), **arguments)
 
 
-# An episode ends at its horizon also when some of the declared agents never got to enter.
+# An episode ends at its horizon, even if some declared agents have not entered.
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
 @worlds(*sorted(entries()), *BARE_MAPS)
 def test_parallel_api(make: Make) -> None:
     parallel_api_test(make(), num_cycles=STEPS)
 
 
-# A seat that waits for a vehicle observes nothing.
+# A seat that waits for a vehicle observes zeros.
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @in_few_worlds
 def test_aec_api(make_aec: Make) -> None:
@@ -100,8 +100,8 @@ def test_aec_api(make_aec: Make) -> None:
 
 @in_few_worlds
 def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> None:
-    # It wants most of the possible agents to act until the end, so none may be left to come, and
-    # random ones must not leave the road in a few steps.
+    # The test needs most possible agents to act until the end, so all must have entered, and random
+    # actions must not lead off the road in a few steps.
     few = {"population.budget": arguments["agents"], "action.steering_rad": 0.05}
     whole = {**arguments["overrides"], **few}
     max_cycles_test(
@@ -116,7 +116,7 @@ def test_state(make: Make, make_aec: Make) -> None:
     state_test(make_aec(), make(), num_cycles=STEPS)
 
 
-@worlds(bare=())  # frames are drawn alike, whatever the population
+@worlds(bare=())  # drawing does not depend on the population mode
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -127,7 +127,7 @@ Step = tuple[Any, ...]
 
 
 def episode(env: CavEnv, seed: int, actions_seed: int = 0) -> Iterator[Step]:
-    """Everything that an episode of random actions gives, step by step."""
+    """Yield all results of an episode of random actions, step by step."""
     rng = np.random.default_rng(actions_seed)
     observations, infos = env.reset(seed=seed)
     yield observations, {}, {}, {}, infos, env.state(), env.state_hash()

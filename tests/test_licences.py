@@ -1,4 +1,4 @@
-"""What an installation brings: its licences are told, its files have hashes."""
+"""Packages of an installation: the page lists their licences, and locked files have hashes."""
 
 from __future__ import annotations
 

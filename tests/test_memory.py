@@ -1,4 +1,4 @@
-"""Memory stays flat however long worlds are driven."""
+"""Memory does not grow with the number of steps."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(not STATM.exists(), reason="memory is read from 
 
 @pytest.fixture(params=["closed", "open", "respawn", "demand"])
 def world(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
-    """Arguments of a world of each population, and of one with demand."""
+    """Return the arguments of a world of each population mode, and of a world with demand."""
     overrides: dict[str, Any] = {"population.mode": request.param}
     if request.param == "demand":
         path = tmp_path / "x.rou.xml"
@@ -44,7 +44,7 @@ def resident_mb() -> float:
 
 
 def growth_mb(work: Callable[[], object], times: int) -> float:
-    """By how much `times` calls let the process grow, after a tenth of them as warm-up."""
+    """Return the growth of the process by `times` calls, after a tenth of them as warm-up."""
     for _ in range(times // 10):
         work()
     before = resident_mb()
@@ -79,12 +79,12 @@ def test_a_million_agent_steps(world: dict[str, Any]) -> None:
 
     number = AGENT_STEPS // (vec.num_envs * world["agents"])
     assert growth_mb(step, number) < GROWTH_MB
-    assert acted > AGENT_STEPS // 10, "too few agents drove for this to mean anything"
+    assert acted > AGENT_STEPS // 10, "too few agents drove for a meaningful test"
 
 
 @pytest.mark.slow
 def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
-    # Divided and undivided side by side: equal after every step, to the end, and no larger.
+    # Run divided and undivided worlds: they are equal after each step, and memory does not grow.
     step_ticks = load_config("rush")[0].clock.ticks_per_step
     steps = CITY_TICKS // step_ticks
     memory_mb: list[float] = []
@@ -109,7 +109,7 @@ def test_a_thousand_worlds_made() -> None:
 
 
 def test_a_hundred_resets_of_divided_worlds() -> None:
-    """The short form, which is in every run."""
+    """The short variant, which is part of every run of the tests."""
     vec = make_vec("grid4x4", num_envs=2, zones=4, agents=8, background=20, seed=0)
 
     def episode() -> None:
@@ -119,5 +119,5 @@ def test_a_hundred_resets_of_divided_worlds() -> None:
 
     vec.reset()
     while not vec.step(vec.suggest_actions())[4]["vehicle_done"].any():
-        pass  # what places new vehicles is loaded at the first end of a trip
+        pass  # kernels for new vehicles are loaded at the first end of a trip
     assert growth_mb(episode, 100) < GROWTH_MB / 5

@@ -1,4 +1,4 @@
-"""Whatever a caller passes: it works, or one of our errors says why and nothing has changed."""
+"""Any input either works, or raises an error of cavmarl and changes nothing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NUMBERS = [0.0, 1e-9, 0.001, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 10.0, 60.0, 300.0, 3
 
 
 def values(hint: Any) -> st.SearchStrategy[Any]:
-    """Values of the type of a field, on its likely borders too."""
+    """Draw values of the type of a field, also likely limits."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return st.sampled_from(arguments)
@@ -68,7 +68,7 @@ def values(hint: Any) -> st.SearchStrategy[Any]:
 
 
 def settings_of(kind: type[Any], prefix: str = "") -> dict[str, st.SearchStrategy[Any]]:
-    """Dotted key → values, for every key of `EnvConfig`."""
+    """Return dotted key → strategy of values, for each key of `EnvConfig`."""
     found: dict[str, st.SearchStrategy[Any]] = {}
     hints = get_type_hints(kind)
     for field in fields(kind):
@@ -152,7 +152,7 @@ def env(request: pytest.FixtureRequest, leniency: dict[str, str]) -> CavEnv:
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_any_action_is_done_or_refused_without_a_trace(env: CavEnv, data: st.DataObject) -> None:
+def test_any_action_works_or_is_refused_without_effect(env: CavEnv, data: st.DataObject) -> None:
     if not env.agents:
         env.reset()
     fine = PAIRS if env.config.action.kind == "continuous" else MOVES
@@ -182,7 +182,7 @@ def vec(request: pytest.FixtureRequest, leniency: dict[str, str]) -> CavVectorEn
         npst.floating_dtypes() | npst.integer_dtypes(), st.sampled_from([(2, 3, 2), (2, 3), (2,)])
     )
 )
-def test_any_array_is_done_or_refused_without_a_trace(vec: CavVectorEnv, actions: Any) -> None:
+def test_any_array_works_or_is_refused_without_effect(vec: CavVectorEnv, actions: Any) -> None:
     before = [vec.state_hash(world) for world in range(2)]
     try:
         vec.step(actions)
@@ -194,7 +194,7 @@ def test_any_array_is_done_or_refused_without_a_trace(vec: CavVectorEnv, actions
 
 @settings(max_examples=60, deadline=None, suppress_health_check=list(HealthCheck))
 @given(seed=ANYTHING)
-def test_any_seed_is_taken_or_refused_without_a_trace(env: CavEnv, seed: Any) -> None:
+def test_any_seed_works_or_is_refused_without_effect(env: CavEnv, seed: Any) -> None:
     env.reset(seed=0)
     before = env.state_hash()
     try:

@@ -1,4 +1,4 @@
-"""What `import cavmarl` gives, and what it costs."""
+"""The names and the cost of `import cavmarl`."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ print(json.dumps([share, sorted(name.split(".")[0] for name in sys.modules)]))
 
 @pytest.fixture(scope="module")
 def imported() -> tuple[float, set[str]]:
-    """What `import cavmarl` costs over what its libraries do, and the packages that are loaded.
+    """Return the cost of `import cavmarl` beyond that of its libraries, and the loaded packages.
 
-    In time of the processor, the least of three in fresh processes.
+    The cost is processor time in s, the least of three new processes.
     """
     runs = []
     for _ in range(3):
@@ -84,14 +84,14 @@ def test_the_function_is_not_hidden_by_the_folder_of_its_name() -> None:
     subprocess.run([sys.executable, "-c", probe], cwd=ROOT, check=True)
 
 
-def test_what_the_readme_promises_is_there() -> None:
+def test_names_in_the_readme_exist() -> None:
     for name in ("parallel_env", "env", "raw_env", "make_vec", "load_policy"):
         assert name in cavmarl.__all__
         assert callable(getattr(cavmarl, name))
         assert getattr(cavmarl, name).__doc__
 
 
-def test_every_public_error_is_one_of_ours() -> None:
+def test_every_public_error_has_the_base_class_of_cavmarl() -> None:
     errors = [
         value
         for name in cavmarl.__all__

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 with warnings.catch_warnings():
-    # Importing pygame warns of a deprecated package that it uses itself.
+    # pygame warns on import about a deprecated package that it uses.
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", UserWarning)
     pytest.importorskip("highway_env", reason="needs the extra 'bench'")
@@ -51,7 +51,7 @@ def test_defaults_equal_highway_env() -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_bicycle_follows_their_vehicle(seed: int) -> None:
+def test_the_bicycle_model_equals_that_of_highway_env(seed: int) -> None:
     rng = np.random.default_rng(seed)
     theirs = Vehicle(None, [3.0, -2.0], heading=rng.uniform(-3, 3), speed=rng.uniform(-42, 42))
     limits = (kinematics.MIN_SPEED_MPS, kinematics.MAX_SPEED_MPS)
@@ -67,11 +67,11 @@ def test_bicycle_follows_their_vehicle(seed: int) -> None:
         )
         assert [x, y, speed] == pytest.approx([*theirs.position, theirs.speed], rel=0, abs=1e-12)
         assert abs(wrap_angle(heading - theirs.heading)) < 1e-12
-        # From the same bits again: rounding may differ in a tick, not pile up over many.
+        # Restart from equal bits: rounding may differ in a tick, but must not accumulate.
         (x, y), heading, speed = theirs.position, theirs.heading, theirs.speed
 
 
-def test_bicycle_stays_with_their_vehicle_for_a_minute() -> None:
+def test_the_bicycle_model_stays_close_for_a_minute() -> None:
     theirs = Vehicle(None, [0.0, 0.0], heading=0.4, speed=12.0)
     x, y, heading, speed = 0.0, 0.0, 0.4, 12.0
     for tick in range(1200):
@@ -85,7 +85,7 @@ def test_bicycle_stays_with_their_vehicle_for_a_minute() -> None:
 
 
 def random_road(seed: int, lanes: int = 3, cars: int = 12) -> Road:
-    """A straight road with IDM cars at random places, speeds and small angles."""
+    """Make a straight road with IDM cars at random positions, speeds and small angles."""
     rng = np.random.default_rng(seed)
     network = RoadNetwork.straight_road_network(lanes, length=400.0, speed_limit=30.0)
     road = Road(network=network, np_random=np.random.RandomState(seed), record_history=False)
@@ -103,14 +103,14 @@ def random_road(seed: int, lanes: int = 3, cars: int = 12) -> Road:
 
 
 def our_acceleration(car: IDMVehicle | None, front: IDMVehicle | None) -> float:
-    """What our model says for one of their cars behind another."""
+    """Return the acceleration of cavmarl's model for a car of highway-env behind another."""
     if car is None:
         return 0.0
     target_speed = min(max(car.target_speed, 0.0), car.lane.speed_limit)
     if front is None:
         return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX)
     front_speed = float(front.velocity @ car.direction)
-    # Their car's own speed is projected too, which is exact only up to its last bit.
+    # highway-env also projects the car's own speed, which is exact only up to the last bit.
     distance = car.lane_distance_to(front)
     taken = idm.idm_interaction(car.speed, distance, front_speed, *IDM_DEFAULTS)
     return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX) - taken
@@ -127,7 +127,7 @@ def test_acceleration_equals_highway_env(seed: int) -> None:
 
 
 def our_mobil(car: IDMVehicle, lane: tuple[str, str, int], mandatory: bool) -> bool:
-    """Our decision on the neighbours that their road finds."""
+    """Return the decision of cavmarl's model with the neighbours that highway-env finds."""
     ahead, behind = car.road.neighbour_vehicles(car)
     new_ahead, new_behind = car.road.neighbour_vehicles(car, lane)
     return lane_change.mobil_accepts(

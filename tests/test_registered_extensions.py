@@ -1,4 +1,4 @@
-"""Doors for users: what is added by one file from outside gives the same bytes however it is run.
+"""Registered extensions of users give the same bytes in all divisions and backends.
 
 The files are the examples of docs/guides/extending.md.
 """
@@ -28,7 +28,7 @@ KINDS = ("A term", "A sensor", "A driver model", "A backend")
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, ModuleType]]:
-    """The page's examples by heading, each imported from a file of its own."""
+    """Return the examples of the page by heading, each imported from its own file."""
     folder = tmp_path_factory.mktemp("outside")
     sys.path.insert(0, str(folder))
     found = {}
@@ -47,7 +47,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Mod
 
 
 def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], np.ndarray, Any]:
-    """Bytes of each step, the states' hashes, the last terms and the environment's settings."""
+    """Return the bytes of each step, the states' hashes, the last terms and the settings."""
     vec = cavmarl.make_vec(
         ENV, num_envs=2, agents=AGENTS, background=BACKGROUND, overrides=overrides, **how
     )
@@ -69,7 +69,7 @@ def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], 
 
 
 def same_bytes(overrides: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Undivided, in four zones, and in four zones over two workers; the terms and what is seen."""
+    """Compare one zone, four zones and two workers; return the terms and observed features."""
     whole = run(overrides)
     for how in ({"zones": 4}, {"zones": 4, "workers": 2}):
         divided = run(overrides, **how)
@@ -89,13 +89,13 @@ def test_a_term_from_outside(examples: dict[str, ModuleType]) -> None:
     env.close()
 
 
-def test_a_batched_term_is_the_one_of_single_agents(examples: dict[str, ModuleType]) -> None:
+def test_a_batched_term_equals_that_of_single_agents(examples: dict[str, ModuleType]) -> None:
     weights = {"headway": -0.5, "headway_of_all": -0.25}
     terms, _ = same_bytes({"terms.weights": weights})
     assert terms[-1] == terms[-2] > 0.0
 
 
-def test_a_batched_answer_is_of_each_agent_alone() -> None:
+def test_batched_results_belong_to_their_agents() -> None:
     def against_the_mean(view: cavmarl.BatchView) -> np.ndarray:
         return view.own["speed"] - view.own["speed"].mean()
 
@@ -106,8 +106,8 @@ def test_a_batched_answer_is_of_each_agent_alone() -> None:
     env.close()
 
 
-def test_workers_do_without_what_they_cannot_import_and_do_not_need() -> None:
-    """As where a notebook has registered something, and other worlds have workers."""
+def test_workers_need_only_the_extensions_of_their_worlds() -> None:
+    """For example, a notebook has registered a term, and worlds without it have workers."""
 
     def zero(view: cavmarl.AgentView) -> float:
         return 0.0
@@ -120,7 +120,7 @@ def test_workers_do_without_what_they_cannot_import_and_do_not_need() -> None:
     REGISTERED_TERMS.remove("zero")
 
 
-def test_a_batched_answer_has_a_number_for_each_agent() -> None:
+def test_a_batched_function_must_return_a_number_for_each_agent() -> None:
     cavmarl.register_term("one", lambda view: np.zeros(1), batched=True)
     env = cavmarl.parallel_env(ENV, agents=4, overrides={"terms.weights": {"one": 1.0}})
     with pytest.raises(
@@ -132,7 +132,7 @@ def test_a_batched_answer_has_a_number_for_each_agent() -> None:
 
 def test_a_sensor_from_outside(examples: dict[str, ModuleType]) -> None:
     _, seen = same_bytes({"sensors.registered": ["crowd"]})
-    assert np.abs(seen[..., -2:]).sum() > 0.0, "its features are the last ones"
+    assert np.abs(seen[..., -2:]).sum() > 0.0, "its features come last"
     assert "crowd" in sensor_names()
     assert REGISTERED_SENSORS["crowd"].name == "crowd"
     with pytest.raises(ConfigError, match=r"cavmarl\.register_sensor"):
@@ -152,7 +152,7 @@ def test_a_backend_from_outside(examples: dict[str, ModuleType]) -> None:
 
 
 def test_a_sensor_is_asked_in_every_step() -> None:
-    """What it said before is gone: no number stands from an earlier step."""
+    """No number of an earlier step remains."""
 
     def parity(view: cavmarl.AgentView) -> float:
         return float(view.own["tick"] % 7) / 7.0
@@ -169,7 +169,7 @@ def test_a_sensor_is_asked_in_every_step() -> None:
 
 
 def drive(env: cavmarl.CavEnv) -> None:
-    """Three steps."""
+    """Drive three steps."""
     env.reset(seed=0)
     for _ in range(3):
         env.step({agent: np.zeros(2, np.float32) for agent in env.agents})

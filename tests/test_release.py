@@ -1,4 +1,4 @@
-"""What a release shows to others: versions, badges and forms agree with the package."""
+"""Public files of a release: versions, badges and forms agree with the package."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""SUMO beside what else a world can have: messages, mounted sensors, their workers, followers."""
+"""SUMO combined with messages, mounted sensors, sensor workers and followers."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*workers.*there are:RuntimeWarn
 
 PEOPLE = {"agents": 4, "background": 60}
 STEPS = 20
-# What a follower sees is a vector that it makes its controls of.
+# A follower computes its controls from a flat observation.
 PLAIN: dict[str, Any] = {"observation.mode": "ground_truth", "rig": {}, "clock.ctrl_dt_s": 0.1}
 
 
 def settings(folder: Path, source: str) -> dict[str, Any]:
-    """All sensors and messages beside SUMO, in steps of two ticks."""
+    """Return settings with SUMO, all sensors and messages, and steps of two ticks."""
     demand = {"traffic.source": source, "traffic.demand": [str(tiny_file(folder))]}
     return EVERYTHING | demand | {"sensors.signal.timing": False, "population.mode": "respawn"}
 
@@ -37,7 +37,7 @@ def settings(folder: Path, source: str) -> dict[str, Any]:
 def drive(
     source: str, folder: Path, steps: int = STEPS, **keywords: Any
 ) -> list[list[str | bytes]]:
-    """Frames of all sensors and digests of all worlds, step by step."""
+    """Yield frames of all sensors and digests of all worlds, step by step."""
     overrides = settings(folder, source)
     vec = make_vec("grid4x4", overrides=overrides, **PEOPLE, **keywords)
     try:
@@ -47,7 +47,7 @@ def drive(
             vec.step(vec.suggest_actions())
             seen.append(results(vec))
         told = vec.traffic_stats()
-        assert told["departed"] > sum(PEOPLE.values()), "nobody comes from SUMO"
+        assert told["departed"] > sum(PEOPLE.values()), "no vehicle comes from SUMO"
         assert told["v2x_received"] > 0
     finally:
         vec.close()
@@ -86,7 +86,7 @@ def test_sensor_workers_and_workers(tmp_path: Path, source: str) -> None:
 
 @pytest.mark.parametrize("source", MODES)
 def test_a_worker_dies_beside_all_sensors_and_messages(tmp_path: Path, source: str) -> None:
-    """What SUMO was told is told again; sensors and messages go on from the image."""
+    """The commands to SUMO are repeated; sensors and messages resume from the image."""
     made: dict[str, Any] = {"num_envs": 2, "overrides": settings(tmp_path, source), **PEOPLE}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
     try:
@@ -105,7 +105,7 @@ def test_a_worker_dies_beside_all_sensors_and_messages(tmp_path: Path, source: s
 
 
 def followed(source: str, folder: Path, zones: int, address: Path) -> list[str]:
-    """A follower drives one of the agents; the digests of the world."""
+    """Let a follower drive one of the agents; return the digests of the world."""
     env = cavmarl.parallel_env(
         "grid4x4", zones=zones, overrides=settings(folder, source) | PLAIN, **PEOPLE
     )
@@ -127,7 +127,7 @@ def followed(source: str, folder: Path, zones: int, address: Path) -> list[str]:
 
 @pytest.mark.parametrize("source", MODES)
 def test_a_follower_drives_whatever_the_zones(tmp_path: Path, source: str) -> None:
-    """It sees and answers the same; other controls of it would make another world."""
+    """Views and controls are equal; other controls would give another world."""
     alone = followed(source, tmp_path, 1, tmp_path / "s")
     assert followed(source, tmp_path, 4, tmp_path / "s") == alone
     assert len(set(alone)) == STEPS

@@ -1,4 +1,4 @@
-"""Worlds with SUMO beside them are the same bit for bit however they are divided."""
+"""Worlds that are coupled with SUMO are equal bit for bit in all divisions."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def overrides(source: str, demand: Path) -> dict[str, object]:
 
 @pytest.mark.parametrize("source", MODES)
 def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
-    """With agents, with generated cars beside SUMO's, and every tick's rows looked at."""
+    """With agents, generated cars and SUMO's cars; the rows are compared after each tick."""
     found = verify_zones(
         "grid4x4",
         (1, 2, 4, 9),
@@ -52,7 +52,7 @@ def test_bologna_runs_for_an_hour(shared_maps: Path, source: str) -> None:
 
 
 def bologna(maps: Path, source: str, seconds: int) -> None:
-    """Its own demand, signals, buses and stops; SUMO's counts are ours."""
+    """Run Bologna with its own demand, signals, buses and stops; compare counts with SUMO's."""
     folder = maps / "net" / "bologna_acosta"
     own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5, "horizon_s": float(seconds + 10)}
     with coupled(

@@ -1,4 +1,4 @@
-"""Each tutorial runs as it stands: its code in Python, and its lines after `sh`."""
+"""Each tutorial runs as written: its Python code, and its lines of shell."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGIS
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "tutorials"
 NEEDS_SERVICE = "nodes_and_service"
-DEAR = {"train"}  # seconds: it trains
+DEAR = {"train"}  # limit in s; the page trains
 PAGES = sorted(path.stem for path in FOLDER.glob("*.md") if path.stem != "README")
 QUICK = [name for name in PAGES if name not in (NEEDS_SERVICE, *DEAR)]
 
 
 @pytest.fixture(autouse=True)
 def nothing_stays_registered() -> Iterator[None]:
-    """Tests that follow find no names of a page."""
+    """Remove the names that a page has registered."""
     registries = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
     before = [set(registry.names) for registry in registries]
     yield
@@ -36,7 +36,7 @@ def nothing_stays_registered() -> Iterator[None]:
 
 
 def run_page(name: str) -> None:
-    """Run the blocks of a page in their order, in the present folder."""
+    """Run the blocks of a page in order, in the working directory."""
     text = (FOLDER / f"{name}.md").read_text(encoding="utf-8")
     blocks = re.findall(r"^```(python|sh)\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     assert blocks
@@ -50,7 +50,7 @@ def run_page(name: str) -> None:
 
 
 def run_line(words: list[str]) -> None:
-    if words[0] == "cavmarl" and words[1] != "train":  # which becomes the program
+    if words[0] == "cavmarl" and words[1] != "train":  # this file becomes the program
         done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
         assert done.exit_code == 0, done.output
         return
@@ -64,7 +64,7 @@ def test_a_tutorial_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     run_page(name)
 
 
-@pytest.mark.slow  # it trains
+@pytest.mark.slow  # the page trains
 @pytest.mark.parametrize("name", sorted(DEAR))
 def test_an_expensive_tutorial_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
@@ -73,7 +73,7 @@ def test_an_expensive_tutorial_runs(
     run_page(name)
 
 
-@pytest.mark.slow  # tests/service/test_service_page.py runs the same commands in each run
+@pytest.mark.slow  # tests/service/test_service_page.py always runs the same commands
 def test_the_tutorial_of_the_service_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.support.service import Cluster, running_service
 

@@ -1,4 +1,4 @@
-"""A wheel works away from the checkout: it carries the data folders."""
+"""A wheel works outside of the checkout, and contains the data folders."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A fresh wheel."""
+    """Build a wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
@@ -32,16 +32,16 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def site(wheel: Path) -> Path:
-    """A folder with the content of the wheel."""
+    """Return a folder with the content of the wheel."""
     zipfile.ZipFile(wheel).extractall(wheel.parent / "site")
     return wheel.parent / "site"
 
 
 @pytest.fixture(scope="module")
 def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The `bin` of an environment of its own that the wheel is installed in.
+    """Return the `bin` folder of a virtual environment with the installed wheel.
 
-    What the wheel depends on is borrowed from here: a test must not need a network.
+    Dependencies are those of this environment, because a test must not need a network.
     """
     folder = tmp_path_factory.mktemp("elsewhere")
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
@@ -54,12 +54,12 @@ def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def room(cache: Path) -> dict[str, str]:
-    """The setting for a cache of its own."""
+    """Return the environment variables for an empty cache."""
     return {"CAVMARL_CACHE_DIR": str(cache)}
 
 
 def run(command: list[str], cwd: Path, settings: Mapping[str, str] = MappingProxyType({})) -> str:
-    """What a command says that knows nothing of the checkout."""
+    """Run a command without access to the checkout; return its output."""
     clean = {name: value for name, value in os.environ.items() if name != "PYTHONPATH"}
     done = subprocess.run(
         command, cwd=cwd, env=clean | settings, capture_output=True, text=True, check=False
@@ -68,7 +68,7 @@ def run(command: list[str], cwd: Path, settings: Mapping[str, str] = MappingProx
     return done.stdout
 
 
-# The compiler and torch are as if they were not installed.
+# Make the compiler and torch appear as not installed.
 BARE = """
 import sys
 for name in ("numba", "llvmlite", "torch"):
@@ -147,9 +147,7 @@ def test_a_trained_driver_of_an_installed_wheel_needs_neither_compiler_nor_torch
 
 
 @pytest.mark.slow
-def test_an_installation_that_cannot_be_written_and_a_missing_cache_do_no_harm(
-    elsewhere: Path, tmp_path: Path
-) -> None:
+def test_a_read_only_installation_works_without_a_cache(elsewhere: Path, tmp_path: Path) -> None:
     command = [
         str(elsewhere / "python"),
         "-c",
@@ -159,7 +157,7 @@ def test_an_installation_that_cannot_be_written_and_a_missing_cache_do_no_harm(
 
 
 @pytest.mark.slow
-def test_a_damaged_library_is_compiled_anew_with_a_reason(site: Path, tmp_path: Path) -> None:
+def test_a_damaged_library_is_compiled_again_with_a_reason(site: Path, tmp_path: Path) -> None:
     damaged = tmp_path / "site"
     shutil.copytree(site, damaged)
     library = damaged / "cavmarl/core/compiled/prebuilt/kernels.so"
@@ -214,7 +212,7 @@ def test_a_wheel_finds_its_own_entries(site: Path) -> None:
 
 
 def files(folder: Path) -> set[Path]:
-    """All files below a folder, relative to it, without Python's caches."""
+    """Return all files below a folder by relative path, without Python's caches."""
     return {
         path.relative_to(folder)
         for path in folder.rglob("*")

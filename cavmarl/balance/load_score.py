@@ -58,7 +58,7 @@ class Utilisation:
 
 @dataclass(frozen=True)
 class LoadRule:
-    """How workers are scored and excluded."""
+    """The rule that scores and excludes workers."""
 
     # weights of CPU, RAM and GPU in the score; they add up to 1
     weights: tuple[float, float, float] = WEIGHTS

@@ -36,23 +36,23 @@ def carla(
     other_ticks: Annotated[
         Literal["obey", "refuse", "follow"],
         about(
-            "What happens if a client ticks that is not the first one that ticks: the world "
-            "advances (obey), the client gets an error (refuse), or it waits for the next tick "
-            "of the first one (follow)."
+            "The first client that ticks leads. If another client ticks, the world advances "
+            "(obey), that client gets an error (refuse), or it waits for the next tick of the "
+            "leading one (follow)."
         ),
     ] = "obey",
     max_clients: Annotated[
-        int, about("Number of clients at a time.", metavar="N", panel=SERVICE)
+        int, about("Maximum number of clients at the same time.", metavar="N", panel=SERVICE)
     ] = 64,
     max_actors: Annotated[
-        int, about("Number of actors that clients may spawn.", metavar="N", panel=SERVICE)
+        int, about("Maximum number of actors that clients spawn.", metavar="N", panel=SERVICE)
     ] = 1024,
     max_message_mb: Annotated[
-        int, about("Size of a message of a client.", metavar="MB", panel=SERVICE)
+        int, about("Maximum size of a message of a client.", metavar="MB", panel=SERVICE)
     ] = 64,
     max_unsent_mb: Annotated[
         int,
-        about("Data that may wait for a client that does not read.", metavar="MB", panel=SERVICE),
+        about("Maximum data that wait for a slow client.", metavar="MB", panel=SERVICE),
     ] = 64,
 ) -> None:
     """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""

@@ -42,7 +42,7 @@ EVALUATION_SEED = 1000  # far from the seeds of training
 EPISODES = 32
 FAILURES = 12  # trips shown in failures.html
 MEASURED = 50_000  # decisions of the training that measures the speed of this machine
-# All that follows the training takes about as long as training on so many decisions.
+# The part after the training takes about as long as training on this number of decisions.
 EVALUATION = 500_000
 ADAPTED, RULES, RANDOM = "adapted", "idm", "random_actions"
 COMPARED = ("success", "collision", "delay_s")
@@ -50,7 +50,7 @@ COMPARED = ("success", "collision", "delay_s")
 
 @dataclass(frozen=True)
 class DemoTask:
-    """What is trained: the keys of the settings file that the demo shows."""
+    """The training: the keys of the settings file that the demo shows."""
 
     env: str
     start: str  # driver before the training

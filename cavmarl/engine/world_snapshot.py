@@ -40,7 +40,7 @@ class Parts(NamedTuple):
     outputs: Outputs  # agents' outputs, including the frames that the next observation stacks
     coordination: OwnershipRuntime  # decides ownership
     partition: ZonePartition  # the zones
-    repartition_steps_done: int  # steps begun so far, which decide when zones are cut anew
+    repartition_steps_done: int  # steps begun so far, which decide when zones are cut again
     has_past: bool  # whether an observation depends on the previous observation
     attached: tuple[Component, ...]  # components that act in each tick
     sumo: SumoTraffic | None  # the other simulator; None: there is none

@@ -52,7 +52,7 @@ class SignalAgents:
 
     @property
     def view(self) -> SignalView:
-        """What controllers know; see `signals.controllers`."""
+        """The state for controllers; see `signals.controllers`."""
         arrays = self._arrays
         return SignalView(
             config=self._config,

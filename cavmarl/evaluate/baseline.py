@@ -59,7 +59,7 @@ def run_baseline(
         policy: the trained driver.
         agents: number of agents in each world; None: as configured by the environment.
         background: number of background vehicles; None: as configured by the environment.
-        episodes: episodes of each driver in traffic. The oracle drives eight times as many, up to
+        episodes: episodes of each driver in traffic. `idm` alone drives eight times as many, up to
             64.
         seed: of the episodes.
         progress: as in `evaluate`.

@@ -24,7 +24,7 @@ NOTHING = "-"
 
 @dataclass(frozen=True)
 class Story:
-    """What a page tells before the results of an evaluation: a training, and pictures of it.
+    """The introduction of a page of results: a training, and pictures of it.
 
     Attributes:
         title: headline of the page.
@@ -32,7 +32,7 @@ class Story:
         compared: names of the metrics in a short table.
         curve: the file progress.csv of the training.
         films: caption → animated WebP, which becomes a part of the page.
-        commands: (command, purpose) of what to try next.
+        commands: (command, purpose) of next steps.
     """
 
     title: str
@@ -224,35 +224,35 @@ class _Figure(NamedTuple):
 
 FIGURES = (
     _Figure("changes", "", "vehicles that changed their owner", lambda found: found.transfers),
-    _Figure("forced", "", "of them with the state attached, since no answer had come in time",
+    _Figure("forced", "", "changes with the state attached, because no answer had come in time",
             lambda found: found.forced),
-    _Figure("failure rate", "%", "share that had to be forced",
+    _Figure("failure rate", "%", "share of forced changes",
             lambda found: None if found.failure_rate is None else 100.0 * found.failure_rate),
-    _Figure("put off", "ticks", "in which a vehicle that had crossed stayed with its owner",
+    _Figure("deferred", "ticks", "for which a vehicle beyond the border stayed with its owner",
             lambda found: found.deferred),
-    _Figure("refused", "", "states that a zone did not take", lambda found: found.refused),
+    _Figure("refused", "", "states that a zone has refused", lambda found: found.refused),
     _Figure("withdrawn", "", "approaches that ended without a change",
             lambda found: found.aborted),
-    _Figure("left meanwhile", "", "vehicles that left the world in the tick of their change",
+    _Figure("left the world", "", "vehicles that left in the tick of their change",
             lambda found: found.removed),
     _Figure("timeouts, acknowledge", "", "no answer by the end of a tick",
             lambda found: found.timeouts["acknowledge"]),
-    _Figure("timeouts, switch", "", "none by the deadline",
+    _Figure("timeouts, switch", "", "no answer by the deadline",
             lambda found: found.timeouts["switch"]),
-    _Figure("timeouts, replica", "", "states that were neither asked for nor withdrawn",
+    _Figure("timeouts, replica", "", "states that were neither requested nor withdrawn",
             lambda found: found.timeouts["replica"]),
-    _Figure("latency", "ticks", "from the first state at the new owner until it had confirmed",
+    _Figure("latency", "ticks", "from the first state at the new owner to its confirmation",
             lambda found: found.latency_ticks),
-    _Figure("of these behind the border", "ticks", "for which the old owner drove on",
+    _Figure("latency behind the border", "ticks", "for which the old owner moved the vehicle",
             lambda found: found.waited_ticks),
-    _Figure("latency", "ms", "the same by the clock; not repeatable",
+    _Figure("latency", "ms", "the same as wall time; not repeatable",
             lambda found: found.latency_ms),
-    _Figure("state", "bytes", "of a vehicle", lambda found: found.state_bytes),
-    _Figure("depth at PREPARE", "m", "outside of the old zone at the first state; inside, below 0",
+    _Figure("state", "bytes", "size of the state of a vehicle", lambda found: found.state_bytes),
+    _Figure("depth at PREPARE", "m", "outside of the old zone at the first state; inside: below 0",
             lambda found: found.prepare_depth_m),
-    _Figure("depth at SWITCH", "m", "when the change was decided",
+    _Figure("depth at SWITCH", "m", "the same when the change was decided",
             lambda found: found.switch_depth_m),
-    _Figure("depth at RELEASE", "m", "when it was committed, and the old owner's copy went",
+    _Figure("depth at RELEASE", "m", "the same when the change was committed",
             lambda found: found.release_depth_m),
 )  # fmt: skip
 

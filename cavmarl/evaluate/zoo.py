@@ -79,7 +79,7 @@ class Verification:
 
 @dataclass(frozen=True)
 class EntryJob:
-    """What is needed to repeat a result."""
+    """The settings that repeat a result."""
 
     world: WorldSpec
     episodes: int

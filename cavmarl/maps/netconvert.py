@@ -225,7 +225,7 @@ def conversion_notes(path: Path) -> list[str]:
     """Return what the conversion of a network from another format decided, guessed or ignored."""
     origin = read_provenance(path)
     if origin.get("traffic side", "").startswith("right"):
-        del origin["traffic side"]  # the usual one
+        del origin["traffic side"]  # the usual side
     told = ("traffic side", "defaults", "notes")
     return [f"{key}: {origin[key]}" for key in told if key in origin]
 
@@ -287,7 +287,7 @@ class _Build:
     defaults: tuple[RoadDefaults, ...] = ()
     notes: tuple[str, ...] = ()
     roads: OsmRoads | None = None  # of OSM
-    decided: str = ""  # the traffic side, and by what it was decided
+    decided: str = ""  # the traffic side, and what has decided it
     report: HeightReport | None = None
     levels: int = 0
 

@@ -30,16 +30,16 @@ _TRAVELLED = {
     "driving": 13.89, "entry": 22.22, "exit": 22.22, "onRamp": 22.22, "offRamp": 22.22,
     "mwyEntry": 22.22, "mwyExit": 22.22, "bus": 13.89, "taxi": 13.89,
 }  # fmt: skip
-# Types that netconvert leaves out without a word, and the type that they are read as.
+# Types that netconvert leaves out silently, and the type as which they are read.
 _READ_AS = {"slipLane": "driving", "shared": "driving", "connectingRamp": "offRamp"}
-# netconvert would open these lanes to through traffic, or close them without a word.
+# netconvert would open these lanes to through traffic, or close them silently.
 _NOT_TRAVELLED = frozenset(("parking", "stop", "HOV", "bidirectional"))
-# Netconvert's type map leaves these out, or closes them to road vehicles, which is meant.
+# netconvert's type map leaves these out, or closes them to road vehicles, as intended.
 _NO_LANES = frozenset(
     "none shoulder border median curb sidewalk walking biking restricted special1 special2 "
     "special3 rail tram roadWorks".split()
 )
-# In addition to netconvert's type map.
+# Entries in addition to netconvert's type map.
 TYPE_MAP = b"""<types>
   <type id="bus" priority="1" speed="13.89" width="3.65" allow="bus taxi emergency"/>
   <type id="taxi" priority="1" speed="13.89" width="3.65" allow="taxi emergency"/>
@@ -53,7 +53,7 @@ Limits = list[tuple[float, float | None]]  # position in m, and the limit in m/s
 
 @dataclass
 class OpenDriveSource:
-    """The roads of an OpenDRIVE file, changed so that netconvert reads them as they are meant.
+    """The roads of an OpenDRIVE file, changed so that netconvert reads them correctly.
 
     Attributes:
         root: the changed document.
@@ -199,7 +199,7 @@ class OpenDriveSource:
         )
 
     def _set_limits_of_lanes(self, road: Element, of_road: Limits) -> Counter[float]:
-        """Return the default speeds in m/s that lanes of a road have for want of a limit."""
+        """Return the default speeds in m/s of a road's lanes without a limit."""
         used: Counter[float] = Counter()
         sections = sorted(
             road.iterfind("lanes/laneSection"), key=lambda one: self._number(one, "s")

@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 MAGIC = b"PAR1"
-MOST_DEPTH = 30  # of nested structures
-MOST_ITEMS = 1 << 20  # of one list in a footer
+MOST_DEPTH = 30  # limit of nested structures
+MOST_ITEMS = 1 << 20  # limit of one list in a footer
 
 _NUM_ROWS, _ROW_GROUPS = 3, 4  # fields of the footer
 _COLUMNS, _ROWS_OF_GROUP = 1, 3  # fields of a row group
@@ -50,7 +50,7 @@ def parquet_size(content: memoryview) -> ParquetSize:
     groups = _items(footer, _ROW_GROUPS)
     num_rows = _number(footer, _NUM_ROWS)
     if sum(_number(group, _ROWS_OF_GROUP) for group in groups) != num_rows:
-        raise ValueError(f"it has {num_rows} rows, and its groups have others")
+        raise ValueError(f"it has {num_rows} rows, but its row groups have another number")
     columns: dict[int, ColumnSize] = {}
     for group in groups:
         for k, column in enumerate(_items(group, _COLUMNS)):

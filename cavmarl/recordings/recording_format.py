@@ -50,7 +50,7 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-MOST_LETTERS = 1000  # of a name in the head
+MOST_LETTERS = 1000  # limit of a text in the head
 MOST_SHOWN = 100
 MOST_ROW_BYTES = 1 << 28  # of a table of samples
 SHORTEST_S, LONGEST_S = 1e-4, 1e3  # of a tick or step
@@ -104,12 +104,12 @@ class RecordingHead:
         return ZonePartition((low_x, low_y, high_x, high_y), np.array(self.rects))
 
     def wrong(self) -> str:
-        """Return what is wrong with a head that was read; empty if nothing. Raises any error."""
-        self.partition  # noqa: B018 - refuses zones that are none
+        """Return what is wrong with a head from a file; empty if nothing. May raise any error."""
+        self.partition  # noqa: B018 - raises for invalid zones
         texts = [self.network[key] for key in ("name", "source_sha256", "layout", "sha256")]
         texts += [self.environment, self.status, *self.terms, *chain(*self.features)]
         if not all(isinstance(text, str) and len(text) <= MOST_LETTERS for text in texts):
-            return f"a text is no text, or longer than {MOST_LETTERS} letters"
+            return f"a value is not a text, or longer than {MOST_LETTERS} letters"
         if not all(text.isprintable() for text in texts):
             return "a text has letters that cannot be printed"
         if not 0.0 <= float(self.halo_m) <= MOST_SECONDS:

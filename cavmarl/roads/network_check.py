@@ -83,7 +83,7 @@ def _faults(network: RoadNetwork) -> Iterator[str]:
             yield f"the map has {len(ids)} ids of {len(rows)} {name}s"
     texts = (*network.lane_ids, *network.edge_ids, *network.junction_kinds, *network.signal_ids)
     if not all(isinstance(text, str) for text in texts):
-        yield "an id is no text"
+        yield "an id is not a text"
         return
     for table, column, target in _INDICES:
         rows, end = getattr(network, table)[column], len(getattr(network, target))

@@ -39,7 +39,7 @@ class Exclusion(NamedTuple):
 
 @dataclass
 class LiveNode:
-    """What is known of a node besides the log: its last heartbeat.
+    """The state of a node that is not in the log: its last heartbeat.
 
     Attributes:
         number: order of registration, which breaks ties.

@@ -125,7 +125,7 @@ class NodeScore(_Answer):
 
 
 class Duties(_Answer):
-    """What a node has to do."""
+    """The tasks of a node."""
 
     draining: bool
     beat_s: float

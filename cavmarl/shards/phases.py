@@ -10,7 +10,7 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class PhaseRule(NamedTuple):
-    """How a phase may be run."""
+    """The ways in which a phase may be run."""
 
     method: Callable[..., None]  # of `ShardGroup`; it calls the kernel of the phase
     is_shared: bool = False  # whether workers share its zones; if not, one process runs all zones

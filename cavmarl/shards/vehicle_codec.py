@@ -13,7 +13,7 @@ sensors, which are taken again.
 
 Reader and writer must have the same layout of the record. The header has a digest of the layout,
 and a change of it needs a new major version (`RECORD_VERSION`). A minor version may append data
-after the frames that no tick reads. A reader skips unknown data and tolerates missing data, so all
+that no tick reads, after the frames. A reader skips unknown data and tolerates missing data, so all
 minor versions can read each other.
 """
 

@@ -40,7 +40,7 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
-FAST_FACTOR = 1.5  # speed divided by the limit; hardly any driver of a demand file wants more
+FAST_FACTOR = 1.5  # speed divided by the limit; few drivers of demand files want more
 JAM_GAP_M = 2.5  # m between the bumpers of queued vehicles
 PLACED_SHARE = 0.75  # share of their lanes that placed agents may occupy so that others find room
 

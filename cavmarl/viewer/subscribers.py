@@ -184,7 +184,7 @@ class Audience:
             return
         try:
             loop.call_soon_threadsafe(partial(function, *given, **named))
-        except RuntimeError:  # the loop has been closed meanwhile
+        except RuntimeError:  # the loop has been closed by now
             return
 
     def _spread(self, publication: Publication) -> None:

@@ -1,6 +1,6 @@
-"""The moving picture of the README: cars that merge on `merge`.
+"""Make the moving picture of the README: cars that merge on `merge`.
 
-`python -m docs.pictures.moving docs/images` makes it anew.
+`python -m docs.pictures.moving docs/images` makes it again.
 The built-in driver drives all agents of a seeded world; the camera stands at the end of the ramp.
 """
 
@@ -24,22 +24,22 @@ from cavmarl.shards.shard import Commands
 
 __all__ = ["MOVING", "Film", "film_frames", "write_film"]
 
-STEP_S = 0.1  # between two frames
+STEP_S = 0.1  # time between two frames
 
 
 @dataclass(frozen=True)
 class Film:
-    """What to film.
+    """The settings of a film.
 
     Attributes:
-        env: the entry.
+        env: name of the environment.
         focus: the part of the map to show, m.
         start_s: world time of the first frame.
         duration_s: world time that the film shows.
-        size: of a frame, pixels.
-        seed: of the world.
-        agents: instead of the entry's number.
-        background: instead of the entry's number.
+        size: size of a frame in pixels.
+        seed: seed of the world.
+        agents: number of agents, instead of the environment's.
+        background: number of background vehicles, instead of the environment's.
     """
 
     env: str
@@ -58,7 +58,7 @@ MOVING = Film(
 
 
 def film_frames(film: Film) -> Iterator[NDArray[np.uint8]]:
-    """A frame (height, width, 3) for each step of the world in the film's time."""
+    """Yield a frame (height, width, 3) for each step of the world in the time of the film."""
     config, folder = load_config(
         film.env,
         agents=film.agents,
@@ -87,7 +87,7 @@ def film_frames(film: Film) -> Iterator[NDArray[np.uint8]]:
 
 
 def write_film(film: Film, path: Path) -> int:
-    """Write a film as a GIF in real time that repeats; returns its size in bytes."""
+    """Write a film as a repeating GIF in real time; return its size in bytes."""
     imageio = require("imageio.v3", "render")
     path.parent.mkdir(parents=True, exist_ok=True)
     imageio.imwrite(path, list(film_frames(film)), duration=1000.0 * STEP_S, loop=0)

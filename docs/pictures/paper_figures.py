@@ -1,6 +1,6 @@
-"""Figures of the two papers, drawn from what is measured here; see docs/explanation/papers.md.
+"""Draw figures of the two papers from own measurements; see docs/explanation/papers.md.
 
-`python -m docs.pictures.paper_figures docs/images` draws `drift.svg` anew, in a minute. The plot of
+`python -m docs.pictures.paper_figures docs/images` draws `drift.svg` again in a minute. The plot of
 the sensor workers is that of `python -m benchmarks sensors --plot`.
 """
 
@@ -13,12 +13,12 @@ from benchmarks.clock_drift import ClockDrift, measure_drift
 from cavmarl.core.errors import require
 
 STEPS, ROGUE = 5000, 0.92
-# Delta of the published Table II before the fix, s, by steps; 0 after it.
+# Drift in s of the published Table II before the fix, by steps; it is 0 after the fix.
 PUBLISHED = {100: 4.6, 500: 23.0, 1000: 46.0, 5000: 230.0}
 
 
 def write_drift(path: Path) -> Path:
-    """How far a follower's clock is ahead, before (it ticks by itself) and after, and published."""
+    """Draw the lead of a follower's clock: with own ticks, without them, and as published."""
     before = measure_drift("ring", steps=STEPS, rogue=ROGUE, answer="obey")
     after = measure_drift("ring", steps=STEPS)
     pyplot = require("matplotlib.pyplot", "report")

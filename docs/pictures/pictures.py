@@ -1,7 +1,7 @@
-"""The pictures of the README and of the entries' cards.
+"""Draw the pictures of the README and of the cards of environments.
 
-`python -m docs.pictures.pictures docs/images` draws them anew.
-Each is one moment of a seeded world in which the built-in driver has all seats.
+`python -m docs.pictures.pictures docs/images` draws them again.
+Each picture shows one moment of a seeded world in which the built-in driver drives all agents.
 """
 
 from __future__ import annotations
@@ -30,17 +30,17 @@ SEED = 0
 
 @dataclass(frozen=True)
 class Picture:
-    """What to draw.
+    """The settings of a picture.
 
     Attributes:
-        env: the entry.
-        time_s: how long the world has run.
-        size: in pixels; by default what suits the map.
-        focus: the part of the map to show, m; by default all of it.
-        agents: instead of the entry's number.
-        background: instead of the entry's number.
+        env: name of the environment.
+        time_s: simulated time of the picture.
+        size: size in pixels; by default, the size fits the map.
+        focus: the part of the map to show, m; by default, the whole map.
+        agents: number of agents, instead of the environment's.
+        background: number of background vehicles, instead of the environment's.
         ghosts_of: the zone whose ghosts are outlined; a divided world is drawn with its zones.
-        approach_ticks: so many ticks before a crossing the transfer begins.
+        approach_ticks: ticks between the start of a transfer and the crossing.
     """
 
     env: str
@@ -107,7 +107,7 @@ def draw_picture(picture: Picture) -> Surface:
 
 
 def moment(world: World, time_s: float) -> Simulation:
-    """A seeded world in which the built-in driver has had all seats for so long."""
+    """Return a seeded world after some time, with the built-in driver in all seats."""
     config = world.config
     simulation = Simulation(config, world.network, demand=world.demand, partition=world.partition)
     simulation.seed(SEED)

@@ -1,6 +1,6 @@
-"""A picture of each sensor: what it tells one agent, drawn over the world around it.
+"""Draw a picture for each sensor: its data for one agent, over the world around the agent.
 
-`python -m docs.pictures.sensor_gallery docs/images/sensors` draws them anew.
+`python -m docs.pictures.sensor_gallery docs/images/sensors` draws them again.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from pygame import Surface
 
 ENV, AGENT, STEPS = "grid4x4", 1, 90
-SIZE, SEES_M = (560, 360), 36.0  # pixels; metres to either side
+SIZE, SEES_M = (560, 360), 36.0  # size in pixels; range to either side in m
 INK, DARK = (200, 40, 120), (28, 32, 40)
 EVERY = {
     "sensors.lidar.rays": 96,
@@ -50,7 +50,7 @@ CARRIED: dict[str, dict[str, Any]] = {
 
 
 def world_with_every_sensor() -> CavEnv:
-    """A crossing in which agents have all sensors, some seconds after its reset."""
+    """Return a crossing whose agents have all sensors, some seconds after the reset."""
     carried = [name.removeprefix("rig.") for name in sensor_names() if name.startswith("rig.")]
     overrides: dict[str, Any] = {
         **EVERY,
@@ -73,7 +73,7 @@ def _drawn(env: CavEnv, kind: str, is_carried: bool) -> Surface:
     row = rows[rows["agent"] == AGENT][0]
     named = [one for one in sensed_shapes(env.config, arrays, 0, AGENT) if one["name"] == kind]
     observed = [one for one in named if one["kind"] not in ("picture", "numbers")]
-    # A name that both an observed and a carried sensor have: the carried one is last.
+    # If an observed and a mounted sensor have the same name, the mounted sensor is last.
     shapes = named[-1:] if is_carried else observed[:1]
     for shape in shapes:
         if shape["kind"] == "picture":
@@ -160,7 +160,7 @@ def _with_text(picture: Surface, lines: list[str]) -> Surface:
 
 
 def write_sensor_gallery(folder: Path) -> list[Path]:
-    """Draw them all into a folder."""
+    """Draw all pictures into a folder."""
     pygame = load_pygame()
     pygame.font.init()
     folder.mkdir(parents=True, exist_ok=True)

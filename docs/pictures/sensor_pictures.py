@@ -1,6 +1,6 @@
-"""A picture of what one vehicle's sensors see, for the pages on them.
+"""Draw the data of one vehicle's sensors, for the pages about sensors.
 
-`python -m docs.pictures.sensor_pictures docs/images` draws it anew.
+`python -m docs.pictures.sensor_pictures docs/images` draws it again.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ RIG: dict[str, dict[str, Any]] = {
     "lidar": {"type": "lidar", "z_m": 1.6, "layers": 32, "rays": 720, "lower_deg": -20.0},
 }
 MARGIN = 6
-LIDAR_M = 32.0  # from the middle of its picture to the edge
+LIDAR_M = 32.0  # distance from the middle of its picture to the edge
 
 Image = NDArray[np.uint8]
 
 
 def sensor_sheet() -> Image:
-    """(H, W, 3): colours and classes, depths and lidar from above; the grid beside them."""
+    """Return (H, W, 3): colours and classes, depths and lidar from above, the grid beside them."""
     overrides = {
         "rig": {name: {**sensor, "rate_hz": 5} for name, sensor in RIG.items()},
         "map.buildings": BUILDINGS,
@@ -55,7 +55,7 @@ def sensor_sheet() -> Image:
 
 
 def write_sensor_sheet(folder: Path) -> Path:
-    """Draw it as `sensors.png` into a folder."""
+    """Write the picture as `sensors.png` into a folder."""
     pygame = load_pygame()
     path = folder / "sensors.png"
     surface = pygame.surfarray.make_surface(sensor_sheet().swapaxes(0, 1))
@@ -88,14 +88,14 @@ def _classes(frames: Frames) -> Image:
 
 
 def _depths(frames: Frames) -> Image:
-    """Near is dark; by the logarithm, as most of what matters is near."""
+    """Return depths as grey: near is dark; the scale is logarithmic."""
     depths = _latest(frames, "depths").astype(np.float64)
     shade = np.log(np.maximum(depths, 1.0)) / np.log(100.0)
     return np.repeat((255 * np.clip(shade, 0, 1)).astype(np.uint8)[..., np.newaxis], 3, axis=2)
 
 
 def _points(frames: Frames) -> Image:
-    """The lidar's points from above, ahead up; those that are higher are lighter."""
+    """Return the lidar's points from above, forward up; higher points are lighter."""
     distances = _latest(frames, "lidar")
     layers, rays = distances.shape
     elevation = np.radians(np.linspace(-20.0, 5.0, layers))[:, np.newaxis]
@@ -114,7 +114,7 @@ def _points(frames: Frames) -> Image:
 
 
 def _grid(frames: Frames, tall: int) -> Image:
-    """As tall as the others beside it."""
+    """Return the grid with the height of the pictures beside it."""
     cells = _palette()[_latest(frames, "grid")]
     rows = np.arange(tall) * cells.shape[0] // tall
     columns = np.arange(tall * cells.shape[1] // cells.shape[0]) * cells.shape[0] // tall

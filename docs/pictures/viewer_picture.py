@@ -1,6 +1,7 @@
-"""The picture of the viewer: its page in a headless Chromium, on a divided world.
+"""Make the picture of the viewer: its page in a headless Chromium, with a divided world.
 
-`python -m docs.pictures.viewer_picture docs/images` draws it anew; it needs Chromium, Playwright.
+`python -m docs.pictures.viewer_picture docs/images` makes it again.
+The program needs Chromium and Playwright.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ SECONDS = 600.0
 
 
 def write_viewer_picture(path: Path) -> Path:
-    """A crossing in four zones: a followed agent, what its sensors see, and its observation."""
+    """Draw a crossing in four zones, with an agent, its sensor data and its observation."""
     env = parallel_env("grid4x4", zones=4, agents=20, background=120, overrides=KEYS)
     told: list[str] = []
     begun = threading.Event()

@@ -1,4 +1,4 @@
-"""What stands in for moviepy, which the libraries' recorders write their videos with."""
+"""A substitute for moviepy, with which the recorders of libraries write videos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 class Video:
-    """One that a recorder has written: its frames and their rate."""
+    """A video that a recorder has written: its frames and the frame rate."""
 
     written: list[Video]
 
@@ -25,7 +25,7 @@ class Video:
 
 @pytest.fixture
 def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Video]:
-    """The videos that the recorders of a test write, in place of files."""
+    """Collect the videos that the recorders of a test write, instead of files."""
     pytest.importorskip("pygame", reason="needs the extra: render")
     Video.written = []
     clips = ModuleType("moviepy.video.io.ImageSequenceClip")

@@ -1,4 +1,4 @@
-"""Every population as a task of BenchMARL, whose algorithms run on it."""
+"""Each population mode is a task of BenchMARL on which its algorithms run."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.core.errors import ConfigError
 
 benchmarl = pytest.importorskip("benchmarl", reason="needs the extra: benchmarl (make libraries)")
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # TorchRL's warnings of itself are many
+pytestmark = pytest.mark.filterwarnings("ignore")  # TorchRL warns about its own code
 
 MODES = ("closed", "open", "respawn")
 SMALL = {"agents": 2, "background": 2, "max_cycles": 8}
@@ -22,7 +22,7 @@ SMALL = {"agents": 2, "background": 2, "max_cycles": 8}
 def run(
     folder: Path, algorithm: str = "Ippo", continuous: bool = True, **overrides: Any
 ) -> tuple[Any, list[float]]:
-    """The experiment after two iterations, with an evaluation; its logged mean rewards."""
+    """Return an experiment after two iterations and an evaluation, and its logged mean rewards."""
     import benchmarl.algorithms
     from benchmarl.experiment import Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig

@@ -1,4 +1,4 @@
-"""A copy or a pickle of a view has worlds of its own, and goes on bit for bit."""
+"""A copy or a pickle of an adapter has its own worlds, which continue bit for bit."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def torchrl(**arguments: Any) -> Any:
 
 
 def step_rows(env: Any) -> list[bytes]:
-    """What comes out of a step, without infos."""
+    """Return the results of a step, without infos."""
     return [part.tobytes() for part in env.step(np.full((ROWS, 2), 0.3, np.float32))[:3]]
 
 
 def step_tensors(env: Any) -> list[bytes]:
-    """The same of TorchRL, whose worlds begin anew by themselves."""
+    """Return the results of a step of TorchRL, whose worlds reset themselves."""
     tensors = env.full_action_spec.zero()
     tensors["car", "action"][:] = 0.3
     told = env.step(tensors)["next"]
@@ -68,7 +68,7 @@ VIEWS: dict[str, tuple[Callable[..., Any], Callable[[Any], list[bytes]]]] = {
     "torchrl": (torchrl, step_tensors),
 }
 
-# TorchRL warns of itself when its parts are imported.
+# TorchRL warns about its own code when it is imported.
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl"),
     pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase"),
@@ -83,7 +83,7 @@ def test_a_copy_continues_like_the_original(view: str, how: str) -> None:
     for _ in range(3):
         step(env)
     other = COPIES[how](env)
-    first = [step(env) for _ in range(15)]  # over the end of an episode
+    first = [step(env) for _ in range(15)]  # past the end of an episode
     assert [step(other) for _ in range(15)] == first
     assert len({parts[0] for parts in first}) > 10, "the worlds move"
 
@@ -97,7 +97,7 @@ def test_views_of_worker_processes_are_refused(view: str) -> None:
 
 
 def test_supersuits_copies_are_worlds_of_their_own() -> None:
-    """PettingZoo's documented way to stable-baselines3."""
+    """PettingZoo documents SuperSuit as the way to stable-baselines3."""
     supersuit = pytest.importorskip("supersuit", reason="needs the extra: bench")
     stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     world = cavmarl.parallel_env("merge", agents=2, **SMALL)
@@ -107,7 +107,7 @@ def test_supersuits_copies_are_worlds_of_their_own() -> None:
     seen = joined.reset()
     assert seen.shape[0] == 4
     assert (np.abs(seen).sum(axis=1) > 0.0).all(), "no row is empty"
-    assert len({row.tobytes() for row in seen}) == 4, "each world is another"
+    assert len({row.tobytes() for row in seen}) == 4, "all worlds differ"
     model = stable_baselines3.PPO("MlpPolicy", joined, n_steps=8, batch_size=16, n_epochs=1)
     model.learn(2 * 8 * 4)
     joined.close()

@@ -1,4 +1,4 @@
-"""One vehicle as a Gymnasium environment, by Gymnasium's checker and wrappers."""
+"""One vehicle as a Gymnasium environment, tested with Gymnasium's checker and wrappers."""
 
 from __future__ import annotations
 
@@ -87,7 +87,7 @@ def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
 
 
 def test_infos_equal_those_of_highway_env() -> None:
-    """It drives as the built-in driver, or straight on at full throttle, into others."""
+    """The vehicle follows the built-in driver, or hits other vehicles at full throttle."""
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):
         driven = seed % 2 == 0
@@ -116,7 +116,7 @@ def test_config_holds_nested_keys_of_the_entry() -> None:
     made = make(config=config).unwrapped.parallel_env.config
     entry, _ = load_config("merge")
     assert made.sensors.lidar.rays == 8
-    assert made.sensors.lanes == entry.sensors.lanes, "what it does not name stays"
+    assert made.sensors.lanes == entry.sensors.lanes, "other keys keep their values"
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
         gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})

@@ -1,4 +1,4 @@
-"""Agents as the rows of a Gymnasium vector: the worlds that they show, and Gymnasium's wrappers."""
+"""Agents as rows of a Gymnasium vector environment: equal to their worlds; with wrappers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make(mode: str = "respawn", kind: str = "flat", **arguments: Any) -> Any:
 
 
 def wild(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """(count, 2) full throttle and any steering: most leave the road or hit somebody soon."""
+    """Return (count, 2) full throttle and random steering: most trips soon end."""
     actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
     actions[:, 0] = 1.0
     return actions
@@ -192,7 +192,7 @@ def test_invalid_rows_are_refused(arguments: dict[str, Any], message: str) -> No
 
 
 def test_rows_without_autoreset_begin_anew_on_reset() -> None:
-    """With one row a world each row by itself; the others go on."""
+    """With one row per world, each row is reset alone, and other rows continue."""
     rows = make(num_worlds=ROWS, autoreset_mode="Disabled")
     assert rows.autoreset_mode is AutoresetMode.DISABLED
     seen, _ = rows.reset(seed=5)
@@ -225,7 +225,7 @@ def test_rows_of_a_world_begin_anew_together() -> None:
         over = terminated | cut
         if over.any():
             seen, told = rows.reset(options={"reset_mask": over})
-            assert not seen[over & ~told["active"]].any(), "a row that waits shows nothing"
+            assert not seen[over & ~told["active"]].any(), "a waiting row observes zeros"
             whole += bool(told["active"][over].all())
             waiting += bool((over & ~told["active"]).any())
     assert whole > 0
@@ -233,7 +233,7 @@ def test_rows_of_a_world_begin_anew_together() -> None:
 
 
 def test_a_world_may_end_while_none_of_its_rows_has_a_vehicle() -> None:
-    """Without autoreset the rows say so: a loop that resets what ended never meets a world over."""
+    """Without autoreset, no finished world is stepped if all ended rows are reset each time."""
     rows = make(num_worlds=4, autoreset_mode="Disabled")
     rows.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -257,7 +257,7 @@ def test_torchrls_wrapper_takes_the_rows(autoreset: str) -> None:
     wrapped = envs.GymWrapper(make(autoreset_mode=autoreset))
     told = wrapped.rollout(30, break_when_any_done=False)
     assert told["observation"].shape == (ROWS, 30, wrapped.observation_spec["observation"].shape[1])
-    assert told["next", "done"].any(dim=1).all(), "each row ends and goes on"
+    assert told["next", "done"].any(dim=1).all(), "each row ends and continues"
 
 
 def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
@@ -281,7 +281,7 @@ def test_gymnasium_records_a_video_of_the_rows(tmp_path: Any, recorded: Any) -> 
     film.close()
     assert len(frames) == ROWS
     assert (frames[0] == frames[ROWS // WORLDS - 1]).all(), "rows of a world show that world"
-    assert (frames[0] != frames[-1]).any(), "and those of another that one"
+    assert (frames[0] != frames[-1]).any(), "rows of the other world show the other world"
     (video,) = recorded
     assert len(video.frames) == 3
     assert video.fps == rows.metadata["render_fps"] == 5

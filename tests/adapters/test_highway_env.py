@@ -1,4 +1,4 @@
-"""highway-env's tasks: its scripts run with the id changed, and its numbers mean the same."""
+"""Tasks of highway-env: its scripts run with a changed id, and numbers have the same meaning."""
 
 from __future__ import annotations
 

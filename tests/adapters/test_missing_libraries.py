@@ -1,4 +1,4 @@
-"""A view without its library says what to install."""
+"""An adapter whose library is missing names the extra to install."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.core.errors import MissingExtraError
         ("rllib_env", "ray", "rllib"),
     ],
 )
-@pytest.mark.filterwarnings("ignore")  # TorchRL's warnings of itself are many
+@pytest.mark.filterwarnings("ignore")  # TorchRL warns about its own code
 def test_a_missing_library_is_named_with_its_extra(
     monkeypatch: pytest.MonkeyPatch, view: str, library: str, extra: str
 ) -> None:

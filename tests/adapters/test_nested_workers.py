@@ -1,6 +1,6 @@
-"""The worlds inside the workers of other libraries, which may not start `multiprocessing` children.
+"""Worlds inside workers of other libraries, which may not start `multiprocessing` children.
 
-What a worker's worlds give is what they give here.
+Their results equal those in this process.
 """
 
 from __future__ import annotations
@@ -18,12 +18,12 @@ from numpy.typing import NDArray
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.env.vector import make_vec
 
-WORKERS = (0, 1)  # processes of our own within each worker
+WORKERS = (0, 1)  # worker processes of cavmarl within each worker of the library
 STEPS = 30
 
 
 class OneRow(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """The first agent of batched worlds, as a library's worker would step it."""
+    """The first agent of batched worlds, as a library's worker steps it."""
 
     def __init__(self, workers: int) -> None:
         self.vec = make_vec(
@@ -51,7 +51,7 @@ class OneRow(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def drive(step: Callable[[NDArray[np.float32]], Any], count: int) -> list[Any]:
-    """What STEPS steps of `count` rows give."""
+    """Return the results of STEPS steps of `count` rows."""
     rng = np.random.default_rng(0)
     return [step(rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)) for _ in range(STEPS)]
 
@@ -89,7 +89,7 @@ def test_worlds_run_in_workers_of_stable_baselines3(workers: int) -> None:
     here.close()
 
 
-@pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+@pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 @pytest.mark.parametrize("workers", WORKERS)
 def test_worlds_run_in_a_ray_actor(workers: int) -> None:
     ray = pytest.importorskip("ray", reason="needs the extra: ray")

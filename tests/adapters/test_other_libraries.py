@@ -1,4 +1,4 @@
-"""Run the examples of docs/guides/libraries.md for libraries without a view of their own."""
+"""Run the examples of docs/guides/libraries.md for libraries without an adapter."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LIBRARIES = ("supersuit", "tianshou", "skrl", "agilerl")
 
 
 def example(library: str) -> str:
-    """The program of the page that imports a library."""
+    """Return the program of the page that imports a library."""
     text = PAGE.read_text(encoding="utf-8")
     programs: list[str] = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     uses = re.compile(rf"^(from|import) {library}\b", re.MULTILINE)

@@ -1,4 +1,4 @@
-"""The worlds as RLlib's multi-agent environments: its algorithms run on them, near and far."""
+"""Worlds as multi-agent environments of RLlib, in this process and in remote runners."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.env.parallel import parallel_env
 ray = pytest.importorskip("ray", reason="needs the extra: rllib (make libraries)")
 pytest.importorskip("ray.rllib", reason="needs the extra: rllib (make libraries)")
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 MODES = ("closed", "open", "respawn")
 HORIZON = 16
@@ -44,10 +44,10 @@ def cluster() -> Iterator[None]:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rllib_gets_the_agents_of_the_world(mode: str) -> None:
-    """All that the world says reaches RLlib once, though its episodes may end earlier."""
+    """Each result of the world reaches RLlib once, although RLlib's episodes may end earlier."""
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
-    # One after the other: the next one enters when the last one has ended.
+    # An agent enters when the trip of the previous one has ended.
     chosen = config(mode) | ({"agents": 1} if mode == "open" else {})
     env, twin = CavRllibEnv(chosen), parallel_env(**chosen)
     sampled = env.get_action_space("car_0")
@@ -98,7 +98,7 @@ def test_a_truncation_is_no_termination() -> None:
 
 
 def train(flat: bool = True, **runners: Any) -> dict[str, Any]:
-    """One update of PPO; what its runners say of the episodes."""
+    """Run one update of PPO; return what its runners report about the episodes."""
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.connectors.env_to_module import FlattenObservations
 

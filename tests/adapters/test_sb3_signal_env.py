@@ -1,4 +1,4 @@
-"""Signals as rows for stable-baselines3, against the worlds that they show."""
+"""Signals as rows for stable-baselines3, compared with their worlds."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_ppo_learns_from_the_rows() -> None:
         assert model.num_timesteps == 8 * 32
 
 
-def test_what_the_adapter_decides_is_refused() -> None:
+def test_arguments_that_the_adapter_sets_are_refused() -> None:
     with pytest.raises(ConfigError, match="autoreset_mode"):
         make(autoreset_mode="next_step")
     with pytest.raises(ConfigError, match="no signal of this map"):

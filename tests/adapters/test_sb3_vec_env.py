@@ -1,4 +1,4 @@
-"""The rows for stable-baselines3, by its own checks, and against the worlds that they show."""
+"""Agents as rows for stable-baselines3: its own checks, and equality with the worlds."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rows() -> Any:
 
 
 def wild(rows: Any, seed: int) -> list[Any]:
-    """80 steps at full throttle, steered at random: vehicles leave the road, then the horizon."""
+    """Return 80 actions with random steering: trips end off the road or at the horizon."""
     rows.seed(seed)
     found = [rows.reset()]
     random = np.random.default_rng(0)
@@ -190,7 +190,7 @@ def test_rows_have_the_spec_of_their_entry(rows: Any) -> None:
     assert rows.get_attr("spec", 0) == [rows.spec]
     assert rows.spec.max_episode_steps == 20
     folder = Path(__file__).parents[2] / "envs" / "ring"
-    assert CavSb3VecEnv(folder).spec is None, "which no id means"
+    assert CavSb3VecEnv(folder).spec is None, "no id creates this environment"
 
 
 def test_wrong_use_is_refused(rows: Any) -> None:

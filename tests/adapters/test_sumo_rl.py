@@ -47,7 +47,7 @@ NAMED = re.compile("We recommend agents to be named")
 
 @pytest.fixture(scope="module")
 def routes(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A file with a vehicle every 6 s on each of some ways through the grid."""
+    """Write a file with a vehicle every 6 s on each of some routes through the grid."""
     flows = [
         f'<flow id="f{k}" begin="0" end="3600" period="6" from="{start}" to="{end}"/>'
         for k, (start, end) in enumerate(ROUTES)
@@ -62,7 +62,7 @@ def grid(routes: str, **more: Any) -> SumoEnvironment:
 
 
 def drive(env: SumoEnvironment, steps: int, every: int = 4) -> list[Any]:
-    """Step with the same green for all signals, another one after some steps."""
+    """Step with one green for all signals, and with the next green after some steps."""
     return [
         env.step({ts: k // every % env.action_spaces(ts).n for ts in env.ts_ids})
         for k in range(steps)
@@ -99,7 +99,7 @@ def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
 
 
 def test_greens_are_counted_as_in_sumo_rl(routes: str, tmp_path: Path) -> None:
-    """Equal phases are two greens, and so are phases with `Y`; elsewhere they are not."""
+    """In sumo-rl's API, equal phases and phases with `Y` are greens; elsewhere, they are not."""
     with closing(grid(routes)) as env:
         first, second = (phase.state for phase in env.traffic_signals["A0"].green_phases)
         size = len(first)
@@ -127,7 +127,7 @@ def test_greens_are_counted_as_in_sumo_rl(routes: str, tmp_path: Path) -> None:
 
 
 def test_greens_change_at_the_times_of_sumo_rl(routes: str) -> None:
-    """sumo-rl's rule: a change is ignored before yellow and the shortest green have passed."""
+    """As in sumo-rl, a change is ignored until yellow and the minimum green have passed."""
     rng = np.random.default_rng(1)
     with closing(grid(routes, min_green=8, yellow_time=3, num_seconds=300)) as env:
         env.reset()
@@ -186,7 +186,7 @@ def on_lanes(env: SumoEnvironment, lanes: list[str]) -> NDArray[np.void]:
 
 
 def test_observations_and_rewards_follow_sumo_rls_formulas(routes: str) -> None:
-    """Compared with formulas over all vehicles, and with the engine's own agents of signals."""
+    """Compare with formulas over all vehicles, and with the signal agents of the engine."""
     names = ["average-speed", "queue", "pressure", "diff-waiting-time"]
     with closing(grid(routes, num_seconds=400, reward_fn=names)) as env:
         env.reset()
@@ -268,7 +268,7 @@ def test_a_csv_file_is_written_for_each_episode(routes: str, tmp_path: Path) -> 
         assert [row["step"] for row in rows] == [f"{t:.1f}" for t in range(55, 151, 5)]
 
 
-def test_ones_own_rewards_and_observations(routes: str) -> None:
+def test_rewards_and_observations_of_the_user(routes: str) -> None:
     class Queues(sumo_rl.ObservationFunction):
         def __call__(self) -> NDArray[np.float32]:
             return np.array(self.ts.get_lanes_queue(), dtype=np.float32)
@@ -363,7 +363,7 @@ def test_a_seed_repeats_an_episode(routes: str) -> None:
         assert run(env, seed=8) != first
         assert run(env, seed=7) == first
         env.close()
-        assert run(env) == first  # made again
+        assert run(env) == first  # created again
     with closing(grid(routes, sumo_seed="random")) as env:
         assert run(env) != run(env)
         assert run(env, seed=7) == first

@@ -1,4 +1,4 @@
-"""The worlds as TorchRL's tensors, by TorchRL's checks, and against the arrays that they show."""
+"""Worlds as tensors of TorchRL: its own checks, and equality with the arrays."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.env.vector import make_vec
 torch = pytest.importorskip("torch", reason="needs the extra: torchrl")
 torchrl = pytest.importorskip("torchrl", reason="needs the extra: torchrl")
 
-# TorchRL warns of itself when its parts are imported.
+# TorchRL warns about its own code when it is imported.
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl"),
     pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase"),
@@ -41,7 +41,7 @@ def make(mode: str = "respawn", **overrides: Any) -> Any:
 
 
 def wild(tensordict: Any) -> Any:
-    """A policy of full throttle: vehicles leave the road, those that do not are cut."""
+    """Return a policy of full throttle: vehicles leave the road, or their trips are truncated."""
     random = torch.Generator().manual_seed(int(tensordict[CAR, "observation"].sum() * 1e3) % 2**31)
     actions = 2.0 * torch.rand((*tensordict[CAR, "mask"].shape, 2), generator=random) - 1.0
     actions[..., 0] = 1.0
@@ -62,7 +62,7 @@ def test_torchrls_own_check_passes(mode: str, kind: str, action: str) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_the_tensors_are_the_worlds_arrays(mode: str) -> None:
-    """TorchRL resets a world between two steps; arrays begin anew by themselves."""
+    """TorchRL resets a world between two steps; the arrays reset themselves."""
     env = make(mode)
     env.set_seed(7)
     rollout = env.rollout(80, wild, break_when_any_done=False)

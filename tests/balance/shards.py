@@ -15,7 +15,7 @@ COSTS = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 0.001, 0.01, 1.0]))
 
 
 def grid(rows: int, columns: int) -> tuple[tuple[int, ...], ...]:
-    """Zones of a grid, row by row, that share a side."""
+    """Return the neighbour relations of a grid of zones, row by row."""
     places = list(product(range(rows), range(columns)))
     return tuple(
         tuple(n for n, (c, d) in enumerate(places) if abs(a - c) + abs(b - d) == 1)
@@ -24,19 +24,19 @@ def grid(rows: int, columns: int) -> tuple[tuple[int, ...], ...]:
 
 
 def row(costs: Sequence[float], worlds: int = 1) -> tuple[ShardCost, ...]:
-    """Shards of `worlds` worlds, as many zones in each."""
+    """Return the shards of `worlds` worlds with equal numbers of zones."""
     zones = len(costs) // worlds
     return tuple(ShardCost(n // zones, n % zones, cost) for n, cost in enumerate(costs))
 
 
 def busy(*cpus: float) -> LoadSnapshot:
-    """Workers of which others use that much of the processor."""
+    """Return loads of workers whose processors other programs use to these shares."""
     workers = tuple(Candidate(n, Utilisation(cpu, 0.0)) for n, cpu in enumerate(cpus))
     return LoadSnapshot(workers, "none", "generated")
 
 
 def least_makespan_s(problem: Problem) -> float:
-    """By trying everything; every worker is admissible."""
+    """Return the least makespan of all assignments; every worker is admissible."""
     speeds = [1.0 - 0.6 * one.use.cpu - 0.2 * one.use.ram for one in problem.snapshot.workers]
     costs = [shard.cost_s for shard in problem.shards]
 

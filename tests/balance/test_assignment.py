@@ -1,4 +1,4 @@
-"""Plans beside the best there are, under loads that mean no good, and round after round."""
+"""Plans compared with optimal plans, under adverse loads, and over several rounds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STRICT = BalanceRule(tolerance=0.0)
 
 
 def alone(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule | None = None) -> Problem:
-    """Shards without neighbours."""
+    """Return shards without neighbours."""
     return Problem(row(costs), ((),) * len(costs), snapshot, rule or BalanceRule())
 
 
@@ -83,7 +83,7 @@ def test_the_order_of_the_input_does_not_matter(
 @pytest.mark.parametrize(
     ("costs", "loads"),
     [
-        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a giant is alone
+        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a very expensive shard has a worker of its own
         ([1.0] * 6, [3.0, 3.0]),
         ([0.0, 0.0, 0.0, 5.0], [0.0, 5.0]),
         ([5e-324, 5e-324, 1.0, 1.0], [1.0, 1.0]),
@@ -107,7 +107,7 @@ def test_worlds_stay_whole_if_that_is_about_as_fast() -> None:
     assert plan.imbalance == 1.0
 
 
-def test_a_world_is_split_where_it_is_more_than_a_workers_share() -> None:
+def test_a_world_above_the_share_of_a_worker_is_split() -> None:
     costs = [4.0] * 4 + [1.0] * 8
     plan = make_plan(Problem(row(costs, worlds=3), grid(2, 2), idle_snapshot(2)))
     assert plan.imbalance <= 1.1
@@ -121,7 +121,7 @@ def test_neighbours_stay_together() -> None:
     zones = grid(4, 4)
     plan = make_plan(Problem(row([1.0] * 16), zones, idle_snapshot(4)))
     assert plan.imbalance == 1.0
-    assert plan.placement.cut_pairs <= 12  # four rows; single shards by turns would cut 24
+    assert plan.placement.cut_pairs <= 12  # four rows; single shards in turn would cut 24
 
 
 @settings(deadline=None)

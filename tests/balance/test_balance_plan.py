@@ -1,4 +1,4 @@
-"""A plan can be read, kept, and made again from what is kept."""
+"""Plans: their text, their file, and recomputing them from the file."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def test_a_plan_goes_to_json_and_back(plan: Plan) -> None:
 @given(
     st.lists(COSTS, min_size=4, max_size=9), st.lists(st.floats(0.0, 0.85), min_size=1, max_size=4)
 )
-def test_a_plan_is_made_again_from_its_snapshot(costs: list[float], cpus: list[float]) -> None:
+def test_a_plan_is_recomputed_from_its_snapshot(costs: list[float], cpus: list[float]) -> None:
     plan = make_plan(Problem(row(costs), grid(1, len(costs)), busy(*cpus)))
     kept = plan_from_dict(json.loads(json.dumps(plan.to_dict())))
     assert replan(kept, kept.problem.snapshot) == plan

@@ -1,4 +1,4 @@
-"""The plan of a run: what is measured goes in, a bounded round comes out."""
+"""The plan of a run: from measured costs to a bounded number of moves per round."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_new_measurement_counts_in_part(balancer: Balancer) -> None:
     assert {shard.cost_s for shard in balancer.costs} == {1.3}
 
 
-def test_a_round_may_go_by_other_costs_and_another_rule(balancer: Balancer) -> None:
+def test_a_round_can_use_given_costs_and_another_rule(balancer: Balancer) -> None:
     strict = BalanceRule(tolerance=0.0, move_s=0.0, max_moves=1)
     costs = tuple(ShardCost(*shard[:2], 1.0 + shard.zone) for shard in balancer.costs)
     plan = balancer.round(idle_snapshot(2), costs=costs, rule=strict)
@@ -58,7 +58,7 @@ def test_shards_of_a_lost_worker_are_placed_in_the_next_round(balancer: Balancer
 
 
 @pytest.mark.parametrize("costs", [[1.0] * 15, [1.0] * 20])
-def test_other_shards_than_those_of_the_plan_are_refused(
+def test_shards_that_are_not_in_the_plan_are_refused(
     balancer: Balancer, costs: list[float]
 ) -> None:
     shards = tuple(ShardCost(n // 4, n % 4, cost) for n, cost in enumerate(costs))

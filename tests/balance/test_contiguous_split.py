@@ -1,4 +1,4 @@
-"""Worlds in a row: pieces of it, whose ends slide."""
+"""Contiguous splits: each worker has consecutive worlds, and boundaries between workers move."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def worlds(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule = EAGER
 
 
 def best_row_s(problem: Problem) -> float:
-    """The least makespan of all ways to cut the row."""
+    """Return the least makespan of all ways to cut the row."""
     costs = [shard.cost_s for shard in problem.shards]
     speeds = [1.0 - 0.6 * one.use.cpu for one in problem.snapshot.workers]
     cuts = combinations(range(1, len(costs)), len(speeds) - 1)
@@ -54,7 +54,7 @@ def problems(draw: st.DrawFn) -> Problem:
 
 
 @given(problems())
-def test_the_first_plan_is_a_row_about_as_long_as_it_should_be(problem: Problem) -> None:
+def test_the_first_plan_is_contiguous_and_nearly_optimal(problem: Problem) -> None:
     plan = make_plan(problem)
     check_row(plan, len(problem.snapshot.workers))
     slowest = min(plan.placement.workers.speeds)

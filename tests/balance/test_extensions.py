@@ -15,7 +15,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 @pytest.fixture(scope="module")
 def town() -> tuple[object, np.ndarray]:
-    """Roads, and places of vehicles of which most are in one corner."""
+    """Return roads, and positions of vehicles, most of them in one corner."""
     network = load_network(find_map("grid4x4"))
     min_x, min_y, max_x, max_y = network.extent_m
     draw = np.random.default_rng(5)

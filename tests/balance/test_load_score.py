@@ -1,4 +1,4 @@
-"""LoadScore and whom it chooses: the paper's figures, the thresholds to the last bit."""
+"""LoadScore and the worker that it selects: the paper's figures, and exact thresholds."""
 
 from __future__ import annotations
 
@@ -134,7 +134,7 @@ def test_shards_that_are_counted_do_not_all_go_to_one_worker() -> None:
         (4, 0, "preferred unavailable"),
     ],
 )
-def test_a_preferred_worker_is_kept_while_it_is_about_as_good(
+def test_a_preferred_worker_is_kept_within_the_margin(
     preferred: int | None, worker: int, outcome: str
 ) -> None:
     workers = fleet((0.1, 0.1, 0.1), (0.15, 0.1, 0.1), (0.3, 0.1, 0.1), (0.9, 0.1, 0.1))
@@ -189,7 +189,7 @@ def test_only_shares_are_utilisations(resource: str, value: float) -> None:
         Utilisation(**shares)
 
 
-def test_percent_is_refused_with_the_share_that_it_would_be() -> None:
+def test_the_error_for_a_percentage_names_the_share() -> None:
     with pytest.raises(ConfigError, match=r"percentage, use 0\.55"):
         Utilisation(55.0, 0.0)
 

@@ -1,4 +1,4 @@
-"""What is in use: of this machine, and on record."""
+"""Load snapshots: measured on this machine, and read from a file."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The balancer needs the standard library and NumPy; two files need more, and say so."""
+"""The balancer imports the standard library and NumPy; two listed files import more."""
 
 from __future__ import annotations
 

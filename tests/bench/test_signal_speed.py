@@ -1,4 +1,4 @@
-"""The comparison of signal control with sumo-rl: what it measures, and what it refuses."""
+"""The comparison of signal control with sumo-rl: measured figures and refused arguments."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def config_in(folder: Path) -> Path:
 def test_rates_are_decisions_of_all_worlds_per_second(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Beside a program that says half a second for each turn."""
+    """The program for comparison reports half a second for each turn."""
     program = tmp_path / "python"
     program.write_text(SIDE)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)

@@ -1,4 +1,4 @@
-"""The comparison with highway-env, small: both sides run, on the same road."""
+"""The comparison with highway-env at a small size: both sides run on the same road."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_both_sides_drive_as_many_vehicles_by_the_same_clock_and_look_alike(tmp_
 
 
 class Clocked:
-    """A world of either side: a reset takes 100 s, a step 0.5 s, for 2 worlds of 3 agents."""
+    """Worlds with a fake clock: a reset takes 100 s, a step 0.5 s, for 2 worlds of 3 agents."""
 
     num_envs, num_agents = 2, 3
 

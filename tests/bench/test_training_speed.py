@@ -1,4 +1,4 @@
-"""PPO from end to end beside stable-baselines3's, and what its report says."""
+"""The comparison of PPO with that of stable-baselines3, and its report."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.bench.training_speed import TrainingRow, TrainingSpeed, measure_tra
 from cavmarl.core.errors import ConfigError, MissingExtraError
 from tests.cli.test_main import run
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+pytestmark = pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 
 
 def test_both_sides_learn_from_the_same_numbers(
@@ -63,7 +63,7 @@ def test_invalid_numbers_are_refused(wrong: dict[str, int], said: str) -> None:
         measure_training(**wrong)
 
 
-def test_what_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "highway_env", None)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[bench\]"):
         measure_training()

@@ -1,4 +1,4 @@
-"""Traces of loads and what placements make of them: figures that follow from what was put in."""
+"""Replays of load traces with known results."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def network() -> RoadNetwork:
 def still(
     network: RoadNetwork, counts: list[int], snapshot: LoadSnapshot, rounds: int = 8
 ) -> LoadTrace:
-    """As many vehicles in each zone of a grid, always, 1 µs each."""
+    """Return a trace with equal numbers of vehicles in all zones of a grid, at 1 µs per vehicle."""
     partition = cut_map(network, "grid", len(counts))
     middles = 0.5 * (partition.rects[:, :2] + partition.rects[:, 2:])
     places = np.repeat(middles, counts, axis=0)

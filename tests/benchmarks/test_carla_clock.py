@@ -1,4 +1,4 @@
-"""Table II with SUMO's traffic, cavmarl in place of CARLA, and two of CARLA's own clients."""
+"""Table II with SUMO's traffic, cavmarl in place of CARLA, and two official CARLA clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
     if other_ticks == "obey":
         assert row.delta_s == pytest.approx(4.6)
         assert row.ratio == 1.92
-        assert found.drift_events == 91  # the last own tick comes after the last step
+        assert found.drift_events == 91  # no step follows the last own tick
         assert found.noticed_ticks == 1
     else:
         assert (row.delta_s, row.ratio) == (0.0, 1.0)

@@ -1,4 +1,4 @@
-"""Where ways give way to each other in a circle."""
+"""Junctions whose movements yield to each other in a circle."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ NODES = """<nodes><node id="C" x="0" y="0" type="{kind}"/>
 
 
 def crossroads(folder: Path, kind: str = "priority", **priorities: int) -> Path:
-    """Four arms, each with a priority of its own."""
+    """Write a crossing whose four arms have different priorities."""
     roads = "".join(
         f'<edge id="{arm}C" from="{arm}" to="C" priority="{priority}"/>'
         f'<edge id="C{arm}" from="C" to="{arm}" priority="{priority}"/>'
@@ -34,8 +34,8 @@ def test_of_four_priorities_three_ways_stop_one_another(tmp_path: Path) -> None:
     found = circular_priority(network)
     ways = network.links[["from_lane", "to_lane"]][found].tolist()
     names = {tuple(network.lane_ids[lane][:2] for lane in way) for way in ways}
-    # From the south straight on gives way to that from the east, this to the left turn from the
-    # north, and this to the south.
+    # Straight on from the south yields to straight on from the east, which yields to the left turn
+    # from the north, which yields to the south.
     assert {("SC", "CN"), ("EC", "CW"), ("NC", "CE")} <= names
     assert not any(way[0] == "WC" for way in names), "the first road gives way to no other"
     assert map_features(network) == ("circular_priority",)

@@ -1,4 +1,4 @@
-"""Table II: a follower in another process, and one that ticks by itself."""
+"""Table II: a follower in another process, and a follower that ticks the world itself."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_rogue_follower(answer: OwnTicks, tmp_path: Path) -> None:
 def test_a_clock_of_its_own_is_compared_with_the_masters() -> None:
     rows = rows_of([0, 1, 2, 3], [7, 8, 9, 10], 0.5, [0.0, 0.4, 1.2, 1.75])
     assert [row.own_delta_s for row in rows] == [0.25]
-    found = measure_drift("ring", steps=20, pace=1e6)  # which no machine keeps
+    found = measure_drift("ring", steps=20, pace=1e6)  # faster than any machine
     (row,) = found.rows
     assert (row.delta_s, found.holds) == (0.0, True)
     assert row.own_delta_s is not None

@@ -1,4 +1,4 @@
-"""Worlds over workers, and programs that share nothing: how fast they are side by side."""
+"""The speed of workers compared with that of independent programs on the same cores."""
 
 from __future__ import annotations
 

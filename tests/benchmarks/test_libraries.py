@@ -1,4 +1,4 @@
-"""What the views of libraries cost: each that is installed is measured on the same world."""
+"""The cost of the adapters: each installed library is measured on the same world."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def test_every_view_is_measured_or_says_how_to_install_it() -> None:
 
 
 def test_all_views_step_the_same_world() -> None:
-    """The seeds and the actions are the same, so the rewards have to be."""
+    """Seeds and actions are equal, so the rewards must be equal."""
     settings = {
         "agents": 3,
         "background": 0,

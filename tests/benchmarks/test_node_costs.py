@@ -1,4 +1,4 @@
-"""The model of what nodes cost finds the parameters that made its samples."""
+"""The cost model of nodes recovers the parameters that generated its samples."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_negative_estimates_become_none() -> None:
 
 
 def test_latency_counts_once_for_each_hop() -> None:
-    """A step of two ticks: a command, a share of each tick and one of agents, a report."""
+    """The hops of a step of two ticks: command, one exchange per tick, one of agents, report."""
     for vehicles, offers in ((100, 0.0), (10**10, 1.0)):
         near, far = (KNOWN.tick(vehicles, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
         assert far - near == pytest.approx(1e-3 * (5.0 + offers) / 2.0, rel=0.05)

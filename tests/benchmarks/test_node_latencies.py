@@ -1,4 +1,4 @@
-"""What nodes cost beside the kernels: an empty tick, a killed node, and what the machine allows."""
+"""Costs of nodes besides the kernels: an empty tick, a killed node, the limit of the machine."""
 
 from __future__ import annotations
 

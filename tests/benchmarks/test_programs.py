@@ -1,4 +1,4 @@
-"""Benchmarks as programs: the list, the options, the table, the JSON, and what is refused."""
+"""Benchmark programs: the list, the options, the table, the JSON, and refused arguments."""
 
 from __future__ import annotations
 
@@ -133,7 +133,7 @@ def test_a_ratio_by_pairs_has_an_interval() -> None:
     draws = random.Random(0)
     within = 0
     for _ in range(200):
-        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]  # what falls on both sides
+        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]  # effects on both sides
         ones = [1.3 * x * math.exp(draws.gauss(0.0, 0.2)) for x in others]
         ratio, interval = paired_interval(ones, others)
         within += abs(ratio - 1.3) < interval

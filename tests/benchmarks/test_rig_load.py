@@ -1,4 +1,4 @@
-"""A rig is made as heavy as is asked for, and can be read again."""
+"""A rig with a requested load is written, and can be read again."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ LIDAR = {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6}
 def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """What does not fit into a cache takes 2.4 times as long: no load is between 10 and 24 ms."""
+    """Beyond the cache, sensors take 2.4 times as long, so no load lies between 10 and 24 ms."""
 
     def costs_ms(rig: Mapping[str, Any]) -> float:
         rays = rig["lidar"]["rays"]
@@ -41,8 +41,8 @@ def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
     loaded = rig_load.loaded(job, 20.0, said.append)
     assert 24.0 <= costs_ms(loaded.spec.overrides["rig"]) <= 30.0
     tries = [float(text.split()[-2]) for text in said[2:]]
-    assert min(tries) < 20.0, "one was too light,"
-    assert max(tries) > 30.0, "another too heavy"
+    assert min(tries) < 20.0, "one try was too light,"
+    assert max(tries) > 30.0, "another try was too heavy"
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])

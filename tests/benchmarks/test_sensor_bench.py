@@ -1,4 +1,4 @@
-"""The benchmark of sensor workers: every run anew, all of them the same, parts that sum up."""
+"""The benchmark of sensor workers: new processes per run, equal results, and parts of a step."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> No
 
 
 def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
-    # How much of it they are, the command tells: here that would be a race against other programs.
+    # Their share is not tested here, because other programs disturb the measurement.
     for row in found.rows:
         parts = found.parts_ms(row.workers)
         assert tuple(parts) == PARTS
@@ -61,7 +61,7 @@ def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
 
 
 def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> None:
-    """Its own step and waiting for it, in both ways to couple it; elsewhere there is none."""
+    """SUMO's step and the wait for it are listed for both kinds of coupling, and only there."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     assert found.parts_ms(1)["SUMO"] == 0.0
     for source in MODES:
@@ -85,7 +85,7 @@ def test_resources_are_those_of_all_processes(found: SensorBench) -> None:
         (window,) = found.windows(number)
         assert window.steps == 6
         assert len(window.worker_cpu_s) == len(window.worker_rss_mb) == number
-        assert window.messages == 2 * number * ticks  # to and fro
+        assert window.messages == 2 * number * ticks  # both directions
         assert window.got_bytes > 6 * 32 * 18 * 3
 
 

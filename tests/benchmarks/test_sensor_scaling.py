@@ -1,4 +1,4 @@
-"""Every derived figure of a scaling table, against a printed one and against its definition."""
+"""Derived figures of a scaling table, compared with a published table and their definitions."""
 
 from __future__ import annotations
 
@@ -92,7 +92,7 @@ def test_spread_within_runs_and_between_them(drawn: list[list[float]]) -> None:
     variances = [statistics.variance(run) for run in drawn]
     assert row.step_ms == pytest.approx(statistics.fmean(means))
     assert row.wait_ms == pytest.approx(0.5 * row.step_ms)
-    rounding = 1e-12 * row.step_ms  # of equal times
+    rounding = 1e-12 * row.step_ms  # error of the mean of equal times
     assert row.sd_within_run == pytest.approx(statistics.fmean(variances) ** 0.5, abs=rounding)
     if len(drawn) < MIN_RUNS:
         assert row.ci95_between_runs is None

@@ -1,4 +1,4 @@
-"""What dividing costs: whose time is whose, and what is not compared. No figure is a time's."""
+"""The cost of dividing a world: parts of a tick, and refused comparisons. No test checks a time."""
 
 from __future__ import annotations
 

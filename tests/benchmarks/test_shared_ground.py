@@ -1,4 +1,4 @@
-"""Which maps draw roads over one another, or lanes on which nobody can change."""
+"""Maps that draw roads over each other, or have lanes too short for a lane change."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def test_a_plain_grid_falls_under_no_rule(tmp_path: Path) -> None:
 def test_both_directions_on_one_lane_share_their_ground(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader would move such lanes apart, so it does not look for them here."""
+    """The reader of networks moves such lanes apart, so the map is built without that repair."""
     monkeypatch.setattr(reader, "find_strips", lambda *_: [])
     spread = "--default.spreadtype=center"
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *GRID, spread))
@@ -39,7 +39,7 @@ def test_both_directions_on_one_lane_share_their_ground(
 def test_two_junctions_share_the_ground_of_the_ways_over_them(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
-    """Two bends, back to back: the one leads from west to south, the other from east to north."""
+    """Two bends lie back to back: from west to south, and from east to north."""
     far = 60.0 + apart_m
     nodes = {"b": (apart_m, apart_m), "e": (far, apart_m), "n": (apart_m, far)}
     network = bend_beside(tmp_path, nodes, ("eb", "be", "bn", "nb"))
@@ -53,7 +53,7 @@ def test_two_junctions_share_the_ground_of_the_ways_over_them(
 def test_a_road_over_a_junction_elsewhere_shares_its_ground(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
-    """It leads past the outer side of a bend."""
+    """The road passes the outer side of a bend."""
     nodes = {"b": (20.0 + apart_m, -20.0 + apart_m), "e": (-20.0 + apart_m, 20.0 + apart_m)}
     network = bend_beside(tmp_path, nodes, ("be",))
     inside = network.lanes["internal"]
@@ -66,7 +66,7 @@ def test_a_road_over_a_junction_elsewhere_shares_its_ground(
 def bend_beside(
     tmp_path: Path, nodes: dict[str, tuple[float, float]], others: tuple[str, ...]
 ) -> RoadNetwork:
-    """A bend from west to south around the origin, and other roads, each from a node to another."""
+    """Build a bend from west to south around the origin, and other roads between nodes."""
     nodes = {"a": (0.0, 0.0), "w": (-60.0, 0.0), "s": (0.0, -60.0), **nodes}
     roads = ("wa", "aw", "as", "sa", *others)
     points = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in nodes.items())

@@ -1,4 +1,4 @@
-"""What worker processes cost in which nothing happens, ours and others'."""
+"""The cost of idle worker processes, in cavmarl and in other libraries."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.vectorization import LIBRARIES, measure
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+pytestmark = pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 
 
 def test_each_library_steps_the_same_agents() -> None:

@@ -1,4 +1,4 @@
-"""Worlds drawn by chance: a function of their seed, and their features are in the files."""
+"""Randomly drawn worlds are functions of their seeds, and their files have the drawn features."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def draw_all(without: tuple[str, ...] = ()) -> list[WorldDraw]:
 
 
 def first_with(*features: str) -> WorldDraw:
-    """The first world that has all of them."""
+    """Return the first world that has all features."""
     return next(draw for draw in draw_all() if set(features) <= set(draw.features))
 
 

@@ -1,4 +1,4 @@
-"""Many worlds: rows, what they come to, and runs that go on where they ended."""
+"""Runs of many worlds: rows, their summary, and runs that continue after an interruption."""
 
 from __future__ import annotations
 
@@ -135,7 +135,7 @@ def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(tmp_p
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Worlds are not run: a folder and a row each; the seeds that were asked for."""
+    """Replace runs by a folder and a row per world; return the requested seeds."""
     ran: list[int] = []
 
     def run_world(job: WorldSeries, seed: int) -> Row:

@@ -1,4 +1,4 @@
-"""The yardstick: its counts, its bound, and when a vehicle stands without a cause."""
+"""The benchmark `yardstick`: its counts, its bound, and vehicles that stand without a cause."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
 def test_contacts_on_shared_ground_are_counted_separately(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader would move such lanes apart, so it does not look for them here."""
+    """The reader of networks moves such lanes apart, so the map is built without that repair."""
     monkeypatch.setattr(reader, "find_strips", lambda *_: [])
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default.spreadtype=center")
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *options))
@@ -63,13 +63,13 @@ def test_contacts_on_shared_ground_are_counted_separately(
     rows["id"], rows["lane"], rows["x"] = [0, 1, 2], [one, other, one], [0.0, 4.0, 50.0]
     assert ground.holds(rows[0], rows, 0.1)
     assert ground.holds(rows[1], rows, 0.1)
-    rows["x"] = [0.0, 50.0, 4.0]  # one behind the other on one lane
+    rows["x"] = [0.0, 50.0, 4.0]  # two vehicles on one lane, one behind the other
     assert not ground.holds(rows[0], rows, 0.1)
-    rows["x"], rows["z"] = [0.0, 2.0, 4.0], [0.0, 5.0, 0.0]  # one on a bridge
+    rows["x"], rows["z"] = [0.0, 2.0, 4.0], [0.0, 5.0, 0.0]  # a vehicle on a bridge
     assert not ground.holds(rows[0], rows, 0.1)
-    rows["x"] = [0.0, 50.0, 50.0]  # one that has departed meanwhile
+    rows["x"] = [0.0, 50.0, 50.0]  # a vehicle that has departed in the meantime
     assert ground.holds(rows[0], rows, 0.1)
-    # The one behind it has the nearer centre, and the one that comes touches it.
+    # The vehicle behind has the nearer centre, and the approaching vehicle touches it.
     rows["z"], rows["length"], rows["width"] = 0.0, 5.0, 2.0
     rows["x"], rows["speed"] = [0.0, 8.0, -6.0], [15.0, 15.0, 0.0]
     rows["heading"][1] = np.pi
@@ -106,7 +106,7 @@ def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
     assert watch.has_cause(rows, 0, green)
 
 
-def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
+def test_priority_and_a_full_road_are_causes_to_stand() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("town", agents=2, background=0), 1))
     vec.reset(seed=1)
     network, watch = vec.network, yardstick.StandingVehicles(vec)
@@ -129,7 +129,7 @@ def test_one_that_comes_first_and_a_full_road_are_causes_to_stand() -> None:
     assert not waits(behind, yardstick.NEAR_AHEAD_M + 1.0)
 
 
-def test_one_inside_a_junction_waits_for_room_behind_it_and_for_no_signal() -> None:
+def test_a_vehicle_inside_a_junction_waits_for_room_and_not_for_a_signal() -> None:
     vec = CavVectorEnv(LocalWorlds(load_world("grid4x4", agents=2, background=0), 1))
     vec.reset(seed=1)
     network, rows = vec.network, vec.simulation.vehicles(0)

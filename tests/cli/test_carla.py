@@ -32,7 +32,7 @@ def test_it_listens_until_it_is_interrupted() -> None:
                 process.send_signal(signal.SIGINT)
                 assert process.wait(30.0) == 130
         finally:
-            process.kill()  # after a failure, the process must not be waited for
+            process.kill()  # after a failure, do not wait for the process
 
 
 @pytest.mark.parametrize(

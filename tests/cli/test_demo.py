@@ -1,4 +1,4 @@
-"""`cavmarl demo`: what it refuses, what it makes, what its page says."""
+"""`cavmarl demo`: refused arguments, its files, and its page."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.config.registry import find_settings
 ROOT = Path(__file__).resolve().parents[2]
 TRAINED = ROOT / "agents" / "merge_careful_ippo"
 RUN = subprocess.run
-# Packages of other extras, which the demo does without.
+# Packages of other extras, which the demo does not need.
 APART = (
     "libsumo",
     "sumo",
@@ -33,7 +33,7 @@ ROW = "{updates},{decisions},1000,0.9{updates},0.0{updates}\n"
 
 
 def run(*words: str) -> int:
-    """The exit code of a command."""
+    """Return the exit code of a command."""
     with pytest.raises(SystemExit) as ended:
         main(words)
     return int(ended.value.code or 0)
@@ -54,7 +54,7 @@ def trains_at_once(command: list[str], **options: Any) -> subprocess.CompletedPr
 
 @pytest.fixture(scope="module")
 def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], str]:
-    """The folder, the JSON file and the output of a demo with one episode per driver."""
+    """Return the folder, the JSON file and the output of a demo with one episode per driver."""
     pytest.importorskip("matplotlib")
     pytest.importorskip("pygame")
     folder = tmp_path_factory.mktemp("demo")
@@ -70,7 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
 
 
 class Printed:
-    """Keeps what a console is told to print."""
+    """A console that stores its output."""
 
     def __init__(self) -> None:
         self.text = ""

@@ -1,4 +1,4 @@
-"""What a newcomer sees: lists with sentences, folders of recordings, figures that need care."""
+"""Output for new users: lists with descriptions, folders of recordings, figures with notes."""
 
 from __future__ import annotations
 

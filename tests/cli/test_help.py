@@ -1,4 +1,4 @@
-"""The help of each command: groups, values, examples that can be copied."""
+"""The help of each command: groups, value names, and examples that work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cavmarl journal`: what a run's log tells, and how a damaged one is refused."""
+"""`cavmarl journal`: the contents of a log, and the refusal of a damaged log."""
 
 from __future__ import annotations
 
@@ -69,4 +69,4 @@ def test_damage_and_unknown_ticks_are_one_line(
     said = refusal(capsys, "journal", str(written))
     assert f"error: {written}: line 3 of the log has number 3, so lines are missing" in said
     said = refusal(capsys, "journal", str(written.parent / "none.journal"))
-    assert "none.journal" in "".join(said.replace("│", "").split()), "in a box, broken anywhere"
+    assert "none.journal" in "".join(said.replace("│", "").split()), "wrapped in a box"

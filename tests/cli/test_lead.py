@@ -1,4 +1,4 @@
-"""`cavmarl lead` goes on, whatever a follower says or does not say."""
+"""`cavmarl lead` continues, whatever a follower sends."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def babbling(address: str) -> None:
 
 
 def shouting(address: str) -> None:
-    """Joins, and then sends what is no frame."""
+    """Join, and then send bytes that are not a frame."""
     with Follower(address, ["car_0"]) as follower:
         os.write(follower.__dict__["_line"].fileno(), b"\x00" * 64)
         time.sleep(1.0)
@@ -67,7 +67,7 @@ def led(address: Path, fault: Callable[[str], None], *words: str) -> int:
         while True:
             try:
                 return fault(str(address))
-            except Exception as error:  # it was told why, or came before the world
+            except Exception as error:  # it got the reason, or called before the world listened
                 if "does not answer (" not in str(error):
                     return None
             time.sleep(0.01)

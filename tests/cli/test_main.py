@@ -1,4 +1,4 @@
-"""The command line: what it shows, what it writes, how it refuses."""
+"""The command line: its output, its files, and its errors."""
 
 from __future__ import annotations
 
@@ -40,14 +40,14 @@ QUICK = (
 
 
 def run(*words: str) -> int:
-    """The exit code of a command."""
+    """Return the exit code of a command."""
     with pytest.raises(SystemExit) as ended:
         main(words)
     return int(ended.value.code or 0)
 
 
 def refusal(capsys: pytest.CaptureFixture[str], *words: str) -> str:
-    """What a refused command says: exit code 2, and nothing of Python's own."""
+    """Return the message of a refused command, which exits with 2 and prints no traceback."""
     assert run(*words) == 2
     said = capsys.readouterr().err
     assert "Traceback" not in said
@@ -403,7 +403,7 @@ def test_train_lists_its_programs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_train_runs_a_program_with_its_own_options(
     config: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """Away from the checkout, and whatever lies under its name in the working directory."""
+    """The program is found outside of the checkout, whatever the working directory contains."""
     ran: list[str] = []
     monkeypatch.setattr("os.execv", lambda _, words: ran.extend(words))
     (tmp_path / "train").mkdir()

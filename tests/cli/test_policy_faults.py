@@ -1,4 +1,4 @@
-"""Exceptions in the code of users: each comes with its own place, and without frames of ours."""
+"""Exceptions in the code of users are shown with the user's lines, without frames of cavmarl."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.verify import lockstep
 from tests.cli.test_main import QUICK, refusal, run
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
 def policy_that(folder: Path, body: str) -> Path:
-    """A policy whose `act_batch`, in line 5, does something."""
+    """Write a policy whose `act_batch` has this statement in line 5."""
     script = folder / "mine.py"
     script.write_text(
         "from cavmarl import Policy\n\n"

@@ -1,4 +1,4 @@
-"""`cavmarl scenario`, as it is typed."""
+"""The command `cavmarl scenario`."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_a_run_prints_its_outcome(tmp_path: Path, capsys: pytest.CaptureFixture[
 def test_a_run_in_which_actors_touch_one_another_has_failed(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    # A second at 4.9 m/s between the centres of cars of 5 m.
+    # Cars of 5 m follow each other at 4.9 m/s and 1 s between their centres, so they overlap.
     words = ["unprotected_left_turn", "--param=oncoming_mps=4.9", "--param=gap_s=1"]
     words += ["--param=cars=2"]
     assert code("scenario", "run", *words, "--json", str(tmp_path / "run.json")) == 1

@@ -1,4 +1,4 @@
-"""`--sensors-of`, and worlds that get the sensors of their drivers without being asked."""
+"""`--sensors-of`, and worlds that get the sensors of their drivers without that option."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.cli.test_main import QUICK, refusal, run
 
 pytest.importorskip("torch")
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
 def test_a_trained_driver_drives_a_real_map_without_a_setting(

@@ -1,4 +1,4 @@
-"""Cures that errors name: each command and option of ours is there."""
+"""Each command and option of cavmarl that an error message suggests exists."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ import cavmarl
 from cavmarl.cli import app
 
 PACKAGE = Path(cavmarl.__file__).parent
-# Of other programs: netconvert, Ray, gdal_calc.py.
+# Options of other programs: netconvert, Ray, gdal_calc.py.
 FOREIGN = {"--keep-edges", "--junctions", "--address", "--head", "--calc"}
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 _COMMAND = re.compile(r"`(?:python -m )?cavmarl ([a-z-]+)(?: ([a-z-]+))?([^`]*)`")
@@ -35,7 +35,7 @@ COMMANDS = dict(_commands(typer.main.get_command(app)))
 
 @pytest.fixture(scope="module")
 def errors() -> list[tuple[str, str]]:
-    """Where the package raises something, and its words; what is put into them is `{}`."""
+    """Yield place and message of each error of the package, with `{}` for inserted values."""
     return [
         (f"{path.relative_to(PACKAGE)}:{node.lineno}", _text(node.exc))
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -1,4 +1,4 @@
-"""`cavmarl verify`: its checks, what each refuses, and how a run of a campaign is done again."""
+"""`cavmarl verify`: its checks, their refused arguments, and repeating a run of a campaign."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`cavmarl verify workers`: what it prints, writes and refuses."""
+"""`cavmarl verify workers`: its output, its files and its refused arguments."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_a_successor_without_the_state_is_detected(
         return replace(processes, k, mail, ordered)
 
     monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
-    monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # states tell it alone
+    monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # only states differ
     assert run("verify", "workers", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
 

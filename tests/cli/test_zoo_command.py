@@ -12,7 +12,7 @@ from cavmarl.cli import main
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.machine import describe_hardware
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
 def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -1,4 +1,4 @@
-"""Each thing that `env.yaml` can get wrong: an error with the place, the value and the cure."""
+"""Each kind of mistake in `env.yaml` is an error with the place, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def load(folder: Path, text: str | bytes) -> EnvConfig:
 
 
 def refusal(folder: Path, text: str | bytes) -> str:
-    """The message that the file is refused with; it begins with the file's path."""
+    """Return the message with which the file is refused; it begins with the file's path."""
     with pytest.raises(ConfigError) as caught:
         load(folder, text)
     message = str(caught.value)
@@ -53,7 +53,7 @@ terms: {weights: {progress: 1}, team_share: 1}
     assert config.terms.weights == {"progress": 1.0}
 
 
-def test_a_file_that_is_read_again_is_read_as_it_stands(tmp_path: Path) -> None:
+def test_reading_again_gives_the_present_file(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text("a: [1, 2]")
     first = read_yaml(path)

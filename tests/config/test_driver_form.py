@@ -1,4 +1,4 @@
-"""The form of a trained driver: which keys it has, and what contradicts it."""
+"""The form of a trained driver (its sensors and actions): its keys, and contradictions to it."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ def test_a_broken_file_is_named(tmp_path: Path, text: str | None) -> None:
         read_form(tmp_path)
 
 
-def test_a_driver_is_named_as_short_as_it_is_found(tmp_path: Path) -> None:
+def test_messages_use_the_shortest_name_of_a_driver(tmp_path: Path) -> None:
     copy = Path(shutil.copytree(TRAINED["merge_ippo"], tmp_path / "merge_ippo"))
     for path, name in ((TRAINED["merge_ippo"], "merge_ippo"), (copy, str(copy))):
         assert name_of_driver(path) == name

@@ -33,7 +33,7 @@ WEIGHTS = {"progress": 0.1, "plugged": -0.5}
 
 @pytest.fixture(autouse=True)
 def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """A working directory with the module `my_plugin`; afterwards, nothing stays imported."""
+    """Change to a folder with the module `my_plugin`; unload it after the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "my_plugin.py").write_text(PLUGIN, encoding="utf-8")

@@ -1,4 +1,4 @@
-"""The finder: names, paths and map files; what shadows what; where maps lie."""
+"""Finding environments by name, path or map file: precedence, and the folders of maps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ ENVS = Path(__file__).resolve().parents[2] / "envs"
 
 @pytest.fixture
 def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
-    """An empty working directory."""
+    """Change to an empty folder."""
     monkeypatch.chdir(tmp_path)
     return tmp_path
 

@@ -1,4 +1,4 @@
-"""Drafts: gone with the block, and with the next draft where their process was killed."""
+"""Drafts are removed at the end of the block; the next draft removes those of killed processes."""
 
 from __future__ import annotations
 

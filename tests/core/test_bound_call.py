@@ -1,4 +1,4 @@
-"""Bound calls and sequences of them give what the same calls give from Python."""
+"""Bound calls, and sequences of them, have the results of the same calls from Python."""
 
 from __future__ import annotations
 

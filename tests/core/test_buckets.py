@@ -10,20 +10,20 @@ from tests.naive import buckets as naive
 
 @kernel
 def add_one(lists: Lists, k: int) -> None:
-    """`add` is only compiled into its callers."""
+    """Call `add`, which exists only inside compiled callers."""
     add(lists, k)
 
 
 @st.composite
 def crowds(draw: st.DrawFn) -> tuple[int, list[list[int]]]:
-    """How many lists, and what is put into them, several times."""
+    """Draw the number of lists, and several rounds of items for them."""
     number = draw(st.integers(1, 200))
     keys = st.lists(st.integers(0, number - 1), max_size=30)
     return number, draw(st.lists(keys, min_size=1, max_size=4))
 
 
 @given(crowds())
-def test_lists_equal_twin_whatever_was_in_them_before(case: tuple[int, list[list[int]]]) -> None:
+def test_lists_equal_twin_after_any_earlier_content(case: tuple[int, list[list[int]]]) -> None:
     number, crowd = case
     lists = make_lists(number)
     for keys in crowd:
@@ -33,15 +33,15 @@ def test_lists_equal_twin_whatever_was_in_them_before(case: tuple[int, list[list
         assert lay_out(lists) == len(keys)
         for k, place in enumerate(naive.laid_out(number, keys)):
             start, end = lists.bounds[k].tolist()
-            assert start == end, "they are filled from here on"
+            assert start == end, "the list is empty before it is filled"
             assert start == place.start or not place
-        # As their users do, who put the items there.
+        # Write the items at the returned places, as callers do.
         for k in keys:
             lists.bounds[k, 1] += 1
         assert (lists.bounds[:, 1] - lists.bounds[:, 0]).sum() == len(keys)
 
 
-def test_forgotten_lists_are_empty() -> None:
+def test_cleared_lists_are_empty() -> None:
     lists = make_lists(100)
     for k in (3, 3, 64, 99):
         add_one(lists, k)

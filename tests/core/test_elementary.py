@@ -1,4 +1,4 @@
-"""Elementary functions: within their error bounds, right at the edges, the same bits each way."""
+"""Elementary functions: error bounds, special values, and equal bits in Python and in kernels."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ floats = st.floats() | st.floats(-10.0, 10.0) | st.sampled_from(EDGES)
 
 @kernel
 def fill(x: Numbers, y: Numbers, out: Numbers) -> None:
-    """All functions of each of x (n,), and those of x and y, in the rows of `out` (n, 16)."""
+    """Write all functions of each x (n,), and of each pair x, y, to the rows of `out` (n, 16)."""
     for i in range(x.shape[0]):
         out[i, 0] = sine(x[i])
         out[i, 1] = cosine(x[i])
@@ -85,7 +85,7 @@ def compiled(x: Numbers, y: Numbers) -> Numbers:
 
 
 def plain(x: float, y: float) -> list[float]:
-    """Return what one row of `fill` has, by the functions in Python."""
+    """Return one row of `fill`, computed by the functions in Python."""
     of_one = [function(x) for function in FUNCTIONS.values()]
     cos, sin = cos_sin(x)
     return [*of_one, atan2(x, y), hypot(x, y), cos, sin, bits_to_float(float_to_bits(x))]

@@ -35,7 +35,7 @@ def test_wrap_angle_at_the_cut() -> None:
 def test_lane_pose_equals_twin(corners: NDArray[np.float64], share: float) -> None:
     points = points_of(corners)
     s = share * float(points["s"][-1])
-    # At a corner, rounding decides which of its two segments a place belongs to.
+    # At a corner, rounding decides to which of the two segments a place belongs.
     assume(np.min(np.abs(points["s"][1:-1] - s), initial=np.inf) > 1e-9)
     pose = geometry.lane_pose(points, 0, len(points), s)
     assert pose == pytest.approx(naive.lane_pose(corners, s), abs=1e-9)
@@ -97,7 +97,7 @@ def test_project_near_stays_on_its_branch() -> None:
 @pytest.mark.parametrize("turn", [1.0, -1.0])
 @pytest.mark.parametrize("y", [1.5, -1.5])
 def test_project_beyond_a_hairpin_is_on_its_outer_side(turn: float, y: float) -> None:
-    # The way goes east and comes back a little to the left (turn 1) or to the right of itself.
+    # The line goes east and returns a little to the left (turn 1) or to the right of itself.
     points = points_of(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, turn, 0.0]]))
     s, d, _, _ = geometry.project(points, 0, 3, 52.0, y)
     assert (s, d) == (50.0, -turn * 2.5)

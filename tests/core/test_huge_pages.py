@@ -1,4 +1,4 @@
-"""Arrays in huge pages are arrays like any others."""
+"""Arrays in huge pages behave like all other arrays."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ RECORD = np.dtype([("x", np.float64), ("on", np.bool_)], align=True)
 
 @pytest.mark.parametrize("size", [1, LEAST // 8 - 1, LEAST // 8, PAGE // 8, 3 * PAGE // 8 + 5])
 def test_huge_arrays_are_zero_and_share_no_byte(size: int) -> None:
-    """Whatever their size, what is written in one is not read in another."""
+    """A value that is written to one array does not appear in another array of any size."""
     first, second = huge_zeros(size), huge_zeros((size, 1), dtype=np.int64)
     assert first.shape == (size,)
     assert second.shape == (size, 1)
@@ -35,7 +35,7 @@ def test_records_in_huge_pages_are_aligned() -> None:
 
 
 def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
-    """Padding, too: hashes of maps read it."""
+    """Padding is copied too, because hashes of maps include it."""
     array = np.frombuffer(bytes(range(256)) * 16 * 64, dtype=RECORD)
     copy = huge_copy(array)
     assert copy.tobytes() == array.tobytes()
@@ -47,7 +47,7 @@ def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
 
 @pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="there are no huge pages")
 def test_arrays_in_huge_pages_are_not_copied() -> None:
-    """A map that is changed in one table shares the others."""
+    """A copy of a map with one changed table shares all other tables."""
     array = huge_zeros(2 * LEAST // 8)
     assert huge_copy(array) is array
     part = array[1:]
@@ -55,7 +55,7 @@ def test_arrays_in_huge_pages_are_not_copied() -> None:
 
 
 def test_memory_is_freed_with_its_arrays() -> None:
-    """Nothing but the arrays holds their pages."""
+    """Only the arrays keep their pages alive."""
     array = huge_zeros(4 * PAGE // 8)
     memory = array
     while isinstance(memory, np.ndarray):
@@ -63,13 +63,13 @@ def test_memory_is_freed_with_its_arrays() -> None:
         memory = memory.base
     gone = weakref.ref(_mapping(memory))
     del memory, array
-    huge_zeros(4 * PAGE // 8)  # the process keeps what is left of the last pages alone
+    huge_zeros(4 * PAGE // 8)  # the process keeps only the rest of the last pages
     gc.collect()
     assert gone() is None
 
 
 def test_arrays_work_without_huge_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """NumPy's own."""
+    """The arrays are then ordinary arrays of NumPy."""
     monkeypatch.delattr(mmap, "MADV_HUGEPAGE")
     assert huge_zeros(PAGE).base is None
 

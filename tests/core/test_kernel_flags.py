@@ -1,4 +1,4 @@
-"""The flags that all kernels share."""
+"""The compiler flags of all kernels."""
 
 from __future__ import annotations
 
@@ -43,12 +43,12 @@ print(kernel(last)(np.arange(3.0)))
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-def test_an_index_of_a_kernel_counts_from_the_front_unless_it_is_written_out(
+def test_only_literal_negative_indices_count_from_the_end(
     tmp_path: Path,
 ) -> None:
     script = tmp_path / "looks.py"
     script.write_text(LOOKS)
-    # Checked: unchecked, a negative index reads what lies before the array.
+    # With bounds checks: otherwise, a negative index reads memory before the array.
     checked = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "CAVMARL_CACHE_DIR": str(tmp_path)}
     checked["PYTHONPATH"] = str(Path(__file__).parents[2])
     told = subprocess.run(

@@ -1,4 +1,4 @@
-"""The library of compiled kernels in a wheel: used where it fits, else refused with a reason."""
+"""The library of compiled kernels in a wheel is used if it fits, else refused with a reason."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.linking import link
 
 compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-pytestmark = pytest.mark.integration  # the linker is a process
+pytestmark = pytest.mark.integration  # the linker runs as a process
 
 NAME = "cavmarl.core.math.bearings.rough_atan2"
 TYPES = "float64;float64"
@@ -42,7 +42,7 @@ TYPES = "float64;float64"
 
 @pytest.fixture(scope="module")
 def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A library of one kernel."""
+    """Build a library of one kernel."""
     folder = tmp_path_factory.mktemp("built")
     link([compile_call(KernelCall(NAME, json.dumps(signature_of((1.0, 2.0)))))], folder)
     return folder
@@ -55,7 +55,7 @@ def copied(built: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Let this process look again where kernels come from, and forget it afterwards."""
+    """Reset the memory of this process about the sources of kernels, before and after the test."""
     for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch
@@ -159,7 +159,7 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     again: Any = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
     assert not (tmp_path / "cache").exists(), "it came from the library"
-    damaged = Path(shutil.copytree(copied, tmp_path / "damaged"))  # the other one is in use
+    damaged = Path(shutil.copytree(copied, tmp_path / "damaged"))  # the other library is in use
     _flip(damaged / LIBRARY_FILE, 1000)
     anew.setattr(Library.__init__, "__defaults__", (damaged,))
     anew.setattr(library, "FOLDER", damaged)

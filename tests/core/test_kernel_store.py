@@ -1,4 +1,4 @@
-"""Where compiled kernels are kept: code of changed or damaged files is never used."""
+"""The cache of compiled kernels: code of changed or damaged files is never used."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
 
 
 def _digests(monkeypatch: pytest.MonkeyPatch, changed: str = "") -> dict[str, str]:
-    """The digest of each file of kernels, if one of them has another line."""
+    """Return the digest of each file of kernels after a line was added to one of them."""
     content = {**SOURCES, **({changed: SOURCES[changed] + b"\n"} if changed else {})}
     monkeypatch.setattr(sources, "kernel_sources", lambda: content)
     return {name: sources.module_digest.__wrapped__(f"cavmarl.{name}") for name in SOURCES}
 
 
 class Compiled(CompileListener):
-    """The kernels that are compiled while this is open."""
+    """A list of the kernels that are compiled within the block."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -82,10 +82,10 @@ def test_every_import_of_another_file_is_seen(name: str) -> None:
         if isinstance(node, ast.ImportFrom):
             assert node.level == 0, f"{name}: imports by the full name are those looked for"
             module = node.module or ""
-            # What is called there does not become a part of a kernel, but the compiler's own.
+            # Code that is called there is part of the compiler and not of a kernel.
             if module.startswith("cavmarl.") and not module.startswith("cavmarl.core.compiled"):
                 imported.add(module.removeprefix("cavmarl."))
-                # A module taken from its folder would be missed.
+                # An import of a module from its folder would be missed.
                 assert not {f"{module[8:]}.{alias.name}" for alias in node.names} & set(SOURCES)
         elif isinstance(node, ast.Import):
             assert not any(alias.name.startswith("cavmarl") for alias in node.names)
@@ -115,7 +115,7 @@ def test_a_damaged_file_is_compiled_again(
         assert kernel(function)(1.0, 2.0) == first
     assert names == ([] if harm is None else ["rough_atan2"])
     assert unpack(file.read_bytes()) is not None
-    assert sorted(tmp_path.rglob("*.*")) == [file], "nothing else stays behind"
+    assert sorted(tmp_path.rglob("*.*")) == [file], "no other file remains"
 
 
 def test_no_flipped_or_missing_byte_of_a_file_is_an_error() -> None:
@@ -217,7 +217,7 @@ def test_a_folder_that_cannot_be_written_is_named_once(tmp_path: Path, how: str)
     )
     assert told.stderr.count(f"{place} cannot be written") == 1
     assert "CAVMARL_CACHE_DIR" in told.stderr
-    assert not list(PACKAGE.rglob("*.kernel")), "nothing beside the sources"
+    assert not list(PACKAGE.rglob("*.kernel")), "no file is written beside the sources"
 
 
 def test_the_cache_folder_follows_the_environment_variables(

@@ -1,4 +1,4 @@
-"""Files whose bytes are read where the system keeps them."""
+"""Files that are mapped into memory."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_missing_and_empty_files_are_refused(tmp_path: Path) -> None:
 
 
 def _resident_kib(path: Path) -> int:
-    """What a file takes of this process's memory."""
+    """Return the resident memory of a mapped file in KiB."""
     lines = Path("/proc/self/smaps").read_text(encoding="ascii").splitlines()
     at = next(n for n, line in enumerate(lines) if line.endswith(str(path)))
     return next(int(line.split()[1]) for line in lines[at:] if line.startswith("Rss:"))

@@ -13,13 +13,13 @@ FOLDERS = """
     core roads maps driving zones traffic v2x rewards sensors ownership shards handoff engine
     env policies config
 """.split()
-# These do not build worlds: they compare maps with scans, and write files for other programs. The
-# last one drives CARLA, whose zones have a tolerance.
+# These files do not build worlds: they compare maps with scans, and write files for other
+# programs. The last file drives CARLA, whose zones have a tolerance.
 OTHER = ("maps/fidelity/", "maps/exports/", "handoff/simulators/carla_zone_client.py")
-# Tables of results, and drivers.
+# These files make tables of results, or are drivers.
 FILES = ("evaluate/*.py", "evaluate/scenarios/criticality.py", "../agents/*.py")
 
-# Functions of the C library or NumPy, rounded as each processor's variant does it.
+# Functions of the C library or NumPy whose rounding depends on the processor.
 UNSAFE = set(
     """
     sin cos tan asin acos atan atan2 arcsin arccos arctan arctan2 sinh cosh tanh asinh acosh atanh

@@ -1,4 +1,4 @@
-"""Bars say what is done, how fast, and how long it takes yet; where nobody sees them, nothing."""
+"""Progress bars show stage, speed and time left; without a terminal, nothing is printed."""
 
 from __future__ import annotations
 

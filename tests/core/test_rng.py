@@ -12,7 +12,7 @@ KEYS = st.integers(0, 2**64 - 1)
 NUMBERS = st.integers(0, 2**48 - 1)
 STREAMS = st.integers(0, 2**32 - 1)
 
-# SplitMix64 counts modulo 2**64: where nothing is compiled NumPy tells of it.
+# SplitMix64 computes modulo 2**64, of which NumPy warns if nothing is compiled.
 wraps_around = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 
@@ -97,7 +97,7 @@ def quick_numbers(vehicles: range, ticks: range) -> list[float]:
 
 @wraps_around
 @pytest.mark.parametrize(("vehicles", "ticks"), [(range(4000), range(1)), (range(1), range(4000))])
-def test_quick_numbers_are_spread_evenly_and_neighbours_know_nothing_of_each_other(
+def test_quick_numbers_are_uniform_and_neighbours_are_independent(
     vehicles: range, ticks: range
 ) -> None:
     numbers = np.array(quick_numbers(vehicles, ticks))
@@ -110,7 +110,7 @@ def test_quick_numbers_are_spread_evenly_and_neighbours_know_nothing_of_each_oth
 
 
 @wraps_around
-def test_quick_numbers_are_a_function_of_each_argument_and_of_nothing_else() -> None:
+def test_quick_numbers_depend_on_each_argument_and_on_nothing_else() -> None:
     asked = [(v, t) for v in range(30) for t in range(30)]
     key = np.uint64(rng.world_key(1, 2, 3))
     forward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in asked}

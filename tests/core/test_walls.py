@@ -1,4 +1,4 @@
-"""Lines of sight are cut where a plain look at every wall says so."""
+"""Lines of sight are blocked exactly if a test of every wall says so."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Worlds with followers, of this process and of others."""
+"""Worlds with followers in this process and in other processes."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def address(tmp_path: Path) -> Path:
 
 
 def steer(sight: FollowerView) -> dict[str, Any]:
-    """Some driver: a function of what it sees and of nothing else."""
+    """Return controls that depend on nothing but the view of the follower."""
     return {
         vehicle: np.tanh(sight.sensors[vehicle]["observation"].values[0, :2]).tolist()
         for vehicle in sight.snapshot.vehicles
@@ -40,7 +40,7 @@ def steer(sight: FollowerView) -> dict[str, Any]:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., threading.Thread]]:
-    """Runs followers in threads, and joins them in the end."""
+    """Run followers in threads, and join the threads after the test."""
     threads: list[threading.Thread] = []
 
     def run(action: Callable[[], None]) -> threading.Thread:
@@ -56,7 +56,7 @@ def start() -> Iterator[Callable[..., threading.Thread]]:
 
 
 def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[FollowerView]:
-    """Follow to the end; what was seen."""
+    """Follow a world to its end; return all views."""
     seen = []
     with Follower(address, vehicles, name) as follower:
         for sight in follower:
@@ -69,7 +69,7 @@ def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Follo
 def seated(
     world: FollowedWorld, vehicles: list[str], name: str = "driver", secret: str = ""
 ) -> Follower:
-    """A follower of this process, which has joined."""
+    """Return a follower of this process, which has joined."""
     found: list[Follower] = []
     caller = threading.Thread(
         target=lambda: found.append(Follower(world.address, vehicles, name, 10.0, secret))
@@ -81,7 +81,7 @@ def seated(
 
 
 def spawn(code: str, *words: Any) -> subprocess.Popen[str]:
-    """A follower in a process of its own."""
+    """Start a follower in a process of its own."""
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, words)],
         stdout=subprocess.PIPE,

@@ -1,4 +1,4 @@
-"""Pedestrians are told from vehicles by a camera."""
+"""A camera distinguishes pedestrians from vehicles."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle
 
 
 def test_a_pedestrian_and_a_van_are_distinguished() -> None:
-    """None is taken for another: a pixel's class is exact, and as wide as 0.2 m at 16 m.
+    """No object gets the class of another: pixels have exact classes and are 0.2 m wide at 16 m.
 
-    Echoes are 2 cm off, so most pixels of a group are its object's; what lies between a pedestrian
-    and the van is left out, because groups join what is nearer than 0.8 m.
+    Echoes have errors of 2 cm, so most pixels of a group belong to its object. Cases with a
+    pedestrian close to the van are left out, because objects nearer than 0.8 m form one group.
     """
     env = cavmarl.parallel_env(
         "grid4x4",
@@ -54,7 +54,7 @@ def test_a_pedestrian_and_a_van_are_distinguished() -> None:
             off = np.hypot(others["x"] - seen.x_m, others["y"] - seen.y_m)
             walker, van = off[on_foot].min(initial=99.0), off[~on_foot].min(initial=99.0)
             if seen.kind == "unknown" or (walker > 0.6) == (van > 3.0 or walker < 3.0):
-                continue  # not seen by the camera, or one beside the other
+                continue  # outside of the picture, or too close together
             if seen.kind != ("pedestrian" if walker < 0.6 else "vehicle"):
                 wrong.append(seen)
             kinds[seen.kind] = kinds.get(seen.kind, 0) + 1

@@ -1,4 +1,4 @@
-"""A world and its followers: who drives, who waits for whom, and what happens to those who fail."""
+"""A world and its followers: controls, waiting, and failures of followers."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ Start = Callable[[Callable[[], Any]], threading.Thread]
 
 
 def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
-    """The same without followers: agents in `drivers` do what `steer` says."""
+    """Run the world without followers: agents in `drivers` use the controls of `steer`."""
     env = make_env()
     observations, _ = env.reset(seed=1)
     found = []
@@ -108,7 +108,7 @@ def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, st
         start(lambda: drive(address, ["car_1"]))
         world.wait_for(2, 10.0)
         world.step()
-        assert world.seats[0].answers == 2  # of the frame that it found, and of the next one
+        assert world.seats[0].answers == 2  # for this frame and the next
     assert found == reference(8, {})
 
 
@@ -139,7 +139,7 @@ def test_controls_are_queued_for_the_next_cycle(address: Path, start: Start) -> 
             rows = env.simulation.vehicles()
             throttles.append(float(rows["throttle"][rows["agent"] == 0][0]))
         assert world.manifest()["control_latency_steps"] == 1
-    # The frame of the second step has number 2; what is computed from it acts in the third.
+    # The frame of the second step has number 2; controls computed from it act in the third step.
     assert [throttle < -1.0 for throttle in throttles] == [False, False, True, False]
 
 
@@ -160,7 +160,7 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
         began = time.monotonic()
         hashes(world, 4)
         assert time.monotonic() - began > 0.2
-        assert world.seats[0].wait_wall_s > 0.2  # the fifth answer may be on its way already
+        assert world.seats[0].wait_wall_s > 0.2  # the fifth answer may have been sent already
     assert frames == [0, 1, 2, 3, 4]
 
 

@@ -88,7 +88,7 @@ def _steer(sight: FollowerView) -> dict[str, list[float]]:
 
 
 def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any) -> Seen:
-    """What a follower of two vehicles in town has seen, and the world's hashes."""
+    """Return the views of a follower of two vehicles in town, and the world's hashes."""
     overrides = {"rig": RIG, "population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
     env = cavmarl.parallel_env(
         "grid4x4",
@@ -122,7 +122,7 @@ def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
-    """The undivided world of one process."""
+    """Return the results of the undivided world in one process."""
     threads = []
 
     def start(action: Callable[[], None]) -> threading.Thread:

@@ -19,7 +19,7 @@ from cavmarl.cosim.followers.framed_socket import Dialect, FramedSocket
 
 
 class Kind(IntEnum):
-    """Kinds of frames of the dialect of these tests."""
+    """Kinds of frames in these tests."""
 
     COMMAND = 0
     DONE = 1
@@ -78,7 +78,7 @@ def read(raw: bytes) -> tuple[Any, list[Any]]:
     return frame, found
 
 
-def test_a_frame_arrives_as_it_was_sent(ends: tuple[FramedSocket, FramedSocket]) -> None:
+def test_received_frames_equal_sent_frames(ends: tuple[FramedSocket, FramedSocket]) -> None:
     near, far = ends
     near.send(Kind.DONE, 7, {"answer": [1, None]}, ARRAYS)
     near.send(Kind.HEARTBEAT, 8)

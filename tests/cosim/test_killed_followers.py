@@ -1,4 +1,4 @@
-"""Followers in processes of their own, killed at random ticks: the world is whole and goes on."""
+"""Follower processes are killed at random ticks: the world stays intact and continues."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def test_followers_are_killed_at_random_ticks(address: Path) -> None:
             assert lost == 1
             assert world.seats == ()
             assert [world.master.world_ticks[0], world.master.drifts] == [STEPS, 0]
-            # It has driven up to the step in which it died, and in that one by its last controls.
+            # It has driven up to the step in which it died, which used its last controls.
             driven = reference(STEPS, {"car_0": None})
             assert found[: death + 1] == driven[: death + 1]
             assert found[death + 1 :] != driven[death + 1 :] or death == STEPS - 1
@@ -76,5 +76,5 @@ def test_stopped_followers_are_replaced(address: Path) -> None:
             finally:
                 first.kill()
                 other.kill()
-    # The second one has driven from its first frame on, as if nobody had died.
+    # The second follower has driven from its first frame on.
     assert found == reference(5, {"car_0": None, "car_1": None})[2:]

@@ -1,4 +1,4 @@
-"""A map made by driving."""
+"""A point-cloud map that is made by driving."""
 
 from __future__ import annotations
 

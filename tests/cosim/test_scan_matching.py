@@ -35,24 +35,24 @@ def world() -> Any:
 
 @pytest.fixture(scope="module")
 def cloud(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map's own surface, as a cloud."""
+    """Return the surface of the map as a point cloud."""
     return write_surface(world, tmp_path_factory.mktemp("cloud") / "grid.ply")
 
 
 @pytest.mark.slow
 def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
-    """The filter alone is off by the bias; with scans by no more than a scan alone may be.
+    """Without scans, the filter has the error of the bias; with scans, at most that of one scan.
 
-    By fixes of 1 m at 10 Hz and a drift of 0.1 m in √s the filter's place has a deviation of
-    √(0.1 · √0.1) m = 0.18 m about the biased one. A scan has 0.1 m east and north (lidar 2 cm, map
-    3 cm, points 0.4 m apart), so its distance is 0.1 · √(π/2) m in the mean.
+    With fixes of 1 m at 10 Hz and a drift of 0.1 m/√s, the position has a standard deviation of
+    √(0.1 · √0.1) m = 0.18 m about the biased position. A scan has 0.1 m east and north (lidar
+    2 cm, map 3 cm, points 0.4 m apart), so its mean error is 0.1 · √(π/2) m.
     """
     drive = Drive(world, cloud, seed=3)
     for _ in range(200):
         assert drive.step()
     bias_m = float(np.hypot(*np.mean(drive.fixes_m, axis=0)))
     before, after = (float(np.mean(off[100:])) for off in drive.off_m.values())
-    assert bias_m > 3.0, "more than a scan finds its place from"
+    assert bias_m > 3.0, "the shift exceeds the range of scan matching"
     assert before == pytest.approx(bias_m, abs=3.0 * 0.18)
     assert after < 0.1 * math.sqrt(0.5 * math.pi)
     matching = drive.stages["scan_matching"]

@@ -1,4 +1,4 @@
-"""Signals as a stack knows them: told, or heard over the air."""
+"""Signals as a driving stack knows them: from the world, or from received messages."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ AIR = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.inbox.signals"
 
 
 def looks(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]]:
-    """What car_0 hears and what it is told, over some steps."""
+    """Return the received signal states of car_0 and the true ones, over some steps."""
     env = cavmarl.parallel_env(
         "grid4x4", agents=2, background=0, workers=workers, overrides=AIR | more
     )
@@ -44,7 +44,7 @@ def test_received_signal_states_equal_the_signals() -> None:
     equal = 0
     for (_, before, _), (readings, told, _) in pairwise(found[1:]):
         heard = stage.read(readings, None)
-        assert ((heard == told) | (heard == before)).all()  # a message is a tick or two old
+        assert ((heard == told) | (heard == before)).all()  # a message is one or two ticks old
         equal += int((heard == told).all())
         assert ToldSignals().read({}, told) is told
         seen |= set(told[told != SIGNAL_NONE].tolist())
@@ -52,7 +52,7 @@ def test_received_signal_states_equal_the_signals() -> None:
     assert equal > 0.6 * len(found)
 
 
-def test_workers_send_what_their_vehicles_hear() -> None:
+def test_received_states_are_equal_on_workers() -> None:
     for (mine, *_), (theirs, *_) in zip(looks(), looks(workers=1), strict=True):
         assert (mine[SPAT].values == theirs[SPAT].values).all()
 
@@ -86,7 +86,7 @@ def test_without_messages_there_is_no_spat() -> None:
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
 def test_the_stack_stops_at_red_with_each(stage: str) -> None:
-    """With nothing told and nothing heard, `spat` stops and `told` drives on by right of way."""
+    """Without any state of a signal, `spat` stops, and `told` follows the right of way."""
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.stack.route_planning import LaneRoute
     from cavmarl.cosim.stack.stack_types import EgoPose, Mission

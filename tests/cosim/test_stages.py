@@ -1,4 +1,4 @@
-"""The stages of the reference stack, each alone."""
+"""Each stage of the reference stack by itself."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_gains_belong_to_the_type_of_the_vehicle() -> None:
 
 
 class TurnedMap(HdMap):
-    """A map whose lanes seem to lead the other way."""
+    """A map whose lanes have reversed directions."""
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
         found = super().near(x_m, y_m, within_m)
@@ -103,7 +103,7 @@ class TurnedMap(HdMap):
 
 
 def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]:
-    """How far from the truth the filter is, step by step, without anybody's help."""
+    """Return the error of the filter after each step, without other sensors."""
     env = cavmarl.parallel_env(
         "grid4x4", agents=2, background=0, overrides={"clock.ctrl_dt_s": TICK_S, "rig": RIG}
     )
@@ -120,7 +120,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
         view = sight.snapshot.vehicles["car_0"]
         mission = Mission(0, view.vclass, view.length_m, view.width_m)
         pose = stage.locate(sight.sensors["car_0"], mission, sight.snapshot.time_s)
-        assert pose is not None  # from the first fix on, which comes with the reset
+        assert pose is not None  # from the first fix on, which is part of the reset
         rows = env.simulation.vehicles()
         row = rows[rows["agent"] == 0][0]
         off.append(math.hypot(pose.x_m - row["x"], pose.y_m - row["y"]))
@@ -160,7 +160,7 @@ def test_a_given_pose_is_used(grid: HdMap) -> None:
 
 
 def lane_of(grid: HdMap, length_m: float) -> int:
-    """A lane of some length that ends before a signal, with a way on from its end."""
+    """Find a lane of some length that ends at a signal and has a link at its end."""
     lanes = grid.network.lanes
     for lane, row in enumerate(lanes):
         if row["internal"] or row["length_m"] < length_m or row["num_links"] == 0:
@@ -170,7 +170,7 @@ def lane_of(grid: HdMap, length_m: float) -> int:
 
 
 def goal_behind(grid: HdMap, lane: int) -> tuple[int, int]:
-    """A link from a lane, and the edge it leads to."""
+    """Return a link from a lane, and its target edge."""
     link = int(grid.network.lanes["first_link"][lane])
     return link, int(grid.network.lanes["edge"][grid.network.links["to_lane"][link]])
 
@@ -247,9 +247,9 @@ def test_vehicles_with_the_right_of_way_go_first(grid: HdMap) -> None:
 def scan_of(
     pose: EgoPose, box: tuple[float, float, float, float], rays: int
 ) -> NDArray[np.float64]:
-    """What a lidar at the vehicle's centre gets of a box (x, y, half length, half width)."""
+    """Scan a box (x, y, half length, half width) with a lidar at the vehicle's centre."""
     ranges = np.full((1, 1, rays), 60.0)
-    for k in [*range(rays // 12), *range(11 * rays // 12, rays)]:  # it is ahead
+    for k in [*range(rays // 12), *range(11 * rays // 12, rays)]:  # the box is ahead
         azimuth = pose.heading_rad + 2.0 * math.pi * k / rays
         for r in np.arange(10.0, 25.0, 0.05):
             x = pose.x_m + r * math.cos(azimuth) - box[0]

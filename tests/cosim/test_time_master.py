@@ -1,4 +1,4 @@
-"""One time master: no other caller ticks, and it changes no result."""
+"""The time master: no other caller ticks the world, and the master changes no result."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_only_the_master_steps_or_resets_its_environment() -> None:
 
 
 @pytest.mark.parametrize("own_ticks", ["refuse", "ignore"])
-def test_followers_come_and_tick_and_go_and_no_trajectory_changes(own_ticks: OwnTicks) -> None:
+def test_followers_change_no_trajectory(own_ticks: OwnTicks) -> None:
     env = make()
     master = TimeMaster(env, own_ticks=own_ticks)
     master.reset(seed=3)
@@ -144,7 +144,7 @@ def test_no_pacing_changes_the_trace(pacer: Pacer | None) -> None:
 
 
 class WallClock:
-    """A clock that goes on only where somebody sleeps or works."""
+    """A clock that advances only by sleeping and by simulated work."""
 
     def __init__(self) -> None:
         self.time_s = 100.0
@@ -164,7 +164,7 @@ def test_real_time_waits_and_measures_how_late_it_is() -> None:
         pacer.wait(0.1 * step)
         starts.append(round(wall.time_s - 100.0, 6))
         wall.pass_by(work_s)
-    # Due every 0.05 s; the second step's 0.2 s are made up for by those that follow.
+    # Steps are due every 0.05 s; the steps after the second one make up for its 0.2 s.
     assert starts == [0.0, 0.05, 0.25, 0.25, 0.25, 0.25]
     lateness = pacer.lateness
     assert (lateness.steps, lateness.late) == (6, 3)

@@ -1,4 +1,4 @@
-"""Whoever calls and says what nobody understands: a typed error, and no harm to the world."""
+"""Callers with unknown or invalid messages: a typed error, and no harm to the world."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def call(address: Path) -> socket.socket:
 
 
 def refusal(connection: socket.socket) -> str:
-    """Why the world has hung up."""
+    """Return the reason with which the world closed the connection."""
     line = FollowerConnection(connection, "the world")
     heard = line.hear(10.0)
     assert heard.kind is Say.REFUSAL
@@ -127,7 +127,7 @@ def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
         world.admit(0.0)
         late = call(address)
         late.sendall(hello_in(VERSION))
-        world.admit(0.0)  # takes the place of the first of the crowd
+        world.admit(0.0)  # takes the place of the oldest caller
         world.admit(0.0)
         assert [follower.name for follower in world.master.followers] == ["x"]
         assert "too many callers" in refusal(crowd[0])
@@ -203,7 +203,7 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
         line.close()
 
 
-@settings(deadline=None)  # the first call makes what checks payloads
+@settings(deadline=None)  # the first call creates the validators of payloads
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),

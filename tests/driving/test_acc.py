@@ -54,7 +54,7 @@ TYPES = """<additional><vType id="acc" carFollowModel="ACC" tau="1.0" sigma="0" 
 
 
 def profile() -> list[float]:
-    """The leader's speed: steady, down to 8 m/s, steady, up to 24 m/s, then a gentle wave."""
+    """Return the leader's speed: steady, down to 8 m/s, steady, up to 24 m/s, a gentle wave."""
     speeds = []
     speed = START_MPS
     for step in range(STEPS):
@@ -70,7 +70,7 @@ def profile() -> list[float]:
 
 
 def car() -> np.void:
-    """SUMO's passenger car with adaptive cruise control."""
+    """Return SUMO's passenger car with adaptive cruise control."""
     kind = np.zeros(1, VTYPE)[0]
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
@@ -101,7 +101,7 @@ def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def theirs(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """Positions and speeds (steps, vehicles, 2) in SUMO."""
+    """Return positions and speeds (steps, vehicles, 2) in SUMO."""
     sumo: Any = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     folder = tmp_path_factory.mktemp("acc")

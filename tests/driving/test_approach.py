@@ -20,7 +20,7 @@ CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20, "blocks": 60}
 
 @pytest.fixture(params=CROWDS, scope="module")
 def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Simulation:
-    """Traffic some seconds after its start, on short streets with signs."""
+    """Return traffic some seconds after its start, on short streets with signs."""
     env = request.param
     if env == "blocks":
         env = netgenerate(

@@ -39,12 +39,12 @@ TICKS = 2000
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of its node."""
+    """Return the map of a crossing with this SUMO type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
 class Queue(NamedTuple):
-    """A vehicle on each of some arms that stands at its line and yields."""
+    """Vehicles on some arms of a crossing, each standing at its line and yielding."""
 
     network: RoadNetwork
     links: list[int]

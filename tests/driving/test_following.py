@@ -30,7 +30,7 @@ SHARES = st.floats(0.0, 1.0, exclude_max=True)
 
 
 def passenger_car(model: int, sigma: float = 0.0) -> np.void:
-    """SUMO's passenger car with a model, MODEL_*."""
+    """Return SUMO's passenger car with a model, MODEL_*."""
     car = np.zeros(1, VTYPE)[0]
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
@@ -170,7 +170,7 @@ def test_a_follower_stops_behind_a_leader_that_brakes_hard(name: str) -> None:
 def test_close_behind_a_standing_leader_a_driver_waits_whatever_is_ahead(
     allowed: float, further: float, gap: float, share: float
 ) -> None:
-    # Therefore `drivers` does not look further ahead.
+    # For this reason, `drivers` does not look further ahead.
     car = passenger_car(MODEL_KRAUSS, 0.5)
     constraint = behind(car, 0.0, gap, 0.0, 4.5)
     assert constraint == 0.0

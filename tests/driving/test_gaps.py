@@ -49,7 +49,7 @@ def network(crossing: Callable[..., Path]) -> RoadNetwork:
 
 @pytest.fixture
 def blocks(network: RoadNetwork) -> Blocks:
-    """Whether a car from the west blocks a car from the south, which yields to it (HOLD_*)."""
+    """Return whether a car from the west blocks a yielding car from the south (HOLD_*)."""
     link = network.links[FROM_SOUTH]
     first = int(link["first_conflict"])
     conflicts = network.conflicts[first : first + int(link["num_conflicts"])]

@@ -17,7 +17,7 @@ Make = Callable[[str], Scene]
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of its node."""
+    """Return the map of a crossing with this SUMO type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 

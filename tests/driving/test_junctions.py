@@ -24,7 +24,7 @@ from tests.support.traffic import on_lane, scratch, travel
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """The map of a crossing, by SUMO's type of its node."""
+    """Return the map of a crossing with this SUMO type of its node."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
@@ -411,7 +411,7 @@ def test_a_yielding_driver_follows_a_faster_foe_and_waits_for_a_slower_one(
 def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
     place_m: float, blocked: bool
 ) -> None:
-    # A slow queue fills the road up to the standing car, so there is no room anywhere.
+    # A slow queue fills the road up to the standing car, so no place on it is free.
     roads, ways = network_of("merge"), travel("merge")
     link = next(
         k

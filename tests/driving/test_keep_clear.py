@@ -48,7 +48,7 @@ class Ahead(NamedTuple):
 
     network: RoadNetwork
     left_turns_from: int  # the lane between both signals
-    link: int  # that the vehicle takes next
+    link: int  # the link that the vehicle takes next
     phase: NDArray[np.int32]
 
 
@@ -73,7 +73,7 @@ def ahead(folder: Path, light: int, *, may_block: bool = False, apart_m: float =
 
 
 def is_blocked(scene: Ahead, *others: tuple[float, float, int]) -> bool:
-    """Whether the way is blocked by cars on the road between: place, speed, reason to stop."""
+    """Return whether cars (place, speed, reason to stop) on the road between block the way."""
     network = scene.network
     goal = network.edge_ids.index("jw2")
     travel = travel_by(make_plans(network, [goal]))

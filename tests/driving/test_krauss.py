@@ -114,7 +114,7 @@ def ours(case: dict[str, float]) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
-    """The cases and SUMO's results; the own speed is such that no other limit of SUMO applies."""
+    """Return the cases and SUMO's results; own speeds are chosen so that no other limit applies."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     cases = []

@@ -35,7 +35,7 @@ def indexed(name: str, rows: NDArray[np.void]) -> Scratch:
 
 
 def looked_for(roads: RoadNetwork, rows: NDArray[np.void]) -> list[tuple[int, int, float]]:
-    """Row, lane and position of each search: the lane of each vehicle, and its neighbours."""
+    """Yield row, lane and position of each search: the lane of each vehicle, and its neighbours."""
     asked = []
     for i, row in enumerate(rows):
         here = roads.lanes[row["lane"]]

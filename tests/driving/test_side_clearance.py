@@ -22,7 +22,7 @@ LEFT, RIGHT = 1, -1
 
 
 def lanes() -> list[int]:
-    """Three adjacent lanes, from right to left."""
+    """Return three adjacent lanes, from right to left."""
     roads = network("merge")
     return [roads.lane_ids.index(f"weave_{k}") for k in range(3)]
 

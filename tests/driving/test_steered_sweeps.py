@@ -73,7 +73,7 @@ def test_maps_of_worlds_without_agents_have_no_such_rows(path: Path, agents: int
 
 
 def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
-    """A link, and its SWEEP row, on which only steered cars would touch, not background cars."""
+    """Return a link, and its SWEEP row, on which only steered cars would touch."""
     for link in range(len(network.links)):
         rows = rows_of(network, link)
         cars = set(rows["foe"][(rows["own"] == CAR) & (rows["other"] == CAR)])

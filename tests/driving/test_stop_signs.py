@@ -22,7 +22,7 @@ ARRIVAL = TERMS.index("arrival")
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """A grid of three by three roads, by SUMO's type of its junctions."""
+    """Return a grid of three by three roads with this SUMO type of its junctions."""
     folder = tmp_path_factory.mktemp("stops")
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default-junction-type")
     return {
@@ -34,7 +34,7 @@ def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def drive(
     path: Path, agents: int, steps: int, zones: int = 1, background: int = 0
 ) -> tuple[int, float, list[str]]:
-    """Run the built-in driver: (arrivals, longest wait at a stop sign in s, hashes)."""
+    """Run the built-in driver; return arrivals, longest wait at a stop sign in s, and hashes."""
     arrivals, longest, hashes = 0, 0.0, []
     settings = {"horizon_s": 400, "population.mode": "closed"}
     vec = cavmarl.make_vec(

@@ -61,7 +61,7 @@ def network(path: Path) -> RoadNetwork:
 
 
 def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
-    """A link, and its SWEEP row, on which a bus sweeps over cars at the line of another link."""
+    """Return a link, and its SWEEP row, on which a bus sweeps over cars at another link's line."""
     for link, row in enumerate(network.links):
         for sweep in network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]:
             over = sweep["own"] == BUS and sweep["other"] == CAR and sweep["foe_enter_m"] < -1.5

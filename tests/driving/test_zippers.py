@@ -101,7 +101,7 @@ def pair(
 
 
 def first(roads: RoadNetwork, two: Pair) -> list[bool]:
-    """Whether the other vehicle passes first, by the driver of each."""
+    """Return for each driver whether it lets the other vehicle pass first."""
     travel = travel_by(np.zeros(len(roads.lanes), PLAN))
     to_line = two.foes["dist"] - two.foes["half"]
     return [

@@ -1,4 +1,4 @@
-"""Actuated signals switch as SUMO's do, and whatever the order of rows and the number of worlds."""
+"""Actuated signals switch as in SUMO, for any order of rows and any number of worlds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.shards.shard import make_worlds
 from tests.support.actuated import actuated_grid
 from tests.support.driving import idle, make_traffic, start
 
-# Runs in a child process: a process holds one libsumo at most.
+# Run in a child process: a process can load libsumo only once.
 SUMO_RUN = """
 import json, sys
 import libsumo as sumo
@@ -51,7 +51,7 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def demand(path: Path, headway_s: float) -> Path:
-    """Routes straight through the grid and around a corner, from all sides at unlike headways."""
+    """Write routes straight on and around a corner, with a different headway on each side."""
     ways = [("left0A0", "B0right0"), ("bottom0A0", "A1top0"), ("right1B1", "A1left1")]
     ways += [("top1B1", "B0bottom1"), ("left1A1", "B0right0"), ("bottom1B0", "A1left1")]
     flows = "".join(
@@ -74,7 +74,7 @@ def run_sumo(net: Path, routes: Path, step_s: float, seconds: float) -> Any:
 def place(
     network: RoadNetwork, worlds: Worlds, vehicles: list[tuple[str, float, float, float]]
 ) -> None:
-    """Put SUMO's vehicles, placed by their fronts, into the rows of world 0."""
+    """Put SUMO's vehicles, whose positions are those of their fronts, into the rows of world 0."""
     rows = worlds.rows[0]
     for row, (lane_id, front, speed, length) in zip(rows, vehicles, strict=False):
         row["lane"] = network.lane_ids.index(lane_id)
@@ -83,7 +83,7 @@ def place(
 
 
 def look_and_switch(network: RoadNetwork, worlds: Worlds, step_s: float) -> None:
-    """Look at the detectors, then switch."""
+    """Update the detectors, then switch the signals."""
     places = network.arrays.lane_place, network.arrays.places
     detect(*places, worlds.rows, worlds.num_owned, worlds.ticks, step_s, worlds.detected_s)
     switch_signals(
@@ -120,7 +120,7 @@ def test_same_vehicles_make_the_signals_switch_at_sumos_ticks(
     for tick, sumo_tick in enumerate(theirs["ticks"]):
         worlds.ticks[0] = tick
         look_and_switch(network, worlds, step_s)
-        # What SUMO shows after a step is what ruled in it.
+        # The state that SUMO reports after a step applied during the step.
         assert shown(network, worlds) == sumo_tick["states"], f"at {tick * step_s} s"
         seen.add(tuple(sumo_tick["states"].values()))
         place(network, worlds, sumo_tick["vehicles"])
@@ -154,10 +154,12 @@ def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
         look_and_switch(network, many, 0.5)
         for name in ("signal_phase", "controllers", "detected_s"):
             assert getattr(one, name)[0].tobytes() == getattr(many, name)[1].tobytes()
-    assert shown(network, many, 0) != shown(network, many, 1), "the empty world switches otherwise"
+    assert shown(network, many, 0) != shown(network, many, 1), (
+        "the empty world switches at other times"
+    )
 
 
-def test_a_reset_in_the_middle_of_a_cycle_begins_it_again(grid: Path) -> None:
+def test_a_reset_restarts_the_cycle(grid: Path) -> None:
     simulation = make_traffic(grid, background=30, num_worlds=2)
     start(simulation, seed=5)
     first = simulation.state_hash(0)

@@ -1,4 +1,4 @@
-"""A step as one compiled call gives the bytes of a step that is run phase by phase."""
+"""A step as one compiled call has the same bytes as a step that is run phase by phase."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Actions decoded at once are those that are decoded with care."""
+"""The fast path of decoding actions has the results of the general path."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ MASK = np.array([[True, False, True], [True, True, False]])
 
 
 def slowly(actions: NDArray[Any]) -> NDArray[Any]:
-    """The same numbers in an array that is not decoded at once."""
+    """Return the same numbers in an array that takes the general path."""
     actions = actions.copy()
     actions.flags.writeable = False
     return actions
@@ -26,7 +26,7 @@ def slowly(actions: NDArray[Any]) -> NDArray[Any]:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_pairs_are_decoded(dtype: type) -> None:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 2)).astype(dtype)
-    actions[~MASK] = np.nan  # nobody reads it
+    actions[~MASK] = np.nan  # no agent reads it
     config = ActionConfig(kind="continuous")
     found = ActionDecoder(config, 2, AGENTS).from_array(actions, MASK)
     expected = ActionDecoder(config, 2, AGENTS).from_array(slowly(actions), MASK)

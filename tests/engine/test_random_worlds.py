@@ -1,7 +1,7 @@
-"""Random worlds: maps, drivers, clocks and zones are drawn, and results stay the same.
+"""Random worlds: maps, drivers, clocks and zones are drawn; divided worlds stay equal.
 
-Agents do what the built-in driver would, or anything else: they leave their lanes, turn round,
-stand in the way and drive against the traffic.
+Agents use the actions of the built-in driver, or random ones: they leave their lanes, turn
+round, block others and drive against the traffic.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def drawn_map(rng: np.random.Generator, path: Path) -> Path:
 
 
 def drawn_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Simulation]:
-    """A world, undivided and divided, at the start of an episode."""
+    """Return a world, undivided and divided, at the start of an episode."""
     path = drawn_map(rng, folder / "drawn.net.xml")
     tick_s = pick(rng, 0.05, 0.1, 0.2)
     world = {
@@ -77,7 +77,7 @@ def drawn_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Sim
 
 
 def acts(rng: np.random.Generator, whole: Simulation) -> Iterator[Commands]:
-    """What agents do: anything at all, or what is suggested with errors."""
+    """Return random actions, or suggested actions with errors."""
     shape = whole.outputs.present.shape
     wild = bool(rng.random() < 0.5)
     drift = np.zeros((*shape, 2))

@@ -1,4 +1,4 @@
-"""The order of rows in the arrays plays no part: shuffled worlds give the same bytes."""
+"""The order of rows in the arrays does not matter: shuffled worlds have the same bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEPS = 150
 
 
 def shuffle_rows(simulation: Simulation, rng: np.random.Generator) -> int:
-    """Put the committed rows of each world in another order; how many of them changed places."""
+    """Shuffle the committed rows of each world; return how many of them changed places."""
     worlds = simulation.shards[0].worlds
     moved = 0
     for w, num in enumerate(worlds.num_owned):
@@ -54,8 +54,8 @@ def test_shuffled_rows_give_the_same_bytes(
     for simulation in (tidy, shuffled):
         start(simulation, seed=5)
     rng = np.random.default_rng(0)
-    # Every other agent pulls to the left, harder than its driver can steer against: some collide,
-    # leave the road and are followed by others.
+    # Every second agent steers to the left, more than its driver can correct: some vehicles
+    # collide or leave the road, and successors enter.
     pull = np.zeros((1, tidy.outputs.present.shape[1], 2))
     pull[0, ::2, 1] = 1.6
     moved = 0

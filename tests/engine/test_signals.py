@@ -1,4 +1,4 @@
-"""Signals follow the programs of the map, read here by themselves from its XML."""
+"""Signals follow the programs of the map, which the test reads from the XML itself."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.driving import idle, make_traffic, start
 
 
 def letters(simulation: Simulation) -> dict[str, str]:
-    """What every signal shows now."""
+    """Return the letters that each signal shows now."""
     network = simulation.network
     shown = {}
     for k, phase in enumerate(simulation.signal_phases()):
@@ -31,7 +31,7 @@ Program = tuple[Fraction, list[tuple[Fraction, str]]]  # offset; duration and st
 
 
 def programs(source: Path) -> dict[str, Program]:
-    """The first program of every signal of a SUMO network, by the signal's name."""
+    """Return the first program of each signal of a SUMO network, by the signal's name."""
     found: dict[str, Program] = {}
     for logic in ElementTree.parse(source).getroot().iter("tlLogic"):
         phases = [(Fraction(p.get("duration", "")), p.get("state", "")) for p in logic]
@@ -40,7 +40,7 @@ def programs(source: Path) -> dict[str, Program]:
 
 
 def planned(program: Program, time: Fraction) -> str:
-    """What a program says, as SUMO runs it: at time - offset in its cycle."""
+    """Return the state of a program as SUMO runs it: at time - offset in its cycle."""
     offset, phases = program
     left = (time - offset) % sum(duration for duration, _ in phases)
     ends = accumulate(duration for duration, _ in phases)
@@ -49,7 +49,9 @@ def planned(program: Program, time: Fraction) -> str:
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])
 @pytest.mark.parametrize("offset", [None, "10"])
-def test_signals_show_what_the_map_plans(env: str, offset: str | None, tmp_path: Path) -> None:
+def test_signals_follow_the_programs_of_the_map(
+    env: str, offset: str | None, tmp_path: Path
+) -> None:
     source = resolve_map(*load_config(env))
     text = source.read_text(encoding="utf-8").replace('type="actuated"', 'type="static"')
     if offset is not None:

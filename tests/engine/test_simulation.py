@@ -1,4 +1,4 @@
-"""Traffic without agents: no vehicle is lost, crashes, breaks a rule, or stands for ever."""
+"""Traffic without agents: no vehicle is lost, crashes, breaks a rule, or stands forever."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import drive, make_simulation, make_traffic, start
 
-# Entries with as many background vehicles as flow freely there.
+# Environments, with a number of background vehicles that flows freely.
 FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 40}
 PER_TICK = {"clock.ctrl_dt_s": 0.05}
 
 
 def minutes(simulation: Simulation, many: float) -> Iterator[int]:
-    """Let the worlds go on; yields the step after each."""
+    """Step the worlds for some minutes; yield the number of each step."""
     for step in range(round(many * 60.0 / simulation.config.clock.ctrl_dt_s)):
         drive(simulation)
         yield step
@@ -134,10 +134,10 @@ def test_drivers_keep_the_limit_times_their_speed_factor(env: str) -> None:
             ratios.append(ratio)
             roads.append(~lane["internal"])
     ratio = np.concatenate(ratios)
-    # The model closes in on a lower limit from above, so a last few per cent remain.
+    # The model approaches a lower limit from above, so the speed stays some per cent higher.
     assert ratio.max() < 1.05
     assert np.mean(ratio[np.concatenate(roads)] > 1.001) < 0.02
-    assert ratio.max() > 0.9, "nobody drives at the limit where the road is free"
+    assert ratio.max() > 0.9, "no vehicle drives at the limit on a free road"
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])

@@ -1,4 +1,4 @@
-"""Zones that other simulators run: exact ones change no bit, faulty ones end in typed errors."""
+"""Zones in other simulators: exact simulators change no bit, faulty ones cause typed errors."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SEEN: dict[str, Any] = {"agents": 4, "background": 40, "seed": 3}
 def hosted(
     name: str, *zones: int, overrides: Mapping[str, Any] | None = None, **keys: Any
 ) -> cavmarl.CavVectorEnv:
-    """Worlds of four zones, of which a simulator runs some."""
+    """Create worlds of four zones, some of which a simulator runs."""
     chosen = dict.fromkeys(zones or (1, 2), name)
     keys = {**SEEN, **keys}
     return cavmarl.make_vec(
@@ -109,7 +109,7 @@ def test_simulators_are_shown_ghosts_and_signals() -> None:
 
 
 class Hesitant(OwnKinematics):
-    """Refuses each vehicle at first."""
+    """A simulator that refuses each vehicle at first."""
 
     times = 2
 
@@ -182,7 +182,7 @@ def test_cavmarl_takes_a_zone_back_that_refuses_vehicles_for_too_long() -> None:
 
 
 class Mortal(OwnKinematics):
-    """Fails in one of its calls, in the first simulator of a zone only."""
+    """A simulator that fails in one of its calls; the next simulator of the zone does not fail."""
 
     call = "read"
     at = 60
@@ -262,7 +262,7 @@ def test_a_simulator_that_fails_is_an_error_or_gives_its_zone_back(
 
 
 class Wrong(OwnKinematics):
-    """Reports something else from a tick on."""
+    """A simulator that reports wrong data from a tick on."""
 
     fault = "absent"
 
@@ -308,7 +308,7 @@ def test_wrong_reports_are_refused(
 
 
 class Drifting(OwnKinematics):
-    """Moves vehicles a little aside and back."""
+    """A simulator that moves vehicles a little aside and back."""
 
     def moved(self, row: np.void, wanted: np.void) -> np.void:
         wanted = super().moved(row, wanted)
@@ -368,7 +368,7 @@ def test_rows_follow_a_simulator_that_is_not_exact() -> None:
         ),
     ],
 )
-def test_what_is_not_possible_is_refused_by_name(keys: dict[str, Any], message: str) -> None:
+def test_unsupported_features_are_refused_by_name(keys: dict[str, Any], message: str) -> None:
     with registered(OwnKinematics) as name:
         simulators = keys.pop("zone_simulators", {1: name})
         named = {zone: name if text == "NAME" else text for zone, text in simulators.items()}

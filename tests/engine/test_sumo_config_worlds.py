@@ -21,7 +21,7 @@ INPUT = '<net value="m.net.xml"/><r value="a%20b.xml"/><additional value="night.
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """A configuration of a crossing, under a name that says nothing."""
+    """Write a configuration of a crossing to a file without a suffix."""
     (tmp_path / "m.net.xml").write_text(CROSSING, encoding="utf-8")
     (tmp_path / "a b.xml").write_text(TRIPS, encoding="utf-8")
     (tmp_path / "night.add.xml").write_text(NIGHT, encoding="utf-8")
@@ -67,7 +67,7 @@ def test_a_configuration_may_name_a_map_alone(config: Path) -> None:
     assert world.demand is None
 
 
-def test_what_is_no_map_is_refused(config: Path) -> None:
+def test_files_that_are_no_maps_are_refused(config: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match="root element must be the <configuration>"):
         load_world(config.parent / "a b.xml")
     config.write_text('<configuration><r value="a b.xml"/></configuration>', encoding="utf-8")

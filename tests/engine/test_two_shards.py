@@ -1,4 +1,4 @@
-"""Two shards with a part of the vehicles each sense and switch signals as one that has them all."""
+"""Two shards that share the vehicles sense and switch signals like one shard with all vehicles."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ EVERYWHERE_M = 1e5
 
 
 class Halves:
-    """The vehicles of undivided worlds in two shards, by x, each with the others as ghosts.
+    """The vehicles of undivided worlds in two shards, divided at an x, with ghosts of all others.
 
     Args:
         whole: the undivided worlds.
@@ -72,9 +72,9 @@ class Halves:
         self._border = 0.5 * (min_x + max_x)
 
     def take(self, whole: Worlds, returns: Returns) -> bool:
-        """Copy rows, tick and keys; whether both shards own vehicles.
+        """Copy rows, tick and keys; return whether both shards own vehicles.
 
-        `returns` are those of the episodes before the step.
+        `returns`: returns of the episodes before the step.
         """
         first = self.shards[0].worlds
         first.ticks[:] = whole.ticks
@@ -90,7 +90,7 @@ class Halves:
         return all(shard.worlds.num_owned.all() for shard in self.shards)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """What a simulation does at the end of a step."""
+        """Do the work of a simulation at the end of a step."""
         self.shared.clear_outputs(chosen)
         self.executor.sense(chosen)
         self.shared.settle_outputs(chosen)
@@ -98,7 +98,7 @@ class Halves:
 
 
 def returns_of(*parts: Worlds) -> Returns:
-    """What owned agents have got in their episodes."""
+    """Return the episode returns of owned agents."""
     return {
         (w, row["id"]): row["episode_return"]
         for worlds in parts
@@ -146,7 +146,7 @@ def test_agents_of_two_shards_get_the_same_results(
         assert returns_of(*(shard.worlds for shard in halves.shards)) == expected
         assert step != STEPS // 2 - 1 or any(expected.values())
         whole.retire_agents()
-    assert both > STEPS // 2, "hardly ever vehicles in both shards"
+    assert both > STEPS // 2, "both shards rarely had vehicles"
 
 
 def test_signals_of_two_shards_are_the_same(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Frames: what is seen of a world is the same however it is divided and wherever it runs."""
+"""Frames of a world do not depend on its zones or its backend."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_frames_are_those_of_the_undivided_world(zones: int, workers: int) -> No
             assert len(set(divided.vehicles["zone"])) > 1
 
 
-def test_a_frame_holds_what_the_world_holds_and_stays() -> None:
+def test_a_frame_equals_the_world_and_does_not_change() -> None:
     world = parallel_env("grid4x4", zones=4)
     world.reset(seed=1)
     for _ in range(10):

@@ -1,4 +1,4 @@
-"""From a configuration to what its world is made of."""
+"""From a configuration to the parts of its world."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.netgenerate import netgenerate, random_map
 
 @pytest.fixture(scope="module")
 def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Five roads by five, 200 m apart."""
+    """Return a grid of five by five roads, 200 m apart."""
     path = tmp_path_factory.mktemp("grid") / "grid.net.xml"
     return netgenerate(path, "--grid", "--grid.number=5", "--grid.length=200")
 
@@ -71,14 +71,14 @@ def test_worlds_of_the_same_files_share_their_map(tmp_path: Path) -> None:
 
 
 def test_a_bare_maps_horizon_follows_its_size(grid: Path) -> None:
-    # 4 · 200 m wide and as high, at SUMO's 13.89 m/s: 115.2 s across, and three times that.
+    # 4 · 200 m in both directions, at SUMO's 13.89 m/s: 115.2 s across, times three.
     worlds = [load_world(grid, agents=2, background=3, zones=zones) for zones in (1, 4)]
     assert [world.config.horizon_s for world in worlds] == [350.0, 350.0]
     assert check_map(grid).horizon_s == 350.0
     assert load_world(grid, overrides={"clock.ctrl_dt_s": 0.15}).config.max_steps == 2333
 
 
-def test_a_horizon_that_is_stated_wins(grid: Path) -> None:
+def test_a_stated_horizon_overrides_that_of_the_map(grid: Path) -> None:
     assert load_world(grid, overrides={"horizon_s": 42.0}).config.horizon_s == 42.0
     assert load_world(grid, max_cycles=30).config.max_steps == 30
     named = {"map.source": str(grid)}

@@ -1,4 +1,4 @@
-"""A grid of accelerations and steering angles, beside the continuous action."""
+"""Actions from a grid of accelerations and steering angles, compared with continuous actions."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def test_each_choice_is_a_pair() -> None:
     found = decoder.from_array(choices, everyone)
     assert [tuple(pair) for pair in found.controls.reshape(35, 2)] == MEANINGS
     read_only = choices.copy()
-    read_only.flags.writeable = False  # is not decoded at once
+    read_only.flags.writeable = False  # takes the general path of decoding
     again = decoder.from_array(read_only, everyone)
     assert [tuple(pair) for pair in again.controls.reshape(35, 2)] == MEANINGS
     assert (decoder.encode(again.controls) == choices).all()
@@ -71,7 +71,7 @@ def test_every_view_has_a_space_of_choices() -> None:
     rows.close()
 
 
-def test_a_choice_does_what_the_continuous_action_does() -> None:
+def test_a_choice_has_the_effect_of_its_continuous_action() -> None:
     grid = worlds()
     fine = worlds(**{"action.kind": "continuous"})
     for vec in (grid, fine):

@@ -1,4 +1,4 @@
-"""Worlds are drawn alike, whichever processes have them."""
+"""Pictures of worlds do not depend on the processes that run them."""
 
 from __future__ import annotations
 

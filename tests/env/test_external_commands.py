@@ -1,6 +1,6 @@
-"""Vehicles that the caller poses or drives: how they move, who sees them, and how they are saved.
+"""Vehicles that the caller poses or drives: motion, visibility, and saved states.
 
-In a divided world, they are bit for bit those of the undivided one.
+In a divided world, they equal those of the undivided world bit for bit.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ ROOM = {"population.external": 4}
 
 
 def place_on(env: Any, k: int, along_m: float = 0.0) -> tuple[float, float, float]:
-    """x, y and heading of a place on the k-th road lane, from the start of its longest part."""
+    """Return x, y and heading of a place on the k-th road lane, measured along its longest part."""
     roads = np.flatnonzero(~env.network.lanes["internal"] & (env.network.lanes["length_m"] > 40.0))
     line = env.network.lane_polyline(int(roads[k]))[:, :2]
     parts = np.diff(line, axis=0)
@@ -46,7 +46,7 @@ def advance(env: Any, steps: int = 1) -> None:
 
 
 def act(env: Any, step: int) -> None:
-    """What a caller may ask for: one vehicle driven, one posed along a line and with jumps."""
+    """Command one vehicle that is driven, and one that is posed along a line and with jumps."""
     min_x, min_y, max_x, max_y = env.network.extent_m
     middle_x, middle_y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)
     if step == 1:
@@ -102,18 +102,18 @@ def test_a_divided_world_equals_the_undivided_one() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:workers = ")
-def test_a_worker_that_dies_is_followed() -> None:
+def test_a_successor_of_a_dead_worker_continues() -> None:
     assert hashes(zones=4, workers=2, kill_at=(5, 21, 29)) == hashes()
 
 
 @pytest.mark.slow
-def test_over_nodes_it_is_the_same_too() -> None:
+def test_worlds_over_nodes_are_equal() -> None:
     undivided = hashes()
     assert hashes(zones=2, nodes=2) == undivided
     assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
 
 
-def test_room_alone_changes_no_vehicle() -> None:
+def test_unused_places_change_no_vehicle() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("ring", agents=1, background=8, overrides=overrides)) as env:
@@ -209,7 +209,7 @@ def test_drivers_stop_behind_a_vehicle_on_their_lane_and_pass_one_beside_the_roa
     assert standing == [1, 0]
 
 
-def test_a_touch_counts_for_both() -> None:
+def test_a_contact_counts_for_both_vehicles() -> None:
     with closing(ring()) as env:
         slot = env.external.spawn(*place_on(env, 0))
         advance(env)

@@ -1,4 +1,4 @@
-"""Vehicles and barriers put into running worlds: the same wherever they run, and on record."""
+"""Vehicles and barriers put into running worlds: equal in all divisions, and recorded."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ROOM = {"population.insertions": 12}
 
 
 def edge_of(env: CavEnv, k: int = 0) -> str:
-    """A road with cars on it; the k-th of them."""
+    """Return the k-th road with cars on it."""
     rows = env.simulation.vehicles(0)
     lanes = env.network.lanes[rows["lane"]]
     edges = np.unique(lanes["edge"][~lanes["internal"]])
@@ -24,7 +24,7 @@ def edge_of(env: CavEnv, k: int = 0) -> str:
 
 
 def act(env: Any, step: int) -> None:
-    """What pages may ask for, at some steps."""
+    """Request insertions as a page does, at some steps."""
     network = env.network
     roads = np.flatnonzero(~network.lanes["internal"] & (network.lanes["length_m"] > 60.0))
     if step in (4, 5, 30):
@@ -55,11 +55,11 @@ def test_a_divided_world_with_insertions_equals_the_undivided_one() -> None:
 
 
 @pytest.mark.slow
-def test_over_nodes_it_is_the_same_too() -> None:
+def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_room_alone_changes_nothing() -> None:
+def test_unused_places_change_nothing() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
@@ -158,7 +158,7 @@ def test_barriers_that_wait_for_a_gap_never_enter_a_road_that_is_opened() -> Non
         assert env.closed_roads() == ()
 
 
-def test_a_step_that_fails_has_what_was_put_there_when_it_is_taken_again(
+def test_a_repeated_step_has_the_insertions_of_the_failed_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     overrides = {**ROOM, "v2x.enabled": True}

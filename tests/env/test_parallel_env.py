@@ -1,4 +1,4 @@
-"""`CavEnv`: who is in the world, when episodes end, what agents see, do and are paid for."""
+"""`CavEnv`: populations, ends of episodes, observations, actions and rewards."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ENDS = ("arrival", "collision", "off_road")
 
 
 def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> Any:
-    """A small environment; Any, as observations are arrays in one form and dicts in the other."""
+    """Make a small environment; typed Any, because observations are arrays or dicts."""
     overrides: Mapping[str, Any] = arguments.pop("overrides", {})
     return parallel_env(
         env,
@@ -26,7 +26,7 @@ def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> Any:
 
 
 def wild(env: CavEnv, rng: np.random.Generator) -> dict[str, Any]:
-    """Full throttle and any steering: most leave the road or hit somebody soon."""
+    """Return full throttle and random steering: most vehicles soon leave the road or collide."""
     return {agent: np.array([1.0, rng.uniform(-1.0, 1.0)]) for agent in env.agents}
 
 
@@ -41,7 +41,7 @@ def test_a_closed_world_starts_with_all_agents_and_only_loses_them() -> None:
     before = set(env.agents)
     while env.agents:
         _, _, terminations, truncations, _ = env.step(wild(env, rng))
-        assert set(terminations) == before, "who acted gets a result, nobody else"
+        assert set(terminations) == before, "exactly the agents that acted get a result"
         gone = {agent for agent in before if terminations[agent] or truncations[agent]}
         before -= gone
         assert set(env.agents) == before
@@ -64,12 +64,12 @@ def test_entering_agents_come_once_and_no_more_than_declared() -> None:
         observations, rewards, terminations, truncations, infos = env.step(wild(env, rng))
         for agent in set(env.agents) - before:
             seen.append(agent)
-            assert observations[agent].any(), "who enters is given a first observation"
+            assert observations[agent].any(), "an entering agent gets a first observation"
             assert rewards[agent] == 0.0
             assert not terminations[agent]
             assert not truncations[agent]
         gone |= {agent for agent in before if terminations[agent] or truncations[agent]}
-    assert sorted(seen) == env.possible_agents, "all the declared ones came"
+    assert sorted(seen) == env.possible_agents, "all declared agents entered"
     assert len(set(vehicles.values())) == 9
 
 
@@ -86,11 +86,11 @@ def test_an_empty_world_goes_on_until_the_next_agent_enters() -> None:
         follower = set(observations) - {agent}
         assert follower == set(env.agents)
         assert all(rewards[other] == 0.0 and infos[other]["active"] for other in follower)
-    assert not env.agents, "nobody is left to come"
+    assert not env.agents, "no agent is left to enter"
 
 
 def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
-    # A full ring: nobody can enter when the only agent has left.
+    # A full ring: no vehicle can enter when the only agent has left.
     env = make("ring", "open", agents=1, background=60, max_cycles=200)
     env.reset()
     rng = np.random.default_rng(0)
@@ -263,7 +263,7 @@ def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
         ("sensors.lanes.range_m", "lanes"),
     ],
 )
-def test_a_sensor_can_be_switched_off_and_leaves_the_others_alone(key: str, sensor: str) -> None:
+def test_switching_a_sensor_off_does_not_change_other_sensors(key: str, sensor: str) -> None:
     on = {"sensors.lidar.rays": 16}
     full, reduced = make("merge", overrides=on), make("merge", overrides={**on, key: 0})
     places = layout(full.config.sensors)
@@ -406,7 +406,7 @@ def test_suggested_actions_are_valid_and_lead_to_the_goal(env_name: str, kind: s
 # Tools
 
 
-def test_traffic_stats_count_what_happened() -> None:
+def test_traffic_stats_count_events() -> None:
     env = make("merge", "respawn")
     env.reset()
     rng = np.random.default_rng(5)
@@ -429,7 +429,7 @@ def test_traffic_stats_count_what_happened() -> None:
     assert env.traffic_stats()["departed"] == env.traffic_stats()["running"]
 
 
-def test_tools_that_look_change_nothing() -> None:
+def test_tools_that_read_a_world_do_not_change_it() -> None:
     env = make("grid4x4", "respawn")
     env.reset()
     env.step(env.suggest_actions())

@@ -45,7 +45,7 @@ def test_a_new_environment_has_no_state(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_an_unknown_argument_is_told_the_nearest(name: str) -> None:
+def test_the_error_for_an_unknown_argument_names_the_nearest(name: str) -> None:
     with pytest.raises(UnknownArgumentError, match=r"'num_agents': did you mean agents\?") as told:
         MAKERS[name]("ring", num_agents=3)
     assert isinstance(told.value, CavmarlError)

@@ -1,4 +1,4 @@
-"""The names under which Gymnasium and PettingZoo find the entries, and what they give."""
+"""The ids of environments in Gymnasium and PettingZoo, and what the ids create."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_every_entry_has_its_ids(name: str) -> None:
         assert world.agents
 
 
-def test_the_discrete_ids_have_meta_actions_whatever_else_is_set() -> None:
+def test_the_discrete_ids_always_have_meta_actions() -> None:
     """Programs such as CleanRL's take an id and nothing else."""
     five = gymnasium.spaces.Discrete(5)
     assert gymnasium.make("cavmarl/ringDiscrete-v5").action_space == five
@@ -109,8 +109,10 @@ def test_a_horizon_is_a_whole_number_of_steps() -> None:
         cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})
 
 
-def test_odd_folders_beside_fail_no_import(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """They lie in the user's `envs`; what can be named can be used, and has an id if it can."""
+def test_unusual_folders_do_not_break_the_import(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The user's `envs` has such folders; each can be used, and has an id if its name allows it."""
     odd = [b"a space", b"not\xffutf8", b"two\nlines", b"-dash", b"latin", b"fine"]
     for name in odd:
         folder = Path(os.fsdecode(bytes(tmp_path) + b"/envs/" + name))

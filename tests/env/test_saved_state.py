@@ -1,4 +1,4 @@
-"""A vector environment goes on bit for bit from bytes, whatever zones and workers run it then."""
+"""A vector environment resumes from bytes bit for bit, with any zones and workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make(mode: str = "SameStep", num_envs: int = WORLDS, **arguments: Any) -> Ca
 
 
 def drive(vec: CavVectorEnv, steps: range) -> list[bytes]:
-    """Everything that comes of steps, their numbers among the seeds of what agents do."""
+    """Return all results of steps; the numbers of the steps are seeds of the actions."""
     found = []
     for step in steps:
         actions = np.random.default_rng(step).uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2))
@@ -85,7 +85,7 @@ def test_invalid_saves_and_loads_are_refused() -> None:
 
 
 def forged(vec: CavVectorEnv, saved: bytes, place: int, value: float, item: int = 0) -> bytes:
-    """A saved state with another value in an item of one of its first arrays, and its checksum."""
+    """Return a saved state with a changed item in one of its first arrays, and a new checksum."""
     arrays = [array.copy() for array in saved_arrays(vec, saved)]
     arrays[place].flat[item] = value
     content = to_bytes(arrays)
@@ -139,7 +139,7 @@ EXTERNAL_COMMANDS, EXTERNAL_USED = 10, 11
 
 
 def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
-    """Worlds in which a vehicle of the caller waits, and their state."""
+    """Return worlds in which a vehicle of the caller waits, and their state."""
     vec = make(overrides={"population.external": 3}, **arguments)
     vec.reset(seed=0)
     min_x, min_y, _, _ = vec.network.extent_m

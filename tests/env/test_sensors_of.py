@@ -20,7 +20,7 @@ SMALL: dict[str, Any] = {"agents": 2, "background": 2}
 
 
 @pytest.mark.parametrize("name", ["cities_residual", "u_turn_ippo"])
-def test_the_driver_fits_where_it_was_not_trained(name: str) -> None:
+def test_a_driver_fits_an_environment_without_training_there(name: str) -> None:
     pytest.importorskip("torch")
     one = parallel_env("merge", sensors_of=name, **SMALL)
     driver = load_policy(name, one)
@@ -53,7 +53,7 @@ def test_overrides_that_contradict_the_driver_are_refused(make: Any) -> None:
         make("merge", sensors_of="idm")
 
 
-def test_views_pass_it_on() -> None:
+def test_adapters_pass_sensors_of_on() -> None:
     ego = CavEgoEnv("ring", sensors_of="merge_ippo")
     lenient = parallel_env("ring", sensors_of="merge_ippo", lenient=True, **SMALL)
     (size,) = make_vec("merge").single_observation_space.shape

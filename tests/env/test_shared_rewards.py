@@ -1,4 +1,4 @@
-"""Rewards that are shared with the agents nearby, as CoPO's local coordination has it."""
+"""Rewards that are shared with nearby agents, as in CoPO's local coordination."""
 
 from __future__ import annotations
 

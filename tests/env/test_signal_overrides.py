@@ -1,6 +1,6 @@
-"""Signals that show states of the caller: who sees them, how they are saved, and what is refused.
+"""Signals that show states of the caller: visibility, saved states, and refused commands.
 
-In a divided world, they are bit for bit those of the undivided one.
+In a divided world, they equal those of the undivided world bit for bit.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ TALKATIVE = {
 
 
 def act(env: Any, step: int) -> None:
-    """What a caller may ask for."""
+    """Show and release states of signals at some steps."""
     if step == 1:
         for index in range(8):
             env.signal_overrides.show("B1", index, "G" if index < 4 else "r")
@@ -83,12 +83,12 @@ def test_messages_and_sensors_change_nothing() -> None:
 
 
 @pytest.mark.filterwarnings("ignore:workers = ")
-def test_a_worker_that_dies_is_followed() -> None:
+def test_a_successor_of_a_dead_worker_continues() -> None:
     assert hashes(zones=4, workers=2, kill_at=(2, 23)) == hashes()
 
 
 @pytest.mark.slow
-def test_over_nodes_it_is_the_same_too() -> None:
+def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
@@ -129,7 +129,7 @@ def test_drivers_wait_while_all_signals_are_red() -> None:
             before = {int(row["id"]): int(row["lane"]) for row in env.simulation.vehicles(0)}
             env.step(env.suggest_actions())
             if step < 60:
-                continue  # those who cannot stop before the line are over it
+                continue  # vehicles that could not stop before the line are over it
             for row in env.simulation.vehicles(0):
                 lane = before.get(int(row["id"]), -1)
                 found += lane >= 0 and not internal[lane] and bool(internal[row["lane"]])

@@ -1,4 +1,4 @@
-"""How many steps an episode has, and that equal actions are equal steps."""
+"""The number of steps of an episode, and actions with negative zeros."""
 
 from __future__ import annotations
 

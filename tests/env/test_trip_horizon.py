@@ -1,4 +1,4 @@
-"""Trips of agents that have a horizon of their own."""
+"""Trips of agents with a time limit of their own."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEPS = 320
 
 
 def standing(zones: int) -> tuple[list[tuple[int, int]], str]:
-    """When which agents that brake are cut, up to the horizon; and the state after that."""
+    """Return when which braking agents are truncated, and the state after the horizon."""
     vec = cavmarl.make_vec(
         "merge",
         zones=zones,
@@ -42,7 +42,7 @@ def test_a_trip_that_takes_too_long_is_truncated_the_same_in_any_division() -> N
     assert standing(zones=2) == (cuts, state)
 
 
-def test_it_has_as_long_as_its_way_takes_and_a_cycle_of_each_signal() -> None:
+def test_a_trip_has_its_free_time_and_a_cycle_of_each_signal() -> None:
     vec = cavmarl.make_vec(
         "grid4x4", agents=6, background=0, overrides={"traffic.trip_horizon": 2.0}
     )

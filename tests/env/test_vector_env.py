@@ -1,4 +1,4 @@
-"""`CavVectorEnv`: many worlds at once are the same worlds as one by one, bit for bit."""
+"""`CavVectorEnv`: worlds that are stepped together equal single worlds bit for bit."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def make(
 
 
 def wild(rng: np.random.Generator, vec: CavVectorEnv) -> NDArray[np.float32]:
-    """(W, A, 2) full throttle and any steering: most leave the road or hit somebody soon."""
+    """Return (W, A, 2) full throttle and random steering: most trips soon end."""
     actions = rng.uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2)).astype(np.float32)
     actions[..., 0] = 1.0
     return actions
@@ -71,7 +71,7 @@ def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
         for agent in active:
             np.testing.assert_array_equal(arrays[0, int(agent[4:])], dicts[agent])
         if not active:
-            break  # the parallel form waits within its step for who comes next
+            break  # the step of the parallel form waits for the next agent
         actions = wild(rng, vec)
         arrays, rewards, terminations, truncations, infos = vec.step(actions)
         dicts, paid, ended, cut, told = env.step({a: actions[0, int(a[4:])] for a in active})
@@ -112,7 +112,7 @@ def test_worlds_do_not_touch_each_other() -> None:
     assert len({calm.state_hash(w) for w in range(3)}) == 3
 
 
-def test_the_seed_decides_and_no_seed_goes_on() -> None:
+def test_a_seed_repeats_episodes_and_no_seed_continues() -> None:
     vec, again = make(2), make(2)
     hashes = []
     for seed in (3, None, 3, None):
@@ -126,7 +126,7 @@ def test_the_seed_decides_and_no_seed_goes_on() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
+def test_a_world_can_reset_in_the_same_step(mode: str) -> None:
     vec = make(2, mode)
     assert vec.metadata["autoreset_mode"] is AutoresetMode.SAME_STEP
     observations, infos = vec.reset(seed=0)
@@ -138,7 +138,7 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
         steps += 1
         over = infos["episode_over"]
         np.testing.assert_array_equal(over[steps >= 40], True)
-        # Whoever acted and has not ended is cut where the horizon is reached, and only there.
+        # Agents that acted and have not ended are truncated exactly at the horizon.
         expected = infos["acted"] & ~terminations & (steps >= 40)[:, None]
         np.testing.assert_array_equal(truncations, expected)
         np.testing.assert_array_equal(infos["acted"], acting)
@@ -149,9 +149,9 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
             shown = np.where(infos["mask"][world][:, None], first, 0.0)
             np.testing.assert_array_equal(observations[world], shown)
             assert vec.simulation.ticks()[world] == 0
-            # In entering mode the last step may find nobody who acts: the others wait to enter.
+            # In entering mode, no agent may act in the last step: all others wait to enter.
             shows = infos["final_observations"][world].any(axis=1)
-            # Who entered in it is seen, has not acted, and was not asked to.
+            # An agent that entered in this step is present, but has not acted and did not have to.
             assert shows[infos["acted"][world]].all()
             assert not (shows & ~infos["acted"][world] & acting[world]).any()
             assert not np.array_equal(observations[world], infos["final_observations"][world])
@@ -165,8 +165,8 @@ def test_a_world_that_is_over_begins_anew_in_the_same_step(mode: str) -> None:
 
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("mode", MODES)
-def test_a_world_may_begin_anew_in_the_next_step(mode: str, copy: bool) -> None:
-    """The same steps as with `SAME_STEP`, but for one more between two episodes."""
+def test_a_world_can_reset_in_the_next_step(mode: str, copy: bool) -> None:
+    """The steps equal those of `SAME_STEP`, except for one more step between two episodes."""
     late, now = make(1, mode, autoreset_mode="NextStep", copy=copy), make(1, mode)
     assert late.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     rng = np.random.default_rng(4)
@@ -196,7 +196,7 @@ def test_a_world_may_begin_anew_in_the_next_step(mode: str, copy: bool) -> None:
     assert episodes >= 3
 
 
-def test_chosen_worlds_begin_anew_and_the_others_go_on() -> None:
+def test_chosen_worlds_are_reset_and_other_worlds_continue() -> None:
     vec, alone = make(3), make(3)
     vec.reset(seed=3)
     alone.reset(seed=3)
@@ -242,7 +242,7 @@ def test_a_wrong_autoreset_mode_is_refused(mode: Any) -> None:
 
 
 def test_without_autoreset_a_world_that_is_over_waits_for_a_reset() -> None:
-    """Up to there it is what the next step gives; the reset's episode is the next one."""
+    """Up to its end, steps equal those of `NEXT_STEP`; the reset begins the same next episode."""
     waits, late = make(2, autoreset_mode="Disabled"), make(2, autoreset_mode="NextStep")
     assert waits.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     waits.reset(seed=4)
@@ -267,7 +267,7 @@ def test_the_mask_marks_acting_agents(mode: str) -> None:
     rng = np.random.default_rng(0)
     for _ in range(100):
         mask = infos["mask"]
-        assert not observations[~mask].any(), "who has no vehicle observes nothing"
+        assert not observations[~mask].any(), "an agent without a vehicle observes zeros"
         assert observations[mask].any(axis=-1).all()
         actions = wild(rng, vec)
         actions[~mask] = np.nan  # not read

@@ -1,4 +1,4 @@
-"""A copy or a pickle of an environment is a world of its own, and goes on bit for bit."""
+"""A copy or a pickle of an environment is independent, and continues bit for bit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def actions_of(env: cavmarl.CavEnv, step: int) -> dict[str, np.ndarray]:
 
 
 def flat(value: Any) -> Any:
-    """What a call has returned, for ==: arrays as their bytes."""
+    """Convert the result of a call so that `==` compares it: arrays become bytes."""
     if isinstance(value, dict):
         return [(key, flat(item)) for key, item in value.items()]
     if isinstance(value, tuple):
@@ -47,7 +47,7 @@ def flat(value: Any) -> Any:
 
 
 def drive(env: cavmarl.CavEnv, first: int, steps: int) -> list[Any]:
-    """All that comes out, and the state at the end."""
+    """Drive some steps; return all results, and the state at the end."""
     seen: list[Any] = []
     for step in range(first, first + steps):
         if not env.agents:
@@ -67,7 +67,7 @@ def test_a_copy_continues_like_the_original(name: str, how: str) -> None:
     assert other.agents == env.agents
     first = drive(env, 15, 12)
     assert drive(other, 15, 12) == first
-    assert flat(other.reset()) == flat(env.reset()), "the next episode is the same, too"
+    assert flat(other.reset()) == flat(env.reset()), "the next episode is equal, too"
 
 
 @pytest.mark.parametrize("how", COPIES)
@@ -105,7 +105,7 @@ def test_a_batch_of_worlds(how: str, copied: bool) -> None:
     for number in range(15):
         step(vec, number)
     other = COPIES[how](vec)
-    for number in range(15, 30):  # over the end of an episode
+    for number in range(15, 30):  # past the end of an episode
         assert step(other, number) == step(vec, number)
     assert not np.shares_memory(other.worlds.arrays.observations, vec.worlds.arrays.observations)
 
@@ -168,14 +168,14 @@ def test_a_copy_goes_on_without_the_journal(tmp_path: Any) -> None:
 
 
 class Named(cavmarl.CavEnv):
-    """A user's own, made in another way."""
+    """A user's own class, with another constructor."""
 
     def __init__(self, name: str) -> None:
         super().__init__(cavmarl.parallel_env("ring").worlds)
         self.name = name
 
 
-def test_a_users_own_class_is_copied_whole() -> None:
+def test_an_instance_of_a_users_own_class_is_copied() -> None:
     env = Named("first")
     env.reset(seed=0)
     other = copy.deepcopy(env)

@@ -1,4 +1,4 @@
-"""Terms near borders and inside: each step of an agent counts once, at its place."""
+"""Reward terms near borders and inside of zones: each step of an agent counts once."""
 
 from __future__ import annotations
 

@@ -29,7 +29,7 @@ def test_times_to_collision_of_simple_cases() -> None:
     assert ttc(body(0, 0, 0, 10), body(25, 3, 0, 0)) == math.inf  # beside
     assert ttc(body(0, 0, 0, 10), body(-25, 0, 0, 0)) == math.inf  # behind
     assert ttc(body(0, 0, 0, 10), body(3, 0, 0, 0)) == 0.0
-    # Both need 2 s to the crossing of their ways; the fronts are 2.5 m nearer, the flanks 1 m.
+    # Both centres need 2 s to the crossing; the fronts are 2.5 m nearer, the flanks 1 m.
     crossing = ttc(body(-20, 0, 0, 10), body(0, -20, 0.5 * math.pi, 10))
     assert crossing == pytest.approx((20 - 2.5 - 1.0) / 10.0)
     passed = ttc(body(-20, 0, 0, 10), body(0, -20, 0.5 * math.pi, 2))
@@ -41,7 +41,7 @@ bodies = st.builds(body, places, places, st.floats(-math.pi, math.pi), st.floats
 
 
 @given(bodies, bodies)
-def test_it_is_when_the_first_small_step_lets_them_overlap(
+def test_time_to_collision_equals_a_search_in_small_steps(
     one: NDArray[np.void], other: NDArray[np.void]
 ) -> None:
     found = ttc(one, other)
@@ -59,7 +59,7 @@ def test_it_is_when_the_first_small_step_lets_them_overlap(
     if hits:
         assert hits[0] - 0.011 <= found <= hits[0] + 1e-9
     elif found < 5.9:
-        # It was too short to be seen in steps of 10 ms: they are as good as touching then.
+        # The overlap is too short for steps of 10 ms, so the bodies nearly touch at that time.
         assert any(touch(found + share) for share in np.linspace(0.0, 0.01, 21)) or found >= 0.0
 
 
@@ -71,11 +71,11 @@ def line(x: float, y: float, vx: float, vy: float, heading: float) -> NDArray[np
     return rows
 
 
-def test_post_encroachment_is_between_leaving_and_coming() -> None:
+def test_post_encroachment_time_is_from_leaving_to_arriving() -> None:
     east = line(-30.0, 0.0, 10.0, 0.0, 0.0)
     # Its rear leaves the crossing area (1 m beyond the middle) at 3.3 s.
     later = line(0.0, -60.0, 0.0, 10.0, 0.5 * math.pi)
-    # Its front, 2 m ahead, comes there (1 m before the middle) at 5.7 s.
+    # Its front, 2 m ahead, reaches the area (1 m before the middle) at 5.7 s.
     assert 2.4 <= post_encroachment_s(east, later) <= 2.4 + 2 * 0.1 + 1e-9
     assert post_encroachment_s(later, east) == post_encroachment_s(east, later)
     assert post_encroachment_s(east, line(0.0, -30.0, 0.0, 10.0, 0.5 * math.pi)) == 0.0

@@ -1,4 +1,4 @@
-"""Evaluation: what it counts, that it repeats itself, and what it refuses."""
+"""Evaluation: metrics, repeatability, and refused arguments."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL: dict[str, Any] = {"episodes": 3, "agents": 3, "background": 3, "max_cycle
 
 
 def results(report: EvaluationReport) -> list[Any]:
-    """All that is repeatable."""
+    """Return the repeatable part of a report."""
     return [(policy.trips, policy.metrics) for policy in report.policies.values()]
 
 
@@ -33,13 +33,11 @@ def by_chance() -> EvaluationReport:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The folder of two policies in three runs, each in a Python of its own."""
+    """Return the folder of two policies in three runs, each in a new interpreter."""
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(
-            subprocess_calls, "start_python", start_python
-        )  # no fork, as elsewhere in the tests
+        patch.setattr(subprocess_calls, "start_python", start_python)  # no fork, as in other tests
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 
@@ -71,7 +69,7 @@ def test_a_report_is_json(by_chance: EvaluationReport) -> None:
     assert set(document["metrics"]) == {metric.name for metric in METRICS}
 
 
-def test_one_run_makes_no_interval_up(by_chance: EvaluationReport) -> None:
+def test_one_run_has_no_interval_between_runs(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
     assert all(found[metric.name].between_run_ci95 is None for metric in METRICS)
     assert found["off_road"].interval == found["off_road"].within_run[0].wilson95
@@ -79,7 +77,9 @@ def test_one_run_makes_no_interval_up(by_chance: EvaluationReport) -> None:
     assert "not available" in by_chance.to_dict()["between_run_ci95"]
 
 
-def test_the_built_in_driver_arrives_where_chance_does_not(by_chance: EvaluationReport) -> None:
+def test_the_built_in_driver_arrives_where_random_actions_do_not(
+    by_chance: EvaluationReport,
+) -> None:
     report = evaluate("merge", "idm", episodes=2, agents=3, background=3, seed=4)
     driver, chance = report["idm"], by_chance["random_actions"]
     assert (driver["success"].mean or 0.0) > 0.8
@@ -144,7 +144,7 @@ def test_the_interval_between_runs_is_that_of_the_run_means(compared: Path) -> N
     assert found.between_run_ci95.high == pytest.approx(means.mean() + half)
 
 
-def test_intervals_of_what_is_bounded_stay_within_and_have_a_width(compared: Path) -> None:
+def test_intervals_of_bounded_metrics_stay_in_bounds_and_have_a_width(compared: Path) -> None:
     for policy in load_report(compared).policies.values():
         for metric in METRICS:
             interval = policy[metric.name].between_run_ci95

@@ -1,4 +1,4 @@
-"""Failed trips: causes, which are the worst, the clip of each, and the page in a browser."""
+"""Failed trips: causes, ranking, clips, and the page in a browser."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_the_page_has_the_worst_trips_with_clips_of_ten_seconds(folder: Path) ->
                 assert abs(y - failure["center_m"][1]) < REACH_M + 0.01
 
 
-def test_a_clip_shows_what_the_recording_has(folder: Path) -> None:
+def test_a_clip_equals_the_recording(folder: Path) -> None:
     failure = told(folder / "out" / "failures.html")["failures"][0]
     path = folder / "recordings" / failure["policy"] / "run-0"
     recording = Recording.open(path)
@@ -91,7 +91,7 @@ def test_a_clip_shows_what_the_recording_has(folder: Path) -> None:
             assert (x, y) == (round(by_id[vehicle]["x"], 2), round(by_id[vehicle]["y"], 2))
 
 
-def test_a_clip_has_what_the_vehicle_observed(folder: Path) -> None:
+def test_a_clip_has_the_observations_of_the_vehicle(folder: Path) -> None:
     failure = told(folder / "out" / "failures.html")["failures"][0]
     recording = Recording.open(folder / "recordings" / failure["policy"] / "run-0")
     config = validate(EnvConfig, recording.manifest["world"]["config"], "manifest")
@@ -125,7 +125,7 @@ def test_observations_that_need_too_much_memory_are_not_kept(
     assert "were not kept" in clip["sensors_note"]
 
 
-def test_the_page_asks_nothing_of_other_hosts(folder: Path) -> None:
+def test_the_page_loads_nothing_from_other_hosts(folder: Path) -> None:
     text = (folder / "out" / "failures.html").read_text(encoding="utf-8")
     assert "http" not in text.replace("http-equiv", "")
     assert "default-src 'none'" in text
@@ -148,7 +148,7 @@ def test_a_browser_shows_the_page(folder: Path) -> None:
     assert int(shown[2]) > 0
 
 
-def test_the_replay_shows_what_the_vehicle_observed(folder: Path) -> None:
+def test_the_replay_shows_the_observations_of_the_vehicle(folder: Path) -> None:
     with chromium() as browser:
         page = browser.new_page()
         problems: list[str] = []

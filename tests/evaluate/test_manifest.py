@@ -1,4 +1,4 @@
-"""The manifest: what it says, that it is there first, and what is refused without it."""
+"""The manifest: its content, written before results, and results that are refused without it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {"episodes": 1, "agents": 2, "background": 2, "max_cycle
 
 @pytest.fixture
 def folder(tmp_path: Path) -> Path:
-    """Results of a small evaluation."""
+    """Return the results folder of a small evaluation."""
     evaluate("merge", "idm", out=tmp_path / "results", **SMALL)
     return tmp_path / "results"
 
@@ -69,7 +69,7 @@ PERSON = (
 )
 
 
-def test_tolerated_demand_is_told_once_and_stated(
+def test_tolerated_demand_is_reported_once_and_recorded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "x.rou.xml"

@@ -1,4 +1,4 @@
-"""Evaluations say what became of messages."""
+"""Metrics of messages in evaluations."""
 
 from __future__ import annotations
 

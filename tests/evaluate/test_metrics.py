@@ -1,4 +1,4 @@
-"""Values of metrics from trips made by hand."""
+"""Values of metrics of hand-made trips."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 
 
 def trips(*distances_m: float) -> NDArray[np.void]:
-    """Trips that count, without any infraction."""
+    """Return counting trips without infractions."""
     rows = np.zeros(len(distances_m), TRIP)
     rows["distance_m"], rows["counted"] = distances_m, True
     return rows
@@ -34,7 +34,7 @@ def test_each_infraction_shortens_the_way_between_two(infraction: str) -> None:
     assert values("km_per_infraction", rows) == [2.0]
 
 
-def test_a_way_that_was_driven_back_is_no_way() -> None:
+def test_distance_that_was_driven_back_does_not_count() -> None:
     assert values("km_per_infraction", trips(3000.0, -1000.0)) == [3.0]
     assert values("km_per_infraction", trips()) == []
 

@@ -1,4 +1,4 @@
-"""Post-encroachment times against their closed form, and where agents are."""
+"""Post-encroachment times compared with their closed form, and positions of agents."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROADS = network("grid4x4")
 MIRROR = mirrored_conflicts(ROADS)
 STEP_S = 0.1
 STEPS = 150
-# The links of a junction that crosses in every direction.
+# The links of a junction with crossing traffic in all directions.
 JUNCTION = int(np.bincount(ROADS.links["junction"]).argmax())
 LINKS = np.flatnonzero(ROADS.links["junction"] == JUNCTION).tolist()
 
@@ -39,7 +39,7 @@ def place(row: np.void, passage: Passage, centre_m: float) -> None:
 
 
 def watch(passages: list[Passage], order: list[int] | None = None) -> NDArray[np.float64]:
-    """The agents' least times; agent k drives passages[k]."""
+    """Return the least time of each agent; agent k drives passages[k]."""
     count = len(passages)
     rows = np.zeros((1, count), VEHICLE)
     shape = (1, len(MIRROR))
@@ -71,7 +71,7 @@ def watch(passages: list[Passage], order: list[int] | None = None) -> NDArray[np
 
 @st.composite
 def passages(draw: st.DrawFn) -> list[Passage]:
-    """Vehicles on different links of the junction, all before it and all through in time."""
+    """Draw vehicles on different links; all start before the junction and leave it in time."""
     links = draw(st.lists(st.sampled_from(LINKS), min_size=2, max_size=6, unique=True))
     return [
         Passage(
@@ -99,7 +99,7 @@ def test_the_order_of_rows_does_not_matter(those: list[Passage], data: st.DataOb
 
 
 def crossing() -> tuple[int, np.void]:
-    """A link of the junction and its conflict with one whose path crosses it."""
+    """Return a link of the junction, and its conflict with a crossing link."""
     for link in LINKS:
         first = int(ROADS.links[link]["first_conflict"])
         for c in range(first, first + int(ROADS.links[link]["num_conflicts"])):
@@ -108,7 +108,7 @@ def crossing() -> tuple[int, np.void]:
     raise AssertionError("no links that cross")
 
 
-def test_only_the_last_that_has_passed_is_met() -> None:
+def test_only_the_last_vehicle_that_has_passed_counts() -> None:
     one, conflict = crossing()
     other = int(conflict["foe"])
     platoon = [Passage(one, start, 10.0, 5.0) for start in (-5.0, -20.0)]
@@ -141,7 +141,7 @@ def test_areas_mirror_each_other_except_where_paths_merge() -> None:
     assert (MIRROR[merging] == -1).all()
 
 
-def test_places_are_those_of_the_agents_vehicles() -> None:
+def test_positions_are_those_of_the_agents_vehicles() -> None:
     rows = np.zeros((2, 3), VEHICLE)
     rows["agent"] = [[1, -1, 0], [0, 1, -1]]
     rows["x"] = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]

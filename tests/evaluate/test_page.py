@@ -1,4 +1,4 @@
-"""The HTML page, as a real browser sees it."""
+"""The HTML page in a real browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUIET = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--hide-scrollbars",
 )  # fmt: skip
-# Runs after the page and writes what the browser made of it into the page.
+# This script runs after the page, and writes the state of the browser into the page.
 PROBE = """<script>
 window.addEventListener("load", () => {
   const size = element => {
@@ -75,7 +75,7 @@ def browse(tmp_path_factory: pytest.TempPathFactory) -> Browse:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Results of two policies in two runs."""
+    """Return the results of two policies in two runs."""
     path = tmp_path_factory.mktemp("results") / "found"
     policies = {"built in": "idm", "<b>chance</b>": "random_actions"}
     evaluate("merge", policies, repeats=2, out=path, **SMALL)
@@ -91,7 +91,7 @@ def page(folder: Path) -> Path:
 
 @pytest.fixture(scope="module")
 def told(page: Path, browse: Browse) -> dict[str, Any]:
-    """What the browser says about the page."""
+    """Return the state of the page in the browser."""
     text = page.read_text(encoding="utf-8")
     probed = page.with_name("probed.html")
     probed.write_text(
@@ -104,7 +104,7 @@ def told(page: Path, browse: Browse) -> dict[str, Any]:
     return document
 
 
-def test_a_browser_shows_it_without_error_and_without_another_file(told: dict[str, Any]) -> None:
+def test_a_browser_shows_the_page_without_errors_and_other_files(told: dict[str, Any]) -> None:
     assert told["errors"] == []
     assert told["loaded"] == []
 
@@ -117,7 +117,7 @@ def test_its_tables_are_filled(told: dict[str, Any]) -> None:
 
 
 def test_its_pictures_have_a_size_and_text(told: dict[str, Any]) -> None:
-    assert len(told["svgs"]) == 3 + 2  # the plots and one map a policy
+    assert len(told["svgs"]) == 3 + 2  # the plots, and one map per policy
     assert all(width > 600 and height > 60 for width, height in told["svgs"])
     assert told["texts"] > 40
 
@@ -182,7 +182,7 @@ def test_a_divided_world_shows_the_changes_of_zone(page: Path, tmp_path: Path) -
         cell = " / ".join(f"{value:.2f}" for value in spread if value is not None)
         assert shown[f"depth at {name} <small>m</small>"] == cell
     assert "zone imbalance" in text
-    assert 'id="transfers"' not in page.read_text(encoding="utf-8"), "that one is undivided"
+    assert 'id="transfers"' not in page.read_text(encoding="utf-8"), "the other world is undivided"
 
 
 def test_a_page_of_results_without_a_manifest_is_refused(tmp_path: Path) -> None:

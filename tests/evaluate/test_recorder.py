@@ -1,4 +1,4 @@
-"""Trips and episodes made by hand."""
+"""Records of hand-made trips and episodes."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_the_terms_of_a_step_without_an_agent_do_not_count() -> None:
     assert worlds.trips["began_s"].tolist() == [0.0, STEP_S]
 
 
-def test_a_seat_makes_one_trip_after_the_other() -> None:
+def test_a_seat_has_several_trips_in_sequence() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[0] = 1.5
     worlds.add(done=(True, False), arrival=(1.0, 0.0), progress=(5.0, 1.0))
@@ -100,7 +100,7 @@ def test_a_seat_makes_one_trip_after_the_other() -> None:
     assert np.isnan(trips["least_pet_s"][1:]).all()
 
 
-def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> None:
+def test_trips_below_a_metre_do_not_count_for_the_evenness_of_delays() -> None:
     worlds = Worlds()
     worlds.add(done=(True, True), delay=(1.0, 1.0), progress=(10.0, 10.0))
     worlds.add(done=(True, True), over=(True, True), delay=(1.0, 1.0), progress=(0.9, 1.1))
@@ -109,7 +109,7 @@ def test_trips_of_less_than_a_metre_do_not_share_in_how_even_delays_are() -> Non
     assert uneven > 0.1
 
 
-def test_vehicles_that_were_driven_back_have_no_speed_to_share() -> None:
+def test_vehicles_that_were_driven_back_have_speed_0_in_jains_index() -> None:
     worlds = Worlds()
     worlds.add(done=(True, True), progress=(4.0, 4.0))
     worlds.add(done=(True, True), over=(True, True), progress=(-4.0, 4.0))
@@ -133,7 +133,7 @@ def test_collided_and_off_road_vehicles_do_not_arrive() -> None:
     assert not (trips["success"] | trips["arrived"] | trips["unfinished"]).any()
 
 
-def test_the_horizon_cuts_a_trip_and_it_is_neither() -> None:
+def test_a_trip_that_the_horizon_truncates_has_neither_arrived_nor_failed() -> None:
     worlds = Worlds(max_steps=2)
     worlds.add()
     worlds.add(over=(True, True))

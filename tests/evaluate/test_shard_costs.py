@@ -1,4 +1,4 @@
-"""What shards cost: whose time it is, and that a clock changes nothing. No figure is a time's."""
+"""Costs of shards: attribution to zones, and measuring changes no result. No test checks a time."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_every_zone_takes_some_time(simulation: Simulation) -> None:
 
 
 def test_a_cost_is_the_median_of_five_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Loading a kernel makes the first part of the first zone dear.
+    # Loading a kernel makes the first part of the first zone expensive.
     parts_s = ([90.0, 1.0], [1.0, 1.0], [2.0, 5.0], [3.0, 1.0], [2.0, 1.0])
     none = np.zeros(0, np.int64)
     rounds = [

@@ -1,4 +1,4 @@
-"""Figures of controllers of signals, and the suite that compares them."""
+"""Metrics of signal controllers, and the suite that compares them."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ NUMBERS = np.random.default_rng(0)
 def test_co2_is_that_of_sumo(tmp_path: Path) -> None:
     sumo = pytest.importorskip("sumo")
     speed, accel = NUMBERS.uniform(0.0, 40.0, 3000), NUMBERS.uniform(-4.0, 3.0, 3000)
-    # SUMO's numbers have five digits. Near the speed or the deceleration of coasting, they may be
-    # on its other side.
+    # SUMO prints five digits. Near the limits of coasting, rounding may put a value on the other
+    # side of the limit.
     speed, accel = np.round(speed, 4), np.round(accel, 4)
     cycle, found = tmp_path / "cycle.csv", tmp_path / "found.csv"
     pairs = enumerate(zip(speed, accel, strict=True))
@@ -76,7 +76,7 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
     assert figures.queue == pytest.approx(5 / 6)
     assert figures.never_departed == 1
     assert figures.delay_s is None
-    # Lost: (20 - 8) / 2 - 0.25 s on the way and 2 s before it; and 7 s of the one that waits.
+    # Lost time: (20 - 8) / 2 - 0.25 s on the way and 2 s before it; 7 s of the waiting vehicle.
     assert figures.delay_of_all_s == pytest.approx((6.0 - 0.25 + 2.0 + 7.0) / 2)
 
 

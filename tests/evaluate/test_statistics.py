@@ -1,4 +1,4 @@
-"""Intervals, shares and evenness against textbooks and against slow twins."""
+"""Intervals, shares and evenness, compared with textbooks and slow twins."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_students_quantile_equals_the_textbook(freedom: int, quantile: float) ->
 
 
 @pytest.mark.parametrize("runs", [2, 3, 5])
-def test_the_interval_between_runs_covers_as_often_as_it_says(runs: int) -> None:
+def test_the_interval_between_runs_has_its_stated_coverage(runs: int) -> None:
     random = np.random.default_rng(runs)
     hits = 0
     for _ in range(1000):
@@ -85,7 +85,7 @@ def test_runs_without_any_hit_or_miss_still_leave_room(
 def test_equal_runs_have_the_interval_of_their_trips() -> None:
     found, trips = run_share_interval(np.full(2, 0.3), 20), share_interval(6, 20)
     assert found == trips
-    # Of 100 trips: runs that nearly agree must not make their 30 % certain to a percent.
+    # 100 trips in all: nearly equal runs must not give an interval of one per cent around 30 %.
     found = run_share_interval(np.array([0.3, 0.3, 0.3, 0.3, 0.31]), 100)
     assert found is not None
     assert found.low < 0.23
@@ -98,7 +98,7 @@ def test_equal_runs_have_the_interval_of_their_trips() -> None:
 def test_an_interval_of_shares_covers_and_stays_inside(
     runs: int, share: float, alike: float
 ) -> None:
-    """Each run has a chance of its own, by a beta distribution, and 50 trips."""
+    """Each run has 50 trips and a success probability from a beta distribution."""
     random, hits = np.random.default_rng(runs), 0
     for _ in range(1000):
         chances = random.beta(alike * share, alike * (1.0 - share), runs)
@@ -106,7 +106,7 @@ def test_an_interval_of_shares_covers_and_stays_inside(
         assert found is not None
         assert 0.0 <= found.low < found.high <= 1.0
         hits += found.low <= share <= found.high
-    assert hits >= 900  # of 950; chances near 0 are far from normal
+    assert hits >= 900  # of 950; shares near 0 are far from normally distributed
 
 
 def test_an_interval_of_evenness_stays_within_its_bounds() -> None:
@@ -157,6 +157,6 @@ def test_gini_equals_the_sum_over_all_pairs(values: np.ndarray) -> None:
 def test_jain_is_one_where_all_have_the_same_and_falls_to_one_over_n() -> None:
     assert jain_index(np.full(5, 3.0)) == pytest.approx(1.0)
     assert jain_index(np.array([7.0, 0.0, 0.0, 0.0])) == pytest.approx(0.25)
-    # Jain, Chiu and Hawe 1984: k of n users served alike have the index k/n.
+    # Jain, Chiu and Hawe 1984: if k of n users get equal shares, the index is k/n.
     assert jain_index(np.array([2.0] * 3 + [0.0] * 7)) == pytest.approx(0.3)
     assert math.isnan(jain_index(np.zeros(3)))

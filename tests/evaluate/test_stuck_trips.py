@@ -1,4 +1,4 @@
-"""How long agents have stood, and why, on worlds made by hand."""
+"""How long and why agents stood, in hand-made worlds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEP_S = 0.5
 
 
 class Worlds:
-    """One world with agents whose speeds, and the built-in driver's actions, are given."""
+    """One world whose agents have given speeds and given actions of the built-in driver."""
 
     def __init__(self, suggested: list[float], kind: str = "continuous") -> None:
         agents = len(suggested)
@@ -51,7 +51,7 @@ class Worlds:
             self.step += 1
 
     def cut(self) -> NDArray[np.void]:
-        """The trips, which the horizon cuts."""
+        """Return the trips, which the horizon truncates."""
         agents = self.mask.shape[1]
         nothing = np.zeros((1, agents))
         return self.recorder.add(
@@ -68,7 +68,7 @@ class Worlds:
 def test_a_vehicle_stands_below_a_tenth_of_a_metre_a_second() -> None:
     worlds = Worlds([0.0, 0.0, 0.0])
     worlds.drive(5, 0.0, 0.09, 0.11)
-    # The first look has no earlier place.
+    # The first sample has no earlier position.
     assert worlds.recorder.still_s[0].tolist() == [2.0, 2.0, 0.0]
     worlds.drive(1, 0.0, 1.0, 0.0)
     worlds.drive(1, 0.0, 0.0, 0.0)
@@ -98,7 +98,7 @@ def test_ten_seconds_count_as_blocked_or_stood(kind: str, goes: float, waits: fl
     assert rows["stood"].tolist() == [True, False, False]
     assert rows["blocked"].tolist() == [False, True, False]
     assert rows["out_of_time"].tolist() == [False, False, True]
-    # The built-in driver is asked every 5 s, from when somebody has stood for 5 s.
+    # The built-in driver is asked every 5 s, once an agent has stood for 5 s.
     assert worlds.asked == 2
 
 

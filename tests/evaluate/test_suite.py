@@ -1,4 +1,4 @@
-"""Suites: what they name, what they drive, what they refuse."""
+"""Suites: their maps, their worlds, and refused files."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.evaluate.suite import load_suite, run_suite, worlds_of
 ROOT = Path(__file__).resolve().parents[2]
 
 
-def test_the_standard_suite_has_the_maps_and_numbers_that_it_should() -> None:
+def test_the_standard_suite_has_its_maps_and_numbers_of_agents() -> None:
     suite = load_suite(find_settings("suite", "standard"))
     assert len(suite.maps) >= 4
     assert suite.agents == (1, 25, 50, 100)
@@ -75,7 +75,7 @@ def test_a_suite_that_cannot_work_is_refused(tmp_path: Path, text: str, message:
         load_suite(file)
 
 
-def test_the_tasks_are_entries_as_they_are() -> None:
+def test_the_tasks_are_unchanged_environments() -> None:
     suite = load_suite(find_settings("suite", "tasks"))
     worlds = worlds_of(suite, ROOT / "envs")
     assert [world.env for world in worlds] == list(suite.maps)

@@ -1,4 +1,4 @@
-"""Whole runs of real demand beside SUMO's own: nobody touches, and the figures are near SUMO's."""
+"""Runs of real demand compared with SUMO's: no contacts, and metrics near SUMO's."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
 GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
-NEAR = 0.15  # of SUMO's figure
+NEAR = 0.15  # relative to SUMO's figure
 
 
 class Case(NamedTuple):
-    """A map, its demand, and which figures are held to SUMO's."""
+    """A map, its demand, and the figures that are compared with SUMO's."""
 
     roads: str
     demand: tuple[str, ...]
     near: tuple[str, ...] = ("arrived", "mean_speed_mps")
 
 
-# On Town10HD some twenty vehicles arrive in the whole time: that number says little.
+# On Town10HD, only about twenty vehicles arrive, too few for a comparison.
 REAL = {
     "bologna": Case(
         "net/bologna_acosta/acosta_buslanes.net.xml", ("net/bologna_acosta/run.sumocfg",)
@@ -65,5 +65,5 @@ def test_on_the_wheels_maps_traffic_is_as_sumos(name: str) -> None:
 
 
 def test_for_three_minutes_traffic_is_as_sumos() -> None:
-    """The short form, which is in every run."""
+    """The short variant, which is part of every run of the tests."""
     compare(GAME, WHEEL["kuehne"], 180)

@@ -1,4 +1,4 @@
-"""SUMO's side of the comparison, on SUMO's own small maps."""
+"""The SUMO side of the comparison, on SUMO's own small maps."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run_sumo(job: SumoJob) -> TrafficRun:
 
 
 def one_car(tmp_path: Path) -> SumoInput:
-    """A car that drives straight on from the first second, at the limit or as fast as it can."""
+    """Write a car that drives straight on from the first second, at the limit or faster."""
     path = tmp_path / "one.rou.xml"
     path.write_text(
         '<routes><vType id="steady" sigma="0" speedDev="0" length="4"/>'
@@ -51,7 +51,7 @@ def one_car(tmp_path: Path) -> SumoInput:
 def test_a_run_is_counted_and_measured() -> None:
     run = run_sumo(job(read_input([ROUTES]), seconds=120))
     figures = run.figures
-    # A flow every 2 s and one every 4 s, each of one vehicle at once from second 0.
+    # One flow every 2 s and one every 4 s, both from second 0.
     assert figures.departed + figures.waiting == 90
     assert 0 < figures.arrived < figures.departed
     assert figures.mean_speed_mps is not None
@@ -80,7 +80,7 @@ def test_metrics_of_one_car_alone(tmp_path: Path) -> None:
 
 def test_without_teleports_no_vehicle_jumps() -> None:
     cross = read_input([GAME / "cross.sumocfg"])
-    # The signals of this map wait for a player; a vehicle that waits for long would be moved.
+    # The signals of this map wait for a player, so SUMO would teleport vehicles that wait long.
     eager = SumoInput(cross.route_files, cross.additional_files, options={"time-to-teleport": "20"})
     moved, stuck = (
         SumoJob(GAME / "cross" / "cross.net.xml", eager, 120, 0.5, 1, teleports)
@@ -127,7 +127,7 @@ def test_a_configuration_gives_files_begin_and_options() -> None:
     assert "option step-length = 0.05 is not used" in ignored
 
 
-def test_files_are_sorted_by_what_stands_in_them(tmp_path: Path) -> None:
+def test_files_are_sorted_by_their_content(tmp_path: Path) -> None:
     routes, types = tmp_path / "a.xml", tmp_path / "b.xml.gz"
     routes.write_text("<!-- first --><routes/>")
     types.write_bytes(gzip.compress(b"<additional/>"))
@@ -174,7 +174,7 @@ def test_detectors_write_nothing(tmp_path: Path) -> None:
     written = without_outputs(path, copies).read_text()
     assert 'file="NUL"' in written
     assert "out.xml" not in written
-    assert f'file="{tmp_path / "in.xml"}"' in written, "what is read is found from the copy"
+    assert f'file="{tmp_path / "in.xml"}"' in written, "input files are found from the copy"
     path.write_text("<additional/>")
     assert without_outputs(path, copies) == path
 

@@ -1,4 +1,4 @@
-"""Both sides of the table in one run, its picture, and its speed."""
+"""The comparison with SUMO: the table, the picture, and the speed."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ WORDS = ("bench", "traffic", str(MAP), "--demand", str(ROUTES))
 
 
 def run(*words: str) -> int:
-    """The exit code of a command."""
+    """Return the exit code of a command."""
     with pytest.raises(SystemExit) as ended:
         main(words)
     return int(ended.value.code or 0)
@@ -57,7 +57,7 @@ def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
     return TrafficComparison("town", 900, 0.1, 1, ours, theirs, ("a", "b"))
 
 
-def test_a_ratio_is_ours_over_sumos_if_it_is_defined() -> None:
+def test_a_ratio_is_cavmarl_over_sumo_if_it_is_defined() -> None:
     found = comparison(side(6, 3.0), side(8, None))
     assert found.ratio("arrived") == 0.75
     assert found.ratio("mean_speed_mps") is None
@@ -101,7 +101,7 @@ def test_both_speeds_are_measured() -> None:
 
 
 class StillSumo:
-    """libsumo, whose seven vehicles stand for ever; what it was started with is on record."""
+    """A fake libsumo whose seven vehicles never move; it records its start options."""
 
     TraCIException = RuntimeError
 
@@ -119,7 +119,7 @@ class StillSumo:
 
 @pytest.fixture
 def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
-    """In place of SUMO, in this process."""
+    """Replace SUMO in this process."""
     found = StillSumo()
 
     @contextmanager
@@ -193,7 +193,7 @@ def test_numbers_out_of_range_are_refused(wrong: dict[str, float], says: str) ->
         ((*WORDS, "--speed", "--after", "0"), "after = 0"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_bad_input_is_reported_without_a_traceback(
     capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
 ) -> None:
     assert run(*words) == 2
@@ -202,7 +202,7 @@ def test_bad_input_is_one_line(
     assert "Traceback" not in said
 
 
-def test_bins_join_what_lies_in_them() -> None:
+def test_bins_join_their_values() -> None:
     density = np.array([1.0, 3.0, 2.0, 5.0, 4.0, 11.0])
     means = binned_means(density, np.array([1.0, 1.0, 1.0, 1.0, 6.0, 100.0]))
     assert means[0].tolist() == [3.0]
@@ -218,7 +218,7 @@ def test_a_picture_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
 
 
 def test_both_sides_drive_the_same_demand(tmp_path: Path) -> None:
-    """Bicycles on lanes of their own, and persons, are not read here: nor does SUMO count them."""
+    """Bicycles on their own lanes and persons are not read; the SUMO side does not count them."""
     words = ("--grid", "--grid.number", "3", "--grid.length", "100", "--sidewalks.guess")
     network = netgenerate(tmp_path / "bikes.net.xml", *words, "--bikelanes.guess")
     demand = tmp_path / "mixed.rou.xml"

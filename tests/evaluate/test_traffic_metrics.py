@@ -1,4 +1,4 @@
-"""The meter on samples made by hand: each figure where it can be counted on fingers."""
+"""Traffic metrics of hand-made samples with known results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def network() -> RoadNetwork:
 
 @pytest.fixture(scope="module")
 def link(network: RoadNetwork) -> int:
-    """A link with a signal, straight on."""
+    """Find a link with a signal that goes straight on."""
     straight = (network.links["signal"] >= 0) & (network.links["direction"] == ord("s"))
     return int(np.flatnonzero(straight)[0])
 
@@ -32,7 +32,7 @@ def link(network: RoadNetwork) -> int:
 def car(
     network: RoadNetwork, number: int, lane: int, to_end_m: float = 1.0, speed: float = 0.0
 ) -> NDArray[np.void]:
-    """A car whose front is so far from the end of its lane; each in a place of its own."""
+    """Create a car whose front is at this distance from its lane's end; cars do not overlap."""
     row = blank_vehicle()
     row["id"] = number
     row["lane"] = lane
@@ -63,7 +63,7 @@ def measure(
 
 
 def inside(network: RoadNetwork, link: int) -> int:
-    """The first lane inside the junction on the way of a link."""
+    """Return the first lane of a link inside the junction."""
     return int(np.flatnonzero(network.lanes["internal"] & (network.lanes["link"] == link))[0])
 
 
@@ -142,7 +142,7 @@ def test_moving_vehicles_and_vehicles_off_the_line_do_not_wait(
     assert measure(network, [way] * 3).locks_s == {}
 
 
-def test_edge_minutes_follow_edie(network: RoadNetwork, link: int) -> None:
+def test_flow_and_density_are_those_defined_by_edie(network: RoadNetwork, link: int) -> None:
     lane = int(network.links["from_lane"][link])
     edge = network.edges[network.lanes["edge"][lane]]
     lane_km = edge["length_m"] * edge["num_lanes"] / 1000.0

@@ -1,4 +1,4 @@
-"""What a training run leaves on record of where its worlds were."""
+"""Records of a training run about the placement of its worlds."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from tests.cli.test_main import refusal, run
 @pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 @pytest.mark.parametrize(
     ("worlds", "zones", "sources"),
-    [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],  # one world is on one worker
+    [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],  # each world is on one worker
 )
-def test_plans_are_made_again_from_the_manifest(
+def test_plans_are_recomputed_from_the_manifest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], worlds: int, zones: int, sources: list[str]
 ) -> None:
     overrides = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}

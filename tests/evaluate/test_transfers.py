@@ -1,4 +1,4 @@
-"""Evaluations of divided worlds tell what became of every transfer."""
+"""Evaluations of divided worlds record all transfers."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_the_report_has_the_summary(folder: Path) -> None:
     assert load_report(folder).to_dict()["policies"]["idm"]["transfers"]["transfers"] == len(rows)
 
 
-def test_the_manifest_knows_the_zones(folder: Path) -> None:
+def test_the_manifest_has_the_zones(folder: Path) -> None:
     world = load_report(folder).manifest["world"]
     partition = load_world("grid4x4", overrides=ZONES).partition
     assert world["zones"] == 4
@@ -87,7 +87,7 @@ def test_each_episode_has_the_imbalance_of_its_zones(folder: Path, tmp_path: Pat
     assert len(set(rows["zone_imbalance"].tolist())) == 6
     found = load_report(folder)["idm"]["zone_imbalance"].mean
     assert found == pytest.approx(rows["zone_imbalance"].mean())
-    # Three slivers at the rim of the map, and all the rest: one zone has everybody.
+    # Three slivers at the rim of the map, and one zone that has all vehicles.
     low_x, low_y, high_x, high_y = load_world("grid4x4").network.extent_m
     cuts = [low_x - 9.0, low_x - 8.0, low_x - 7.0, low_x - 6.0, high_x + 9.0]
     rects = [(a, low_y - 9.0, b, high_y + 9.0) for a, b in pairwise(cuts)]

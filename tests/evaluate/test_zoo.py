@@ -1,4 +1,4 @@
-"""The zoo: an entry is verified by driving again; what was changed is refused."""
+"""The zoo: entries are verified by driving again; changed files are refused."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
 from cavmarl.policies.loading import load_policy, policy_files
 from tests.golden.zoo import OTHER, SAME, record
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
 FILES = ["README.md", "config.json", "manifest.json", "model.safetensors", "result"]
@@ -28,11 +28,11 @@ def entry(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("found", zoo_entries(), ids=lambda entry: entry.name)
-def test_each_entry_is_what_its_result_says(found) -> None:  # type: ignore[no-untyped-def]
+def test_each_entry_equals_its_recorded_result(found) -> None:  # type: ignore[no-untyped-def]
     assert found.weights_bytes <= 1_000_000
     assert found.trips >= 50
     config, *_ = load_config(found.environment.rpartition("-")[0])
-    if config.traffic.endless:  # nothing arrives
+    if config.traffic.endless:  # no vehicle arrives
         assert found.shares["collision"] == 0.0
     else:
         assert 0.5 < found.shares["success"] <= 1.0

@@ -1,4 +1,4 @@
-"""The fuzz targets on their seeds and on some mutations of them, without the fuzzer."""
+"""The fuzz targets, run on their seed files and some mutations of them without the fuzzer."""
 
 from __future__ import annotations
 

@@ -2,8 +2,8 @@
 
     python -m tests.golden.portability [--quick|--emulated]
 
-drives the rows of `worlds.py` and the episodes of some trained drivers, first as this machine
-does it, then with the settings of `PROCESSORS`, each time with maps that are read anew. It prints
+drives the rows of `worlds.py` and the episodes of some trained drivers, first without settings,
+then with each setting of `PROCESSORS`, each time with maps that are read anew. It prints
 a line for each run. The exit code is 1 if the bytes of a run differ from those of the first one.
 Recorded hashes are not used. `--quick` leaves out what takes longer than a minute. `--emulated`
 drives one step on the processors that `qemu-x86_64` emulates, and on the one whose kernels they
@@ -116,7 +116,7 @@ def hashes(processor: Processor, tasks: tuple[str, ...], folder: str) -> Iterato
     with tempfile.TemporaryDirectory() as cache:
         kernels = cache_dir() / "kernels"
         kernels.mkdir(parents=True, exist_ok=True)
-        Path(cache, "kernels").symlink_to(kernels)  # their names tell processors apart
+        Path(cache, "kernels").symlink_to(kernels)  # their names identify processors
         settings = {**os.environ, "CAVMARL_CACHE_DIR": cache, **processor.settings}
         command = [sys.executable, "-m", "tests.golden.portability", "--run", folder]
         if processor.emulated:

@@ -1,4 +1,4 @@
-"""Eight worlds do what they did when `make record` was last run, undivided and divided."""
+"""Eight worlds, undivided and divided, have the hashes that `make record` has written last."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
-"""Golden hashes: what eight worlds do, recorded before a change that must not alter any of it.
+"""Golden hashes of eight worlds, recorded before a change that must not alter their results.
 
     python -m tests.golden.worlds [ROW ...]
 
 writes `worlds.json`; `test_golden.py` compares. A row is a world that is driven for some steps. The
-bytes that come out, in a fixed order and without names, make one hash for each part. `WAYS` divide
-the world, and have to end in the same hashes. Names of cavmarl that may change are at the top.
+bytes of its results, in a fixed order and without names, give one hash for each part. `WAYS`
+divide the world, and must give the same hashes. Names of cavmarl that may change are at the top.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ mirrored: {traffic: {source: sumo-traffic}, sensors: {signal.timing: false}}}"""
 
 
 class Row(NamedTuple):
-    """A world, and what drives in it."""
+    """A world and its driver."""
 
     env: str
     settings: str  # of SETTINGS; later ones win
@@ -84,7 +84,7 @@ ROWS: dict[str, Row] = {
 
 
 def _parts(row: Row, vec: cavmarl.CavVectorEnv) -> Iterator[tuple[str, Any]]:
-    """Drive a world; yield what comes out, each with its part."""
+    """Drive a world; yield each result with the name of its part."""
     worlds = range(vec.num_envs)
     policy = cavmarl.load_policy(row.driver, vec)
     observations, infos = vec.reset(seed=11)
@@ -106,7 +106,7 @@ def _parts(row: Row, vec: cavmarl.CavVectorEnv) -> Iterator[tuple[str, Any]]:
 def drive(row: Row, way: Mapping[str, Any], folder: str) -> dict[str, str]:
     """Drive a world in one of the `WAYS`, or undivided; return the hash of each part.
 
-    `folder` is that of `write_inputs`.
+    `folder`: as for `write_inputs`.
     """
     overrides: dict[str, Any] = {}
     for name in row.settings.split():

@@ -1,4 +1,4 @@
-"""Results of the zoo, made again: for each trained driver, `result/` is driven anew and replaced.
+"""Make the results of the zoo again: evaluate each trained driver, and replace its `result/`.
 
     python -m tests.golden.zoo [DRIVER ...]
 
@@ -27,7 +27,7 @@ SAME, OTHER = "same results as before", "recorded anew"
 
 
 def record(driver: str | Path) -> str:
-    """Replace the result of a driver, given by its name or folder; return what has become of it.
+    """Replace the result of a driver, given by its name or folder; return a word for the outcome.
 
     The old result stays if the new one is the same, and if the evaluation fails or is interrupted.
     """
@@ -36,7 +36,7 @@ def record(driver: str | Path) -> str:
     before = read_closed(result)
     with draft_folder(folder) as draft:
         made, old = draft / RESULT_FOLDER, draft / "old"
-        # A name is given as such: a path in the manifest would be that of this machine.
+        # Keep a name as a name, because a path in the manifest would depend on this machine.
         entry_job(before, folder).drive(next(iter(before["policies"])), Path(driver), made)
         load_report(made)
         found = read_closed(made)
@@ -52,7 +52,7 @@ def record(driver: str | Path) -> str:
 
 
 def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
-    """Return what a manifest says of results, without times, machine and version of the code."""
+    """Return the part of a manifest that depends on neither time, machine nor code version."""
     keys = ("schema", "metrics_version", "episodes", "seeds")
     return {
         **{key: document.get(key) for key in keys},

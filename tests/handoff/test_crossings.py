@@ -1,6 +1,6 @@
-"""Borders under stress: many at once, thin zones, corners, turns back, ends and resets in between.
+"""Difficult crossings of borders: many at once, thin zones, corners, U-turns, arrivals, resets.
 
-Each world is run divided and undivided; after every tick their hashes are equal and nobody is lost.
+Each world is run divided and undivided; after every tick, hashes are equal and no vehicle is lost.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Build = Callable[[dict[str, Any]], Simulation]
 
 
 def zones_by_id(simulation: Simulation, world: int = 0) -> dict[int, int]:
-    """In which zone each vehicle lies, by its id."""
+    """Return the zone of each vehicle by its id."""
     rows = simulation.vehicles(world)
     places: NDArray[np.float64] = np.stack([rows["x"], rows["y"]], axis=1)
     zones = simulation.partition.zones_of(places)
@@ -38,7 +38,7 @@ def zones_by_id(simulation: Simulation, world: int = 0) -> dict[int, int]:
 
 
 def both(build: Build, layout: Path, count: int, **overrides: Any) -> tuple[Simulation, Simulation]:
-    """The undivided and the divided world, at the start of the same episode."""
+    """Return the undivided and the divided world at the start of the same episode."""
     zones = {"zones.layout": str(layout), "zones.count": count}
     pair = build(ONE_TICK | overrides), build(ONE_TICK | zones | overrides)
     for simulation in pair:
@@ -47,7 +47,7 @@ def both(build: Build, layout: Path, count: int, **overrides: Any) -> tuple[Simu
 
 
 def together(whole: Simulation, divided: Simulation, ticks: int) -> Iterator[dict[int, int]]:
-    """Run both; after every tick they are equal, and the divided world's zones by id are given."""
+    """Run both, and check that they are equal; yield the zone of each vehicle after every tick."""
     for _ in range(ticks):
         drive(whole)
         drive(divided)
@@ -65,7 +65,7 @@ def check(whole: Simulation, divided: Simulation) -> None:
 
 @pytest.fixture
 def platoon(tmp_path: Path) -> Build:
-    """A hundred roads beside one another, a car on each."""
+    """Return a demand of a hundred parallel roads with a car on each."""
     roads = [((0.0, 4.0 * k), (200.0, 4.0 * k)) for k in range(MANY)]
     net = write_roads(tmp_path / "rows.net.xml", roads, SPEED_MPS)
     cars = write_platoon(tmp_path / "rows.rou.xml", MANY, 40.0, SPEED_MPS)
@@ -104,7 +104,7 @@ def test_a_hundred_vehicles_cross_in_both_directions_in_the_same_tick(tmp_path: 
 
 @pytest.mark.parametrize("side_m", [4.0, 1.5])
 def test_a_chain_of_zones_in_consecutive_ticks(side_m: float, tmp_path: Path) -> None:
-    # At 25 m/s and 0.2 s a tick, 5 m each: from A to B to C, or over zones that are never entered.
+    # At 25 m/s and 0.2 s per tick, cars move 5 m: from A to B to C, or past zones without entering.
     roads = [((0.0, 4.0 * k), (200.0, 4.0 * k)) for k in range(10)]
     net = write_roads(tmp_path / "rows.net.xml", roads, 25.0)
     cars = write_platoon(tmp_path / "rows.rou.xml", 10, 20.0, 25.0)
@@ -124,7 +124,7 @@ def test_a_chain_of_zones_in_consecutive_ticks(side_m: float, tmp_path: Path) ->
 
 
 def test_corners_where_four_zones_meet(tmp_path: Path) -> None:
-    # Diagonals through the corner itself, and so near it that a third zone is touched.
+    # Diagonals go through the corner itself, or so close to it that they touch a third zone.
     aside = np.array([-6.0, -3.0, -1.0, 0.0, 1.0, 3.0, 6.0])
     forth = [((20.0 + a, 20.0 - a), (180.0 + a, 180.0 - a)) for a in aside.tolist()]
     roads = [*forth, ((20.0, 180.0), (180.0, 20.0))]
@@ -145,7 +145,8 @@ def test_corners_where_four_zones_meet(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_that_arrives_on_the_border_leaves_once(platoon: Build, tmp_path: Path) -> None:
-    # Behind the border, within the hysteresis, the road ends: the old zone's cars arrive there.
+    # The road ends behind the border within the hysteresis, so cars arrive while the old zone owns
+    # them.
     whole, divided = both(platoon, strips(tmp_path, [199.0]), 2)
     for _ in together(whole, divided, 200):
         pass
@@ -157,7 +158,7 @@ def test_a_vehicle_that_arrives_on_the_border_leaves_once(platoon: Build, tmp_pa
 def test_a_reset_around_the_tick_of_the_crossing(
     ticks: int, platoon: Build, tmp_path: Path
 ) -> None:
-    # After 45 ticks their middles are the hysteresis, 2 m, behind the border.
+    # After 45 ticks, the centres are 2 m (the hysteresis) behind the border.
     whole, divided = both(platoon, strips(tmp_path, [80.0]), 2)
     for simulation in (whole, divided):
         for _ in range(ticks):

@@ -1,4 +1,4 @@
-"""Digests of rows do not know order or zones, and know every bit that counts."""
+"""Digests of rows depend on every bit of the state, but not on the order of rows or on zones."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.kernels.digests import digest_rows
 from tests.naive import digests as naive
 
-# Without the compiler NumPy warns where a product wraps around, as it shall.
+# Without the compiler, NumPy warns of products that wrap around as intended.
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 WORDS = st.integers(0, (1 << 64) - 1)
@@ -23,7 +23,7 @@ def test_the_digest_is_that_of_its_plain_twin(
     rows: list[tuple[int, int, int]], masks: tuple[int, int, int]
 ) -> None:
     factors = [0x9E3779B97F4A7C15, 1, (1 << 64) - 1]
-    words = np.array([*rows, (1, 2, 3)], dtype=np.uint64)  # the last one does not count
+    words = np.array([*rows, (1, 2, 3)], dtype=np.uint64)  # the last row does not count
     upper, lower = digest_rows(
         words, len(rows), np.array(masks, np.uint64), np.array(factors, np.uint64)
     )

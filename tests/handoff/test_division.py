@@ -1,4 +1,4 @@
-"""Who owns what in a divided world, and who sees what: looked at between its steps."""
+"""Owners and ghosts of a divided world between its steps."""
 
 from __future__ import annotations
 
@@ -35,13 +35,13 @@ def divided(zones: int = 4, **overrides: Any) -> Simulation:
 
 
 def owned(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
-    """Of each shard."""
+    """Return the owned rows of each shard."""
     parts = [shard.worlds for shard in simulation.shards]
     return [worlds.rows[world, : worlds.num_owned[world]] for worlds in parts]
 
 
 def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
-    """Of each shard."""
+    """Return the ghosts of each shard."""
     parts = [shard.worlds for shard in simulation.shards]
     return [
         worlds.rows[world, worlds.num_owned[world] : worlds.num_rows[world]] for worlds in parts

@@ -1,4 +1,4 @@
-"""The monitor's look at the rows of a world, beside its plain twin."""
+"""The monitor's check of the rows of a world, compared with its plain twin."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.naive import monitor as naive
 from tests.naive.zones import distance
 
-# Without the compiler NumPy warns where a product wraps around, as it shall.
+# Without the compiler, NumPy warns of products that wrap around as intended.
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 CAPACITY = 40
@@ -47,7 +47,7 @@ MASKS, FACTORS = digest_tables(GHOST_FIELDS)
 
 
 class Looks:
-    """A world that is looked at tick after tick, by the kernel and by its twin."""
+    """A world that the kernel and its twin check in every tick."""
 
     def __init__(self) -> None:
         self.zoned: ZoneState = make_zone_state(PARTITION.count, 1, CAPACITY)
@@ -56,7 +56,7 @@ class Looks:
         self.strays = make_strays(PARTITION.count, CAPACITY)
         self.found = np.zeros(1, dtype=FINDING)
         self.tallies = np.zeros(PARTITION.count, dtype=TALLY)
-        self.foreign = np.zeros(PARTITION.count, dtype=np.uint64)  # what nobody has, but should
+        self.foreign = np.zeros(PARTITION.count, dtype=np.uint64)  # added to expected sums
         self.before: dict[int, naive.Kept] = {}
 
     def put(self, zones: list[naive.Zone]) -> None:
@@ -73,7 +73,7 @@ class Looks:
         new_late: int = 1,
         missing: int = 0,
     ) -> int:
-        """The kernel looks: KIND_*."""
+        """Run the kernel; return the kind of its finding, KIND_*."""
         self.put(zones)
         told = watch(
             PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
@@ -87,7 +87,7 @@ class Looks:
     def compare(
         self, zones: list[naive.Zone], tick: int, new_late: int = 1, missing: int = 0
     ) -> dict[int, str]:
-        """Both look; what they find is the same. So many more vehicles are expected."""
+        """Check that kernel and twin agree, if `missing` more vehicles are expected than exist."""
         masks, factors = MASKS.tolist(), FACTORS.tolist()
         tallies = naive.tallies(zones, PARTITION.reaching, HALO_M, masks, factors)
         expected = np.array([owned for _, owned, _, _ in tallies], dtype=np.uint64)
@@ -116,12 +116,12 @@ class Looks:
         return wrong
 
     def entered(self) -> list[int]:
-        """Vehicles that the last look but one has not seen."""
+        """Return the vehicles that are new since the check before."""
         return sorted(self.strays.entered[: self.found["entered"].item()].tolist())
 
 
 def drawn(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
-    """Vehicles anywhere, of that tick or, every other one, of the tick before."""
+    """Draw vehicles anywhere; every second one is at the previous tick."""
     rows = np.zeros(number, dtype=VEHICLE)
     rows["id"] = rng.choice(10_000, number, replace=False)
     rows["x"], rows["y"] = rng.uniform(0, 160, number), rng.uniform(0, 100, number)
@@ -131,7 +131,7 @@ def drawn(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
 
 
 def dealt(rows: NDArray[np.void]) -> list[naive.Zone]:
-    """Each to the zone that it is in, with the ghosts that are due."""
+    """Assign each vehicle to the zone that contains it, with the ghosts that zones must have."""
     owners = np.array([zone_of(PARTITION.arrays, row["x"], row["y"]) for row in rows])
     result = []
     for z, rect in enumerate(PARTITION.reaching):
@@ -148,7 +148,7 @@ def moved(rng: np.random.Generator, rows: NDArray[np.void], furthest_m: float) -
 
 
 def started(seed: int) -> tuple[Looks, np.random.Generator, NDArray[np.void]]:
-    """A world of ten ticks, and its rows."""
+    """Return a world after ten ticks, and its rows."""
     rng = np.random.default_rng(seed)
     looks, rows = Looks(), drawn(rng, 25, 10)
     rows["tick"] = 10
@@ -193,18 +193,18 @@ def test_sums_of_a_correct_state_are_equal() -> None:
         assert sum(hashes) % (1 << 64) == int(looks.tallies["owned"][z])
 
 
-def test_a_zone_that_owns_others_than_it_should_is_found() -> None:
+def test_a_zone_that_owns_wrong_vehicles_is_found() -> None:
     looks, rng, rows = started(7)
     looks.foreign[2] = 1
     assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
 
 
-def test_a_vehicle_too_few_is_found() -> None:
+def test_a_missing_vehicle_is_found() -> None:
     looks, rng, rows = started(7)
     assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11, missing=1)
 
 
-def test_a_vehicle_that_a_second_zone_owns_enters_where_it_already_was() -> None:
+def test_a_vehicle_with_two_owners_is_reported_as_entering_again() -> None:
     looks, rng, rows = started(8)
     zones = dealt(moved(rng, rows, 1.0))
     doubled = zones[0].owned[:1]

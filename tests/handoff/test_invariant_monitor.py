@@ -1,4 +1,4 @@
-"""Each invariant of a divided world, violated on purpose, is caught by the monitor at run time."""
+"""The monitor detects each deliberate violation of an invariant of a divided world."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def watched(env: str = "grid4x4", worlds: int = 1, **overrides: Any) -> Simulati
 
 @pytest.fixture
 def simulation() -> Simulation:
-    """Some steps old."""
+    """Return a divided world after some steps."""
     found = watched()
     for _ in range(STEPS):
         drive(found)
@@ -57,14 +57,14 @@ def test_a_clean_run_passes(env: str) -> None:
 
 
 class Meddling:
-    """Puts a hand into the rows just before the monitor looks."""
+    """Change rows just before the monitor checks them."""
 
     def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
         self.simulation, self._patch = simulation, monkeypatch
         self.division: ZonedShards = simulation.division
 
     def zone(self, zone: int) -> tuple[Any, int, int]:
-        """Rows, owned ones and all of a zone."""
+        """Return the rows of a zone, and the numbers of owned and of all rows."""
         worlds = self.simulation.shards[zone].worlds
         return worlds.rows[0], int(worlds.num_owned[0]), int(worlds.num_rows[0])
 
@@ -135,7 +135,7 @@ def a_ghost_of_the_tick_before(world: Meddling) -> None:
     rows[owned]["tick"] -= 1
 
 
-def a_ghost_that_somebody_has_written(world: Meddling) -> None:
+def a_ghost_with_a_changed_field(world: Meddling) -> None:
     rows, owned, _ = world.zone(1)
     rows[owned]["speed"] += 0.5
 
@@ -155,7 +155,7 @@ VIOLATIONS = {
     a_row_that_is_with_another_zone_than_on_record: r"owner on record: zone \d owns vehicle \d+ at",
     a_clock_that_is_late: r"one clock: zone 2 is at tick \d+, not at \d+",
     a_ghost_of_the_tick_before: r"age of ghosts: zone 1 has a ghost of vehicle \d+ with tick = ",
-    a_ghost_that_somebody_has_written: r"age of ghosts: .* ghost of vehicle \d+ with speed",
+    a_ghost_with_a_changed_field: r"age of ghosts: .* ghost of vehicle \d+ with speed",
     a_ghost_that_is_not_there: r"ghosts: zone 1 has 0 ghosts of vehicle \d+, not 1: the vehicle",
 }
 
@@ -170,7 +170,7 @@ def test_the_monitor_finds_each_violation(
 
 @pytest.fixture
 def narrow(monkeypatch: pytest.MonkeyPatch) -> Meddling:
-    """Zones that do not see the whole map, and have room for more ghosts."""
+    """Return zones that do not see the whole map, with room for more ghosts."""
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)
     found = watched()
     drive(found)
@@ -214,7 +214,7 @@ def test_a_ghost_of_a_missing_vehicle_is_detected(narrow: Meddling) -> None:
 def test_a_recorded_arrival_of_a_present_vehicle_is_detected(
     narrow: Meddling, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All sums hold: it is said to arrive, deep in a zone where nobody else sees it."""
+    """All sums are correct: the vehicle is deep in a zone, and no other zone has a ghost of it."""
     coordination: Any = coordination_of(narrow.simulation)
     coordinator = coordination.coordinators[0]
 
@@ -243,7 +243,7 @@ def test_an_unrecorded_arrival_is_detected(monkeypatch: pytest.MonkeyPatch) -> N
         drive(simulation)
 
 
-def test_the_monitor_takes_as_much_memory_as_it_began_with(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_memory_of_the_monitor_does_not_grow(monkeypatch: pytest.MonkeyPatch) -> None:
     monitors: set[InvariantMonitor] = set()
     look = InvariantMonitor.end
 
@@ -269,8 +269,8 @@ def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) ->
         ghosts[0]["x"] = 0.0
 
 
-def test_worlds_go_on_from_a_saved_state(simulation: Simulation) -> None:
-    """The monitor's clock is then that of the state; a zone at another tick is still found."""
+def test_worlds_resume_from_a_saved_state_with_the_monitor(simulation: Simulation) -> None:
+    """The monitor takes its tick from the state, and still finds a zone at another tick."""
     saved = [array.copy() for array in simulation.save()]
     hashes = []
     for _ in range(2):

@@ -1,4 +1,4 @@
-"""The log on disk: what was appended is there, and what is damaged is refused by file and line."""
+"""The journal on disk: appended records are read back, and damage is refused with file and line."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
 def eventful() -> Bench:
-    """Two zones: births, a hand-off, a forced one after two late ticks, a crash, a removal."""
+    """Run two zones: births, a hand-off, a forced one after two late ticks, a crash, a removal."""
     bench = Bench()
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.tick(movers=[(7, 1)], births=[(8, 1)])
@@ -48,7 +48,7 @@ def eventful() -> Bench:
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
-    """The journal of `eventful`."""
+    """Write the journal of `eventful`."""
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
         journal.append(eventful().log)
@@ -108,7 +108,7 @@ def test_a_journal_goes_on_behind_what_is_there(tmp_path: Path) -> None:
     assert list(JournalReader(path)) == log
 
 
-def test_a_fork_does_not_write_its_parents_journal(tmp_path: Path) -> None:
+def test_a_fork_does_not_write_to_the_journal_of_its_parent(tmp_path: Path) -> None:
     log, path = eventful().log, tmp_path / "run.journal"
     with Journal(path) as journal:
         journal.append(log[:3])
@@ -133,13 +133,13 @@ time.sleep(float(sys.argv[2]))
 
 
 def other_process(path: Path, seconds: float) -> subprocess.Popen[str]:
-    """Goes on with a journal, and keeps it for so long."""
+    """Start a process that opens a journal, and holds it for some seconds."""
     words = [sys.executable, "-c", HOLD, str(path), str(seconds)]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.skipif(sys.platform == "win32", reason="files are not locked there")
-def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
+def test_two_runs_cannot_write_the_same_journal(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     words = f"{re.escape(str(path))}: another run is writing this journal; choose another"
     with Journal(path) as journal:
@@ -155,7 +155,7 @@ def test_two_runs_do_not_write_one_journal(tmp_path: Path) -> None:
         with pytest.raises(JournalError, match=words):
             Journal(path, resume=True)
         writer.kill()
-    with Journal(path, resume=True) as journal:  # a lock dies with its process
+    with Journal(path, resume=True) as journal:  # a lock ends with its process
         assert journal.sequence == 2
 
 
@@ -211,7 +211,7 @@ def test_invalid_paths_are_refused_with_a_fix(tmp_path: Path, written: Path) -> 
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """What a full disk does to a write: a part of it is done, then there is an error."""
+    """Imitate a full disk: a part of a write is done, then there is an error."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
@@ -257,7 +257,7 @@ def test_a_coordinator_goes_on_with_its_journal(written: Path) -> None:
     assert directory.table.tick == bench.directory.table.tick
 
 
-# What it tells
+# Contents
 
 
 def test_a_summary_counts_what_was_committed(written: Path) -> None:
@@ -296,7 +296,7 @@ def test_owners_at_every_tick(written: Path) -> None:
         owners_at(written, 9)
 
 
-def test_what_no_coordinator_writes_is_refused_with_its_line(tmp_path: Path) -> None:
+def test_records_that_no_coordinator_writes_are_refused_with_their_line(tmp_path: Path) -> None:
     def refused(records: list[Record]) -> str:
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.journal"
         with Journal(path) as journal:
@@ -316,7 +316,7 @@ def test_what_no_coordinator_writes_is_refused_with_its_line(tmp_path: Path) -> 
 
 
 def lines_of_all_kinds() -> dict[str, str]:
-    """Of each kind of record the longest line of a run with hand-offs."""
+    """Return the longest line of each kind of record in a run with hand-offs."""
     found: dict[str, str] = {}
     for line in lines_of(eventful().log):
         kind = json.loads(line)["kind"]
@@ -326,7 +326,7 @@ def lines_of_all_kinds() -> dict[str, str]:
 
 
 def form(hint: Any, name: str = "") -> str:
-    """How a field is written."""
+    """Return the type of a field as the page writes it."""
     if get_origin(hint) is tuple:
         return f"list of {form(get_args(hint)[0])}"
     if hint in (int, bool):
@@ -369,7 +369,7 @@ def test_the_page_explains_every_key_of_a_line() -> None:
 
 
 def independent_replay(journal: Path) -> Any:
-    """The owners by the program of the page, which knows none of our code."""
+    """Return the owners as computed by the program of the page, which does not import cavmarl."""
     page = PAGE.read_text(encoding="utf-8")
     _, program = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert "cavmarl" not in re.sub(r'"cavmarl[^"]*"', "", program)

@@ -1,4 +1,4 @@
-"""The coordinator of a divided world in one process: its journal, and what it counts."""
+"""The coordinator of a divided world in one process: its journal and its counts."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
 
 
 def just_before_the_end_of(edge: str, path: Path) -> Path:
-    """A zone file with two strips of grid4x4: the right one begins 11 m before an edge ends."""
+    """Write two strips of grid4x4 as zones: the right strip begins 11 m before an edge's end."""
     roads = load_world("grid4x4").network
     lane = roads.lanes[int(roads.edges[roads.edge_ids.index(edge)]["first_lane"])]
     end_x = float(roads.points[int(lane["first_point"] + lane["num_points"]) - 1]["x"])
@@ -73,7 +73,7 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
 
 
 def test_vehicles_that_leave_in_the_tick_of_their_change_are_marked(tmp_path: Path) -> None:
-    """The trip ends in 3.5 m, and a tick takes the car up to 2.8 m."""
+    """The trip ends after 3.5 m, and the car moves up to 2.8 m per tick."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
         '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',
@@ -103,7 +103,7 @@ def test_a_vehicle_that_turns_away_from_a_border_is_forgotten() -> None:
     assert len(simulation.coordinators[0].in_flight()) > 5
 
 
-def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
+def test_a_world_of_few_vehicles_has_room_for_all_pending_changes() -> None:
     whole, divided = (
         make_vec("ring", zones=zones, agents=2, background=3, max_cycles=1000) for zones in (1, 4)
     )
@@ -122,7 +122,7 @@ def test_a_world_of_few_vehicles_has_room_for_all_changes_that_wait() -> None:
 def test_the_table_is_updated_on_request_or_after_many_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    late = 16  # so many changes are soon there
+    late = 16  # this number of changes is soon reached
     monkeypatch.setattr(direct, "UNREAD_LIMIT", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
@@ -151,7 +151,7 @@ def test_a_change_from_a_zone_that_is_not_the_recorded_owner_is_detected() -> No
     assert isinstance(coordinator, LocalCoordinator)
     vec.step(vec.suggest_actions())
     directory, book = coordinator.directory, vec.simulation.division.book
-    assert directory.table.owners, "who is there at the start is on record"
+    assert directory.table.owners, "initial vehicles are recorded"
     while not book.num_changes[0]:
         vec.step(vec.suggest_actions())
     vehicle, target, epoch = book.changes[0, 0][["vehicle", "target", "epoch"]].tolist()
@@ -198,4 +198,4 @@ def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> No
     assert set(owners) == set(vec.simulation.vehicles()["id"].tolist())
     assert {zone for zone, _ in owners.values()} == {0}
     undivided = make_vec("grid4x4", num_envs=1, agents=4, background=10)
-    assert not undivided.simulation.coordinators, "nobody keeps what nobody asks for"
+    assert not undivided.simulation.coordinators, "without a journal, no log is kept"

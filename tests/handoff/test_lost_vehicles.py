@@ -1,4 +1,4 @@
-"""An agent that is steered off its lane and against the traffic: nobody there minds it any more."""
+"""An agent that leaves its lane and drives against the traffic: other drivers then ignore it."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ STREET = "road0"  # along y = 0, where the agent begins
 CROSSED = [((200.0 + 3.2 * k, -900.0), (200.0 + 3.2 * k, 30.0)) for k in range(8)]
 BOUNDS = (-10.0, -910.0, 410.0, 40.0)
 WAY = [(203.0, 0.0), (214.0, -8.0), (216.0, -30.0), (216.0, -1000.0)]
-STOPS_Y_M = -720.0  # further from the street than any zone sees
+STOPS_Y_M = -720.0  # farther from the street than the halo of any zone
 SLOW_MPS, FAST_MPS = 5.0, 30.0
 
 
 @pytest.fixture
 def worlds(tmp_path: Path) -> tuple[Simulation, Simulation]:
-    """A street across a one-way road of eight lanes, undivided and cut into three zones."""
+    """Return a street across a one-way road of eight lanes, undivided and in three zones."""
     net = write_roads(tmp_path / "x.net.xml", [((0.0, 0.0), (400.0, 0.0)), *CROSSED], 15.0)
     cars = "".join(
         f'<vehicle id="{k}" type="car" depart="{30 + 4 * k}"><route edges="{STREET}"/></vehicle>'
@@ -52,7 +52,7 @@ def agent_of(simulation: Simulation) -> np.void:
 
 
 class Astray:
-    """Turns left off its street into the wrong lanes of the other one, and stops far away."""
+    """Turn left into the wrong lanes of the other road, and stop far away."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation

@@ -1,4 +1,4 @@
-"""Partitions that change while a world runs leave results the same and make loads more even."""
+"""Partitions that change while a world runs do not change results, and balance loads."""
 
 from __future__ import annotations
 
@@ -128,10 +128,10 @@ def test_zones_of_one_world_over_workers_stay() -> None:
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
 
 
-def test_zones_that_change_places_hand_over_what_no_vehicle_could_drive(
+def test_zones_that_swap_places_hand_over_distant_vehicles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Vehicles of a zone that is far away now are teleports; nothing else is different."""
+    """Vehicles whose new zone is far away count as teleports; all else is equal."""
     path = tmp_path / "run.jsonl"
     strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
     strips["zones.repartition_steps"] = 6

@@ -1,4 +1,4 @@
-"""How far zones see: as far as exactness needs, or the settings are refused with the numbers."""
+"""The halo of zones: as wide as exactness needs; narrower settings are refused with the numbers."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from tests.support.driving import make_simulation
 SETTINGS = {"clock.sim_dt_s": 0.1, "zones.count": 4, "zones.hysteresis_m": 3.0}
 
 
-def test_the_halo_is_reach_hysteresis_and_the_way_of_late_ticks() -> None:
+def test_the_halo_is_reach_hysteresis_and_the_distance_of_late_ticks() -> None:
     config = load_config("grid4x4", overrides=SETTINGS | {"zones.max_deferred_ticks": 4})[0]
-    for late_ticks in (0, 3):  # the deadline is one of messages between nodes
+    for late_ticks in (0, 3):  # the deadline is that of messages between nodes
         needed_m = 100.0 + 3.0 + (late_ticks + 1) * MAX_SPEED_MPS * 0.1
         wide_m = halo_m(config, 100.0, 4, late_ticks=late_ticks)
         assert needed_m < wide_m < needed_m + 1e-5
@@ -29,7 +29,7 @@ def test_a_wider_halo_is_taken_and_a_narrower_one_refused_with_the_numbers() -> 
     ):
         halo_m(narrow, 100.0, 4, late_ticks=2)
     assert halo_m(narrow, 99.0, 4, late_ticks=2) == 120.0
-    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "nobody looks over a border"
+    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "no driver looks over a border"
 
 
 def test_a_world_is_not_made_that_could_not_be_exact() -> None:

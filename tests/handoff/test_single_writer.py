@@ -1,4 +1,4 @@
-"""One zone drives a vehicle and senses for it: what others are told of it changes nothing."""
+"""Only its zone drives a vehicle and senses for it: commands to other zones have no effect."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def divided(kind: str) -> Simulation:
 
 
 class Strict(PhaseExecutor):
-    """Calls shards one after the other, and looks at who commands and who senses.
+    """Call shards one after the other, and check which shards use commands and sense.
 
     Args:
-        simulation: whose phases it runs.
-        strangers: what a zone is commanded for agents that it does not own.
+        simulation: simulation whose phases are run.
+        strangers: command to a zone for agents that it does not own.
     """
 
     def __init__(self, simulation: Simulation, strangers: float) -> None:
@@ -61,7 +61,7 @@ class Strict(PhaseExecutor):
         return Commands(controls, meta_actions)
 
     def _sense(self, shard: Shard, group: ShardGroup, chosen: NDArray[np.bool_]) -> None:
-        """Nobody's outputs but those of owned agents are written."""
+        """Check that the shard writes only the outputs of its own agents."""
         owned, outputs = agents_of(shard), shard.outputs
         before = [array.copy() for array in outputs]
         group.sense(chosen)
@@ -72,7 +72,7 @@ class Strict(PhaseExecutor):
 
 
 def agents_of(shard: Shard) -> NDArray[np.int64]:
-    """Agents whose vehicles a zone owns."""
+    """Return the agents whose vehicles a zone owns."""
     agents: NDArray[np.int64] = shard.worlds.rows["agent"][0, : shard.worlds.num_owned[0]]
     return agents[agents >= 0]
 

@@ -14,7 +14,7 @@ HALO_M = 60.0
 
 @pytest.fixture
 def divided(monkeypatch: pytest.MonkeyPatch) -> Simulation:
-    """Nine zones that see less than the whole map."""
+    """Create nine zones that see less than the whole map."""
     monkeypatch.setattr(dividing, "halo_m", lambda *_: HALO_M)
     simulation = make_simulation(
         "grid4x4",
@@ -36,7 +36,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
             view, rows = divided.zones.view(world), divided.vehicles(world)
             for row, owner in zip(rows, view.owners.tolist(), strict=True):
                 away = [squared_distance(rects, k, row["x"], row["y"]) for k in range(len(rects))]
-                # Who has crossed in this tick is handed over when the next one begins.
+                # Vehicles that crossed in this tick are handed over at the start of the next one.
                 assert away[owner] ** 0.5 <= divided.config.clock.sim_dt_s * row["speed"] + 1e-9
                 seen_by = {k for k, ghosts in enumerate(view.ghosts) if row["id"] in ghosts}
                 assert seen_by == {k for k in range(len(rects)) if away[k] <= HALO_M**2} - {owner}
@@ -55,7 +55,7 @@ def test_a_view_stays_what_it_was(divided: Simulation) -> None:
         np.testing.assert_array_equal(ghosts, then)
 
 
-def test_transfers_are_handed_through(divided: Simulation) -> None:
+def test_transfers_are_passed_on(divided: Simulation) -> None:
     one = TransferInFlight(vehicle=7, source=0, target=1, state="offered")
     view = view_zones(divided.shards, divided.partition, HALO_M, transfers=[one])
     assert view.transfers == (one,)

@@ -1,4 +1,4 @@
-"""Probabilities, entropies and distances of actions, by hand."""
+"""Probabilities, entropies and distances of actions, compared with values worked out by hand."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Advantages, by hand."""
+"""Advantages, compared with values worked out by hand."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_advantages_by_hand() -> None:
 
 
 def test_what_the_next_vehicle_gets_is_not_credited_to_the_one_before() -> None:
-    # No step lies between: one vehicle ends in step 0, the next has the seat from step 1 on.
+    # Without a step between: one vehicle ends in step 0, the next has the seat from step 1 on.
     batch = batch_of_one_seat(
         rewards=[1.0, 50.0, -7.0],
         acted=[True, True, True],
@@ -67,7 +67,7 @@ def test_what_the_next_vehicle_gets_is_not_credited_to_the_one_before() -> None:
     assert found == pytest.approx([1.0 - 0.5, second, last])
 
 
-def test_seats_know_nothing_of_each_other() -> None:
+def test_seats_are_independent() -> None:
     one, other = (
         batch_of_one_seat([r, 2.0 * r, 3.0], [True] * 3, [on, True, False], 1.0)
         for r, on in ((1.0, True), (4.0, False))

@@ -1,4 +1,4 @@
-"""What is collected of worlds, for a critic that sees an agent and for one that sees the world."""
+"""Data collected from worlds, for a critic of single agents and a critic of whole worlds."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_what_is_collected_is_cut_at_ends_and_at_the_horizon(central: bool) -> N
     ended = boundary & ~bootstrapped
     assert ended.any()
     assert not (batch.goes_on & ~batch.acted).any()
-    # Where the vehicle goes on, the next decision is the same vehicle's.
+    # If the vehicle continues, the next decision belongs to the same vehicle.
     assert batch.acted[1:][batch.goes_on[:-1]].all()
 
 
@@ -68,7 +68,7 @@ def test_values_are_of_the_state_that_the_world_was_in() -> None:
         seen, state = batch.observations[step, world, agent], batch.states[step, world]
         value = collector.network.value(seen[None], state[None]).item()
         assert batch.values[step, world, agent].item() == pytest.approx(value, abs=1e-5)
-    # A world that the horizon has cut is judged by its last state, not by its next episode's.
+    # A world at its horizon has the value of its last state, not of the next episode's state.
     step, world, agent = (batch.acted & ~batch.goes_on).nonzero()[-1].tolist()
     cut = batch.next_values[:HORIZON] != 0.0
     step, world, agent = (cut & ~batch.goes_on[:HORIZON]).nonzero()[0].tolist()
@@ -143,7 +143,7 @@ def test_no_return_is_expected_after_a_red_light() -> None:
     assert (strict.next_values[ended] == 0.0).all()
 
 
-def test_a_residual_driver_sees_what_the_built_in_one_would_do() -> None:
+def test_a_residual_driver_observes_the_actions_of_the_built_in_driver() -> None:
     vec = make_worlds("SameStep")
     collector = make_collector(vec, 0, residual=True)
     proposed = torch.from_numpy(vec.suggest_actions().copy())
@@ -155,7 +155,7 @@ def test_a_residual_driver_sees_what_the_built_in_one_would_do() -> None:
 
 
 @pytest.mark.parametrize("name", ["", "gentle"])
-def test_what_is_imitated_is_what_that_driver_would_do(name: str) -> None:
+def test_imitated_actions_are_those_of_the_driver(name: str) -> None:
     vec = make_vec("ring22", num_envs=2)
     collector = make_collector(vec, 0, imitate=name)
     teacher = load_policy(name or "idm", vec)

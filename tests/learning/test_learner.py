@@ -1,4 +1,4 @@
-"""The weights and rates of PPO's update over a run, by hand."""
+"""Weights and rates of PPO's updates over a run, compared with values worked out by hand."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ PPO = load_program("ppo")
 
 
 def learner(**settings: Any) -> Any:
-    """It observes three numbers."""
+    """Create a learner that observes three numbers."""
     torch.manual_seed(0)
     network = ActorCritic(NetworkConfig("merge", 3, SensorsConfig(), ActionConfig(), (4,)))
     return PPO.Learner(network, PPO.Args(**settings))
@@ -32,7 +32,7 @@ def test_imitation_ends_after_its_share_of_the_run(left: float, weight: float) -
 
 
 def batch(rewards: list[float]) -> Any:
-    """Decisions of one agent that end its trip each, numbered by what it observes."""
+    """Create decisions that each end a trip; the observation is the number of the decision."""
     steps = len(rewards)
     shape = (steps, 1, 1)
     observations = torch.zeros(*shape, 3)
@@ -57,7 +57,7 @@ def test_the_learning_rate_falls_with_what_is_left(anneal: bool, rate: float) ->
     assert [group["lr"] for group in found.optimizer.param_groups] == [rate]
 
 
-def test_decisions_with_the_largest_advantages_are_learned_from_good_or_bad(
+def test_learning_uses_decisions_with_large_positive_or_negative_advantages(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = learner(keep=0.5, epochs=1, minibatches=1)

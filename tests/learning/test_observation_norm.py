@@ -1,4 +1,4 @@
-"""Scales of observations against means and deviations worked out by hand."""
+"""Scales of observations, compared with means and deviations worked out by hand."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from cavmarl.policies.network_files import NetworkConfig
 
 
 def network() -> ActorCritic:
-    """It observes two numbers."""
+    """Create a network that observes two numbers."""
     return ActorCritic(NetworkConfig("merge", 2, SensorsConfig(), ActionConfig(), (4,)))
 
 
-def test_batches_that_differ_spread_as_all_their_observations_together() -> None:
+def test_batches_together_have_the_deviation_of_all_observations() -> None:
     observer = network()
     scales = Scales(observer)
     scales.add(torch.tensor([[0.0, 3.0], [2.0, 3.0]]))
@@ -33,7 +33,7 @@ def test_batches_that_differ_spread_as_all_their_observations_together() -> None
     # The mean of 0, 2, 10, 12, 14 is 7.6, and the squares about it sum up to 155.2.
     assert observer.mean.tolist() == pytest.approx([7.6, 3.0])
     assert observer.deviation[0].item() == pytest.approx(math.sqrt(155.2 / 5.0))
-    assert observer.deviation[1].item() == pytest.approx(0.02), "a constant is not blown up"
+    assert observer.deviation[1].item() == pytest.approx(0.02), "a constant is not amplified"
 
 
 def test_a_driver_counts_as_many_decisions_as_it_has_learned_from(
@@ -50,7 +50,7 @@ def test_a_driver_counts_as_many_decisions_as_it_has_learned_from(
     scales = Scales(observer)
     scales.start(NetworkConfig("merge", 2, SensorsConfig(), ActionConfig(), (4,)), Path())
     scales.add(torch.tensor([[3.0, 0.0], [5.0, 0.0]]))
-    # Ten of 1 ± 2 and two of 4 ± 1: their mean is 1.5, their squares 40 + 2 + 10 · 2 / 12 · 9.
+    # Ten of 1 ± 2 and two of 4 ± 1: the mean is 1.5, the sum of squares 40 + 2 + 10 · 2 / 12 · 9.
     assert observer.mean[0].item() == pytest.approx(1.5)
     assert observer.deviation[0].item() == pytest.approx(math.sqrt(57.0 / 12.0))
 

@@ -1,4 +1,4 @@
-"""Which agents opponents drive, counted with drivers that only say who they are."""
+"""The agents that opponents drive, counted with drivers whose actions are their names."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class Named:
 
 @pytest.fixture
 def drivers(monkeypatch: pytest.MonkeyPatch) -> list[Named]:
-    """The drivers, in the order in which they are loaded."""
+    """Return the drivers in the order in which they are loaded."""
     loaded: list[Named] = []
 
     def load(name: str, vec: object) -> Named:
@@ -40,7 +40,7 @@ def drivers(monkeypatch: pytest.MonkeyPatch) -> list[Named]:
 
 
 def driven(names: str, share: float, mask: NDArray[np.bool_]) -> tuple[Any, NDArray[np.float32]]:
-    """The opponents, and the number of each agent's driver; 0: the driver that learns."""
+    """Return the opponents, and the number of each agent's driver; 0: the learning driver."""
     vec: Any = SimpleNamespace(num_envs=WORLDS, num_agents=AGENTS)
     found = opponents.Opponents(names, vec, share, 7)
     actions = np.zeros((WORLDS, AGENTS, 2), np.float32)

@@ -34,7 +34,7 @@ class WithPlugins:
     plugins: Annotated[str, "modules"] = ""
 
 
-def test_options_shadow_a_file_and_a_file_the_defaults(tmp_path: Path) -> None:
+def test_options_override_a_file_and_a_file_overrides_defaults(tmp_path: Path) -> None:
     file = tmp_path / "few.yaml"
     file.write_text("steps: 7\nrate: 0.25\n")
     assert parse_settings(Few, [], "") == Few()
@@ -66,7 +66,7 @@ def test_the_first_line_of_the_text_is_the_help(capsys: pytest.CaptureFixture[st
     assert "of a run (default: 5)" in shown
 
 
-def test_a_run_lies_where_its_name_says() -> None:
+def test_the_name_of_a_run_is_its_folder() -> None:
     assert run_folder("runs", "mine", "merge", "ippo", 3) == Path("runs/mine")
     assert run_folder("runs", "", "maps/town.net.xml", "ippo", 3) == Path("runs/town_ippo_3")
 

@@ -1,4 +1,4 @@
-"""Returns and ends of trips during a training, by hand."""
+"""Returns and ends of trips during a training, compared with values worked out by hand."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.learning.log import Trips
 def step(
     trips: Trips, reward: tuple[float, float], ends: str = "", *, red: bool = False
 ) -> dict[str, float]:
-    """A step of two agents; `ends` says how: `a` arrives, `c` is cut, `-` drives on."""
+    """Add a step of two agents; letters of `ends`: `a` arrives, `c` is cut, `-` continues."""
     terms = np.zeros((1, 2, len(TERMS)), np.float32)
     done, cut = np.zeros((2, 1, 2), np.bool_)
     for agent, letter in enumerate(ends):

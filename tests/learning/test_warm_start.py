@@ -1,4 +1,4 @@
-"""A run begins with a driver's weights, and decides as the driver does, whatever it sees beside."""
+"""A run that begins with a driver's weights acts like the driver, also with further sensors."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def network(config: NetworkConfig) -> ActorCritic:
 
 
 def named(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
-    """The newest frame is the last."""
+    """Name the observed numbers; the newest frame is the last."""
     frames = range(-sensors.stack, 0)
     return [(frame, *name) for frame in frames for name in feature_names(sensors)]
 
@@ -72,14 +72,14 @@ def test_with_the_same_sensors_the_weights_are_the_same(tmp_path: Path) -> None:
         assert run.state_dict()[name].equal(tensor), name
 
 
-def test_one_that_observes_what_the_run_does_not_is_refused(tmp_path: Path) -> None:
+def test_a_driver_with_other_sensors_is_refused(tmp_path: Path) -> None:
     its, ours = made(MORE, {}, 1), made(FEWER, {}, 2)
     save_network(tmp_path, network(its), its)
     with pytest.raises(PolicyError, match=r"observes \d+ numbers that this run does not, first"):
         begin_with(network(ours), ours, tmp_path)
 
 
-def test_one_of_another_form_is_refused(tmp_path: Path) -> None:
+def test_a_driver_with_another_network_is_refused(tmp_path: Path) -> None:
     its, ours = made(FEWER, {}, 1), made(MORE, {"shared": True}, 2)
     save_network(tmp_path, network(its), its)
     with pytest.raises(PolicyError, match="does not fit this run"):

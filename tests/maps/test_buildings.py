@@ -178,7 +178,7 @@ def test_buildings_of_real_maps_do_not_stand_on_roads(
     source = shared_maps / "osm" / name
     network = load_world(source, overrides={"map.buildings": "osm"}).network
     assert len(set(network.walls["building"].tolist())) >= buildings
-    # Roads meet buildings where they lead through; a wrong frame would let them do it anywhere.
+    # Roads meet buildings only where they lead through; in a wrong frame, they meet them anywhere.
     middles = np.stack([network.points["x"], network.points["y"]], axis=1)
     built_over = np.zeros(len(middles), dtype=bool)
     for part in network.roofs:

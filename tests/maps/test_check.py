@@ -21,7 +21,7 @@ from tests.support.kept_maps import network_of
 BuiltMap = Callable[[str], Path]
 
 # road km, lane km, junctions, signals, edges in the largest connected part, edges.
-# Two of Mcity's 37 junctions join footpaths only and do not count here.
+# Two of Mcity's 37 junctions join only footpaths, and are not counted.
 FIGURES = {
     "osm/monaco.osm.gz": (76.81, 96.54, 265, 4, 591, 636),
     "osm/laufamholz.osm.xml": (6.96, 8.23, 15, 2, 51, 51),
@@ -59,7 +59,7 @@ RING = """<net version="1.20">
 """
 
 
-# Two roads that a signal joins; its phases are put in.
+# Two roads that a signal joins; the tests insert its phases.
 SIGNALLED = """<net version="1.20">
   <edge id="a" from="A" to="B">
     <lane id="a_0" index="0" speed="10" length="50" shape="0,0 50,0"/>
@@ -187,7 +187,7 @@ def test_a_map_for_buses_cannot_be_driven(check: Callable[..., MapReport]) -> No
     assert "no edge is open to passenger cars" in report.problems[0]
 
 
-def test_odd_things_are_named(check: Callable[..., MapReport]) -> None:
+def test_unusual_places_are_named(check: Callable[..., MapReport]) -> None:
     second = '<lane id="a_1" index="1" speed="500" length="50" shape="0,3 50,3"/>'
     report = check(
         ('</edge>\n  <edge id="b"', f'{second}</edge>\n  <edge id="b"'),
@@ -198,7 +198,7 @@ def test_odd_things_are_named(check: Callable[..., MapReport]) -> None:
     assert report.lanes_without_successor == ("a_1",)
     assert report.self_loops == ("x",)
     assert report.speed_outliers == ("a_1", "x_0")
-    assert len(report.notes) == 6  # with a_1 and b_0, which are on one strip
+    assert len(report.notes) == 6  # with a_1 and b_0, which share a strip
 
 
 def test_merging_without_a_rule_is_named(check: Callable[..., MapReport]) -> None:

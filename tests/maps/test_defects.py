@@ -1,4 +1,4 @@
-"""Each kind of place that looks wrong is found where it is, and only there."""
+"""Each kind of defect of a map is found at its place, and only there."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def changed(path: Path, pattern: str, new: str) -> Path:
     return path
 
 
-def test_a_sound_map_has_none(town: Path) -> None:
+def test_a_sound_map_has_no_defects(town: Path) -> None:
     assert found(town) == []
 
 
@@ -117,7 +117,7 @@ def test_paths_on_two_levels_do_not_cross() -> None:
 
 
 def two_parts(folder: Path) -> Path:
-    """A ring of three roads, and two roads far from it."""
+    """Write a ring of three roads, and two roads far from it."""
     places = {"a": (0, 0), "b": (200, 0), "c": (0, 200), "d": (900, 0), "e": (900, 200)}
     roads = ["ab", "bc", "ca", "ba", "de", "ed"]
     nodes = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in places.items())
@@ -131,7 +131,7 @@ def two_parts(folder: Path) -> Path:
     return path
 
 
-def test_what_is_cut_off_is_mended(tmp_path: Path) -> None:
+def test_disconnected_roads_are_removed(tmp_path: Path) -> None:
     path = two_parts(tmp_path)
     fixed, page, report = (tmp_path / name for name in ("fixed.net.xml", "p.html", "r.json"))
     words = ["check", str(path), "--fix", str(fixed), "--page", str(page), "--json", str(report)]

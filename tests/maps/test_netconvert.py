@@ -63,9 +63,7 @@ def test_an_extension_does_not_matter(town: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_what_netconvert_refuses_is_refused_in_its_words(
-    shared_maps: Path, tmp_path: Path, name: str
-) -> None:
+def test_errors_of_netconvert_are_shown(shared_maps: Path, tmp_path: Path, name: str) -> None:
     with pytest.raises(MapError) as caught:
         build_network(shared_maps / name, tmp_path / "out.net.xml")
     message = str(caught.value)
@@ -253,7 +251,7 @@ def test_netconvert_ends_with_the_process_that_runs_it(tmp_path: Path, how: sign
     )
 
 
-def test_a_command_that_is_terminated_leaves_nothing_half(tmp_path: Path) -> None:
+def test_a_terminated_command_leaves_no_partial_file(tmp_path: Path) -> None:
     code = _end_in_netconvert(
         tmp_path,
         "from cavmarl.cli import main; main(['map', 'build', source, '-o', target])",
@@ -264,7 +262,7 @@ def test_a_command_that_is_terminated_leaves_nothing_half(tmp_path: Path) -> Non
 
 
 def _end_in_netconvert(tmp_path: Path, call: str, how: signal.Signals) -> int:
-    """End a program while its netconvert runs, see that this ends too; the exit code."""
+    """End a program while its netconvert runs; check that netconvert ends; return the exit code."""
     slow = tmp_path / "bin" / "netconvert"
     slow.parent.mkdir()
     slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
@@ -298,7 +296,7 @@ def _runs(pid: int) -> bool:
         return False
 
 
-def test_what_a_killed_build_has_left_goes_with_the_next_one(
+def test_the_next_build_removes_files_of_a_killed_build(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
@@ -310,7 +308,7 @@ def test_what_a_killed_build_has_left_goes_with_the_next_one(
     ring = find_entry("ring") / "map" / "map.net.xml"
     with draft_folder(place) as living:
         build_network(ring, place / "copy.net.xml")
-        assert living.exists(), "another process may be at it"
+        assert living.exists(), "another process may use it"
     assert [folder.exists() for folder in left] == [False, True]
     made = build_network(ring, options=["--no-turnarounds"]).path
     assert made.is_relative_to(cached)

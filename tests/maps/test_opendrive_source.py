@@ -1,4 +1,4 @@
-"""What OpenDRIVE says of roads reaches the lanes of the network."""
+"""Attributes of roads in OpenDRIVE reach the lanes of the network."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_limits_change_along_a_road_and_those_of_lanes_win(tmp_path: Path) -> No
         s = 0.5 * float(network.lanes["length_m"][lane])
         x = network.pose_on(lane, s)[0]
         by_place[name.startswith("-"), round(x)] = mps
-    # Netconvert cuts both directions at each change; a limit of the last 0.5 m makes no edge.
+    # netconvert cuts both directions at each change; a limit for the last 0.5 m makes no edge.
     assert by_place == {
         (True, 30): 10.0,
         (True, 90): 5.0,

@@ -1,4 +1,4 @@
-"""Tags of lanes and of access reach the lanes of the network."""
+"""OSM tags of lanes and access reach the lanes of the network."""
 
 from __future__ import annotations
 

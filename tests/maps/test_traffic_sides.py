@@ -48,7 +48,7 @@ def test_countries_have_their_side(places: dict[str, tuple[float, float]], side:
     assert wrong == {}
 
 
-def test_places_at_a_border_do_not_decide() -> None:
+def test_places_at_a_border_do_not_determine_the_side() -> None:
     vientiane, south_of_it = (102.62, 17.965), (102.62, 17.80)
     assert sides_at([vientiane]) == set()
     assert sides_at([vientiane, south_of_it]) == {"left"}
@@ -65,7 +65,7 @@ def test_a_roundabout_in_london_is_driven_clockwise(
     assert result.provenance["traffic side"] == "left (by the place of its roads)"
     network = read_network(result.path)
     assert network.left_hand
-    # Nobody on the ring yields, and everybody yields to it.
+    # Vehicles on the ring never yield, and all others yield to them.
     yields = {
         network.lane_ids[row["from_lane"]].partition("_")[0].lstrip("-")
         for row in network.links

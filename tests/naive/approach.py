@@ -1,4 +1,4 @@
-"""Who is on which link or comes towards it, one vehicle at a time."""
+"""Vehicles on links or approaching them, computed for one vehicle at a time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
-Entry = tuple[int, int, float]  # link, vehicle's id, m of its centre to the stop line
+Entry = tuple[int, int, float]  # link, vehicle's id, m from its centre to the line
 
 
 def link_into(roads: RoadNetwork, row: np.void) -> int:
-    """The link that leads to its lane or beside it, its own one if it does; -1: there is none."""
+    """Return the link into the vehicle's lane or a lane beside, preferably its own; -1: none."""
     if row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == row["lane"]:
         return int(row["link"])
     own = roads.lanes[row["lane"]]
@@ -26,7 +26,7 @@ def link_into(roads: RoadNetwork, row: np.void) -> int:
 
 
 def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[Entry]:
-    """What one vehicle announces."""
+    """Return the links at which a vehicle registers."""
     lane, way, name = int(row["lane"]), int(row["way"]), int(row["id"])
     here = roads.lanes[lane]
     found: list[Entry] = []
@@ -50,8 +50,8 @@ def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[
     idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
     ahead: list[tuple[int, float]] = []
     while len(ahead) < 2:
-        # By those that turn into its lane it is minded from farther away, unless it stands, or has
-        # to give way before that.
+        # Vehicles that turn into its lane consider it from farther away, unless it stands or may
+        # have to stop before that.
         may_stop = any(inside or roads.links[link]["state"] != ord("M") for link, _ in ahead)
         stands = idle and row["speed"] <= 0.5
         far = max(sight, 300.0) if here["merges"] else sight
@@ -62,7 +62,7 @@ def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[
         else:
             step = travel.steps[way + lane]
             if step["next"] < 0:
-                is_minded = to_end < 15.0 or step["change"] == 0  # or its trip ends there
+                is_minded = to_end < 15.0 or step["change"] == 0  # or its trip ends
                 if not ahead and is_minded and here["num_links"]:
                     found.append((int(here["first_link"]), name, max(to_end, 0.0)))
                 break

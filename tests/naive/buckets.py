@@ -1,4 +1,4 @@
-"""Lists of items by key, one after the other."""
+"""Lists of items by key, stored consecutively."""
 
 from __future__ import annotations
 
@@ -6,6 +6,6 @@ from collections.abc import Sequence
 
 
 def laid_out(number: int, keys: Sequence[int]) -> list[range]:
-    """Where the items of each key lie when all stand in the order of keys."""
+    """Return the start and end of each key's items, if all items are in the order of keys."""
     counts = [sum(key == k for key in keys) for k in range(number)]
     return [range(sum(counts[:k]), sum(counts[: k + 1])) for k in range(number)]

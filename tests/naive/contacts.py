@@ -1,4 +1,4 @@
-"""Contacts by the area that each pair of vehicles shares."""
+"""Contacts, computed from the common area of each pair of vehicles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.naive.geometry import box_corners, common_area
 
 
 def find_contacts(rows: NDArray[np.void], margin: float = 0.0) -> list[int]:
-    """Smallest id that each row touches, or -1, with boxes larger by `margin` on each side."""
+    """Return the smallest id that each row touches, or -1; boxes grow by `margin` per side."""
     corners = [
         box_corners(
             v["x"], v["y"], v["heading"], 0.5 * v["length"] + margin, 0.5 * v["width"] + margin

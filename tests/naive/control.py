@@ -9,7 +9,7 @@ from tests.naive.idm import not_zero
 
 
 def steering_control(speed: float, d: float, heading_error: float, length: float) -> float:
-    """Offset -> lateral speed -> heading -> yaw rate -> slip -> steering."""
+    """Compute offset -> lateral speed -> heading -> yaw rate -> slip -> steering."""
     lateral_speed = -d / 0.6
     sine = max(-1.0, min(1.0, lateral_speed / not_zero(speed)))
     approach = max(-math.pi / 4, min(math.pi / 4, math.asin(sine)))

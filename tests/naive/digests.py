@@ -1,4 +1,4 @@
-"""Digests of rows with Python's own numbers."""
+"""Digests of rows, computed with integers of Python."""
 
 from __future__ import annotations
 
@@ -6,14 +6,14 @@ WORD = (1 << 64) - 1
 
 
 def mixed(word: int) -> int:
-    """The finaliser of SplitMix64."""
+    """Apply the finaliser of SplitMix64."""
     word = ((word ^ (word >> 30)) * 0xBF58476D1CE4E5B9) & WORD
     word = ((word ^ (word >> 27)) * 0x94D049BB133111EB) & WORD
     return word ^ (word >> 31)
 
 
 def digest(rows: list[list[int]], masks: list[int], factors: list[int]) -> int:
-    """The sum of the digests of rows of words."""
+    """Return the sum of the digests of rows of words."""
     total = 0
     for row in rows:
         words = zip(row, masks, factors, strict=True)

@@ -1,4 +1,4 @@
-"""Mean speeds of edges, edge by edge from their definition."""
+"""Mean speeds of edges, computed edge by edge from their definition."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def millimetres(speed: float) -> int:
-    """Metres a second as whole millimetres a second, halves up; nobody drives backwards."""
+    """Round a speed in m/s to whole mm/s, halves up; speeds are not negative."""
     return int(np.floor(max(speed, 0.0) * 1000.0 + 0.5))
 
 
 def mean_speeds(roads: RoadNetwork, rows: NDArray[np.void]) -> list[int]:
-    """Mean of the vehicles on each edge, in mm/s; a lane without any has one at its limit."""
+    """Return the mean speed per edge in mm/s; an empty lane counts as one vehicle at its limit."""
     means = []
     for edge in roads.edges:
         speeds = []

@@ -10,16 +10,16 @@ from cavmarl.roads.network import RoadNetwork
 
 
 class Passage(NamedTuple):
-    """A vehicle's way over a junction."""
+    """The passage of a vehicle over a junction."""
 
     link: int
-    start_m: float  # centre's way from the stop line at time 0; negative: before it
+    start_m: float  # position of the centre behind the stop line at time 0; negative: before it
     speed_mps: float
     length_m: float
 
 
 def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> list[float]:
-    """Of each vehicle, the least time between its stay in a shared area and another's; inf: none.
+    """Return each vehicle's least time between its stay in a shared area and another's; inf: none.
 
     Vehicles on crossing paths share the area of their conflict; on paths into one lane they do not.
     """
@@ -41,7 +41,7 @@ def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> li
 
 
 def _stay(passage: Passage, enter_m: float, leave_m: float) -> tuple[float, float]:
-    """When the front bumper comes and when the rear bumper leaves."""
+    """Return the times at which the front bumper enters and the rear bumper leaves."""
     half = 0.5 * passage.length_m
     return (
         (float(enter_m) - half - passage.start_m) / passage.speed_mps,

@@ -1,4 +1,4 @@
-"""Plane geometry by the shortest way that is plainly right."""
+"""Plane geometry, computed by the simplest correct method."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ Point = tuple[float, float]
 
 
 def wrap_angle(angle: float) -> float:
-    """IEEE remainder, with the lower end moved to the upper one."""
+    """Return the IEEE remainder, with -π replaced by π."""
     wrapped = math.remainder(angle, 2.0 * math.pi)
     return math.pi if wrapped == -math.pi else wrapped
 
 
 def lane_pose(corners: NDArray[np.float64], s: float) -> tuple[float, ...]:
-    """Walk along (n, 3) corners until `s` is used up; the last segment has no end."""
+    """Return the pose at `s` along (n, 3) corners; the last segment continues beyond its end."""
     left = s
     for i in range(len(corners) - 1):
         step = corners[i + 1] - corners[i]
@@ -31,7 +31,7 @@ def lane_pose(corners: NDArray[np.float64], s: float) -> tuple[float, ...]:
 
 
 def nearest_on_polyline(corners: NDArray[np.float64], x: float, y: float) -> tuple[float, float]:
-    """Distance to the polyline (n, 2) and the arc length of its nearest point."""
+    """Return the distance to the polyline (n, 2) and the arc length of its nearest point."""
     best = (math.inf, 0.0)
     start = 0.0
     for a, b in pairwise(corners):
@@ -47,7 +47,7 @@ def nearest_on_polyline(corners: NDArray[np.float64], x: float, y: float) -> tup
 def box_corners(
     x: float, y: float, heading: float, half_length: float, half_width: float
 ) -> list[Point]:
-    """Counter-clockwise from the front left."""
+    """Return the corners of a box, counter-clockwise from the front left."""
     cos, sin = math.cos(heading), math.sin(heading)
     return [
         (x + a * cos - b * sin, y + a * sin + b * cos)
@@ -61,7 +61,7 @@ def box_corners(
 
 
 def common_area(one: list[Point], other: list[Point]) -> float:
-    """Area shared by two convex counter-clockwise polygons: clip one by each side of the other."""
+    """Return the common area of two convex counter-clockwise polygons, by clipping."""
     shape = one
     for i, a in enumerate(other):
         shape = _clip(shape, a, other[(i + 1) % len(other)])
@@ -70,7 +70,7 @@ def common_area(one: list[Point], other: list[Point]) -> float:
 
 
 def _clip(shape: list[Point], a: Point, b: Point) -> list[Point]:
-    """What of `shape` lies to the left of the line from a to b."""
+    """Return the part of `shape` to the left of the line from a to b."""
 
     def side(p: Point) -> float:
         return (b[0] - a[0]) * (p[1] - a[1]) - (b[1] - a[1]) * (p[0] - a[0])

@@ -6,7 +6,7 @@ import math
 
 
 def not_zero(value: float) -> float:
-    """At least 1 cm (or cm/s) away from zero."""
+    """Return the number, but at least 1 cm (or cm/s) away from zero."""
     return math.copysign(max(abs(value), 0.01), value if value != 0.0 else 1.0)
 
 
@@ -20,7 +20,7 @@ def idm_acceleration(
     jam_distance: float,
     time_headway: float,
 ) -> float:
-    """Equation 5 of Treiber, Hennecke, Helbing 2000; no leader if `distance` is None."""
+    """Evaluate equation 5 of Treiber, Hennecke, Helbing 2000; no leader if `distance` is None."""
     free = 1.0 - (max(speed, 0.0) / abs(not_zero(target_speed))) ** 4
     if distance is None:
         return accel_max * free

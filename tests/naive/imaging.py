@@ -1,7 +1,7 @@
-"""What rays and pixels meet, by trying everything on each of them; bodies as six half-spaces.
+"""What rays and pixels hit, by testing each object; a body is six half-spaces.
 
-The frame is the vehicle's. `margin` makes every body and wall larger, to tell what only rounding
-decides.
+The frame is the vehicle's. `margin` makes each body and wall larger, to find the cases in which
+rounding decides.
 """
 
 from __future__ import annotations
@@ -19,14 +19,14 @@ Vector = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Echo:
-    """What a ray met; `what` is ("body", id), ("wall", building), ("ground", 0) or ("", 0)."""
+    """The object that a ray hits: ("body", id), ("wall", building), ("ground", 0) or ("", 0)."""
 
     distance: float
     what: tuple[str, int] = ("", 0)
 
 
 def turn(yaw: float, pitch: float, roll: float) -> Vector:
-    """(3, 3) axes of a frame turned by yaw, then nose up, then left side up."""
+    """Return the (3, 3) axes of a frame turned by yaw, then nose up, then left side up."""
     about_z = np.array(
         [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
     )
@@ -41,20 +41,20 @@ def turn(yaw: float, pitch: float, roll: float) -> Vector:
 
 
 def to_vehicle(ego: np.void, x: float, y: float, z: float) -> Vector:
-    """A place of the world in the frame of a vehicle."""
+    """Transform a point of the world to the frame of a vehicle."""
     axes = turn(ego["heading"], ego["pitch"], 0.0)
     place: Vector = axes.T @ np.array([x - ego["x"], y - ego["y"], z - ego["z"]])
     return place
 
 
 def seen_bodies(rows: NDArray[np.void], row: int) -> list[np.void]:
-    """All others on the level of the one who looks."""
+    """Return all other vehicles on the level of the ego vehicle."""
     z = rows[row]["z"]
     return [o for i, o in enumerate(rows) if i != row and abs(o["z"] - z) <= LEVEL_HEIGHT_M]
 
 
 def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin: float) -> float:
-    """In lengths of the ray; 0 inside, inf if missed. The body stands upright in ego's frame."""
+    """Return the distance to an upright body in lengths of the ray; 0: inside, inf: missed."""
     base = to_vehicle(ego, body["x"], body["y"], body["z"])
     heading = body["heading"] - ego["heading"]
     along = np.array([math.cos(heading), math.sin(heading), 0.0])
@@ -80,7 +80,7 @@ def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin:
 
 
 def ray_to_wall(start: Vector, ray: Vector, ego: np.void, wall: np.void, margin: float) -> float:
-    """In lengths of the ray, inf if missed. Walls stand on the ground of who looks."""
+    """Return the distance to a wall in lengths of the ray; inf: missed. Walls start at z = 0."""
     axes = turn(ego["heading"], 0.0, 0.0)[:2, :2]
     a = axes.T @ np.array([wall["ax"] - ego["x"], wall["ay"] - ego["y"]])
     b = axes.T @ np.array([wall["bx"] - ego["x"], wall["by"] - ego["y"]])
@@ -104,7 +104,7 @@ def trace(
     reach: float,
     margin: float = 0.0,
 ) -> Echo:
-    """What one ray meets first, nearer than `reach`; the ground where nothing else is."""
+    """Return the first object that a ray hits within `reach`, or else the ground."""
     ego = rows[row]
     found = [
         Echo(ray_to_body(start, ray, ego, body, margin), ("body", int(body["id"])))
@@ -123,7 +123,7 @@ def trace(
 
 
 def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
-    """(A, E, 3) unit vectors in the vehicle's frame."""
+    """Return (A, E, 3) unit vectors in the vehicle's frame."""
     return np.array(
         [
             [
@@ -136,7 +136,7 @@ def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
 
 
 def pixel_ray(axes: Vector, width: int, height: int, fov: float, row: int, column: int) -> Vector:
-    """As long as a metre of depth, in the vehicle's frame."""
+    """Return the ray of a pixel in the vehicle's frame; its length covers one metre of depth."""
     focal = 0.5 * width / math.tan(0.5 * fov)
     right = (column + 0.5 - 0.5 * width) / focal
     down = (row + 0.5 - 0.5 * height) / focal
@@ -145,7 +145,7 @@ def pixel_ray(axes: Vector, width: int, height: int, fov: float, row: int, colum
 
 
 def covers(body: np.void, x: float, y: float, margin: float) -> bool:
-    """Whether a place of the world lies under a body."""
+    """Return whether a point of the world is under a body."""
     dx, dy = x - body["x"], y - body["y"]
     along = dx * math.cos(body["heading"]) + dy * math.sin(body["heading"])
     across = dy * math.cos(body["heading"]) - dx * math.sin(body["heading"])

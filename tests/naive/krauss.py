@@ -1,4 +1,4 @@
-"""Krauss's safe speed by halving intervals, and his imperfection as it is told."""
+"""Krauss's safe speed by bisection, and his imperfection by its definition."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 def safe_speed(
     gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float
 ) -> float:
-    """The largest speed whose way to a stand is no longer than the gap and the leader's."""
+    """Return the largest speed whose stopping distance is at most gap plus the leader's one."""
     room = gap + front_speed**2 / (2.0 * max(decel, front_decel))
     low, high = 0.0, 1000.0
     for _ in range(100):
@@ -19,6 +19,6 @@ def safe_speed(
 
 
 def dawdle(speed: float, accel: float, sigma: float, share: float, dt: float) -> float:
-    """What is left of a speed after a random share of sigma times one tick's acceleration."""
+    """Reduce a speed by a random share of sigma times one tick's acceleration."""
     lost = sigma * share * dt * (speed if speed < accel else accel)
     return speed - lost if speed > lost else 0.0

@@ -9,7 +9,7 @@ def mobil_accepts(
     old_follower: tuple[float, float],
     mandatory: bool,
 ) -> bool:
-    """Each pair is an acceleration before and after the change; followers count for nothing."""
+    """Decide by pairs of accelerations before and after the change; politeness is 0."""
     safe_for_follower = new_follower[1] >= -2.0
     safe_for_me = own[1] >= -2.0
     politeness = 0.0

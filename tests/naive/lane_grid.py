@@ -19,7 +19,7 @@ def cells_of_lanes(
     Args:
         network: the map.
         origin: x and y of the first cell's corner, m.
-        shape: how many cells along x and along y.
+        shape: numbers of cells along x and along y.
         cell_m: the side of a cell.
     """
     members: list[set[int]] = [set() for _ in range(shape[0] * shape[1])]

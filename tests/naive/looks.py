@@ -1,4 +1,4 @@
-"""Whom a zone's drivers may ask about, by sets of lanes: the slow twin of `kernels.looks`."""
+"""The lanes that the drivers of a zone may look at, as sets: the slow twin of `kernels.looks`."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from tests.naive.lanes import beside_s
 __all__ = ["Looks"]
 
 Ways = dict[int, float]
-STEP_M = 0.25  # between places of a lane that are looked at
+STEP_M = 0.25  # distance between checked positions of a lane
 
 
 class Looks:
-    """The lanes of a map, and what a zone asks of them.
+    """The lanes of a map, and the parts of them that a zone must see.
 
     Args:
         network: the map.
-        rect: min_x, min_y, max_x, max_y of where the zone's drivers can be.
+        rect: min_x, min_y, max_x, max_y of the area of the zone's drivers.
         view_m: as `kernels.looks.find_looks` takes it.
         see_m: the same.
         half_m: the same.
@@ -76,7 +76,7 @@ class Looks:
         }
         foes |= swept
         following = foes
-        while following:  # on equal roads, along circles of those that give way
+        while following:  # on equal roads, follow cycles of yielding links
             following = {
                 int(conflict["foe"])
                 for link in following
@@ -100,7 +100,7 @@ class Looks:
             self._see(lane, 0.0, EXIT_LOOK_M - way)
 
     def _own(self, rect: tuple[float, float, float, float]) -> dict[int, tuple[float, float]]:
-        """The zone's part of each lane, a little wider; of lanes beside each other the same."""
+        """Return the zone's part of each lane with a margin, equal for all lanes of an edge."""
         parts: dict[int, list[float]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             row = self.network.lanes[lane]
@@ -119,7 +119,7 @@ class Looks:
         return own
 
     def _along(self, view_m: float) -> Ways:
-        """See along the roads, ahead and back; the ways to the lanes ahead."""
+        """See along the roads, ahead and back; return the distances to the lanes ahead."""
         starts: Ways = {}
         ends: Ways = {}
         for lane, (first, last) in self.own.items():
@@ -140,7 +140,7 @@ class Looks:
         return ahead
 
     def _asked(self, ahead: Ways, see_m: float) -> set[int]:
-        """Links that its drivers may want to enter, or are on."""
+        """Return the links that drivers of the zone may enter, or are on."""
         lanes = set()
         for lane, row in enumerate(self.network.lanes):
             if row["internal"]:
@@ -158,13 +158,13 @@ class Looks:
         }
 
     def _leads_to(self, lane: int) -> set[int]:
-        """The lanes before the junction at the start of a lane."""
+        """Return the lanes before the junction at the start of a lane."""
         links = self.network.links
         here = (links["to_lane"] == lane) & (links["first_internal"] >= 0)
         return set(links["from_lane"][here].tolist())
 
     def _at_lines(self, foes: set[int], places: dict[int, float]) -> None:
-        """See who announces itself at the lines of foes."""
+        """See the vehicles that register at the stop lines of foes."""
         lines: Ways = {}
         for link in foes:
             _shorten(lines, self._beside(int(self.network.links["from_lane"][link])), 0.0)
@@ -174,7 +174,7 @@ class Looks:
                 places[beside] = min(places[beside], line)
 
     def _at_merges(self, foes: set[int]) -> None:
-        """See those that are minded from farther away at the lines of foes."""
+        """See the merging vehicles that are considered from farther away."""
         lanes, links = self.network.lanes, self.network.links
         before = {k for link in foes for k in self._beside(int(links["from_lane"][link]))}
         for lane in before:
@@ -210,7 +210,7 @@ class Looks:
                 self.head[beside] = math.inf
 
     def _beyond(self, lane: int) -> list[tuple[int, float]]:
-        """Lanes behind the end of one, and how far there bodies may cover longer lanes beside."""
+        """Return lanes behind a lane's end, and how far bodies there may cover longer lanes."""
         row = self.network.lanes[lane]
         if row["internal"]:
             return []
@@ -228,7 +228,7 @@ class Looks:
         return found
 
     def _ways(self, begin: Ways, neighbors: Callable[[int], list[int]], limit_m: float) -> Ways:
-        """Dijkstra's shortest ways."""
+        """Return the shortest distances by Dijkstra's algorithm."""
         found: Ways = {}
         waiting = [(way, lane) for lane, way in begin.items() if way <= limit_m]
         heapq.heapify(waiting)
@@ -261,7 +261,7 @@ class Looks:
         return beside
 
     def _path(self, link: int) -> list[int]:
-        """The lanes of a link inside the junction, and the one behind it."""
+        """Return the lanes of a link inside the junction, and the lane behind it."""
         path = [int(self.network.links["next_lane"][link])]
         while self.network.lanes["internal"][path[-1]]:
             path += self._after(path[-1])

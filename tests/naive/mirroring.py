@@ -1,4 +1,4 @@
-"""Where a vehicle of SUMO's stands, written down plainly."""
+"""The position of a vehicle of SUMO, computed plainly."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def centre(seen: np.void, length: float) -> tuple[float, float, float]:
-    """X and y of the body's centre and its heading, counter-clockwise from east."""
+    """Return x and y of the body's centre, and the heading, counter-clockwise from east."""
     north, east = math.cos(math.radians(seen["angle"])), math.sin(math.radians(seen["angle"]))
     return (
         float(seen["x"] - 0.5 * length * east),
@@ -23,7 +23,7 @@ def centre(seen: np.void, length: float) -> tuple[float, float, float]:
 def place(
     network: RoadNetwork, seen: np.void, length: float, link: int
 ) -> tuple[int, float, float]:
-    """LANE row and s of the centre: back from the front along the lanes that it came by."""
+    """Return LANE row and s of the centre, searched backwards from the front along its lanes."""
     lanes, edges = network.lanes, network.edges
     lane = int(seen["lane"])
     scale = lanes[lane]["length_m"] / edges[lanes[lane]["edge"]]["length_m"]
@@ -43,7 +43,7 @@ def place(
 
 
 def leads_to(network: RoadNetwork, before: int, lane: int, link: int | None) -> bool:
-    """Whether a lane's end is the start of another, inside junctions or by one link."""
+    """Return whether a lane leads into another, inside a junction or by one link."""
     row: Any = network.lanes[before]
     if row["internal"]:
         return bool(row["successor"] == lane and (link is None or row["link"] == link))

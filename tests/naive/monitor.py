@@ -1,4 +1,4 @@
-"""What the monitor's look at a world's rows has to find, with Python's own sets and numbers."""
+"""The findings that the monitor must have, computed with sets and integers of Python."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.naive.zones import distance
 
 
 class Kept(NamedTuple):
-    """A vehicle a tick before."""
+    """A vehicle one tick earlier."""
 
     x: float
     y: float
@@ -21,21 +21,21 @@ class Kept(NamedTuple):
 
 
 class Zone(NamedTuple):
-    """VEHICLE records of a zone."""
+    """The VEHICLE records of a zone."""
 
     owned: NDArray[np.void]
     ghosts: NDArray[np.void]
 
 
 def owner_hash(vehicle: int, epoch: int) -> int:
-    """What a vehicle adds to its owner's sum."""
+    """Return the contribution of a vehicle to the sum of its owner."""
     return mixed((mixed(vehicle) + epoch) & WORD)
 
 
 def findings(
     zones: list[Zone], before: Mapping[int, Kept], tick: int, new_late: int, limit_m: float
 ) -> dict[int, str]:
-    """Vehicle → what is wrong with it: `tick` or `far`."""
+    """Return vehicle → fault: `tick` or `far`."""
     found: dict[int, str] = {}
     for zone in zones:
         for row in zone.owned:
@@ -56,7 +56,7 @@ def tallies(
     masks: list[int],
     factors: list[int],
 ) -> list[tuple[int, int, int, int]]:
-    """By zone: vehicles, and the sums of owners, of ghosts that it should have and that it has."""
+    """Return per zone the number of vehicles, and the sums of owners, due and present ghosts."""
 
     def sum_of(rows: list[np.void]) -> int:
         words = [np.frombuffer(row.tobytes(), np.uint64).tolist() for row in rows]

@@ -1,4 +1,4 @@
-"""The nearest vehicles by looking at all of them."""
+"""The nearest vehicles by a search over all vehicles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def k_nearest(
     rows: NDArray[np.void], row: int, x: float, y: float, z: float, radius_m: float, k: int
 ) -> list[tuple[float, int]]:
-    """(squared distance, row) of at most k others on the level, by distance, then id."""
+    """Return (squared distance, row) of up to k vehicles on the level, by distance, then id."""
     found = [
         (_square(other["x"] - x) + _square(other["y"] - y), other["id"], i)
         for i, other in enumerate(rows)

@@ -1,4 +1,4 @@
-"""The `lanes` sensor by sorting all vehicles."""
+"""The `lanes` sensor, computed by sorting all vehicles."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ HALF_M, LANES_AHEAD, SLOWEST_MPS = 10.0, 8, 1.0
 def way_ahead(
     plans: NDArray[np.void], goal: int, lane: int, roads: RoadNetwork
 ) -> dict[int, float]:
-    """Lanes of the way from the start of `lane` and how far the start of each is."""
+    """Return the lanes of the path from the start of `lane`, and the distance to each start."""
     found: dict[int, float] = {}
     way = 0.0
     while lane >= 0 and len(found) < LANES_AHEAD and lane not in found:
@@ -28,7 +28,7 @@ def way_ahead(
 def next_link(
     plans: NDArray[np.void], vehicle: np.void, roads: RoadNetwork, range_m: float
 ) -> tuple[int, float] | None:
-    """(link, way to its stop line) of the link that a vehicle is on or comes to."""
+    """Return the link that a vehicle is on or reaches next, and the distance to its stop line."""
     here = roads.lanes[vehicle["lane"]]
     if here["internal"]:
         return int(here["link"]), -float(here["link_offset_m"] + vehicle["s"])
@@ -49,7 +49,7 @@ def lanes(
     held: set[int],
     range_m: float,
 ) -> list[float]:
-    """The sensor's numbers; `held` are the links whose signal is red."""
+    """Return the sensor's features; `held`: links whose signal is red."""
     ego = rows[i]
     near = [
         other
@@ -73,7 +73,7 @@ def slots(
     lane: int,
     range_m: float,
 ) -> list[float]:
-    """Closeness and relative speed of who is ahead and of who is behind on a lane."""
+    """Return closeness and relative speed of the vehicles ahead and behind on a lane."""
     s = ego["s"] * roads.lanes[lane]["length_m"] / roads.lanes[ego["lane"]]["length_m"]
     mine = way_ahead(plans, ego["goal"], lane, roads)
     ahead, behind = [], []
@@ -107,7 +107,7 @@ def crossing(
     held: set[int],
     range_m: float,
 ) -> list[float]:
-    """Who comes first to a place that the own next link shares with its own."""
+    """Return the features of the first vehicle at an area shared with the own next link."""
     own = next_link(plans, ego, roads, range_m)
     found = []
     for other in near:
@@ -134,10 +134,10 @@ def crossing(
 
 
 def closeness(way: float) -> float:
-    """1 where two touch, 0.5 at `HALF_M`."""
+    """Return 1 at contact, 0.5 at `HALF_M`."""
     return float(np.float32(HALF_M / (HALF_M + max(way, 0.0))))
 
 
 def scaled(speed: float) -> float:
-    """In 40 m/s."""
+    """Return a speed in units of 40 m/s."""
     return float(np.float32(min(max(speed / 40.0, -1.0), 1.0)))

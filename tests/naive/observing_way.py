@@ -1,4 +1,4 @@
-"""The `way` and `conflicts` sensors by listing the whole way and by sorting all vehicles."""
+"""The `way` and `conflicts` sensors, computed from the whole path and by sorting all vehicles."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ LOOKS_S = [0.5 * k for k in range(10)]
 
 @dataclass
 class Stretch:
-    """A lane of the way."""
+    """A lane of the path."""
 
     lane: int
-    start_m: float  # from the vehicle
+    start_m: float  # distance of its start from the vehicle
     end_m: float
-    link: int  # at its end, or -1
+    link: int  # the link at its end, or -1
 
 
 def way_of(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, most: int = 48
 ) -> list[Stretch]:
-    """The lanes of the way from the vehicle on."""
+    """Return the lanes of the path from the vehicle on."""
     lane, start = int(vehicle["lane"]), -float(vehicle["s"])
     found: list[Stretch] = []
     while lane >= 0 and len(found) < most:
@@ -54,7 +54,7 @@ def _beyond(roads: RoadNetwork, plan: NDArray[np.void], lane: int) -> tuple[int,
 
 
 def pose(roads: RoadNetwork, lane: int, s: float) -> tuple[float, float, float]:
-    """X, y and direction at a place of a lane; beyond its ends straight on."""
+    """Return x, y and direction at a position of a lane, which is straight beyond its ends."""
     points = roads.lane_points(lane)
     k = min(max(int(np.searchsorted(points["s"], s, side="right")) - 1, 0), len(points) - 2)
     one, other = points[k], points[k + 1]
@@ -64,7 +64,7 @@ def pose(roads: RoadNetwork, lane: int, s: float) -> tuple[float, float, float]:
 
 
 def on_way(way: list[Stretch], distance: float) -> tuple[Stretch, float]:
-    """The stretch that lies so far ahead, and where on it."""
+    """Return the lane of the path at a distance ahead, and the position on it."""
     for stretch in way:
         if distance <= stretch.end_m:
             return stretch, distance - stretch.start_m
@@ -78,7 +78,7 @@ def clip(value: float) -> float:
 def places(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, distances_m: list[float]
 ) -> list[float]:
-    """Left, curvature, width and limit at each distance."""
+    """Return lateral position, curvature, width and speed limit at each distance."""
     way = way_of(roads, plans, vehicle)
     reach = way[-1].end_m
     numbers: list[float] = []
@@ -108,7 +108,7 @@ def lines(
     count: int,
     range_m: float,
 ) -> list[float]:
-    """Nearness, red, yellow, green and duty of each stop line; `shown` is the letter of a link."""
+    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link."""
     found = []
     for stretch in way_of(roads, plans, vehicle):
         if stretch.end_m > range_m:
@@ -132,7 +132,7 @@ def lines(
 
 
 def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
-    """Where it will be at each look if it goes straight on: x, y, direction."""
+    """Return the predicted poses if the vehicle goes straight on: x, y, direction."""
     x, y, heading, speed = (float(vehicle[name]) for name in ("x", "y", "heading", "speed"))
     return [
         (x + time * speed * math.cos(heading), y + time * speed * math.sin(heading), heading)
@@ -143,7 +143,7 @@ def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
 def indicated_way(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void
 ) -> tuple[list[Stretch], int]:
-    """The way up to the end of the lane behind the next junction; the link over it, or -1."""
+    """Return the path up to the end of the lane behind the next junction, and its link or -1."""
     way = way_of(roads, plans, vehicle)
     here = roads.lanes[way[0].lane]
     links = [int(here["link"])] if here["internal"] else []
@@ -158,7 +158,7 @@ def indicated_way(
 def looks_along(
     roads: RoadNetwork, way: list[Stretch], vehicle: np.void, speed: float
 ) -> list[tuple[float, float, float]]:
-    """Where the vehicle is now, and will be at each look: x, y, direction."""
+    """Return the present and predicted poses of the vehicle: x, y, direction."""
     found = [(float(vehicle["x"]), float(vehicle["y"]), float(vehicle["heading"]))]
     for time in LOOKS_S[1:]:
         stretch, s = on_way(way, speed * time)
@@ -172,7 +172,7 @@ def approach(
     ego: np.void,
     other: np.void,
 ) -> tuple[float, float]:
-    """The gap of the approach that counts most, and its time."""
+    """Return gap and time of the most critical approach."""
     gaps = []
     for time, (x, y, direction), (x_there, y_there, direction_there) in zip(
         LOOKS_S, looks, others, strict=True
@@ -195,7 +195,7 @@ def approach(
 def goes_first(
     roads: RoadNetwork, way: list[Stretch], reach_m: float, other: np.void, shown: dict[int, str]
 ) -> float:
-    """1 if the other goes first at the next junction of the way, -1 if it gives way."""
+    """Return 1 if the other has priority at the next junction, -1 if it must yield, else 0."""
     here = roads.lanes[way[0].lane]
     ahead = [int(here["link"])] if here["internal"] else []
     for stretch in way:
@@ -228,7 +228,7 @@ def goes_first(
 
 
 def turn_over(roads: RoadNetwork, link: int) -> float:
-    """1: to the left, -1: to the right, 0: neither."""
+    """Return 1 for a left turn, -1 for a right turn, else 0."""
     if link < 0:
         return 0.0
     before, after = int(roads.links[link]["from_lane"]), int(roads.links[link]["to_lane"])
@@ -253,10 +253,10 @@ def conflicts(
     told: Mapping[int, tuple[np.void, float]] | None = None,
     indicators: bool = False,
 ) -> list[float]:
-    """Nine numbers of each of the `count` vehicles that count most, with `indicators` ten.
+    """Return nine features of each of the `count` most critical vehicles; ten with `indicators`.
 
-    `hidden`: ids of those that are not seen. `told`: what messages say of each
-    vehicle, as a VEHICLE row and its age in s; then the numbers are eleven.
+    `hidden`: ids of vehicles that are not seen. `told`: reports of vehicles in messages, as a
+    VEHICLE row and an age in s; with reports, there are eleven features.
     """
     ego = rows[i]
     way = way_of(roads, plans, ego)
@@ -274,7 +274,7 @@ def conflicts(
             its_way = indicated_way(roads, plans, other)[0]
             others = looks_along(roads, its_way, other, float(other["speed"]))
         near, when = approach(looks, others, ego, other)
-        # Of equal ones the sum rounds differently here and there: these are told apart by id.
+        # Rounding may differ between equally critical vehicles, so these are ordered by id.
         ranked.append((round(near + 2.0 * when, 6), subject, near, when))
     numbers: list[float] = []
     for _, subject, near, when in sorted(ranked)[:count]:

@@ -14,9 +14,9 @@ LANE_CHANGE_M = 250.0
 
 
 def followers(roads: RoadNetwork, lane: int) -> list[tuple[int, int]]:
-    """(next lane, link or -1) of the movements that a way may take from the end of a lane.
+    """Return (next lane, link or -1) of the movements of a route at the end of a lane.
 
-    Turning round is one only where the whole road leads nowhere else.
+    U-turns count only if the whole road has no other movement.
     """
     row = roads.lanes[lane]
     if row["internal"]:
@@ -41,7 +41,7 @@ def _turns_round(roads: RoadNetwork, link: int) -> bool:
 
 
 def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
-    """The lanes beside a lane that may be changed to: none inside junctions."""
+    """Return the lanes beside a lane to which a vehicle may change; none inside junctions."""
     row = roads.lanes[lane]
     if row["internal"]:
         return []
@@ -50,12 +50,12 @@ def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
 
 
 def change_cost(roads: RoadNetwork, lane: int) -> float:
-    """What it costs to leave a lane sideways, in s."""
+    """Return the cost of leaving a lane sideways, in s."""
     return LANE_CHANGE_COST_S * (1.0 + LANE_CHANGE_M / float(roads.lanes[lane]["length_m"]))
 
 
 def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.float64]:
-    """(L,) travel time in s from the start of each lane to the end of the goal edge, or inf."""
+    """Return (L,) travel times in s from the start of each lane to the goal edge's end, or inf."""
     drive = roads.lanes["length_m"] / roads.lanes["speed_mps"]
     allowed = roads.lanes["permissions"] & permission != 0
     cost = np.full(len(roads.lanes), math.inf)

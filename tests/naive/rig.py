@@ -1,4 +1,4 @@
-"""Mounted sensors, written down as plainly as their definitions."""
+"""Mounted sensors, computed plainly from their definitions."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ GRAVITY = np.array([0.0, 0.0, 9.80665])
 
 
 def sample_ticks(rate: Fraction, phase: int, last_tick: int) -> list[int]:
-    """The tick that delivers each sample, one entry a sample."""
+    """Return the tick that delivers each sample."""
     ticks = []
     number = 0
     while (tick := phase + math.ceil(number / rate)) <= last_tick:
@@ -27,7 +27,7 @@ def sample_ticks(rate: Fraction, phase: int, last_tick: int) -> list[int]:
 
 
 def turn(yaw: float, pitch: float, roll: float) -> Matrix:
-    """Yaw about z, then pitch upwards (about -y), then roll about x."""
+    """Return a rotation: yaw about z, then pitch upwards (about -y), then roll about x."""
     cy, sy, cp, sp, cr, sr = (f(a) for a in (yaw, pitch, roll) for f in (math.cos, math.sin))
     about_z = np.array([[cy, -sy, 0.0], [sy, cy, 0.0], [0.0, 0.0, 1.0]])
     about_y = np.array([[cp, 0.0, -sp], [0.0, 1.0, 0.0], [sp, 0.0, cp]])
@@ -41,7 +41,7 @@ def mount_turn(config: Any) -> Matrix:
 
 
 def place_in_world(row: np.void, config: Any) -> Matrix:
-    """Where a mounted sensor is."""
+    """Return the position of a mounted sensor in the world."""
     body = turn(float(row["heading"]), float(row["pitch"]), 0.0)
     at = np.array([config.x_m, config.y_m, config.z_m])
     place: Matrix = np.array([row["x"], row["y"], row["z"]]) + body @ at
@@ -49,7 +49,7 @@ def place_in_world(row: np.void, config: Any) -> Matrix:
 
 
 def between(before: np.void | None, after: np.void, name: str, share: float) -> float:
-    """A quantity within a tick."""
+    """Interpolate a quantity within a tick."""
     if before is None:
         return float(after[name])
     return float((1.0 - share) * before[name] + share * after[name])
@@ -64,7 +64,7 @@ def odometry(before: np.void | None, after: np.void, share: float) -> Matrix:
 def inertia(
     before: np.void | None, after: np.void, share: float, tick_s: float, config: Any
 ) -> Matrix:
-    """Specific force and angular rate along the sensor's axes, by vectors."""
+    """Return specific force and angular rate along the sensor's axes, by vector algebra."""
     v, a, r, steering, pitch = (
         between(before, after, name, share)
         for name in ("speed", "accel", "yaw_rate", "steering", "pitch")
@@ -84,7 +84,7 @@ def inertia(
 
 
 def lane_boundary(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, config: Any) -> Matrix:
-    """To the left, to the right, width, direction and curvature, by looking at all segments."""
+    """Return distances left and right, width, direction and curvature, from all segments."""
     points = roads.lane_polyline(int(row["lane"]))[:, :2]
     x, y, _ = place_in_world(row, config)
     best: tuple[float, float, float] | None = None
@@ -108,7 +108,7 @@ def lane_boundary(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, con
 
 
 def _ahead(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, ahead: float) -> Matrix:
-    """A place on the way ahead, walking along its points."""
+    """Return a point on the path ahead, by walking along its points."""
     lane, rest = int(row["lane"]), float(row["s"]) + ahead
     while True:
         points = roads.lane_polyline(lane)[:, :2]
@@ -126,7 +126,7 @@ def _ahead(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, ahead: flo
 
 
 def _circle(one: Matrix, two: Matrix, three: Matrix) -> float:
-    """One over the radius of the circle through three points, positive to the left."""
+    """Return the curvature of the circle through three points, positive to the left."""
     a, b, c = (float(np.hypot(*d)) for d in (two - one, three - two, three - one))
     if min(a, b, c) == 0.0:
         return 0.0

@@ -1,4 +1,4 @@
-"""Shortest ways along a sequence of edges, by repeating the definition until nothing changes."""
+"""Shortest paths along a sequence of edges, by iterating the definition until nothing changes."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.naive.plans import change_cost
 
 
 def lanes_of(roads: RoadNetwork, edge: int) -> range:
-    """The lanes of an edge, from right to left."""
+    """Return the lanes of an edge, from right to left."""
     row = roads.edges[edge]
     return range(int(row["first_lane"]), int(row["first_lane"] + row["num_lanes"]))
 
@@ -18,7 +18,7 @@ def lanes_of(roads: RoadNetwork, edge: int) -> range:
 def costs(
     roads: RoadNetwork, edges: Sequence[int], permission: int
 ) -> dict[tuple[int, int], float]:
-    """Travel time in s by (place in the route, lane), changes of lanes included; inf: no way."""
+    """Return travel times in s by (index in the route, lane), with lane changes; inf: no path."""
     allowed = roads.lanes["permissions"] & permission != 0
     cost = {(n, lane): math.inf for n, edge in enumerate(edges) for lane in lanes_of(roads, edge)}
     while True:
@@ -43,5 +43,5 @@ def costs(
 
 
 def length(roads: RoadNetwork, lane: int, link: int) -> float:
-    """Metres along a lane and the link at its end."""
+    """Return the length of a lane and of the link at its end, in m."""
     return float(roads.lanes[lane]["length_m"] + roads.links[link]["length_m"])

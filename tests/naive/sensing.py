@@ -1,4 +1,4 @@
-"""Lidar by letting each ray meet each side of each vehicle."""
+"""Lidar, by intersecting each ray with each side of each vehicle."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.naive.geometry import Point, box_corners
 def lidar(
     rows: NDArray[np.void], row: int, num_rays: int, range_m: float, margin: float = 0.0
 ) -> list[tuple[float, int]]:
-    """(distance, id) along each ray, with boxes larger by `margin` on each side."""
+    """Return (distance, id) along each ray; boxes are larger by `margin` on each side."""
     ego = rows[row]
     scan = []
     for ray in range(num_rays):
@@ -39,7 +39,7 @@ def lidar(
 
 
 def ray_to_polygon(direction: Point, corners: list[Point]) -> float:
-    """Distance from the origin along a unit vector to a convex counter-clockwise polygon."""
+    """Return the distance along a unit vector to a convex counter-clockwise polygon."""
     sides = list(pairwise([*corners, corners[0]]))
     if all(a[0] * b[1] - b[0] * a[1] >= 0.0 for a, b in sides):
         return 0.0
@@ -50,7 +50,7 @@ def _ray_to_side(direction: Point, a: Point, b: Point) -> float:
     edge = (b[0] - a[0], b[1] - a[1])
     slant = direction[0] * edge[1] - direction[1] * edge[0]
     if abs(slant) < 1e-12:
-        return math.inf  # runs along the side; the neighbouring sides tell
+        return math.inf  # parallel to the side; the neighbouring sides decide
     distance = (a[0] * edge[1] - a[1] * edge[0]) / slant
     share = (a[0] * direction[1] - a[1] * direction[0]) / slant
     return distance if distance >= 0.0 and 0.0 <= share <= 1.0 else math.inf

@@ -1,4 +1,4 @@
-"""What worlds report of a step, one array after the other."""
+"""The results of a step, computed array by array."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Time to collision by letting rectangles drive on and looking at their corners."""
+"""Time to collision, by moving rectangles and comparing their corners."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Body = tuple[float, float, float, float, float, float]  # x, y, heading, speed, 
 
 
 def ttc_risk(rows: NDArray[np.void], i: int, larger_m: float = 0.0) -> float:
-    """1 - ttc / horizon of the first that would be hit, or 0; all bodies `larger_m` larger."""
+    """Return 1 - ttc / horizon of the first vehicle that is hit, or 0; boxes grow by `larger_m`."""
     me = rows[i]
     least = HORIZON_S
     for j, other in enumerate(rows):
@@ -27,10 +27,10 @@ def ttc_risk(rows: NDArray[np.void], i: int, larger_m: float = 0.0) -> float:
 
 
 def time_to_collision_s(one: Body, other: Body, horizon_s: float = HORIZON_S) -> float:
-    """When their free room is used up, within the horizon; inf: later or never.
+    """Return when the free distance of two bodies is used up; inf: not within the horizon.
 
-    The free room of bodies that keep their velocities is convex in time: it has one least value,
-    and is used up once before that.
+    The free distance of bodies that keep their velocities is convex in time: it has one minimum,
+    and reaches 0 at most once before.
     """
     begin, end = 0.0, horizon_s
     for _ in range(60):
@@ -55,7 +55,7 @@ def time_to_collision_s(one: Body, other: Body, horizon_s: float = HORIZON_S) ->
 
 
 def free_m(one: Body, other: Body, time_s: float) -> float:
-    """The widest gap between two bodies along any of their sides, after some time; < 0: overlap."""
+    """Return the widest gap between two bodies along their sides after some time; < 0: overlap."""
     corners = [_corners(body, time_s) for body in (one, other)]
     gaps = []
     for _, _, heading, *_ in (one, other):

@@ -1,4 +1,4 @@
-"""What is sent and what is received, by the definitions and slowly."""
+"""Sending and receiving messages, computed slowly from the definitions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MASK = (1 << 64) - 1
 
 @dataclass(frozen=True)
 class Said:
-    """One report."""
+    """A report of a vehicle."""
 
     subject: int
     sender: int
@@ -31,7 +31,7 @@ class Said:
 
     @property
     def rank(self) -> tuple[int, int, int]:
-        """The newest, then what one says of oneself, then the smallest sender counts."""
+        """The order of reports: newest first, then reports of oneself, then the smallest sender."""
         return (-self.tick, 0 if self.cam else 1, self.sender)
 
 
@@ -40,7 +40,7 @@ def finalised(word: int) -> int:
 
 
 def number(key: int, receiver: int, sender: int, tick: int, kind: int) -> float:
-    """Of one reception, in [0, 1)."""
+    """Return the random number of a reception, in [0, 1)."""
     of_receiver = finalised(finalised(key + GOLDEN) ^ (receiver * GOLDEN & MASK))
     stream = ((STREAM_V2X + kind) << 32) + tick
     of_packet = finalised(finalised(sender * GOLDEN) ^ (stream * GOLDEN & MASK))
@@ -48,7 +48,7 @@ def number(key: int, receiver: int, sender: int, tick: int, kind: int) -> float:
 
 
 def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float) -> float:
-    """Of a reception, by the formulas of docs/reference/v2x.md."""
+    """Return the probability of a reception, by the formulas of docs/reference/v2x.md."""
     result = 1.0 - config.loss
     if config.path_loss_exponent > 0.0:
         lost = 10.0 * config.path_loss_exponent * math.log10(max(distance_m, 1.0))
@@ -64,14 +64,14 @@ def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float)
 
 
 def airtime_s(config: ChannelConfig) -> float:
-    """IEEE 802.11p in 10 MHz: 32 µs of training and 8 µs of signal field, then the bits."""
+    """Return the airtime of IEEE 802.11p in 10 MHz: 32 µs training, 8 µs signal field, the bits."""
     if config.data_rate_mbps == 0.0:
         return 0.0
     return 32e-6 + 8e-6 + config.packet_bytes * 8 / (config.data_rate_mbps * 1e6)
 
 
 def sensing_m(config: ChannelConfig) -> float:
-    """How far a station is heard: half of the packets are received there, or the range ends."""
+    """Return the sensing range: where half of the packets are received, or the end of the range."""
     sensing = config.range_m or math.inf
     if config.path_loss_exponent > 0.0:
         sensing = min(sensing, 10.0 ** (_margin_db(config) / (10.0 * config.path_loss_exponent)))
@@ -79,7 +79,7 @@ def sensing_m(config: ChannelConfig) -> float:
 
 
 def _margin_db(config: ChannelConfig) -> float:
-    """What may be lost beyond the first metre until half of the packets are."""
+    """Return the loss in dB beyond the first metre at which half of the packets are lost."""
     loss_1m = 20.0 * math.log10(4.0 * math.pi * 5.9e9 / 299_792_458.0)
     return config.tx_power_dbm - loss_1m - config.sensitivity_dbm
 
@@ -87,7 +87,7 @@ def _margin_db(config: ChannelConfig) -> float:
 def inbox(
     old: Sequence[Said], heard: Sequence[Said], receiver: int, x: float, y: float, most: int
 ) -> list[Said]:
-    """The nearest subjects, each by its best report; nearest first, then by subject."""
+    """Return the best report of each of the nearest subjects; nearest first, then by subject."""
     best: dict[int, Said] = {}
     for said in (*old, *heard):
         if said.subject == receiver:
@@ -96,7 +96,7 @@ def inbox(
         if known is None or said.rank < known.rank:
             best[said.subject] = said
 
-    # One that was known stays, wherever it is now, until nearer ones push it out.
+    # A known vehicle stays, wherever it is now, until nearer vehicles displace it.
     def key(said: Said) -> tuple[float, int]:
         return ((said.x - x) ** 2 + (said.y - y) ** 2, said.subject)
 
@@ -106,7 +106,7 @@ def inbox(
 def seen(
     rows: Any, own: int, x: float, y: float, range_m: float, most: int, bodies: bool
 ) -> list[int]:
-    """Rows of the vehicles that are seen from (x, y): samples of the line of sight."""
+    """Return the rows of vehicles that are visible from (x, y), by sampling lines of sight."""
     places = [
         (math.hypot(row["x"] - x, row["y"] - y), int(row["id"]), k)
         for k, row in enumerate(rows)
@@ -125,7 +125,7 @@ def seen(
 
 
 def _meets(row: Any, x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether a point of a line lies in the rectangle of a body; in 2,000 samples."""
+    """Return whether one of 2,000 points of a line is in the rectangle of a body."""
     share = np.linspace(0.0, 1.0, 2001)
     dx, dy = x + share * (to_x - x) - row["x"], y + share * (to_y - y) - row["y"]
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
@@ -134,7 +134,7 @@ def _meets(row: Any, x: float, y: float, to_x: float, to_y: float) -> bool:
 
 
 def crosses(wall: Sequence[float], x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether two segments meet, by solving for the place."""
+    """Return whether two segments intersect, by solving for the point."""
     ax, ay, bx, by = wall
     det = (to_x - x) * (by - ay) - (to_y - y) * (bx - ax)
     if det == 0.0:

@@ -1,4 +1,4 @@
-"""Zones by looking at every rectangle."""
+"""Zones, by checking each rectangle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def owners(rects: NDArray[np.float64], x: float, y: float) -> list[int]:
-    """All zones whose half-open rectangle holds the place; it should be one."""
+    """Return all zones whose half-open rectangle contains the point; there should be one."""
     return [
         zone
         for zone, (min_x, min_y, max_x, max_y) in enumerate(rects.tolist())
@@ -19,18 +19,18 @@ def owners(rects: NDArray[np.float64], x: float, y: float) -> list[int]:
 
 
 def distance(rect: NDArray[np.float64], x: float, y: float) -> float:
-    """From a place to the nearest point of a rectangle."""
+    """Return the distance from a point to a rectangle."""
     min_x, min_y, max_x, max_y = rect.tolist()
     return math.hypot(x - min(max(x, min_x), max_x), y - min(max(y, min_y), max_y))
 
 
 def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]) -> list[np.void]:
-    """The rows that lie within a distance of a rectangle."""
+    """Return the rows within a distance of a rectangle."""
     found = []
     for row in rows:
         dx = max(rect[0] - row["x"], row["x"] - rect[2], 0.0)
         dy = max(rect[1] - row["y"], row["y"] - rect[3], 0.0)
-        # Squares, as the kernel: a root would round once more.
+        # Compare squares like the kernel, because a root would round once more.
         if dx * dx + dy * dy <= distance_m * distance_m:
             found.append(row)
     return found
@@ -39,14 +39,14 @@ def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]
 def published(
     rects: NDArray[np.float64], halo_m: float, xy: NDArray[np.float64], zone: int
 ) -> list[list[int]]:
-    """For each zone the rows of `xy`, all owned by `zone`, that lie within its halo."""
+    """Return for each zone the rows of `xy`, all owned by `zone`, within its halo."""
     needed: list[list[int]] = []
     for other, rect in enumerate(rects.tolist()):
         rows = []
         for row, (x, y) in enumerate(xy.tolist()):
             dx = max(rect[0] - x, x - rect[2], 0.0)
             dy = max(rect[1] - y, y - rect[3], 0.0)
-            # Squares, as the kernel: a root would round once more.
+            # Compare squares like the kernel, because a root would round once more.
             if other != zone and dx * dx + dy * dy <= halo_m * halo_m:
                 rows.append(row)
         needed.append(rows)
@@ -60,7 +60,7 @@ def near_borders(
     ahead_s: float,
     rows: NDArray[np.void],
 ) -> list[tuple[int, int, bool]]:
-    """(row, other zone, whether it has crossed) of the vehicles that other zones are told of."""
+    """Return (row, other zone, whether it has crossed) of the vehicles near borders."""
     found = []
     for i, row in enumerate(rows):
         here = zone

@@ -1,6 +1,6 @@
-"""A coordinator and its hosts on a bench: a test hands every message over itself.
+"""A coordinator and its hosts in one process; the test delivers each message itself.
 
-A vehicle's state is its version, (vehicle, tick). The bench is its own committed store.
+A vehicle's state is its version, (vehicle, tick), so `Bench` is also the store of committed states.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ RUN = bytes(range(16))
 
 
 class Bench:
-    """Zones 0, 1, … of one world."""
+    """The coordinator and the hosts of zones 0, 1, … of one world."""
 
     def __init__(self, zones: int = 2, limits: Limits | None = None) -> None:
         self.limits = limits or Limits()
@@ -40,7 +40,7 @@ class Bench:
         return state_digest(self.state(vehicle))
 
     def note(self, output: Output) -> Output:
-        """Log what is to be logged."""
+        """Log the records of an output."""
         self.log += output.records
         self.trace.logged(output.records)
         return output
@@ -51,20 +51,20 @@ class Bench:
         return output
 
     def crash(self, zone: int) -> Output:
-        """The zone's host dies and is replaced."""
+        """Let a zone's host die, and replace it."""
         self.note(self.directory.fence(zone))
         return self.host(zone)
 
     def begin(
         self, movers: Iterable[tuple[int, int]] = (), births: Iterable[tuple[int, int]] = ()
     ) -> tuple[Step, ...]:
-        """BEGIN with vehicles in zones, and new ones in zones; the STEPs."""
+        """Begin a tick with moving and new vehicles by zone; return the STEPs."""
         new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]
         output = self.note(self.directory.begin(movers, new))
         return tuple(message for message in output.messages if isinstance(message, Step))
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
-        """Deliver a message; what its receiver sends, with DONE after a STEP."""
+        """Deliver a message; return the answers of its receiver, with DONE after a STEP."""
         destination, *copies = message.destinations()
         for zone in copies:
             self.trace.delivered(zone, message)
@@ -87,7 +87,7 @@ class Bench:
         return (endpoint.complete(rows, gone),)
 
     def offer(self, zone: int, *approaches: tuple[int, int]) -> tuple[Message, ...]:
-        """The offers of a zone's host: (vehicle, target)."""
+        """Let a zone's host offer vehicles to targets, and return its messages."""
         endpoint = self.endpoints[zone]
         return endpoint.offer(
             Approach(vehicle, target, version(vehicle, endpoint.tick))
@@ -95,7 +95,7 @@ class Bench:
         )
 
     def pass_on(self, messages: Iterable[Message]) -> None:
-        """Deliver messages, what they lead to, and so on."""
+        """Deliver messages and all messages that follow from them."""
         for message in messages:
             self.pass_on(self.give(message))
 
@@ -110,7 +110,7 @@ class Bench:
         offers: Sequence[tuple[int, int]] = (),
         removed: Sequence[int] = (),
     ) -> tuple[Message, ...]:
-        """A whole tick without faults; what was offered, (vehicle, target), is answered."""
+        """Run a tick without faults; offers (vehicle, target) are answered."""
         sent: list[Message] = []
         for step in self.begin(movers, births):
             for done in self.give(step, removed):

@@ -1,12 +1,12 @@
-"""Breadth first through everything that can happen to the real parties in a small world.
+"""Breadth-first search over all states of the real parties in a small world.
 
-As in docs/model/handoff.pml: a message, once sent, lies in a soup; it may arrive at any later time,
-any number of times or never. Hosts and the coordinator may die between any two events, and a host
-may be suspected while it lives on. Where vehicles are after a tick is chosen freely, and a
-vehicle's state is its version, (vehicle, tick), so that a state that is not exact is seen at once.
+As in docs/model/handoff.pml, sent messages are in a set (the "soup"): each may arrive at any later
+time, any number of times, or never. Hosts and the coordinator may die between any two events, and
+a living host may be suspected. Positions of vehicles after a tick are chosen freely. A vehicle's
+state is its version, (vehicle, tick), so that a state that is not exact is found at once.
 
-Parties are never changed, only replaced by changed copies. Equal ones are kept once and known by
-number, and so is what a message does to a party: most steps of the search are look-ups.
+Parties are never changed, only replaced by changed copies. Equal parties are stored once under a
+number, and so are the effects of messages on parties: most steps of the search are look-ups.
 """
 
 from __future__ import annotations
@@ -73,22 +73,22 @@ class Small:
 
 
 class Node(NamedTuple):
-    """A state of the whole world; parties and messages by number."""
+    """A state of the whole world, with the numbers of parties and messages."""
 
     directory: int
     endpoints: tuple[int, ...]
     soup: frozenset[tuple[int, int]]
     places: tuple[Place, ...]
-    writers: tuple[int, ...]  # the zone that advanced each vehicle in the tick in progress
+    writers: tuple[int, ...]  # the zone that has advanced each vehicle in this tick
     visited: int  # zones in which a vehicle has been
     budget: tuple[int, int, int]  # crashes, false alarms, crashes of the coordinator
 
 
 class Versions:
-    """The committed store of a coordinator: at its tick everybody has the version of that tick.
+    """The committed store of a coordinator: all vehicles have the version of its tick.
 
     Attributes:
-        tick: of the coordinator that reads the store next.
+        tick: tick of the coordinator that reads the store next.
     """
 
     tick = 0
@@ -114,7 +114,7 @@ class Explorer:
         self._known: dict[Any, Any] = {}
 
     def run(self, most: int = 10**7) -> tuple[int, int]:
-        """Visit every state; the numbers of states, and of those from which the end is reached.
+        """Visit all states; return their number, and the number from which the end can be reached.
 
         Raises:
             ProtocolError: in some state an invariant does not hold.
@@ -192,7 +192,7 @@ class Explorer:
         soup, writers = node.soup | sent, (-1,) * small.vehicles
         zones = range(min(small.zones, node.visited + 1))
         paths = product(product(zones, nears), repeat=small.vehicles)
-        if self._tick(node) == small.ticks - 1:  # where they are at the end moves nobody
+        if self._tick(node) == small.ticks - 1:  # positions at the end move no vehicle
             paths = iter([tuple((0, True) for _ in range(small.vehicles))])
         for places in paths:
             visited = max(node.visited, *(zone + 1 for zone, _ in places))
@@ -281,7 +281,7 @@ class Explorer:
         return node._replace(directory=number, endpoints=endpoints, soup=node.soup | sent)
 
     def _all_that_it_says(self, node: Node, zone: int) -> Node:
-        """A host that is suspected, but takes in all that is under way to it before it ends."""
+        """Let a suspected host receive all messages to it before it ends."""
         zombie = node
         for destination, number in sorted(node.soup):
             if destination == zone:
@@ -296,7 +296,7 @@ class Explorer:
         return node._replace(directory=self._keep_directory(directory, log), soup=node.soup | sent)
 
     def _changed(self, number: int, what: Any, change: Any) -> tuple[int, frozenset[Any]]:
-        """The coordinator after something, and what it sends."""
+        """Return the coordinator after a change, and the messages that it sends."""
         key = (number, what)
         if key not in self._known:
             directory = fork(self._parties[number])
@@ -328,7 +328,7 @@ class Explorer:
             if tally(RUN, owned) != expected:
                 raise ProtocolError(f"I6: the ledger of zone {zone} is not that of its vehicles")
         if any(ticks > self.small.limits.deferral for ticks in table.deferred.values()):
-            raise ProtocolError(f"I5: somebody waits too long: {table.deferred}")
+            raise ProtocolError(f"I5: a vehicle waits too long: {table.deferred}")
 
     # Numbers for parties and messages
 
@@ -355,7 +355,7 @@ class Explorer:
         return self._keep(Endpoint(hosting, self.small.limits))
 
     def _stirred(self, sent: Iterable[Message]) -> frozenset[tuple[int, int]]:
-        """Messages as items of the soup. Copies for the source are left out: nobody repeats."""
+        """Return messages as items of the soup, without copies for the source, as none repeats."""
         items = []
         for message in sent:
             number = self._message_numbers.setdefault(message, len(self._messages))
@@ -384,7 +384,7 @@ def fork(party: Any) -> Any:
 
 
 def _fork(party: Any, forked: dict[int, Any]) -> Any:
-    """`forked`: the copies up to now, by the `id` of what was copied."""
+    """`forked`: the copies so far, by the `id` of the original."""
     if isinstance(party, dict):
         copied = party.copy()
         for key, inner in party.items():
@@ -406,7 +406,7 @@ def _fork(party: Any, forked: dict[int, Any]) -> Any:
 
 
 def freeze(value: Any) -> Any:
-    """A value that is equal for equal states and can be a key."""
+    """Return a hashable value that is equal for equal states."""
     if isinstance(value, dict):
         return frozenset((key, freeze(inner)) for key, inner in value.items())
     if isinstance(value, set):
@@ -425,7 +425,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _reached(before: list[list[int]], ends: list[int]) -> set[int]:
-    """States from which one of the ends can be reached."""
+    """Return the states from which one of the ends can be reached."""
     found, stack = set(ends), list(ends)
     while stack:
         for origin in before[stack.pop()]:

@@ -1,7 +1,7 @@
-"""What always holds (I1 to I10), checked on the parties' own states while they run.
+"""The invariants I1 to I10, checked on the states of the parties while they run.
 
-A monitor is told which rows a host advances, and is asked to look before and after every tick.
-It is for tests, and for runs in which the user pays for it: it checks every vehicle.
+A monitor gets the rows that a host advances, and checks the state before and after each tick.
+It checks each vehicle, so it is slow.
 """
 
 from __future__ import annotations
@@ -22,20 +22,22 @@ class Store(Protocol):
     committed: Mapping[int, bytes]
 
     def world(self) -> int:
-        """Digest of the committed world."""
+        """Return the digest of the committed world."""
 
 
 class Monitor:
-    """Raises ProtocolError at the first invariant that does not hold."""
+    """Raise ProtocolError at the first invariant that does not hold."""
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._writers: dict[int, tuple[int, int]] = {}  # vehicle → advanced by, this tick
+        self._writers: dict[
+            int, tuple[int, int]
+        ] = {}  # vehicle → process that has advanced it in this tick
         self._executed: dict[tuple[int, int], int] = {}  # process → newest tick that it advanced to
         self._tick = -1
 
     def advanced(self, zone: int, incarnation: int, tick: int, vehicles: Iterable[int]) -> None:
-        """I1: in a tick one zone advances a vehicle, and each of its processes once."""
+        """Check I1: in a tick, one zone advances a vehicle, and each of its processes once."""
         if tick > self._tick:
             self._tick, self._writers = tick, {}
         if self._executed.get((zone, incarnation), -1) >= tick:
@@ -50,7 +52,7 @@ class Monitor:
             self._writers[vehicle] = (zone, incarnation)
 
     def check(self, directory: Directory, endpoints: Mapping[int, Endpoint], store: Store) -> None:
-        """I1 to I6 and I10, at any time."""
+        """Check I1 to I6 and I10, at any time."""
         self._check_copies(directory, store)
         self._check_leases(directory, endpoints)
         self._check_retained(directory, endpoints)
@@ -60,7 +62,7 @@ class Monitor:
                 raise ProtocolError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
 
     def committed(self, world: int, store: Store) -> None:
-        """I10: the digest of the world is the sum of the zones' digests."""
+        """Check I10: the digest of the world is the sum of the zones' digests."""
         if world != store.world():
             raise ProtocolError("I10: the committed world is not what the zones told of")
 

@@ -23,7 +23,7 @@ OTHER_RUN = bytes(reversed(range(16)))
 
 
 def explored(**small: object) -> None:
-    """In every state all invariants hold, and the end can be reached."""
+    """Check that all invariants hold in each state, and that the end can be reached."""
     states, reached = Explorer(Small(**small)).run()  # type: ignore[arg-type]
     assert states == reached
 
@@ -64,11 +64,13 @@ def deadline() -> None:
 
 
 def target_by_position() -> None:
-    """H17, H18: the target is where the vehicle is, not was."""
+    """H17, H18: the target is the zone where the vehicle is, not where it was."""
     bench = Bench(3)
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.begin(movers=[(7, 2)])
-    assert not bench.directory.table.planned.switches, "it is not where it was prepared"
+    assert not bench.directory.table.planned.switches, (
+        "the vehicle is not in the zone that was prepared"
+    )
 
 
 # Acknowledgements
@@ -162,7 +164,9 @@ def replica_slot() -> None:
 def replica_lifetime() -> None:
     """I8: a replica that is not refreshed expires."""
     bench = approached(Bench(limits=Limits(lifetime=3)))
-    bench.endpoints[0].offers.open.clear()  # as in a source that died and knows of nothing
+    bench.endpoints[
+        0
+    ].offers.open.clear()  # as for a source that died and has forgotten the transfer
     for _ in range(5):
         bench.tick()
     assert not bench.endpoints[1].replicas.held
@@ -173,7 +177,7 @@ def replica_lifetime() -> None:
 
 
 def log_before_send() -> None:
-    """H11, H23: a decision is logged before anyone hears of it."""
+    """H11, H23: a decision is logged before any party gets it."""
     explored(ticks=2, coordinator_crashes=1)
 
 
@@ -280,7 +284,7 @@ def segment_per_incarnation() -> None:
 
 
 def digest_before_commit() -> None:
-    """H28: what is stored is what DONE told of."""
+    """H28: the stored rows are those that DONE has reported."""
     bench = Bench()
     for step in bench.begin():
         bench.give(bench.give(step)[0])
@@ -314,13 +318,13 @@ def early_offer() -> None:
 
 
 def approached(bench: Bench) -> Bench:
-    """Vehicle 7 of zone 0 has been offered to zone 1, which has acknowledged it, in tick 1."""
+    """Return a run in tick 1: zone 1 has acknowledged the offer of vehicle 7 of zone 0."""
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     return bench
 
 
 def prepared() -> tuple[Bench, Prepare]:
-    """Tick 1 is computed, not committed; zone 0 has sent a PREPARE that has not arrived."""
+    """Return a run whose tick 1 is not committed; a PREPARE of zone 0 has not arrived."""
     bench = Bench()
     for step in bench.begin(births=[(7, 0)]):
         bench.give(bench.give(step)[0])

@@ -1,7 +1,7 @@
-"""The whole protocol in one thread: the real parties, a network and crashes from a seed.
+"""The whole protocol in one thread: the real parties, and a network and crashes from a seed.
 
-`Simulator.run` drives the toy world tick by tick. `crashes` says who dies at which point of which
-tick. Everything that happens is in `trace`; the coordinator's log is `log`, as text.
+`Simulator.run` drives the toy world tick by tick. `crashes` decides which party dies at which point
+of which tick. All events are in `trace`; the coordinator's log is `log`, as text.
 """
 
 from __future__ import annotations
@@ -48,11 +48,11 @@ Crashes = Callable[[int, str, int], bool]
 
 
 class Stalled(AssertionError):
-    """A tick that does not come to its end."""
+    """A tick that does not end."""
 
 
 class Died(Exception):
-    """A zone host, in the middle of something."""
+    """A zone host died during its work."""
 
 
 @dataclass
@@ -95,7 +95,7 @@ class Simulator:
             self._host(zone)
 
     def run(self, ticks: int) -> None:
-        """Some ticks, and then the judgement of the trace so far."""
+        """Run some ticks, and then check the trace so far."""
         for _ in range(ticks):
             self.step()
         self.judge()
@@ -104,7 +104,7 @@ class Simulator:
         check_trace(self.trace.entries, self.limits.deferral, self.limits.lifetime)
 
     def step(self) -> None:
-        """One tick."""
+        """Run one tick."""
         tick = self.directory.table.tick + 1
         self._begin(tick)
         for wait in range(1, self.patience + 1):
@@ -121,13 +121,13 @@ class Simulator:
         raise Stalled(f"tick {tick} waits for zones {self.directory.waiting_for()}")
 
     def reset(self) -> None:
-        """Another episode, at any time."""
+        """Begin another episode, at any time."""
         self._do(self.directory.reset())
         self.store.reset(self.directory.table.tick)
         self.next_id = 0
 
     def open_handoffs(self) -> list[int]:
-        """Vehicles outside their owner's zone."""
+        """Return the vehicles outside their owner's zone."""
         owners = self.directory.table.owners
         states = self.store.committed
         return [v for v, (zone, _) in owners.items() if self.world.zone(states[v]) != zone]
@@ -138,7 +138,7 @@ class Simulator:
         born = self.world.births(tick, self.next_id)
         self.next_id += len(born)
         self._decide(born)
-        if self._strikes("torn log", COORDINATOR):  # it was never acted upon
+        if self._strikes("torn log", COORDINATOR):  # no party has acted upon it
             self.log = self.log[: -len(self.log.splitlines()[-1]) // 2]
             self.trace.entries.pop()
             self._restart()
@@ -248,7 +248,7 @@ class Simulator:
         for zombie in [host for host in self.zombies if host.endpoint.zone == zone]:
             self._react(zombie, message, refused, zombie=True)
             if zombie.endpoint.tick > self.directory.table.tick:
-                self.zombies.remove(zombie)  # it has said what it could say
+                self.zombies.remove(zombie)  # it has sent all its messages
         host = self.hosts.get(zone)
         if host is None:
             return
@@ -319,7 +319,7 @@ class Simulator:
         ]
 
     def _offered(self) -> bool:
-        """Whether offers of the tick are answered, or have been sent as often as allowed."""
+        """Return whether offers of the tick are answered, or were sent as often as allowed."""
         tick = self.directory.table.planned.record.tick
         return all(
             not host.endpoint.offers.unanswered
@@ -341,5 +341,5 @@ class Simulator:
 
 
 def whole_lines(text: str) -> str:
-    """A log without what follows its last whole line: a torn record was never acted upon."""
+    """Return a log up to its last whole line: no party has acted upon a torn record."""
     return text[: text.rfind("\n") + 1]

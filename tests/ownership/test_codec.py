@@ -1,4 +1,4 @@
-"""Messages as bytes: what is sent arrives, and nothing else does."""
+"""Messages as bytes: decoded messages equal sent ones, and other bytes are refused."""
 
 from __future__ import annotations
 
@@ -64,12 +64,12 @@ def test_every_kind_is_tried() -> None:
     assert {type(message) for message in MESSAGES} == set(KINDS)
 
 
-def test_the_wire_form_is_that_on_file() -> None:
+def test_the_wire_form_equals_the_recorded_one() -> None:
     assert GOLDEN.read_text().split() == [encode(message).hex() for message in MESSAGES]
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_a_message_that_is_cut_short_or_goes_on_is_refused(message: Message) -> None:
+def test_messages_that_are_too_short_or_too_long_are_refused(message: Message) -> None:
     wire = encode(message)
     for length in range(len(wire)):
         with pytest.raises(MessageError):
@@ -117,7 +117,7 @@ def test_refusals_have_their_types() -> None:
 
 
 @given(st.binary(max_size=200))
-def test_no_bytes_do_more_than_be_refused(data: bytes) -> None:
+def test_arbitrary_bytes_are_refused(data: bytes) -> None:
     for wire in (data, resealed(b"CVMO\x01\x00\x00\x00" + data)):
         try:
             message = decode(wire)

@@ -1,4 +1,4 @@
-"""AT10: nobody is lost or doubled in very many hand-offs under random faults."""
+"""AT10: no vehicle is lost or doubled in very many hand-offs under random faults."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FAULTS = Rates(drop=0.1, delay=0.1, duplicate=0.1, reorder=0.2, corrupt=0.02, lo
 
 
 class Traffic:
-    """Vehicles that are in another zone after every tick, over a network that loses messages."""
+    """Vehicles that change their zone in each tick, over a network that loses messages."""
 
     def __init__(self) -> None:
         self.bench = Bench(ZONES)

@@ -1,4 +1,4 @@
-"""Everything that can happen in small worlds: no state is wrong, and each leads to the end.
+"""All states of small worlds: each is correct, and can reach the end.
 
 One vehicle and three zones, two vehicles and two zones, with messages that are late, doubled or
 lost, and with deaths of source, target, bystander and coordinator at any moment.
@@ -48,13 +48,13 @@ SLOW = {
 
 
 @pytest.mark.parametrize("small", QUICK.values(), ids=QUICK)
-def test_every_state_is_right_and_leads_to_the_end(small: Small) -> None:
+def test_every_state_is_correct_and_can_reach_the_end(small: Small) -> None:
     states, reached = Explorer(small).run()
     assert states == reached > 300
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("small", SLOW.values(), ids=SLOW)
-def test_every_state_of_larger_ones_is_right_and_leads_to_the_end(small: Small) -> None:
+def test_every_state_of_larger_worlds_is_correct_and_can_reach_the_end(small: Small) -> None:
     states, reached = Explorer(small).run()
     assert states == reached > 300

@@ -1,7 +1,7 @@
-"""The holes of the paper's protocol, H1 to H28: what would go through each does not.
+"""The holes of the paper's protocol, H1 to H28: none of the faults can occur.
 
-H21 (pairs across a border), H24 (what stands in a state) and H27 (load readings) lie outside the
-core, which carries states as bytes; that it carries them unchanged is tested here.
+H21 (pairs across a border), H24 (content of a state) and H27 (load readings) lie outside the core,
+which transfers states as bytes; these tests check that the bytes do not change.
 """
 
 from __future__ import annotations
@@ -169,7 +169,7 @@ def test_h19_removed_and_born_in_the_middle_of_a_transfer() -> None:
 def test_h20_the_approach_prepares_and_the_position_decides() -> None:
     bench = approached(Bench())
     bench.tick(offers=[(7, 1)])
-    assert bench.owner(7) == 0, "an ACK alone moves nobody"
+    assert bench.owner(7) == 0, "an ACK alone moves no vehicle"
     scenarios.early_offer()
 
 

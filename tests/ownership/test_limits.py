@@ -1,4 +1,4 @@
-"""Numbers that cannot work are refused, and small helpers do what they say."""
+"""Impossible limits are refused; small helper functions."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_tally_is_that_of_its_set() -> None:
         whole.check(whole.minus(RUN, 8, 3), "here")
 
 
-def test_ids_that_were_seen_take_no_room_as_long_as_they_are_dense() -> None:
+def test_dense_ids_take_no_memory() -> None:
     seen = SeenIds()
     for block in range(0, 1000, 10):
         for vehicle in reversed(range(block, block + 10)):

@@ -1,4 +1,4 @@
-"""The model and the tests of the code know the same remedies, and the model holds."""
+"""The formal model and the tests have the same remedies, and the model is correct."""
 
 from __future__ import annotations
 

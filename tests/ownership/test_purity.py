@@ -1,4 +1,4 @@
-"""The core is pure: the standard library, and no input, output, clock, thread or chance."""
+"""The core is pure: the standard library, without input, output, clocks, threads or randomness."""
 
 from __future__ import annotations
 

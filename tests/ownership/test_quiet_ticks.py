@@ -1,4 +1,4 @@
-"""Ticks of which nothing is said: what comes of them is what would have come of telling."""
+"""Quiet ticks, which have no messages: their results equal those of ticks with messages."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Digests:
 
 
 class Both:
-    """A coordinator and two zones of which the first owns vehicles 1 and 2."""
+    """A coordinator and two zones, of which zone 0 owns vehicles 1 and 2."""
 
     def __init__(self) -> None:
         self.directory = Directory(RUN, (0, 1), Digests(), LIMITS)
@@ -45,13 +45,13 @@ class Both:
                     self.directory.on_message(message)
 
     def tell(self, births: list[Birth], movers: list[tuple[int, int]] | None = None) -> None:
-        """A tick with STEP and DONE."""
+        """Run a tick with STEP and DONE."""
         self.deliver(self.directory.begin(movers or (), births).messages)
         self.deliver(tuple(zone.complete(0) for zone in self.zones.values()))
         self.directory.commit({0: 0, 1: 0})
 
     def leave_alone(self) -> None:
-        """One without."""
+        """Run a quiet tick."""
         assert self.directory.begin_quiet()
         for zone in self.zones.values():
             zone.go_on()
@@ -122,7 +122,7 @@ def test_an_episode_that_begins_in_a_quiet_tick_goes_on_from_it() -> None:
     both.check()
 
 
-def test_one_tick_at_a_time() -> None:
+def test_only_one_tick_is_in_progress() -> None:
     both = Both()
     both.leave_alone()
     with pytest.raises(ProtocolError, match="tick 2 is not committed"):

@@ -1,4 +1,4 @@
-"""The log as JSON lines: replayed, it is the table; damaged, it is refused by name."""
+"""The log as JSON lines: replaying it gives the table; a damaged log is refused with the reason."""
 
 from __future__ import annotations
 
@@ -145,7 +145,7 @@ def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
         replay([*records[: second + 1], records[commit]])
 
 
-def test_a_log_whose_vehicles_do_what_they_cannot_is_refused() -> None:
+def test_a_log_with_impossible_events_of_vehicles_is_refused() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1)])
     bench.tick(movers=[(7, 1)], removed=[8])

@@ -243,7 +243,7 @@ def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> 
     bench.offer(0, (7, 1))
     bench.commit()
     bench.give(bench.begin()[0])
-    assert not endpoint.offer_again(), "it was of the tick before"
+    assert not endpoint.offer_again(), "it belonged to the previous tick"
 
 
 def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
@@ -313,7 +313,7 @@ def test_r24_a_living_zone_moves_between_ticks_only() -> None:
     bench = approached(Bench())
     bench.host(1)
     bench.tick(movers=[(7, 1)])
-    assert bench.directory.table.deferred == {7: 1}, "the ACK was another process's"
+    assert bench.directory.table.deferred == {7: 1}, "the ACK came from another process"
     bench.begin()
     with pytest.raises(ProtocolError, match="fence it first"):
         bench.host(1)
@@ -401,7 +401,7 @@ def test_r33_what_a_network_does_is_a_function_of_its_seed() -> None:
 
 
 class Untouchable(dict[int, tuple[int, int]]):
-    """Owners that can be looked up one by one, and not looked through."""
+    """A table of owners that allows look-ups, but no iteration."""
 
     def __iter__(self) -> Iterator[int]:
         raise AssertionError("every vehicle was looked at")

@@ -80,7 +80,7 @@ def test_a_crash_at_any_point_is_invisible(point: str, party: int) -> None:
 
 
 def campaign(seed: int, layout: str) -> Simulator:
-    """A run in which everything happens now and then, also several times in a tick."""
+    """Run a campaign in which all faults occur, also several times in a tick."""
 
     def crashes(tick: int, point: str, party: int) -> bool:
         return number(seed, "crash", tick, point, party) % 100 < 2
@@ -102,7 +102,7 @@ def test_a_seeded_campaign_is_invisible_and_repeats_itself(seed: int) -> None:
 
 
 def test_once_the_faults_end_every_open_hand_off_does() -> None:
-    """Liveness: D + 2 ticks after the last fault nobody waits who had crossed before."""
+    """Liveness: D + 2 ticks after the last fault, no vehicle waits that had crossed before."""
     limits = Limits()
     for seed in range(6):
         plan = FaultPlan(seed=seed, otherwise=Rates(drop=0.6, delay=0.3), until=150)

@@ -17,7 +17,7 @@ FATES = st.sampled_from(["arrives", "arrives", "is lost", "is doubled", "is late
 
 
 class Ownership(RuleBasedStateMachine):
-    """The model is a dictionary: where each living vehicle is."""
+    """The model is a dictionary of the zone of each living vehicle."""
 
     def __init__(self) -> None:
         super().__init__()

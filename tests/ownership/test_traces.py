@@ -1,6 +1,6 @@
-"""Readable transcripts of what happens, and the judge of transcripts (AT6).
+"""Readable traces of runs, and the checker of traces (AT6).
 
-`CAVMARL_REWRITE=1` writes the files anew; read the difference before you commit it.
+`CAVMARL_REWRITE=1` rewrites the files; read the difference before you commit it.
 """
 
 from __future__ import annotations
@@ -79,8 +79,8 @@ def reset_in_a_switch(bench: Bench) -> None:
         bench.give(message)
 
 
-# Stories that are ticks alone: how many zones there are, and of each tick the arguments of
-# `Bench.tick`. Vehicle 7 is born in zone 0 in the first one.
+# Runs without faults: number of zones, and the arguments of `Bench.tick` for each tick. Vehicle 7
+# is created in zone 0 in the first tick.
 TICKS: dict[str, tuple[int, list[dict[str, Any]]]] = {
     "straight_crossing": (2, [{}, {"offers": [(7, 1)]}, {"movers": [(7, 1)]}, {}]),
     "lost_ack": (2, [

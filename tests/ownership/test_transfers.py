@@ -1,4 +1,4 @@
-"""Every change of owner leaves a row that tells how it came about."""
+"""Each change of owner has a row in the table of transfers."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def test_a_forced_transfer_has_its_deferral() -> None:
     assert log.counts == {"forced": 1, "deferred": 2, "removed": 1}
 
 
-def test_an_approach_that_ends_is_counted_and_one_that_is_forgotten_takes_no_room() -> None:
+def test_ended_approaches_are_counted_and_forgotten_ones_take_no_memory() -> None:
     bench = Bench(3)
     bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1), (8, 2)])
     bench.tick(offers=[(8, 2)])
@@ -83,7 +83,7 @@ def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
     assert log.counts["switched"] + log.counts["forced"] == len(rows)
 
 
-def test_rows_that_are_made_later_are_those_of_the_newest_changes() -> None:
+def test_the_stored_rows_are_those_of_the_newest_changes() -> None:
     log = TransferLog(Limits().lifetime)
     made = []
 
@@ -101,7 +101,7 @@ def test_rows_that_are_made_later_are_those_of_the_newest_changes() -> None:
     for first in range(0, 6 * batch, batch):
         later(first, batch)
     assert log.counts == {"switched": 6 * batch, "removed": 6}
-    assert made == [], "nobody has read a row"
+    assert made == [], "no row was read"
     assert [row.tick for row in log.rows] == list(range(2 * batch, 6 * batch))
     assert made == [2 * batch, 3 * batch, 4 * batch, 5 * batch]
     later(6 * batch, 3)

@@ -1,4 +1,4 @@
-"""The transition table is whole, and what it does not list is an error."""
+"""The transition table is complete, and other transitions are errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_transitions_outside_of_the_table_raise() -> None:
             after(party, state, event)
 
 
-def test_a_host_is_not_given_what_it_owns_and_gives_nothing_that_it_does_not_own() -> None:
+def test_a_host_does_not_receive_vehicles_that_it_owns_or_release_others() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0), (8, 1)])
     step = bench.begin()[0]

@@ -1,7 +1,7 @@
 """A toy world for the protocol: vehicles on a torus of whole numbers.
 
-A vehicle's next state is a hash of its own state and of all states near it, so that anybody who
-computes it from a state that is old, torn or foreign comes to another world for ever after.
+A vehicle's next state is a hash of its own state and of all states near it. A state that is
+computed from an old, torn or foreign state therefore differs for ever.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def place(state: bytes) -> tuple[int, int]:
 
 
 def number(*parts: object) -> int:
-    """A 64-bit number that belongs to its arguments."""
+    """Return a 64-bit number that depends on its arguments only."""
     return int.from_bytes(blake2b(repr(parts).encode(), digest_size=8).digest(), "little")
 
 
 @dataclass(frozen=True)
 class ToyWorld:
-    """Size, zones and who enters; `cuts_x` and `cuts_y` are where zones begin, besides 0."""
+    """Size, zones and entering vehicles; zones begin at 0, `cuts_x` and `cuts_y`."""
 
     size: int = 24
     cuts_x: tuple[int, ...] = (12,)
@@ -55,7 +55,7 @@ class ToyWorld:
         return self._zone_at(*place(state))
 
     def near(self, state: bytes, distance: int) -> set[int]:
-        """Zones that the square around a vehicle touches."""
+        """Return the zones that the square around a vehicle touches."""
         x, y = place(state)
         offsets = range(-distance, distance + 1)
         columns = {bisect_right(self.cuts_x, (x + d) % self.size) for d in offsets}
@@ -63,7 +63,7 @@ class ToyWorld:
         return {row * (len(self.cuts_x) + 1) + column for row in rows for column in columns}
 
     def births(self, tick: int, next_id: int) -> list[tuple[int, bytes]]:
-        """Vehicles that begin at a tick, with their states."""
+        """Return the vehicles that enter at a tick, with their states."""
         count = self.vehicles if next_id == 0 else 0
         if number(self.seed, "birth", tick) % 1000 < 1000 * self.born_each_tick:
             count += 1
@@ -72,7 +72,7 @@ class ToyWorld:
     def advance(
         self, vehicle: int, state: bytes, others: Mapping[int, bytes], tick: int
     ) -> bytes | None:
-        """The next state of a vehicle, or None if it leaves the world."""
+        """Return the next state of a vehicle, or None if it leaves the world."""
         x, y, _ = _STATE.unpack(state)
         digest = blake2b(struct.pack("<qqq", self.seed, vehicle, tick) + state, digest_size=8)
         for other in sorted(others):
@@ -88,7 +88,7 @@ class ToyWorld:
         )
 
     def undivided(self, ticks: int) -> list[int]:
-        """Digests of the world that nobody divided, tick by tick."""
+        """Return the digests of the undivided world, tick by tick."""
         states: dict[int, bytes] = {}
         digests, next_id = [], 0
         for tick in range(1, ticks + 1):

@@ -92,7 +92,7 @@ PLACES: dict[str, Keywords] = {
     "worlds on Ray": {"num_envs": 2, "backend": "ray:2"},
     "nodes on Ray": {"zones": 3, "backend": "ray:2"},
 }
-# Settings that the undivided world of a comparison does not have.
+# Settings that are left out in the undivided world of a comparison.
 ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu",

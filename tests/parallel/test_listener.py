@@ -94,7 +94,7 @@ def test_strangers_are_refused(said: bytes, error: type[Exception]) -> None:
     stranger.close()
 
 
-def test_a_silent_caller_makes_room_before_one_that_has_said_who_it_is(
+def test_silent_callers_are_dropped_before_callers_that_have_sent_hello(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(listener_module, "MAX_CALLERS", 2)

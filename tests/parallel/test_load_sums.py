@@ -1,4 +1,4 @@
-"""Loads of nodes from totals that are given."""
+"""Loads of nodes, computed from given totals."""
 
 from __future__ import annotations
 
@@ -10,8 +10,9 @@ import numpy as np
 from cavmarl.parallel.nodes.node_loads import NodeLoad, since, totals
 
 
-def test_a_load_is_what_has_been_added_since_the_report_before() -> None:
-    # Processor, waiting, bytes, frames are sums; memory, vehicles and ghosts are of now.
+def test_a_load_is_the_difference_to_the_previous_report() -> None:
+    # Processor time, waiting time, bytes and frames are sums; memory, vehicles, ghosts are present
+    # values.
     before = [10.0, 4.0, 1000, 20, 5000, 7, 3]
     now = [12.5, 4.5, 1600, 26, 4000, 6, 2]
     assert since(1, 40, now, before) == NodeLoad(1, 40, 2.5, 0.5, 600, 6, 4000, 6, 2)

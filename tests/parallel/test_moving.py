@@ -38,7 +38,7 @@ RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "wor
 
 @pytest.fixture
 def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Exchange the costs of shards in each round; yield the number of moves of each round."""
+    """Replace measured costs by random ones; the list gets the number of moves of each round."""
     rng = np.random.default_rng(3)
     moved: list[int] = []
     round_ = StepPlacement.round

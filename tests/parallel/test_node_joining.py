@@ -350,5 +350,5 @@ def test_zones_after_losses_and_joins() -> None:
     with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4") as caught:
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
     assert "make the environment again" in str(caught.value)
-    assert "SIGKILL" not in str(caught.value)  # nothing says that a process was killed
+    assert "SIGKILL" not in str(caught.value)  # no record says that a process was killed
     assert json.dumps(again)  # it is sent as JSON

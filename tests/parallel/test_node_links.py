@@ -225,7 +225,7 @@ def test_the_sender_of_a_bad_frame_is_lost_and_not_its_receiver() -> None:
     links.close()
 
 
-def test_of_two_nodes_that_miss_each_other_either_is_lost_in_turn() -> None:
+def test_two_nodes_that_cannot_reach_each_other_are_lost_in_turn() -> None:
     links, far = pair()
     with far:
         found = []
@@ -238,7 +238,7 @@ def test_of_two_nodes_that_miss_each_other_either_is_lost_in_turn() -> None:
     assert found == [3, 0, 3, 0]
 
 
-def test_whoever_has_the_action_of_an_agent_is_lost() -> None:
+def test_a_node_that_keeps_an_action_of_another_node_is_lost() -> None:
     """A node waits for the action of an agent, which another node has got and not refused."""
     links, far = pair()
     seen = watch(links)

@@ -99,7 +99,7 @@ def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
     vec = make(net, zones=3, nodes=2, **wanted)
     assert same(drive(vec, steps=300, before=lose_one(vec, 221)), whole)
     assert over_nodes(vec).pool.recoveries == 1
-    assert one.traffic_stats()["rerouted"] > 0, "nobody has taken another way"
+    assert one.traffic_stats()["rerouted"] > 0, "no vehicle has taken another route"
 
 
 @pytest.mark.parametrize("source", MODES)

@@ -1,4 +1,4 @@
-"""Callers that are no nodes of the run, or are not needed, at real sockets."""
+"""Callers that are no nodes of the run, or are not needed, with real sockets."""
 
 from __future__ import annotations
 

@@ -207,7 +207,7 @@ def test_two_nodes_that_are_not_neighbours_are_lost_at_once(make: Make) -> None:
     assert worlds.pool.losses == 2
 
 
-def test_equal_commands_are_repeated_as_often_as_they_were_given(make: Make) -> None:
+def test_repeated_equal_commands_are_all_carried_out(make: Make) -> None:
     wanted = {**WANTED, "max_cycles": 100}
     vecs = [make("grid4x4", **wanted), make("grid4x4", zones=4, nodes=3, **wanted)]
     for vec in vecs:

@@ -12,7 +12,7 @@ from tests.support.vec_runs import Make
 
 ray = pytest.importorskip("ray", reason="needs the extra: ray")
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -14,7 +14,7 @@ from cavmarl.core.errors import WorkerError
 
 pytest.importorskip("ray", reason="needs the extra: ray")
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 ROOT = Path(__file__).resolve().parents[2]
 

@@ -29,7 +29,7 @@ ray = pytest.importorskip("ray", reason="needs the extra: ray")
 
 __all__ = ["uneven"]
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # Ray's warnings of itself are many
+pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 ROOT = Path(__file__).resolve().parents[2]
 WANTED = {"num_envs": 5, "agents": 4, "background": 12, "max_cycles": 8}

@@ -125,8 +125,8 @@ def test_results_do_not_depend_on_the_division_of_frames(
 ) -> None:
     """Frames as small as these are not divided without force; the results are the same.
 
-    What a frame costs is said to the sharing, as what is measured depends on the machine: each time
-    another one is so dear that all workers have to write of it.
+    The test sets the costs of frames, because measured costs depend on the machine: each time,
+    another frame is so expensive that all workers must write parts of it.
     """
     divided, turn = set[int](), count()
 

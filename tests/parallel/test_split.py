@@ -30,7 +30,7 @@ SEATS = {"population.mode": "respawn", "action.kind": "discrete"}
 
 @pytest.mark.parametrize(
     ("env", "zones", "workers", "overrides"),
-    [  # all pairs of values
+    [  # all pairs of settings
         ("grid4x4", 4, 1, {}),
         ("grid4x4", 9, 2, SEATS),
         ("grid4x4", 4, 3, SEATS),
@@ -152,7 +152,7 @@ def test_a_member_that_fails(make: Make, phase: str, monkeypatch: pytest.MonkeyP
         return step(actions)
 
     monkeypatch.setattr(vec, "step", step_again)
-    assert same(drive(vec), whole), "all are as they were before"
+    assert same(drive(vec), whole), "all worlds are unchanged"
     (failure,) = failures
     assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
     assert "world 0, zone" in str(failure)
@@ -198,7 +198,7 @@ def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
 
     assert same(drive(vec, steps=300, before=strike), whole)
     assert len(pool_of(vec).deaths) == 2
-    assert one.traffic_stats()["rerouted"] > 0, "nobody has taken another way"
+    assert one.traffic_stats()["rerouted"] > 0, "no vehicle has taken another route"
 
 
 def test_more_workers_than_zones() -> None:

@@ -1,4 +1,4 @@
-"""Arrays are read from an image as they were written, whatever was there before."""
+"""Arrays are read from an image as they were written, whatever the image contained before."""
 
 from __future__ import annotations
 

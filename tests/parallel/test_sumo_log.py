@@ -77,7 +77,7 @@ def test_a_copy_equals_the_log_after_any_number_of_updates() -> None:
     segment.close()
 
 
-def test_a_copy_of_another_episode_is_written_anew() -> None:
+def test_a_copy_of_another_episode_is_rewritten() -> None:
     segment = Segment.make(FIRST_LOG_BYTES)
     kept, log = KeptLog(segment), log_of(50)
     kept.write(log)

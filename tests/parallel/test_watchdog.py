@@ -18,7 +18,7 @@ subprocess.run([sys.executable, "-c", sys.argv[1]])
 
 
 def verdict(child: str) -> str | None:
-    """Return the verdicts on a process that waits for one that runs `child`."""
+    """Return the verdicts on a process that waits for a process that runs `child`."""
     words = [sys.executable, "-c", PARENT, f"print(flush=True)\n{child}"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

@@ -1,4 +1,4 @@
-"""Frames of a valid form that do not fit: their sender is lost, and the run goes on equal."""
+"""Frames of a valid form with wrong content: their sender is lost, and the run stays equal."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from cavmarl.policies.kernels.activations import apply_clamp, apply_relu, apply_tanh, sigmoid
 
-INFINITY = 0x7F800000  # the bits of it; all smaller ones are finite and not negative
+INFINITY = 0x7F800000  # its bits; smaller bit patterns are finite numbers that are not negative
 TANH_ULP = 7.0
 TANH_ERROR = 4e-7
 SIGMOID_ERROR = 3e-7
@@ -45,7 +45,7 @@ def test_tanh_is_close_to_the_exact_function_for_every_float32() -> None:
         check_tanh(np.arange(first, min(first + step, INFINITY), dtype=np.uint32))
 
 
-def test_functions_of_infinite_numbers_and_of_none() -> None:
+def test_functions_of_infinite_numbers_and_nan() -> None:
     special = np.array([np.inf, -np.inf, np.nan, -0.0], dtype=np.float32)
     found = special.copy()
     apply_tanh(found)

@@ -1,4 +1,4 @@
-"""Trained drivers: an observation alone gives the bytes that it gives among others."""
+"""Trained drivers: the result of an observation does not depend on the rest of the batch."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.support.saved_drivers import save_driver, small_vec
 
 DRIVERS = {name: path for name, path in sorted(agent_entries().items()) if path.is_dir()}
 ROWS = 40
-ERROR = 2e-6  # of an output, beside torch
+ERROR = 2e-6  # largest error of an output, compared with torch
 
 every_driver = pytest.mark.parametrize("name", DRIVERS)
 
 
 def likely(folder: Path, num_rows: int, seed: int = 0) -> NDArray[np.float32]:
-    """Return observations as spread as those that a driver has learned from."""
+    """Return observations with the distribution that a driver was trained on."""
     weights, config = read_network(folder)
     rng = np.random.default_rng(seed)
     noise = rng.normal(0.0, 2.0, (num_rows, config.observation_size))
@@ -80,6 +80,6 @@ def test_choices_are_those_of_torch(tmp_path: Path) -> None:
     assert load_driver_network(folder).best(rows[:0]).shape == (0,)
 
 
-def test_no_observation_has_no_action() -> None:
+def test_an_empty_batch_has_no_actions() -> None:
     network = load_driver_network(DRIVERS["merge_ippo"])
     assert network.best(np.empty((0, 105), dtype=np.float32)).shape == (0, 2)

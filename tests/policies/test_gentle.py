@@ -1,4 +1,4 @@
-"""`ring22`: one agent among 21 human drivers, beside 22 human drivers."""
+"""`ring22`: one agent among 21 human drivers, compared with 22 human drivers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def test_one_gentle_driver_raises_the_speed_of_all_by_more_than_flows_57_percent
     assert gentle["crashed"] == 0
 
 
-def test_a_driver_that_has_learnt_it_needs_no_clock() -> None:
+def test_a_trained_gentle_driver_needs_no_clock() -> None:
     _, learnt = ring22.measure(["ring22_ippo"], episodes=4, seed=1000).rows
     assert learnt["gain"] > 57.0
     assert learnt["crashed"] == 0

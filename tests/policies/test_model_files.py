@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
-SIZE = 105  # numbers of an observation of merge
+SIZE = 105  # size of an observation of merge
 
 
 def rows(**overrides: Any) -> CavSb3VecEnv:
@@ -36,7 +36,7 @@ def rows(**overrides: Any) -> CavSb3VecEnv:
 
 
 def act(policy: Any, vec: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Observations of acting agents after some steps, and the policy's actions of them."""
+    """Return observations of acting agents after some steps, and the policy's actions for them."""
     observations, infos = vec.reset(seed=2)
     for _ in range(3):
         actions = policy.act_batch(observations, infos["mask"])
@@ -46,7 +46,7 @@ def act(policy: Any, vec: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("kind", [PPO, A2C, SAC])
-def test_a_model_of_stable_baselines3_acts_as_it_predicts(
+def test_the_actions_of_a_model_of_stable_baselines3_equal_its_predictions(
     kind: Callable[..., BaseAlgorithm], tmp_path: Path
 ) -> None:
     worlds = rows()

@@ -29,9 +29,9 @@ from tests.naive.driver_networks import exact_actions, exact_outputs, layer_norm
 
 Floats = NDArray[np.float32]
 
-ERROR = 2e-6  # of an output, beside torch and beside float64
-# Of what `run_all_kinds` computes. The numbers in it are exact in float32, so every processor, and
-# Python without the compiler, gives these bytes.
+ERROR = 2e-6  # largest error of an output, compared with torch and with float64
+# Hash of the results of `run_all_kinds`. Its numbers are exact in float32, so every processor, and
+# Python without the compiler, computes the same bytes.
 DIGEST = "1aa005700f35a94ad5d33de69c7121b7"
 
 

@@ -1,4 +1,4 @@
-"""Policies: names and paths, what fits where, and that drivers drive."""
+"""Policies: names and paths, fitting environments, and driving."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ACTIONS = ("continuous", "discrete")
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    """A driver for `merge` that has learned nothing."""
+    """Return an untrained driver for `merge`."""
     pytest.importorskip("torch")
     return save_driver(tmp_path / "driver", small_vec())
 
@@ -105,7 +105,7 @@ def test_random_actions_repeat_with_the_seed() -> None:
     assert draw(7) != draw(8)
 
 
-# What a scripted driver asks of an environment.
+# Settings that scripted drivers require.
 NEEDED = {
     "cacc": {
         "v2x.enabled": True,
@@ -123,7 +123,7 @@ NEEDED = {
 }
 
 
-def test_every_driver_of_the_folder_loads_where_it_belongs() -> None:
+def test_each_bundled_driver_loads_in_its_environment() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
@@ -140,7 +140,7 @@ def test_a_wrapped_environment_is_unwrapped() -> None:
 
 
 @pytest.mark.parametrize("wrong", ["merge", None, 3])
-def test_only_our_environments_are_taken(wrong: Any) -> None:
+def test_only_environments_of_cavmarl_are_accepted(wrong: Any) -> None:
     with pytest.raises(PolicyError, match=r"pass what parallel_env\(\) or make_vec\(\) returned"):
         load_policy("idm", wrong)
 
@@ -199,7 +199,7 @@ def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) 
     assert all(str(size) in str(caught.value) for size in sizes)
 
 
-def test_the_overrides_that_a_refusal_names_make_it_fit(checkpoint: Path) -> None:
+def test_overrides_of_the_error_message_make_a_driver_fit(checkpoint: Path) -> None:
     changed = {"sensors.lidar.rays": 32, "action.kind": "discrete", "sensors.route.points": 2}
     with pytest.raises(PolicyError) as caught:
         load_policy(checkpoint, make_vec("merge", overrides=changed))
@@ -238,7 +238,7 @@ def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
 
 
 class Fixed(Policy):
-    """Gives the same actions at all times."""
+    """A policy with constant actions."""
 
     def __init__(self, env: Environment, actions: NDArray[np.float32]) -> None:
         super().__init__(env)
@@ -263,7 +263,7 @@ def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
     assert own[0, 4].tolist() == [-0.2, -0.1], "the driver's own actions stay"
 
 
-def test_corrections_are_added_to_what_the_built_in_driver_would_do(tmp_path: Path) -> None:
+def test_corrections_are_added_to_the_actions_of_the_built_in_driver(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     vec = make_vec("merge", num_envs=1, agents=3)
     folder = save_driver(tmp_path / "residual", vec, residual=True)
@@ -301,7 +301,7 @@ def test_a_shield_compares_throttles() -> None:
         load_policy("shielded:idm", vec).act_batch(observations, infos["mask"])
 
 
-def test_opponents_do_what_no_good_driver_does() -> None:
+def test_opponents_drive_badly_on_purpose() -> None:
     vec = make_vec("merge", num_envs=4, agents=8)
     rows = {}
     for name in ("blind", "phantom_braking", "idm"):
@@ -327,7 +327,7 @@ def test_opponents_do_what_no_good_driver_does() -> None:
 def test_code_of_the_working_directory_runs_by_its_path_alone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A folder that was fetched from elsewhere cannot take the place of a driver."""
+    """A downloaded folder cannot replace a named driver."""
     trap = "raise SystemExit('it was run')\n"
     (tmp_path / "agents").mkdir()
     for name in ("idm.py", "mine.py"):
@@ -347,7 +347,7 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
 
 
 def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
-    """On 25 m of road it is not in the other lane before the end: it stood there for ever."""
+    """On 25 m of road, the change does not end before the road; the vehicle must not get stuck."""
     vec = make_vec("cities_validation", num_envs=1, agents=1, background=0)
     driver = load_policy("idm", vec)
     observations, infos = vec.reset(seed=500, options={"first_world": 89})

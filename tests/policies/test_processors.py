@@ -1,4 +1,4 @@
-"""Driver networks under other instruction sets: the same bytes as on this processor."""
+"""Driver networks with other instruction sets compute the same bytes as on this processor."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Trained drivers drive the same in any number of worlds, through each interface, without torch."""
+"""Trained drivers drive equally in any number of worlds, through each interface, without torch."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def test_an_episode_is_the_same_however_many_are_driven_together(
 
 
 @pytest.mark.parametrize("driver", ["merge_ippo", "merge_ippo+merge_ippo", "shielded:merge_ippo"])
-def test_both_interfaces_drive_alike(driver: str) -> None:
+def test_both_interfaces_give_the_same_actions(driver: str) -> None:
     world = {"agents": 5, "background": 4}
     env = parallel_env("merge", **world)  # type: ignore[arg-type]
     vec = make_vec("merge", num_envs=3, **world)  # type: ignore[arg-type]

@@ -1,10 +1,10 @@
-"""Record again all that a change of behaviour makes stale: `make record`, or one part of it.
+"""Record again all files that a change of behaviour makes stale: `make record`, or one part.
 
     python -m tests.record [golden|zoo|scores|blocks [NAME ...]] [--processes N]
 
 Without a part, all four are recorded, in this order:
 
-golden: hashes of what worlds do (tests.golden.worlds); names are rows.
+golden: hashes of the results of worlds (tests.golden.worlds); names are rows.
 zoo: results of trained drivers (tests.golden.zoo); names are drivers.
 scores: tables of scores on pages (tests.record.score_tables); names are pages, or blocks as
     PAGE:BLOCK.
@@ -31,7 +31,7 @@ from tests.record.score_tables import TABLES, Results, ScoreTable
 from tests.support.generated import write_block
 
 RECORDED = ("*.md", "docs/**/*.md", "envs/**/*.md", "agents/**/*", "tests/golden/*.json")
-OF_INSTALLATION = "tests/test_licences.py"  # its table shows the installation, which may be another
+OF_INSTALLATION = "tests/test_licences.py"  # its table depends on the installation
 
 
 class RecordError(CavmarlError):
@@ -59,7 +59,7 @@ def scores(names: Sequence[str], given: argparse.Namespace) -> None:
 
 
 def blocks(names: Sequence[str], given: argparse.Namespace) -> None:
-    """Run the tests that compare blocks, and have them write these."""
+    """Run the tests that compare blocks, and let them write the blocks."""
     tests = list(names) or block_tests()
     _run("-m", "pytest", "-q", "-n", "0", *tests, CAVMARL_REWRITE="1")
 
@@ -99,7 +99,7 @@ def tables_named(names: Sequence[str]) -> list[ScoreTable]:
 
 
 def record(part: str, names: Sequence[str], given: argparse.Namespace) -> None:
-    """Record one part, and tell what has changed and how long it took."""
+    """Record one part; print the changed files and the duration."""
     print(f"{part} …", flush=True)
     before, began_s = _hashes(), time.monotonic()
     try:

@@ -33,7 +33,7 @@ def figure(
 
     Args:
         name: of the metric.
-        unit: what stands behind the mean, with its space; empty where the title has the unit.
+        unit: unit behind the mean, with a leading space; empty if the title has the unit.
         decimals: of the mean.
         interval: "[]" for its ends, "±" for half its width; empty for none.
         interval_decimals: of the interval.
@@ -59,7 +59,7 @@ def share(name: str, *, decimals: int = 1) -> Figure:
 
 
 def way_per_infraction(report: EvaluationReport) -> str:
-    """Return the kilometres for each infraction, with three digits or all before the point."""
+    """Return the kilometres per infraction, with three digits or all digits before the point."""
     km = driver_report(report)["km_per_infraction"].mean
     return NONE if km is None else f"{km:,.1f} km" if km < 100.0 else f"{km:,.0f} km"
 
@@ -90,7 +90,7 @@ def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number with so many decimals; with two where one would show 0 for more than that."""
+    """Return a number with some decimals; with two if one would show a non-zero value as 0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 
@@ -110,6 +110,6 @@ def _interval_text(mean: float, scale: float, found: Interval, style: str, decim
     low, high = scale * found.low, scale * found.high
     if style == "±":
         return f" ± {high - mean:.{decimals}f}"
-    if f"{high:.{decimals}f}" == f"{0.0:.{decimals}f}":  # the mean says the same
+    if f"{high:.{decimals}f}" == f"{0.0:.{decimals}f}":  # the mean has the same digits
         return ""
     return f" [{low:.{decimals}f}, {high:.{decimals}f}]"

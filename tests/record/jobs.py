@@ -1,4 +1,4 @@
-"""Jobs: what the commands beside tables of scores drive, one driver at a time.
+"""Jobs: the evaluations of the commands beside tables of scores, one driver at a time.
 
 Several tables share drivers and worlds, so the unit is one driver in one world: it is driven once.
 Results stay in runs/record, under the hash of the sources that made them. An interrupted recording

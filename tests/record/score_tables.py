@@ -1,7 +1,6 @@
-"""The tables of scores: each block of a page, the commands beside it, and what its cells show.
+"""The tables of scores: each block of a page, the commands beside it, and its cells.
 
-Commands stand here as in the page; a word of `PLACEHOLDERS` in one of them stands for each name in
-turn.
+Commands are those of the page; a word of `PLACEHOLDERS` in a command stands for each name in turn.
 """
 
 from __future__ import annotations
@@ -38,7 +37,7 @@ Column = tuple[str, str, str]  # title, command, driver
 
 @dataclass(frozen=True)
 class Results:
-    """What the jobs of all commands have found."""
+    """The results of the jobs of all commands."""
 
     by_key: Mapping[str, Any]
 
@@ -56,7 +55,7 @@ class ScoreTable:
         block: its name, between `<!--` and `-->`.
         shown: the commands as the page shows them.
         write: makes the block from the results.
-        names: what the word in capitals in a command stands for.
+        names: the names that replace the word in capitals in a command.
     """
 
     page: str
@@ -67,7 +66,7 @@ class ScoreTable:
 
     @property
     def name(self) -> str:
-        """Page and block, as a recording can be told to make it."""
+        """Page and block, as named on the command line of a recording."""
         return f"{self.page}:{self.block}"
 
     @property
@@ -94,19 +93,19 @@ def filled(command: str, name: str) -> str:
 
 
 def drivers_table(columns: Sequence[Column], rows: Rows, results: Results) -> str:
-    """A table with a column for each driver, and a row for each figure."""
+    """Return a table with a column for each driver, and a row for each figure."""
     reports = [results.of(command, driver) for _, command, driver in columns]
     lines = [(title, *map(write, reports)) for title, write in rows]
     return table(("", *(title for title, _, _ in columns)), lines, is_right=True)
 
 
 def columns_of(command: str, *more: Column) -> list[Column]:
-    """A column for each driver of a command, then more."""
+    """Return a column for each driver of a command, and further columns."""
     return [*((driver, command, driver) for driver in drivers_of(command)), *more]
 
 
 def maps_table(command: str, columns: Sequence[tuple[str, str, str]], results: Results) -> str:
-    """A table with a row for each map; columns are (title, driver, share)."""
+    """Return a table with a row for each map; columns are (title, driver, share)."""
     drivers = dict.fromkeys(driver for _, driver, _ in columns)
     maps = {driver: by_map(results.of(command, driver)) for driver in drivers}
     lines = [
@@ -123,7 +122,7 @@ def names_table(
     columns: Sequence[tuple[str, str, str, Figure]],
     results: Results,
 ) -> str:
-    """A table with a row for each name; columns are (title, command, driver, figure)."""
+    """Return a table with a row for each name; columns are (title, command, driver, figure)."""
     lines = [
         (f"`{name}`", *(
             write(results.of(filled(command, name), filled(driver, name)))
@@ -141,14 +140,14 @@ WAY = ("way per infraction", way_per_infraction)
 
 
 def shares(*names: str, decimals: int = 1, **titles: str) -> Rows:
-    """A row for each share; titles are the names in words, or as given."""
+    """Return a row for each share; titles are the names in words, or as given."""
     return [
         (titles.get(name, name.replace("_", " ")), share(name, decimals=decimals)) for name in names
     ]
 
 
 def task_card(task: str) -> ScoreTable:
-    """The card of a driver that has learnt one task."""
+    """Return the table for the card of a driver that was trained on one task."""
     driver = filled("NAME_ippo", task)
     command = f"cavmarl evaluate {task} -p {driver} -p idm -n 32 --seed 1000"
     alone = f"cavmarl evaluate {task} -p idm {ALONE} -n 16 --seed 1000"
@@ -221,14 +220,14 @@ WORLD_TEXTS = {
     "merge": "busy highway and an on-ramp whose lane ends",
     "grid4x4": "sixteen signalled crossings to cross in time",
     "town": "Berlin-Adlershof, 38 km of streets (extra `sumo`)",
-    "rush": "a quarter of it that all vehicles leave, in four zones (extra `sumo`)",
+    "rush": "the same map in four zones; all vehicles leave one quarter (extra `sumo`)",
 }
 LOSSES = {"none": "0", "10 %": "0.1", "20 %": "0.2", "30 %": "0.3", "40 %": "0.4", "50 %": "0.5"}
 LOSSES["all"] = "1"
 
 
 def worlds_table(results: Results) -> str:
-    """The environments of the README, with a picture each."""
+    """Return the table of environments of the README, with pictures."""
     short = [figure(name, decimals=0) for name in ("arrived", "collision")]
     lines = []
     for name, text in WORLD_TEXTS.items():
@@ -243,7 +242,7 @@ def worlds_table(results: Results) -> str:
 
 
 def messages_table(results: Results) -> str:
-    """`gap_taker` at the blind junction with ever fewer messages."""
+    """Return the table of `gap_taker` at the blind junction with increasing loss of messages."""
     names = {"collision": "collision, %", "success": "success, %", "delay_s": "delay, s"}
     reports = {
         title: results.of(filled(MESSAGES, loss), "gap_taker") for title, loss in LOSSES.items()
@@ -258,13 +257,13 @@ def messages_table(results: Results) -> str:
 
 
 def ring_rows(results: Results) -> dict[str, dict[str, Any]]:
-    """The rows of the benchmark `ring22` by driver."""
+    """Return the rows of the benchmark `ring22` by driver."""
     rows: dict[str, dict[str, Any]] = results.of(RING22, "idm")
     return rows
 
 
 def ring_card(results: Results) -> str:
-    """The card of `ring22_ippo`."""
+    """Return the table for the card of `ring22_ippo`."""
     lines = []
     for name, row in ring_rows(results).items():
         if name != "human":
@@ -279,7 +278,7 @@ def ring_card(results: Results) -> str:
 
 
 def ring_page(results: Results) -> str:
-    """The card of `ring22`."""
+    """Return the table for the card of `ring22`."""
     texts = {
         "human": "one more human driver (`all_human.rou.xml`)",
         "idm": "`idm`",
@@ -295,12 +294,12 @@ def ring_page(results: Results) -> str:
 
 
 def gain_text(row: Mapping[str, Any]) -> str:
-    """The speed over that of human drivers."""
+    """Return the gain in speed over human drivers as text."""
     return NONE if row.get("gain") is None else f"{row['gain']:+.0f} %"
 
 
 def _cards() -> Iterator[ScoreTable]:
-    """The cards of trained drivers."""
+    """Return the tables in the cards of trained drivers."""
     yield from map(task_card, TASKS)
     page = "agents/cities_ippo/README.md"
     alone = ("idm alone", CITIES_ALONE, "idm")
@@ -349,7 +348,7 @@ def _cards() -> Iterator[ScoreTable]:
 
 
 def _pages() -> Iterator[ScoreTable]:
-    """Tables of other pages."""
+    """Return the tables of other pages."""
     yield ScoreTable("README.md", "environments", (WORLDS,), worlds_table, tuple(WORLD_TEXTS))
     yield ScoreTable("envs/ring22/README.md", "mean speed", (RING22,), ring_page)
     tasks, learning = "docs/figures/tasks.md", "docs/figures/learning.md"

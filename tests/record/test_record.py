@@ -33,7 +33,7 @@ each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.na
 
 
 def made_up(runs: int = 1, collisions: int = 1) -> EvaluationReport:
-    """A report of 40 trips a run on two maps; 38 minus collisions of a run arrive."""
+    """Return a report of 40 trips per run on two maps, of which 38 minus the collisions arrive."""
     rows, episodes = np.zeros(40 * runs, TRIP), np.zeros(2 * runs, EPISODE)
     number_in_run = np.arange(40 * runs) % 40
     rows["run"], episodes["run"] = np.arange(40 * runs) // 40, np.arange(2 * runs) // 2
@@ -131,7 +131,7 @@ def test_a_number_that_is_not_0_does_not_look_so() -> None:
 
 @dataclass(frozen=True)
 class FailingJob:
-    """A job that has begun to write when it fails."""
+    """A job that fails after it has begun to write."""
 
     key: str = "failing"
 
@@ -160,7 +160,7 @@ def test_results_that_are_there_are_not_driven_again(tmp_path: Path) -> None:
     assert finish_all([job], 1, print, tmp_path) == {"failing": "failing"}
 
 
-def test_a_page_without_scores_is_refused_with_those_that_have_some() -> None:
+def test_the_error_for_a_page_without_scores_lists_pages_with_scores() -> None:
     page = "docs/guides/bring_a_map.md"
     with pytest.raises(CavmarlError, match=rf"{page}.*(?s:.*)docs/figures/tasks\.md:tasks"):
         tables_named([page])

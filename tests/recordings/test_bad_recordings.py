@@ -1,4 +1,4 @@
-"""Recordings that are cut short, damaged, of another version, without their map: typed errors."""
+"""Recordings that are truncated, damaged, of another version or without a map: typed errors."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.recordings.recording import Recording
 
 @pytest.fixture(scope="module")
 def good(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A recording of three parts."""
+    """Make a recording of three parts."""
     path = tmp_path_factory.mktemp("recordings") / "good"
     with pytest.MonkeyPatch.context() as patch, closing(parallel_env("ring", record=path)) as env:
         patch.setattr(recording_writer, "COMMIT_S", 0.05)
@@ -149,7 +149,7 @@ def test_an_empty_folder_a_file_and_nothing_are_no_recordings(tmp_path: Path) ->
             Recording.open(tmp_path / name)
 
 
-def test_a_recording_takes_no_others_place(good: Path, tmp_path: Path) -> None:
+def test_a_recording_does_not_overwrite_another_one(good: Path, tmp_path: Path) -> None:
     before = json.loads((good / "recording.json").read_text())
     with pytest.raises(RecordingError, match="give a new folder"):
         parallel_env("ring", record=good)

@@ -1,4 +1,4 @@
-"""Memory of frames is used again when nothing reads it any more, and never before."""
+"""Memory of frames is reused once nothing reads it any more, and never before."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from cavmarl.recordings.frame_memory import FrameMemory
 from cavmarl.recordings.recording import Recording
 
 
-def test_rows_come_back_only_when_they_are_given_back() -> None:
+def test_rows_are_reused_only_after_they_are_returned() -> None:
     memory = FrameMemory()
     first, second = memory.take(10), memory.take(10)
     assert not np.shares_memory(first, second)
-    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # of elsewhere
+    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # rows of another memory
     assert not np.shares_memory(memory.take(10), second)
     memory.give_back(first)
     assert np.shares_memory(memory.take(12), first)
     memory.give_back(second)
-    assert len(memory.take(1000)) == 1000, "what is too small is let go"
+    assert len(memory.take(1000)) == 1000, "rows that are too small are freed"
 
 
-def test_rows_that_are_given_back_twice_are_handed_out_once() -> None:
+def test_rows_that_are_returned_twice_are_reused_once() -> None:
     memory = FrameMemory()
     rows = memory.take(10)
     memory.give_back(rows)
@@ -35,7 +35,7 @@ def test_rows_that_are_given_back_twice_are_handed_out_once() -> None:
     assert not np.shares_memory(memory.take(10), memory.take(10))
 
 
-def test_frames_in_memory_that_is_used_again_are_recorded_as_they_were(
+def test_reusing_memory_does_not_change_recorded_frames(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 20_000)

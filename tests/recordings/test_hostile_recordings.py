@@ -1,4 +1,4 @@
-"""Recordings that a stranger forged: one line that says what is wrong, and little memory."""
+"""Forged recordings: an error of one line, and little memory."""
 
 from __future__ import annotations
 
@@ -182,10 +182,10 @@ def test_a_forged_recording_is_refused_in_one_line(
     with limited_memory(1 << 30), pytest.raises(RecordingError, match=words) as caught:
         Use(pictures=True, page=True).read(bad, tmp_path)
     assert "\n" not in str(caught.value)
-    assert ";" in str(caught.value)  # what is wrong, and what to do
+    assert ";" in str(caught.value)  # the fault, and the remedy
 
 
-def test_replay_says_what_is_wrong(bad: Path) -> None:
+def test_the_replay_command_reports_the_fault(bad: Path) -> None:
     changed(VEHICLES, "x", 1e300)(bad)
     result = CliRunner().invoke(app, ["replay", str(bad), "--csv", str(bad / "rows.csv")])
     assert isinstance(result.exception, CavmarlError | SystemExit)
@@ -211,7 +211,7 @@ def test_all_maps_pass_the_check_of_networks() -> None:
         assert wrong_network(load_network(path)) == "", path
 
 
-def test_what_is_written_is_within_the_limits(good: Path) -> None:
+def test_written_recordings_are_within_the_limits(good: Path) -> None:
     for file in good.rglob("*.parquet"):
         content = file.read_bytes()
         size = parquet_size(memoryview(content))

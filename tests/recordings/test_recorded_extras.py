@@ -1,4 +1,4 @@
-"""Observations, samples and messages in a recording: as they were, bit by bit, on request only."""
+"""Observations, samples and messages in a recording: equal bit for bit, on request only."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, NUM_KINDS
 from tests.support.killed_recordings import killed_recording
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 V2X = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.perception.rate_hz": 5.0}
 RIG = {

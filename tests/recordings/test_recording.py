@@ -1,4 +1,4 @@
-"""Recordings: what is read is what was recorded, field by field, wherever the world runs."""
+"""Recordings: frames that are read equal recorded frames, for each backend."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.killed_recordings import killed_recording
 
 
 def drive(env: CavEnv, steps: int) -> list[WorldFrame]:
-    """Frames of a seeded episode with its reset, as the environment shows them."""
+    """Return the frames of a seeded episode, with its reset."""
     env.reset(seed=5)
     found = env.world_frames(ghosts=True)
     for _ in range(steps):
@@ -111,8 +111,8 @@ def test_an_episode_without_a_step_is_one(tmp_path: Path) -> None:
     assert [len(recording.ticks(0, episode)) for episode in (0, 1)] == [1, 2]
 
 
-def test_an_end_in_the_step_that_begins_the_world_anew_is_an_event(tmp_path: Path) -> None:
-    """Of autoreset's last step there is no frame; what ended in it is told all the same."""
+def test_an_end_in_the_step_of_an_autoreset_is_an_event(tmp_path: Path) -> None:
+    """The last step before an autoreset has no frame, but the ends of trips in it are events."""
     arguments: dict[str, Any] = {"agents": 2, "background": 0, "max_cycles": 40}
     with closing(make_vec("ring", record=tmp_path / "run", **arguments)) as vec:
         vec.reset(seed=1)

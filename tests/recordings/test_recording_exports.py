@@ -1,4 +1,4 @@
-"""What a recording becomes elsewhere: FCD, CSV, MCAP, pictures, and the command."""
+"""Exports of a recording: FCD, CSV, MCAP, pictures, and the command."""
 
 from __future__ import annotations
 
@@ -143,7 +143,7 @@ def test_the_command_exports_and_films(path: Path, tmp_path: Path) -> None:
         (["PATH", "--episode", "4", "--csv", "x.csv"], "no episode 4"),
     ],
 )
-def test_the_command_refuses_what_is_not_there(
+def test_the_command_refuses_missing_worlds_and_files(
     path: Path, words: list[str], told: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     given = [str(path) if word == "PATH" else word for word in words]

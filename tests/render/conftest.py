@@ -26,7 +26,7 @@ def grid() -> RoadNetwork:
 
 @pytest.fixture
 def car() -> Callable[..., NDArray[np.void]]:
-    """One VEHICLE row; keywords set its fields: `car(x=3.0, agent=1)`."""
+    """Return a function that makes a VEHICLE row with the given fields: `car(x=3.0, agent=1)`."""
 
     def make(**fields: float) -> NDArray[np.void]:
         row = blank_vehicle()

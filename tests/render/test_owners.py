@@ -1,4 +1,4 @@
-"""Divided worlds, seen from above: zones, owners, ghosts and transfers, in pixels."""
+"""Drawings of divided worlds: pixels of zones, owners, ghosts and transfers."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def picture(
 
 
 def at(frame: NDArray[np.uint8], x: float, y: float) -> tuple[int, ...]:
-    """The pixel at a place in metres."""
+    """Return the pixel at a point in metres."""
     column, row = pixel(x, y)
     return tuple(int(c) for c in frame[row, column])
 
@@ -68,7 +68,7 @@ def test_a_vehicle_has_the_colour_of_its_owner_wherever_it_is(
 
 def test_each_zone_has_its_tint_and_is_bordered(ring: RoadNetwork, car: Car) -> None:
     frame = picture(ring, car()[:0], view_of([]))
-    # Beside the roads.
+    # These points are beside the roads.
     tints = {at(frame, x, y) for x in (-4.0, 4.0) for y in (-4.0, 4.0)}
     assert len(tints) == 4
     assert at(frame, 10.0, 0.0) == at(frame, 0.0, 10.0) == palette.INK
@@ -92,7 +92,7 @@ def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> No
 
     assert count(around(seen[0], 6.0), rim(0)) > 20 > count(around(plain, 6.0), rim(0))
     assert count(around(seen[1], 13.0), rim(1)) > 20 > count(around(plain, 13.0), rim(1))
-    # A zone that sees nobody outlines nobody.
+    # A zone without ghosts outlines no vehicle.
     np.testing.assert_array_equal(around(seen[2], 6.0), around(plain, 6.0))
     for frame in seen.values():
         assert at(frame, 6.0, 5.0) == palette.zone_color(3)
@@ -126,7 +126,7 @@ def test_a_transfer_is_ringed_in_the_targets_colour_and_points_there(
     away_m = np.hypot(*offsets.T) / CAMERA.scale
     assert half_m < away_m.min(), "around the car"
     assert away_m.max() < half_m + 2.0
-    # The target lies to the east, and so does the head.
+    # The target is to the east, and so is the head of the arrow.
     assert offsets[:, 1].max() > 6 - offsets[:, 1].min()
     assert count(after[80:], palette.zone_color(3)) > count(before[80:], palette.zone_color(3))
     assert at(after, -1.5, 8.0) == palette.zone_color(2)

@@ -72,7 +72,7 @@ def test_vehicle_has_its_colour_at_its_place(ring: RoadNetwork, car: Car, agent:
     assert middle(renderer.frame(row[:0])) != expected
 
 
-def test_vehicle_is_as_long_and_wide_as_it_is(ring: RoadNetwork, car: Car) -> None:
+def test_a_vehicle_is_drawn_with_its_length_and_width(ring: RoadNetwork, car: Car) -> None:
     renderer = TopDownRenderer(ring, SIZE, focus=(-10.0, -7.5, 10.0, 7.5))
     frame = renderer.frame(car(agent=2, length=12.0, width=3.0))
     scale = renderer.camera.scale
@@ -84,7 +84,7 @@ def test_vehicle_is_as_long_and_wide_as_it_is(ring: RoadNetwork, car: Car) -> No
     assert rows.max() - 120 == pytest.approx(1.5 * scale, abs=2.0)
 
 
-def test_buildings_stand_where_they_are(ring: RoadNetwork) -> None:
+def test_buildings_are_drawn_at_their_positions(ring: RoadNetwork) -> None:
     min_x, min_y, max_x, max_y = ring.extent_of(0)
     x, y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)  # within the ring
     focus = (x - 10.0, y - 7.5, x + 10.0, y + 7.5)
@@ -201,7 +201,7 @@ def test_pictures_need_no_display_and_leave_the_environment_alone(
     assert not load_pygame().display.get_init()
 
 
-def test_window_shows_what_was_drawn(headless: None, ring: RoadNetwork, car: Car) -> None:
+def test_the_window_shows_the_drawn_frame(headless: None, ring: RoadNetwork, car: Car) -> None:
     renderer = TopDownRenderer(ring, SIZE)
     for _ in range(3):
         renderer.show(renderer.draw(car()), "ring", fps=1000.0)

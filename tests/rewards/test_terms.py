@@ -28,7 +28,7 @@ STEP_S = 0.1
 
 
 def terms(rows: NDArray[np.void], i: int = 0, max_speed: float = MAX_SPEED_MPS) -> dict[str, float]:
-    """The terms of row i by name; all drive on lane 0 of the ring."""
+    """Return the terms of row i by name; all vehicles drive on lane 0 of the ring."""
     kind = generated_types().copy()
     kind["max_speed"] = max_speed
     grid = make_grid((-100.0, -100.0, 100.0, 100.0), 25.0, len(rows))
@@ -57,7 +57,7 @@ def test_progress_is_the_way_towards_the_goal() -> None:
 
 @pytest.mark.parametrize(
     ("before", "after", "speed", "progress"),
-    # At most what is driven in two steps; who stands might have driven at 1 m/s.
+    # At most the distance of two steps; for standing vehicles, that at 1 m/s.
     [
         (80.0, 900.0, 10.0, -2.0),
         (900.0, 80.0, 10.0, 2.0),
@@ -118,7 +118,7 @@ def test_time_to_collision_of_one_behind_another() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (25.0, 0.0, 0.0)], speed=[15.0, 5.0])
     assert terms(rows)["ttc_risk"] == pytest.approx(1.0 - 2.0 / TTC_HORIZON_S)
     assert terms(rows[::-1], 1)["ttc_risk"] == terms(rows)["ttc_risk"]
-    # A metre more of one of them is half a metre less between the bumpers.
+    # If one of them is a metre longer, the gap between the bumpers is half a metre shorter.
     for lengths in ((6.0, 5.0), (5.0, 6.0)):
         longer = rows.copy()
         longer["length"] = lengths
@@ -127,16 +127,16 @@ def test_time_to_collision_of_one_behind_another() -> None:
     assert terms(rows)["ttc_risk"] == 0.0
     rows["speed"] = [15.0, 5.0]
     rows["z"] = [0.0, 6.0]
-    assert terms(rows)["ttc_risk"] == 0.0, "one on a bridge"
+    assert terms(rows)["ttc_risk"] == 0.0, "the other is on a bridge"
     rows["z"] = 0.0
     rows["y"] = [0.0, 3.2]
-    assert terms(rows)["ttc_risk"] == 0.0, "one on the next lane"
+    assert terms(rows)["ttc_risk"] == 0.0, "the other is on the next lane"
 
 
 def test_cars_side_by_side_do_not_collide_unless_they_drift_together() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (1.0, 3.2, 0.0)], speed=[15.0, 10.0])
-    assert terms(rows)["ttc_risk"] == 0.0, "one passes the other"
-    # 1.2 m of room between flanks 2 m wide; the one turns towards the other with 1 m/s.
+    assert terms(rows)["ttc_risk"] == 0.0, "one vehicle passes the other"
+    # The flanks are 1.2 m apart; one vehicle approaches the other sideways at 1 m/s.
     rows["heading"] = [math.asin(0.1), 0.0]
     rows["speed"] = [10.0, 10.0]
     turned_m = 2.5 * 0.1 + 1.0 * math.cos(math.asin(0.1)) - 1.0
@@ -150,7 +150,8 @@ def test_time_to_collision_equals_twin(rows: NDArray[np.void], i: int) -> None:
     i %= len(rows)
     found = terms(rows, i)["ttc_risk"]
     assert 0.0 <= found <= 1.0
-    # Rounding decides whether bodies graze each other: those a bit smaller and larger say more.
+    # Rounding decides whether bodies graze each other, so compare with slightly smaller and larger
+    # bodies.
     assert ttc_risk(rows, i, -1e-6) - 1e-4 <= found <= ttc_risk(rows, i, 1e-6) + 1e-4
 
 

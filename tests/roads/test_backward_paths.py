@@ -1,4 +1,4 @@
-"""Paths over junctions that run backwards: drawn anew, and nothing else changed."""
+"""Paths over junctions that run backwards are drawn again, and nothing else changes."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,7 +15,7 @@ from tests.support.kept_maps import network_of
 sumo = pytest.importorskip("sumo", reason="needs the extra: sumo")
 
 MOST_CORNER_RAD = np.radians(100.0)
-U_TURN_RAD = np.radians(150.0)  # where roads turn by so much, a path may have no width
+U_TURN_RAD = np.radians(150.0)  # if roads turn by this angle, a path may have no width
 
 
 def _line(*points: tuple[float, float]) -> Shape:
@@ -27,7 +27,7 @@ def _length(shape: Shape) -> float:
 
 
 def _corners(*parts: Shape) -> NDArray[np.float64]:
-    """Unsigned angles between the steps of polylines, by their dot products, in rad."""
+    """Return unsigned angles between segments of polylines, by their dot products, in rad."""
     steps = np.concatenate([np.diff(part[:, :2], axis=0) for part in parts])
     steps /= np.hypot(*steps.T)[:, None]
     cosines: NDArray[np.float64] = (steps[1:] * steps[:-1]).sum(axis=1)
@@ -105,7 +105,7 @@ def test_a_lane_that_a_movement_without_a_path_leaves_keeps_its_end() -> None:
 
 
 def _check_forward(network: RoadNetwork) -> None:
-    """No corner from a lane over a junction into the next one goes back, but where roads do."""
+    """Check that paths over junctions do not run backwards, except where the roads do."""
     for link in network.links[network.links["first_internal"] >= 0]:
         lanes = [int(link["from_lane"]), int(link["first_internal"])]
         while network.lanes["internal"][lanes[-1]]:

@@ -56,7 +56,7 @@ def test_a_large_map_stays_in_its_file(
     crossing: Callable[..., Path],
     cache_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    copied: int,  # bytes, at most
+    copied: int,  # bytes up to which a map is copied
 ) -> None:
     monkeypatch.setattr("cavmarl.roads.network.COPIED", copied)
     monkeypatch.setattr("cavmarl.core.huge_pages.LEAST", 1)

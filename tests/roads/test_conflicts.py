@@ -1,4 +1,4 @@
-"""What two links share of a junction, and where drivers wait inside for it."""
+"""Shared areas of two links in a junction, and waiting positions before them."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_paths_that_keep_apart_are_not_near_whatever_the_map_says(
 def waiting_place(
     wait_m: float, enter_m: float, yields: tuple[bool, bool] = (True, False)
 ) -> float:
-    """Where a turn waits, of which netconvert's place and the begin of an area are given."""
+    """Return a turn's waiting position, given netconvert's position and the start of an area."""
     links, lanes = np.zeros(2, LINK), np.zeros(2, LANE)
     links["wait_m"] = wait_m, np.inf
     links["from_lane"] = links["to_lane"] = 0, 1
@@ -50,24 +50,24 @@ def waiting_place(
 @pytest.mark.parametrize(
     ("enter_m", "place_m"),
     [
-        (9.5, 10.0),  # its front stands 1 m before its place, 0.5 m before the area
+        (9.5, 10.0),  # the front stops 1 m before the position, so 0.5 m before the area
         (8.9, 9.9),
         (6.1, 7.1),
-        (5.9, 10.0),  # it is asked about at the line
+        (5.9, 10.0),  # the area is checked at the line
     ],
 )
-def test_one_waits_inside_before_the_way_of_those_that_it_lets_pass(
+def test_a_turn_waits_inside_before_the_paths_to_which_it_yields(
     enter_m: float, place_m: float
 ) -> None:
     assert waiting_place(10.0, enter_m) == pytest.approx(place_m)
 
 
 @pytest.mark.parametrize("yields", [(False, True), (True, True), (False, False)])
-def test_those_that_do_not_drive_on_meanwhile_move_no_waiting_place(
+def test_only_links_with_priority_move_a_waiting_position(
     yields: tuple[bool, bool],
 ) -> None:
     assert waiting_place(10.0, 8.0, yields) == 10.0
 
 
-def test_one_that_need_not_wait_inside_gets_no_place_there() -> None:
+def test_a_turn_without_need_to_wait_has_no_waiting_position() -> None:
     assert waiting_place(np.inf, 8.0) == np.inf

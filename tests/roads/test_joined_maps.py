@@ -22,7 +22,7 @@ OVERRIDES: dict[str, Any] = {"map.source": MAPS, "horizon_s": 8.0}
 
 
 def drive(vec: CavVectorEnv, steps: int) -> list[str]:
-    """The states of all worlds after some steps."""
+    """Return the states of all worlds after some steps."""
     vec.reset(seed=5)
     actions = np.zeros((vec.num_envs, vec.num_agents, 2), dtype=np.float32)
     actions[:, :, 0] = 0.2
@@ -32,7 +32,7 @@ def drive(vec: CavVectorEnv, steps: int) -> list[str]:
 
 
 def maps_of(vec: CavVectorEnv) -> list[set[int]]:
-    """The maps on which the vehicles of each world are."""
+    """Return the maps of the vehicles of each world."""
     on = vec.network.lanes["map"]
     simulation = vec.simulation
     return [set(on[simulation.vehicles(w)["lane"]].tolist()) for w in range(vec.num_envs)]
@@ -59,7 +59,7 @@ def test_workers_and_worlds_taken_apart_see_the_same() -> None:
     here = make_vec("cities", num_envs=4, **settings)
     there = make_vec("cities", num_envs=4, workers=2, **settings)
     try:
-        assert drive(here, 60) == drive(there, 60)  # 40 steps an episode
+        assert drive(here, 60) == drive(there, 60)  # 40 steps per episode
     finally:
         there.close()
     alone = make_vec("cities", num_envs=1, **settings)

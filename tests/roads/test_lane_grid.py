@@ -1,4 +1,4 @@
-"""Which lanes may reach into which cells of a map."""
+"""The lanes that may reach into each cell of a map."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def goals(roads: RoadNetwork, many: int = 6) -> list[int]:
-    """Edges spread over the map."""
+    """Return edges spread over the map."""
     outside = np.flatnonzero(~roads.edges["internal"])
     return [int(outside[int(k)]) for k in np.linspace(0, len(outside) - 1, many)]
 
@@ -30,7 +30,7 @@ def test_plans_take_the_least_time_from_every_lane(name: str) -> None:
             if roads.lanes[lane]["edge"] == goal:
                 assert (step["next"], step["link"], step["change"]) == (-1, -1, 0)
                 continue
-            # One step of the plan costs just what it saves.
+            # Each step of the plan reduces the remaining time by its own cost.
             if step["change"] != 0:
                 beside = roads.lanes[lane]["left" if step["change"] > 0 else "right"]
                 spent = naive.change_cost(roads, lane) + cost[beside]

@@ -1,4 +1,4 @@
-"""Lane shapes: where neighbours of other lengths lie beside one another."""
+"""Lane shapes beside neighbours of other lengths."""
 
 from __future__ import annotations
 

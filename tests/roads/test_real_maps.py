@@ -1,4 +1,4 @@
-"""What must hold on any map, held on real ones and against sumolib's own view of the same file."""
+"""Properties of all maps, checked on real maps, and compared with sumolib."""
 
 from __future__ import annotations
 
@@ -160,7 +160,7 @@ def check_against_sumolib(network: RoadNetwork, net: Any) -> None:
         for foe in np.flatnonzero(links["junction"] == link["junction"]) if node._foes else ():
             a, b = int(link["index"]), int(links["index"][foe])
             either = foe != mine and (node.areFoes(a, b) or node.areFoes(b, a))
-            # Beyond the map's own foes there are those that pass too narrowly, never fewer.
+            # Links that pass too closely are foes besides the map's, so there are never fewer.
             assert foe in listed or not either
             if either:
                 assert listed[foe] == node.forbids(connections[foe], connections[mine])

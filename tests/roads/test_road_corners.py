@@ -25,7 +25,7 @@ def line(*points: tuple[float, ...]) -> Shape:
 
 
 def radii(shape: Shape) -> NDArray[np.float64]:
-    """The radius of the circle through each point and its neighbours."""
+    """Return the radius of the circle through each point and its neighbours."""
     a, b, c = shape[:-2, :2], shape[1:-1, :2], shape[2:, :2]
     one, two, three = (np.hypot(*(p - q).T) for p, q in ((b, a), (c, b), (c, a)))
     area = np.abs((b - a)[:, 0] * (c - a)[:, 1] - (b - a)[:, 1] * (c - a)[:, 0]) / 2.0
@@ -54,7 +54,7 @@ def test_lanes_keep_their_distance() -> None:
     shapes = [
         line((0, -3.2 * k), (100 + 3.2 * k, -3.2 * k), (100 + 3.2 * k, 100)) for k in range(3)
     ]
-    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # of the other direction
+    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # lanes of the other direction
     assert round_corners(shapes, [3.2] * 4, [range(3), range(3, 4)]) == [0, 1, 2, 3]
     for one, other in ((0, 1), (1, 2), (3, 0)):
         own, far = (

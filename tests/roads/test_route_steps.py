@@ -17,11 +17,11 @@ from tests.naive import routes as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
 PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
-FIRST_STEP = 5  # other routes come before
+FIRST_STEP = 5  # other routes precede them in the table
 
 
 def following(roads: RoadNetwork, edge: int) -> list[int]:
-    """The edges that some lane of an edge leads to, by rising row."""
+    """Return the edges to which some lane of an edge leads, by rising row."""
     found = set()
     for lane in naive.lanes_of(roads, edge):
         row = roads.lanes[lane]
@@ -32,7 +32,7 @@ def following(roads: RoadNetwork, edge: int) -> list[int]:
 
 @st.composite
 def routes(draw: st.DrawFn, name: str) -> tuple[str, list[int]]:
-    """A walk over the edges of an entry; on a ring it comes round again."""
+    """Draw a walk over the edges of an environment; on a ring, it repeats edges."""
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"]).tolist()
     edges = [draw(st.sampled_from(outside))]
@@ -47,7 +47,7 @@ def routes(draw: st.DrawFn, name: str) -> tuple[str, list[int]]:
 def planned(
     roads: RoadNetwork, edges: list[int], permission: int = PASSENGER
 ) -> tuple[NDArray[np.void], NDArray[np.float64], list[int]]:
-    """Steps, costs, and the way on each edge."""
+    """Return steps, costs, and the route on each edge."""
     number = int(roads.edges["num_lanes"][edges].sum())
     steps, cost = np.zeros(FIRST_STEP + number, PLAN), np.full(FIRST_STEP + number, -1.0)
     row = np.array(edges, np.int32)
@@ -115,7 +115,7 @@ def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(shared_maps: Pa
 
 
 def walk(roads: RoadNetwork, steps: NDArray[np.void], lane: int, way_: int) -> list[int]:
-    """The lanes that `next_step` leads over, lane changes included."""
+    """Return the lanes along which `next_step` leads, with lane changes."""
     travel, lanes = travel_by(steps), [lane]
     for _ in range(10_000):
         here = roads.lanes[lane]
@@ -150,7 +150,7 @@ def test_the_steps_lead_over_the_edges_in_order(case: tuple[str, list[int]]) -> 
 
 @settings(max_examples=30)
 @given(st.sampled_from(NAMES).flatmap(routes), st.floats(0.0, 1.0))
-def test_what_is_left_of_a_way_is_the_sum_of_what_lies_ahead(
+def test_the_remaining_length_is_the_sum_of_the_steps_ahead(
     case: tuple[str, list[int]], share: float
 ) -> None:
     name, edges = case
@@ -189,7 +189,7 @@ def changes_lane(roads: RoadNetwork, pair: list[int]) -> bool:
 
 
 def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
-    """The time at the limits; of an edge with lane changes, only the last lane counts."""
+    """Return the time at the limits; of an edge with lane changes, only the last lane counts."""
     total = 0.0
     for k, lane in enumerate(lanes):
         if k + 1 == len(lanes) or not changes_lane(roads, lanes[k : k + 2]):
@@ -214,7 +214,7 @@ def test_the_edges_of_a_way_are_those_of_its_lanes(name: str) -> None:
             if not ways:
                 assert number == 0
                 continue
-            # The fastest way, then the way with the fewest lane changes to begin with.
+            # First the fastest path, then the path with the fewest lane changes at its start.
             best = min(ways, key=lambda lanes: (_time_s(roads, lanes), plan[lanes[0]]["changes"]))
             driven = [
                 int(roads.lanes[lane]["edge"]) for lane in best if not roads.lanes[lane]["internal"]

@@ -32,7 +32,7 @@ def strips_of(*shapes: Shape, left_hand: bool = False) -> list[Strip]:
 
 
 def tram_street(folder: Path) -> Path:
-    """A street whose inner lanes of both directions are the same tracks."""
+    """Write a street whose inner lanes of both directions share the same tracks."""
     places = range(0, 1001, 250)
     nodes = "".join(f'<node id="n{k}" x="{x}" y="0"/>' for k, x in enumerate(places))
     edges = ""
@@ -48,7 +48,7 @@ def tram_street(folder: Path) -> Path:
 
 
 def least_apart(network: RoadNetwork) -> float:
-    """The smallest distance of the middle of a lane to a lane of the opposite edge, in m."""
+    """Return the least distance from the middle of a lane to a lane of the opposite edge, in m."""
     found = [np.inf]
     rows = np.flatnonzero(~network.lanes["internal"])
     ends = network.edges[["from_junction", "to_junction"]][network.lanes["edge"]].tolist()
@@ -89,9 +89,9 @@ def test_parallels_of_a_bent_lane_keep_their_distance() -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        line((100, 3.2), (0, 3.2)),  # beside it
-        line((100, 0, 5.0), (0, 0, 5.0)),  # on a bridge above it
-        line((100, 0), (50, 40), (0, 0)),  # only the ends meet
+        line((100, 3.2), (0, 3.2)),  # an edge beside it
+        line((100, 0, 5.0), (0, 0, 5.0)),  # an edge on a bridge above it
+        line((100, 0), (50, 40), (0, 0)),  # an edge that touches only its ends
     ],
 )
 def test_other_streets_stay(other: Shape) -> None:

@@ -1,4 +1,4 @@
-"""Programs of additional files join those of the map; the last one loaded is on, as in SUMO."""
+"""Programs of additional files are added to those of the map; as in SUMO, the last one is on."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def additional(tmp_path: Path) -> Callable[..., Path]:
 def states(
     network: RoadNetwork, ticks: Iterable[int], dt: float = 1.0, stands_m: float | None = None
 ) -> list[str]:
-    """What is shown at these ticks, while a car stands so far along the main road, if it does."""
+    """Return the shown states at these ticks, with an optional car standing on the main road."""
     worlds = make_worlds(1, 1, network)
     if stands_m is not None:
         worlds.rows[0, 0] = on_lane(network, network.lane_ids.index("w_1"), stands_m)[0]
@@ -122,7 +122,7 @@ def test_of_several_programs_in_a_map_the_last_is_on(crossing: Callable[..., Pat
     assert states(network, [0, 7]) == ["ggg", "ggg"]
 
 
-def test_a_choice_stands_above_all(
+def test_a_selected_program_overrides_all_others(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())
@@ -227,7 +227,7 @@ def test_actuated_programs_get_detectors_where_the_green_empties(
     text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="3"')
     green = ('duration="30"', 'duration="30" minDur="5" maxDur="50"')
     network = read_network(crossing(text, green))
-    # 2 s at 10 m/s before the end of the 95 m lane: nearer than 5 s of queue.
+    # 2 s at 10 m/s before the end of the 95 m lane: closer than the queue that 5 s of green empty.
     assert network.detectors["s_m"].tolist() == [75.0]
     assert [network.lane_ids[row] for row in network.detectors["lane"]] == ["w_1"]
     assert network.phases["num_detectors"].tolist() == [1, 0, 0]
@@ -245,7 +245,9 @@ def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
     ticks = [*range(0, 12_400, 100), *range(12_400, 12_510)]
     shown = states(network, ticks, 0.001, stands_m=75.0)
     assert ticks[shown.index("yrr")] == 12_500
-    assert ticks[states(network, ticks, 0.001).index("yrr")] == 5_000, "nobody prolongs it"
+    assert ticks[states(network, ticks, 0.001).index("yrr")] == 5_000, (
+        "no vehicle prolongs the green"
+    )
 
 
 @pytest.mark.parametrize(
@@ -257,7 +259,7 @@ def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
         (('state="Grr"', 'state="Grr" next="1 2"'), True),
     ],
 )
-def test_rules_that_are_not_run_are_reported(
+def test_unsupported_rules_are_reported(
     crossing: Callable[..., Path], change: tuple[str, str], simplified: bool
 ) -> None:
     report = check_map(read_network(crossing(change)))

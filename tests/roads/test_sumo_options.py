@@ -43,7 +43,7 @@ def test_every_option_of_sumo_is_known(tmp_path: Path) -> None:
         for name in (option, *synonyms.split())
     }
     assert len(theirs) > 500
-    theirs["osg-view"] = ("osg-view", "false")  # only in SUMO with OpenSceneGraph
+    theirs["osg-view"] = ("osg-view", "false")  # exists only in SUMO with OpenSceneGraph
     assert theirs == {name: (o.name, o.default) for name, o in known_options().items()}
 
 

@@ -41,7 +41,7 @@ def shoot(
     strips: Floats | None = None,
     row: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], PixelRows]:
-    """Depths and classes."""
+    """Return depths and classes of a picture."""
     reach_m = camera_reach_m(camera, *size) + 1.0  # a pitch moves a camera above the ground
     panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
     picture = make_picture(*size, panorama)
@@ -55,10 +55,10 @@ def shoot(
 
 
 @given(crowds(most=6), wall_sets(), mounts(), st.integers(1, HEIGHT))
-def test_rows_do_not_depend_on_which_are_taken_together(
+def test_rows_do_not_depend_on_bands(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
 ) -> None:
-    """Pictures that are too large for the cache are taken in bands; a worker takes some of them."""
+    """Pictures too large for the cache are rendered in bands; a worker may get some bands."""
     camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
     depths, classes, _ = shoot(rows, camera, walls=walls)
     reach_m = camera_reach_m(camera, WIDTH, HEIGHT) + 1.0
@@ -81,7 +81,7 @@ def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> Came
 
 
 def stands_in(wall: np.void, row: np.void, mounted: Floats) -> bool:
-    """Whether a camera is in the plane of a wall, or on its top: it sees it from no side."""
+    """Return whether a camera is in the plane of a wall or on its top, so that it sees no side."""
     turned = np.exp(1j * row["heading"]) * complex(mounted[0], mounted[1])
     camera = complex(row["x"], row["y"]) + turned
     one, other = complex(wall["ax"], wall["ay"]), complex(wall["bx"], wall["by"])
@@ -110,7 +110,7 @@ def test_pixels_equal_twin(
         ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
         exact = naive.trace(rows, 0, walls, start, ray, range_m, 0.0)
         if exact.distance < 0.02:
-            continue  # inside of a body, of which a camera sees no face, or with its nose on it
+            continue  # inside of a body, where a camera sees no face, or touching a body
         is_equal = depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
         if is_equal and classes[j, i] == CLASS_OF[exact.what[0]]:
             continue
@@ -141,7 +141,7 @@ def test_a_wall_at_ten_metres_is_ten_metres_deep_in_every_pixel() -> None:
     assert (depths[:above] == 10.0).all()
     assert (classes[:above] == BUILDING).all()
     assert (classes[-1] == GROUND).all()
-    # Of the ground: height over slope of the lowest row.
+    # Depth of the ground: height divided by the slope of the lowest row.
     slope = (HEIGHT - 0.5 - 0.5 * HEIGHT) / (0.5 * WIDTH)
     assert depths[-1] == pytest.approx(1.5 / slope)
 
@@ -177,7 +177,7 @@ def test_left_is_left_and_up_is_up() -> None:
 def test_a_rolled_camera_sees_the_horizon_upright() -> None:
     camera = make_camera(mount((0.0, 0.0, 1.0), (0.0, 0.0, RIGHT)), WIDTH, RIGHT, 60.0)
     _, classes, _ = shoot(vehicles([(0.0, 0.0, 0.0)]), camera)
-    # Its left side is up: the sky is to the left.
+    # The left side of the camera is up, so the sky is to the left.
     assert (classes[:, 0] == NOTHING).all()
     assert (classes[:, -1] == GROUND).all()
 
@@ -192,7 +192,7 @@ def test_roads_lie_on_the_ground_and_bodies_stand_on_them() -> None:
 
 
 def test_neighbouring_faces_leave_no_gap() -> None:
-    """A prism that turns round shows no ground or sky inside of its outline."""
+    """A rotated prism shows no ground or sky inside of its outline."""
     for heading in np.linspace(0.0, math.pi, 25):
         rows = vehicles([(0.0, 0.0, 0.0), (8.0, 0.3, heading)])
         _, classes, _ = shoot(rows, forward(width=64, z_m=1.6), (64, 40))
@@ -201,7 +201,7 @@ def test_neighbouring_faces_leave_no_gap() -> None:
             assert len(seen) == 0 or len(seen) == seen[-1] - seen[0] + 1
 
 
-def test_halves_are_those_of_numpy() -> None:
+def test_float16_numbers_equal_those_of_numpy() -> None:
     values = np.geomspace(0.01, 300.0, 4001, dtype=np.float32).reshape(1, -1)
     ties = (np.arange(2048, 4096, dtype=np.float32) / 16.0 + 1.0 / 32.0).reshape(1, -1)
     for floats in (values, ties):

@@ -1,4 +1,4 @@
-"""GNSS: from the map to the earth and back, against PROJ and against the vehicle's place."""
+"""GNSS: from the map to the earth and back, compared with PROJ and with the vehicle's position."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ACOSTA = "net/bologna_acosta/acosta_buslanes.net.xml"
 
 
 def _metres_apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float:
-    """The largest distance between two lists of latitudes, longitudes and heights."""
+    """Return the largest distance between two lists of latitudes, longitudes and heights."""
     _, _, apart = pyproj.Geod(ellps="WGS84").inv(one[:, 1], one[:, 0], other[:, 1], other[:, 0])
     return float(np.hypot(apart, one[:, 2] - other[:, 2]).max())
 
@@ -42,10 +42,10 @@ def test_a_tangent_plane_is_that_of_proj(origin: tuple[float, float, float]) -> 
     np.testing.assert_allclose(plane.to_map(found), points, atol=1e-6)
 
 
-def test_a_projected_map_is_taken_at_its_word(shared_maps: Path) -> None:
+def test_the_projection_of_a_map_is_used(shared_maps: Path) -> None:
     network = read_network(shared_maps / ACOSTA)
     assert load_network(shared_maps / ACOSTA).geo == network.geo
-    assert load_network(shared_maps / ACOSTA).geo == network.geo  # from the cache, too
+    assert load_network(shared_maps / ACOSTA).geo == network.geo  # also from the cache
     geodesy = geodesy_of(network, GnssConfig(rate_hz=1.0, origin_height_m=54.0))
     low, high = np.array(network.extent_m).reshape(2, 2)
     points = np.random.default_rng(1).uniform([*low, 0.0], [*high, 20.0], (200, 3))
@@ -58,7 +58,7 @@ def test_a_projected_map_is_taken_at_its_word(shared_maps: Path) -> None:
     assert 11.2 < found[0, 1] < 11.4
 
 
-def test_an_antenna_is_where_it_is_mounted() -> None:
+def test_an_antenna_is_at_its_mounting_position() -> None:
     gnss = {"type": "gnss", "rate_hz": 20, "x_m": -1.0, "y_m": 0.7, "z_m": 1.5}
     vec = make_vec("grid4x4", agents=5, background=10, overrides={"rig": {"gnss": gnss}})
     config = vec.config.rig["gnss"]
@@ -75,7 +75,7 @@ def test_an_antenna_is_where_it_is_mounted() -> None:
                 )
 
 
-def test_errors_of_an_antenna_are_other_ones_at_each_tick_and_for_each_vehicle() -> None:
+def test_errors_of_an_antenna_differ_between_ticks_and_vehicles() -> None:
     gnss = {"type": "gnss", "rate_hz": 20}
     rig = {"clean": gnss, "noisy": {**gnss, "noise": [2.0, 2.0, 0.0]}}
     settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "respawn"}

@@ -1,4 +1,4 @@
-"""`sensors.conflicts.heard`: messages, and nothing else, tell of vehicles behind houses."""
+"""`sensors.conflicts.heard`: vehicles behind houses are known only from messages."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def part(vec: Any) -> slice:
 
 
 def reported(vec: Any, me: np.void) -> dict[int, tuple[np.void, float]]:
-    """What an agent's inbox says of others: a row for each, gone on since, and its age in s."""
+    """Return the vehicles in an agent's inbox: extrapolated rows, and ages of the reports in s."""
     found = {}
     for report in vec.simulation.messages.mail.objects[0, me["agent"]]:
         if report["sender"] < 0:
@@ -61,9 +61,9 @@ def reported(vec: Any, me: np.void) -> dict[int, tuple[np.void, float]]:
 
 
 def by_place(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Those that count the same have an order that hangs on the last bit: here it is by place."""
+    """Sort rows by position, since rounding decides the order of equally critical vehicles."""
     rows = numbers.reshape(COUNT, SIZE)
-    assert bool(rows[-1, 0] == 0.0), "more are known than are told"
+    assert bool(rows[-1, 0] == 0.0), "more vehicles are known than observed"
     return rows[np.lexsort(np.round(rows[:, 2:4], 3).T)]
 
 
@@ -98,7 +98,7 @@ def test_seen_and_heard_vehicles_count_at_their_reported_position() -> None:
     vec.close()
 
 
-def test_without_a_message_those_in_sight_alone_are_known() -> None:
+def test_without_messages_only_visible_vehicles_are_known() -> None:
     deaf, sight = made({"v2x.channel.loss": 1.0}), made({"sensors.conflicts.heard": False})
     for one, other in zip(driven(deaf, 60), driven(sight, 60), strict=True):
         heard = one[..., part(deaf)].reshape(-1, COUNT, SIZE)

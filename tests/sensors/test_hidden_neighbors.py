@@ -1,4 +1,4 @@
-"""`sensors.neighbors.through_walls`: a house hides whom the straight line to cannot reach."""
+"""`sensors.neighbors.through_walls`: a house on the line of sight hides a vehicle."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def seen_from(through_walls: bool, steps: int, **keywords: Any) -> Any:
 
 
 def blocked(x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Whether the line runs through a house, by asking many places of it."""
+    """Return whether the line of sight runs through a house, by sampling the line."""
     share = np.linspace(0.0, 1.0, 401)
     px, py = x + share * (to_x - x), y + share * (to_y - y)
     inside = np.zeros(len(share), dtype=bool)

@@ -1,4 +1,4 @@
-"""The cells equal highway-env's, on its own roads and among bodies in any place."""
+"""The cells of the lidar equal highway-env's, on its roads and with bodies at any position."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.builders import vehicles
 
 
 def cells(rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
-    """Our array (cells, 2) of row i."""
+    """Return the array (cells, 2) of cavmarl for row i."""
     settings = SensorsConfig(lidar_observation=LidarObservationConfig(**config))
     sensor = lidar_observation.settings(settings, 0)
     out = np.zeros(np.prod(lidar_observation.shape(settings), dtype=int), np.float32)
@@ -29,7 +29,7 @@ def cells(rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
 @pytest.mark.parametrize("normalize", [True, False])
 def test_the_cells_are_highway_envs(name: str, num_cells: int, normalize: bool) -> None:
     env = highway.make(name, 1)
-    env.road.objects.clear()  # the end of merge-v0's ramp; we have no obstacles
+    env.road.objects.clear()  # the end of the ramp of merge-v0; cavmarl has no obstacles
     config = {"cells": num_cells, "normalize": normalize}
     theirs = highway.observation(env, "LidarObservation", **config)
     ours = cells(highway.vehicles(env), highway.own_row(env), **config)
@@ -37,7 +37,7 @@ def test_the_cells_are_highway_envs(name: str, num_cells: int, normalize: bool) 
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_bodies_in_any_place_are_drawn_alike(seed: int) -> None:
+def test_cells_are_equal_for_bodies_at_any_position(seed: int) -> None:
     env = highway.make("highway-v0", 0)
     env.road.objects.clear()
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What lidars, radars, cameras and grids in worlds read of a wall."""
+"""Readings of lidars, radars, cameras and grids before a wall."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _alone(**overrides: Any) -> CavVectorEnv:
 
 @pytest.fixture
 def before_a_wall(tmp_path: Path) -> CavVectorEnv:
-    """One vehicle, and square before its front sensors, ten metres away, a hall."""
+    """Return a world with one vehicle, ten metres in front of the wall of a hall."""
     row = _alone().simulation.vehicles()[0]
     heading, away = float(row["heading"]), FRONT["x_m"] + DISTANCE_M
     corners = [
@@ -128,7 +128,7 @@ def test_invalid_camera_settings_are_refused(sensor: dict[str, Any], words: str)
 
 
 def _crossing(occluded: bool) -> tuple[set[int], NDArray[np.void]]:
-    """The classes that a driver sees before a pedestrian sets off, and the rows."""
+    """Return the classes that a driver sees before a pedestrian starts, and the rows."""
     rig = {"eyes": {"type": "semantic_camera", "rate_hz": 5, "width": 640, "height": 90, **FRONT}}
     scenario = {"scenario.name": "pedestrian_crossing", "scenario.params": {"occluded": occluded}}
     vec = make_vec("grid4x4", agents=1, background=0, overrides={"rig": rig, **scenario})

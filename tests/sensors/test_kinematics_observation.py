@@ -20,7 +20,7 @@ from tests.support.traffic import network
 def table(
     env: Any, rows: NDArray[np.void], i: int, ranges: dict[str, Any], **config: Any
 ) -> NDArray[np.float32]:
-    """Our table (V, F) of row i."""
+    """Return the table (V, F) of cavmarl for row i."""
     settings = SensorsConfig(kinematics=KinematicsConfig(**config))
     sensor = kinematics.settings(settings, 0, network("ring"), highway.destinations(env))
     if ranges and config.get("normalize", True):
@@ -31,12 +31,13 @@ def table(
 
 
 def road_ranges(env: Any) -> dict[str, Any]:
-    """highway-env's default ranges on the road of its vehicle."""
+    """Return highway-env's default ranges on the road of its vehicle."""
     y = 4.0 * len(env.road.network.all_side_lanes(env.vehicle.lane_index))
     return {"x": (-200, 200), "y": (-y, y), "vx": (-80, 80), "vy": (-80, 80)}
 
 
-# Of curved lanes ours are polylines of `highway.SAMPLES` points: a quarter turn in steps of 0.025.
+# Curved lanes of cavmarl are polylines of `highway.SAMPLES` points: a quarter turn has steps of
+# 0.025.
 OFFSETS = {"long_off": 0.1, "lat_off": 0.02, "ang_off": 0.0125}
 
 CONFIGS: dict[str, dict[str, Any]] = {
@@ -55,7 +56,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 @cache
 def standing(name: str, seed: int) -> Any:
-    """One of highway-env's environments, which no test steps any further."""
+    """Return an environment of highway-env that tests do not step."""
     return highway.make(name, seed)
 
 
@@ -75,7 +76,7 @@ def test_the_table_is_highway_envs(name: str, seed: int, case: str) -> None:
         np.testing.assert_allclose(
             ours[:, column], theirs[:, column], rtol=1e-6, atol=OFFSETS.get(feature, 0.0)
         )
-    assert theirs[1:].any() or name == "intersection-v1", "nobody was near"
+    assert theirs[1:].any() or name == "intersection-v1", "no vehicle was near"
 
 
 @pytest.mark.parametrize("seed", range(3))

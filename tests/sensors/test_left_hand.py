@@ -1,4 +1,4 @@
-"""Where one drives on the left: what agents observe is that of the mirrored world, mirrored."""
+"""Left-hand traffic: observations are the mirrored observations of the mirrored world."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ SETTINGS = {
     "sensors.way.lines": 2,
     "rig": {"lane": {"type": "lane_boundary", "rate_hz": 5}},
 }
-LIKE = ("ego", "route", "signal", "lanes", "way")  # their order follows no distance to others
+LIKE = ("ego", "route", "signal", "lanes", "way")  # not ordered by distance
 TURNED = ("y", "left", "curvature", "lateral_offset", "heading_error", "steering", "yaw_rate")
 STEPS = 40
 
 
 def mirror_of(names: list[str]) -> tuple[list[int], NDArray[np.float64]]:
-    """Which feature of the other world each one is, and its sign."""
+    """Return for each feature the index in the mirrored world, and the sign."""
     sides = str.maketrans({"<": "right_", ">": "left_"})
     other = [name.replace("left_", "<").replace("right_", ">").translate(sides) for name in names]
     stems = [name.rstrip("_0123456789") for name in names]
@@ -60,6 +60,6 @@ def test_features_of_route_and_lanes_are_mirrored(tmp_path: Path) -> None:
         different |= (seen != other)[..., chosen].any(axis=(0, 1))
         seen = right.step(right.suggest_actions())[0]
         other = left.step(left.suggest_actions())[0]
-    assert different.sum() > 20, "what is compared has a side"
+    assert different.sum() > 20, "compared features are not symmetric"
     right.close()
     left.close()

@@ -32,7 +32,7 @@ def scan(
 def test_lidar_equals_twin(rows: NDArray[np.void], row: int, num_rays: int, range_m: float) -> None:
     row %= len(rows)
     out = scan(rows, row, num_rays, range_m)
-    # Rounding decides whether a ray that grazes a side meets it: sizes differ by a micrometre.
+    # Rounding decides whether a ray that grazes a side hits it, so sizes differ by a micrometre.
     nearer = naive.lidar(rows, row, num_rays, range_m, 1e-6)
     further = naive.lidar(rows, row, num_rays, range_m, -1e-6)
     twin = naive.lidar(rows, row, num_rays, range_m)
@@ -64,7 +64,7 @@ def test_every_ray_that_can_meet_a_body_is_tried(
 
 
 def test_rays_that_pass_a_corner_meet_nothing() -> None:
-    """A fine fan over turned bodies near and far: each edge of each is passed on both sides."""
+    """A fine fan of rays over rotated bodies near and far passes each corner on both sides."""
     for k in range(8):
         place = (7.0 * math.cos(0.8 * k), 7.0 * math.sin(0.8 * k), 0.35 * k)
         rows = vehicles([(0.0, 0.0, 0.3), place], length=8.0)
@@ -118,7 +118,7 @@ def test_the_end_of_a_truck_is_seen_when_its_centre_is_out_of_range() -> None:
 
 
 @given(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3))
-def test_the_rough_angle_is_as_good_as_it_claims(y: float, x: float) -> None:
+def test_the_approximate_angle_is_within_its_bound(y: float, x: float) -> None:
     if x == 0.0 and y == 0.0:
         return
     error = math.remainder(bearings.rough_atan2(y, x) - math.atan2(y, x), 2.0 * math.pi)

@@ -1,4 +1,4 @@
-"""What sensors that look at nobody else measure, against plain twins, tick by tick."""
+"""Sensors that measure only their own vehicle, compared with plain twins in each tick."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _trembling(vec: CavVectorEnv, rng: np.random.Generator) -> NDArray[np.float3
     return np.clip(shaken, -1.0, 1.0).astype(np.float32)
 
 
-def test_every_sample_is_what_the_twins_say() -> None:
+def test_every_sample_equals_the_twins() -> None:
     vec, rng = _make(), np.random.default_rng(0)
     vec.reset(seed=2)
     before = _agents(vec)
@@ -76,7 +76,7 @@ def test_every_sample_is_what_the_twins_say() -> None:
 
 
 def _circling(steering: float) -> tuple[CavVectorEnv, float]:
-    """A car at rest on its own speed that steers the same way all the time; and its radius."""
+    """Return a car that circles at constant speed and steering, and the radius."""
     vec = make_vec(
         "ring", agents=1, background=0,
         overrides={"clock.sim_dt_s": 0.01, "clock.ctrl_dt_s": 0.01, "rig": {
@@ -90,7 +90,7 @@ def _circling(steering: float) -> tuple[CavVectorEnv, float]:
     return vec, 0.5 * 5.0 / math.sin(slip)
 
 
-def test_a_circle_is_felt_as_speed_squared_over_radius() -> None:
+def test_the_imu_measures_the_centripetal_acceleration() -> None:
     steering = 0.1
     vec, radius = _circling(steering)
     actions = np.zeros((1, 1, 2), dtype=np.float32)
@@ -106,7 +106,7 @@ def test_a_circle_is_felt_as_speed_squared_over_radius() -> None:
     assert y > 0.0  # inwards, which is to the left
     assert z == pytest.approx(GRAVITY_MPS2)
     assert rates == pytest.approx([0.0, 0.0, speed / radius], rel=1e-4)
-    # Two metres ahead of the centre it is drawn to the centre of the circle by r² x more.
+    # Two metres ahead of the centre, the acceleration along the car differs by -rate² · x.
     ahead = frames["front"].data[0, 0, -1].tolist()
     assert ahead[0] - x == pytest.approx(-2.0 * (speed / radius) ** 2, rel=1e-3)
     assert ahead[3:] == pytest.approx(rates)

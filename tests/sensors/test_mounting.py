@@ -1,4 +1,4 @@
-"""Mounting transforms, against rotations written as products of matrices."""
+"""Mounting transforms, compared with products of rotation matrices."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ from cavmarl.policies.policy import Policy
 from cavmarl.sensors.observed import SENSORS, frame_size
 
 with warnings.catch_warnings():
-    # PettingZoo's tests import its own environments the way that it has deprecated.
+    # PettingZoo's tests import its own environments in a deprecated way.
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import parallel_api_test
 
@@ -52,7 +52,7 @@ ONLY_HIGHWAY = {**NOTHING, "sensors.kinematics.vehicles_count": 5}
 
 
 def make(env: str = "merge", mode: str = "respawn", **overrides: Any) -> Any:
-    """A small world; Any, as observations are arrays in one form and dicts in the other."""
+    """Make a small world; typed Any, because observations are arrays or dicts."""
     return cavmarl.parallel_env(
         env, agents=4, background=10, seed=3, max_cycles=60,
         overrides={"population.mode": mode, "population.budget": 8, **overrides},
@@ -60,7 +60,7 @@ def make(env: str = "merge", mode: str = "respawn", **overrides: Any) -> Any:
 
 
 def wild(env: Any, rng: np.random.Generator) -> dict[str, Any]:
-    """Full throttle and any steering: most leave the road or hit somebody soon."""
+    """Return full throttle and random steering: most vehicles soon leave the road or collide."""
     return {agent: np.array([1.0, rng.uniform(-1.0, 1.0)]) for agent in env.agents}
 
 
@@ -160,7 +160,7 @@ def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> N
     for _ in range(60):
         for agent, frame in seen.items():
             if infos[agent]["vehicle_id"] < 0:
-                assert not held[agent].any(), "a seat without a vehicle sees nothing"
+                assert not held[agent].any(), "a seat without a vehicle observes zeros"
                 continue
             if vehicle.get(agent) != infos[agent]["vehicle_id"]:
                 vehicle[agent] = infos[agent]["vehicle_id"]
@@ -174,7 +174,7 @@ def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> N
                    if infos[agent]["active"]}  # fmt: skip
         seen, *_ = plain.step(actions)
         held, _, _, _, infos = stacked.step(actions)
-    assert fresh > 5, "nobody came later"
+    assert fresh > 5, "no agent entered later"
     again, _ = stacked.reset()
     first = again[stacked.agents[0]].reshape(4, -1)
     assert np.all(first == first[0]), "a new episode begins a new stack"
@@ -194,7 +194,7 @@ def test_a_batch_stacks_as_a_single_world_does() -> None:
 
 
 class Recorder(Policy):
-    """Keeps the flat observations that it is shown."""
+    """A policy that stores its flat observations."""
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         self.shown = observations

@@ -46,7 +46,7 @@ def observed(
 
 
 def phases(name: str, random: object) -> NDArray[np.int32]:
-    """A phase for every signal."""
+    """Return a phase for each signal."""
     programs = network(name).programs[network(name).signals["program"]]
     found = [p["first_phase"] + random.randrange(p["num_phases"]) for p in programs]  # type: ignore[attr-defined]
     return np.array(found, dtype=np.int32)
@@ -61,12 +61,12 @@ def red_links(name: str, phase: NDArray[np.int32]) -> set[int]:
 
 @st.composite
 def traffic(draw: st.DrawFn, name: str) -> NDArray[np.void]:
-    """Vehicles on lanes that stand where they say, with goals and speeds."""
+    """Draw vehicles at exact positions on lanes, with goals and speeds."""
     rows = draw(crowds_on_lanes(name, most=10))
     placed = [on_lane(network(name), row["lane"], row["s"])[0] for row in rows]
     for row, there in zip(rows, placed, strict=True):
         row["x"], row["y"], row["heading"] = there["x"], there["y"], there["heading"]
-        # Off the way to its goal a vehicle goes where its lane leads; the twin says it stands.
+        # Off its route, a vehicle follows its lane in the kernel, but stands in the twin.
         ways = plans(name)[:4, row["lane"]]["to_go"]
         row["goal"] = draw(st.sampled_from(np.flatnonzero(np.isfinite(ways)).tolist() or [0]))
         assume(np.isfinite(ways[row["goal"]]) or not network(name).lanes[row["lane"]]["internal"])
@@ -78,7 +78,7 @@ def traffic(draw: st.DrawFn, name: str) -> NDArray[np.void]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(deadline=None)
 @given(data=st.data(), random=st.randoms(use_true_random=False))
-def test_lanes_equals_twin_whatever_the_order(
+def test_lanes_equals_twin_for_any_order_of_rows(
     name: str, data: st.DataObject, random: object
 ) -> None:
     rows = data.draw(traffic(name))
@@ -108,8 +108,8 @@ def test_gaps_on_a_straight_road() -> None:
     assert found[6:] == [0.0] * 8
 
 
-def test_one_that_has_left_a_shorter_lane_is_ahead_on_the_longer_one(tmp_path: Path) -> None:
-    """It is on the junction by its own lane, and still covers the one beside it."""
+def test_a_vehicle_that_has_left_a_shorter_lane_is_ahead_on_the_longer_lane(tmp_path: Path) -> None:
+    """The vehicle is on the junction by its own lane, and still covers the longer lane beside."""
     path = with_shorter_lane(build_crossing(tmp_path, "priority", side_lanes=2), "S_in_1", 8.0)
     roads = read_network(path)
     own, inside = (roads.lane_ids.index(lane) for lane in ("S_in_0", ":c_10_0"))

@@ -1,4 +1,4 @@
-"""The sensors for any map equal their twins, and tell of places, lines and vehicles as they are."""
+"""The sensors `way` and `conflicts` equal their twins, and observe positions and vehicles."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ CONFIG = SensorsConfig(
     conflicts=ConflictsConfig(count=COUNT, range_m=RANGE_M),
 )
 INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
-# What the entry `cities` has.
+# The settings of the environment `cities`.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
     "sensors.way.lines": LINES,
@@ -80,7 +80,7 @@ def observed_conflicts(
 
 
 def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
-    """The letter of each link that has a signal."""
+    """Return the letter of each link with a signal."""
     roads = network(name)
     with_signal = np.flatnonzero(roads.links["signal"] >= 0)
     return {int(k): SIGNAL_STATES[link_signal(roads.arrays, int(k), phase)] for k in with_signal}
@@ -89,14 +89,13 @@ def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(deadline=None, max_examples=25)
 @given(data=st.data(), random=st.randoms(use_true_random=False))
-def test_way_and_conflicts_equal_their_twins_whatever_the_order(
+def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
     name: str, data: st.DataObject, random: object
 ) -> None:
     rows = data.draw(traffic(name))
     rows["width"] = 2.0
-    # Vehicles stand at equal places, or mirrored about a third: their ranks must not hang on the
-    # last bit of a sum. Drawn numbers have no relation to one another; squares have (1 + 49 is
-    # twice 25).
+    # Vehicles may have equal or mirrored positions, so rounding of sums could decide their ranks.
+    # Random numbers avoid this; squares do not (1 + 49 is twice 25).
     nudge = np.random.default_rng(0).uniform(0.0, 1.0, (2, len(rows)))
     rows["x"], rows["y"] = rows["x"] + nudge[0], rows["y"] + nudge[1]
     phase = phases(name, random)
@@ -119,7 +118,7 @@ def test_way_and_conflicts_equal_their_twins_whatever_the_order(
 
 
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
-    """Cars at (s, d, speed) of the road behind the merge, on their way to its end."""
+    """Return cars at (s, d, speed) on the road behind the merge, whose goal is its end."""
     roads = network("merge")
     lane = roads.lane_ids.index("main_out_0")
     rows = np.concatenate([on_lane(roads, lane, s, d=d, speed=speed) for s, d, speed in cars])
@@ -129,13 +128,13 @@ def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
     return rows
 
 
-def test_the_one_that_is_hit_first_stands_first_and_the_nearest_in_space_may_not() -> None:
-    # Ahead by 30 m and standing; behind by 10 m and falling back.
+def test_vehicles_are_ordered_by_time_to_contact_and_not_by_distance() -> None:
+    # One car stands 30 m ahead; the other is 10 m behind and falls back.
     rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
     numbers = np.array(observed_conflicts("merge", rows, 0, np.zeros(0, np.int32))).reshape(-1, 9)
     assert numbers[0, 2] == pytest.approx(30.0 / 40.0)
     assert numbers[0, 4] == pytest.approx(-20.0 / 30.0)
-    assert numbers[0, :2] == pytest.approx([1.0, 2.0 / 3.5])  # it is hit within 1.5 s
+    assert numbers[0, :2] == pytest.approx([1.0, 2.0 / 3.5])  # the standing car is hit within 1.5 s
     assert numbers[1, 2] == pytest.approx(-10.0 / 20.0)
     assert not numbers[2:].any()
 
@@ -150,7 +149,7 @@ def test_the_plan_of_another_changes_nothing() -> None:
 
 
 def test_an_indicated_route_is_observed_over_one_junction_only() -> None:
-    """Of two cars that come to a junction, one changes its mind; of another, the one after."""
+    """A car changes its route over the next junction, or only over the junction after it."""
     roads, ways = network("grid4x4"), plans("grid4x4")
     phase = np.zeros(len(roads.arrays.signals), np.int32)
     num_lanes = len(roads.lanes)
@@ -184,11 +183,11 @@ def made(env: str = "grid4x4", **overrides: Any) -> Any:
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
-def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None:
+def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
     observations, infos = vec.reset()
-    assert place.stop == observations.shape[2], "it stands last"
+    assert place.stop == observations.shape[2], "the history is last"
     rng = np.random.default_rng(0)
     fresh = 0
     before = None
@@ -206,7 +205,7 @@ def test_history_is_what_was_observed_before_and_begins_with_the_first() -> None
         before = history
         actions = rng.uniform(-1.0, 1.0, (2, 6, 2)).astype(np.float32)
         observations, *_, infos = vec.step(actions)
-    assert fresh > 12, "nobody came later"
+    assert fresh > 12, "no agent entered later"
     vec.close()
 
 

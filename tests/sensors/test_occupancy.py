@@ -1,4 +1,4 @@
-"""The grid equals highway-env's, on its own roads."""
+"""The occupancy grid equals highway-env's on its own roads."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 
 def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
-    """Our grid (F, W, H) of row i."""
+    """Return the grid (F, W, H) of cavmarl for row i."""
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(**config))
     sensor = occupancy_grid_sensor.settings(settings, 0, network("ring"), highway.destinations(env))
     road = highway.roads(env)
@@ -58,7 +58,7 @@ def test_the_grid_is_highway_envs(name: str, seed: int, case: str) -> None:
     ours = layers(env, highway.vehicles(env), highway.own_row(env), **config)
     assert ours.shape == theirs.shape
     np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-7)
-    assert np.count_nonzero(theirs[0]) > 2, "nobody was near"
+    assert np.count_nonzero(theirs[0]) > 2, "no vehicle was near"
 
 
 def test_a_grid_turns_with_the_vehicle() -> None:
@@ -88,7 +88,7 @@ def test_a_cell_shows_the_smallest_id_and_no_other_level() -> None:
 
 
 @pytest.mark.parametrize("name", ["ring", "grid4x4", "merge"])
-def test_near_lanes_draw_what_all_lanes_draw(name: str) -> None:
+def test_near_lanes_suffice_for_the_grid(name: str) -> None:
     roads = network(name)
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(features=("on_road",)))
     rng = np.random.default_rng(0)

@@ -22,7 +22,7 @@ AZIMUTHS = (-0.5, 0.05, 21)
 def echoes(
     rows: NDArray[np.void], matrix: Floats, walls: NDArray[np.void] = NO_WALLS, row: int = 0
 ) -> NDArray[np.void]:
-    """TARGET, nearest first."""
+    """Return TARGET records, nearest first."""
     fan = make_fan(matrix, AZIMUTHS, np.zeros(1), 60.0)
     panorama, counts = look_around(rows, row, backdrop(walls), 65.0)
     hits = np.zeros((AZIMUTHS[2], 1), HIT)
@@ -47,7 +47,7 @@ def test_targets_equal_twin(
         )
         if large.what != small.what or abs(large.distance - small.distance) > 1e-3:
             unsure |= {large.what, small.what}
-        if large.what[0] == "wall":  # another one may stand in the same place
+        if large.what[0] == "wall":  # another body may be at the same place
             others = walls[walls["building"] != large.what[1]]
             other = naive.trace(rows, 0, others, matrix[:, 3], ray, 60.0)
             if other.distance - large.distance < 1e-3:
@@ -82,7 +82,7 @@ def test_a_wall_at_ten_metres_is_one_target() -> None:
 
 @pytest.mark.parametrize("azimuth", [-0.45, -0.2, 0.3, 0.5])
 def test_the_nearest_echo_may_come_from_any_ray(azimuth: float) -> None:
-    """Of a body that turns its corner to the sensor, wider than a ray on both sides."""
+    """The corner of a body points to the sensor; its sides are hit by several rays."""
     x, y = 20.0 * math.cos(azimuth), 20.0 * math.sin(azimuth)
     rows = vehicles(
         [(0.0, 0.0, 0.0), (x, y, azimuth + 0.25 * math.pi)], length=4.0, width=4.0, speed=[3.0, 7.0]
@@ -114,7 +114,7 @@ def test_radial_speeds_are_relative_and_positive_away() -> None:
 def test_a_turning_vehicle_moves_its_sensors(
     yaw_rate: float, x: float, y: float, normal: float
 ) -> None:
-    """The nearest place of a long wall lies along its normal."""
+    """The nearest point of a long wall is along its normal."""
     cos, sin = math.cos(normal), math.sin(normal)
     ends = [(30.0 * cos - side * sin, 30.0 * sin + side * cos) for side in (-90.0, 90.0)]
     wall = np.array([(*ends[0], *ends[1], 8.0, 0)], WALL)

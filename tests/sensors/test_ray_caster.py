@@ -21,7 +21,7 @@ LEVEL = np.zeros(1)
 def scan(
     rows: NDArray[np.void], fan: Fan, row: int = 0, walls: NDArray[np.void] = NO_WALLS
 ) -> NDArray[np.void]:
-    """HIT (A, E); `what` of bodies and walls is their own number and not the panorama's."""
+    """Return HIT (A, E); `what` of bodies and walls is their own number, not the panorama's."""
     panorama, counts = look_around(rows, row, backdrop(walls), fan.range_m + 3.0)
     hits = np.zeros(fan.rays.shape[:2], HIT)
     cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)
@@ -38,7 +38,7 @@ AZIMUTHS = st.sampled_from(
 
 
 @given(crowds(most=6), wall_sets(), mounts(), st.integers(1, 16))
-def test_columns_do_not_depend_on_which_are_cast_together(
+def test_rays_do_not_depend_on_which_are_cast_together(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, columns: int
 ) -> None:
     fan = make_fan(matrix, (0.3, math.pi / 8, 16), np.array([-0.2, 0.1]), 60.0)
@@ -52,7 +52,7 @@ def test_columns_do_not_depend_on_which_are_cast_together(
 
 
 def begins_on_a_wall(walls: NDArray[np.void], start: Floats) -> bool:
-    """Whether a place of the world is on a wall, its ends and its top included."""
+    """Return whether a point of the world is on a wall, including its ends and its top."""
     along = np.array([walls["bx"] - walls["ax"], walls["by"] - walls["ay"]])
     before = np.array([start[0] - walls["ax"], start[1] - walls["ay"]])
     share = ((along * before).sum(axis=0) / (along * along).sum(axis=0)).clip(0.0, 1.0)
@@ -61,7 +61,7 @@ def begins_on_a_wall(walls: NDArray[np.void], start: Floats) -> bool:
 
 
 def runs_within_a_wall(walls: NDArray[np.void], start: Floats, ray: Floats) -> bool:
-    """Whether a ray begins on the line of a wall and is parallel to it, within a micrometre a m."""
+    """Return whether a ray starts on a wall's line and is parallel to it, within 1 µm per m."""
     along = np.array([walls["bx"] - walls["ax"], walls["by"] - walls["ay"]])
     before = np.array([start[0] - walls["ax"], start[1] - walls["ay"]])
     least = 1e-6 * np.hypot(*along)
@@ -93,13 +93,13 @@ def test_rays_equal_twin(
     start = matrix[:, 3]
     axes = naive.turn(rows["heading"][0], 0.0, 0.0)
     place = axes @ start + np.array([rows["x"][0], rows["y"][0], 0.0])
-    # From there, a wall is 0 m away: rounding decides whether it is ahead of the ray or behind it.
+    # The wall is 0 m away, so rounding decides whether it is ahead of the ray or behind it.
     assume(not begins_on_a_wall(walls, place))
     for a, e in np.ndindex(*hits.shape):
         hit = hits[a, e]
         if runs_within_a_wall(walls, place, axes @ rays[a, e]):
-            continue  # rounding decides whether, and where, it meets that wall
-        # Rounding decides whether a ray that grazes a side meets it: sizes differ by a micrometre.
+            continue  # rounding decides whether and where the ray hits that wall
+        # Rounding decides whether a ray that grazes a side hits it, so sizes differ by 1 µm.
         nearer, further = (
             naive.trace(rows, 0, walls, start, rays[a, e], range_m, margin)
             for margin in (1e-6, -1e-6)
@@ -150,7 +150,7 @@ def test_a_sensor_that_looks_down_sees_the_ground() -> None:
     pitch = -math.radians(30.0)
     hits = scan(vehicles([(0.0, 0.0, 0.0)]), full_circle(mount((0, 0, 1.5), (0.0, pitch, 0.0))))
     assert hits["distance"][0, 0] == pytest.approx(3.0)
-    assert hits["distance"][4, 0] == 60.0  # backwards it looks up
+    assert hits["distance"][4, 0] == 60.0  # the backward rays look up
 
 
 def test_a_rolled_sensor_sees_the_ground_on_its_lower_side() -> None:
@@ -181,7 +181,7 @@ def test_nothing_slips_through_the_corner_of_a_building() -> None:
 def test_every_ray_that_can_meet_a_wall_is_tried(
     distance: float, direction: float, matrix: Floats
 ) -> None:
-    """A closed square around the vehicle is met by all level rays, wherever its corners are."""
+    """All level rays hit a closed square around the vehicle, for any position of its corners."""
     corners = [
         (distance * math.cos(direction + k * 0.5 * math.pi),
          distance * math.sin(direction + k * 0.5 * math.pi))

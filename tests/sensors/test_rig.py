@@ -1,4 +1,4 @@
-"""Mounted sensors in worlds: no division, worker or death of a host changes a sample."""
+"""Mounted sensors in worlds: samples do not depend on zones, workers or deaths of hosts."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RIG: dict[str, Any] = {
     "events": {"type": "collision", "dropout": 0.2},
 }
 WORLD = {**BUSY, "rig": RIG}
-# The rates of the ten sensors are not those of the long ticks here.
+# The rates of the ten sensors do not fit the long ticks of these tests.
 TEN: dict[str, Any] = {
     "rig": "ten_sensors",
     **dict.fromkeys((f"rig.{name}.rate_hz" for name in load_rig("ten_sensors")), 5),
@@ -42,7 +42,7 @@ TEN: dict[str, Any] = {
     [{"rig": RIG}, TEN, {"rig": RIG, "zones.repartition_steps": 5}],
     ids=["rig", "ten", "repartition"],
 )
-def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -> None:
+def test_samples_of_divided_worlds_equal_the_undivided_world(rig: dict[str, Any]) -> None:
     modes = {"observation.mode": "sensors", "observation.kind": "dict"}
     overrides = {**BUSY, **modes, **rig}
     found = verify_zones("grid4x4", (2, 4, 9), overrides=overrides, steps=30, seed=3)
@@ -53,7 +53,7 @@ def test_divided_worlds_sense_what_the_undivided_one_does(rig: dict[str, Any]) -
 
 
 def _drive(vec: CavVectorEnv, steps: int = 8) -> list[bytes]:
-    """All frames and hashes of some steps."""
+    """Return all frames and hashes of some steps."""
     vec.reset(seed=7)
     seen = []
     for _ in range(steps):
@@ -97,7 +97,7 @@ def test_a_reset_begins_with_the_samples_that_are_due_then() -> None:
     assert (frames["slow"].data[0] == 0.0).all()
 
 
-def test_worlds_that_go_on_elsewhere_keep_their_samples() -> None:
+def test_worlds_that_resume_elsewhere_keep_their_samples() -> None:
     world = load_world("grid4x4", overrides=WORLD)
     here, there = LocalWorlds(world, 2), LocalWorlds(world, 2)
     here.arrays.chosen[:] = True

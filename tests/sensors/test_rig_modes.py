@@ -1,4 +1,4 @@
-"""Observations made of what mounted sensors sense."""
+"""Observations that consist of samples of mounted sensors."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def _equal(one: Any, other: Any) -> bool:
 
 
 def _same(space: Any, seen: Any) -> bool:
-    """Whether observations have the shapes and dtypes of their space."""
+    """Return whether observations have the shapes and dtypes of their space."""
     if isinstance(seen, dict):
         return all(_same(space[name], array) for name, array in seen.items())
     return bool(seen.shape == space.shape and seen.dtype == space.dtype)

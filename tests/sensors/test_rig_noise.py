@@ -1,4 +1,4 @@
-"""Errors of sensors: their size, their independence, and that the same asker gets the same."""
+"""Errors of sensors: their size, their independence, and their repeatability."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CLEAN = {"type": "odometry", "rate_hz": 20}
 
 
 def _speeds(rig: dict[str, Any], seed: int = 0, steps: int = 40) -> dict[str, NDArray[np.float64]]:
-    """(steps, A, 3) samples of each sensor, of cars that are driven by the built-in driver."""
+    """Return (steps, A, 3) samples of each sensor, of cars that the built-in driver drives."""
     settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "respawn"}
     vec = make_vec("grid4x4", agents=24, background=0, overrides=settings)
     vec.reset(seed=seed)

@@ -1,4 +1,4 @@
-"""When sensors take samples, against a list of them; and in worlds, over a minute."""
+"""Times of samples, compared with a list, and in worlds over a minute."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ RATES = [Fraction(1), Fraction(1, 2), Fraction(1, 20), Fraction(5), Fraction(3, 
 
 @pytest.mark.parametrize("rate", RATES)
 @pytest.mark.parametrize("phase", [0, 1])
-def test_samples_are_due_as_they_stand_in_the_list(rate: Fraction, phase: int) -> None:
+def test_samples_are_due_at_the_listed_ticks(rate: Fraction, phase: int) -> None:
     phase = 0 if rate >= 1 else phase
     steps, slots = 4, -(-4 * rate.numerator // rate.denominator)
     schedule = SensorSchedule(rate.numerator, rate.denominator, phase, steps, slots)

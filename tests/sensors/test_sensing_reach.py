@@ -1,4 +1,4 @@
-"""Whoever is further away than the declared reach changes no observation and no term."""
+"""Vehicles beyond the declared reach change no observation and no reward term."""
 
 from __future__ import annotations
 
@@ -21,15 +21,15 @@ from tests.support.driving import drive, make_simulation, start
 from tests.support.world import tick_of
 
 TERMS_ALONE = "none but ego"
-MOST = 30  # vehicles of a crowd
-RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # of the largest ones
+MOST = 30  # number of vehicles of a crowd
+RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # half the diagonal of the largest vehicles
 EVERYWHERE = np.ones(1, dtype=np.bool_)
 
 OFF: dict[str, Any] = {
     "sensors.route.points": 0, "sensors.neighbors.count": 0, "sensors.signal.enabled": False,
     "sensors.lanes.range_m": 0.0, "sensors.lidar.rays": 0,
 }  # fmt: skip
-# What switches each sensor on. Reaches that can be set are larger than that of the terms.
+# Settings that switch each sensor on, with reaches above that of the terms.
 ON: dict[str, dict[str, Any]] = {
     TERMS_ALONE: {},
     "route": {"sensors.route.points": 8},
@@ -55,14 +55,14 @@ ON: dict[str, dict[str, Any]] = {
     "conflicts": {"sensors.conflicts.count": 6, "sensors.conflicts.range_m": 70.0},
     "history": {"sensors.history.steps": 2},
 }
-BLIND = {"route", "signal", "way", "history"}  # look at no vehicle
-# Shows an inbox, which one bus fills for all zones, however far away senders are (tests/v2x).
+BLIND = {"route", "signal", "way", "history"}  # these sensors observe no vehicle
+# It observes an inbox, which one bus fills for all zones at any distance (see tests/v2x).
 TOLD = {"messages"}
 
 
 @cache
 def world(env: str, sensor: str) -> Simulation:
-    """A world whose agents have one sensor beside `ego`, one step old."""
+    """Return a world after one step, whose agents have one sensor beside `ego`."""
     overrides = {**OFF, **ON[sensor]}
     simulation = make_simulation(env, mode="closed", agents=1, background=MOST, overrides=overrides)
     start(simulation, seed=4)
@@ -72,7 +72,7 @@ def world(env: str, sensor: str) -> Simulation:
 
 @cache
 def places(env: str) -> NDArray[np.float64]:
-    """(N, 5) lane, s, x, y and heading all along the lanes."""
+    """Return (N, 5) lane, s, x, y and heading of positions on all lanes."""
     network = world(env, TERMS_ALONE).network
     found = []
     for lane in range(len(network.lanes)):
@@ -98,7 +98,7 @@ def far_from(rows: NDArray[np.void], agent: NDArray[np.void]) -> NDArray[np.floa
 
 
 def put(env: str, where: NDArray[np.int64], rng: np.random.Generator) -> NDArray[np.void]:
-    """VEHICLE (n,) cars at rows of `places`, some of them headed anywhere."""
+    """Return VEHICLE (n,) cars at rows of `places`, some with random headings."""
     rows = np.repeat(blank_vehicle(), where.size)
     rows["id"] = 1000 + rng.permutation(where.size)
     for name, column in zip(("lane", "s", "x", "y", "heading"), places(env)[where].T, strict=True):
@@ -111,7 +111,7 @@ def put(env: str, where: NDArray[np.int64], rng: np.random.Generator) -> NDArray
 
 
 def sensed(simulation: Simulation, rows: NDArray[np.void]) -> tuple[bytes, bytes]:
-    """The agent's observation and terms among these vehicles."""
+    """Return the agent's observation and terms among these vehicles."""
     worlds = simulation.worlds
     worlds.rows[0, : rows.size] = rows
     worlds.num_owned[0] = worlds.num_rows[0] = rows.size
@@ -146,7 +146,7 @@ def test_a_crowd_beyond_the_reach_changes_nothing(env: str, sensor: str, seed: i
 
 
 @pytest.mark.parametrize("sensor", sorted(set(ON) - BLIND))
-def test_the_reach_is_no_longer_than_it_has_to_be(sensor: str) -> None:
+def test_the_reach_is_not_too_long(sensor: str) -> None:
     env = "grid4x4"
     simulation = world(env, sensor)
     agent = agent_of(simulation)
@@ -160,7 +160,7 @@ def test_the_reach_is_no_longer_than_it_has_to_be(sensor: str) -> None:
     distance = np.hypot(*(places(env)[:, 2:4] - [agent["x"][0], agent["y"][0]]).T)
     rng = np.random.default_rng(0)
     others = put(env, np.flatnonzero(np.abs(distance - reach_m) < 1.0), rng)
-    # Half of them come straight at the agent, which stands.
+    # Half of the vehicles drive straight towards the agent, which stands.
     agent["speed"] = 0.0
     towards = np.arctan2(agent["y"] - others["y"], agent["x"] - others["x"])
     others["heading"][::2] = towards[::2]

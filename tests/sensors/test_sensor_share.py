@@ -1,4 +1,4 @@
-"""Rows for sensor workers: each once, agents first, and first of them those of one's share."""
+"""Rows for sensor workers: each once; first the agents of the worker's share, then other agents."""
 
 from __future__ import annotations
 

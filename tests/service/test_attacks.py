@@ -57,7 +57,7 @@ def title_of(answer: httpx.Response) -> str:
 
 
 def change(path: Path, statement: str, **values: Any) -> None:
-    """Change a store as another program could."""
+    """Change a store as another program could do."""
     engine = create_engine(f"sqlite:///{path}")
     with engine.begin() as connection:
         connection.execute(text(statement), values)
@@ -142,7 +142,7 @@ def test_a_state_that_cannot_be_used_ends_its_session_alone(service: LoopbackSer
 
 
 def test_a_changed_state_is_damaged_or_usable() -> None:
-    """A node signs nothing; another node's state may be any bytes."""
+    """Nodes do not sign states, so a state from another node may be any bytes."""
     document = {**WORLD, "max_cycles": None, "num_envs": 2, "seed": 0, "overrides": {}}
     world = SessionWorld(document, None, 0, {})
     world.command("reset", 1, 0, b"", False)
@@ -182,7 +182,7 @@ def test_the_signature_of_a_state_opens_no_session(service: LoopbackService) -> 
 
 @pytest.mark.parametrize("how", ["state", "result", "closed", "forgotten"])
 def test_shared_content_is_kept_for_its_other_users(fleet: Fleet, how: str) -> None:
-    """A node stores the bytes of a configuration, and then lets its reference to them end."""
+    """A node stores the bytes of a configuration, and then its reference to them ends."""
     found = add_configuration(fleet.log, fleet.client, ConfigurationBody(environment="merge"))
     fleet.log.flush()
     content = fleet.log.content(found["hash"])
@@ -325,7 +325,7 @@ def test_no_flood_from_an_address_locks_an_identity_out(tmp_path: Path) -> None:
         assert service.ask("", "POST", "/token", json=again).status_code == 200
 
 
-def test_an_identity_exchanges_its_secret_at_a_rate_of_its_own(tmp_path: Path) -> None:
+def test_each_identity_has_a_rate_for_exchanging_its_secret(tmp_path: Path) -> None:
     with loopback_service(tmp_path / "store.sqlite", rate_hz=5.0) as service:
         for _ in range(30):
             last = service.ask("", "POST", "/token", json={"secret": service.secrets["viewer"]})
@@ -333,7 +333,7 @@ def test_an_identity_exchanges_its_secret_at_a_rate_of_its_own(tmp_path: Path) -
         assert service.ask("client", "GET", "/nodes").status_code == 200
 
 
-def test_unknown_keys_make_a_node_ask_once_a_second_at_most(service: LoopbackService) -> None:
+def test_unknown_keys_make_a_node_ask_at_most_once_per_second(service: LoopbackService) -> None:
     opened = open_session(service)
     url = f"{service.nodes['a'][1]}/v1/worlds/{opened['session']}/hash"
     assert open_on_node(service, opened).status_code == 200
@@ -359,7 +359,7 @@ def test_a_node_forgets_keys_that_the_service_has_replaced(
     service.run(link.public_key(old, 0.0))
     for _ in range(2):
         service.ask("admin", "POST", "/keys")
-    service.run(link.public_key(old))  # until the next look
+    service.run(link.public_key(old))  # until the next look-up of keys
     monkeypatch.setattr("cavmarl.service.node_link.KEYS_KEPT_S", 0.0)
     with pytest.raises(KeyError):
         service.run(link.public_key(old))
@@ -374,8 +374,8 @@ def test_a_new_key_signs_states_at_once(service: LoopbackService) -> None:
         assert service.run(link.saved_state(opened["session"])) == (b"state", 1)
 
 
-def test_a_node_says_so_if_it_cannot_ask_for_keys() -> None:
-    """The client then resolves the session again, until the service is back."""
+def test_a_node_reports_that_it_cannot_ask_for_keys() -> None:
+    """The client then asks the service for the session again, until the service is back."""
     body = {"name": "a", "address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
     link = NodeLink("http://127.0.0.1:1", "x", body)
     token = jwt.encode({"sub": "x"}, "k" * 32, "HS256", headers={"kid": "key-00000000"})
@@ -408,7 +408,7 @@ def make_store(tmp_path: Path) -> Path:
 
 
 def recompute(path: Path) -> None:
-    """Let all digests of a store follow from each other again."""
+    """Recompute all digests of a store, so that they are consistent."""
     store = EventStore(path)
     lines, last = list(store.read()), ""
     store.close()
@@ -460,7 +460,7 @@ def test_changed_content_is_not_read(tmp_path: Path, statement: str) -> None:
 # The store's file
 
 
-def test_a_store_has_one_service_by_whatever_name(tmp_path: Path) -> None:
+def test_a_store_has_one_service_also_through_links(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     store = EventStore(path)
     (tmp_path / "soft.sqlite").symlink_to(path)
@@ -472,7 +472,7 @@ def test_a_store_has_one_service_by_whatever_name(tmp_path: Path) -> None:
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(tmp_path / "hard.sqlite")
     store.close()
-    with pytest.raises(ServiceError, match="has 2 names"):  # SQLite's own log has only one
+    with pytest.raises(ServiceError, match="has 2 names"):  # SQLite's own log has only one name
         EventStore(tmp_path / "hard.sqlite")
     (tmp_path / "hard.sqlite").unlink()
     EventStore(tmp_path / "soft.sqlite").close()
@@ -517,7 +517,7 @@ def test_answers_name_no_path_of_the_installation(
 
 
 def drive(flow: Flow[Any], *answers: dict[str, Any]) -> None:
-    """Answer the requests of a flow as a server that is no service could."""
+    """Answer the requests of a flow as a server that is not the service could."""
     said: Any = None
     for answer in answers:
         assert isinstance(flow.send(said), Ask)

@@ -1,4 +1,4 @@
-"""Nodes come and go, and sessions follow them; time is the test's."""
+"""Nodes join and leave, and sessions move; the test sets the time."""
 
 from __future__ import annotations
 
@@ -95,19 +95,19 @@ def test_the_steps_of_a_job_are_those_of_all_its_runs_and_drivers(
 
 def test_a_state_that_is_too_old_is_not_relied_upon(fleet: Fleet) -> None:
     fleet.join("a")
-    fleet.now_s += 3.5  # nothing has swept yet
+    fleet.now_s += 3.5  # no sweep has run yet
     assert reasons(fleet) == {"a": "stale"}
-    fleet.register("b")  # and has told no load
+    fleet.register("b")  # and has reported no load
     assert reasons(fleet) == {"a": "stale", "b": "stale"}
 
 
-def test_fifty_requests_at_once_over_five_equal_nodes_give_ten_each(fleet: Fleet) -> None:
+def test_fifty_requests_over_five_equal_nodes_give_ten_to_each(fleet: Fleet) -> None:
     fleet.join(*"abcde", slots=16)
     found = Counter(fleet.open().node for _ in range(50))
     assert found == dict.fromkeys("abcde", 10)
 
 
-def test_a_node_with_a_little_less_load_is_not_stampeded(fleet: Fleet) -> None:
+def test_a_node_with_slightly_less_load_does_not_get_all_sessions(fleet: Fleet) -> None:
     fleet.join("a", "b", slots=16)
     fleet.beat("b", cpu=0.05)
     found = Counter(fleet.open().node for _ in range(20))
@@ -189,7 +189,7 @@ def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
     assert reasons(fleet) == {"full": "capacity", "plain": "capacity", "others": "access"}
 
 
-def test_the_paper_s_redirect(fleet: Fleet) -> None:
+def test_the_redirect_of_the_paper(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     fleet.beat("b", cpu=0.12)
     kept = fleet.open(preferred="b")
@@ -299,7 +299,7 @@ def test_unused_sessions_end_and_are_forgotten(fleet: Fleet) -> None:
     assert fleet.log.store.blob(blob) is None
 
 
-def test_an_identity_has_so_many_sessions_at_most(tmp_path: Path) -> None:
+def test_the_number_of_sessions_of_an_identity_is_limited(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "other.sqlite", max_sessions=2)
     fleet.join("a")
     first = fleet.open()
@@ -329,7 +329,7 @@ def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> Non
     fleet.log.store = again.store
 
 
-def test_what_has_taken_too_long_is_a_timeout_on_record(fleet: Fleet) -> None:
+def test_a_timeout_is_recorded(fleet: Fleet) -> None:
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1}, wait_s=30.0)
     fleet.now_s += 29.0
     fleet.broker.sweep()
@@ -352,7 +352,7 @@ def test_what_has_taken_too_long_is_a_timeout_on_record(fleet: Fleet) -> None:
     ]
 
 
-def test_a_job_that_a_node_had_waits_on_when_that_is_lost(fleet: Fleet) -> None:
+def test_a_job_of_a_lost_node_waits_again(fleet: Fleet) -> None:
     fleet.join("a")
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1}, wait_s=5.0)
     fleet.now_s += 60.0
@@ -406,7 +406,7 @@ def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fle
     assert asked <= 1100  # a hundred a second
 
 
-def test_a_pass_that_stopped_goes_round_to_the_jobs_before(fleet: Fleet) -> None:
+def test_the_next_pass_continues_with_the_jobs_that_were_not_tried(fleet: Fleet) -> None:
     job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
     early = fleet.open(job=job, needs=["x"])
     for k in range(60):
@@ -448,7 +448,7 @@ def test_nodes_that_are_gone_for_a_day_are_forgotten(fleet: Fleet) -> None:
     fleet.broker.sweep()
     assert [*fleet.log.state.nodes] == [*fleet.broker.live] == ["a"]
     assert "b" not in session.members
-    fleet.join("b", "c")  # ties are broken by the order of coming
+    fleet.join("b", "c")  # ties are broken by the order of registration
     numbers = [live.number for live in fleet.broker.live.values()]
     assert numbers == sorted(set(numbers))
 

@@ -1,6 +1,6 @@
-"""What the store promises, on SQLite and on a real PostgreSQL.
+"""Guarantees of the event store, on SQLite and on a real PostgreSQL.
 
-A real service is killed in each run: no cheaper test shows what outlives that.
+A real service is killed in each run of the tests, since no cheaper test shows which data survive.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def postgresql() -> Iterator[str]:
 
 @pytest.fixture
 def empty_postgresql(postgresql: str) -> str:
-    """The same server, and a database of this test alone."""
+    """Return a new database on the same server."""
     name = f"d{uuid.uuid4().hex}"
     engine = create_engine(postgresql.replace("postgresql:", "postgresql+psycopg:"))
     with engine.connect().execution_options(isolation_level="AUTOCOMMIT") as connection:
@@ -43,7 +43,7 @@ def empty_postgresql(postgresql: str) -> str:
 
 
 def history(where: str | Path) -> tuple[list[str], EventLog]:
-    """The kinds of events of one day at a service, and its log."""
+    """Return the kinds of events of one day at a service, and its log."""
     fleet = Fleet(where)
     fleet.join("a", "b")
     session = fleet.open(preferred="b")
@@ -74,7 +74,7 @@ def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Pat
     assert kinds == expected
 
 
-def test_a_store_is_one_service_s(tmp_path: Path) -> None:
+def test_a_store_has_only_one_service(tmp_path: Path) -> None:
     store = EventStore(tmp_path / "store.sqlite")
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(tmp_path / "store.sqlite")
@@ -158,7 +158,7 @@ def test_what_was_acknowledged_outlives_a_kill(
         service.kill()  # with requests under way
         for one in askers:
             one.join()
-        service.start_again()  # which shows no secret: there is an admin
+        service.start_again()  # prints no secret, because an admin exists
         with service.client() as client:
             known = {one["id"] for one in client.get("/identities")["identities"]}
     assert len(acknowledged) >= 20

@@ -1,4 +1,4 @@
-"""A command that a page holds is asked for again until it is answered; no process is started."""
+"""While a page pauses a session, its client repeats the command until it is answered."""
 
 from __future__ import annotations
 
@@ -11,7 +11,9 @@ from cavmarl.client.service_protocol import Ask, Rest, ServiceFlows
 from cavmarl.client.world_protocol import WorldFlows
 
 
-def test_while_a_page_has_paused_commands_are_asked_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_commands_are_repeated_while_a_page_has_paused_the_session(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("cavmarl.client.world_protocol.AGAIN_S", 0.0)
     paused = {"title": "paused", "detail": "a page has paused the session"}
     lease = {

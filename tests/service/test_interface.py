@@ -1,7 +1,7 @@
-"""The document of the interface is true of all kinds of requests, which Schemathesis makes of it.
+"""The document of the interface is correct for all kinds of requests; Schemathesis makes them.
 
-Answers have the status, the type and the fields that the document shows; what the document does not
-allow is refused; nothing is a fault of the service.
+Answers have the status, type and fields of the document. Requests that the document does not allow
+are refused. No request causes an internal error.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ OPERATIONS = sorted(RULES.keys() - {ENDLESS})
 
 
 class Served:
-    """A service in this process, with a node, a session and a job, and what its document says."""
+    """A service in this process with a node, a session and a job, and its document."""
 
     def __init__(self, store: Path) -> None:
         self.fleet = Fleet(store, max_nodes=50, max_sessions=20)
@@ -52,7 +52,7 @@ class Served:
         self.operations = {one.ok().label: one.ok() for one in document.get_all_operations()}
 
     def known(self) -> dict[str, str]:
-        """What paths can name; there is always a node and a session again."""
+        """Return values for the parameters of paths, after creating node and session again."""
         fleet = self.fleet
         fleet.join("a", slots=1000)
         for one in list(fleet.log.state.sessions.values()):
@@ -79,7 +79,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def plain(value: Any) -> Any:
-    """As JSON's whole numbers are written: 3 and not 3.0, which is refused."""
+    """Write whole numbers as 3, because 3.0 is refused."""
     if isinstance(value, dict):
         return {key: plain(one) for key, one in value.items()}
     if isinstance(value, list):
@@ -127,7 +127,7 @@ def test_answers_are_as_the_document_says(served: Served, name: str) -> None:
 
 
 def can_be_wrong(name: str) -> bool:
-    """Not where nothing is sent, or content that may be anything."""
+    """Return whether a request can be invalid: it has parameters, or content with a schema."""
     method, path = name.split()
     if method == "PUT" and path.endswith(("/state", "/results/{name}")):
         return False
@@ -140,7 +140,7 @@ def test_what_the_document_does_not_allow_is_refused(served: Served, name: str) 
 
 
 def test_each_answer_has_its_fields_in_the_document(served: Served) -> None:
-    """A client can be written from it alone."""
+    """A client can be written from the document alone."""
     for name, operation in served.operations.items():
         for status, answer in operation.definition.raw["responses"].items():
             for kind, content in answer.get("content", {}).items():

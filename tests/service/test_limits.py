@@ -1,4 +1,4 @@
-"""What a service takes from one caller: sizes, times, rates and numbers."""
+"""Limits of a service for each caller: sizes, times, rates and numbers."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_only_content_of_nodes_may_be_larger(
     assert httpx.post(f"{service.url}/v1/token", json=secret).status_code == 413
 
 
-def test_an_identity_has_so_many_streams_at_most(service: RunningService) -> None:
+def test_the_number_of_streams_of_an_identity_is_limited(service: RunningService) -> None:
     secret = service.grant("listener", "viewer")
     token = token_of(service, secret).json()["access_token"]
     place = urlsplit(service.url)
@@ -76,7 +76,7 @@ def test_an_identity_has_so_many_streams_at_most(service: RunningService) -> Non
     with service.client() as admin:
         while ask(service, token, "GET", "/nodes").status_code != 200:
             time.sleep(0.1)
-        for k in range(100):  # those that have gone are noticed when there is something to tell
+        for k in range(100):  # closed streams are noticed at the next event
             admin.post("/identities", {"name": f"heard-{k}", "role": "viewer"})
             with httpx.stream(
                 "GET", f"{service.url}/v1/events/stream",
@@ -110,7 +110,7 @@ def test_vehicles_that_pages_may_insert_need_room_in_a_node_too(tmp_path: Path) 
     fleet.close()
 
 
-def test_an_identity_has_so_many_configurations_at_most(tmp_path: Path) -> None:
+def test_the_number_of_configurations_of_an_identity_is_limited(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "store.sqlite")
     fleet.log.state.configurations_of[fleet.client.id] = MOST_CONFIGURATIONS - 1
     for agents, refused in ((3, False), (3, False), (4, True)):
@@ -148,14 +148,14 @@ def test_a_long_head_ends_the_connection(service: RunningService) -> None:
     assert httpx.get(f"{service.url}/v1/health").status_code == 200
 
 
-@pytest.mark.slow  # it waits for as long as a body may take
+@pytest.mark.slow  # it waits as long as a body may take
 def test_slow_heads_and_bodies_are_given_up(service: RunningService) -> None:
     token = token_of(service, service.secret).json()["access_token"]
     place = urlsplit(service.url)
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(b"GET /v1/health HTTP/1.1\r\nX-Slow: ")
         line.settimeout(20.0)
-        assert line.recv(4096) == b""  # nor is a head that does not end
+        assert line.recv(4096) == b""  # also for a head that does not end
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(
             b"POST /v1/configurations HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"

@@ -1,4 +1,4 @@
-"""Owners of vehicles and members of sessions follow from the log; time is the test's."""
+"""Owners of vehicles and members of sessions are restored from the log; the test sets the time."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_the_newest_owners_are_kept(fleet: Fleet) -> None:
     assert [*session.owners["0"].zones] == [*range(5, KEPT_OWNERS + 5)]
 
 
-def test_members_are_replaced_and_called_to_their_leader_s_door(fleet: Fleet) -> None:
+def test_lost_members_are_replaced_and_get_the_address_of_their_leader(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     session = fleet.open(preferred="a", zone_nodes=2)
     assert session.node == "a"

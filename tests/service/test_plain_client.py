@@ -1,4 +1,4 @@
-"""A client that knows the documents of the interfaces and nothing of cavmarl's own client."""
+"""A client that uses the documents of the interfaces, and not cavmarl's own client."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WORLD = {"environment": "ring", "agents": 2, "background": 2, "seed": 0}
 
 
 class Document:
-    """Requests by the summaries of an OpenAPI document."""
+    """Send requests by the summaries of an OpenAPI document."""
 
     def __init__(self, base: str) -> None:
         self.base = base

@@ -1,4 +1,4 @@
-"""Requests that are almost right: no fault, no traceback, no wait, no path of the installation."""
+"""Almost valid requests cause no internal error, traceback or wait, and show no local path."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WORLD = {"environment": "ring", "agents": 1, "background": 1}
 
 
 def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
-    """Give the fuzz tokens and ids that are valid, whatever the last requests have ended."""
+    """Renew the tokens and ids of the fuzz, which earlier requests may have invalidated."""
     link = service.nodes["a"][0]
     state = service.events.state
     for role in ROLES:
@@ -54,7 +54,7 @@ def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
     bearer = {"Authorization": f"Bearer {opened[0]['token']}"}
     world = f"{service.nodes['a'][1]}/v1/worlds/{opened[0]['session']}"
     for command in ("", "/reset?number=1&seed=0"):
-        until_s = time.monotonic() + 20.0  # the node learns of new keys and of its resumption
+        until_s = time.monotonic() + 20.0  # the node gets new keys, and resumes
         while (answer := service.http.post(world + command, headers=bearer)).status_code != 200:
             assert time.monotonic() < until_s, answer.text
             time.sleep(0.05)
@@ -108,13 +108,13 @@ def run_fuzz(store: Path, count: int, seed: int) -> Counter[int]:
     return found
 
 
-def test_requests_that_are_almost_right_are_refused(tmp_path: Path) -> None:
+def test_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     found = run_fuzz(tmp_path / "store.sqlite", 2500, seed=1)
     assert min(found[status] for status in (200, 401, 404, 405, 422)) >= 10
 
 
 @pytest.mark.slow  # the same for more requests
-def test_many_requests_that_are_almost_right_are_refused(tmp_path: Path) -> None:
+def test_many_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     found = run_fuzz(tmp_path / "store.sqlite", 25_000, seed=2)
     print(f"answers by status, 0 for a closed connection: {dict(sorted(found.items()))}")
     assert min(found[status] for status in (200, 401, 403, 404, 405, 409, 413, 422)) >= 20

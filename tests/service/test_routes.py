@@ -1,4 +1,4 @@
-"""The interface over a real socket: who may do what, what is refused and how."""
+"""The interface over a real socket: permissions, and errors of refused requests."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ ALL = {*ROLES}
 READERS = ALL - {"node"}
 WATCHERS = {"viewer", "operator", "admin"}
 CLIENTS = {"client", "operator", "admin"}
-OPEN = None  # no token is asked for
+OPEN = None  # no token is needed
 
-# Each route has a row here: one that has none fails.
+# Each route has a row here; the test fails for a route without a row.
 MATRIX: dict[str, set[str] | None] = {
     "GET /v1/health": OPEN,
     "GET /v1/keys": OPEN,
@@ -122,7 +122,7 @@ def test_a_role_may_do_what_the_matrix_says(
     refused = set()
     for role in ROLES:
         if name in ("DELETE /v1/token", "GET /v1/events/stream") and role in (allowed or ()):
-            continue  # it would end what other tests use; it would not end
+            continue  # would close sessions of other tests; would not end
         answer = ask(service, tokens[role], method, path)
         assert answer.status_code != 401
         refused |= {role} if answer.status_code == 403 else set()
@@ -280,7 +280,7 @@ def test_a_refresh_token_is_good_once(service: RunningService) -> None:
     assert ask(service, second, "GET", "/nodes").status_code == 200
     again = httpx.post(f"{service.url}/v1/token", json=body)
     assert problem_of(again) == "bad-token"
-    for stolen in (first, second):  # all of that identity are void
+    for stolen in (first, second):  # all tokens of the identity are invalid
         assert ask(service, stolen, "GET", "/nodes").status_code == 401
     assert token_of(service, secret).status_code == 200
 
@@ -339,7 +339,7 @@ def test_the_document_of_the_interface_has_each_route(service: RunningService) -
     assert found == set(MATRIX)
 
 
-def test_events_are_streamed_and_go_on_where_one_ended(service: RunningService) -> None:
+def test_streams_of_events_resume_after_an_event(service: RunningService) -> None:
     with service.client() as client:
         last = client.get("/health")["events"]
         following = client.follow(after=last - 1)
@@ -349,7 +349,7 @@ def test_events_are_streamed_and_go_on_where_one_ended(service: RunningService) 
         assert (found["kind"], found["data"]["name"]) == ("identity.added", "seen")
 
 
-def test_a_client_s_page_of_events_is_full_of_its_own(service: RunningService) -> None:
+def test_a_page_of_events_is_filled_with_events_of_the_client(service: RunningService) -> None:
     secret = service.grant("quiet", "client")
     with service.client() as admin, service.client(secret) as quiet:
         after = admin.get("/health")["events"]

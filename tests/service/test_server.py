@@ -1,4 +1,4 @@
-"""Starting a service: quickly, on this machine alone unless there is TLS."""
+"""Starting a service: quickly, and only for this machine unless TLS is used."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
 
 
 def test_it_starts_within_two_seconds(tmp_path: Path) -> None:
-    """Of the processor: others use this machine, too."""
+    """The limit is for processor time, since other programs use this machine."""
     with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
         assert sum(psutil.Process(service.process.pid).cpu_times()[:2]) < 2.0
@@ -72,7 +72,7 @@ def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
 
 
 def test_the_service_has_no_client_of_its_own() -> None:
-    """It calls no address that it was told: only nodes and clients import what could."""
+    """A service never calls an address of a request: only nodes and clients import HTTP clients."""
     for path in (ROOT / "cavmarl" / "service").glob("*.py"):
         text = path.read_text(encoding="utf-8")
         calls = re.search(
@@ -82,7 +82,7 @@ def test_the_service_has_no_client_of_its_own() -> None:
 
 
 def make_certificate(folder: Path) -> tuple[Path, Path]:
-    """A certificate for 127.0.0.1 that has signed itself."""
+    """Create a self-signed certificate for 127.0.0.1."""
     key = ec.generate_private_key(ec.SECP256R1())
     name = x509.Name([x509.NameAttribute(x509.NameOID.COMMON_NAME, "cavmarl")])
     now = datetime.datetime.now(datetime.UTC)

@@ -1,6 +1,7 @@
-"""`docs/guides/service.md` is true: its session runs, its tests exist, its containers can run.
+"""`docs/guides/service.md`: its commands run, its tests exist, and its containers can run.
 
-The session is in each run, though it starts a service and two nodes: it is what readers try first.
+The commands are tested in each run, although they start a service and two nodes, because readers
+try them first.
 """
 
 from __future__ import annotations
@@ -60,7 +61,7 @@ def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [json.loads(line)["kind"] for line in told][:2] == ["session.opened", "session.assigned"]
 
 
-@pytest.mark.slow  # test_sessions.py says the same of smaller worlds
+@pytest.mark.slow  # test_sessions.py tests the same with smaller worlds
 def test_the_page_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)
@@ -106,7 +107,7 @@ def test_the_containers_run_existing_commands() -> None:
 
 
 def parse(words: list[str]) -> None:
-    """Let the command line read a command; wrong names and values raise."""
+    """Parse a command; wrong names and values raise an error."""
     group = typer.main.get_command(app)
     assert isinstance(group, click.Group) or hasattr(group, "get_command")
     context = group.make_context("cavmarl", list(words), resilient_parsing=False)

@@ -1,7 +1,7 @@
 """Worlds and evaluations on nodes in processes of their own; nodes and the service are killed.
 
-Three nodes serve all tests; what they cost is counted at the last one. It is in each run, since no
-cheaper test shows that sessions outlive their nodes.
+Three nodes serve all tests; their processor time counts for the last test. It is part of each run,
+since no cheaper test shows that sessions outlive their nodes.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ def open_world(client: Client, node: str | None = None) -> RemoteWorld:
 
 
 def assert_same(remote: RemoteWorld, local: cavmarl.CavVectorEnv, steps: range) -> None:
-    """Both worlds give the same bytes for the same actions."""
+    """Check that both worlds give the same bytes for the same actions."""
     for step in steps:
         actions = local.suggest_actions()
         ours, theirs = remote.step(actions), local.step(actions)
@@ -82,7 +82,7 @@ def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
     cluster.processes["victim"].kill()
     assert_same(remote, local, range(60, 75))
     assert remote.flows.moves == 1
-    events = client.get("/events", limit=1000)["events"]  # of this client alone
+    events = client.get("/events", limit=1000)["events"]  # only events of this client
     kinds = [one["kind"] for one in events]
     assert kinds == [
         "configuration.added", "session.opened", "session.assigned", "session.saved",
@@ -102,11 +102,11 @@ def test_a_session_moves_from_a_drained_node(cluster: Cluster, client: Client) -
         admin.post(f"/nodes/{place}/drain")
         while remote.flows.assignment["assigned"] == place:
             assert_same(remote, local, range(1))
-        assert remote.flows.moves >= 1  # on a busy machine another node may be late with its beats
+        assert remote.flows.moves >= 1  # other nodes may be slow
     remote.close()
 
 
-def test_another_client_takes_a_session_up(cluster: Cluster, client: Client) -> None:
+def test_another_client_resumes_a_session(cluster: Cluster, client: Client) -> None:
     remote, local = open_world(client), make_local()
     remote.reset(seed=2)
     local.reset(seed=2)
@@ -201,7 +201,7 @@ def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None
             local.reset(seed=8)
             assert_same(remote, local, range(40))
             service.kill()
-            assert_same(remote, local, range(40, 60))  # without a service, while the lease lasts
+            assert_same(remote, local, range(40, 60))  # the lease still holds
             service.start_again(*options)
             assert_same(remote, local, range(60, 90))
             nodes.processes[remote.flows.assignment["assigned"]].kill()
@@ -241,7 +241,7 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
                 message = page.recv(timeout=10)
                 told_of = json.loads(message) if isinstance(message, str) else {}
                 rows = told_of.get("rows", rows)
-                if len(rows) > 1 and rows[-1]["score"] is not None:  # None while its beat is late
+                if len(rows) > 1 and rows[-1]["score"] is not None:  # None: late heartbeat
                     break
             assert "node of the service" in rows[-1]["name"]
             assert rows[-1]["score"] is not None
@@ -262,9 +262,7 @@ def heard(page: Any, kind: str) -> None:
     raise AssertionError(kind)
 
 
-def test_what_a_page_changes_is_in_the_session_that_goes_on_elsewhere(
-    cluster: Cluster, client: Client
-) -> None:
+def test_changes_by_a_page_remain_when_the_session_moves(cluster: Cluster, client: Client) -> None:
     keys: dict[str, Any] = {"agents": AGENTS, "background": 8}
     keys["overrides"] = {"population.insertions": 4}
     cluster.start("controlled")

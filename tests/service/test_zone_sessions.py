@@ -68,7 +68,7 @@ def test_zones_are_at_nodes_that_are_killed(cluster: Cluster, client: Client) ->
 def assert_told(
     client: Client, session: str, remote: RemoteWorld, local: cavmarl.CavVectorEnv
 ) -> None:
-    """The service tells the owners of vehicles that have changed their zone."""
+    """Check that the service reports the owners of vehicles that have changed their zone."""
     rows = local.simulation.transfers[0].rows
     last = {row.vehicle: {"zone": row.target, "epoch": row.epoch} for row in rows}
     assert last

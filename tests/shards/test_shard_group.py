@@ -1,4 +1,4 @@
-"""Shards do the same whichever of them are called together."""
+"""The results of shards do not depend on the groups in which they are called."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Parting = Callable[[Sequence[Shard]], list[Sequence[Shard]]]
 
 
 class Groups(PhaseExecutor):
-    """Several groups, called one after the other, as those of several processes are."""
+    """Several groups of shards, called one after the other like those of several processes."""
 
     def __init__(self, parts: Sequence[Sequence[Shard]]) -> None:
         self._groups = [ShardGroup(part) for part in parts]
@@ -43,7 +43,7 @@ def divided(**overrides: Any) -> Simulation:
 
 
 def all_rows(simulation: Simulation) -> bytes:
-    """Every row of every zone as it lies, and the counts."""
+    """Return the bytes of all rows of all zones, and the counts."""
     zoned = simulation.division.zoned
     numbers = (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_contacts)
     rows = [
@@ -71,7 +71,7 @@ def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
         assert all_rows(together) == all_rows(apart), f"step {step}"
         assert together.state_hash(1) == apart.state_hash(1)
     assert together.migrations > 10
-    assert together.traffic_stats().departed > 64, "nobody has left and been followed"
+    assert together.traffic_stats().departed > 64, "no vehicle has left and been replaced"
 
 
 def test_a_shard_is_stepped_alone() -> None:

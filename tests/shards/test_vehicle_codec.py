@@ -1,4 +1,4 @@
-"""A vehicle's state as bytes: who is carried over goes on bit for bit, the rest is refused."""
+"""A vehicle's state as bytes: transferred vehicles continue exactly; wrong bytes are refused."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def lifted(shape: re.Match[str]) -> str:
 
 @pytest.fixture(scope="module")
 def hilly(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
-    """The roads of `merge`, climbing 4 % to the east, and a demand of cars, buses and trucks."""
+    """Write the roads of `merge` with a slope of 4 % to the east, and cars, buses and trucks."""
     folder = tmp_path_factory.mktemp("hilly")
     roads, demand = folder / "hills.net.xml", folder / "mixed.rou.xml"
     flat = (ROOT / "envs/merge/map/map.net.xml").read_text(encoding="utf-8")
@@ -74,7 +74,7 @@ def hilly(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def rough_world(files: tuple[Path, Path], **overrides: Any) -> Simulation:
-    """Delayed actions, stacked frames, agents of the generator beside the demand, slow steps."""
+    """Make worlds with delayed actions, stacked frames, generated agents, a demand, long steps."""
     roads, demand = files
     settings = {
         "clock.sim_dt_s": 0.1,
@@ -90,7 +90,7 @@ def rough_world(files: tuple[Path, Path], **overrides: Any) -> Simulation:
 
 
 def carry_everybody(simulation: Simulation) -> None:
-    """Pack every vehicle, spoil all that was packed, and unpack them in another order."""
+    """Pack each vehicle, overwrite all packed arrays, and unpack the vehicles in another order."""
     worlds, codec = simulation.shards[0].worlds, codec_of(simulation)
     packed = []
     for w, num in enumerate(worlds.num_owned.tolist()):
@@ -104,7 +104,7 @@ def carry_everybody(simulation: Simulation) -> None:
 
 
 class Carrier(PhaseLog):
-    """Carries all vehicles after the last phase that moves them, and keeps their rows."""
+    """Pack and unpack all vehicles after the last phase that moves them, and store their rows."""
 
     def __init__(self, simulation: Simulation) -> None:
         super().__init__(executor_of(simulation))
@@ -119,7 +119,7 @@ class Carrier(PhaseLog):
 
 
 def trace(simulation: Simulation, steps: int = 60) -> list[bytes]:
-    """Everything that agents get and the worlds' states, step by step."""
+    """Yield the results of agents and the states of the worlds, step by step."""
     found, rng = [], np.random.default_rng(1)
     for _ in range(steps):
         noise = rng.normal(0.0, (2.0, 0.02), size=(*simulation.outputs.present.shape, 2))
@@ -194,7 +194,7 @@ Arrays = tuple[TransferCodec, NDArray[np.void], NDArray[np.float64], NDArray[np.
 
 
 def arrays(record: np.dtype[np.void] = VEHICLE, agents: int = AGENTS) -> Arrays:
-    """A codec of two worlds with four rows each, its rows, commands and frames, all spoilt."""
+    """Return a codec of two worlds of four rows, and its rows, commands and frames of garbage."""
     rows = np.empty((2, 4), dtype=record)
     commands = np.empty((2, agents, TICKS, 2))
     frames = np.empty((2, agents, NUMBERS), dtype=np.float32)
@@ -204,7 +204,7 @@ def arrays(record: np.dtype[np.void] = VEHICLE, agents: int = AGENTS) -> Arrays:
 
 
 def filled(record: np.dtype[np.void], agent: int) -> Arrays:
-    """Row 2 of world 1 with another value in every field."""
+    """Fill row 2 of world 1 with another value in every field."""
     codec, rows, commands, frames = arrays(record)
     for k, name in enumerate(record.names or ()):
         rows[name][1, 2] = 10 + k
@@ -215,7 +215,7 @@ def filled(record: np.dtype[np.void], agent: int) -> Arrays:
 
 
 def a_state() -> tuple[bytes, int]:
-    """A state of tick `TICK`, and its vehicle."""
+    """Return a state of tick `TICK`, and its vehicle."""
     codec, rows, _, _ = filled(VEHICLE, agent=1)
     return codec.pack(rows, 1, 2, TICK), int(rows[1, 2]["id"])
 
@@ -295,7 +295,7 @@ def test_refusals_have_their_types() -> None:
 
 
 def patched(state: bytes, field: str, value: int) -> bytes:
-    """A state with another value of an int32 field of its record."""
+    """Return a state with another value of an int32 field of its record."""
     at = RECORD_AT + int((VEHICLE.fields or {})[field][1])
     return state[:at] + struct.pack("<i", value) + state[at + 4 :]
 
@@ -360,7 +360,7 @@ def golden() -> dict[str, Any]:
 
 
 def test_a_state_of_version_one_is_read() -> None:
-    """With the record of its time: the file says how that was laid out."""
+    """The file states the layout of its record."""
     if os.environ.get("CAVMARL_REWRITE"):
         state, vehicle = a_state()
         content = {

@@ -10,7 +10,7 @@ __all__ = ["actuated_grid"]
 
 
 def actuated_grid(folder: Path) -> Path:
-    """Four crossings with actuated signals and short roads, each of two lanes."""
+    """Make a map of four crossings with actuated signals and short roads of two lanes."""
     return netgenerate(
         folder / "grid.net.xml",
         *("--grid", "--grid.number", "2", "--grid.length", "120"),

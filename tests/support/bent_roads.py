@@ -20,9 +20,9 @@ def bent_street(
     lanes: int = 1,
     attributes: str = "",
 ) -> Path:
-    """A street at 50 km/h whose middle edges, `ab` and `ba`, turn after each leg but the last.
+    """Make a street at 50 km/h whose middle edges, `ab` and `ba`, turn after each leg but the last.
 
-    At its ends, cars turn round. `attributes` are those of all edges, besides lanes and speed.
+    At its ends, cars turn round. `attributes`: further attributes of all edges.
     """
     places, heading = [(0.0, 0.0)], 0.0
     for leg, turn in zip(legs_m, (*turns_deg, 0.0), strict=True):

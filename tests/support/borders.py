@@ -1,4 +1,4 @@
-"""Roads and zones whose vehicles cross borders at a time that the test sets."""
+"""Roads and zones whose vehicles cross borders at chosen times."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ Place = tuple[float, float]
 
 
 def write_roads(path: Path, roads: Sequence[tuple[Place, Place]], speed_mps: float) -> Path:
-    """A net of straight roads of one lane each, `road0` and so on, that meet nowhere."""
+    """Write a network of straight roads with one lane, `road0` and so on, without junctions."""
     parts = []
     for k, ((x, y), (end_x, end_y)) in enumerate(roads):
         length = float(np.hypot(end_x - x, end_y - y))
@@ -44,7 +44,7 @@ def write_roads(path: Path, roads: Sequence[tuple[Place, Place]], speed_mps: flo
 
 
 def write_platoon(path: Path, roads: int, place_m: float, speed_mps: float) -> Path:
-    """One car a road, without imperfection: all of them at the same place at any time."""
+    """Write one car per road without imperfection; all cars have the same position at any time."""
     cars = "".join(
         f'<vehicle id="{k}" type="car" depart="0" departPos="{place_m}" '
         f'departSpeed="{speed_mps}"><route edges="road{k}"/></vehicle>'
@@ -59,13 +59,13 @@ def write_platoon(path: Path, roads: int, place_m: float, speed_mps: float) -> P
 
 
 def bounds_around(network: RoadNetwork) -> Bounds:
-    """Bounds that hold all roads."""
+    """Return bounds around all roads."""
     low_x, low_y, high_x, high_y = network.extent_m
     return (low_x - MARGIN_M, low_y - MARGIN_M, high_x + MARGIN_M, high_y + MARGIN_M)
 
 
 def cut_at(path: Path, bounds: Bounds, xs: Sequence[float], ys: Sequence[float] = ()) -> Path:
-    """A zone file of all cells between cuts at some x and some y."""
+    """Write a zone file of all cells between cuts at some x and some y."""
     columns = list(pairwise([bounds[0], *xs, bounds[2]]))
     rows = list(pairwise([bounds[1], *ys, bounds[3]]))
     rects = [[x, y, end_x, end_y] for x, end_x in columns for y, end_y in rows]

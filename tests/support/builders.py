@@ -13,19 +13,19 @@ from cavmarl.roads.network import POINT
 
 
 def coordinates(size_m: float) -> st.SearchStrategy[float]:
-    """Any place up to `size_m` from the origin; whole metres often, to make ties and touches."""
+    """Draw coordinates up to `size_m`, often whole metres, to produce ties and contacts."""
     whole = st.integers(-int(size_m), int(size_m)).map(float)
     return whole | st.floats(-size_m, size_m)
 
 
 def angles() -> st.SearchStrategy[float]:
-    """Headings in (-pi, pi], right angles often."""
+    """Draw headings in (-pi, pi], often right angles."""
     right = st.sampled_from([-0.5 * np.pi, 0.0, 0.5 * np.pi, np.pi])
     return right | st.floats(-np.pi, np.pi, exclude_min=True)
 
 
 def points_of(corners: NDArray[np.float64]) -> NDArray[np.void]:
-    """POINT records of a polyline given as (n, 3) corners."""
+    """Return POINT records of a polyline with (n, 3) corners."""
     steps = np.diff(corners, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     points = np.zeros(len(corners), POINT)
@@ -39,7 +39,7 @@ def points_of(corners: NDArray[np.float64]) -> NDArray[np.void]:
 
 @st.composite
 def polylines(draw: st.DrawFn) -> NDArray[np.float64]:
-    """(n, 3) corners, at least 1 m apart."""
+    """Draw (n, 3) corners, at least 1 m apart."""
     corner = st.tuples(coordinates(50.0), coordinates(50.0), st.floats(-5.0, 5.0))
     corners = [np.array(draw(corner))]
     for step in draw(st.lists(corner, min_size=1, max_size=5)):
@@ -51,7 +51,7 @@ def polylines(draw: st.DrawFn) -> NDArray[np.float64]:
 
 
 def vehicles(places: Sequence[tuple[float, ...]], **fields: object) -> NDArray[np.void]:
-    """Cars of 5 m by 2 m by 1.5 m at (x, y, heading), ids rising; `fields` override columns."""
+    """Return cars of 5 m by 2 m by 1.5 m at (x, y, heading), by rising id; `fields` set columns."""
     rows = np.zeros(len(places), VEHICLE)
     rows["id"] = np.arange(len(places))
     rows["length"], rows["width"], rows["height"] = 5.0, 2.0, 1.5
@@ -64,7 +64,7 @@ def vehicles(places: Sequence[tuple[float, ...]], **fields: object) -> NDArray[n
 
 @st.composite
 def crowds(draw: st.DrawFn, most: int = 12, size_m: float = 30.0) -> NDArray[np.void]:
-    """Cars and trucks in random order of ids, on two levels, often on top of each other."""
+    """Draw cars and trucks in random order of ids, on two levels, often overlapping."""
     place = st.tuples(coordinates(size_m), coordinates(size_m), angles())
     rows = vehicles(draw(st.lists(place, min_size=1, max_size=most)))
     num = len(rows)

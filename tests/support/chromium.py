@@ -17,7 +17,7 @@ SOFTWARE_GL = ["--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swi
 
 @contextmanager
 def chromium() -> Iterator[Any]:
-    """A browser; the test is skipped where there is none."""
+    """Start a browser; skip the test if there is none."""
     api = pytest.importorskip("playwright.sync_api", reason="Playwright is not installed")
     if CHROMIUM is None:
         pytest.skip("there is no Chromium")
@@ -28,9 +28,9 @@ def chromium() -> Iterator[Any]:
 
 
 def until(page: Any, expression: str, seconds: float = 30.0) -> None:
-    """Wait for something to be true on a page.
+    """Wait until an expression is true on a page.
 
-    Not Playwright's own way: it evaluates text in the page, which the page's policy forbids.
+    Playwright's own function evaluates text in the page, which the page's policy forbids.
     """
     end = time.monotonic() + seconds
     while not page.evaluate(f"Boolean({expression})"):

@@ -1,4 +1,4 @@
-"""Counts what makes code hard to follow: wide classes and calls, reachable and total lines."""
+"""Count properties of code that make it hard to follow: wide classes and calls, and lines."""
 
 from __future__ import annotations
 
@@ -31,18 +31,18 @@ class PackageCode:
 
     @property
     def lines(self) -> int:
-        """Lines of all files."""
+        """The number of lines of all files."""
         return sum(self._lines.values())
 
     def classes(self) -> Iterator[tuple[str, ast.ClassDef]]:
-        """Each class at the top of a module, with a name that says where it is."""
+        """Yield each top-level class with its full name."""
         for module, tree in self._trees.items():
             for node in tree.body:
                 if isinstance(node, ast.ClassDef):
                     yield f"{module}.{node.name}", node
 
     def public_methods(self, node: ast.ClassDef) -> set[str]:
-        """Public methods of a class and its bases; properties are not counted."""
+        """Return the public methods of a class and its bases; properties are not counted."""
         return {
             function.name
             for part in self._with_bases(node)
@@ -53,7 +53,7 @@ class PackageCode:
         }
 
     def attributes(self, node: ast.ClassDef) -> set[str]:
-        """Attributes that methods of a class and its bases set on `self`."""
+        """Return the attributes that methods of a class and its bases set on `self`."""
         return {
             target.attr
             for part in self._with_bases(node)
@@ -65,13 +65,13 @@ class PackageCode:
         }
 
     def functions(self) -> Iterator[tuple[str, Function, bool]]:
-        """Each function and method but those of the command line, and whether it has a `self`."""
+        """Yield functions and methods outside of cavmarl.cli, and whether they have a `self`."""
         for module, tree in self._trees.items():
             if not module.startswith("cavmarl.cli"):
                 yield from _functions_of(tree.body, module, is_class=False)
 
     def reachable_lines(self, start: list[str]) -> int:
-        """Lines of the modules that importing some modules imports, directly or not."""
+        """Return the lines of all modules that some modules import, directly or indirectly."""
         seen: set[str] = set()
         waiting = list(start)
         while waiting:
@@ -96,9 +96,9 @@ class PackageCode:
 
 
 def counted_parameters(function: Function, is_method: bool) -> int:
-    """Parameters that a caller has to keep apart.
+    """Return the number of parameters that a caller must distinguish.
 
-    Keyword-only ones of public functions do not count, nor do those of kernels.
+    Keyword-only parameters of public functions and parameters of kernels do not count.
     """
     if _decorators(function) & _KERNELS:
         return 0
@@ -109,7 +109,7 @@ def counted_parameters(function: Function, is_method: bool) -> int:
 
 
 def has_untyped_arguments(function: Function) -> bool:
-    """Whether a function takes `*arguments` of any kind; those of a `ParamSpec` are typed."""
+    """Return whether a function takes untyped `*arguments`; those of a `ParamSpec` are typed."""
     given = function.args.vararg
     if given is None or function.name == "__exit__":
         return False
@@ -139,7 +139,7 @@ def _functions_of(
 
 
 def _imports(tree: ast.Module) -> Iterator[str]:
-    """Names that the top of a module imports."""
+    """Yield the names that the top level of a module imports."""
     for node in tree.body:
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)

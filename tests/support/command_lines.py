@@ -10,7 +10,7 @@ import typer
 
 from cavmarl.cli import app
 
-USAGE: Any = typer.BadParameter.__base__  # what a command line that is not understood raises
+USAGE: Any = typer.BadParameter.__base__  # errors of an invalid command line
 
 
 def check_command(line: str) -> None:
@@ -26,7 +26,7 @@ def check_command(line: str) -> None:
     try:
         _, left, _ = command.make_parser(context).parse_args(words)
     except USAGE as error:
-        if "requires an argument" not in str(error):  # as a page may name an option
+        if "requires an argument" not in str(error):  # pages may name an option with a value
             raise
         left = []
     assert not left or context.ignore_unknown_options, line

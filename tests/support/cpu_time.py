@@ -1,7 +1,7 @@
-"""What tests cost: seconds of processor, with those of children and forks that have ended.
+"""The processor time of tests, including ended children and forks.
 
-Seconds of processor say the same on a busy machine as on a quiet one; seconds of a clock do not.
-`tests/costs.txt` has those of dear tests, as they were when it was made:
+Processor time does not depend on other programs, unlike wall time. `tests/costs.txt` has the times
+of expensive tests at the time of its recording:
 
     CAVMARL_TEST_COSTS=tests/costs.txt pytest -n 3 --dist loadfile -m "not alone"
 """
@@ -30,12 +30,12 @@ __all__ = [
     "rare_tests",
 ]
 
-LISTED_AT_END_S = 2.0  # a test that costs more is listed at the end of a run
-ARGUED_S = 2.0  # one that costs more is slow, but for those of the file of argued tests
-LISTED_S = 0.5  # a test that costs less is not in the file of costs
-OFTEN_S = 1.5  # of a test's variants, so many seconds are in every run, and one of them at least
-TURNS = 30  # runs of `make rotation` in which each slow test comes up that is not long
-CHEAP_S = 0.05  # what one costs that is not in the file of costs
+LISTED_AT_END_S = 2.0  # tests above this time are listed at the end of a run
+ARGUED_S = 2.0  # tests above this time are slow, except tests in argued.txt
+LISTED_S = 0.5  # tests below this time are not in costs.txt
+OFTEN_S = 1.5  # total time of a test's variants in every run; at least one variant runs
+TURNS = 30  # runs of `make rotation` after which each slow test that is not long has run
+CHEAP_S = 0.05  # assumed time of a test that is not in costs.txt
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
 LONG = COSTS.with_name("long.txt")
@@ -43,20 +43,20 @@ LONG = COSTS.with_name("long.txt")
 
 @cache
 def known_costs() -> dict[str, float]:
-    """Seconds of processor by test, of those that are in the file."""
+    """Return the processor time in s of each test in the file."""
     lines = COSTS.read_text(encoding="utf-8").splitlines() if COSTS.exists() else []
     return {name: float(cost_s) for cost_s, name in (line.split(" ", 1) for line in lines)}
 
 
 @cache
 def argued() -> frozenset[str]:
-    """Dear tests that are in every run, and with `[*]` those whose variants all are."""
+    """Return the expensive tests of every run; `[*]` marks tests whose variants all are."""
     return _listed(ARGUED)
 
 
 @cache
 def long_tests() -> frozenset[str]:
-    """Slow tests that are in `make soak` alone; a file stands for all its slow tests."""
+    """Return the slow tests that only `make soak` runs; a file stands for all its slow tests."""
     return _listed(LONG)
 
 
@@ -68,12 +68,12 @@ def _listed(path: Path) -> frozenset[str]:
 def rare_tests(
     names: Iterable[str], costs: Mapping[str, float], kept: frozenset[str] = frozenset()
 ) -> set[str]:
-    """Which tests are too dear to be in every run.
+    """Return the tests that are too expensive for every run.
 
     Args:
-        names: of all tests, in their order; variants of one test differ behind the bracket.
-        costs: seconds of processor by name, of those that are known.
-        kept: of dear ones, those that are in every run; `[*]` after a test: all its variants.
+        names: of all tests in order; variants of a test differ after the bracket.
+        costs: known processor times in s by name.
+        kept: expensive tests that are in every run; `[*]` after a test: all its variants.
     """
     spent: dict[str, float] = {}
     rare = set()
@@ -104,7 +104,7 @@ def is_due(name: str, turn: int, long: frozenset[str]) -> bool:
 
 
 def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:
-    """Seconds of processor by file, of tests that are in every run; a cheap test counts, too."""
+    """Return the processor time in s by file, of tests in every run, including cheap tests."""
     found: dict[str, float] = defaultdict(float)
     for name in names:
         found[name.partition("::")[0]] += costs.get(name, CHEAP_S)
@@ -112,31 +112,31 @@ def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str
 
 
 class CpuTimes:
-    """A plugin that adds up what each test costs, over all processes of pytest-xdist."""
+    """A plugin that sums the processor time of each test over all processes of pytest-xdist."""
 
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self._last_s = 0.0
 
     def pytest_runtest_logstart(self) -> None:
-        """A test begins."""
+        """Note the start of a test."""
         self._last_s = _used_s()
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Iterator[Any]:
-        """A phase of a test is over: its report carries its cost to the process that adds up."""
+        """Store the time of a phase in its report, for the process that sums."""
         report = yield
         now_s = _used_s()
         report.cpu_s, self._last_s = now_s - self._last_s, now_s
         return report
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """The report of a phase has come."""
-        # A process of pytest-xdist that has crashed has not said what its test cost.
+        """Add the time of a report."""
+        # A crashed process of pytest-xdist has not reported its time.
         self.seconds[report.nodeid] += getattr(report, "cpu_s", 0.0)
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        """Say the sum, and the dearest tests."""
+        """Print the sum, and the most expensive tests."""
         if not self.seconds:
             return
         if path := os.environ.get("CAVMARL_TEST_COSTS"):
@@ -160,7 +160,7 @@ def _used_s() -> float:
 
 
 def _forks_s() -> float:
-    """Of the process whose forks tests start, and of those forks that have ended."""
+    """Return the time of the process that forks for tests, and of its ended forks."""
     server: Any = forkserver._forkserver  # type: ignore[attr-defined]
     if server._forkserver_pid is None:
         return 0.0

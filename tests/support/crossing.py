@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-# West to east with a pavement, south to north, and a right turn from the south to the east.
+# Roads from west to east with a pavement, from south to north, and a right turn from the south.
 CROSSING = """<?xml version="1.0" encoding="UTF-8"?>
 <net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
@@ -69,7 +69,7 @@ CROSSING = """<?xml version="1.0" encoding="UTF-8"?>
 
 @pytest.fixture
 def crossing(tmp_path: Path) -> Callable[..., Path]:
-    """Write the crossing to a file, pieces of its text replaced: `crossing(("old", "new"))`."""
+    """Return a function that writes the crossing with replaced text: `crossing(("old", "new"))`."""
 
     def write(*changes: tuple[str, str]) -> Path:
         text = CROSSING

@@ -1,4 +1,4 @@
-"""A road of two lanes: the left one leads to the goal, the right one to a dead end."""
+"""A road of two lanes: the left lane leads to the goal, the right lane to a dead end."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ DEAD_END = {
 
 
 def before_dead_end(folder: Path, length_m: float) -> tuple[Simulation, int, int, int]:
-    """A world with two agents; the right and the left lane, and the goal.
+    """Return a world with two agents, the right and the left lane, and the goal.
 
     Args:
-        folder: where the map is made.
-        length_m: of the dead end, in which a car cannot turn. If it is short the way from the right
-            lane leads through it, else back over a lane change.
+        folder: folder for the map.
+        length_m: length of the dead end, in which a car cannot turn. If it is short, the route from
+        the right lane leads through it, else over a lane change.
     """
     for kind, text in DEAD_END.items():
         (folder / f"m.{kind}.xml").write_text(text.format(length_m=length_m))
@@ -41,7 +41,7 @@ def before_dead_end(folder: Path, length_m: float) -> tuple[Simulation, int, int
 
 
 def put(world: Simulation, row: np.void, lane: int, s: float, speed: float, goal: int) -> None:
-    """Let a vehicle drive along a lane to a goal."""
+    """Put a vehicle on a lane with a goal."""
     x, y, _, cos, sin = world.network.pose_on(lane, s)[:5]
     row["lane"], row["s"], row["d"], row["x"], row["y"] = lane, s, 0.0, x, y
     row["heading"], row["speed"] = math.atan2(sin, cos), speed

@@ -1,4 +1,4 @@
-"""Worlds whose vehicles come from demand files: tiny ones on the entries' maps, and real ones."""
+"""Worlds with vehicles of demand files: tiny files on bundled maps, and real files."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ from typing import Any
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import make_simulation
 
-# Short enough to run in seconds, with all that a file can order: words for lane, place and speed,
-# drawn types and routes, flows of all kinds, stops, trips without a route.
+# Short demands with all features of files: words for lane, position and speed, random types and
+# routes, flows of all kinds, stops, trips without a route.
 MERGE = """<routes>
   <vType id="car" sigma="0.6" speedFactor="normc(1,0.1,0.8,1.2)"/>
   <vType id="idm" carFollowModel="IDM" length="4.2"/>
@@ -49,7 +49,7 @@ def make(
     agents: int = 0,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Worlds with the files' vehicles and nobody else's; not reset yet."""
+    """Make worlds with the vehicles of the files only, before their first reset."""
     wanted = {"traffic.demand": [str(path) for path in files], "horizon_s": 120.0}
     return make_simulation(
         env,
@@ -62,14 +62,14 @@ def make(
 
 
 def tiny(env: str, folder: Path, **options: Any) -> Simulation:
-    """The worlds of one of `TINY`'s files."""
+    """Make the worlds of a file of `TINY`."""
     path = folder / f"{env}.rou.xml"
     path.write_text(TINY[env], encoding="utf-8")
     return make(env, [path], **options)
 
 
 def real(name: str, maps: Path, **options: Any) -> Simulation:
-    """Bologna's or Mcity's own demand, with Bologna's signal programs."""
+    """Make worlds with the own demand of Bologna or Mcity, and Bologna's signal programs."""
     folder = maps / "net" / {"bologna": "bologna_acosta", "mcity": "mcity"}[name]
     overrides = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
     if name == "mcity":

@@ -1,4 +1,4 @@
-"""A process that has no file descriptors left."""
+"""A process without free file descriptors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 
 @contextmanager
 def without_descriptors() -> Iterator[None]:
-    """The time in which this process can open no file and no socket."""
+    """Let this process open no file and no socket within the block."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     used = max(int(name) for name in os.listdir("/proc/self/fd"))
     filling = []

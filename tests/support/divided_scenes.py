@@ -1,4 +1,4 @@
-"""Vehicles put by hand on the arms of a crossing, in one zone and divided, bit for bit alike."""
+"""Vehicles at chosen positions at a crossing, compared in one zone and in four zones."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from tests.support.traffic import on_lane
 CLASSES = {"car": "passenger", "bus": "bus"}
 MARGIN_M = 20.0  # beyond the arms' ends, within the zones
 TICK_S = 0.05
-# No vehicle of the file departs in the time of a scene: it says which types and ways there are.
+# The vehicles of the file depart after the scene; they define types and routes.
 LATE_S = 900
 CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 1000.0}
-# Zones see no further than bodies touch, but for vehicles that drivers ask about.
+# Zones see only as far as bodies can touch, except for vehicles that drivers look at.
 CLOCK |= {"zones.approach_ticks": 2}
 
 
 class DividedScene:
-    """The same vehicles in one zone and in the four that meet at a place, m from the middle.
+    """The same vehicles in one zone, and in four zones that meet at a point, in m from the middle.
 
-    `departs` has more lines of the demand file, which depart in the time of the scene, by name.
+    `departs`: further lines of the demand file by name, for vehicles that depart in the scene.
     """
 
     def __init__(
@@ -74,7 +74,7 @@ class DividedScene:
         self.departs = list(departs)
 
     def put(self, name: str, way: str, front_m: float, kind: str = "car", **fields: Any) -> None:
-        """A vehicle on a way such as "W_in_0 N_out_0", its front `front_m` beyond its line."""
+        """Put a vehicle on a route like "W_in_0 N_out_0", its front `front_m` beyond its line."""
         network, plans = self.whole.network, self.whole.plans
         travel = self.whole.travel
         before, after = (network.lane_ids.index(lane) for lane in way.split())
@@ -97,29 +97,29 @@ class DividedScene:
         self.names.append(name)
 
     def begin(self) -> None:
-        """Give both the vehicles that were put."""
+        """Copy the vehicles into both worlds."""
         rows = np.concatenate(self.rows)
         self.names += self.departs
         for simulation in (self.whole, self.divided):
             simulation.departures.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]
             zones = simulation.division.count
-            saved[-zones - 2][...] = 0  # the owners of these vehicles are not on record
+            saved[-zones - 2][...] = 0  # the log has no owners of these vehicles
             saved[-zones:] = [rows, *(rows[:0] for _ in range(1, zones))]
             simulation.load(saved)
 
     def run(self, seconds: float) -> Iterator[dict[str, np.void]]:
-        """Yields the vehicles by name after each tick, which both have driven alike."""
+        """Run both worlds, compare them, and yield the vehicles by name after each tick."""
         for tick in range(round(seconds / TICK_S)):
             for simulation in (self.whole, self.divided):
                 drive(simulation)
             assert self.divided.state_hash() == self.whole.state_hash(), f"tick {tick}"
             vehicles = self.whole.vehicles()
-            assert (vehicles["hit"] < 0).all(), "a crash"
+            assert (vehicles["hit"] < 0).all(), "vehicles touch"
             yield {self.names[row["id"]]: row for row in vehicles}
 
     def ghosts(self, name: str) -> set[str]:
-        """The names of the vehicles that the zone of one sees of others."""
+        """Return the names of the ghosts in the zone of a vehicle."""
         division, own = self.divided.division, self.names.index(name)
         for zone in range(division.count):
             worlds = division._shards[zone].worlds

@@ -1,4 +1,4 @@
-"""Worlds for tests: seeded, small, and driven by the built-in driver or without agents."""
+"""Small seeded worlds for tests, with the built-in driver or without agents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def make_simulation(
     num_worlds: int = 1,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Worlds of an environment in one population; not reset yet."""
+    """Make worlds of an environment with a population mode, before their first reset."""
     config, network, demand, partition = load_world(
         env,
         agents=agents,
@@ -43,7 +43,7 @@ def make_traffic(
     renewed: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Worlds without agents; `renewed` says whether who arrives is followed by another."""
+    """Make worlds without agents; `renewed`: whether arrived vehicles are replaced."""
     simulation = make_simulation(
         env, mode="respawn", background=background, num_worlds=num_worlds, overrides=overrides
     )
@@ -59,20 +59,20 @@ def start(simulation: Simulation, seed: int) -> None:
 
 
 def idle(simulation: Simulation) -> Commands:
-    """Commands that leave every agent without throttle and steering."""
+    """Return commands without throttle and steering for all agents."""
     shape = simulation.outputs.present.shape
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
 
 def suggested(simulation: Simulation) -> NDArray[np.float64]:
-    """(W, A, 2) throttle in m/s² and steering in rad of the built-in driver."""
+    """Return (W, A, 2) throttle in m/s² and steering in rad of the built-in driver."""
     raw = np.zeros((*simulation.outputs.present.shape, 2))
     simulation.suggest(raw)
     return raw
 
 
 def drive(simulation: Simulation, noise: NDArray[np.float64] | float = 0.0) -> None:
-    """One step in which agents do what is suggested, plus `noise`; who has ended is taken out."""
+    """Step with the suggested actions plus `noise`, and remove agents that have ended."""
     commands = idle(simulation)
     simulation.step(Commands(suggested(simulation) + noise, commands.meta_actions))
     simulation.retire_agents()

@@ -1,4 +1,4 @@
-"""A program of workers of a team, whose members fail once in a phase that FAILING_PHASE names."""
+"""A program for workers of a team, which fail once in the phase that FAILING_PHASE names."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.parallel.workers.team import TeamMember
 from cavmarl.shards.shard_group import ShardGroup
 
 PHASE = os.environ["FAILING_PHASE"]
-AT = 9  # the call that fails
+AT = 9  # the number of the call that fails
 
 run_unchanged = TeamMember.run_phases
 phase_unchanged = getattr(ShardGroup, PHASE)

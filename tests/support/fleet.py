@@ -1,4 +1,4 @@
-"""A service in this process, without a socket, whose clock a test moves."""
+"""A service in this process without a socket; the test advances its clock."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ CONFIGURATION = "0" * 64
 
 
 class Fleet:
-    """A broker, and nodes and clients of it that do as a test says."""
+    """A broker with nodes and clients that the test controls."""
 
     def __init__(self, where: str | Path, *, identities: bool = True, **rules: Any) -> None:
         self.now_s = 1000.0
         self.log = EventLog(EventStore(where), lambda: self.now_s)
         self.access = Access(self.log, lambda: self.now_s)
         self.broker = Broker(self.log, BrokerRules(**rules), lambda: self.now_s)
-        self.secrets: dict[str, str] = {}  # by names of identities
+        self.secrets: dict[str, str] = {}  # by name of the identity
         if identities:
             self.nodes = self.identity("nodes", "node")
             self.client = self.identity("ada", "client")

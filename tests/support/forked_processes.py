@@ -1,7 +1,7 @@
-"""Processes as forks of one that has loaded the kernels: each starts in milliseconds.
+"""Processes as forks of a process with loaded kernels: each starts in milliseconds.
 
-Elsewhere each begins as a Python of its own, which takes more than a second. Tests that look at
-that ask for the fixture `fresh_processes`.
+Outside of tests, each process is a new interpreter, which takes more than a second. Tests of that
+use the fixture `fresh_processes`.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ __all__ = ["FORKS", "ForkedProcess", "start_forked"]
 
 
 class ForkedProcess:
-    """What of `subprocess.Popen` pools and tests use.
+    """The part of `subprocess.Popen` that pools and tests use.
 
-    `words` are those of a Python: `-m` and a module, or `-c` and a program, and arguments. Of its
-    environment, `env` are variables; None: those here.
+    `words`: arguments of an interpreter: `-m` and a module, or `-c` and a program, and others.
+    `env`: environment variables; None: those of this process.
     """
 
     def __init__(
@@ -91,7 +91,7 @@ class ForkedProcess:
 
 
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
-    """In the place of `start_python`; words that run nothing of ours go there."""
+    """Replace `start_python`; programs that do not use cavmarl are passed on to it."""
     ours = words[0] == "-m" and words[1].startswith(("cavmarl.", "tests."))
     if ours or words == ["-c", PROGRAM]:
         return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)
@@ -125,7 +125,7 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     os.environ.clear()
     os.environ.update(variables)
     own, asked = os.getpid(), os.getppid
-    # Between the two is the process that has forked this one.
+    # Between them is the process that has forked this process.
     os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.stdin = open(0, closefd=False)
     sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # type: ignore[misc]
@@ -141,5 +141,5 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     assert spec.origin is not None
     sys.argv = [spec.origin, *arguments]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # it has been imported before
+        warnings.simplefilter("ignore", RuntimeWarning)  # the module was imported before
         runpy.run_module(what, run_name="__main__")

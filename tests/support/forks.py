@@ -1,4 +1,4 @@
-"""What a fork of this process says to a call."""
+"""Errors of calls in a fork of this process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cavmarl.core.errors import CavmarlError
 
 
 def said_in_fork(*calls: Callable[[], object]) -> str:
-    """The words of all that were refused; the fork ends without what Python does at an end."""
+    """Make calls in a fork that ends without cleanup; return the messages of refused calls."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -1,6 +1,6 @@
 """Blocks of Markdown that are generated from the code: between `<!-- NAME -->` and `<!-- end -->`.
 
-With `CAVMARL_REWRITE=1` in the environment a test writes them, else it compares.
+With `CAVMARL_REWRITE=1` in the environment, a test writes the blocks; otherwise it compares them.
 """
 
 from __future__ import annotations
@@ -14,14 +14,14 @@ from cavmarl.core.atomic_file import write_whole
 
 
 def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, is_right: bool = False) -> str:
-    """A Markdown table; `is_right` aligns all columns but the first to the right."""
+    """Return a Markdown table; `is_right` aligns all columns but the first to the right."""
     others = "---:" if is_right else "---"
     lines = [header, ["---", *[others] * (len(header) - 1)], *rows]
     return "\n".join(f"| {' | '.join(line)} |" for line in lines)
 
 
 def check_block(path: Path, name: str, expected: str) -> None:
-    """Assert that the block `name` of the file says what is `expected`, or make it so."""
+    """Check that the block `name` of the file is `expected`, or write it."""
     if os.environ.get("CAVMARL_REWRITE"):
         write_block(path, name, expected)
         return

@@ -1,4 +1,4 @@
-"""How much an object keeps in its containers, to see that its memory does not grow with time."""
+"""The number of entries in containers of an object, to check that its memory does not grow."""
 
 from __future__ import annotations
 

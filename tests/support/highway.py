@@ -1,7 +1,7 @@
-"""highway-env's roads and vehicles in our records, and its observations beside ours.
+"""Roads, vehicles and observations of highway-env as records of cavmarl.
 
-Its y points down: lanes, places and headings are mirrored on the way. Each of its lanes becomes one
-of ours, as a polyline; vehicles get ids in the order of its list.
+The y axis of highway-env points down, so lanes, positions and headings are mirrored. Each of its
+lanes becomes a polyline; vehicles get ids in the order of its list.
 """
 
 from __future__ import annotations
@@ -19,13 +19,13 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import LANE
 from tests.support.builders import points_of
 
-SAMPLES = 64  # points of a lane that is not straight
-# What its intersection writes to the class of all drivers, for the rest of the process.
+SAMPLES = 64  # number of points of a curved lane
+# Attributes that highway-env's intersection overwrites in the class of all drivers.
 OVERWRITTEN = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 def make(name: str, seed: int, **config: Any) -> Any:
-    """One of highway-env's environments, a second into an episode."""
+    """Return an environment of highway-env, a second after its reset."""
     pytest.importorskip("highway_env", reason="needs cavmarl[bench]")
     import gymnasium
     import highway_env
@@ -43,13 +43,13 @@ def make(name: str, seed: int, **config: Any) -> Any:
 
 
 def lanes(env: Any) -> dict[tuple[Any, ...], Any]:
-    """Its lanes by index; our LANE rows are in this order."""
+    """Return the lanes of highway-env by index; LANE rows are in this order."""
     found: dict[tuple[Any, ...], Any] = env.road.network.lanes_dict()
     return found
 
 
 def roads(env: Any) -> RoadArrays:
-    """Its lanes as road arrays, without links and signals."""
+    """Return the lanes of highway-env as road arrays, without links and signals."""
     parts, first = [], 0
     rows = np.zeros(len(lanes(env)), LANE)
     for row, lane in zip(rows, lanes(env).values(), strict=True):
@@ -70,14 +70,14 @@ def roads(env: Any) -> RoadArrays:
 
 
 def everywhere(road: RoadArrays) -> LaneGrid:
-    """One cell that all lanes lie in."""
+    """Return a grid whose only cell contains all lanes."""
     num = len(road.lanes)
     start = np.array([0, num], np.int32)
     return LaneGrid(-1e4, -1e4, 2e4, 1, 1, start, np.arange(num, dtype=np.int32))
 
 
 def vehicles(env: Any) -> NDArray[np.void]:
-    """Its vehicles as VEHICLE rows; goal k is the destination of vehicle k."""
+    """Return highway-env's vehicles as VEHICLE rows; goal k is the destination of vehicle k."""
     index = {key: row for row, key in enumerate(lanes(env))}
     rows = np.zeros(len(env.road.vehicles), VEHICLE)
     for k, (row, vehicle) in enumerate(zip(rows, env.road.vehicles, strict=True)):
@@ -93,19 +93,19 @@ def vehicles(env: Any) -> NDArray[np.void]:
 
 
 def destinations(env: Any) -> NDArray[np.float64]:
-    """(1, G, 2) where each vehicle goes."""
+    """Return (1, G, 2) destinations of the vehicles."""
     return np.array([[vehicle.destination * (1.0, -1.0) for vehicle in env.road.vehicles]])
 
 
 def grid_of(rows: NDArray[np.void]) -> Grid:
-    """The spatial index over the rows."""
+    """Return the spatial index over the rows."""
     grid = make_grid((-100.0, -100.0, 500.0, 100.0), 25.0, len(rows))
     fill_grid(rows, len(rows), grid)
     return grid
 
 
 def observation(env: Any, kind: str, **config: Any) -> NDArray[np.float32]:
-    """What highway-env's first vehicle observes."""
+    """Return the observation of highway-env's first vehicle."""
     from highway_env.envs.common.observation import observation_factory
 
     with np.errstate(invalid="ignore"):
@@ -114,5 +114,5 @@ def observation(env: Any, kind: str, **config: Any) -> NDArray[np.float32]:
 
 
 def own_row(env: Any) -> int:
-    """The row of the vehicle that looks."""
+    """Return the row of the ego vehicle."""
     return int(env.road.vehicles.index(env.vehicle))

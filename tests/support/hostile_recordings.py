@@ -1,4 +1,4 @@
-"""Recordings as a stranger could send them: damaged, forged, or with numbers that do not fit."""
+"""Damaged and forged recordings."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def make_recording(path: Path, steps: int = 5) -> Path:
 
 @dataclass(frozen=True)
 class Use:
-    """What is done with a recording."""
+    """The ways in which a recording is used."""
 
     pictures: bool = False
     page: bool = False
@@ -123,7 +123,7 @@ class Forger:
         self._write(self._files)
 
     def forge(self) -> str:
-        """Write another forged recording to `path`; return what was done."""
+        """Write another forged recording to `path`; return a description of the change."""
         self._write(self._files)
         kinds: list[Callable[[], str]] = [
             self._spoil_bytes, self._spoil_bytes, self._change_table, self._change_table,
@@ -142,7 +142,7 @@ class Forger:
         rng = self._rng
         name = rng.choice(sorted(self._tables))
         content = bytearray(self._files[name])
-        if rng.random() < 0.5:  # without checksums, more than the checksum is tried
+        if rng.random() < 0.5:  # without checksums, readers check more than the checksum
             content = bytearray(_parquet(self._tables[name], rng))
         start = max(0, len(content) - 3000) if rng.random() < 0.6 else 0
         for _ in range(rng.randint(1, 4)):

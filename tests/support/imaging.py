@@ -1,4 +1,4 @@
-"""What the tests of rays and pictures need: bodies, walls, mounts, and a look around."""
+"""Bodies, walls, mounts and scenes for tests of rays and pictures."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ def mount(
     place: tuple[float, float, float] = (0.0, 0.0, 1.0),
     angles: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> NDArray[np.float64]:
-    """(3, 4): axes and place of a sensor."""
+    """Return (3, 4) axes and position of a sensor."""
     return np.column_stack([turn(*angles), place])
 
 
 @st.composite
 def mounts(draw: st.DrawFn) -> NDArray[np.float64]:
-    """Level ones and tilted ones, on all sides of a car."""
+    """Draw level and tilted mounts on all sides of a car."""
     place = draw(st.tuples(st.floats(-2.5, 2.5), st.floats(-1.0, 1.0), st.floats(0.1, 1.6)))
     yaw = draw(st.sampled_from([0.0, RIGHT, math.pi]) | st.floats(-math.pi, math.pi))
-    # Without the compiler NumPy warns of overflow at angles like 1e-308.
+    # Without the compiler, NumPy warns of overflow at angles like 1e-308.
     tilted = st.tuples(st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
     tilts = draw(st.just((0.0, 0.0)) | tilted.map(lambda tilt: tuple(round(a, 9) for a in tilt)))
     return mount(place, (yaw, *tilts))
@@ -46,7 +46,7 @@ def mounts(draw: st.DrawFn) -> NDArray[np.float64]:
 
 @st.composite
 def wall_sets(draw: st.DrawFn) -> NDArray[np.void]:
-    """Up to six walls, some of them very low, some through the vehicle."""
+    """Draw up to six walls, some very low, some through the vehicle."""
     ends = st.tuples(*(coordinates(40.0) for _ in range(4)))
     height = st.sampled_from([0.5, 3.0, 20.0])
     found = draw(st.lists(st.tuples(ends, height, st.integers(0, 2)), max_size=6))
@@ -56,7 +56,7 @@ def wall_sets(draw: st.DrawFn) -> NDArray[np.void]:
 
 
 def one_cell(num: int) -> Grid:
-    """An index of which one cell holds all."""
+    """Return an index whose only cell has all bodies."""
     index = make_grid((0.0, 0.0, 1.0, 1.0), 1.0, 0)
     index.start[:] = 0, num
     index.largest[0] = 1e3
@@ -66,7 +66,7 @@ def one_cell(num: int) -> Grid:
 def backdrop(
     walls: NDArray[np.void] = NO_WALLS, strips: NDArray[np.float64] | None = None
 ) -> Backdrop:
-    """A map with these walls and lanes; type 0 is a car, type 1 a pedestrian."""
+    """Return a map with these walls and lanes; type 0 is a car, type 1 a pedestrian."""
     if strips is None:
         strips = np.zeros((0, 4, 2))
     return Backdrop(
@@ -85,7 +85,7 @@ def backdrop(
 def look_around(
     rows: NDArray[np.void], row: int = 0, scenery: Backdrop | None = None, reach_m: float = 100.0
 ) -> tuple[Panorama, Counts]:
-    """What stands around a vehicle."""
+    """Return the scene around a vehicle."""
     scenery = scenery or backdrop()
     grid = make_grid((-40.0, -40.0, 40.0, 40.0), 10.0, len(rows))
     fill_grid(rows, len(rows), grid)

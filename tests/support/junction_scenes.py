@@ -1,4 +1,4 @@
-"""Cars put by hand on the arms of a crossing."""
+"""Cars at chosen positions on the arms of a crossing."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 
 
 def build_crossing(folder: Path, kind: str, side_lanes: int = 1, only_in: str = "") -> Path:
-    """A west-east main road and a south-north side road that cross, by SUMO's type of the node.
+    """Build a crossing of a west-east main road and a south-north side road.
 
-    No road leads out to the arms `only_in`.
+    `kind`: SUMO's type of the node. The arms `only_in` have no outgoing road.
     """
     target = folder / f"{kind}_{side_lanes}{only_in}.net.xml"
     if target.exists():
@@ -55,7 +55,7 @@ def build_crossing(folder: Path, kind: str, side_lanes: int = 1, only_in: str = 
 
 
 def with_shorter_lane(path: Path, lane: str, by_m: float) -> Path:
-    """The same map, a straight lane of which ends earlier: ways over the junction begin there."""
+    """Return the same map with a shortened straight lane, at whose end the junction begins."""
     tree = ElementTree.parse(path)
     edge, index = lane.rsplit("_", 1)
     rows = {row.get("id"): row for row in tree.iter("lane")}
@@ -79,7 +79,7 @@ def _stretch(row: ElementTree.Element, shape: str, by_m: float) -> None:
 
 
 class Scene:
-    """A crossing with the cars that were put on it; goes on tick by tick."""
+    """A crossing with cars, which runs tick by tick."""
 
     def __init__(self, path: Path) -> None:
         self.simulation: Simulation = make_traffic(
@@ -91,7 +91,7 @@ class Scene:
         self.names: list[str] = []
 
     def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
-        """A car whose front is `to_line_m` before a lane's end and that drives to edge `goal`."""
+        """Put a car with its front `to_line_m` before a lane's end and the goal edge `goal`."""
         network, worlds = self.simulation.network, self.simulation.shards[0].worlds
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
@@ -108,26 +108,26 @@ class Scene:
         self.names.append(name)
 
     def clear(self) -> None:
-        """Take all cars out."""
+        """Remove all cars."""
         worlds = self.simulation.shards[0].worlds
         worlds.num_owned[0] = worlds.num_rows[0] = self.simulation.departures.next_id[0] = 0
         self.names.clear()
 
     def __getitem__(self, name: str) -> Any:
-        """The record of a car that is still there."""
+        """Return the record of a car that has not left."""
         vehicles = self.simulation.vehicles()
         return vehicles[vehicles["id"] == self.names.index(name)][0]
 
     def run(self, seconds: float) -> Iterator[float]:
-        """Yields the time after each tick; no two vehicles may touch."""
+        """Run, check that no two vehicles touch, and yield the time after each tick."""
         for _ in range(round(seconds / 0.05)):
             drive(self.simulation)
             vehicles = self.simulation.vehicles()
-            assert (vehicles["hit"] < 0).all(), "a crash"
+            assert (vehicles["hit"] < 0).all(), "vehicles touch"
             yield float(self.simulation.ticks()[0]) * 0.05
 
     def entries(self, seconds: float) -> dict[str, float]:
-        """When each car's front crossed its line."""
+        """Return the times at which the fronts of cars crossed their lines."""
         times: dict[str, float] = {}
         network = self.simulation.network
         for time in self.run(seconds):

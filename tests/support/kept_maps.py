@@ -1,7 +1,6 @@
-"""Real maps as networks, kept between runs: built and read anew when the sources change.
+"""Networks of real maps, cached between runs, and built again if the sources change.
 
-Tests of what is in a network need not wait for netconvert and for the reader each time; tests of
-these two call them.
+Tests of networks need not run netconvert and the reader each time; only tests of these two do.
 """
 
 from __future__ import annotations
@@ -27,11 +26,11 @@ __all__ = ["built", "network_of"]
 
 _FOLDER = cache_dir() / "tests"
 _PACKAGE = Path(__file__).parents[2] / "cavmarl"
-_OLD_S = 2 * 24 * 3600.0  # what other sources have made is removed after so long
+_OLD_S = 2 * 24 * 3600.0  # networks of other sources are removed after this time
 
 
 def built(source: Path) -> Path:
-    """The SUMO network of a map, built tolerantly."""
+    """Return the SUMO network of a map, built tolerantly."""
     digest = hashlib.sha256(source.read_bytes() + version("eclipse-sumo").encode()).hexdigest()
 
     def build(target: Path) -> None:
@@ -41,7 +40,7 @@ def built(source: Path) -> Path:
 
 
 def network_of(path: Path) -> RoadNetwork:
-    """What the reader makes of a SUMO network."""
+    """Return a SUMO network as the reader reads it."""
     digest = source_hash(path)
 
     def read(target: Path) -> None:
@@ -54,7 +53,7 @@ def network_of(path: Path) -> RoadNetwork:
 
 
 def _kept(domain: str, name: str, make: Callable[[Path], None]) -> Path:
-    """A file in the folder of the sources of a domain, made if it is not there."""
+    """Return a file in the folder for the sources of a domain; make it if it is missing."""
     folder = _FOLDER / f"{domain}-{_sources(domain)}"
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / name
@@ -67,7 +66,7 @@ def _kept(domain: str, name: str, make: Callable[[Path], None]) -> Path:
 
 @cache
 def _sources(domain: str) -> str:
-    """Hash of the sources of `core`, `roads`, and `maps` if it is about these."""
+    """Return the hash of the sources of `core`, `roads` and a domain."""
     digest = hashlib.sha256()
     for part in ("core", "roads", domain):
         for path in sorted((_PACKAGE / part).rglob("*.py")):
@@ -77,7 +76,7 @@ def _sources(domain: str) -> str:
 
 @contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """No other process is in such a block of the same path."""
+    """Lock a path against other processes within the block."""
     with path.open("w") as lock:
         fcntl.flock(lock, fcntl.LOCK_EX)
         yield

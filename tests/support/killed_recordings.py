@@ -12,12 +12,12 @@ from tests.support.forked_processes import ForkedProcess
 
 
 def killed_recording(path: Path, program: str, parts: int) -> Recording:
-    """What a program has left that records into a path, killed once so many parts are there.
+    """Return the recording of a program that is killed once it has written some parts.
 
     Args:
         path: its first argument.
-        program: its text; it prints `begun`, and goes on for ever.
-        parts: of the first world.
+        program: its text; it prints `begun`, and never ends.
+        parts: number of parts of the first world.
     """
     with ForkedProcess(["-c", program, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

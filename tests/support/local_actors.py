@@ -1,4 +1,4 @@
-"""Nodes as processes of this machine: does what `RayActors` does, without Ray."""
+"""Nodes as processes of this machine, instead of `RayActors`."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORKS.set_forkserver_preload(["tests.support.loaded_kernels"])
 
 
 class LocalActors:
-    """At most two processes and a spare one; a process that dies is started again."""
+    """At most two processes and one spare process; dead processes are started again."""
 
     address = "127.0.0.1"
 

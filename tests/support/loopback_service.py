@@ -1,6 +1,6 @@
 """A service and nodes on loopback sockets, in a thread of this process; their logs are collected.
 
-It costs less than processes of their own, and a test can look into the store and the log.
+This is cheaper than separate processes, and a test can read the store and the log.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BEAT_S = 0.2
 
 
 class Lines(logging.Handler):
-    """The records of the service's loggers, as they would stand in its log."""
+    """The records of the service's loggers, formatted as in its log."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -57,8 +57,8 @@ class LoopbackService:
     """A service at `url` and its nodes.
 
     Attributes:
-        log: what the service and the nodes have logged.
-        nodes: the nodes' links by name, and the URL of each.
+        log: log lines of the service and the nodes.
+        nodes: the link and the URL of each node, by name.
     """
 
     url: str
@@ -68,7 +68,7 @@ class LoopbackService:
     log: Lines
     loop: asyncio.AbstractEventLoop
     http: httpx.Client
-    secrets: dict[str, str] = field(default_factory=dict)  # by names of identities
+    secrets: dict[str, str] = field(default_factory=dict)  # by name of the identity
     nodes: dict[str, tuple[NodeLink, str]] = field(default_factory=dict)
     worlds: dict[str, SessionWorlds] = field(default_factory=dict)
     servers: list[uvicorn.Server] = field(default_factory=list)
@@ -101,7 +101,7 @@ class LoopbackService:
         return self.http.request(method, f"{self.url}/v1{path}", headers=headers, **given)
 
     def start_node(self, name: str, identity: str, slots: int = 4) -> NodeLink:
-        """Start a node whose beats are sent until `stop_node`."""
+        """Start a node, whose heartbeats are sent until `stop_node`."""
         found: NodeLink = self.run(self._start_node(name, identity, slots))
         self.wait_for_beat(name)
         return found
@@ -148,7 +148,7 @@ async def _beat(link: NodeLink, worlds: SessionWorlds) -> None:
 def loopback_service(
     store: str | Path, *, rate_hz: float = 1e9, address_hz: float = 1e9, **rules: Any
 ) -> Iterator[LoopbackService]:
-    """A service with an identity for each role, whose name is the role's."""
+    """Start a service with an identity for each role, named like the role."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="loopback service")
     thread.start()

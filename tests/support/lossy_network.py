@@ -1,8 +1,8 @@
-"""A network in memory that does to messages what a seed says.
+"""A network in memory whose faults are determined by a seed.
 
-What becomes of a message is a function of the seed and of the message's key, never of timing: a
-message sent in phase k arrives in phase k + 1, or the plan drops or delays it. A run with faults
-can so be repeated bit for bit.
+The fate of a message depends on the seed and on the message's key, never on timing: a message that
+is sent in phase k arrives in phase k + 1, unless the plan drops or delays it. Runs with faults can
+therefore be repeated bit for bit.
 """
 
 from __future__ import annotations
@@ -50,14 +50,14 @@ class Rates:
 
 
 def check_rate(name: str, value: Any, most: float) -> None:
-    """See that a value is a probability up to `most`."""
+    """Check that a value is a probability up to `most`."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
     if not is_number or not 0.0 <= value <= most:
         raise ConfigError(f"{name} is {value!r}: must be a number from 0 to {most:g}")
 
 
 def check_whole(name: str, value: Any, least: int) -> None:
-    """See that a value is a whole number, `least` or more."""
+    """Check that a value is a whole number of at least `least`."""
     if not isinstance(value, int) or isinstance(value, bool) or value < least:
         raise ConfigError(f"{name} is {value!r}: must be a whole number, {least} or more")
 
@@ -67,18 +67,18 @@ FAULTLESS = Rates()
 
 @dataclass(frozen=True, slots=True)
 class FaultPlan:
-    """What happens to which messages."""
+    """The faults of messages."""
 
-    seed: int = 0  # of all choices
+    seed: int = 0  # seed of all choices
     # name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`
     rates: Mapping[str, Rates] = field(default_factory=dict)
     otherwise: Rates = FAULTLESS
-    until: int | None = None  # the first phase in which nothing happens any more; None means never
-    # the first tick whose messages nothing happens to any more; None means never
+    until: int | None = None  # the first phase without faults; None: there is none
+    # the first tick whose messages have no faults; None: there is none
     until_tick: int | None = None
 
     def of(self, kind: str, phase: int, tick: int = 0) -> Rates:
-        """The rates of a kind of message in a phase, about a tick."""
+        """Return the rates of a kind of message, by phase of sending and tick."""
         if self.until is not None and phase >= self.until:
             return FAULTLESS
         if self.until_tick is not None and tick >= self.until_tick:
@@ -86,7 +86,7 @@ class FaultPlan:
         return self.rates.get(kind, self.otherwise)
 
     def chance(self, key: tuple[object, ...], question: str) -> float:
-        """A number in [0, 1) that belongs to the seed, the message and the question."""
+        """Return a number in [0, 1) that depends on the seed, the message and the question."""
         text = repr((self.seed, key, question)).encode()
         return int.from_bytes(blake2b(text, digest_size=7).digest(), "little") / (1 << 56)
 
@@ -111,21 +111,21 @@ class Network:
 
     def __init__(self, plan: FaultPlan | None = None) -> None:
         self.plan = FaultPlan() if plan is None else plan
-        self.phase = 0  # how often `deliver` has been called
-        self.sent: Counter[str] = Counter()  # kind → copies that were sent
-        self.faults: Counter[tuple[str, str]] = Counter()  # (kind, fault) → how often
+        self.phase = 0  # number of calls of `deliver`
+        self.sent: Counter[str] = Counter()  # kind → number of sent copies
+        self.faults: Counter[tuple[str, str]] = Counter()  # (kind, fault) → number of faults
         self._flights: list[_Flight] = []
         self._copies: Counter[tuple[object, ...]] = Counter()
         self._sequence = 0
 
     def send(self, messages: Iterable[Message]) -> None:
-        """Take messages; each goes to all of its destinations."""
+        """Send messages to all of their destinations."""
         for message in messages:
             for destination in message.destinations():
                 self._send(message, destination)
 
     def deliver(self) -> list[Delivery]:
-        """Begin the next phase: what arrives in it, in order."""
+        """Begin the next phase; return its deliveries in order."""
         self.phase += 1
         self._copies.clear()
         due = sorted(flight[:3] for flight in self._flights if flight.phase <= self.phase)
@@ -173,7 +173,7 @@ class Network:
         self._sequence += 1
 
     def _damaged(self, message: Message, key: tuple[object, ...]) -> bool:
-        """Whether the receiver sees that a bit of the message's wire form has flipped."""
+        """Return whether the receiver detects a flipped bit in the message's bytes."""
         wire = bytearray(encode(message))
         bit = int(self.plan.chance(key, "bit") * len(wire) * 8)
         wire[bit // 8] ^= 1 << (bit % 8)

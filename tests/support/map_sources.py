@@ -10,7 +10,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
 _LANE = '<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>'
-# A straight road of 200 m with a lane in each direction; `<type/>` is a place for its types.
+# A straight road of 200 m with a lane in each direction; `<type/>` is replaced by its types.
 ROAD = (
     '<road name="" length="200" id="1" junction="-1"><type/><planView>'
     '<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry></planView>'

@@ -1,7 +1,7 @@
-"""The committed store in memory: what a store has to promise, in its smallest form.
+"""The committed store in memory, as a minimal implementation of the contract of stores.
 
-It holds the state of every vehicle at the committed tick, and room for the next. Each process
-writes to a segment of its own, and only `commit` makes segments the truth.
+The store has the state of each vehicle at the committed tick, and room for the next tick. Each
+process writes to its own segment, and only `commit` makes segments valid.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ class MemoryStore:
     """States as bytes, by vehicle.
 
     Attributes:
-        segments: (zone, incarnation) → what that process has written for the next tick.
+        segments: (zone, incarnation) → states that the process has written for the next tick.
     """
 
     def __init__(self) -> None:
@@ -30,11 +30,11 @@ class MemoryStore:
         return state_digest(self.committed[vehicle])
 
     def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
-        """One row of the next tick, from the process of that incarnation."""
+        """Write a row of the next tick for the process of this incarnation."""
         self.segments.setdefault((zone, incarnation), {})[vehicle] = state
 
     def clear(self, zone: int, incarnation: int) -> None:
-        """Throw away what a process has written."""
+        """Discard the rows of a process."""
         self.segments.pop((zone, incarnation), None)
 
     def digest(self, zone: int, incarnation: int) -> int:
@@ -42,10 +42,10 @@ class MemoryStore:
         return world_digest(row_hash(vehicle, state) for vehicle, state in rows.items())
 
     def commit(self, tick: int, incarnations: Mapping[int, int]) -> None:
-        """Make the segments of the living hosts the truth of `tick`.
+        """Make the segments of the living hosts the state of `tick`.
 
-        After a COMMIT that was logged but not carried out, a coordinator that starts again calls
-        it once more: the segments are still there.
+        After a COMMIT that was logged but not carried out, a restarted coordinator calls this
+        function again; the segments still exist.
         """
         self.committed = {
             vehicle: state

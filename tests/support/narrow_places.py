@@ -1,4 +1,4 @@
-"""Maps on which few vehicles fit: two lanes that become one, and two signals close together."""
+"""Maps with little room for vehicles: a lane drop, and two signals close together."""
 
 from __future__ import annotations
 
@@ -52,13 +52,13 @@ PAIR_DEMAND = """<routes>
 
 
 def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[Path, Path]:
-    """A road on which two lanes become one, with `per_h` vehicles/h on each lane."""
+    """Make a road on which two lanes become one, with `per_h` vehicles/h on each lane."""
     demand = ZIPPER_DEMAND.format(type=vehicle_type, per_h=per_h)
     return _made(folder, ZIPPER_NODES, ZIPPER_EDGES, ZIPPER_CONNECTIONS, demand)
 
 
 def signal_pair(folder: Path, apart_m: float = 24.0) -> tuple[Path, Path]:
-    """Two crossings with signals; opposing left turns share the short roads between them."""
+    """Make two crossings with signals; opposing left turns share the short road between them."""
     nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0)
     return _made(folder, nodes, PAIR_EDGES, PAIR_CONNECTIONS, PAIR_DEMAND)
 

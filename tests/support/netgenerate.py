@@ -1,4 +1,4 @@
-"""Maps made by SUMO's netgenerate, and by its netconvert of drawn roads."""
+"""Maps that SUMO's netgenerate makes, and that netconvert makes of plain roads."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ JUNCTIONS = ("priority", "traffic_light", "right_before_left", "allway_stop")
 
 
 def netgenerate(path: Path, *options: str) -> Path:
-    """Make a network with these options in a file; the test is skipped where SUMO is absent."""
+    """Make a network with these options; skip the test if SUMO is not installed."""
     return _made("netgenerate", path, *options)
 
 
 def netconvert(folder: Path, name: str) -> Path:
-    """The network of `NAME.nod.xml`, `NAME.edg.xml` and `NAME.con.xml`, beside them."""
+    """Build the network of `NAME.nod.xml`, `NAME.edg.xml` and `NAME.con.xml` beside these files."""
     kinds = {"node": "nod", "edge": "edg", "connection": "con"}
     files = [f"--{kind}-files={folder / name}.{end}.xml" for kind, end in kinds.items()]
     return _made("netconvert", folder / f"{name}.net.xml", *files)
@@ -33,7 +33,7 @@ def _made(program: str, path: Path, *options: str) -> Path:
 
 
 def random_map(folder: Path, number: int) -> Path:
-    """The map of a number: random, grid or spider, of each kind of junction."""
+    """Make the map with this number: random, grid or spider, with each kind of junction."""
     common = ["-L", str(1 + number % 2), "-j", JUNCTIONS[number // 3 % 4], "--seed", str(number)]
     kinds = (
         ["--rand", "--rand.iterations", "40"],

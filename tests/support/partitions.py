@@ -1,4 +1,4 @@
-"""Divisions of the plane, and the places where they could go wrong."""
+"""Divisions of the plane, and critical points of them."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.zones.partition.zone_partition import Bounds, ZonePartition
 
 BOUNDS: Bounds = (-40.0, -30.0, 60.0, 50.0)
 
-# Five zones around one in the middle: no straight line cuts it in two.
+# Five zones around a zone in the middle, so that no straight line separates them.
 PINWHEEL = ZonePartition(
     (0.0, 0.0, 30.0, 30.0),
     np.array(
@@ -21,7 +21,7 @@ PINWHEEL = ZonePartition(
 
 
 def four(x: float = 10.0, y: float = 20.0) -> ZonePartition:
-    """Four zones that meet at (x, y)."""
+    """Return four zones that meet at (x, y)."""
     low_x, low_y, high_x, high_y = BOUNDS
     rects = [
         [low_x, low_y, x, y],
@@ -34,7 +34,7 @@ def four(x: float = 10.0, y: float = 20.0) -> ZonePartition:
 
 @st.composite
 def partitions(draw: st.DrawFn, max_cuts: int = 7) -> ZonePartition:
-    """Rectangles cut in two again and again, whole metres often: borders meet in four corners."""
+    """Draw rectangles that are cut repeatedly, often at whole metres, so that four corners meet."""
     if draw(st.integers(0, 9)) == 0:
         return PINWHEEL
     rects = [BOUNDS]
@@ -58,7 +58,7 @@ def partitions(draw: st.DrawFn, max_cuts: int = 7) -> ZonePartition:
 
 @st.composite
 def places(draw: st.DrawFn, partition: ZonePartition, size: int = 8) -> NDArray[np.float64]:
-    """(n, 2) places: on borders and corners, a bit beside them, inside, and far outside."""
+    """Draw (n, 2) points on borders and corners, close to them, inside, and far outside."""
     columns = []
     for axis in (0, 1):
         sides = np.unique(partition.rects[:, [axis, axis + 2]])

@@ -1,4 +1,4 @@
-"""Pools of toy jobs, and whether their processes have gone."""
+"""Pools of toy jobs, and checks that their processes have ended."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.toy_job import TASKS, TOTAL
 
 MODULE = "tests.support.toy_job"
 ROOT = Path(__file__).resolve().parents[2]
-MORE = 1000  # numbers that each task adds
+MORE = 1000  # the numbers that each task adds
 Make = Callable[..., Pool]
 
 
@@ -30,7 +30,7 @@ def program(
 
 @contextmanager
 def toy_pools() -> Iterator[Make]:
-    """Makes pools of toy jobs, and closes them at the end."""
+    """Yield a function that makes pools of toy jobs; close the pools after the test."""
     pools: list[Pool] = []
 
     def call(
@@ -52,17 +52,17 @@ def totals(pool: Pool) -> list[list[float]]:
 
 
 def committed_image(pool: Pool) -> memoryview:
-    """Return the memory in which the last state of the workers was committed, to damage it."""
+    """Return the memory with the last committed state of the workers, for damaging it."""
     return pool._processes._resources.segments[2 + pool._committed].map()
 
 
 def alive(pids: list[int]) -> list[int]:
-    """Those that are there, and be it as a zombie of ours."""
+    """Return the processes that exist, including zombie children of this process."""
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
 def strike_soon(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
-    """Send a signal a while later; by then the process may have died of another one."""
+    """Send a signal some time later; the process may have died by then."""
 
     def strike() -> None:
         with suppress(ProcessLookupError):
@@ -81,7 +81,7 @@ def gone(pids: list[int], limit_s: float = 60.0) -> bool:
 
 
 def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """What `work` returns; SIGALRM ends it, where it waits for ever."""
+    """Return the result of `work`; SIGALRM ends it after the limit."""
 
     def give_up(*_: object) -> None:
         raise TimeoutError(f"not done after {limit_s:g} s")
@@ -96,7 +96,7 @@ def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
 
 
 def gone_soon(pids: list[int]) -> bool:
-    """Whether all have ended, buried or not."""
+    """Return whether all processes have ended, including zombies."""
     for pid in pids:
         try:
             pidfd = os.pidfd_open(pid)

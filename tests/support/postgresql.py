@@ -19,7 +19,7 @@ DEBIAN = Path("/usr/lib/postgresql")  # the package puts no server in the path
 
 
 def find_programs() -> Path | None:
-    """The folder of initdb, postgres and pg_ctl: of the path, or Debian's newest."""
+    """Return the folder of initdb, postgres and pg_ctl: in the path, or Debian's newest."""
     if (found := shutil.which("initdb")) and shutil.which("postgres") and shutil.which("pg_ctl"):
         return Path(found).parent
     folders = sorted(DEBIAN.glob("*/bin"), key=lambda one: float(one.parent.name))
@@ -28,19 +28,19 @@ def find_programs() -> Path | None:
 
 @contextmanager
 def running_postgresql() -> Iterator[str]:
-    """URL of a server that ends with the block; without its programs the test is skipped."""
+    """Yield the URL of a server that ends with the block; skip the test if it is not installed."""
     programs = find_programs()
     if programs is None:
         pytest.skip(
             "no PostgreSQL on this machine, so stores are tested on SQLite alone; on Debian: "
             "apt-get install postgresql"
         )
-    folder = Path(tempfile.mkdtemp(prefix="cavmarl-pg-"))  # where every user may go
+    folder = Path(tempfile.mkdtemp(prefix="cavmarl-pg-"))  # a folder that every user can read
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
     user = ["setpriv", "--reuid=65534", "--regid=65534", "--clear-groups"]
-    prefix = user if os.geteuid() == 0 else []  # it does not run for root
+    prefix = user if os.geteuid() == 0 else []  # PostgreSQL refuses to run as root
     if prefix:
         os.chown(folder, 65534, 65534)
     data = folder / "data"

@@ -1,4 +1,4 @@
-"""Dotted names and files in backticks in docstrings and comments of the package: the dead ones."""
+"""Find dotted names and files in docstrings and comments of the package that do not exist."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.config.io import dotted_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# First parts of names that are not of the package: of libraries, of highway-env, of a logger.
+# First parts of names outside of the package: libraries, highway-env, a logger.
 OTHERS = frozenset(
     """
     copy defusedxml dtype flags gymnasium httpx numba numpy ray select socket sumolib time
@@ -30,7 +30,7 @@ _DATA = ("html", "json", "jsonl", "parquet", "safetensors", "xml", "yaml", "zst"
 
 
 class _Members:
-    """Names inside of a class, its attributes among them, and its bases."""
+    """The names inside of a class with its attributes, and its bases."""
 
     def __init__(self, node: ast.ClassDef) -> None:
         self.bases = [base.id for base in node.bases if isinstance(base, ast.Name)]
@@ -41,7 +41,7 @@ class _Members:
 
 
 def _defined(body: list[ast.stmt]) -> Iterator[str]:
-    """Names that statements define or import, those under an `if` too."""
+    """Yield the names that statements define or import, also under an `if`."""
     for node in body:
         match node:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
@@ -58,7 +58,7 @@ def _defined(body: list[ast.stmt]) -> Iterator[str]:
 
 
 def _annotated(tree: ast.Module) -> dict[str, set[str]]:
-    """Classes in the annotations of parameters and fields of a module, by their names."""
+    """Return the classes in annotations of parameters and fields of a module, by name."""
     found: dict[str, set[str]] = defaultdict(set)
     for node in ast.walk(tree):
         if isinstance(node, ast.arg) and node.annotation is not None:
@@ -77,7 +77,7 @@ class Package:
     def __init__(self) -> None:
         self.sources: dict[str, str] = {}
         self._classes: dict[str, list[_Members]] = defaultdict(list)
-        self._modules: dict[str, list[str]] = defaultdict(list)  # by the last part of their name
+        self._modules: dict[str, list[str]] = defaultdict(list)  # by the last part of names
         self._keys = dotted_keys(EnvConfig)
         trees: dict[str, ast.Module] = {}
         for path in sorted((ROOT / "cavmarl").rglob("*.py")):
@@ -92,7 +92,7 @@ class Package:
         self._tops = {name: set(_defined(tree.body)) for name, tree in trees.items()}
 
     def dead(self) -> list[str]:
-        """Place and name of each reference that leads nowhere."""
+        """Return place and name of each dead reference."""
         return [
             f"{module}: `{name}`"
             for module, source in self.sources.items()
@@ -100,7 +100,7 @@ class Package:
         ]
 
     def dead_in(self, source: str) -> Iterator[str]:
-        """Names and files in the docstrings and comments of a source that lead nowhere."""
+        """Yield names and files in docstrings and comments of a source that do not exist."""
         text = "\n".join([*_DOCSTRING.findall(source), *_COMMENT.findall(source)])
         for name in _FILE.findall(text):
             if "NAME" not in name and not self._is_file(name):
@@ -121,13 +121,13 @@ class Package:
         return name.removesuffix(".py") in self._modules
 
     def _is_key(self, name: str) -> bool:
-        """Whether it is a key of `env.yaml`, a section of it, or the end of one."""
+        """Return whether a name is a key or section of `env.yaml`, or the end of a key."""
         return any(
             f".{key}.".find(f".{name}.") >= 0 or name.startswith(f"{key}.") for key in self._keys
         )
 
     def _is_name(self, parts: list[str]) -> bool:
-        """Whether parts are a module by its last names, something in one, or a class member."""
+        """Return whether parts name a module by its last names, a name in it, or a class member."""
         if self._has(parts[0], parts[1]):
             return True
         for size in range(1, len(parts) + 1):

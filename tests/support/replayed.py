@@ -16,7 +16,7 @@ from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import TraceChecker
 from cavmarl.verify.differences import Arrays, same_bytes, step_results
 
-# Long ticks, so that a few of them are enough for many to go over borders.
+# Long ticks, so that many vehicles cross borders in few ticks.
 QUICK: Mapping[str, Any] = {
     "clock.sim_dt_s": 0.2,
     "clock.ctrl_dt_s": 0.4,
@@ -28,7 +28,7 @@ BUSY: Mapping[str, Any] = {
 
 
 class Checked:
-    """A watcher that lets the trace checker judge all records."""
+    """A watcher that passes all records to the trace checker."""
 
     def __init__(self) -> None:
         limits = Limits()
@@ -41,7 +41,7 @@ class Checked:
 
 @dataclass
 class Recorded:
-    """An undivided run: what was done, and what came of it after each step, the reset first."""
+    """An undivided run: actions, and results after the reset and after each step."""
 
     env: str | Path
     settings: dict[str, Any]
@@ -59,7 +59,7 @@ class Recorded:
 def record(
     env: str | Path, settings: Mapping[str, Any], steps: int, seed: int = 0, worlds: int = 1
 ) -> Recorded:
-    """The undivided run under the built-in driver."""
+    """Record an undivided run with the built-in driver."""
     plain = {k: v for k, v in settings.items() if not k.startswith("zones.")}
     vec = make_vec(env, num_envs=worlds, overrides=plain)
     found = Recorded(env, dict(settings), worlds, seed)
@@ -72,9 +72,9 @@ def record(
 
 
 def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None) -> CavVectorEnv:
-    """Drive a divided world through the same run; it is the same after every step.
+    """Repeat the run in a divided world, which must be equal after each step.
 
-    The trace of each world is checked, too, and hand-overs happen.
+    The trace of each world is checked, too, and vehicles must change their zones.
     """
     wanted = run.settings | dict(settings or {})
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
@@ -86,7 +86,7 @@ def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None)
 
 
 def follow(run: Recorded, vec: CavVectorEnv) -> None:
-    """The run again in other worlds; they are the same after every step."""
+    """Repeat the run in other worlds, which must be equal after each step."""
     same(run, vec, 0, {"observations": vec.reset(seed=run.seed)[0]})
     for step, actions in enumerate(run.actions, start=1):
         same(run, vec, step, step_results(vec.step(actions), actions))

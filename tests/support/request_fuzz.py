@@ -1,4 +1,4 @@
-"""Requests to a service and a node that are almost right, as bytes for a socket."""
+"""Almost valid requests to a service and a node, as bytes for a socket."""
 
 from __future__ import annotations
 
@@ -139,7 +139,7 @@ class RequestFuzz:
     """Makes requests from templates by one to four changes.
 
     Args:
-        random: decides all.
+        random: source of all choices.
         known: values for the places of templates.
         tokens: by roles; `lease` is that of the session on the node.
     """
@@ -324,7 +324,7 @@ def send(url: str, request: RawRequest) -> Answer:
     """Return the answer to a request; raise TimeoutError if there is none in time."""
     place = urlsplit(url)
     with socket.create_connection((place.hostname, place.port), timeout=TIMEOUT_S) as line:
-        with suppress(ConnectionError):  # it may be refused before it is read
+        with suppress(ConnectionError):  # the server may refuse it before reading it
             line.sendall(request.content())
         if request.is_cut:
             with suppress(OSError):  # the server has closed the connection

@@ -1,4 +1,4 @@
-"""A map with a short and a long way to the same place, and traffic that has the choice."""
+"""A map with a short and a long route to the same goal, and traffic that can take both."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from cavmarl.engine.simulation import Simulation
 from tests.support.demand_worlds import make
 from tests.support.driving import drive, start
 
-# in → short → narrow → out, or in → long → out. What the narrow edge, slow and 40 m long, cannot
-# take stands on the short one.
+# in → short → narrow → out, or in → long → out. The narrow edge is slow and 40 m long; vehicles
+# that do not fit there queue on the short edge.
 NODES = """<nodes>
   <node id="A" x="0" y="0"/><node id="B" x="300" y="0"/><node id="C" x="700" y="0"/>
   <node id="D" x="740" y="0"/><node id="E" x="1040" y="0"/><node id="X" x="520" y="-350"/>
@@ -48,7 +48,7 @@ def sumo_binary(name: str) -> str:
 
 
 def make_map(folder: Path) -> Path:
-    """The two ways as a SUMO network."""
+    """Make the two routes as a SUMO network."""
     parts = {"nodes": NODES, "edges": EDGES, "connections": CONNECTIONS}
     options = []
     for name, content in parts.items():
@@ -62,7 +62,7 @@ def make_map(folder: Path) -> Path:
 
 
 def write_demand(folder: Path, body: str, additional: str = "") -> list[Path]:
-    """Files of a demand: routes, and what stands beside them."""
+    """Write files of a demand: routes, and additional elements."""
     files = [folder / "x.rou.xml", folder / "x.add.xml"]
     for path, root, content in zip(
         files, ("routes", "additional"), (body, additional), strict=True
@@ -80,7 +80,7 @@ def two_ways(
     num_worlds: int = 1,
     seed: int | None = 1,
 ) -> Simulation:
-    """Worlds on that map, from their reset on unless the seed is None."""
+    """Make worlds on that map; reset them unless the seed is None."""
     clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
     simulation = make(
         net, write_demand(folder, body, additional), num_worlds=num_worlds, overrides=clock
@@ -91,12 +91,12 @@ def two_ways(
 
 
 def rerouter(inside: str, attrs: str = "", span: str = 'begin="100" end="500"') -> str:
-    """A <rerouter> on the first edge."""
+    """Return a <rerouter> on the first edge."""
     return f'<rerouter id="x" edges="in" {attrs}><interval {span}>{inside}</interval></rerouter>'
 
 
 def passed(simulation: Simulation, seconds: int) -> dict[str, int]:
-    """How many vehicles are seen on each edge in the next seconds."""
+    """Return the number of vehicles that are seen on each edge in the next seconds."""
     network = simulation.network
     found: set[tuple[int, int]] = set()
     for _ in range(seconds):
@@ -110,7 +110,7 @@ def passed(simulation: Simulation, seconds: int) -> dict[str, int]:
 
 
 def sumo_passed(net: Path, files: list[Path], folder: Path) -> Counter[str]:
-    """How many vehicles of SUMO's own run have driven over each edge."""
+    """Return the number of vehicles that have driven over each edge in SUMO's own run."""
     out = folder / "routes.out.xml"
     command = (
         f"-n {net} -r {files[0]} -a {files[1]} --vehroute-output {out} --step-length 0.2 "

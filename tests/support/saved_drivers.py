@@ -1,4 +1,4 @@
-"""Trained drivers that have learned nothing, saved for tests."""
+"""Saved untrained drivers for tests."""
 
 from __future__ import annotations
 

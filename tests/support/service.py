@@ -24,7 +24,7 @@ class RunningService:
 
     process: Any
     url: str
-    secret: str  # of the admin
+    secret: str  # secret of the admin
     store: str | Path
 
     def client(self, secret: str = "", **options: Any) -> Client:
@@ -47,7 +47,7 @@ class RunningService:
         self.process.stdout.close()
 
     def start_again(self, *options: str) -> None:
-        """Start it anew, at the same port and on the same store."""
+        """Start the service again with the same port and store."""
         port = self.url.rsplit(":", 1)[1]
         words = ["-m", "cavmarl", "serve", "--port", port, "--store", str(self.store), *options]
         self.process = ForkedProcess(words, stdout=subprocess.PIPE, text=True)
@@ -58,9 +58,9 @@ class RunningService:
 def running_service(
     store: str | Path, *options: str, fresh: bool = False
 ) -> Iterator[RunningService]:
-    """A service on a socket, with a new store; it ends with the block.
+    """Run a service on a socket with a new store; it ends with the block.
 
-    It is a fork of a process that has loaded the kernels, or a Python of its own if it is `fresh`.
+    It is a fork of a process with loaded kernels, or a new interpreter if `fresh` is true.
     """
     words = ["-m", "cavmarl", "serve", "--port", "0", "--store", str(store), *options]
     process: Any
@@ -81,7 +81,7 @@ def running_service(
 
 @dataclass
 class Cluster:
-    """Node processes of a running service, by name; forks of one that has loaded the kernels."""
+    """Node processes of a running service by name, as forks of a process with loaded kernels."""
 
     service: RunningService
     processes: dict[str, ForkedProcess] = field(default_factory=dict)

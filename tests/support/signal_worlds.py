@@ -1,4 +1,4 @@
-"""State of worlds that tests of signals read."""
+"""Access of tests to the signals of worlds."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from cavmarl.engine.simulation import Simulation
 
 
 def common_of_worlds(simulation: Simulation) -> SharedState:
-    """Ticks, signals and controllers that all zones share."""
+    """Return the ticks, signals and controllers that all zones share."""
     return simulation._tick.common

@@ -1,4 +1,4 @@
-"""Made models of the ground as GeoTIFF and HGT, and towns of OpenStreetMap that lie on them."""
+"""Generated terrain models as GeoTIFF and HGT, and towns of OpenStreetMap on them."""
 
 from __future__ import annotations
 
@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin
 
-WEST, SOUTH = 11.0, 48.0  # of the town
-M_PER_DEG = 111_195.0  # of latitude, about
+WEST, SOUTH = 11.0, 48.0  # position of the town
+M_PER_DEG = 111_195.0  # metres per degree of latitude, approximately
 
 Ground = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 
@@ -32,7 +32,7 @@ TOWN = """<osm version="0.6">
 
 
 def plane(east: float, north: float, base: float = 500.0) -> Ground:
-    """Ground that climbs by so much, as ratios."""
+    """Return a plane with these slopes, as ratios."""
     scale = M_PER_DEG * np.cos(np.radians(SOUTH))
 
     def height(lon: NDArray[Any], lat: NDArray[Any]) -> NDArray[Any]:
@@ -51,7 +51,7 @@ def write_geotiff(
     keys: tuple[int, ...] = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326),
     holes: Callable[[NDArray[Any]], None] = lambda heights: None,
 ) -> Path:
-    """A model with heights in the middle of its cells, void -9999."""
+    """Write a model with heights in the middle of its cells; -9999 marks voids."""
     west, south, east, north = box
     lon = np.arange(west, east + step / 2, step)
     lat = np.arange(north, south - step / 2, -step)
@@ -70,7 +70,7 @@ def write_geotiff(
 
 
 def write_hgt(path: Path, ground: Ground) -> Path:
-    """SRTM's tile N48E011 or what the name says, of 1201 by 1201 heights."""
+    """Write a tile of SRTM with 1201 by 1201 heights: N48E011, or as the name states."""
     lon = np.linspace(11.0, 12.0, 1201)
     lat = np.linspace(49.0, 48.0, 1201)
     path.write_bytes(np.round(ground(*np.meshgrid(lon, lat))).astype(">i2").tobytes())

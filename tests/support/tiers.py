@@ -1,9 +1,9 @@
-"""Which tests are dear: those that start processes, or read SUMO or real maps.
+"""Tiers of tests: unit, integration, slow, and tests that must run alone.
 
-A test is `integration` where its file says so by what it imports or calls, or where a fixture of
-it makes a map; it is `slow` where it is marked so, or is dear (`cpu_time.py`); the rest are unit
-tests. A test is `alone` where it measures time, memory or cores, or kills: nothing may run beside
-it.
+A test is `integration` if its file imports or calls parts that start processes or read SUMO, or if
+a fixture makes a map. It is `slow` if it is marked so or expensive (`cpu_time.py`). All others are
+unit tests. A test is `alone` if it measures time, memory or cores, or kills processes: no other
+test may run at the same time.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ RAY_FILES = (
     "tests/parallel/test_ray_worlds.py",
 )
 
-_IN_RAY = "test_worlds_run_in_a_ray_actor"  # begins the name of a test that starts a cluster
+_IN_RAY = "test_worlds_run_in_a_ray_actor"  # prefix of names of tests that start a cluster
 
-# They measure time, memory or cores, or count on being let run at once.
+# These tests measure time, memory or cores, or need a free core.
 ALONE_FILES: tuple[str, ...] = (
     "tests/parallel/test_core_placement.py",
     "tests/parallel/test_pool_resources.py",
@@ -50,7 +50,7 @@ ALONE_FILES: tuple[str, ...] = (
     "tests/test_memory.py",
 )
 
-# Their kernels draw numbers by unsigned products, which Python warns of.
+# Their kernels use unsigned products, of whose overflow Python warns.
 _COMPILED_ONLY = (
     "tests/sensors/test_gnss.py",
     "tests/sensors/test_heard_conflicts.py",
@@ -61,7 +61,7 @@ _COMPILED_ONLY = (
 
 
 def mark(item: pytest.Item) -> None:
-    """Say which tier a test is of, and whether it runs alone."""
+    """Mark a test with its tier, and whether it runs alone."""
     path = item.path.relative_to(item.config.rootpath).as_posix()
     of_maps = _MAP_FIXTURES & set(getattr(item, "fixturenames", ()))
     if of_maps or path.startswith(_DEAR_FOLDERS) or _starts_processes(item.path):
@@ -77,9 +77,9 @@ def mark(item: pytest.Item) -> None:
 
 
 def is_needed(path: Path, root: Path, expression: str) -> bool:
-    """Whether a file may have tests that `-m` asks for; most need not be read for a small tier.
+    """Return whether a file may have tests for `-m`; for a small tier, most files are not read.
 
-    `expression`: of `-m`, as `twin and not slow`; if it has another form, any file may.
+    `expression`: of `-m`, such as `twin and not slow`; in other forms, any file may have some.
     """
     if path.suffix != ".py" or not path.name.startswith("test_"):
         return True
@@ -129,7 +129,7 @@ class TimeLimit:
 
 
 class ProcessWatch:
-    """A plugin that names the unit tests which have started a process after all."""
+    """A plugin that lists unit tests that have started a process."""
 
     def __init__(self) -> None:
         self.found: set[str] = set()
@@ -137,24 +137,24 @@ class ProcessWatch:
         sys.addaudithook(self._look)
 
     def pytest_runtest_logstart(self) -> None:
-        """A test begins."""
+        """Note the start of a test."""
         self._started = False
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self, item: pytest.Item) -> Iterator[Any]:
-        """A phase of a test is over: its report carries whether it was what its tier says."""
+        """Store in the report of a phase whether the test has started a process."""
         report = yield
         is_unit = not any(item.iter_markers("integration")) and not any(item.iter_markers("slow"))
         report.is_no_unit, self._started = self._started and is_unit, False
         return report
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """The report of a phase has come."""
-        if getattr(report, "is_no_unit", False):  # not of a process that has crashed
+        """Collect the names of such tests."""
+        if getattr(report, "is_no_unit", False):  # missing from a crashed process
             self.found.add(report.nodeid)
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        """Name them."""
+        """Print the tests."""
         for name in sorted(self.found):
             terminalreporter.write_line(f"a unit test has started a process: {name}")
 

@@ -1,4 +1,4 @@
-"""Work of a toy job that goes on until something has been done to it, however fast the machine."""
+"""A toy task that runs until the test has acted on it, independently of the machine's speed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.support.toy_job import AT_WORK, ENOUGH
 def toiling(
     folder: Path, workers: int, act: Callable[[], object], *, ends: bool = True
 ) -> Iterator[str]:
-    """What to tell TOIL, so that `act` is called once when so many are at it.
+    """Yield the payload of TOIL; call `act` once all of these workers run the task.
 
-    They are let go after that; without `ends`, at the end of the block.
+    The workers then finish; without `ends`, they finish at the end of the block.
     """
     os.mkfifo(folder / AT_WORK)
-    heard = os.open(folder / AT_WORK, os.O_RDWR)  # so that nobody waits for the other end
+    heard = os.open(folder / AT_WORK, os.O_RDWR)  # so that no process waits for the other end
     given_up = False
 
     def watch() -> None:

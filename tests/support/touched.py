@@ -19,12 +19,12 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT_S = 50.0  # from the first test on; after that, no other test begins
+LIMIT_S = 50.0  # from the first test on; later, no other test begins
 
-# Folders of Python files beside the package, whose imports are read off their text.
+# Folders of Python files beside the package, whose imports are parsed.
 BESIDE = ("tests", "benchmarks", "fuzz", "docs")
 
-# Files that are read and not imported, and the tests that read them.
+# Files that tests read without importing them, and these tests.
 READ = {
     "envs": ("tests/test_envs_data.py", "tests/test_cards.py", "tests/config/test_registry.py"),
     "agents": ("tests/policies/test_policies.py", "tests/test_cards.py"),
@@ -125,7 +125,7 @@ class RunCount:
 
 
 def main() -> int:
-    """Run the affected tests in two processes; skip and report those that there is no time for."""
+    """Run the affected tests in two processes; skip and report tests for which there is no time."""
     tests = touched_tests(changed_files())
     print(f"{len(tests)} test files are affected")
     return run(tests, "not slow and not integration and not alone")

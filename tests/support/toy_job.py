@@ -1,4 +1,4 @@
-"""A job that adds up, for the processes of a pool; run as a program."""
+"""A job that adds numbers, for the processes of a pool; run as a program."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT, FALL = range(len(TASKS))
 POINTS = ("begun", "half done", "done", "image begun")
 
 
-AT_WORK, ENOUGH = "at work", "enough"  # files of those that toil
+AT_WORK, ENOUGH = "at work", "enough"  # files by which TOIL reports its start and learns of its end
 
 
 def toil(payload: Any) -> None:
-    """For so many s; or in a folder: say that it has begun, and go on until it is enough."""
+    """Run for some seconds; with a folder: report the start, and run until the test ends it."""
     if isinstance(payload, str):
         with open(os.path.join(payload, AT_WORK), "wb", buffering=0) as heard:
             heard.write(b".")
@@ -37,7 +37,7 @@ def toil(payload: Any) -> None:
 
 
 class Fatal(np.ndarray[Any, Any]):
-    """Whoever copies it dies of it."""
+    """An array that kills the process that copies it."""
 
     def view(self, *_: Any, **__: Any) -> Any:
         os.kill(os.getpid(), signal.SIGKILL)
@@ -46,21 +46,21 @@ class Fatal(np.ndarray[Any, Any]):
 class Adder:
     def __init__(self) -> None:
         self.numbers = np.zeros(3, dtype=[("a", np.float64), ("b", np.int32)])
-        self.more = np.zeros(0)  # another one each time
+        self.more = np.zeros(0)  # replaced by another array in each task
         self.falls_at = ""
 
     def on_idle(self) -> None:
-        """Nothing to do."""
+        """Do nothing: there is no idle work."""
 
     def before_fork(self) -> None:
-        """Nothing is shared."""
+        """Do nothing: no memory is shared."""
 
     def perform(self, task: int, payload: Any) -> Any:
         if task == TOTAL:
             return [float(self.numbers["a"].sum()), len(self.more)]
         if task == FALL:
             self.falls_at = ""
-            with suppress(FileNotFoundError):  # whoever comes first falls, and nobody else
+            with suppress(FileNotFoundError):  # only the first process falls
                 os.unlink(payload[1])
                 self.falls_at = POINTS[payload[0]]
         self.pass_by("begun")
@@ -98,7 +98,7 @@ def make_jobs(message: Mapping[str, Any]) -> list[Adder]:
     if "fails" in message:
         raise RuntimeError(message["fails"])
     for file in message.get("dies_while", ()):
-        with suppress(FileNotFoundError):  # each of these files ends one start
+        with suppress(FileNotFoundError):  # each of these files makes one start fail
             os.unlink(file)
             os.kill(os.getpid(), message.get("dies_by", signal.SIGKILL))
     if "ends" in message:

@@ -1,4 +1,4 @@
-"""Vehicles on the lanes of the entries' maps, for the kernels that need roads."""
+"""Vehicles on lanes of bundled maps, for kernels that need roads."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ NAMES = ("ring", "merge", "grid4x4")
 
 @cache
 def network(name: str) -> RoadNetwork:
-    """The roads of an entry."""
+    """Return the roads of an environment."""
     return load_network(resolve_map(*load_config(name)))
 
 
 @cache
 def plans(name: str) -> NDArray[np.void]:
-    """PLAN (4, L): four goals spread over the edges outside junctions."""
+    """Return PLAN (4, L): plans to four goals, spread over the edges outside of junctions."""
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"])
     picks = np.linspace(0, len(outside) - 1, 4).astype(int)
@@ -45,7 +45,7 @@ def travel_by(
     types: NDArray[np.void] | None = None,
     stops: NDArray[np.void] | None = None,
 ) -> TripTables:
-    """Ways (any shape of PLAN), with the generator's type and no stops unless others are given."""
+    """Return tables with plans of any shape, and by default the generator's type and no stops."""
     return TripTables(
         generated_types() if types is None else types,
         steps.reshape(-1),
@@ -61,12 +61,12 @@ def travel_by(
 
 @cache
 def travel(name: str) -> TripTables:
-    """The generator's type and the ways to the four goals of `plans`."""
+    """Return tables with the generator's type and the four plans of `plans`."""
     return travel_by(plans(name))
 
 
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
-    """Room for the kernels; as long as no vehicle is listed, buses are looked for at junctions."""
+    """Return scratch memory; before vehicles are listed, each junction may have buses."""
     room = make_shard_scratch(roads, capacity)
     room.largest[:] = len(SIZE_LENGTHS_M)
     return room
@@ -75,7 +75,7 @@ def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
 def on_lane(
     roads: RoadNetwork, lane: int, s: float, travel: TripTables | None = None, **fields: object
 ) -> NDArray[np.void]:
-    """VEHICLE (1,): a car on a lane, on its way to its goal if it has one; `fields` override."""
+    """Return VEHICLE (1,): a car on a lane, on its plan if it has a goal; `fields` override."""
     row = blank_vehicle()
     row["lane"], row["target_lane"], row["s"] = lane, lane, s
     for field, value in fields.items():
@@ -94,7 +94,7 @@ def on_lane(
 
 @st.composite
 def crowds_on_lanes(draw: st.DrawFn, name: str, most: int = 24) -> NDArray[np.void]:
-    """Cars on a few lanes of an entry, many at equal places, ids in random order."""
+    """Draw cars on a few lanes of an environment, many at equal positions, ids in random order."""
     roads = network(name)
     lanes = draw(st.lists(st.integers(0, len(roads.lanes) - 1), min_size=1, max_size=5))
     places = draw(

@@ -11,11 +11,11 @@ TRAIN = Path(__file__).resolve().parents[2] / "train"
 
 
 def load_program(name: str) -> ModuleType:
-    """A program as a module: a file that is read, for `train` is no package."""
+    """Return a program as a module; it is loaded from its file, since `train` is no package."""
     spec = importlib.util.spec_from_file_location(name, TRAIN / f"{name}.py")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look their module up
+    sys.modules[spec.name] = module  # dataclasses look up their module
     spec.loader.exec_module(module)
     return module

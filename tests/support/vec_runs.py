@@ -1,4 +1,4 @@
-"""What comes out of worlds that are stepped, for tests that compare it."""
+"""Results of steps, for tests that compare them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def drive(
     seed: int = 5,
     before: Callable[[int], None] = lambda step: None,
 ) -> Run:
-    """All that comes out of an episode's beginning in which agents do not drive well."""
+    """Return all results of the first steps of an episode in which agents drive badly."""
     observations, infos = vec.reset(seed=seed, options={"first_world": 3})
     found: Run = [observations, *infos.values()]
     rng = np.random.default_rng(seed)

@@ -1,4 +1,4 @@
-"""What stands between two processes, hears what they say, and spoils it."""
+"""A proxy between two processes that reads and changes their bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ __all__ = ["Proxy", "free_port", "own_address"]
 
 
 def own_address() -> str | None:
-    """An address of this machine that others can reach, if it has one."""
+    """Return an address of this machine that other machines can reach, if it has one."""
     for addresses in psutil.net_if_addrs().values():
         for each in addresses:
             if each.family == socket.AF_INET and not each.address.startswith("127."):
@@ -27,12 +27,12 @@ def free_port(address: str) -> int:
 
 
 class Proxy:
-    """Passes on what comes, and keeps it."""
+    """A proxy that forwards and stores bytes."""
 
     def __init__(self, target: tuple[str, int]) -> None:
-        self.heard: list[bytearray] = []  # of each caller
-        self.said = bytearray()  # to all of them
-        self.spoiler = b""  # goes to the target instead of what a caller says next
+        self.heard: list[bytearray] = []  # bytes of each caller
+        self.said = bytearray()  # bytes to all callers
+        self.spoiler = b""  # replaces the next bytes of a caller to the target
         self._target = target
         self._server = socket.create_server((target[0], 0))
         self.place: tuple[str, int] = self._server.getsockname()[:2]
@@ -65,7 +65,7 @@ class Proxy:
                 each.shutdown(socket.SHUT_RDWR)
 
     def cut(self) -> None:
-        """End what there is."""
+        """Close all connections."""
         for each in self._sockets:
             with suppress(OSError):
                 each.shutdown(socket.SHUT_RDWR)

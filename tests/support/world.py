@@ -1,4 +1,4 @@
-"""What tests need of a running world that its public interface does not show."""
+"""Access of tests to parts of a running world that are not public."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.traffic.native import NativeTraffic
 
 
 class PhaseLog(PhaseExecutor):
-    """Passes phases on to another executor and keeps their order."""
+    """An executor that passes phases on to another executor and stores their order."""
 
     def __init__(self, executor: Executor) -> None:
         self.phases: list[Phase] = []
@@ -34,12 +34,12 @@ def traffic_of(simulation: Simulation) -> NativeTraffic:
 
 
 def coordination_of(simulation: Simulation) -> Any:
-    """Return what decides ownership."""
+    """Return the coordination of ownership."""
     return simulation._tick.coordination
 
 
 def executor_of(simulation: Simulation) -> Executor:
-    """Return what runs the phases of the shards."""
+    """Return the executor of the phases of the shards."""
     return simulation._tick.executor
 
 

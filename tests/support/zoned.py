@@ -1,4 +1,4 @@
-"""Rows of several zones for the kernels that carry them from one to another."""
+"""Rows of several zones, for kernels that move rows between zones."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ NO_BORDERS = Borders(0.0, 0.0, 0.0)
 
 
 def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> ZoneState:
-    """One world whose zones own these rows, with what is no ghost behind them.
+    """Return one world whose zones own these rows; garbage follows the rows.
 
     Args:
         parts: the rows of each zone.
-        room: rows of a zone; default: enough for a ghost of everybody.
+        room: rows of a zone; default: enough for ghosts of all vehicles.
     """
     zoned = make_zone_state(len(parts), 1, room or max(1, sum(map(len, parts))))
     zoned.rows["id"] = zoned.border[:] = -7
@@ -44,7 +44,7 @@ def exchanged(
     borders: Borders = NO_BORDERS,
     book: BorderRecords | None = None,
 ) -> ZoneState:
-    """The same after the zones have exchanged their ghosts."""
+    """Return the same world after the zones have exchanged their ghosts."""
     zoned = zoned_of(parts)
     if book is None:
         book = make_book(1, zoned.rows.shape[-1] * partition.count)
@@ -54,6 +54,6 @@ def exchanged(
 
 
 def ghosts_of(zoned: ZoneState, zone: int) -> NDArray[np.void]:
-    """What a zone sees of the others."""
+    """Return the ghosts of a zone."""
     first, last = zoned.num_owned[zone, 0], zoned.num_rows[zone, 0]
     return zoned.rows[SIDE, zone, 0, first:last]

@@ -1,4 +1,4 @@
-"""How departures of all zones are agreed at the departure queue."""
+"""The departure queue decides on proposals of departures of all zones."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FIRST_ID = 50
 
 
 def gate_of(num_queue: int) -> DepartureQueue:
-    """A departures where so many wait; the one at place q has the id 50 + q."""
+    """Return a departure queue of this length; the vehicle at position q has the id 50 + q."""
     departures = make_departure_queue(1, 12, ROADS.arrays, VEHICLE)
     departures.queue[0]["id"] = FIRST_ID + np.arange(12)
     departures.queue[0]["lane"] = MAIN[0]
@@ -35,7 +35,7 @@ def gate_of(num_queue: int) -> DepartureQueue:
 
 
 def offer(departures: DepartureQueue, xs: Sequence[tuple[int, float]]) -> None:
-    """Proposals as (place in the queue, x), in the order in which the zones made them."""
+    """Add proposals (position in the queue, x) in the order in which the zones made them."""
     for n, (q, x) in enumerate(xs):
         departures.passing[0, n] = vehicles([(x, 0.0, 0.0)], id=FIRST_ID + q)[0]
         departures.places[0, n] = q
@@ -54,7 +54,7 @@ def running(number: int) -> NDArray[np.int64]:
     return np.array([number], dtype=np.int64)
 
 
-def test_proposals_are_taken_in_the_order_of_the_queue_whichever_zone_made_them() -> None:
+def test_proposals_are_accepted_in_the_order_of_the_queue() -> None:
     departures = gate_of(6)
     offer(departures, [(3, 300.0), (5, 500.0), (0, 0.0), (2, 200.0)])
     accept(departures, running(0), 100)
@@ -64,7 +64,7 @@ def test_proposals_are_taken_in_the_order_of_the_queue_whichever_zone_made_them(
 
 
 @pytest.mark.parametrize("order", [(1, 0), (0, 1)])
-def test_of_two_that_would_touch_over_a_border_the_first_of_the_queue_enters(
+def test_if_two_departures_would_touch_over_a_border_the_first_in_the_queue_enters(
     order: tuple[int, int],
 ) -> None:
     departures = gate_of(3)
@@ -75,7 +75,7 @@ def test_of_two_that_would_touch_over_a_border_the_first_of_the_queue_enters(
 
 
 @pytest.mark.parametrize(("present", "enter"), [(8, 2), (9, 1), (10, 0)])
-def test_a_full_world_takes_no_more_than_fit(present: int, enter: int) -> None:
+def test_a_full_world_accepts_only_as_many_as_fit(present: int, enter: int) -> None:
     departures = gate_of(4)
     offer(departures, [(3, 300.0), (1, 100.0), (2, 200.0)])
     accept(departures, running(present), 10)
@@ -84,7 +84,7 @@ def test_a_full_world_takes_no_more_than_fit(present: int, enter: int) -> None:
     assert waiting(departures) == sorted(waiting(departures))
 
 
-def test_one_a_tick_tries_on_each_lane() -> None:
+def test_one_vehicle_per_tick_tries_to_enter_each_lane() -> None:
     departures = gate_of(4)
     departures.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
     worlds = make_worlds(1, 12, ROADS)
@@ -93,7 +93,7 @@ def test_one_a_tick_tries_on_each_lane() -> None:
 
 
 def test_an_entered_vehicle_has_one_owner_and_is_a_ghost_nearby() -> None:
-    # Four zones around (10, 20), halo 5 m; three vehicles: in a corner, near a border, far off.
+    # Four zones around (10, 20), halo 5 m; vehicles: in a corner, near a border, far from both.
     partition = four()
     halo = zone_halo(partition, 5.0)
     entering = vehicles([(9.0, 19.0, 0.0), (12.0, 40.0, 0.0), (-30.0, -20.0, 0.0)], id=[7, 8, 9])

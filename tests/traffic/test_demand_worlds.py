@@ -1,4 +1,4 @@
-"""Worlds that demand files fill: the same bytes whatever the order, and nobody is lost."""
+"""Worlds with demand files: results do not depend on the order of rows, and no vehicle is lost."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def test_shuffled_rows_give_the_same_bytes(make: Make) -> None:
     assert moved > 10 * step, "hardly anything shuffled"
 
 
-def test_worlds_together_are_the_worlds_alone_and_differ(make: Make) -> None:
+def test_worlds_together_equal_single_worlds_and_differ(make: Make) -> None:
     together = make(num_worlds=3)
     start(together, seed=9)
     alone = [make() for _ in range(3)]
@@ -167,8 +167,8 @@ def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("model", ["Krauss", "IDM"])
-def test_a_slow_type_alone_on_its_way_has_no_delay(tmp_path: Path, model: str) -> None:
-    """SUMO's timeLoss of this vehicle is 0, too."""
+def test_a_slow_type_alone_on_its_route_has_no_delay(tmp_path: Path, model: str) -> None:
+    """SUMO's timeLoss of this vehicle is also 0."""
     path = tmp_path / "slow.rou.xml"
     path.write_text(
         f'<routes><vType id="slow" maxSpeed="4" sigma="0" speedDev="0" carFollowModel="{model}"/>'

@@ -1,4 +1,4 @@
-"""Low, medium and high density: one entry, `rush`, in which only the number of vehicles changes."""
+"""Low, medium and high density: the environment `rush` with different numbers of vehicles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.driving import drive, start
 LOW, MEDIUM, HIGH = 25, 50, 100
 DENSITIES = (LOW, MEDIUM, HIGH)
 ZONES = 4
-# The fullest of four zones has at least this share, so maximum ÷ mean is at least four times that.
+# The fullest of four zones has at least this share, so maximum ÷ mean is at least four times this.
 SHARE = 0.6
 APPROACH_TICKS = 100
 EPISODE = 600  # steps
@@ -97,7 +97,7 @@ def test_low_density_crosses_now_and_then() -> None:
         in_flight = simulation.zones.view().transfers
         at_once |= Counter((transfer.source, transfer.target) for transfer in in_flight)
     assert simulation.migrations >= 1
-    assert min(at_once.values()) == 1, "at some border there are never two at a time"
+    assert min(at_once.values()) == 1, "at some border, there are never two vehicles at a time"
 
 
 def test_medium_density_has_twice_the_updates_of_low() -> None:
@@ -108,21 +108,23 @@ def test_medium_density_has_twice_the_updates_of_low() -> None:
     assert updates[1] == pytest.approx(2 * updates[0], rel=0.05)
 
 
-def test_high_density_has_many_at_borders_at_once() -> None:
-    # Told four seconds ahead.
+def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
+    # Approaches are announced four seconds ahead.
     simulation = world(HIGH, zones=9, approach_ticks=APPROACH_TICKS)
     in_flight = []
     for _ in first_minute(simulation):
         in_flight.append(len({transfer.vehicle for transfer in simulation.zones.view().transfers}))
         ids = simulation.vehicles()["id"]
-        assert len(set(ids.tolist())) == len(ids), "nobody twice"
+        assert len(set(ids.tolist())) == len(ids), "no vehicle twice"
         stats = simulation.traffic_stats()
-        assert stats.departed - stats.arrived - stats.removed == len(ids), "nobody lost"
+        assert stats.departed - stats.arrived - stats.removed == len(ids), "no vehicle is lost"
     assert max(in_flight) >= 10
     assert simulation.migrations >= 50
     (transfers,) = simulation.transfers
     assert len(transfers.rows) == simulation.migrations
-    assert all(0 <= row.tick - row.approached for row in transfers.rows), "nobody unannounced"
+    assert all(0 <= row.tick - row.approached for row in transfers.rows), (
+        "each change was announced"
+    )
     assert {row.forced for row in transfers.rows} == {False}
 
 
@@ -133,7 +135,7 @@ def test_a_divided_city_is_the_undivided_one(vehicles: int) -> None:
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
 def test_a_divided_town_of_carla_is_the_undivided_one(vehicles: int, shared_maps: Path) -> None:
-    # Not all of a hundred find room there: the others wait.
+    # There is no room for all hundred agents: the others wait.
     equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"})
 
 

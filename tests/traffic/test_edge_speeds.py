@@ -17,7 +17,7 @@ PASSENGER, BUS = (1 << VEHICLE_CLASSES.index(name) for name in ("passenger", "bu
 
 
 class Meter:
-    """The arrays of one world, fed second by second."""
+    """The arrays of one world, updated second by second."""
 
     def __init__(self, roads: RoadNetwork) -> None:
         self.roads = roads
@@ -36,7 +36,7 @@ class Meter:
 @st.composite
 def vehicles(draw: st.DrawFn, lanes: int) -> NDArray[np.void]:
     rows = np.zeros(draw(st.integers(0, 12)), VEHICLE)
-    # Few lanes, so that they meet.
+    # Few lanes, so that vehicles share them.
     some = draw(st.lists(st.integers(0, lanes - 1), min_size=1, max_size=4))
     for row in rows:
         row["lane"] = draw(st.sampled_from(some))
@@ -86,4 +86,4 @@ def test_speeds_of_traffic_take_the_place_of_limits_and_closed_edges_of_ways() -
     closed[edge] = PASSENGER
     np.testing.assert_allclose((roads.lanes["length_m"] / speeds(5))[mine], CLOSED_S)
     assert (speeds(0, BUS) == roads.lanes["speed_mps"]).all(), "closed to others"
-    assert (speeds(0, BUS | PASSENGER) == roads.lanes["speed_mps"]).all(), "heeds no permission"
+    assert (speeds(0, BUS | PASSENGER) == roads.lanes["speed_mps"]).all(), "ignores permissions"

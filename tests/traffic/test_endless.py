@@ -1,4 +1,4 @@
-"""`traffic.endless`: agents drive on to another goal, and are not charged for it."""
+"""`traffic.endless`: agents get another goal, without effect on their rewards."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ PROGRESS = TERMS.index("progress")
 
 
 def drive(endless: bool) -> tuple[float, bool]:
-    """Way of one car alone on a ring of 260 m in 90 s, in m, and whether its trip has ended."""
+    """Return how far a single car drives on a ring of 260 m in 90 s, and whether its trip ended."""
     overrides = {"traffic.endless": endless, "traffic.demand": []}
     vec = cavmarl.make_vec("ring22", overrides=overrides)
     vec.reset(seed=2)
@@ -17,7 +17,7 @@ def drive(endless: bool) -> tuple[float, bool]:
     for _ in range(449):
         _, _, terminated, _, _ = vec.step(vec.suggest_actions())
         progress_m = float(vec.worlds.arrays.terms[0, 0, PROGRESS])
-        assert progress_m > -0.1  # another goal is no way back
+        assert progress_m > -0.1  # another goal is no step back
         way_m += progress_m
         ended |= bool(terminated.any())
     return way_m, ended
@@ -26,7 +26,7 @@ def drive(endless: bool) -> tuple[float, bool]:
 def test_no_trip_ends_where_trips_are_endless() -> None:
     way_m, ended = drive(endless=True)
     assert not ended
-    assert way_m > 2 * 260.0  # it has driven round, and each metre was counted
+    assert way_m > 2 * 260.0  # the car has driven round, and each metre was counted
     assert drive(endless=False)[1]
 
 

@@ -1,4 +1,4 @@
-"""Each of SUMO's words for where, and how fast, a vehicle enters."""
+"""Each of SUMO's words for lane, position and speed of departures."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ PLAN = make_plans(ROADS, [ROADS.edge_ids.index("main_out")])
 TRAVEL = travel_by(PLAN)
 KIND = generated_types()[0]
 KEY = world_key(1, 0, 0)
-# Three lanes, of which the rightmost ends: from there the way goes on after a lane change.
+# Three lanes; the rightmost lane ends, so vehicles on it must change lanes.
 WEAVE = [ROADS.lane_ids.index(f"weave_{k}") for k in range(3)]
 MAIN = [ROADS.lane_ids.index(f"main_in_{k}") for k in range(2)]
 LENGTH = float(ROADS.lanes["length_m"][MAIN[0]])
@@ -41,7 +41,7 @@ LIMIT = float(ROADS.lanes["speed_mps"][MAIN[0]])
 
 
 def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
-    """A car that waits to enter; its lane, place and speed are given unless `fields` say more."""
+    """Return a waiting departure; lane, position and speed are given unless `fields` differ."""
     row = np.zeros(1, DEPARTURE)
     row["id"], row["agent"], row["lane"], row["speed_factor"] = 50, -1, lane, 1.0
     for field, value in fields.items():
@@ -50,7 +50,7 @@ def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
 
 
 def traffic(*places: tuple[int, float, float]) -> tuple[NDArray[np.void], Scratch]:
-    """Cars as (lane, s, speed), ids rising, and their index."""
+    """Return cars at (lane, s, speed) by rising id, and their index."""
     rows = [
         on_lane(ROADS, lane, s, TRAVEL, speed=speed, id=k)
         for k, (lane, s, speed) in enumerate(places)
@@ -126,7 +126,7 @@ def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
     _, room = traffic((WEAVE[1], 20.0, 5.0))
     assert lane_of(codes.LANE_BEST, room) == WEAVE[2]
     taken = WEAVE[1:]
-    assert lane_of(codes.LANE_BEST, room, taken=taken) == -1, "it waits for one of them"
+    assert lane_of(codes.LANE_BEST, room, taken=taken) == -1, "it waits for one of the lanes"
 
 
 def test_no_lane_that_leads_nowhere_is_taken() -> None:
@@ -174,11 +174,11 @@ def test_last_keeps_the_gap_to_stop_behind_the_last(wanted_mps: float) -> None:
     assert place(room, **words) == pytest.approx(expected)
     _, room = traffic((MAIN[0], 60.0, 0.0))
     words["speed"] = LIMIT
-    assert place(room, **words) == 2.5, "there it waits"
+    assert place(room, **words) == 2.5, "it waits at that place"
 
 
 def test_last_on_an_empty_lane_is_its_end() -> None:
-    """At the speed with which it may come to the line; at rest it is at the line itself."""
+    """The vehicle has the speed at which it may approach the line, or stands at the line."""
     _, room = traffic()
     words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN}
     assert place(room, **words, speed=0.0) == pytest.approx(LENGTH - 3.5)
@@ -257,7 +257,7 @@ def test_a_leader_makes_slower_but_a_given_speed_waits() -> None:
 
 
 def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
-    # The lane that follows begins inside the junction.
+    # The next lane is inside the junction.
     beyond = int(PLAN[0][MAIN[0]]["next"])
     _, room = traffic((beyond, 0.0, 0.0))
     near = speed(room, s=LENGTH - 12.0, speed_code=codes.SPEED_MAX)
@@ -272,7 +272,7 @@ def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
 def test_a_steered_car_that_sticks_out_from_the_lane_beside_is_a_leader(
     askew: float, driver: int, minds: bool
 ) -> None:
-    # It has nearly made its change to the left, and its rear is still over the entrant's lane.
+    # The car has nearly finished its change to the left; its rear is over the departure's lane.
     cars, _ = traffic((MAIN[1], 50.0, 2.0))
     cars["driver"], cars["d"] = driver, -0.3
     cars["heading"] -= askew
@@ -292,7 +292,7 @@ def test_before_the_end_of_a_lane_no_vehicle_enters_fast() -> None:
 
 
 def test_only_a_line_where_it_may_have_to_stop_makes_a_departure_slow() -> None:
-    """Behind it a lower limit does."""
+    """Behind that line, a lower speed limit has the same effect."""
     _, room = traffic()
     place_m = LENGTH - 12.0
     link = int(PLAN[0][MAIN[0]]["link"])
@@ -328,7 +328,7 @@ def test_a_follower_need_not_brake_hard_for_a_departure(
 
 
 def test_all_followers_are_checked_not_only_the_nearest() -> None:
-    """A vehicle that stands nearer, on another way into the lane, hides no fast one behind it."""
+    """A nearer, standing vehicle on another link does not hide a fast vehicle."""
     roads, ways = network("grid4x4"), travel("grid4x4")
     lane = next(
         k for k, row in enumerate(roads.lanes) if row["num_into"] > 1 and not row["internal"]
@@ -351,10 +351,10 @@ def test_all_followers_are_checked_not_only_the_nearest() -> None:
 
 
 @pytest.mark.parametrize(("rear_m", "safe"), [(-1.0, False), (30.0, True)])
-def test_one_that_has_turned_off_elsewhere_is_a_leader_while_its_rear_is_before_the_fork(
+def test_a_vehicle_on_another_link_is_a_leader_while_its_rear_is_before_the_fork(
     rear_m: float, safe: bool
 ) -> None:
-    """The departure goes straight on; `rear_m`: of the other one, beyond the line of both."""
+    """The departure goes straight on; `rear_m`: the other vehicle's rear beyond the common line."""
     roads, plans = network("grid4x4"), travel("grid4x4")
     lane, link, other = _fork(roads)
     plan = np.zeros(len(roads.lanes), _PLAN)
@@ -375,12 +375,13 @@ def test_one_that_has_turned_off_elsewhere_is_a_leader_while_its_rear_is_before_
 @pytest.mark.parametrize(
     ("to_start_m", "fork_m", "brakes"), [(2.0, 3.0, True), (60.0, 3.0, False), (2.0, 1.0, False)]
 )
-def test_nothing_enters_before_one_that_turns_into_the_lane_beside_from_the_same_lane(
+def test_no_vehicle_enters_before_a_vehicle_that_turns_into_the_lane_beside(
     to_start_m: float, fork_m: float, brakes: bool
 ) -> None:
-    """`to_start_m`: of its front, at 10 m/s, on a way of 8 m that runs beside the own for so far.
+    """`to_start_m`: distance of its front, at 10 m/s, to the end of a path of 8 m. `fork_m`: length
+    over which the path runs beside the own path.
 
-    A long one is in the way for 6 m more.
+    A long vehicle blocks the lane for 6 m more.
     """
     roads, plans = network("grid4x4"), travel("grid4x4")
     _, link, other = _fork(roads)
@@ -397,7 +398,7 @@ def test_nothing_enters_before_one_that_turns_into_the_lane_beside_from_the_same
 
 
 def _fork(roads: Any) -> tuple[int, int, int]:
-    """A lane, and two links that leave it: one over the junction straight on, and another."""
+    """Return a lane, and two links from it: straight on over the junction, and another link."""
     for lane in np.flatnonzero(roads.lanes["num_links"] > 1).tolist():
         first, num = roads.lanes["first_link"][lane], roads.lanes["num_links"][lane]
         links = range(first, first + num)

@@ -1,4 +1,4 @@
-"""Where one drives on the left: read as it is, driven as in a mirror, staged on the other side."""
+"""Left-hand traffic: reading maps, driving mirrored, and scenarios on the other side."""
 
 from pathlib import Path
 
@@ -41,10 +41,10 @@ def test_neighbours_lie_on_the_side_that_the_map_says(tmp_path: Path) -> None:
         assert network.lanes["left"][row["right"]] == lane
         assert network.lanes["index"][row["right"]] == row["index"] + 1
         x, y, *_ = network.pose_on(lane, 0.5 * row["length_m"])
-        assert network.beside(row["right"], x, y)[1] > 1.0  # so far to the left of it
+        assert network.beside(row["right"], x, y)[1] > 1.0  # distance to its left
 
 
-def test_u_turns_are_known_as_such_on_either_side(tmp_path: Path) -> None:
+def test_u_turns_are_recognized_on_both_sides(tmp_path: Path) -> None:
     directions = [
         np.sort(read_network(netgenerate(tmp_path / f"{n}.net.xml", *options)).links["direction"])
         for n, options in enumerate((["--grid", "-L", "2"], ["--grid", *TWO_LANES]))
@@ -93,7 +93,7 @@ def test_agents_in_a_mirrored_world_steer_to_the_other_side(tmp_path: Path) -> N
     most_rad = 0.0
     for _ in range(300):
         right, left = (suggested(world) for world in worlds)
-        # Angles are wrapped upwards, so a mirrored one is the same to the last digits only.
+        # Angles are wrapped upwards, so mirrored angles are equal except for rounding.
         np.testing.assert_allclose(right, left * [1.0, -1.0], atol=1e-6)
         most_rad = max(most_rad, float(np.abs(right[..., 1]).max()))
         for world in worlds:
@@ -129,7 +129,7 @@ def test_scenarios_are_staged_as_in_a_mirror(tmp_path: Path, name: str) -> None:
         np.testing.assert_allclose(right[field], MIRRORED[field] * left[field], atol=1e-9)
 
 
-def test_routes_with_lane_changes_and_stops_go_on_where_one_drives_on_the_left(
+def test_routes_with_lane_changes_and_stops_work_in_left_hand_traffic(
     tmp_path: Path,
 ) -> None:
     plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-L", "3")
@@ -148,5 +148,5 @@ def test_routes_with_lane_changes_and_stops_go_on_where_one_drives_on_the_left(
         stats = world.traffic_stats()
         found.append((stats.departed, stats.waiting, stats.arrived, round(stopped_s)))
     assert found[0] == found[1]
-    assert found[0][2] > 5, "some arrived"
-    assert found[0][3] > 3, "one stood at its stop"
+    assert found[0][2] > 5, "some vehicles arrived"
+    assert found[0][3] > 3, "a vehicle stood at its stop"

@@ -1,4 +1,4 @@
-"""Where trips of the generator begin."""
+"""Starts of generated trips."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.driving import make_traffic
 from tests.support.world import traffic_of
 
 
-def test_where_no_way_in_can_be_followed_vehicles_enter_anywhere() -> None:
+def test_without_usable_roads_into_the_map_vehicles_enter_anywhere() -> None:
     traffic = traffic_of(make_traffic("grid4x4", background=4, overrides={"traffic.origins": []}))
     trips, num_goals = traffic.trips_of(0), traffic.goal_edges.shape[1]
     ways_in = np.flatnonzero(

@@ -1,4 +1,4 @@
-"""Mirrored rows against a plain twin, for fronts anywhere on a map."""
+"""Mirrored rows of SUMO's vehicles compared with a plain twin, for random fronts on a map."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def network() -> RoadNetwork:
 
 
 def fronts(network: RoadNetwork, number: int) -> np.ndarray:
-    """SEEN (number,) with fronts anywhere on the lanes, many of them near a lane's start."""
+    """Return SEEN (number,) with random fronts on the lanes, many of them near a lane's start."""
     random = np.random.default_rng(3)
     seen = np.zeros(number, dtype=SEEN)
     seen["number"] = np.sort(random.permutation(10 * number)[:number])
@@ -45,7 +45,7 @@ def fronts(network: RoadNetwork, number: int) -> np.ndarray:
 
 
 def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
-    """No ways at all: every path is of one edge that nobody is on."""
+    """Return empty routes: each consists of one edge without vehicles."""
     steps = np.zeros(2 * len(network.lanes), dtype=PLAN)
     steps["next"] = -1
     stops = np.zeros(0, dtype=STOP)
@@ -96,7 +96,7 @@ def test_rows_stand_where_the_twin_says(network: RoadNetwork) -> None:
 
 
 def came_by(network: RoadNetwork, seen: np.void) -> int:
-    """Some link that leads to the front's lane."""
+    """Draw a link that leads to the front's lane."""
     found = np.flatnonzero(network.links["to_lane"] == seen["lane"])
     return int(found[0]) if len(found) else -1
 

@@ -1,4 +1,4 @@
-"""Random demand: routes that connect, as long as asked, the same for the same seed."""
+"""Random demand: connected routes of a minimum length, determined by the seed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def grid() -> RoadNetwork:
 
 
 def turns(network: RoadNetwork) -> set[tuple[int, int]]:
-    """Pairs of edges that a link joins, U-turns left out."""
+    """Return pairs of edges that a link joins, without U-turns."""
     links, edge = network.links[network.links["direction"] != ord("t")], network.lanes["edge"]
     return set(zip(edge[links["from_lane"]].tolist(), edge[links["to_lane"]].tolist(), strict=True))
 
@@ -41,7 +41,7 @@ def test_each_leg_is_a_shortest_way(grid: RoadNetwork) -> None:
     route = trips.route(0.0)
     lengths, joined = grid.edges["length_m"], turns(grid)
     shortest = {route[0]: 0.0}
-    for _ in range(len(grid.edges)):  # Bellman and Ford
+    for _ in range(len(grid.edges)):  # the Bellman-Ford algorithm
         for before, after in joined:
             if before in shortest:
                 way = shortest[before] + float(lengths[after])

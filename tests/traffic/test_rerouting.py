@@ -1,4 +1,5 @@
-"""Vehicles that look for their way while the world runs, beside SUMO's on a map with two ways."""
+"""Vehicles that search for routes while the world runs, compared with SUMO's on a map with two
+routes."""
 
 from __future__ import annotations
 
@@ -34,7 +35,7 @@ SOME = (
 ROUTES = (
     '<route id="near" edges="in short narrow out"/><route id="far" edges="in long1 long2 out"/>'
 )
-# Sparse: the short way is always the faster one.
+# Sparse traffic: the short route is always faster.
 SPARSE = '<flow id="f" type="car" route="near" begin="0" end="900" period="6" departSpeed="max"/>'
 CLOSED = '<closingReroute id="narrow"/>'
 
@@ -91,7 +92,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         (CLOSED, 'off="true"', 0, 0),
         ('<closingReroute id="narrow" disallow="bus"/>', "", 0, 0),
         ('<closingReroute id="narrow" allow="bus"/>', "", 65, 75),
-        ('<closingReroute id="out"/>', "", 0, 0),  # no way around: it drives on
+        ('<closingReroute id="out"/>', "", 0, 0),  # without another route, it continues
         ('<closingReroute id="out"/><destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>', "", 22, 48),
@@ -128,7 +129,7 @@ def test_vehicles_with_a_stop_or_an_edge_to_pass_keep_their_route(
 
 
 def jam(net: Path, folder: Path, num_worlds: int = 1) -> Simulation:
-    """Devices and a rerouter at work; not reset yet."""
+    """Make worlds with devices and a rerouter, before their first reset."""
     sometimes = rerouter(CLOSED, 'probability="0.5"', 'begin="90" end="120"')
     body = cars(SOME) + FLOW.replace('period="3"', 'period="exp(0.4)"')
     return two_ways(net, folder, body, sometimes, num_worlds=num_worlds, seed=None)
@@ -179,7 +180,7 @@ def test_a_reset_of_one_world_leaves_the_others(net: Path, tmp_path: Path) -> No
     assert simulation.state_hash(1) == before
 
 
-def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: Path) -> None:
+def test_the_hash_covers_measured_speeds_and_found_routes(net: Path, tmp_path: Path) -> None:
     simulation = jam(net, tmp_path)
     start(simulation, seed=5)
     while simulation.traffic_stats().rerouted < 3:
@@ -188,7 +189,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
     rerouting = traffic_of(simulation).rerouting
     assert rerouting is not None
     past, speed_sums, looks, steps = rerouting.arrays()
-    # A vehicle drives on the first of these steps.
+    # A vehicle is on the first of these steps.
     for array in (past, speed_sums, looks["next"], looks["goal"], steps["to_go"]):
         value = array.reshape(-1)[:1].copy()
         array[(0,) * array.ndim] -= 1
@@ -197,7 +198,7 @@ def test_the_hash_covers_what_is_known_of_traffic_and_ways(net: Path, tmp_path: 
     assert simulation.state_hash() == before
 
 
-def test_room_does_not_grow_and_slots_serve_many(net: Path, tmp_path: Path) -> None:
+def test_memory_does_not_grow_and_slots_are_reused(net: Path, tmp_path: Path) -> None:
     simulation = two_ways(net, tmp_path, cars(DEVICE) + FLOW)
     traffic = traffic_of(simulation)
     assert traffic.slots is not None
@@ -207,12 +208,12 @@ def test_room_does_not_grow_and_slots_serve_many(net: Path, tmp_path: Path) -> N
         drive(simulation)
     arrays = (traffic.travel.steps, *traffic.rerouting.arrays())
     assert [array.size for array in arrays] == sizes
-    # Fewer ever had a way of their own at a time than there were ways.
+    # Slots were reused: fewer slots than found routes were ever written.
     written = (arrays[-1]["to_go"].reshape(-1, traffic.slots.steps) > 0.0).any(axis=1)
     assert 0 < np.count_nonzero(written) < 60
 
 
-def test_ways_beyond_all_memory_are_refused(
+def test_too_many_routes_for_the_memory_are_refused(
     net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(way_slots, "MAX_STEPS", 100)

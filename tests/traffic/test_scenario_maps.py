@@ -1,4 +1,4 @@
-"""Scenarios on maps drawn by chance: staged only where their conflict exists."""
+"""Scenarios on random maps: staged only where their conflict exists."""
 
 from __future__ import annotations
 

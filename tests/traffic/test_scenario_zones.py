@@ -1,4 +1,4 @@
-"""A scenario is the same wherever borders of zones run: through its very place, too."""
+"""A scenario does not depend on borders of zones, not even on borders through its place."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.traffic.test_scenarios import NAMES, ROOMY
 
 STEPS = 75
-CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and lines of zones
+CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and rows of zones
 
 
 def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
-    """A zone file whose border, or the corner of whose borders, is the middle of the scene."""
+    """Write a zone file with a border or a corner of borders in the middle of the scene."""
     scene, extent = vec.simulation.scene, vec.network.extent_m
     assert scene is not None
     low_x, low_y, high_x, high_y = extent
@@ -36,7 +36,7 @@ def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
 
 
 def hashes(vec: CavVectorEnv, driver: str = "idm", steps: int = STEPS) -> list[str]:
-    """The state after each step, until the agent is gone."""
+    """Yield the state after each step, until the agent has left."""
     observations, infos = vec.reset(seed=0)
     policy = load_policy(driver, vec)
     found = [vec.state_hash()]
@@ -56,7 +56,7 @@ def divided(name: str, path: Path, count: int, whole: CavVectorEnv, **keys: Any)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_border_through_the_place_changes_nothing(name: str, tmp_path: Path) -> None:
+def test_a_border_through_the_scene_changes_nothing(name: str, tmp_path: Path) -> None:
     whole = make_scenario(name, density="low")
     expected = hashes(whole)
     for count in CUTS:
@@ -103,7 +103,7 @@ def test_several_agents_are_independent_of_zones(name: str, tmp_path: Path) -> N
 
 
 def test_a_vehicle_that_turns_on_a_border_does_not_alternate_its_owner(tmp_path: Path) -> None:
-    """The car goes to and fro where four zones meet: hysteresis keeps it with one of them."""
+    """The car turns where four zones meet: the hysteresis keeps it with one of them."""
     whole = make_scenario("failed_u_turn")
     steady, restless = (
         divided("failed_u_turn", tmp_path, 4, whole, **{"zones.hysteresis_m": hysteresis_m})
@@ -119,7 +119,7 @@ def test_a_vehicle_that_turns_on_a_border_does_not_alternate_its_owner(tmp_path:
 
 
 def turning(vec: CavVectorEnv) -> tuple[list[int], int]:
-    """The owners of the car that turns, step by step, and how often it went over a border."""
+    """Return the owner of the turning car at each step, and the number of crossed borders."""
     _, infos = vec.reset(seed=0)
     policy = load_policy("idm", vec)
     rows, scene = vec.simulation.vehicles(), vec.simulation.scene

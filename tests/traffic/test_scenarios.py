@@ -1,4 +1,4 @@
-"""Each scenario on two maps: the reference driver comes through, one that never yields does not."""
+"""Each scenario on two maps: the reference driver passes, and `never_yield` fails."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
 )
-# Where there is a road behind the first agent: that which is drawn has none.
+# A place with a road behind the first agent, unlike the randomly drawn place.
 ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
-# The reference driver on grid4x4, seed 0, nobody else on the road.
+# The reference driver on grid4x4, seed 0, without other traffic.
 GOLDEN = {
     ("failed_u_turn", False): "8c96686d6f7f4c3fb7618e14c20de981",
     ("intersection_blockage", False): "8076b53af2bd13a47b5420ae08f51132",
@@ -58,7 +58,7 @@ def played(name: str, driver: str, seed: int = 0, **settings: Any) -> ScenarioRu
         return run_scenario(vec, driver, seed)
 
 
-def test_the_library_is_what_lies_in_its_folder() -> None:
+def test_the_library_has_each_file_of_its_folder() -> None:
     assert scenario_names() == list(NAMES)
     for name in NAMES:
         assert summary_of(name).endswith(".")
@@ -81,7 +81,7 @@ def test_the_reference_driver_passes_and_a_driver_that_never_yields_fails(
     careless = played(name, "never_yield", seed, params=params)
     assert careless.verdict == "collided"
     assert (careless.min_ttc_s, careless.pet_s) == (0.0, 0.0)
-    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # it kept its speed to the end
+    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # it kept its speed
     assert careless.place == found.place
 
 
@@ -116,13 +116,13 @@ def test_scenarios_separate_drivers_on_a_real_map(
 
 
 def test_between_two_lanes_of_a_bend_no_vehicle_is_off_the_road(shared_maps: Path) -> None:
-    """The lanes at this place leave a seam of millimetres, on which the driver once was."""
+    """The lanes at this place leave a gap of millimetres, in which a vehicle was off the road."""
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
     assert played("intersection_blockage", "idm", env=env, place="85_1").verdict == "passed"
 
 
 @pytest.mark.parametrize(("name", "occluded"), GOLDEN)
-def test_a_run_is_known_to_the_last_bit(name: str, occluded: bool) -> None:
+def test_a_run_has_the_recorded_hash(name: str, occluded: bool) -> None:
     params = {"occluded": True} if occluded else {}
     assert played(name, "idm", params=params).state_hash == GOLDEN[name, occluded]
 
@@ -213,7 +213,7 @@ def test_several_agents_come_one_after_the_other(name: str) -> None:
     assert (careless.verdict, careless.verdicts[0]) == ("collided", "collided")
 
 
-def test_the_first_agent_is_where_it_is_alone() -> None:
+def test_the_first_agent_starts_where_it_starts_alone() -> None:
     starts = []
     for agents in (1, 3):
         with made("unprotected_left_turn", agents=agents, density="high") as vec:
@@ -230,7 +230,7 @@ def test_the_first_agent_is_where_it_is_alone() -> None:
         assert starts[0][name][0] == starts[1][name][0]
 
 
-def test_agents_of_a_parallel_env_play_it_too() -> None:
+def test_agents_of_a_parallel_env_are_in_the_scene() -> None:
     keys = {"scenario.name": "road_closure", "population.mode": "closed",
             "population.budget": None}  # fmt: skip
     env = parallel_env("grid4x4", agents=3, background=0, overrides=keys)
@@ -255,7 +255,7 @@ def test_the_driver_that_never_yields_steers() -> None:
         load_policy("never_yield", vec)
 
 
-OWN = '''"""Nobody is there."""
+OWN = '''"""The scene is empty."""
 from dataclasses import dataclass
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.scene import setting
@@ -291,8 +291,8 @@ def test_a_file_can_add_a_scenario(tmp_path: Path) -> None:
         make_scenario(str(path))
 
 
-def test_many_worlds_play_it_side_by_side() -> None:
-    """Each world is what it would be alone, whatever the others' agents do."""
+def test_worlds_with_a_scenario_are_independent() -> None:
+    """Each world equals the world alone, whatever agents of other worlds do."""
     keys = {"scenario.name": "pedestrian_crossing", "population.mode": "closed",
             "population.budget": None, "action.kind": "continuous"}  # fmt: skip
     one, three = (make_vec("grid4x4", num_envs=n, agents=1, background=20, overrides=keys)

@@ -1,4 +1,4 @@
-"""Stops and detours, acted out on the entries' maps."""
+"""Stops and detours on bundled maps."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ World = Callable[..., Simulation]
 
 @pytest.fixture
 def world(tmp_path: Path) -> World:
-    """A world with what stands in a <routes>, from its reset on."""
+    """Make a world with the content of a <routes>, and reset it."""
 
     def build(body: str, env: str = "merge") -> Simulation:
         path = tmp_path / "x.rou.xml"
@@ -40,7 +40,7 @@ def car(stops: str, depart: float = 0.0, lane: str = "0") -> str:
 
 
 def stands(simulation: Simulation, seconds: float) -> list[tuple[float, float, str, float]]:
-    """(first second, last second, lane, place of the front) of each stand of the one vehicle."""
+    """Return (first second, last second, lane, position of the front) of the vehicle's stops."""
     found: list[tuple[float, float, str, float]] = []
     standing = False
     for _ in range(round(seconds / DT)):
@@ -130,7 +130,7 @@ def test_a_vehicle_that_cannot_change_lanes_takes_another_route(world: World) ->
         "grid4x4",
     )
     network, travel = simulation.network, simulation.travel
-    # Drivers ask themselves once a second.
+    # Drivers consider another route once per second.
     while not len(simulation.vehicles()) or simulation.ticks()[0] % round(1.0 / DT):
         drive(simulation)
     row = simulation.vehicles()[0]

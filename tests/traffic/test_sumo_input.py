@@ -1,4 +1,4 @@
-"""What SUMO is given by a user's files writes no file."""
+"""SUMO writes no file, whatever files of a user it reads."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 
 @pytest.fixture(scope="module")
 def trip() -> str:
-    """A trip over two edges of the map."""
+    """Write a trip over two edges of the map."""
     network = network_of(MAP)
     link = network.links[0]
     ends = (network.lanes["edge"][link[side]] for side in ("from_lane", "to_lane"))
@@ -33,7 +33,7 @@ def trip() -> str:
 
 
 def run(folder: Path, *demand: str, map_file: Path = MAP) -> None:
-    """SUMO itself, for ten seconds."""
+    """Run SUMO itself for ten seconds."""
     given = read_input([folder / name for name in demand])
     own = folder / "own"
     own.mkdir()
@@ -95,7 +95,7 @@ def test_signal_programs_of_a_map_write_nothing(tmp_path: Path, trip: str, param
     assert not (tmp_path / "victim").exists()
 
 
-def test_what_looks_like_a_comment_hides_nothing(tmp_path: Path, trip: str) -> None:
+def test_apparent_comments_do_not_hide_outputs(tmp_path: Path, trip: str) -> None:
     data = '<edgeData id="d" file="victim"/>'
     (tmp_path / "a.add.xml").write_text(
         f"<additional><![CDATA[<!--]]>{data}<![CDATA[-->]]></additional>"
@@ -116,7 +116,7 @@ def test_a_map_that_writes_nothing_is_not_copied(tmp_path: Path) -> None:
 def test_a_name_that_means_another_file_is_refused(
     tmp_path: Path, trip: str, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """SUMO would read a file that was not searched."""
+    """SUMO would read a file that was not checked for outputs."""
     monkeypatch.setenv("OTHER", "other")
     (tmp_path / "a").write_text("<additional/>")
     (tmp_path / name).write_text("<additional/>")
@@ -149,7 +149,7 @@ def test_options_that_write_are_not_passed_on(
     assert not (tmp_path / "victim").exists()
 
 
-def test_options_that_change_traffic_are(tmp_path: Path, trip: str) -> None:
+def test_options_that_change_traffic_are_passed_on(tmp_path: Path, trip: str) -> None:
     (tmp_path / "r.rou.xml").write_text(f"<routes>{trip}</routes>")
     (tmp_path / "run.sumocfg").write_text(
         '<c><input><route-files value="r.rou.xml"/></input><processing><time-to-teleport '
@@ -169,7 +169,7 @@ def test_options_that_change_traffic_are(tmp_path: Path, trip: str) -> None:
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-7"])
-def test_what_cannot_be_searched_is_refused(tmp_path: Path, trip: str, encoding: str) -> None:
+def test_files_that_cannot_be_checked_are_refused(tmp_path: Path, trip: str, encoding: str) -> None:
     head = f'<?xml version="1.0" encoding="{encoding}"?>'
     text = f'{head}<additional><edgeData id="d" file="victim"/></additional>'
     (tmp_path / "a.add.xml").write_bytes(text.encode(encoding))

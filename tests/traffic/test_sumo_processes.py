@@ -1,4 +1,4 @@
-"""The processes of SUMO: they come and go with their worlds, and one that dies takes nothing."""
+"""The processes of SUMO: they start and end with their worlds, and a death loses no world."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.sumo_worlds import MODES, alone, coupled, demand_of, tiny_fil
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
-# Started in the background, a program would not hear of Ctrl-C.
+# A program that is started in the background ignores Ctrl-C.
 RUN = """
 import signal, sys
 from cavmarl import make_vec
@@ -84,7 +84,7 @@ def test_the_memory_of_sumo_is_limited(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("source", MODES)
 def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: str) -> None:
-    """This one is one of them."""
+    """One of them is this process."""
     demand = tiny_file(tmp_path)
     with run(demand, source, "end") as other:
         both = settings(demand, source)
@@ -116,7 +116,7 @@ def test_nothing_is_left_after_ctrl_c_or_a_kill(tmp_path: Path, number: signal.S
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_sumo_that_dies_takes_nothing_with_it(tmp_path: Path, source: str) -> None:
+def test_a_dead_sumo_loses_no_world(tmp_path: Path, source: str) -> None:
     with coupled("grid4x4", [tiny_file(tmp_path)], source, agents=3, num_worlds=2) as simulation:
         for _ in range(40):
             drive(simulation)
@@ -144,7 +144,7 @@ def test_a_sumo_that_dies_takes_nothing_with_it(tmp_path: Path, source: str) -> 
 
 
 def resets(folder: Path, number: int) -> None:
-    """So many, with a few steps between; neither processes, files nor memory become more."""
+    """Reset a number of times with a few steps between; processes, files and memory do not grow."""
     with coupled("grid4x4", [tiny_file(folder)], agents=2) as simulation:
         assert simulation.sumo is not None
         (pid,) = simulation.sumo.worlds.pids
@@ -278,8 +278,8 @@ def test_workers_have_sumos_of_their_own(tmp_path: Path, source: str, zones: int
 
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("zones", [1, 2])
-def test_a_worker_that_dies_is_followed(tmp_path: Path, source: str, zones: int) -> None:
-    """SUMO runs again up to the tick; after it, after a reset in the middle of it, and again."""
+def test_a_successor_of_a_dead_worker_continues(tmp_path: Path, source: str, zones: int) -> None:
+    """SUMO repeats the run up to the tick; workers die again after that, and after a reset."""
     worlds = 2 if zones == 1 else 1
     made = {"num_envs": worlds, "agents": 3, "background": 2, "zones": zones, "max_cycles": 37,
             "overrides": settings(tiny_file(tmp_path), source)}  # fmt: skip
@@ -289,7 +289,7 @@ def test_a_worker_that_dies_is_followed(tmp_path: Path, source: str, zones: int)
         for one in (plain, vec):
             one.reset(seed=5)
         for step in range(80):
-            if step in (20, 21, 36, 37, 38, 70):  # 37 begins new episodes
+            if step in (20, 21, 36, 37, 38, 70):  # step 37 begins new episodes
                 os.kill(int(draw.choice(vec.worlds.pool.pids)), signal.SIGKILL)
             results = [one.step(one.suggest_actions()) for one in (plain, vec)]
             assert results[0][0].tobytes() == results[1][0].tobytes(), step
@@ -349,7 +349,7 @@ def test_a_worker_dies_whose_sumo_log_exceeds_its_limit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_node_goes_on_with_what_another_one_has_left(tmp_path: Path, source: str) -> None:
+def test_a_node_resumes_the_log_of_another_node(tmp_path: Path, source: str) -> None:
     wanted = {"num_envs": 2, "agents": 3, "background": 0}
     wanted["overrides"] = settings(tiny_file(tmp_path), source)
     with (
@@ -370,7 +370,7 @@ def test_a_node_goes_on_with_what_another_one_has_left(tmp_path: Path, source: s
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks Linux for a process's settings")
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
-def test_what_the_user_has_set_of_the_c_library_counts_last(
+def test_settings_of_the_c_library_by_the_user_take_precedence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", own)
@@ -385,7 +385,7 @@ def test_what_the_user_has_set_of_the_c_library_counts_last(
         environ = Path(f"/proc/{pid}/environ").read_bytes()
     finally:
         vec.close()
-    # The C library ends each setting where it has read it.
+    # The C library writes an end after each setting that it has read.
     _, _, found = environ.replace(b":", b"\0").partition(b"GLIBC_TUNABLES=")
     words = found.decode().split("\0")
     assert words[0] == "glibc.malloc.hugetlb=1"

@@ -1,4 +1,4 @@
-"""`sumo-demand`: vehicles that depart from SUMO make the stops that it has for them."""
+"""`sumo-demand`: vehicles make the stops that SUMO has for them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODE = {"traffic.source": "sumo-demand", "sensors.signal.timing": False}
 
 
 def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, float, float]]]:
-    """Where each vehicle has stood, by its name: front on the road in m, from when on, how long."""
+    """Return the stops of each vehicle by name: position of the front in m, start, duration."""
     assert simulation.sumo is not None
     dt, tracks = simulation.config.clock.ctrl_dt_s, {}
     for step in range(round(seconds / dt)):
@@ -46,8 +46,8 @@ def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, 
     return found
 
 
-def test_the_table_is_what_the_reader_of_demand_finds(tmp_path: Path) -> None:
-    """SUMO tells of lanes, places and times as our own reader does, also of a bus stop."""
+def test_the_table_of_stops_equals_that_of_the_reader(tmp_path: Path) -> None:
+    """SUMO reports the same lanes, positions and times as cavmarl's reader, also for a bus stop."""
     paths = write_stops(tmp_path)
     with coupled("merge", paths, "sumo-demand") as simulation:
         network, travel = simulation.network, simulation.travel

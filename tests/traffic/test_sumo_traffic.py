@@ -1,4 +1,4 @@
-"""`sumo-traffic`: SUMO moves its vehicles, which are rows here, and brakes for ours."""
+"""`sumo-traffic`: SUMO moves its vehicles, which are mirrored as rows, and brake for agents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEADY = '<vType id="car" sigma="0" speedDev="0"/>'
 
 
 def mirrored(simulation: Simulation) -> np.ndarray:
-    """SUMO's rows of the first world by rising numbers."""
+    """Return SUMO's rows of the first world by rising id."""
     rows = simulation.vehicles()
     rows = rows[rows["driver"] == DRIVER_SUMO]
     return np.sort(rows, order="order")
@@ -39,8 +39,8 @@ def names(simulation: Simulation) -> list[str]:
     return simulation.sumo.worlds.names[0]
 
 
-def test_places_speeds_and_signals_are_those_of_sumo_by_itself(tmp_path: Path) -> None:
-    """Without agents the coupled SUMO does what it does alone; rows and it agree at every tick."""
+def test_positions_speeds_and_signals_equal_those_of_sumo_alone(tmp_path: Path) -> None:
+    """Without agents, the coupled SUMO runs as it does alone; rows equal SUMO at every tick."""
     turned = False
     with (
         coupled("grid4x4", [tiny_file(tmp_path)]) as simulation,
@@ -86,7 +86,7 @@ def blinker(signals: int) -> int:
 
 
 def shown(simulation: Simulation) -> dict[str, str]:
-    """The letters of each signal."""
+    """Return the letters of each signal."""
     network = simulation.network
     found = {}
     for name, phase, row in zip(
@@ -134,7 +134,7 @@ def test_ids_and_names_are_a_bijection(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_has_the_route_that_sumo_gave_it(tmp_path: Path) -> None:
-    """Also after it has gone over to another zone: its way leads over the same edges."""
+    """This also holds after it has moved to another zone."""
     zones = {"zones.count": 4}
     with (
         coupled("grid4x4", [tiny_file(tmp_path)], overrides=zones) as simulation,
@@ -153,11 +153,11 @@ def test_a_vehicle_has_the_route_that_sumo_gave_it(tmp_path: Path) -> None:
             assert ahead == rest[-len(ahead) :]
             assert len(ahead) >= len(rest) - 1
             compared += row["epoch"] > 0
-        assert compared > 0, "nobody has changed its zone"
+        assert compared > 0, "no vehicle has changed its zone"
 
 
 def edges_ahead(simulation: Simulation, row: np.void) -> list[str]:
-    """Edges from a vehicle to the end of its way, wherever it has to change lanes."""
+    """Return the edges from a vehicle to the end of its route, with its lane changes."""
     network, travel = simulation.network, simulation.shards[0].travel
     lane, way, found = int(row["lane"]), int(row["way"]), []
     for _ in range(1000):
@@ -189,7 +189,7 @@ def test_clocks_are_equal(tmp_path: Path) -> None:
             drive(simulation)
         assert simulation.sumo is not None
         assert simulation.sumo.worlds.at(0).tick == simulation.ticks()[0]
-        # A flow that has begun 100 s earlier: SUMO has begun at its 100th second, too.
+        # The flow began 100 s earlier, because SUMO starts at its 100th second.
         assert demand_begin(simulation) == 100.0
         simulation.shards[0].worlds.ticks[0] += 1
         with pytest.raises(Exception, match="its SUMO at"):
@@ -201,7 +201,7 @@ def demand_begin(simulation: Simulation) -> float:
 
 
 def test_sumos_cars_brake_for_an_agent_that_stands(tmp_path: Path) -> None:
-    """On one lane: nobody touches it, and a queue forms behind it."""
+    """On one lane, no vehicle touches the agent, and a queue forms behind it."""
     files = write_demand(tmp_path, STEADY + FLOW)
     origin = {"traffic.origins": ["in"], "traffic.destinations": ["out"], "clock.sim_dt_s": 0.1}
     with coupled(make_map(tmp_path), files, agents=1, overrides=origin) as simulation:
@@ -222,7 +222,7 @@ def test_sumos_cars_brake_for_an_agent_that_stands(tmp_path: Path) -> None:
 
 
 def test_agents_see_sumos_red_and_stop(tmp_path: Path) -> None:
-    """All signals are red in SUMO, and nowhere else."""
+    """All signals are red in SUMO, but not in the programs of the map."""
     network = load("grid4x4")
     programs = "".join(
         f'<tlLogic id="{name}" type="static" programID="red" offset="0">'
@@ -289,7 +289,7 @@ def test_a_teleport_is_counted_and_moves_no_agent(
 
 @pytest.mark.parametrize("source", ["sumo-traffic", "sumo-demand"])
 def test_closures_and_reroutings_are_sumos(tmp_path: Path, source: str) -> None:
-    """The narrow edge is closed from second 100 on: whoever comes then goes the long way."""
+    """The narrow edge is closed from second 100 on; later vehicles take the long route."""
     net = make_map(tmp_path)
     cars = CARS.format(device="")
     flow = '<flow id="f" type="car" from="in" to="out" begin="0" end="300" period="6"/>'
@@ -307,7 +307,7 @@ def test_closures_and_reroutings_are_sumos(tmp_path: Path, source: str) -> None:
 
 
 def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path) -> None:
-    """It is where it is: nothing breaks, and it comes back under the same name."""
+    """SUMO keeps the agent at its position, and accepts its successor under the same name."""
     files = write_demand(tmp_path, STEADY + FLOW)
     origin = {"traffic.origins": ["in"], "traffic.destinations": ["out"], "clock.sim_dt_s": 0.1}
     with coupled(make_map(tmp_path), files, agents=1, overrides=origin) as simulation:
@@ -323,7 +323,7 @@ def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path)
 
 
 def test_a_cycle_is_that_of_algorithm_1(tmp_path: Path) -> None:
-    """SUMO goes to t + dt, its vehicles are mirrored, the world ticks once, sensors see t + dt."""
+    """SUMO steps to t + dt, its vehicles are mirrored, the world ticks once, sensors see t + dt."""
     own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
     with coupled("grid4x4", [tiny_file(tmp_path)], agents=1, overrides=own) as simulation:
         trace = StepTrace()

@@ -1,4 +1,4 @@
-"""Ways of trips on an empty map: as fast as duarouter's, and loops are reported."""
+"""Routes of trips on an empty map: as fast as duarouter's; loops are reported."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ GRID = "--grid --grid.number=4 --grid.length=70 --turn-lanes=1 --turn-lanes.leng
 
 
 def duarouter(folder: Path, net: Path, pairs: Sequence[tuple[str, str]]) -> list[list[str] | None]:
-    """The edges of duarouter's ways; None: there is no way."""
+    """Return the edges of duarouter's routes; None: there is no route."""
     trips, routes = folder / "d.trips.xml", folder / "d.rou.xml"
     rows = (TRIP.format(k=k, start=start, goal=goal) for k, (start, goal) in enumerate(pairs))
     trips.write_text(f'<routes><vType id="car" maxSpeed="99"/>{"".join(rows)}</routes>')
@@ -48,7 +48,7 @@ def duarouter(folder: Path, net: Path, pairs: Sequence[tuple[str, str]]) -> list
 
 
 def time_s(roads: RoadNetwork, edges: Sequence[int]) -> float:
-    """The time of a way at the speed limits, without lane changes."""
+    """Return the time of a route at the speed limits, without lane changes."""
     lanes, links = roads.lanes, roads.links
     time = lanes["length_m"] / lanes["speed_mps"]
     total = sum(float(time[lanes["edge"] == edge].min()) for edge in edges)

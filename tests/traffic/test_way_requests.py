@@ -36,7 +36,7 @@ def outside(roads: RoadNetwork) -> list[int]:
 
 
 def with_speeds(roads: RoadNetwork, seed: int) -> RoadNetwork:
-    """The same roads in traffic: some edges slow."""
+    """Return the roads with reduced speeds on some edges."""
     lanes = roads.lanes.copy()
     share = np.random.default_rng(seed).choice([1.0, 0.5, 0.05], len(roads.edges))
     lanes["speed_mps"] *= share[lanes["edge"]]
@@ -46,7 +46,7 @@ def with_speeds(roads: RoadNetwork, seed: int) -> RoadNetwork:
 def way_to(
     roads: RoadNetwork, goal: int, lane: int, room: int = ROOM
 ) -> tuple[NDArray[np.void], int]:
-    """Steps of the fastest way, and how many there are."""
+    """Return the steps of the fastest route, and their number."""
     plan = np.zeros(len(roads.lanes), PLAN)
     plan_goal(roads.arrays, goal, PASSENGER, 1.0, plan)
     steps = np.zeros(room, PLAN)
@@ -56,7 +56,7 @@ def way_to(
 
 
 def on_edge(roads: RoadNetwork, lane: int) -> int:
-    """The way of steps that begin at 0, on the edge of a lane."""
+    """Return the route of steps from 0 on, as an offset for the edge of a lane."""
     return -int(roads.edges[roads.lanes[lane]["edge"]]["first_lane"])
 
 
@@ -99,7 +99,7 @@ def test_a_route_that_does_not_fit_its_slot_is_dropped() -> None:
     assert way_to(roads, goal, lane, 2)[1] == 0
 
 
-def test_vehicles_ask_by_rising_id_if_it_is_their_time_or_a_rerouter_stands_there() -> None:
+def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> None:
     roads = network("grid4x4")
     first, second = (int(roads.edges[edge]["first_lane"]) for edge in outside(roads)[:2])
     inside = int(np.flatnonzero(roads.lanes["internal"])[0])
@@ -139,7 +139,7 @@ def test_vehicles_ask_by_rising_id_if_it_is_their_time_or_a_rerouter_stands_ther
     ("speed", "back", "changes", "link", "fits"),
     [
         (10.0, 60.0, 0, 1, True),
-        (10.0, 15.0, 0, 1, False),  # it could not stop any more for another turn
+        (10.0, 15.0, 0, 1, False),  # it can no longer stop for another turn
         (10.0, 15.0, 0, 0, True),  # the same turn
         (0.0, 3.0, 0, 1, True),
         (0.0, 3.0, 1, 1, False),  # no room to change lanes
@@ -179,11 +179,11 @@ def test_slots_are_taken_in_order_kept_by_their_vehicles_and_free_again() -> Non
     np.testing.assert_array_equal(travel.steps[first : first + number], found[:number])
     mark_slots(roads.arrays, rows[1:], 2, first, steps, used)
     assert used.tolist() == [False, True]
-    # Who has a slot writes its next way there.
+    # A vehicle with a slot writes its next route there.
     again = take_slot(roads.arrays, travel, rows[1:2][0], found[:number], first, steps, used)
     assert again
     assert rows[1]["way"] + lane == first + steps
-    # In a junction its way is already that of the lane behind it.
+    # Inside a junction, the route is that of the lane behind the junction.
     step = found[:number][found[:number]["next"] >= 0][0]
     assert step["shift"] > 0
     rows[1]["way"] += step["shift"]

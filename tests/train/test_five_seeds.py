@@ -1,4 +1,4 @@
-"""What five_seeds.py leaves behind when it is ended in the middle: no process, no traceback."""
+"""Interrupting five_seeds.py leaves no process and prints no traceback."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.training import TRAIN, load_program
 
 pytest.importorskip("torch", reason="needs the extra: train")
 
-WAIT_MS = 20_000  # until what is waited for is taken not to come
+WAIT_MS = 20_000  # time limit of waits
 
 
 @pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGINT])
@@ -28,7 +28,7 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
     errors = tmp_path / "errors"
     # In the background of a shell, SIGINT is ignored, here and in children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    with errors.open("w") as file:  # a pipe would be open as long as they train
+    with errors.open("w") as file:  # a pipe would stay open as long as the trainings run
         program = subprocess.Popen(
             [sys.executable, str(TRAIN / "five_seeds.py"), *words],
             cwd=tmp_path,
@@ -48,10 +48,10 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
             assert len(trainings) == 2
             program.send_signal(ended_by)
             ended = [has_ended(training) for training in trainings]
-            assert ended == [True, True], "they train on"
+            assert ended == [True, True], "the trainings continue"
             program.wait(WAIT_MS / 1000)
         finally:
-            program.kill()  # a fault here must not wait for it
+            program.kill()  # a failed test must not wait for the process
     assert "Traceback" not in errors.read_text()
     if ended_by is signal.SIGINT:
         assert program.returncode == 130
@@ -61,7 +61,7 @@ def test_trainings_end_with_the_program(tmp_path: Path, ended_by: signal.Signals
 
 
 def has_ended(pidfd: int) -> bool:
-    """Whether a process ends in time; afterwards it has, anyway."""
+    """Return whether a process ends in time; kill it otherwise."""
     ends = select.poll()
     ends.register(pidfd, select.POLLIN)
     ended = bool(ends.poll(WAIT_MS))

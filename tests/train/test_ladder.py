@@ -1,7 +1,7 @@
-"""A sanity ladder: what a learner that learns at all must learn, on a crossing without signals.
+"""Sanity checks of learning on a crossing without signals.
 
-First rung: an agent alone learns to reach its goal. Second: two agents learn not to collide, where
-two drivers that only know how to be alone do.
+First, an agent alone learns to reach its goal. Second, two agents learn not to collide, while
+drivers that were trained alone collide.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def ippo() -> ModuleType:
 
 
 def learn(ippo: ModuleType, folder: Path, agents: int, agent_steps: int) -> Path:
-    """Train from nothing: no example is imitated."""
+    """Train from random weights, without imitation."""
     words = ["--env", str(CROSSING), "--agents", str(agents), "--num-envs", str(64 // agents)]
     words += ["--total-agent-steps", str(agent_steps), "--hidden", "32"]
     words += ["--throttle-std", "0.4"]
@@ -47,7 +47,7 @@ def learn(ippo: ModuleType, folder: Path, agents: int, agent_steps: int) -> Path
 
 
 def ends(driver: Path, agents: int) -> tuple[float, float]:
-    """Shares of trips that arrive and that collide, in one episode of many worlds."""
+    """Return the shares of trips that arrive and collide, in one episode of many worlds."""
     vec = make_vec(CROSSING, num_envs=WORLDS, agents=agents, seed=1)
     policy = load_policy(driver, vec)
     observations, infos = vec.reset()
@@ -63,7 +63,7 @@ def ends(driver: Path, agents: int) -> tuple[float, float]:
 
 
 def test_the_first_rung(ippo: ModuleType, tmp_path: Path) -> None:
-    """The short form, which is in every run."""
+    """The short variant, which is part of every run of the tests."""
     assert ends(learn(ippo, tmp_path, agents=1, agent_steps=120_000), agents=1)[0] > 0.9
 
 

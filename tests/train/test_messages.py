@@ -1,4 +1,4 @@
-"""The table of `train/messages.py`: both arms, and their difference by seed."""
+"""The table of `train/messages.py`: with and without messages, and paired differences by seed."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ def test_the_arms_are_compared_by_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = program.table(arms, args).splitlines()
     assert lines[-1].startswith("| on minus off | -2.50 [-8.85, 3.85] | 15.00 [")
     assert "| off | 4.00 [" in lines[-2]
-    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # no share
+    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # not a share
     assert "| on | 1.50 [" in lines[-3]
 
 
 def test_intervals_of_shares_end_at_0_and_100(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Student's t about 99.9 and 0.1 % would reach over the ends."""
+    """Student's t around 99.9 and 0.1 % would exceed these limits."""
     monkeypatch.syspath_prepend(TRAIN)
     found = load_program("messages").row(np.array([99.9, 99.8, 100.0]), percent=True).interval
     assert 99.0 < found.low < 99.9 < found.high <= 100.0

@@ -1,4 +1,4 @@
-"""Our PPO programs by their command line, with tiny numbers."""
+"""The PPO programs of cavmarl, run from the command line with small settings."""
 
 from __future__ import annotations
 
@@ -109,7 +109,7 @@ def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path, form: list[
 
 
 def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
-    """The weights, and the curve without what it took."""
+    """Return the weights, and the learning curve without times."""
     rows = [{key: row[key] for key in row.keys() - TIMES} for row in log(folder)]
     return (folder / "model.safetensors").read_bytes(), rows
 
@@ -182,7 +182,7 @@ def test_the_clock_ends_a_run(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--minutes", "0.0001", "--name", "short"]
     assert ippo.main([*words, "--total-agent-steps", "1000000000"]) == 0
     rows = log(here / "runs" / "short")
-    assert 1 <= len(rows) < 1000  # 6 ms are some updates, however fast the machine
+    assert 1 <= len(rows) < 1000  # 6 ms suffice for few updates on any machine
 
 
 def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None:
@@ -231,7 +231,7 @@ def test_words_that_are_no_settings_are_wrong_use(ippo: ModuleType, words: list[
         ippo.main(words)
 
 
-def test_what_cannot_change_is_refused(
+def test_settings_that_cannot_change_are_refused(
     ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert ippo.main([*TINY, "--total-agent-steps", "20", "--name", "run"]) == 0

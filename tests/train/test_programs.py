@@ -1,4 +1,4 @@
-"""The other training programs, as a user calls them, on a few decisions."""
+"""The other training programs, called as by a user, with few decisions."""
 
 from __future__ import annotations
 
@@ -35,17 +35,17 @@ def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], program: str, *words: object) -> str:
-    """What a program says that refuses the words; in this process, for torch takes seconds."""
+    """Return the message of a program that refuses arguments; run it here: torch loads slowly."""
     try:
         code = load_program(program.removesuffix(".py")).main([*map(str, words)])
-    except SystemExit as end:  # of argparse
+    except SystemExit as end:  # the errors of argparse
         code = end.code
     assert code == 2
     return capsys.readouterr().err
 
 
 def small(updates: int) -> list[object]:
-    """Options of a run of so many updates, each of 2 worlds · 8 steps."""
+    """Return options of a run with this number of updates, each of 2 worlds · 8 steps."""
     sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
     return [*sizes, "--total-agent-steps", 2 * 8 * AGENTS * (updates - 1) + 1]
 
@@ -59,7 +59,7 @@ def small(updates: int) -> list[object]:
         ("ppo_rllib.py", "ray.rllib", "rllib (make libraries)"),
     ],
 )
-@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+@pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 def test_a_library_trains_a_driver_that_evaluate_takes(
     tmp_path: Path, program: str, module: str, extra: str
 ) -> None:
@@ -83,7 +83,7 @@ def test_a_library_trains_a_driver_that_evaluate_takes(
 
 
 @pytest.mark.parametrize("algorithm", ["ippo", "mappo"])
-@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+@pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
     pytest.importorskip("benchmarl", reason="needs the extra: benchmarl (make libraries)")
     sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
@@ -106,7 +106,7 @@ def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
         ("ppo_gymnasium.py", "gymnasium", ["--num-worlds", 3], "a multiple of num_worlds = 3"),
     ],
 )
-@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+@pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 def test_wrong_use_of_a_librarys_program_is_refused(
     tmp_path: Path,
     program: str,
@@ -155,7 +155,7 @@ def test_wrong_use_of_five_seeds_is_refused(
     assert message in refusal(capsys, "five_seeds.py", *given)
 
 
-@pytest.mark.filterwarnings("ignore")  # what the library warns of itself
+@pytest.mark.filterwarnings("ignore")  # the library warns about its own code
 def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     sizes = ["--num-worlds", 1, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]

@@ -1,6 +1,6 @@
-"""Runs that are cut short go on bit for bit, and nothing is overwritten or mixed on the way.
+"""Interrupted runs resume bit for bit, and overwrite or mix no files of other runs.
 
-The one that is really killed is a program of its own, which takes 2 s to be there.
+Only one test kills a separate program, which needs 2 s to start.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ TINY = [
 LENGTH = ["--total-agent-steps", "200"]
 CUT_AFTER = 5  # updates, of seven or more; the checkpoint is that of update 4
 
-# A program that is killed by the system after a row of its log.
+# A program that is killed after a row of its log.
 KILLED = """\
 import os, runpy, signal, sys
 from cavmarl.learning.log import Log
@@ -54,7 +54,7 @@ Learnt = tuple[bytes, list[dict[str, str]], set[str]]
 
 
 class Cut(BaseException):
-    """Ends a run in the middle, and is caught by nothing."""
+    """An exception that ends a run, and that no code catches."""
 
 
 @pytest.fixture(scope="module")
@@ -64,7 +64,7 @@ def ippo() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def whole(ippo: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
-    """What a run learns that nothing cuts short."""
+    """Return the result of an uninterrupted run."""
     runs = tmp_path_factory.mktemp("runs")
     assert ippo.main([*TINY, *LENGTH, "--runs", str(runs), "--name", "whole"]) == 0
     return learnt(runs / "whole")
@@ -86,7 +86,7 @@ def refusal(ippo: ModuleType, capsys: pytest.CaptureFixture[str]) -> Callable[..
 
 
 def learnt(folder: Path) -> Learnt:
-    """The weights, the curve without what it took, and which files there are."""
+    """Return the weights, the learning curve without times, and the names of files."""
     with (folder / "progress.csv").open(newline="") as file:
         rows = [{key: row[key] for key in row.keys() - TIMES} for row in csv.DictReader(file)]
     return (folder / "model.safetensors").read_bytes(), rows, {p.name for p in folder.iterdir()}
@@ -123,7 +123,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     left = here / "runs" / "cut" / ".build-left"  # killed while it was written
     left.mkdir()
     (left / CHECKPOINT_FILE).touch()
-    # The driver is for others: a run does not go on from it.
+    # The saved driver is for users: a run does not resume from it.
     (here / "runs" / "cut" / "model.safetensors").write_bytes(b"of another step")
     assert ippo.main(["--resume", "runs/cut"]) == 0
     assert learnt(here / "runs" / "cut") == whole
@@ -234,7 +234,7 @@ def test_a_row_that_finds_no_room_is_a_typed_error(here: Path) -> None:
     log.close()
 
 
-def test_a_run_that_found_no_room_at_all_can_be_begun_again(
+def test_a_run_that_failed_on_a_full_disk_can_be_started_again(
     ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def no_room(*_: object) -> None:
@@ -248,7 +248,7 @@ def test_a_run_that_found_no_room_at_all_can_be_begun_again(
     assert ippo.main(words) == 0
 
 
-def test_what_is_damaged_or_of_another_run_is_refused(
+def test_damaged_files_and_files_of_other_runs_are_refused(
     ippo: ModuleType, here: Path, refusal: Callable[..., str]
 ) -> None:
     assert ippo.main([*TINY, "--total-agent-steps", "20", "--name", "run"]) == 0
@@ -309,7 +309,7 @@ def test_tensorboard_is_cut_where_the_checkpoint_is(
     ("name", "module"),
     [("ppo_gymnasium", "gymnasium"), ("ppo_sb3", "stable_baselines3"), ("ippo_torchrl", "torchrl")],
 )
-@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+@pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 def test_a_librarys_run_goes_on(
     here: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str
 ) -> None:
@@ -334,7 +334,7 @@ def test_a_librarys_run_goes_on(
     assert program.main(["--resume", "runs/cut"]) == 0
     assert is_trained(here / "runs" / "cut")
     uncut, resumed = learnt(here / "runs" / "whole"), learnt(here / "runs" / "cut")
-    if name == "ippo_torchrl":  # whose collector keeps its worlds: they begin new episodes
+    if name == "ippo_torchrl":  # its collector keeps its worlds, which begin new episodes
         assert (resumed[1][:4], resumed[2]) == (uncut[1][:4], uncut[2])
         rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
         updates = [int(row.partition(",")[0]) for row in rows[1:]]

@@ -1,4 +1,4 @@
-"""Buses with vehicles that stand where a test puts them."""
+"""Message buses of vehicles at chosen positions."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
 
 
 class Standing:
-    """A bus of one world whose rows a test writes.
+    """A message bus of one world, whose rows a test writes.
 
     Args:
-        agents: seats; vehicle k < agents is driven by agent k.
-        env: whose map it is.
-        rays: of the agents' lidar.
+        agents: number of agents; agent k drives vehicle k < agents.
+        env: environment with the map.
+        rays: number of rays of the agents' lidar.
         walls: (n, 4) ends of the buildings' walls, ax, ay, bx, by.
-        settings: keys under `v2x`.
+        settings: values of keys under `v2x`.
     """
 
     def __init__(
@@ -60,7 +60,7 @@ class Standing:
         self.bus.reset(np.ones(1, dtype=np.bool_))
 
     def put(self, places: NDArray[np.float64], **fields: Any) -> NDArray[np.void]:
-        """Let vehicles stand at (n, 2) places; vehicle k has the id k."""
+        """Put standing vehicles at (n, 2) positions; vehicle k has the id k."""
         rows = np.zeros(len(places), VEHICLE)
         rows[:] = blank_vehicle()
         rows["id"] = np.arange(len(places))
@@ -72,17 +72,17 @@ class Standing:
         return self.write(rows)
 
     def write(self, rows: NDArray[np.void]) -> NDArray[np.void]:
-        """Make these the vehicles, in any order."""
+        """Replace the vehicles, in any order."""
         self.worlds.rows[0, : len(rows)] = rows
         self.worlds.num_owned[0] = self.worlds.num_rows[0] = len(rows)
         return rows
 
     def tick(self) -> int:
-        """Send and receive; which tick it was."""
+        """Send and receive; return the tick."""
         self.worlds.ticks[0] += 1
         self.bus.exchange(self.simulation.shards[0].side)
         return int(self.worlds.ticks[0])
 
     def key(self) -> int:
-        """Of the world's random numbers."""
+        """The key of the world's random numbers."""
         return int(self.worlds.keys[0])

@@ -1,4 +1,4 @@
-"""A driver that listens to the vehicle ahead follows closer than one that only looks."""
+"""A driver with messages of the vehicle ahead follows closer than a driver without them."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ WARMUP, STEPS = 500, 900
 
 
 class Platoon(NamedTuple):
-    """What the vehicles of a platoon did behind a leader whose speed swings; the leader is first.
+    """Motion of a platoon behind a leader with oscillating speed; the leader is first.
 
     Attributes:
-        spread: (n,) standard deviation of each one's speed, m/s.
-        headway_s: mean of the followers.
-        gap_m: the smallest.
+        spread: (n,) standard deviation of each vehicle's speed, m/s.
+        headway_s: mean headway of the followers.
+        gap_m: the smallest gap.
     """
 
     spread: NDArray[np.float64]
@@ -43,7 +43,7 @@ class Platoon(NamedTuple):
 
 @pytest.fixture(scope="module")
 def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Four kilometres of one lane."""
+    """Make four kilometres of road with one lane."""
     folder = tmp_path_factory.mktemp("road")
     (folder / "n.xml").write_text(
         '<nodes><node id="A" x="0" y="0"/><node id="B" x="500" y="0"/><node id="C" x="4000" y="0"/>'
@@ -82,11 +82,11 @@ def drive(road: Path, policy: str, **settings: Any) -> Platoon:
     return Platoon(speed.std(axis=0), float((gap / speed[:, 1:]).mean()), float(np.min(gaps)))
 
 
-def test_it_follows_closer_than_idm_and_swings_do_not_grow(road: Path) -> None:
+def test_it_follows_closer_than_idm_and_oscillations_do_not_grow(road: Path) -> None:
     cacc, idm = drive(road, "cacc"), drive(road, "idm")
     assert cacc.headway_s < 0.5 * idm.headway_s
     assert cacc.gap_m > 0.0
-    # String stability: nobody's speed swings more than that of the one ahead.
+    # String stability: no vehicle's speed oscillates more than that of the vehicle ahead.
     assert (np.diff(cacc.spread) <= 0.0).all()
 
 

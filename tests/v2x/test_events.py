@@ -1,4 +1,4 @@
-"""Agents and roadside units tell others of events, also where worlds live in other processes."""
+"""Agents and roadside units send messages about events, also in other processes."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TOLD = {
     "sensors.messages.events": 1,
     "population.mode": "respawn",
 }
-PRESENT, OTHER = 0, 7  # of the features of an event
+PRESENT, OTHER = 0, 7  # indices of the features of an event
 
 
 def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
-    """What agents observe of events while one of them tells of an obstacle in the third step."""
+    """Return observations of events; an agent declares an obstacle in the third step."""
     env = make_vec("grid4x4", agents=4, workers=workers, zones=zones, overrides=TOLD)
     part = observation_parts(env.config.sensors)["messages"].place
     env.reset(seed=3)
@@ -43,7 +43,7 @@ def test_declared_events_reach_all_other_agents() -> None:
     assert (seen[:2] == 0.0).all()
     assert seen[2:, [0, 2, 3], PRESENT].all()
     assert seen[2:, [0, 2, 3], OTHER].all()
-    assert not seen[:, 1].any()  # whoever tells it knows
+    assert not seen[:, 1].any()  # the sender knows it
 
 
 def test_workers_and_zones_receive_the_same_events() -> None:
@@ -63,7 +63,7 @@ def test_it_is_sent_once_a_step_and_kept_for_its_validity() -> None:
         env.step(env.suggest_actions())
         known.append(len(messages_of(KIND_DENM, bus.mail.events[0, 1])))
     assert bus.statistics().sent[KIND_DENM] == 1
-    assert known == [1, 1, 0, 0]  # said in tick 1, kept up to tick 9; a step has four ticks
+    assert known == [1, 1, 0, 0]  # sent in tick 1, valid up to tick 9; a step has four ticks
 
 
 def test_a_roadside_unit_sends_and_receives_events() -> None:

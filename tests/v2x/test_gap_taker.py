@@ -1,4 +1,4 @@
-"""A driver that crosses where it knows a gap: messages save it collisions at a blind junction."""
+"""`gap_taker` crosses in known gaps: messages prevent collisions at a blind junction."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLLISION, DELAY = TERMS.index("collision"), TERMS.index("delay")
 
 
 def driven(loss: float, seed: int, worlds: int = 8, **overrides: Any) -> tuple[int, int, float]:
-    """Trips that end within a horizon, those that collide, and the delay of a trip in s."""
+    """Return the numbers of ended trips and of collisions, and the mean delay in s."""
     vec = make_vec("blind_junction", num_envs=worlds, overrides={LOSS: loss, **overrides})
     driver = load_policy("gap_taker", vec)
     driver.reset(seed)

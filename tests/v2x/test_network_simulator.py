@@ -1,4 +1,4 @@
-"""A network simulator beside the world: a barrier in each tick, and its answers are checked."""
+"""A network simulator coupled with the world: a barrier in each tick, and checked answers."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ EXTERNAL = {"channel__external": True, "channel__latency_ticks": 3}
 
 
 class Federate:
-    """A fake one, in a thread of its own with a clock of its own.
+    """A fake network simulator in its own thread with its own clock.
 
-    It delivers each packet to every receiver but its sender, after `delay(sender)` ticks.
+    It delivers each packet to all receivers except the sender, after `delay(sender)` ticks.
     """
 
     def __init__(self, delays: dict[int, int]) -> None:
@@ -36,7 +36,7 @@ class Federate:
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         self._asked.put((sent.tick, sent.packets.copy(), sent.receivers.copy()))
-        return self._answers.get()  # the barrier
+        return self._answers.get()  # waits at the barrier
 
     def _run(self) -> None:
         while (asked := self._asked.get()) is not None:
@@ -59,7 +59,7 @@ class Federate:
         self._thread.join()
 
 
-def test_both_go_tick_by_tick_and_delays_are_kept() -> None:
+def test_world_and_simulator_advance_together_and_delays_hold() -> None:
     world = Standing(2, cam__rate_hz=10.0, **EXTERNAL)
     federate = Federate({1: 2, 2: 0, 3: 3})
     world.bus.connect(federate)

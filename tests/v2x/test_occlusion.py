@@ -11,13 +11,13 @@ from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CP
 from tests.support.world import tick_of
 from tests.v2x.station_worlds import Standing
 
-# The agent, a truck before it, a car hidden behind the truck, and a car beside that sees both.
+# The agent, a truck ahead, a car hidden behind the truck, and a car beside that sees both.
 PLACES = np.array([[100.0, 120.0], [112.0, 120.0], [135.0, 120.0], [118.0, 140.0]])
 HIDDEN = 2
 
 
 def known(world: Standing, receiver: int = 0) -> dict[int, tuple[int, int]]:
-    """Whom a receiver knows of, from whom and how."""
+    """Return the known vehicles of a receiver, with the sender and the kind of message."""
     box = world.bus.mail.objects[0, receiver]
     return {
         int(report["subject"]): (int(report["sender"]), int(report["kind"]))
@@ -36,7 +36,7 @@ def behind_a_truck(**settings: Any) -> Standing:
 
 def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
     world = behind_a_truck(perception__rate_hz=10.0)
-    # What the agent sees itself, as a CPM of its own would say, is without the hidden car.
+    # The CPM of the agent lists what it sees itself, without the hidden car.
     world.tick()
     mail = world.bus.mail
     reports = mail.reports[0, 0, : mail.num_reports[0, 0]]
@@ -70,7 +70,7 @@ def test_a_vehicle_hidden_from_lidar_is_known_from_messages() -> None:
         return simulation.outputs.observations[0, 0, place].copy()
 
     with_hidden, without = lidar(placed), lidar(placed[:2])
-    assert (with_hidden == without).all()  # no ray can tell whether it is there
+    assert (with_hidden == without).all()  # no ray can detect whether the car exists
     world.write(placed)
     world.tick()
     assert known(world)[2] == (2, KIND_CAM)
@@ -91,14 +91,14 @@ def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
     assert known(world) == {1: (FIRST_ROADSIDE_ID + 5, KIND_CPM)}
 
 
-def test_buildings_weaken_what_goes_through_them() -> None:
+def test_buildings_weaken_packets_through_them() -> None:
     ratios = []
     for building_db in (0.0, 12.0, 60.0):
         world = Standing(
             1, walls=[(150.0, -500.0, 150.0, 500.0)], channel__path_loss_exponent=2.75,
             channel__building_db=building_db, inbox__objects=1,
         )  # fmt: skip
-        # 20 cars behind the wall, 60 m away: without it nearly all is received.
+        # 20 cars are 60 m away behind the wall: without the wall, nearly all packets are received.
         ring = np.linspace(-0.5, 0.5, 20)
         behind = 100.0 + 60.0 * np.stack([np.cos(ring), np.sin(ring)], 1)
         world.put(np.concatenate([[[100.0, 100.0]], behind]))

@@ -1,4 +1,4 @@
-"""Receptions, and what is kept of them, follow the definitions."""
+"""Receptions and inboxes agree with the definitions."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ CHANNELS: dict[str, dict[str, Any]] = {
 def heard_by(
     world: Standing, tick: int, receiver: int, x: float, y: float
 ) -> tuple[list[naive.Said], int, int]:
-    """What one receives in a tick, of how many packets within reach, by the definitions."""
+    """Return the receptions in a tick, and the number of packets within reach, by definition."""
     config = world.config.v2x.channel
     slots = config.latency_ticks + 1
     slot = (tick - config.latency_ticks) % slots
@@ -45,7 +45,7 @@ def heard_by(
     packets = mail.packets[0, slot, : mail.num_packets[0, slot]]
     near = np.hypot(packets["x"] - x, packets["y"] - y)
     busy = naive.airtime_s(config) / 0.1 * float((near <= naive.sensing_m(config)).sum())
-    busy = math.floor(64.0 * min(busy, 1.0) + 0.5) / 64.0  # chances are known in 64 steps
+    busy = math.floor(64.0 * min(busy, 1.0) + 0.5) / 64.0  # probabilities are tabulated in 64 steps
     said: list[naive.Said] = []
     reachable = received = 0
     for packet, distance in zip(packets, near.tolist(), strict=True):
@@ -113,7 +113,7 @@ def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
 
 
 def test_receptions_have_the_configured_probability() -> None:
-    # 300 receptions at each distance: within four standard deviations.
+    # 300 receptions at each distance agree within four standard deviations.
     world = Standing(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
     distances = np.array([20.0, 90.0, 120.0, 140.0, 220.0])
     ring = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
@@ -140,9 +140,9 @@ def test_packets_beyond_the_capacity_are_those_of_the_larger_ids() -> None:
     assert mail.packets[0, 0, :10]["sender"].tolist() == list(range(10))
 
 
-def test_what_the_air_cannot_carry_is_dropped() -> None:
-    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s: 4.84 ms each, three times what there is time
-    # for.
+def test_packets_beyond_the_capacity_of_the_channel_are_dropped() -> None:
+    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s take 4.84 ms each, three times the available
+    # time.
     world = Standing(1, channel__data_rate_mbps=0.5)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
     world.tick()
@@ -156,7 +156,7 @@ def test_what_the_air_cannot_carry_is_dropped() -> None:
 
 @pytest.mark.parametrize(
     ("bytes_", "rate_mbps", "airtime_us"),
-    # At 6 Mbit/s a symbol of 8 µs has 48 bits.
+    # At 6 Mbit/s, a symbol of 8 µs has 48 bits.
     [(300, 6.0, 440.0), (300, 3.0, 840.0), (1500, 12.0, 1040.0), (300, 0.0, 0.0)],
 )
 def test_a_packet_takes_the_air_for_its_preamble_and_its_bits(
@@ -197,7 +197,7 @@ def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert there[there >= 0].tolist() == [10]  # the only other one who has sent in this tick
+    assert there[there >= 0].tolist() == [10]  # the only other sender of this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

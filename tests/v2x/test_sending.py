@@ -1,4 +1,4 @@
-"""When stations send, and what they say."""
+"""Times and contents of messages of stations."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SPREAD = np.stack([np.linspace(0.0, 390.0, 40), np.full(40, 100.0)], 1)
 
 
 def sent(world: Standing, kind: int) -> Any:
-    """What all have just sent, as records of the schema."""
+    """Return the packets of this tick, as records of the schema."""
     mail, slot = world.bus.mail, 0
     return messages_of(kind, mail.reports[0, slot, : mail.num_reports[0, slot]])
 
@@ -60,7 +60,7 @@ def test_triggered_cams_come_with_a_change_and_once_a_second() -> None:
     world = Standing(1, cam__triggered=True)
     rows = world.put(SPREAD)
     world.tick()
-    assert len(sent(world, KIND_CAM)) == 40  # their first ones
+    assert len(sent(world, KIND_CAM)) == 40  # the first CAM of each vehicle
     rows["x"][3] += 4.1
     rows["heading"][4] += math.radians(4.1)
     rows["speed"][5] += 0.6
@@ -123,7 +123,7 @@ def test_seen_vehicles_are_reported(units: bool) -> None:
     world = Standing(1, cam__rate_hz=0.0, denm__rate_hz=0.0, **settings)
     random = np.random.default_rng(8)
     cells = np.stack(np.meshgrid(np.arange(9), np.arange(8)), -1).reshape(-1, 2)
-    places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))  # nobody in another one
+    places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))  # no station in other ticks
     rows = world.put(places, heading=random.uniform(-3.0, 3.0, 72))
     world.tick()
     told: dict[int, list[int]] = {}

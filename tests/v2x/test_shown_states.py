@@ -26,7 +26,7 @@ def test_states_are_read_as_they_were_written() -> None:
     for index in random.permutation(NUM_LETTERS)[:30].tolist():
         wanted[index] = random.integers(0, SIGNAL_YELLOW_MAJOR + 1)
         note_shown(report, index, int(wanted[index]))
-        note_shown(report, index, int(wanted[index]))  # another link with this index
+        note_shown(report, index, int(wanted[index]))  # a link with this index at another signal
     assert [shown_at(report, index) for index in range(NUM_LETTERS)] == wanted.tolist()
     assert report["code"] == -42
     assert phase_of(report) == 41

@@ -1,4 +1,4 @@
-"""Settings that cannot work are refused, with the key, the value and the cure."""
+"""Impossible settings are refused with the key, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def test_messages_that_no_station_sends_cannot_be_observed(name: str) -> None:
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})
 
 
-def test_a_vehicle_cannot_be_heard_of_without_messages() -> None:
+def test_heard_vehicles_need_messages() -> None:
     settings = {"sensors.conflicts.count": 4, "sensors.conflicts.heard": True}
     with pytest.raises(ConfigError, match=r"sensors\.conflicts\.heard = True: .*set v2x\.enabled"):
         load_world("grid4x4", overrides=settings)
 
 
-def test_it_is_off_by_default_and_every_effect_of_the_channel_too() -> None:
+def test_messages_and_all_effects_of_the_channel_are_off_by_default() -> None:
     default = V2xConfig()
     assert not default.enabled
     channel = default.channel

@@ -1,4 +1,4 @@
-"""Buildings of the map stand in the way of messages."""
+"""Buildings of the map weaken messages."""
 
 from __future__ import annotations
 

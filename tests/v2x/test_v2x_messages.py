@@ -1,4 +1,4 @@
-"""The schema of messages is fixed: bytes that were written once can be read for ever."""
+"""The schema of messages is fixed: recorded bytes stay readable."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ GOLDEN = Path(__file__).parent / "messages.golden.txt"
 
 
 def example(kind: int, count: int = 1) -> bytes:
-    """A packet with a different number in every field."""
+    """Return a packet with a different number in each field."""
     reports = np.zeros(count, REPORT)
     for place, name in enumerate(REPORT.names or ()):
         reports[name] = 2 * place + np.arange(count)

@@ -40,7 +40,7 @@ def test_received_messages_do_not_depend_on_zones(channel: dict[str, Any], stack
 
 
 def everything_said(zones: int) -> list[bytes]:
-    """All inboxes and counts after each step, in the order of the receivers."""
+    """Return all inboxes and counts after each step, in the order of the receivers."""
     overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
     env = make_vec("grid4x4", num_envs=2, zones=zones, overrides=overrides)
     said = []

@@ -1,4 +1,4 @@
-"""Three processes agree, and where they do not, the first difference is named."""
+"""Runs in three processes are equal; otherwise, the first difference is reported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from cavmarl.core.errors import ConfigError, EvaluationError, PolicyError
 from cavmarl.verify.determinism import verify_determinism
 
-# A driver whose actions depend on the order of a process's own hashes, in one step, for one agent.
+# A driver whose action depends on the hash seed of the process, in one step for one agent.
 HASHING = """
 from cavmarl.policies.policy import Policy
 
@@ -43,7 +43,7 @@ def test_the_built_in_driver_is_the_same_in_every_process() -> None:
     assert found.state_hash != other.state_hash
 
 
-def test_a_driver_that_hashes_is_found_out(tmp_path: Path) -> None:
+def test_a_driver_that_depends_on_hashes_is_detected(tmp_path: Path) -> None:
     script = tmp_path / "hashing.py"
     script.write_text(HASHING)
     found = verify_determinism("merge", script, steps=20, **SMALL)

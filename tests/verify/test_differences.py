@@ -27,7 +27,7 @@ def test_the_smallest_id_and_the_first_field_come_first() -> None:
     assert (found.step, found.tick) == (5, 10)
 
 
-def test_a_vehicle_that_only_one_has_is_named() -> None:
+def test_a_vehicle_of_only_one_run_is_named() -> None:
     other = state()
     other["vehicles"] = other["vehicles"][1:]
     found = find_difference(5, 10, state(), other)

@@ -1,4 +1,4 @@
-"""A network that fails on request, and worlds over nodes that do not."""
+"""A network with injected faults, and worlds over nodes that tolerate them."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {"agents": 4, "background": 20}
 
 @pytest.fixture
 def ends() -> Iterator[tuple[FaultyNetwork, socket.socket, socket.socket]]:
-    """A network, and both ends of a connection through it."""
+    """Yield a network, and both ends of a connection through it."""
     network = FaultyNetwork(seed=0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         host, port = network.route(server.getsockname())
@@ -48,7 +48,7 @@ def test_a_connection_carries_both_directions(
 
 
 def exchanged(one: socket.socket, other: socket.socket) -> list[bytes]:
-    """What comes of a word each way; None that comes counts as nothing."""
+    """Send a word in each direction; return the received words, or None."""
     found = []
     for source, target in ((one, other), (other, one)):
         source.sendall(b"word")
@@ -141,7 +141,7 @@ def test_worlds_run_through_the_faulty_network(fault: str) -> None:
 
 
 def test_processes_are_killed_one_after_the_other() -> None:
-    """Each is replaced before the next one is killed, so the run goes on."""
+    """Each node is replaced before the next node is killed, so the run continues."""
     found = verify_node_faults("merge", [2], faults=[KILL], seeds=1, per_run=3, zones=2, **SMALL)
     assert found.holds
     told = found.to_dict()

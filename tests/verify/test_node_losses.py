@@ -1,4 +1,4 @@
-"""`cavmarl verify nodes`: nodes beside the undivided worlds."""
+"""`cavmarl verify nodes`: nodes compared with undivided worlds."""
 
 from __future__ import annotations
 
@@ -46,6 +46,6 @@ def test_bad_input_is_refused(arguments: dict[str, object], words: str) -> None:
 
 
 def test_the_command_prints_and_writes_its_result(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # none of them is for kills
+    words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # too short for kills
     assert run("verify", "nodes", "grid4x4", *words) == 0
     assert "equal" in capsys.readouterr().out

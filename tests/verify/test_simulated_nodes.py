@@ -1,4 +1,4 @@
-"""Faults on a simulated machine: each is injected and counted, and each run is equal or ends."""
+"""Faults on a simulated machine: each is injected and counted; runs stay equal or end."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def world() -> World:
 def exchange(
     world: World, seed: int, change: Callable[[SimulatedSocket], None] = lambda end: None
 ) -> tuple[list[str], float]:
-    """What two processes say to each other, and how long that takes."""
+    """Let two processes exchange messages; return the messages and the duration."""
     machine = SimulatedMachine(seed, world)
     listener = SimulatedListener(machine, machine.caller)
     heard: list[str] = []
@@ -129,12 +129,12 @@ def test_a_fault_is_injected_and_counted_and_the_run_is_equal(fault: Fault) -> N
     assert not line.wrong
     assert set(line.injected) == {fault}
     assert (line.runs, line.equal + line.ended) == (4, 4)
-    if fault is not Fault.KILL_IN_RECOVERY:  # two of three nodes may die, and both have the state
+    if fault is not Fault.KILL_IN_RECOVERY:  # both nodes with the state may die
         assert (line.equal, line.injected[fault] <= 4) == (4, True)
     assert line.deaths == (line.injected[fault] if fault in DEATHS else 0)
     if fault in TOLERATED:
         assert line.lost == line.recoveries == 0
-    elif fault is not Fault.STOP:  # a short one is borne
+    elif fault is not Fault.STOP:  # a short silence is tolerated
         assert line.lost == line.injected[fault]
 
 
@@ -147,7 +147,7 @@ def test_nodes_end_after_their_caller(fault: Fault) -> None:
 
 
 def test_a_run_is_a_function_of_its_seed() -> None:
-    """So a run of a campaign can be done again alone."""
+    """A single run of a campaign can be repeated."""
     lines = [one_line("many", 2, first_seed=seed) for seed in (5, 6, 5)]
     assert lines[0] == lines[2] != lines[1]
     both = one_line("many", 2, seeds=2, first_seed=5)
@@ -183,7 +183,7 @@ def test_another_error_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_a_world_that_is_given_up_too_soon(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: the next node has the state of the lost one."""
+    """The next node has the state of the lost one."""
 
     def give_up(*arguments: Any) -> Any:
         raise WorkerDeathError(0, "zone 0", 1, "step", ["it was lost"])
@@ -194,37 +194,37 @@ def test_a_world_that_is_given_up_too_soon(monkeypatch: pytest.MonkeyPatch) -> N
 
 
 def test_a_node_that_is_given_up_without_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: a late answer is an answer."""
+    """A late answer is an answer."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_watch.PONG_S", 0.01)
     line = one_line("stale_heartbeat")
     assert "nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
 def test_nodes_that_ignore_a_rollback_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: they wait for ever for a node that only the caller misses."""
+    """They wait for ever for a node that only the caller has lost."""
     monkeypatch.setattr(Links, "check_recovery", lambda self: None)
     assert one_line("partition", seeds=3).wrong
 
 
 @pytest.mark.slow
 def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: a frame that is damaged, or comes twice, is taken for another one.
+    """Damaged or repeated frames are taken for other frames.
 
-    What it says is checked, too, so that most of them are refused for that.
+    The content of frames is checked, too, so most of these frames are refused.
     """
     monkeypatch.setattr("cavmarl.parallel.nodes.link.xxh3_64_intdigest", lambda data, seed=0: 0)
     assert one_line("damage", seeds=12).wrong or one_line("duplicate", seeds=40).wrong
 
 
 def test_frames_without_a_sequence_number_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: a frame comes twice. Missing ones are found by what frames say."""
+    """A frame arrives twice. Missing frames are detected by the content of others."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     assert one_line("duplicate", seeds=8).wrong
 
 
 def test_a_missing_rollback_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The campaign finds it: nodes go on from what they have, and do steps twice."""
+    """Nodes continue from their present states, and run steps twice."""
 
     def present(data: Bytes, like: list[Any]) -> list[Any]:
         return [array.copy() for array in like]
@@ -234,7 +234,7 @@ def test_a_missing_rollback_is_detected(monkeypatch: pytest.MonkeyPatch) -> None
 
 
 def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list[int]:
-    """Let a connection between two nodes carry nothing more from the nth frame of a kind on."""
+    """Let a connection between two nodes drop all data from the nth frame of a kind on."""
     send = SimulatedSocket.send
     seen: list[int] = []
 
@@ -253,10 +253,10 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
 @pytest.mark.parametrize(
     ("kind", "nth", "mix"),
     [
-        (FrameKind.KEEP, 1, "stop_caller"),  # of the first state, before any tick
+        (FrameKind.KEEP, 1, "stop_caller"),  # the first state, before any tick
         (FrameKind.SYNC, 2, "stop_caller"),
         (FrameKind.SHARE, 5, "stop_caller"),
-        (FrameKind.MESSAGES, 2, "stop_caller"),  # an offer, which no later frame follows
+        (FrameKind.MESSAGES, 2, "stop_caller"),  # an offer, after which no other frame is sent
         (FrameKind.AGENT, 1, "stop_caller"),
         (FrameKind.GIVE, 1, "kill"),
     ],
@@ -264,7 +264,7 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
 def test_a_silent_connection_between_two_nodes(
     monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int, mix: str
 ) -> None:
-    """All nodes answer the caller; one of the two is given up, whatever the other one waits for."""
+    """All nodes answer the caller; one of the two is given up, whatever the other node awaits."""
     seen = silenced(monkeypatch, kind, nth)
     keys: dict[str, Any] = {"agents": 12, "background": 20, "zones": 8, "steps": 24}
     found = verify_simulated_nodes(
@@ -277,7 +277,7 @@ def test_a_silent_connection_between_two_nodes(
 
 
 def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An epoch that no record has is noticed, though the vehicles move as they should."""
+    """An epoch that no record has is detected, although the vehicles move correctly."""
     checked: dict[str, Any] = {**SMALL, "steps": 30, "overrides": {CHECKED: True}}
     assert verify_simulated_nodes("merge", [3], mixes=["kill"], seeds=1, **checked).holds
     take_over = OwnerChanges.take_over
@@ -298,7 +298,7 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_node_with_an_impossible_report_is_lost(
     monkeypatch: pytest.MonkeyPatch, stream: type[RowStream] | type[AgentStream]
 ) -> None:
-    """A whole frame, of which the words cannot be: a connection ends, and no node fails."""
+    """An intact frame has impossible content: its connection ends, and no node fails."""
     packed: Any = stream.packed
     send = Links.send
     calls = 0

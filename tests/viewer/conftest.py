@@ -1,4 +1,4 @@
-"""A server with a small divided world behind it, and a browser where there is one."""
+"""A server with a small divided world, and a browser if there is one."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.chromium import chromium
 
 @dataclass
 class Served:
-    """A world that is driven in a thread, and its server."""
+    """A world that a thread drives, and its server."""
 
     env: CavEnv
     run: ShownRun
@@ -46,7 +46,7 @@ class Served:
 
 @contextmanager
 def served(env: CavEnv, options: WebOptions, drives: bool = True) -> Iterator[Served]:
-    """Serve a world; it runs unless `drives` is false, as then turns are the caller's."""
+    """Serve a world; a thread drives it unless `drives` is false."""
     with ExitStack() as stack:
         stack.callback(env.close)
         stage = first_stage("world 0", env.network, hello_of(env, "idm"))
@@ -74,7 +74,7 @@ def chromium_browser() -> Iterator[Any]:
 
 @pytest.fixture
 def browser(chromium_browser: Any) -> Iterator[Any]:
-    """A browser whose pages are closed after the test."""
+    """Yield a browser; close its pages after the test."""
     yield chromium_browser
     for context in chromium_browser.contexts:
         context.close()
@@ -82,7 +82,7 @@ def browser(chromium_browser: Any) -> Iterator[Any]:
 
 @pytest.fixture
 def serve() -> Iterator[Callable[..., Served]]:
-    """Serves worlds until the test ends."""
+    """Yield a function that serves worlds until the test ends."""
     with ExitStack() as stack:
 
         def begin(

@@ -1,4 +1,4 @@
-"""axe-core, in a real browser, finds nothing wrong with the pages, light and dark."""
+"""axe-core in a real browser finds no fault of the pages, light and dark."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Serve = Callable[..., Served]
 
 @pytest.fixture(scope="module")
 def axe() -> str:
-    """The script of axe-core, as a package of Python has it."""
+    """Return the script of axe-core from a Python package."""
     found = importlib.util.find_spec("axe_playwright_python")
     if found is None or not found.submodule_search_locations:
         pytest.skip("axe-playwright-python is not installed")
@@ -27,7 +27,7 @@ def axe() -> str:
 
 
 def violations(page: Any, axe: str) -> list[str]:
-    """What axe finds: the rule, and the elements."""
+    """Return the findings of axe: rules and elements."""
     page.evaluate(axe)
     found = page.evaluate("axe.run(document)")
     assert len(found["passes"]) > 10
@@ -53,7 +53,7 @@ def test_axe_finds_nothing_on_the_page(browser: Any, serve: Serve, axe: str, the
     assert violations(page, axe) == []
 
 
-def test_axe_finds_nothing_where_a_token_is_asked_for(browser: Any, serve: Serve, axe: str) -> None:
+def test_axe_finds_nothing_on_the_request_for_a_token(browser: Any, serve: Serve, axe: str) -> None:
     served = serve(options=WebOptions(port=0, token="open sesame"))
     page = browser.new_page()
     page.goto(served.server.address)

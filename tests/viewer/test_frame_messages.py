@@ -1,4 +1,4 @@
-"""Frames and rosters come back from their bytes; late watchers get the whole."""
+"""Frames and rosters are decoded equal; late watchers get complete messages."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ORIGIN = np.array([100.0, -50.0])
 
 
 class Page:
-    """Reads messages as the page does."""
+    """A reader of messages like the page."""
 
     def __init__(self) -> None:
         self.roster = np.zeros(0, ROSTER_ROW)
@@ -145,7 +145,7 @@ def test_messages_include_ghosts_and_transfers() -> None:
     assert FRAME_HEAD.unpack_from(shown.frame)[1] == 1
 
 
-def test_what_lies_beyond_the_range_stays_at_its_end() -> None:
+def test_values_beyond_the_range_are_clipped() -> None:
     frame = frame_with([1], 0)
     frame.vehicles["x"], frame.vehicles["speed"] = -1e9, 1e9
     shown = FrameEncoder(ORIGIN).publication(frame)

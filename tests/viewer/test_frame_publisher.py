@@ -1,4 +1,4 @@
-"""When frames, details and events are sent, with times and events that the test gives."""
+"""Times at which frames, details and events are sent, with a clock and events of the test."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cavmarl.viewer.subscribers import Wishes
 
 
 class World:
-    """A world whose ticks are given, and what its watchers get."""
+    """A world with given ticks, and the messages to its watchers."""
 
     def __init__(self, has_events: bool = True) -> None:
-        self.frames: list[int] = []  # ticks
-        self.details: list[tuple[int, int, bool]] = []  # tick, vehicle, with sensors
+        self.frames: list[int] = []  # ticks of the frames
+        self.details: list[tuple[int, int, bool]] = []  # tick, vehicle, whether with sensors
         self.events: list[list[Any]] = []
         self.ghosts: list[bool] = []
         self.tick = 0
@@ -55,7 +55,7 @@ def test_twenty_frames_and_five_details_a_second() -> None:
     assert [tick for tick, _, _ in world.details] == [1, 7, 9]
 
 
-def test_a_world_that_stands_is_shown_again_when_a_page_asks_for_more() -> None:
+def test_a_paused_world_is_sent_again_when_a_page_asks_for_more() -> None:
     world = World(has_events=False)
     world.publish(10.0)
     world.publish(10.1, is_new=False)

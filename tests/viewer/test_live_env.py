@@ -1,4 +1,4 @@
-"""An environment that a program steps, shown while it does; in notebooks and evaluations, too."""
+"""An environment is shown while a program steps it, also in notebooks and evaluations."""
 
 from __future__ import annotations
 
@@ -70,10 +70,10 @@ def test_a_page_chooses_among_the_worlds_that_a_program_steps(
         assert tick_of(client) % ticks == 0
         assert shown.publishers[0].published == 0
     monkeypatch.setattr(shown, "turn", None)
-    vec.step(vec.suggest_actions())  # does not call it any more
+    vec.step(vec.suggest_actions())  # no longer called
 
 
-def test_what_is_shown_changes_nothing_of_what_is_stepped() -> None:
+def test_showing_a_world_does_not_change_it() -> None:
     hashes = []
     for is_shown in (True, False):
         vec = make_vec("ring", num_envs=1, agents=2, background=2)
@@ -90,7 +90,7 @@ def test_what_is_shown_changes_nothing_of_what_is_stepped() -> None:
     assert hashes[0] == hashes[1]
 
 
-def test_a_page_that_may_pauses_the_program(vec: CavVectorEnv) -> None:
+def test_a_page_with_control_pauses_the_program(vec: CavVectorEnv) -> None:
     vec.reset(seed=0)
     with cavmarl.show(vec, port=0, control=True) as shown, joined(shown.address) as client:
         first_of(client, 1)
@@ -118,11 +118,11 @@ def test_an_unknown_world_is_refused(vec: CavVectorEnv) -> None:
 
 def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVectorEnv) -> None:
     with cavmarl.show(vec, port=0) as shown:
-        assert shown.address in shown._repr_html_()  # before the first reset, too
+        assert shown.address in shown._repr_html_()  # also before the first reset
         vec.reset(seed=0)
         vec.step(vec.suggest_actions())
         assert "<iframe" in shown._repr_html_()
-        with joined(shown.address) as client:  # though no step comes any more
+        with joined(shown.address) as client:  # although no further step is run
             assert tick_of(client) == vec.config.clock.ticks_per_step
         policy = httpx.get(shown.address).headers["content-security-policy"]
         assert "frame-ancestors 'self' http://127.0.0.1:* http://localhost:* vscode" in policy
@@ -133,7 +133,7 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
 
 
 def test_an_evaluation_is_watched_and_stays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CavVectorEnv, "watch", None)  # what it shows is asked for
+    monkeypatch.setattr(CavVectorEnv, "watch", None)  # requests of the page
     keys: dict[str, Any] = {"agents": 2, "background": 2, "overrides": {"horizon_s": 5.0}}
     looks: list[int] = []
 

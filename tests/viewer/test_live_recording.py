@@ -1,4 +1,4 @@
-"""A recording on the page: played, paused, searched along its time line; and bad recordings."""
+"""A recording on the page: playing, pausing, seeking; and bad recordings."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ STEPS = 30
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two worlds, divided, thirty steps each."""
+    """Record two divided worlds with thirty steps each."""
     folder = tmp_path_factory.mktemp("recorded") / "run"
     record = RecordOptions(folder, ("observations",))
     vec = make_vec("grid4x4", num_envs=2, zones=2, agents=2, background=6, record=record)
@@ -39,13 +39,13 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """Stands for the server's: what waits for it is carried out in each turn."""
+    """A substitute for the server's event loop, which runs waiting calls in each turn."""
     with closing(asyncio.new_event_loop()) as made:
         yield made
 
 
 class Heard:
-    """A watcher of a stage, without a server."""
+    """A watcher of a stage without a server."""
 
     def __init__(self, path: Path, loop: asyncio.AbstractEventLoop, world: int = 1) -> None:
         recording = Recording(path)
@@ -60,7 +60,7 @@ class Heard:
         self.stage.audience.ask(self.watcher, PageRequest(kind, number, sensors=True))
 
     def turn(self) -> tuple[int, bool] | None:
-        """Tick of a frame that came, and whether it is paused."""
+        """Return the tick of the last frame, and whether it is paused."""
         time.sleep(0.06)
         self.shown.turn()
         self._loop.run_until_complete(asyncio.sleep(0.0))
@@ -72,7 +72,7 @@ class Heard:
         return head[5], bool(head[1])
 
     def told_of(self, vehicle: int, tick: int) -> Any:
-        """What the page is told of a vehicle at a tick."""
+        """Return the details of a vehicle at a tick."""
         self.ask("pause")
         self.ask("seek", tick)
         self.ask("watch", vehicle)
@@ -141,7 +141,7 @@ def test_an_agent_is_shown_with_its_observation(
     assert "observation" not in heard.told_of(int(others["id"][0]), tick)
 
 
-def test_without_its_map_or_any_frame_it_is_refused(path: Path, tmp_path: Path) -> None:
+def test_a_recording_without_a_map_or_frames_is_refused(path: Path, tmp_path: Path) -> None:
     (path / "network.bin").rename(tmp_path / "network.bin")
     try:
         with pytest.raises(RecordingError, match="has no map"):

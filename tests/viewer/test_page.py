@@ -1,4 +1,4 @@
-"""The page in a real browser: it draws, asks, tells no other host, and takes names as text."""
+"""The page in a real browser: drawing, requests, no other hosts, and names as text."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
 
 
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
-    """A page that shows a first frame; its complaints, and the hosts that it has asked."""
+    """Open a page until its first frame; return it with its errors, and the requested hosts."""
     page = browser.new_page(viewport={"width": 1280, "height": 760})
     problems: list[str] = []
     hosts: set[str] = set()
@@ -43,7 +43,7 @@ def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[st
     return page, problems, hosts
 
 
-def test_the_page_draws_follows_and_asks_no_other_host(browser: Any, serve: Serve) -> None:
+def test_the_page_draws_and_follows_without_other_hosts(browser: Any, serve: Serve) -> None:
     served = serve()
     page, problems, hosts = opened(browser, served)
     until(page, "viewer.firstPicture > 0")
@@ -147,7 +147,7 @@ def test_names_of_maps_are_text(
     nasty = "<script>alert(1)</script><img src=x onerror=alert(1)>"
     served = serve()
     network = served.env.network
-    # To be undone: worlds of one process share the network of a map.
+    # Undo this later, because worlds of one process share the network of a map.
     monkeypatch.setitem(vars(network), "lane_ids", (nasty,) * len(network.lane_ids))
     page, problems, _ = opened(browser, served)
     page.on("dialog", lambda dialog: problems.append(dialog.message))
@@ -159,7 +159,7 @@ def test_names_of_maps_are_text(
     assert not problems
 
 
-def test_without_webgl2_there_are_words_and_a_still_picture(browser: Any, serve: Serve) -> None:
+def test_without_webgl2_a_message_and_a_still_picture_are_shown(browser: Any, serve: Serve) -> None:
     page, problems, _ = opened(browser, serve(), WITHOUT_WEBGL2)
     until(page, "viewer.stillDrawn > 0")
     assert "no WebGL2" in page.inner_text("#notice")
@@ -182,11 +182,11 @@ def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Ser
     drawn = """(() => { const c = document.querySelector('#labels');
         const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
         let n = 0; for (let k = 3; k < d.length; k += 4) n += d[k] > 0; return n; })()"""
-    until(page, f"{drawn} > 20000")  # the cone of the camera alone is more
+    until(page, f"{drawn} > 20000")  # the cone of the camera alone has more pixels
     page.uncheck("#sensors")
     until(page, "viewer.shapes && viewer.shapes.all.length === 0")
     until(page, f"{drawn} < 20000 && {drawn} > 0")
-    assert not [one for one in problems if "getImageData" not in one]  # that is the test's own
+    assert not [one for one in problems if "getImageData" not in one]  # of the test itself
 
 
 def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_path: Path) -> None:
@@ -221,7 +221,7 @@ def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_pat
 
 
 def replayed(stack: ExitStack, path: Path) -> tuple[str, list[int]]:
-    """A recording of two worlds that is served; its address, and the span of its time line."""
+    """Serve a recording of two worlds; yield its address, and the span of its time line."""
     vec = make_vec("ring", num_envs=2, agents=1, background=2, record=path)
     vec.reset(seed=0)
     for _ in range(30):

@@ -1,4 +1,4 @@
-"""A replay shows what the sensors of an agent saw, as the live page did, or says what is not."""
+"""A replay shows the sensor data of an agent like the live page, or reports missing data."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.viewer.recorded_sensors import RecordedSensors
 from cavmarl.viewer.vehicle_details import vehicle_details
 
-pytestmark = pytest.mark.integration  # a manifest asks git for the commit
+pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 RIG = {
     "roof": {"type": "lidar", "rate_hz": 10, "rays": 24, "z_m": 0.8, "range_m": 50},
@@ -24,7 +24,7 @@ STEPS = 12
 
 
 def recorded(path: Path, *include: str) -> list[tuple[int, int, Any]]:
-    """Tick, vehicle and what the live page was told of it, step by step."""
+    """Return tick, vehicle and its details on the live page, step by step."""
     seen = []
     options = RecordOptions(path, include)
     with closing(

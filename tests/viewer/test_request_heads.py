@@ -1,4 +1,4 @@
-"""Peers of the viewer's server that send half a request, an endless one, or something after it."""
+"""Clients that send partial or endless requests, or data after a request, to the viewer."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def head(server: WebServer, *fields: str) -> bytes:
     return "".join(f"{line}\r\n" for line in lines).encode()
 
 
-def test_half_heads_lock_out_nobody_for_long(server: WebServer) -> None:
+def test_partial_heads_do_not_block_other_clients_for_long(server: WebServer) -> None:
     with ExitStack() as stack:
         peers = [stack.enter_context(connection(server)) for _ in range(2 * MOST_WATCHERS + 20)]
         for peer in peers:

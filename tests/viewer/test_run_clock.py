@@ -1,4 +1,4 @@
-"""When steps are due, by a clock that the test moves."""
+"""Times at which steps are due, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.viewer.run_clock import RunClock
 
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """The time, `now.s`, from 100 s on."""
+    """The time, `now.s`; it starts at 100 s."""
     found = SimpleNamespace(s=100.0)
     monkeypatch.setattr(run_clock, "time", SimpleNamespace(monotonic=lambda: found.s))
     return found
@@ -43,7 +43,7 @@ def test_as_fast_as_possible_never_waits(now: SimpleNamespace) -> None:
     assert steps_due(RunClock(0.0), now.s, 0.1) == 100
 
 
-def test_a_late_clock_makes_up_for_half_a_second(now: SimpleNamespace) -> None:
+def test_a_late_clock_makes_up_for_at_most_half_a_second(now: SimpleNamespace) -> None:
     clock = RunClock(1.0)
     now.s += 3.0
     # The steps of 102.5, 102.7 and 102.9 s are taken at once.
@@ -51,7 +51,7 @@ def test_a_late_clock_makes_up_for_half_a_second(now: SimpleNamespace) -> None:
     assert clock.wait_s(now.s) == pytest.approx(0.1)
 
 
-def test_a_pause_takes_steps_on_request_alone_ten_at_most(now: SimpleNamespace) -> None:
+def test_a_paused_world_takes_only_requested_steps_ten_at_most(now: SimpleNamespace) -> None:
     clock = RunClock(1.0)
     assert clock.handle(PageRequest("pause"))
     assert steps_due(clock, now.s, 0.1) == 0
@@ -65,7 +65,7 @@ def test_a_pause_takes_steps_on_request_alone_ten_at_most(now: SimpleNamespace) 
     assert steps_due(clock, now.s, 0.1) == 1, "the time of the pause is not made up for"
 
 
-def test_a_step_pauses_a_world_that_runs(now: SimpleNamespace) -> None:
+def test_a_requested_step_pauses_a_running_world(now: SimpleNamespace) -> None:
     clock = RunClock(1.0)
     clock.handle(PageRequest("step"))
     assert clock.is_paused

@@ -1,4 +1,4 @@
-"""What pages are told of sensors lies where the things are that were sensed."""
+"""Shapes of sensor data are at the positions of the sensed objects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RIG = {
 
 @pytest.fixture(scope="module")
 def told() -> Any:
-    """Details of an agent with all kinds of sensors, its frame and its environment."""
+    """Return details of an agent with all kinds of sensors, its frame and its environment."""
     grid = {"features": ["presence", "on_road"], "align_to_vehicle_axes": True}
     sensors = {"sensors.lidar.rays": 72, "sensors.occupancy_grid": grid}
     env = parallel_env("merge", agents=4, background=20, overrides={"rig": RIG, **sensors})
@@ -44,7 +44,7 @@ def shapes_of(told: Any) -> dict[str, dict[str, Any]]:
 
 
 def on_map(told: Any, flat: list[float]) -> np.ndarray:
-    """Places of the vehicle's frame as places on the map."""
+    """Transform points of the vehicle's frame to the map."""
     rows = told[1].vehicles
     row = rows[rows["id"] == told[2]][0]
     cos, sin = np.cos(row["heading"]), np.sin(row["heading"])
@@ -54,7 +54,7 @@ def on_map(told: Any, flat: list[float]) -> np.ndarray:
 
 
 def to_bodies_m(told: Any, places: np.ndarray) -> np.ndarray:
-    """How far each place is from the nearest body of another vehicle; 0 within."""
+    """Return the distance of each point to the nearest body of another vehicle; 0: inside."""
     others = told[1].vehicles[told[1].vehicles["id"] != told[2]]
     gaps = []
     for row in others:

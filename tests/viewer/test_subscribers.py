@@ -1,4 +1,4 @@
-"""What each watcher of a world gets, without a server and without a world."""
+"""Messages to each watcher of a world, without a server and without a world."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SECOND = (*FIRST, Change(2, b"change"))
 
 
 def audience() -> Audience:
-    """Its server's thread is this one."""
+    """Return an audience whose server thread is this thread."""
 
     def call(function: Callable[[], None]) -> None:
         function()
@@ -59,7 +59,7 @@ def test_a_watcher_that_reads_no_texts_is_lost_after_256() -> None:
     assert watcher.take() == [str(number) for number in range(256)]
 
 
-def test_who_comes_later_gets_the_last_frame_and_the_events_so_far() -> None:
+def test_a_late_watcher_gets_the_last_frame_and_all_events() -> None:
     here = audience()
     here.publish(Publication(b"frame", FIRST))
     here.send_events([[3, "arrived", 7, -1, ""]])
@@ -87,7 +87,7 @@ def test_details_go_to_the_pages_that_watch_the_vehicle() -> None:
     assert here.wishes == Wishes(3, frozenset({7}), frozenset(), (2,))
 
 
-def test_a_page_that_leaves_frees_its_seat_and_wishes_nothing() -> None:
+def test_a_page_that_leaves_frees_its_seat_and_its_requests_end() -> None:
     here = audience()
     watcher, stays = here.join(), here.join()
     here.ask(watcher, PageRequest("watch", 7.0))

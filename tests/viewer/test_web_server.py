@@ -1,4 +1,4 @@
-"""The viewer's server: headers, origins, tokens, slow and rude watchers, a taken port."""
+"""The viewer's server: headers, origins, tokens, slow and invalid watchers, a taken port."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def welcome(server: WebServer, token: str = "") -> Iterator[ClientConnection]:
 
 
 def first_of(client: ClientConnection, kind: int | str) -> Any:
-    """The next message of a kind, a number or a name."""
+    """Return the next message of a kind, given by number or name."""
     end = time.monotonic() + 20.0
     while time.monotonic() < end:
         message = client.recv(timeout=20.0)
@@ -148,7 +148,7 @@ def test_all_answers_have_the_headers(serve: Serve, path: str) -> None:
     assert "server" not in answer.headers
 
 
-def test_the_page_holds_nothing_that_its_policy_forbids() -> None:
+def test_the_page_obeys_its_content_security_policy() -> None:
     for file in PAGE.iterdir():
         text = file.read_text(encoding="utf-8")
         assert "innerHTML" not in text
@@ -166,7 +166,9 @@ def test_foreign_origins_and_names_are_refused(serve: Serve) -> None:
     for headers in (
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
-        {"Origin": f"http://localhost:{port}"},  # of this machine, but not the page's
+        {
+            "Origin": f"http://localhost:{port}"
+        },  # an origin of this machine, but not that of the page
         {"Host": f"evil.example:{port}", "Origin": f"http://evil.example:{port}"},
     ):
         assert status_of_handshake(port, headers) == 403
@@ -190,7 +192,7 @@ def status_of_handshake(port: int, headers: dict[str, str]) -> int:
     return status
 
 
-def test_a_token_is_needed_where_there_is_one(serve: Serve) -> None:
+def test_a_configured_token_is_required(serve: Serve) -> None:
     served = serve(drives=False, options=WebOptions(port=0, token="a secret"))
     with welcome(served.server) as client:
         assert ended_with(client) == (4401, "a token is needed")
@@ -246,7 +248,7 @@ def test_other_machines_are_only_served_with_a_token() -> None:
         ('{"kind": "' + "\U0001f697" * 40 + '"}', "request of kind"),
     ],
 )
-def test_what_is_not_understood_ends_the_connection(serve: Serve, text: str, reason: str) -> None:
+def test_invalid_messages_end_the_connection(serve: Serve, text: str, reason: str) -> None:
     served = serve(drives=False)
     with welcome(served.server) as client:
         first_of(client, 1)

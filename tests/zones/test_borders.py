@@ -1,4 +1,4 @@
-"""Vehicles near a border, and rows that change hands."""
+"""Vehicles near a border, and changes of owner of rows."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
             id=100 * zone + np.arange(len(xy)),
         )
         parts.append(rows)
-    reach_m = MAX_SPEED_MPS * ahead_s  # as far as anybody can drive by then
+    reach_m = MAX_SPEED_MPS * ahead_s  # the distance that a vehicle can drive until then
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
     if check_all:
@@ -69,7 +69,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # so small a distance has no square
+        if depth_m * depth_m == 0.0:  # the square of such a small distance is 0
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)
@@ -78,7 +78,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
 def _margins(
     partition: ZonePartition, zone: int, hysteresis_m: float, ahead_s: float, rows: NDArray[np.void]
 ) -> list[float]:
-    """How far each vehicle is from where the answer changes."""
+    """Return the distance of each vehicle to the limits at which the result changes."""
     rect = partition.reaching[zone]
     margins = []
     for row in rows:
@@ -95,7 +95,7 @@ def _margins(
 
 def test_a_vehicle_near_a_corner_is_found_for_both_zones() -> None:
     partition = four()
-    row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # of zone 0, 3 m to the east of it
+    row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # 3 m to the east of zone 0
     none = row[:0]
     zoned = exchanged(partition, 60.0, [row, none, none, none], borders=BORDERS)
     out = np.zeros(2, dtype=NEAR)
@@ -117,7 +117,7 @@ def test_removed_rows_are_ignored() -> None:
 
 
 def two_zones() -> ZoneState:
-    """Of three and two vehicles, which see each other's."""
+    """Return two zones with three and two vehicles, and ghosts of each other's vehicles."""
     zoned = make_zone_state(2, 1, 6)
     zoned.rows["id"][SIDE, 0, 0, :5] = [10, 11, 12, 21, 20]
     zoned.rows["id"][SIDE, 1, 0, :5] = [20, 21, 12, 10, 11]
@@ -149,7 +149,7 @@ def test_a_handed_over_vehicle_is_owned_by_the_target_and_a_ghost_at_the_source(
 @pytest.mark.parametrize(("vehicle", "why"), [(20, -1), (99, -1), (13, -2)])
 def test_a_vehicle_without_owner_or_ghost_is_not_handed_over(vehicle: int, why: int) -> None:
     zoned = two_zones()
-    zoned.rows["id"][SIDE, 0, 0, 1] = 13  # whom the other zone has not seen
+    zoned.rows["id"][SIDE, 0, 0, 1] = 13  # a vehicle without a ghost in the other zone
     before = zoned.rows.copy()
     assert pass_on(vehicle, 0, 0, 1, 5, zoned, SIDE, 0) == why
     assert zoned.num_owned[:, 0].tolist() == [3, 2]

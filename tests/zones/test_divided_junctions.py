@@ -1,4 +1,4 @@
-"""Junctions that a border runs through, or past: drivers decide as in one zone, bit for bit."""
+"""Junctions at borders of zones: drivers decide as in one zone, bit for bit."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tests.support.divided_scenes import TICK_S, DividedScene
 from tests.support.junction_scenes import build_crossing, with_shorter_lane
 from tests.support.netgenerate import netconvert
 
-CRAWLS = 1e-3  # of the limit: for others such a vehicle stands
+CRAWLS = 1e-3  # share of the speed limit: such a vehicle counts as standing
 
 
 @pytest.fixture(scope="module")
@@ -25,7 +25,7 @@ def priority(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
     priority: Path, tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """One that stays on the junction blocks three others; the fourth need not wait for those."""
+    """A vehicle that stays on the junction blocks three others, but not the fourth."""
     here = DividedScene(priority, tmp_path, corner_m, ("car",))
     here.put("stays", "W_in_0 E_out_0", 9.0, wait_s=10.0, speed_factor=CRAWLS)
     here.put("held", "S_in_0 N_out_0", 2.0, wait_s=10.0)
@@ -44,10 +44,10 @@ def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
 
 
 @pytest.mark.parametrize("corner_m", [(0.0, 0.0), (1.6, -1.6), (-9.0, 9.0), (20.0, 14.0)])
-def test_a_border_through_a_circle_of_vehicles_that_wait_on_equal_roads_changes_nothing(
+def test_a_border_through_a_deadlock_on_equal_roads_changes_nothing(
     tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """Each gives way to the one on its right; which of them lets the others go is by chance."""
+    """Each vehicle yields to the vehicle on its right; chance decides which lets the others go."""
     here = DividedScene(build_crossing(tmp_path, "right_before_left"), tmp_path, corner_m, ("car",))
     for arm, goal in {"W": "E", "S": "N", "E": "W", "N": "S"}.items():
         here.put(arm, f"{arm}_in_0 {goal}_out_0", -0.2, wait_s=1.0, hold=HOLD_YIELD)
@@ -60,10 +60,10 @@ def test_a_border_through_a_circle_of_vehicles_that_wait_on_equal_roads_changes_
     assert set(order[:4]) == set("WSEN")
 
 
-def test_no_driver_waits_for_one_that_cannot_come_which_its_zone_does_not_see(
+def test_no_driver_waits_for_an_unseen_vehicle_that_cannot_come(
     tmp_path: Path,
 ) -> None:
-    # No lane leads to the side road's zone on which another vehicle could follow one of it.
+    # No lane leads to the zone of the side road, so no vehicle can follow a vehicle there.
     path = build_crossing(tmp_path, "priority", only_in="S")
     here = DividedScene(path, tmp_path, (-1.0, -24.0), ("car",))
     here.put("stays", "E_in_0 W_out_0", 23.0, speed_factor=CRAWLS)
@@ -73,14 +73,14 @@ def test_no_driver_waits_for_one_that_cannot_come_which_its_zone_does_not_see(
     for vehicles in here.run(0.5):
         assert vehicles["held"]["hold"] == HOLD_EXIT_BLOCKED
         assert "held" not in here.ghosts("side")
-        assert vehicles["side"]["speed"] > 8.0, "it does not wait"
+        assert vehicles["side"]["speed"] > 8.0, "the vehicle does not wait"
 
 
 @pytest.mark.parametrize("is_second", [False, True])
 def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
     priority: Path, tmp_path: Path, is_second: bool
 ) -> None:
-    """It turns over the place where the other would stop, and is let stand: it does not come."""
+    """The queued bus turns over the position where the other bus would stop, but stands still."""
     here = DividedScene(priority, tmp_path, (6.0, -22.0), ("car", "bus"))
     here.put("waits", "S_in_0 N_out_0", -11.0, "bus", speed=8.0)
     here.put("queued", "E_in_0 S_out_0", -22.5, "bus", wait_s=10.0)
@@ -91,7 +91,7 @@ def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
     assert "queued" in here.ghosts("waits")
     first = next(here.run(1.0))
     assert first["waits"]["hold"] == HOLD_YIELD
-    assert first["waits"]["speed"] < 7.8, "it brakes for a place before its line"
+    assert first["waits"]["speed"] < 7.8, "the bus brakes for a position before its line"
     for _ in here.run(3.0):
         pass
 
@@ -112,19 +112,19 @@ def test_no_car_departs_where_a_bus_turns_over_the_line(
     if is_far:
         assert entered_s < 0.5, "the bus can wait"
     else:
-        assert 2.0 < entered_s < 6.0, "it waits until the bus has passed, and no longer"
+        assert 2.0 < entered_s < 6.0, "the car waits until the bus has passed, and no longer"
 
 
 @pytest.fixture(scope="module")
 def shorter(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The left lane of the southern arm ends 8 m before the right one."""
+    """Return a map on which the left lane of the southern arm ends 8 m before the right lane."""
     path = build_crossing(tmp_path_factory.mktemp("shorter"), "priority", side_lanes=2)
     return with_shorter_lane(path, "S_in_1", 8.0)
 
 
 @pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -11.5), (0.0, -14.0), (0.0, 0.0)])
 @pytest.mark.parametrize("way", ["S_in_1 N_out_1", "S_in_1 W_out_0"])
-def test_one_that_has_left_a_shorter_lane_is_seen_on_the_longer_one_that_it_still_covers(
+def test_a_vehicle_that_has_left_a_shorter_lane_is_seen_on_the_longer_lane(
     shorter: Path, tmp_path: Path, corner_m: tuple[float, float], way: str
 ) -> None:
     here = DividedScene(shorter, tmp_path, corner_m, ("car",))
@@ -144,7 +144,7 @@ def test_one_that_has_left_a_shorter_lane_is_seen_on_the_longer_one_that_it_stil
 
 @pytest.fixture
 def streets(tmp_path: Path) -> Path:
-    """A crossing, another one on its western arm: 115 m of a street that leads here alone."""
+    """Return two crossings; the 115 m of road between them lead only to the first."""
     places = {"W": "-150 0", "m": "-115 0", "n": "-115 90", "c": "0 0"}
     places |= {"E": "150 0", "S": "0 -150", "N": "0 150"}
     ways = [("far", "W", "m"), ("beside", "n", "m"), ("W_in", "m", "c")]
@@ -165,10 +165,10 @@ def streets(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("corner_m", [(-5.0, 4.0), (-2.0, 9.0)])
-def test_one_that_turns_in_waits_for_one_behind_a_border_before_the_junction_before(
+def test_a_turning_vehicle_waits_for_a_vehicle_before_the_previous_junction(
     streets: Path, tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """At 11 m/s it has 130 m to the line: it would not be listed so far from others."""
+    """At 11 m/s, the vehicle has 130 m to the line, too far to register for other vehicles."""
     way = """<vehicle id="w" type="car" depart="900"><route edges="far W_in E_out"/></vehicle>"""
     here = DividedScene(streets, tmp_path, corner_m, ("car",), {"w": way})
     here.put("side", "S_in_0 E_out_0", -1.0, wait_s=2.0, hold=HOLD_YIELD)

@@ -1,4 +1,4 @@
-"""Rows that go from shard to shard, and rows that leave: who goes, who stays, what lies where."""
+"""Rows that move between shards, and rows that leave."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ TICKS_PER_STEP = 2
 
 
 def cars(number: int) -> NDArray[np.void]:
-    """Ids from 100 on, each with a speed of its own."""
+    """Return cars with ids from 100 on and different speeds."""
     ids = 100 + np.arange(number)
     return vehicles([(0.0, 0.0, 0.0)] * number, id=ids, speed=0.5 * ids)
 
@@ -59,7 +59,7 @@ def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
 
 
 def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.void]]:
-    """Rows of each zone, anywhere: a transfer may be late."""
+    """Draw rows of each zone at any position, because a transfer may be late."""
     parts, next_id = [], 0
     for _ in range(partition.count):
         xy = data.draw(places(partition, size=4))
@@ -113,7 +113,7 @@ def test_exchange_equals_twin(
     st.sampled_from([0.0, 3.0, 40.0]),
     st.booleans(),
 )
-def test_zones_that_gather_have_what_those_have_that_exchange(
+def test_gathering_zones_have_the_rows_of_exchanging_zones(
     data: st.DataObject,
     partition: ZonePartition,
     halo_m: float,
@@ -143,7 +143,7 @@ def test_zones_that_gather_have_what_those_have_that_exchange(
         assert name == "due" or array.tobytes() == getattr(book, name).tobytes(), name
 
 
-def test_more_ghosts_than_are_found_at_once_are_those_that_zones_gather() -> None:
+def test_several_batches_of_ghosts_equal_those_that_zones_gather() -> None:
     rng, rects = np.random.default_rng(3), four().reaching
     middle = np.array([rects[0, 2], rects[0, 3]])
     xy = middle + rng.uniform(-9.0, 9.0, (6 * BATCH_SIZE, 2))
@@ -160,11 +160,13 @@ def test_more_ghosts_than_are_found_at_once_are_those_that_zones_gather() -> Non
         assert noted[0] == noted[1]
     for name in ("rows", "num_rows", "num_near"):
         assert getattr(sent, name).tobytes() == getattr(gathered, name).tobytes(), name
-    assert (sent.num_rows - sent.num_owned).sum() > 4 * BATCH_SIZE, "some zone sends them twice"
+    assert (sent.num_rows - sent.num_owned).sum() > 4 * BATCH_SIZE, (
+        "some zone sends a vehicle twice"
+    )
 
 
 def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> None:
-    """Note who may be seen by other zones, as `advance` does."""
+    """List the rows that other zones may see, as `advance` does."""
     for zone, rows in enumerate(parts):
         left, low, right, high = halo.inner[zone]
         x, y = rows["x"], rows["y"]
@@ -174,14 +176,14 @@ def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> N
 
 
 def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int64]) -> None:
-    """Note some rows as OUTER."""
+    """List some rows as OUTER."""
     noted["row"][: len(places)] = places
     for name in ("x", "y", "s", "speed", "lane", "driver"):
         noted[name][: len(places)] = rows[name][places]
 
 
-def test_what_an_owner_knows_of_its_way_goes_with_each_ghost() -> None:
-    """Some ghosts can touch and go before those that cannot, which make room for them."""
+def test_ghosts_carry_the_route_step_of_their_owner() -> None:
+    """Ghosts that can touch owned vehicles precede other ghosts, which are moved."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(-10.0, 50.0, (40, 2))
     rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()], id=np.arange(len(xy)))
@@ -241,7 +243,7 @@ def test_unlisted_rows_are_not_read() -> None:
 
 
 def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, DepartureQueue]:
-    """One world with owned rows and ghosts, and its departures."""
+    """Return one world with owned rows and ghosts, and its departure queue."""
     roads = network("merge")
     worlds = make_worlds(1, len(rows), roads)
     worlds.rows[0] = rows
@@ -260,7 +262,7 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
     assert set(ids(departures.passing[0, : departures.num_passing[0]])) == {100, 103}
     assert (worlds.num_owned[0], worlds.num_rows[0]) == (2, 4)
     assert set(ids(worlds.rows[0, :2])) == {101, 102}
-    assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "ghosts leave where they are owned"
+    assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "ghosts leave in their owner's zone"
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=9))

@@ -1,4 +1,4 @@
-"""Changes of owner in one call: who changes, in which order, and what is kept of it."""
+"""Changes of owner in one call: vehicles, order and records."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=0.2, max_speed_mps=60.0)
 def world(
     *places: tuple[float, float, float], ids: list[int], speed: float = 10.0
 ) -> tuple[ZoneState, BorderRecords]:
-    """Vehicles of zone 0 at (x, y, heading), seen by all zones at tick 7."""
+    """Return vehicles of zone 0 at (x, y, heading), with ghosts in all zones, at tick 7."""
     rows = vehicles(list(places), speed=speed, id=np.array(ids), epoch=4)
     book = make_book(1, 16)
     book.tick[0] = 6
@@ -42,7 +42,7 @@ def call(zoned: ZoneState, book: BorderRecords, check_all: bool = False, newborn
 
 
 def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
-    """Look on, after rows have moved."""
+    """Search again, after rows have moved."""
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]
     zoned.num_border[:, 0] = [owned, 0, 0, 0]
@@ -123,7 +123,7 @@ def test_a_vehicle_that_turns_away_is_counted_once() -> None:
 def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
     zoned, book = world((9.5, 5.0, 0.0), (9.0, 5.0, 0.0), ids=[3, 4], speed=20.0)
     next_tick(zoned, book)
-    zoned.num_owned[0, 0] = 1  # the other one has left
+    zoned.num_owned[0, 0] = 1  # the other vehicle has left
     for _ in range(3):
         assert call(zoned, book, check_all=True) == 0
         assert coming(book) == [(3, 1)]

@@ -1,4 +1,4 @@
-"""How far drivers look, as declared: no less than what they look at; and how far vehicles move."""
+"""The declared reach of drivers covers all that they look at; longest moves of vehicles."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.netgenerate import netgenerate
 from tests.support.traffic import NAMES, network, travel
 from tests.support.watchers import looks_of
 
-LENGTH_M = 5.0  # of the generator's cars
+LENGTH_M = 5.0  # length of generated cars
 # Two roads of 40 m and a gap of 20 m between them, which vehicles jump over.
 GAP = """<?xml version="1.0" encoding="UTF-8"?>
 <net version="1.20">
@@ -47,7 +47,7 @@ GAP = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def widest_junction_m(roads: RoadNetwork) -> float:
-    """Between the ends of lanes whose paths conflict, pair by pair."""
+    """Return the largest distance between ends of lanes with conflicting paths, pair by pair."""
     widest = 0.0
     for link in roads.links:
         first = int(link["first_conflict"])
@@ -67,7 +67,7 @@ def test_reach_covers_view_junction_and_approaching_vehicles(name: str) -> None:
     reach_m = driving_reach_m(roads, travel(name))
     rest_m = reach_m - VIEW_M - APPROACH_M - 2.0 * LENGTH_M - ASIDE_M
     assert widest_junction_m(roads) <= rest_m + 1e-9
-    assert rest_m <= 40.0, "no halo of a whole map"
+    assert rest_m <= 40.0, "the halo does not cover the map"
 
 
 def test_reach_shrinks_with_how_far_lines_are_seen() -> None:
@@ -152,7 +152,7 @@ def test_no_vehicle_exceeds_the_longest_move(internal: tuple[str, ...], tmp_path
 def test_no_vehicle_exceeds_the_distance_off_its_lane(
     internal: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """A body whose bumpers are on both sides of a jump has its centre between them."""
+    """A body with bumpers on both sides of a jump has its centre between them."""
     path = netgenerate(
         tmp_path / "x.net.xml",
         "--grid", "--grid.number", "3", "--grid.length", "120", "-L", "3", *internal,
@@ -173,7 +173,7 @@ def test_no_vehicle_exceeds_the_distance_off_its_lane(
 
 
 def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
-    """As far as anybody asks about lanes, and as far as bodies are off them."""
+    """The distance includes how far drivers look along lanes, and how far bodies are off lanes."""
     path = netgenerate(
         tmp_path / "x.net.xml",
         "--grid", "--grid.number", "8", "--grid.length", "100", "--no-internal-links",
@@ -194,7 +194,7 @@ def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
     margins = partition.reaching[inner, 2] - halo.inner[inner, 2]
     assert len(margins) == 2
     assert margins == pytest.approx(halo.seen_m, abs=1e-4)
-    # A zone's own drivers, too: they may be late, and as far off their lanes.
+    # This also holds for the zone's own drivers, whose transfer may be late.
     wide_m = 8.0 + aside_m
     half_m = 0.5 * float(kinds.types["length"].max())
     scratch = make_scratch(len(roads.lanes), len(roads.links))

@@ -1,4 +1,4 @@
-"""Maps cut through roundabouts, bridges and junctions are still the undivided world."""
+"""Maps that are cut through roundabouts, bridges and junctions equal the undivided world."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from cavmarl.verify.equivalence import verify_zones
 from tests.support.borders import bounds_around, cut_at
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
-BRIDGE_M = 4.0  # one road so far above another,
-NEAR_M = 5.0  # where points of both are as near in the plane
+BRIDGE_M = 4.0  # distance of one road above another,
+NEAR_M = 5.0  # where points of both are this close in the plane
 Place = NDArray[np.float64]
 
 
 def equal_around(place: Place, net: Path, folder: Path, *, crossings: int, steps: int = 60) -> None:
-    """Four zones that meet at the place, and nine whose cuts lie around it."""
+    """Check four zones that meet at a point, and nine zones whose cuts are around it."""
     x, y = (float(v) for v in place[:2])
     bounds = bounds_around(load_network(net))
     for name, xs, ys in (("four", [x], [y]), ("nine", [x - 6.0, x + 6.0], [y - 6.0, y + 6.0])):
@@ -37,7 +37,7 @@ def equal_around(place: Place, net: Path, folder: Path, *, crossings: int, steps
 
 
 def roundabouts(net: Path, network: RoadNetwork) -> list[tuple[float, Place]]:
-    """Radius and middle of each, the largest first."""
+    """Return radius and centre of each roundabout, the largest first."""
     found = []
     for element in ElementTree.parse(net).iter("roundabout"):
         edges = [network.edge_ids.index(name) for name in element.attrib["edges"].split()]
@@ -49,7 +49,7 @@ def roundabouts(net: Path, network: RoadNetwork) -> list[tuple[float, Place]]:
 
 
 def bridges(network: RoadNetwork) -> Place:
-    """Places (n, 2) where a lane's point lies over or under another's."""
+    """Return points (n, 2) of lanes above or below points of other lanes."""
     lanes = [network.lane_polyline(lane) for lane in range(len(network.lanes))]
     points = np.concatenate(lanes)
     found = []

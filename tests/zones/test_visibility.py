@@ -1,4 +1,4 @@
-"""Zones see whom their drivers may ask about, and nobody else far away."""
+"""Zones see all vehicles that their drivers may look at, and no other distant vehicles."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 40
 
 @pytest.fixture(scope="module")
 def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Streets without signals, so fast that who has the right of way is minded from afar."""
+    """Make fast streets without signals, where drivers consider distant vehicles with priority."""
     return netgenerate(
         tmp_path_factory.mktemp("blocks") / "blocks.net.xml",
         "--grid", "--grid.number", "4", "--grid.length", "200", "-L", "2",
@@ -27,7 +27,7 @@ def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def driven(path: Path, **overrides: object) -> DrivenWorld:
-    """A world of drivers alone, in nine zones."""
+    """Make a world without agents, in nine zones."""
     make = world_maker(
         str(path),
         (),
@@ -49,7 +49,7 @@ def ghosts(world: DrivenWorld) -> int:
 
 
 def test_a_configured_halo_is_seen_whole_and_changes_no_result(blocks: Path) -> None:
-    """More ghosts, the same world."""
+    """There are more ghosts, but the world is equal."""
     narrow = driven(blocks)
     whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zones.loads().halo_m})
     assert ghosts(narrow) < 0.9 * ghosts(whole)
@@ -66,7 +66,7 @@ def test_vehicles_at_a_line_are_within_half_a_body_and_the_clearance(
 
 
 def test_the_monitor_expects_ghosts_of_seen_vehicles(blocks: Path) -> None:
-    """It would name a ghost too few as well as one too many."""
+    """The monitor would report missing and needless ghosts."""
     assert ghosts(driven(blocks, **{"zones.check_invariants": True})) > 0
 
 
@@ -74,7 +74,7 @@ def test_the_monitor_expects_ghosts_of_seen_vehicles(blocks: Path) -> None:
 def test_a_smaller_visible_part_changes_results(
     blocks: Path, fields: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Leaders ahead, and foes of the right of way: who is not seen is driven into."""
+    """Unseen leaders, and unseen vehicles with the right of way, cause collisions."""
     seen = Visibility.halo
 
     def blind(sight: Visibility, partition: ZonePartition) -> Halo:

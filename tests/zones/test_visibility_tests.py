@@ -1,4 +1,4 @@
-"""Whom a zone's drivers may ask about: as sets of lanes say, and as one sees on a plain map."""
+"""The lanes that drivers of a zone look at, compared with a twin, and on plain maps."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.netgenerate import netgenerate
 from tests.support.traffic import network
 
 VIEW_M, SEE_M, HALF_M = 90.0, 40.0, 6.0
-# Three roads one after the other, of 400 m each, without junctions that anybody could ask about.
+# Three consecutive roads of 400 m, without junctions at which drivers look at others.
 LINE = """<?xml version="1.0" encoding="UTF-8"?>
 <net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
@@ -51,13 +51,13 @@ def looks_of(
 ) -> NDArray[np.void]:
     looks = np.zeros(len(roads.lanes), dtype=LOOK)
     scratch = make_scratch(len(roads.lanes), len(roads.links))
-    for _ in range(2):  # what the scratch held before does not matter
+    for _ in range(2):  # earlier content of the scratch does not matter
         find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, half_m, scratch, looks)
     return looks
 
 
 def same_looks(found: NDArray[np.void], twin: Looks) -> None:
-    """As finely as the twin looks at lanes."""
+    """Check that parts are equal, up to the step with which the twin checks lanes."""
     for field, told in (
         ("head", twin.head),
         ("tail", twin.tail),
@@ -76,11 +76,11 @@ def same_looks(found: NDArray[np.void], twin: Looks) -> None:
 )
 @pytest.mark.parametrize("half_m", [2.5, HALF_M])
 @pytest.mark.parametrize("steered", [False, True])
-def test_kernel_sees_what_sets_of_lanes_see(
+def test_the_kernel_equals_its_twin(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
-    """Same heads, tails and lines, as finely as the twin looks at lanes."""
-    # From the cache: without the compiler it takes minutes to drive a car over each link.
+    """Heads, tails and lines are equal, up to the step with which the twin checks lanes."""
+    # Read from the cache: without the compiler, driving a car over each link takes minutes.
     roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
@@ -88,17 +88,17 @@ def test_kernel_sees_what_sets_of_lanes_see(
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On these maps vans, buses and steered cars alone sweep over ways beside theirs.
+    # On these maps, only vans, buses and steered cars sweep over paths beside theirs.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
 
 
 @pytest.mark.parametrize("side_m", [60.0, 140.0])
 @pytest.mark.parametrize("part", [(0.0, 0.0, 0.2, 0.2), (0.45, 0.45, 0.55, 0.55)])
-def test_those_that_turn_into_a_lane_see_over_the_junction_before_it(
+def test_merging_drivers_see_vehicles_beyond_the_previous_junction(
     tmp_path: Path, side_m: float, part: tuple[float, float, float, float]
 ) -> None:
-    """Along one lane more, where nothing has to stop before that."""
+    """They are seen one lane farther if no vehicle has to stop before the junction."""
     options = ("--grid.number", "7", "--grid.length", str(side_m), "-L", "2")
     net = netgenerate(tmp_path / "net.net.xml", "-g", "-j", "priority_stop", *options)
     roads = read_network(net)
@@ -114,16 +114,16 @@ def test_those_that_turn_into_a_lane_see_over_the_junction_before_it(
 
 
 @pytest.mark.parametrize(("junctions", "seen"), [("right_before_left", 4), ("priority", 1)])
-def test_on_equal_roads_those_are_seen_that_foes_give_way_to(
+def test_on_equal_roads_vehicles_are_seen_to_which_foes_yield(
     tmp_path: Path, junctions: str, seen: int
 ) -> None:
-    """One asks whether it waits in a circle: along those that each gives way to."""
+    """A driver checks for a deadlock along the vehicles to which each vehicle yields."""
     roads = read_network(netgenerate(tmp_path / "net.net.xml", "-g", "-j", junctions))
     links, conflicts = roads.links.copy(), roads.conflicts.copy()
     middle = np.bincount(links["junction"]).argmax()
     one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
     assert len(rest) == 2
-    # Those from the one lane give way to one from another lane alone, which gives way to most.
+    # Links from one lane yield to a single link of another lane, which yields to the most links.
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
     conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
@@ -141,10 +141,10 @@ def test_on_equal_roads_those_are_seen_that_foes_give_way_to(
 
 
 @pytest.mark.parametrize("from_line_m", [-40.0, 10.0, 95.0, 120.0])
-def test_behind_a_shorter_lane_those_are_seen_that_may_cover_the_longer_one(
+def test_vehicles_behind_a_shorter_lane_are_seen_if_they_may_cover_the_longer_lane(
     tmp_path: Path, from_line_m: float
 ) -> None:
-    """From a place behind the junction, and from places before it: near, far, and too far."""
+    """The zone is behind the junction, or before it: near, far, and too far."""
     path = build_crossing(tmp_path, "priority", side_lanes=2)
     roads = read_network(with_shorter_lane(path, "S_in_1", 8.0))
     turn = roads.lane_ids.index(":c_10_0")
@@ -167,17 +167,17 @@ def line(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
 
 
 def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
-    """From a zone at the end of the second road into the third, and back on their own."""
+    """A zone at the end of the second road sees into the third road, and back on its own road."""
     before, own, beyond = looks_of(line, (780.0, -10.0, 795.0, 10.0))
     assert before["head"] == -np.inf
-    assert before["back"] == np.inf, "followers this far behind concern nobody"
+    assert before["back"] == np.inf, "followers this far behind do not matter"
     assert own["tail"] == pytest.approx(380.0 - ASIDE_M - VIEW_M - ROUNDING_M)
     assert beyond["head"] == pytest.approx(VIEW_M + ROUNDING_M)
     assert (np.array([before["line"], own["line"], beyond["line"]]) == np.inf).all()
 
 
 def test_a_follower_across_a_border_is_seen(line: RoadNetwork) -> None:
-    """The end of a lane before the zone is near, so who comes on it may be a follower."""
+    """The end of a lane before the zone is near, so vehicles on it may be followers."""
     before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
     assert before["tail"] == np.inf
     assert before["back"] == pytest.approx(400.0 + 50.0 - ASIDE_M - ROUNDING_M)
@@ -196,7 +196,7 @@ def test_a_zone_without_roads_sees_no_vehicles(line: RoadNetwork) -> None:
 def test_no_visible_vehicle_is_beyond_the_farthest_distance(
     part: tuple[float, float, float, float],
 ) -> None:
-    """Beside places that lie close together on all lanes."""
+    """Vehicles are beside closely spaced positions on all lanes."""
     roads = network("grid4x4")
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)

@@ -1,4 +1,4 @@
-"""Vehicles go to zones that watch their lanes, as if every zone were asked about each of them."""
+"""Vehicles are sent to the zones that watch their lanes, as if each zone checked each vehicle."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ VEHICLES = 150
 def asked_at_random(
     rng: np.random.Generator, roads: RoadNetwork, partition: ZonePartition
 ) -> tuple[Halo, NDArray[np.void]]:
-    """What zones ask of lanes, mostly nothing."""
+    """Draw the parts of lanes that zones watch, mostly none."""
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
     for field in LOOK.names or ():
@@ -59,7 +59,7 @@ def asked_at_random(
 def dealt(
     rng: np.random.Generator, roads: RoadNetwork, partition: ZonePartition
 ) -> list[NDArray[np.void]]:
-    """Rows of each zone: drivers beside their lanes, agents anywhere."""
+    """Draw rows of each zone: drivers near their lanes, agents anywhere."""
     lanes = rng.integers(0, len(roads.lanes), VEHICLES)
     rows = vehicles([(0.0, 0.0, 0.0)] * VEHICLES, id=100 + np.arange(VEHICLES))
     rows["lane"] = lanes
@@ -84,7 +84,7 @@ def dealt(
 def expected_of(
     looks: NDArray[np.void], partition: ZonePartition, zone: int, others: list[np.void]
 ) -> list[int]:
-    """Ids that a zone has to see."""
+    """Return the ids that a zone has to see."""
     near = {int(row["id"]) for row in naive.within(partition.reaching[zone], SURE_M, others)}
     found = []
     for row in naive.within(partition.reaching[zone], SEEN_M, others):
@@ -133,7 +133,7 @@ def test_zones_watch_lanes_that_they_ask_about_and_those_beside_them() -> None:
     roads = network("grid4x4")
     partition = cut_map(roads, "grid", 4)
     looks = blank_looks((4, len(roads.lanes)))
-    far = int(np.argmax(roads.lanes["min_x"] + roads.lanes["min_y"]))  # from the zone at the origin
+    far = int(np.argmax(roads.lanes["min_x"] + roads.lanes["min_y"]))  # to the zone at the origin
     looks["line"][0, far] = 3.0
     start, watchers = lane_watchers(partition, roads.lanes, looks, 20.0)
     halo = zone_halo(partition, 100.0)._replace(watcher_start=start, watchers=watchers)

@@ -25,7 +25,7 @@ LAYOUTS = ["grid", "strips", "bisection"]
 
 @pytest.fixture
 def cross(crossing: Callable[..., Path]) -> RoadNetwork:
-    """200 m x 200 m, a junction of 10 m in the middle."""
+    """Return a map of 200 m x 200 m with a junction of 10 m in the middle."""
     return read_network(crossing())
 
 
@@ -74,7 +74,7 @@ def test_cuts_can_keep_out_of_junctions(cross: RoadNetwork, layout: str) -> None
     assert zone_statistics(kept, cross).junctions_cut == 0
 
 
-def test_a_density_is_shared_out_instead_of_lanes(cross: RoadNetwork) -> None:
+def test_zones_can_have_equal_density_instead_of_lane_length(cross: RoadNetwork) -> None:
     crowd = np.array([[x, 0.0, 1.0] for x in range(40)] + [[-90.0, 0.0, 40.0], [70.0, 0.0, 0.0]])
     zones = cut_map(cross, "bisection", 2, density=crowd)
     assert -90.0 < zones.arrays.cuts_x[0] <= 0.0
@@ -89,7 +89,7 @@ def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
         cut_map(cross, "bisection", 2, weight="speed")
 
 
-def test_area_is_shared_out_on_request(cross: RoadNetwork) -> None:
+def test_zones_can_have_equal_area(cross: RoadNetwork) -> None:
     rects = cut_map(cross, "bisection", 3, weight="uniform").rects
     assert np.prod(rects[:, 2:] - rects[:, :2], axis=1) == pytest.approx(210.0 * 70.0)
 
@@ -135,7 +135,7 @@ def test_real_maps_are_cut(city: RoadNetwork, layout: str, avoid: bool) -> None:
         assert sum(found.lane_km) == pytest.approx(metres / 1e3)
 
 
-def test_bisection_shares_lanes_out_evenly(city: RoadNetwork) -> None:
+def test_bisection_divides_lane_length_evenly(city: RoadNetwork) -> None:
     plain = zone_statistics(cut_map(city, "bisection", 4), city)
     kept = zone_statistics(cut_map(city, "bisection", 4, avoid_junctions=True), city)
     assert plain.lane_imbalance < 1.01

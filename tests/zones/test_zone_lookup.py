@@ -27,7 +27,7 @@ def cars(xy: NDArray[np.float64]) -> NDArray[np.void]:
 def ghosts(
     partition: ZonePartition, halo_m: float, rows: NDArray[np.void], zone: int
 ) -> list[list[int]]:
-    """The rows, all owned by `zone`, that each zone gets."""
+    """Return the rows, all owned by `zone`, that each zone gets."""
     rows = rows.copy()
     rows["id"] = np.arange(len(rows))
     parts = [rows if own == zone else rows[:0] for own in range(partition.count)]
@@ -36,9 +36,7 @@ def ghosts(
 
 
 @given(st.data(), partitions())
-def test_each_place_is_in_the_one_zone_that_holds_it(
-    data: st.DataObject, partition: ZonePartition
-) -> None:
+def test_each_point_is_in_exactly_one_zone(data: st.DataObject, partition: ZonePartition) -> None:
     xy = data.draw(places(partition))
     rows = cars(xy)
     out = np.full(len(rows), -7, np.int32)
@@ -76,25 +74,25 @@ def test_distance_equals_twin(data: st.DataObject, partition: ZonePartition) -> 
 def test_publication_equals_twin(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
-    # Not only the zone's own places: a vehicle whose transfer is late is anywhere.
+    # Positions outside of the zone, too: a vehicle whose transfer is late can be anywhere.
     xy = data.draw(places(partition))
     zone = data.draw(st.integers(0, partition.count - 1))
     expected = naive.published(partition.reaching, halo_m, xy, zone)
     assert ghosts(partition, halo_m, cars(xy), zone) == expected
 
 
-def test_zones_are_skipped_diagonal_and_narrow() -> None:
+def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
     strips = ZonePartition(
         (0.0, 0.0, 100.0, 10.0),
         np.array([[0, 0, 49, 10], [49, 0, 51, 10], [51, 0, 100, 10]], dtype=np.float64),
     )
-    # Over a zone of 2 m.
+    # Across a zone of 2 m.
     assert ghosts(strips, 5.0, cars(np.array([[48.0, 5.0], [40.0, 5.0]])), 0) == [[], [0], [0]]
-    # Over a corner: 3 m and 4 m are 5 m.
+    # Across a corner: 3 m and 4 m give 5 m.
     car = cars(np.array([[7.0, 16.0]]))
     assert ghosts(four(), 5.0, car, 0) == [[], [0], [0], [0]]
     assert ghosts(four(), 4.9, car, 0) == [[], [0], [0], []]
-    # In another zone than its own, as a transfer is late.
+    # In another zone than its own, because a transfer is late.
     assert ghosts(PINWHEEL, 1.0, cars(np.array([[15.0, 15.0]])), 0) == [[], [], [], [], [0]]
 
 
@@ -106,7 +104,7 @@ def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
     drift_m = 2.0 + (deferred + 1) * 5.0
     places_then = data.draw(places(partition))
     owners = partition.zones_of(places_then)
-    # Every vehicle has driven on since, as far as it can without a new owner.
+    # Each vehicle has moved since then, as far as it can without a new owner.
     headings = data.draw(st.lists(st.floats(0.0, 6.3), min_size=len(owners), max_size=len(owners)))
     now = places_then + drift_m * np.stack([np.cos(headings), np.sin(headings)], axis=1) * (
         1 - 1e-12
@@ -127,7 +125,7 @@ def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
 def test_a_halo_of_just_the_distance_is_wide_enough(
     partition: ZonePartition, here: tuple[float, float], angle: float
 ) -> None:
-    # No margin: the pair's own squared distance, by the same operations, is the limit.
+    # Without margin: the limit is the squared distance of the pair, by the same operations.
     there = (here[0] + 13.0 * math.cos(angle), here[1] + 13.0 * math.sin(angle))
     dx, dy = there[0] - here[0], there[1] - here[1]
     zone = partition.zone_of(*here)

@@ -27,7 +27,7 @@ def halves(x: float) -> ZonePartition:
 
 
 def test_lanes_are_cut_where_the_zones_are(cross: RoadNetwork) -> None:
-    # Two lanes from -100 to -5, one from 5 to 100, two at 0.
+    # Two lanes from -100 to -5, one lane from 5 to 100, two lanes at 0.
     assert zone_statistics(halves(-50.0), cross).lane_km == pytest.approx((0.1, 0.375))
     assert zone_statistics(halves(50.0), cross).lane_km == pytest.approx((0.425, 0.05))
 
@@ -63,7 +63,7 @@ def test_vehicles_and_ghosts_are_counted_as_they_are_published(cross: RoadNetwor
 
 
 def test_zones_narrower_than_the_halo_are_named(cross: RoadNetwork) -> None:
-    # The rim reaches to infinity: only the middle has an end.
+    # Outer zones are infinite: only the middle zone has an end.
     assert zone_statistics(PINWHEEL, cross, halo_m=10.0).narrow == ()
     assert zone_statistics(PINWHEEL, cross, halo_m=10.1).narrow == (4,)
 

@@ -26,7 +26,7 @@ Handler = TypeVar("Handler", bound=Callable[..., Any])
 
 
 class Effect(Enum):
-    """What a call does."""
+    """The kind of effect of a call."""
 
     WORKS = "works"
     ACCEPTED = "accepted without effect"

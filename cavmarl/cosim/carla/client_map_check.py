@@ -62,7 +62,7 @@ class Deviation(NamedTuple):
 
 
 class Share(NamedTuple):
-    """How many things of a map CARLA's library finds."""
+    """The number of elements of a map, and how many of them CARLA's library finds."""
 
     total: int
     found: int
@@ -74,7 +74,7 @@ class Share(NamedTuple):
 
 @dataclass(frozen=True)
 class ClientMapReport:
-    """How CARLA's library reads a map.
+    """The map of cavmarl compared with the map that CARLA's library reads.
 
     Attributes:
         points: number of points on lanes for cars.
@@ -105,7 +105,7 @@ class ClientMapReport:
 
     @property
     def problems(self) -> list[str]:
-        """What CARLA's programs would notice."""
+        """Differences that programs for CARLA would notice."""
         found = []
         if self.off_m.usual > OFF_LIMIT_M:
             found.append(

@@ -97,7 +97,7 @@ class CarlaZone:
             raise
 
     def _places(self) -> list[tuple[float, float, float]]:
-        """Return the middles of some lanes of the map."""
+        """Return the middle points of some lanes of the map."""
         network = self._setup.network
         lanes = np.flatnonzero(~network.lanes["internal"].astype(np.bool_))
         some = lanes[:: max(1, len(lanes) // _CHECKED_LANES)]

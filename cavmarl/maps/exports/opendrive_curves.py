@@ -1,8 +1,8 @@
 """Repairs the curves of netconvert's OpenDRIVE for the rules of ASAM's checker.
 
 netconvert writes lengths of cubic curves with errors up to a decimetre, and repeats elevations that
-do not change. It draws roads for U-turns from the wrong side, or about one point. The directions of
-lines over junctions differ from the directions of roads by some milliradians.
+do not change. It starts some roads for U-turns at the wrong side of a lane, or turns them about a
+point. The directions of lines over junctions differ from those of roads by some milliradians.
 """
 
 from __future__ import annotations

@@ -42,7 +42,7 @@ ROOM = 1 << 14  # bytes of the buffer for heads and small frames
 
 
 class FrameKind(IntEnum):
-    """What a frame carries; C is the caller, N a node."""
+    """Kinds of frames; C is the caller, N a node."""
 
     JOB = 0  # C → N: the worlds to load
     READY = 1  # N → C: where other nodes can call

@@ -1,4 +1,4 @@
-"""How nodes connect to each other; both ends prove that they know the secret."""
+"""Connections between nodes; both ends prove that they know the secret."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ class LocalNodes(NodeStarter):
     def start(self, number: int) -> subprocess.Popen[Any]:
         """Start the process of a node."""
         arguments = map(str, (*self._place, number))
-        # Kept states and large frames are allocated anew each time.
+        # Kept states and large frames are allocated again each time.
         process = start_python(
             ["-m", NODE, *arguments], huge_heap(), stdin=subprocess.PIPE, text=True
         )
@@ -130,7 +130,7 @@ class LocalNodes(NodeStarter):
         process.kill()
         status = process.wait()
         cure = (
-            "it was killed, by a user, or for want of memory, or here for want of an answer: use "
+            "it was killed, by a user, for lack of memory, or because it did not answer: use "
             "fewer nodes, or raise workers.max_retries"
             if status < 0
             else "see its standard error"

@@ -1,4 +1,4 @@
-"""What the caller and the nodes need of their system: a clock, connections and worlds."""
+"""The system of the caller and the nodes: a clock, connections and worlds."""
 
 from __future__ import annotations
 

@@ -53,11 +53,11 @@ class NodeWatch:
         self._pings = 0
 
     def report_missed(self, number: int, peer: int, fault: str) -> None:
-        """Note that a node has lost its connection to another one. Raises LinkLostError.
+        """Note that a node has lost its connection to another node. Raises LinkLostError.
 
         Args:
             number: of the node.
-            peer: of the other one.
+            peer: number of the other node.
             fault: reason why a frame of the other node is bad; empty if the connection has ended.
         """
         self._missed += (number, peer)
@@ -84,7 +84,7 @@ class NodeWatch:
         timeout_s: float,
         wait: Callable[[float], Found],  # waits up to a number of seconds; may be called again
     ) -> Found:
-        """Call `wait` until it succeeds, as long as all nodes answer meanwhile.
+        """Call `wait` until it succeeds, as long as all nodes answer.
 
         Raises:
             SilentNodeError: a node does not answer, or its process is stopped, or it owes a frame

@@ -88,13 +88,13 @@ def _word(dtype: np.dtype[Any], name: str) -> int:
 
 
 class RowStream:
-    """The stream of ghosts between this node and another one."""
+    """The stream of ghosts between this node and another node."""
 
     def __init__(
         self,
         zoned: ZoneState,
         zones: NDArray[np.int64],  # of this node
-        others: NDArray[np.int64],  # of the other one
+        others: NDArray[np.int64],  # zones of the other node
         running: NDArray[np.int64],  # (W,) see `ExchangeState`
         rerouted: NDArray[np.int64],  # (W,) see `ExchangeState`
         law: Forecast,

@@ -57,7 +57,7 @@ _LENGTH = struct.Struct("<II")
 
 
 class Report(NamedTuple):
-    """What the coordinator needs to know about a tick of a world beside DONE."""
+    """Data about a tick of a world for the coordinator, in addition to DONE."""
 
     # vehicle, zone that it is in, digest of its state in hex
     movers: list[tuple[int, int, str]]
@@ -214,7 +214,7 @@ class ZoneEndpoints(OwnershipRuntime):
             self._stirred[w] = True
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Start ownership anew, with the vehicles where they are."""
+        """Start ownership again, with the vehicles in their present zones."""
         self.reset(np.ones(len(self._stirred), dtype=np.bool_))
 
     def in_flight(self, w: int) -> list[TransferInFlight]:

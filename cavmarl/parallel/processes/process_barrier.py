@@ -1,4 +1,4 @@
-"""How a process waits for another process: it polls for a moment, then it sleeps.
+"""A barrier of two processes: a waiting process polls for a moment, then it sleeps.
 
 Each of the two sides has a line of 64-bit words that only this side writes. Word `NUMBER` counts
 what the side has done; word `ASLEEP` says whether it has to be woken. A side that waits first polls
@@ -7,7 +7,7 @@ Then it sleeps on a socket, which takes no processor time.
 
 All accesses are sequentially consistent. If each of two sides writes one word and reads the word of
 the other, at least one of them sees what the other wrote: the side about to sleep sees the number,
-or the side that has written the number sees that the other one sleeps. A side that sees a number
+or the side that has written the number sees that the other side sleeps. A side that sees a number
 also sees all memory written before it.
 """
 

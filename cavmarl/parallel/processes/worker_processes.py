@@ -35,7 +35,7 @@ _FIRST_IMAGE_BYTES = 1 << 12
 
 
 class Program(NamedTuple):
-    """What the workers of a pool run."""
+    """The program of the workers of a pool."""
 
     module: str  # run as a program, which calls `worker_loop.serve`
     message: Mapping[str, Any]  # JSON value from which the program makes the jobs

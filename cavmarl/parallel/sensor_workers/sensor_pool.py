@@ -35,7 +35,7 @@ NEW_COST = 0.5  # weight of new costs after that; the first measurements suffer 
 
 
 class SensorWorkerPlan(NamedTuple):
-    """What is needed to start sensor workers."""
+    """The settings for starting sensor workers."""
 
     module: str  # program of the workers
     message: Mapping[str, Any]  # for the program; the descriptors of shared memory are added

@@ -40,10 +40,10 @@ class CheckpointLog:
     """The state of worlds between two commands: an image, and the steps after it.
 
     There are two images, each with room for the steps after it. While one image is written, the
-    committed state starts with the other one. Beside each image is a copy of the SUMO logs.
+    committed state starts with the other image. Beside each image is a copy of the SUMO logs.
 
     Attributes:
-        place: (2,) number of the image, and number of steps after it; part of what is committed.
+        place: (2,) number of the image, and number of steps after it; part of the committed state.
         entries: commands of all steps for which there is room, for the first and the second image.
     """
 

@@ -3,8 +3,8 @@
 Worlds move between two commands. A worker that gives worlds away writes them to its outbox, which
 all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with its
 new worlds, which it finds in the outboxes of other workers (UNPACK). Both tasks give the same
-result if they are repeated, so a worker that dies meanwhile is replaced as usual. The bounds that
-say where the worlds are belong to the committed state.
+result if they are repeated, so a worker that dies during a move is replaced as usual. The bounds
+that say where the worlds are belong to the committed state.
 """
 
 from __future__ import annotations

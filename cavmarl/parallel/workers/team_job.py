@@ -16,8 +16,8 @@ from cavmarl.parallel.worlds.tasks import Task
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
 
-# The phase after which members have finished a task. The leader does the rest of the task alone;
-# meanwhile one of the members wakes the caller.
+# The phase after which members have finished a task. The leader does the rest of the task
+# alone, while one of the members wakes the caller.
 LAST = {Task.STEP: Phase.SENSE, Task.SUGGEST: Phase.SUGGEST}
 # Tasks that the leader does alone; the pool does not send them to the members.
 ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
@@ -67,7 +67,7 @@ class LedTeam:
             yield TeamMemberJob(member, self._kept.first, number, self.hosts.copy())
 
     def forget(self) -> None:
-        """Start anew after the processes of the whole team have died."""
+        """Restart after the processes of the whole team have died."""
         self._team.forget()
 
     def command(self, task: Task) -> AbstractContextManager[None]:

@@ -12,7 +12,7 @@ from cavmarl.shards.shard import COMMANDS, Commands
 
 
 class Task(IntEnum):
-    """What a worker or a node can do."""
+    """The tasks of a worker or a node."""
 
     STEP = 0
     RESET = 1
@@ -38,7 +38,7 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 
 class WorldTask(NamedTuple):
-    """How the process of the worlds does a task.
+    """The execution of a task by the process of the worlds.
 
     Attributes:
         method: of the worlds.

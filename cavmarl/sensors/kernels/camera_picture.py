@@ -221,7 +221,7 @@ def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int
 LEAST_DEPTH_M = 0.01
 
 # Conversion from float32 to float16: number of dropped bits, and difference of the exponents'
-# biases less half of the dropped range.
+# biases minus half of the dropped range.
 _DROPPED = np.uint32(13)
 _ONE = np.uint32(1)
 _REBIAS = np.uint32((112 << 23) - 0xFFF)

@@ -202,7 +202,7 @@ def _nearest_approach(
     """Return the gap in m and the time in s of the most critical approach between two boxes.
 
     The gap is the sum of the gaps along and across the ego vehicle; a later gap counts as larger.
-    `looks`, `others` (NUM_LOOKS, 4): predicted poses of the ego vehicle and of the other one.
+    `looks`, `others` (NUM_LOOKS, 4): predicted poses of the ego vehicle and of the body.
     """
     half_length = 0.5 * row["length"]
     half_width = 0.5 * row["width"]

@@ -94,8 +94,8 @@ def frame_size(config: SensorsConfig) -> int:
 def carried_from(config: SensorsConfig) -> int:
     """Return the index from which an observation is carried over to the next one.
 
-    Everything before this index is the oldest frame or is observed anew in each step. If nothing is
-    carried over, the index equals the observation's size.
+    Everything before this index is the oldest frame or is observed again in each step. If nothing
+    is carried over, the index equals the observation's size.
     """
     if config.stack > 1:
         return frame_size(config)

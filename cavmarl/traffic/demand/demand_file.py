@@ -183,7 +183,7 @@ class DemandFile:
 
     @property
     def tolerated(self) -> tuple[str, ...]:
-        """What was left out or replaced in the files, one line each with its count."""
+        """Parts of the files that were left out or replaced, one line each with its count."""
         return tuple(self.report.lines())
 
     def begun(self, horizon_s: float) -> DemandFile:

@@ -157,7 +157,7 @@ class Element:
 
 @dataclass
 class Tally:
-    """How often something was tolerated, and its first place."""
+    """The number of tolerated cases of one kind, and the place of the first one."""
 
     count: int
     first: str

@@ -1,4 +1,4 @@
-"""How waiting departures enter: the departure queue assigns lanes, and the shards find gaps.
+"""Admission of waiting departures: the departure queue assigns lanes, and shards find gaps.
 
 In one tick at most one vehicle tries to enter each lane, in the order of the queue. There are five
 calls: `rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the departure queue),

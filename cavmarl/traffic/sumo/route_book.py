@@ -21,7 +21,7 @@ MAX_WAY_STEPS = 8_000_000  # limit for all worlds; memory that is never written 
 
 
 class RouteBook:
-    """The paths of W worlds: each a route as driven by vehicles with certain permissions.
+    """The paths of W worlds; a path is a route for vehicles that may use certain lanes.
 
     `steps`: PLAN, the table of all ways. `first`: start of the room for these worlds, which ends
     the table. `permissions`: (num_types,) of VTYPE rows.
@@ -42,8 +42,8 @@ class RouteBook:
         nowhere["next"] = nowhere["link"] = -1
         nowhere["to_go"] = np.inf
         self._nowhere = first
-        # These unused steps keep the ways of each world greater than all others: a way is the row
-        # of a step minus the row of a lane.
+        # A way is the row of a step minus the row of a lane. Unused steps before the first one keep
+        # the ways of these worlds greater than all other ways.
         self._first = first + 2 * lanes
         self._of_world = (len(steps) - self._first) // num_worlds
         self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)

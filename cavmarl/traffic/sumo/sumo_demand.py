@@ -50,7 +50,7 @@ class SumoDemand:
 
     @property
     def tolerated(self) -> tuple[str, ...]:
-        """What is not obeyed or not usual in the files, one line each with its count."""
+        """Ignored and unusual parts of the files, one line each with its count."""
         return self.given.tolerated
 
     def setup(self) -> dict[str, Any]:

@@ -31,7 +31,7 @@ MAX_SUMO_BYTES = 1 << 35
 MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that changes this limit
 END_S = 2.0  # time for the process to end by itself
 LAST_WORDS = 2000  # maximum number of quoted characters of its output
-# What SUMO, Python and the system say when they get no memory.
+# Messages of SUMO, Python and the system when memory runs out.
 OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Cannot allocate memory")
 
 

@@ -38,14 +38,14 @@ def make_server(
 
 @pytest.fixture(scope="module")
 def session() -> Iterator[CarlaSession]:
-    """A session whose world only moves by its ticks."""
+    """Open a session whose world advances only when the session ticks."""
     with make_server() as server:
         yield server.session
 
 
 @pytest.fixture(scope="module")
 def call(session: CarlaSession) -> Call:
-    """Calls as a client does; returns the value, or raises RuntimeError with the message."""
+    """Call as a client does; return the value, or raise RuntimeError with the message."""
     caller = Caller("test")
 
     def send(name: str, *arguments: Any) -> Any:
@@ -111,7 +111,7 @@ _END = "\nprint('FOUND' + json.dumps(found), flush=True)\n"
 
 
 def run_client(port: int, program: str, version: str = DEFAULT_VERSION) -> dict[str, Any]:
-    """Run a program with `client` and `world`; return what it has put into `found`."""
+    """Run a program with `client` and `world`; return the dict `found` that it has filled."""
     done = subprocess.run(
         [client_python(version), "-c", _START + program + _END, str(port)],
         capture_output=True,

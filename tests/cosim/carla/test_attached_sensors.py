@@ -1,4 +1,4 @@
-"""Sensors that are attached while a world runs measure the world as it is."""
+"""Sensors that are attached while a world runs measure its present state."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ROOF = CarlaPose(0.0, 0.0, 2.0)
 
 
 class Recorder:
-    """Keeps the frames of all streams."""
+    """Stores the frames of all streams."""
 
     def __init__(self) -> None:
         self.frames: dict[int, list[tuple[bytes, bytes]]] = {}

@@ -1,4 +1,4 @@
-"""The map that clients see is the network's: lanes, spawn points, lights and their states."""
+"""The map for clients equals the network: lanes, spawn points, lights and their states."""
 
 from __future__ import annotations
 

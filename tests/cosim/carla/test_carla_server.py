@@ -1,4 +1,4 @@
-"""The ports of a server: what comes in on them harms neither the world nor other clients."""
+"""The ports of a server: bad input harms neither the world nor other clients."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ CONTINUOUS = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
 
 
 class Wire:
-    """A client without any knowledge."""
+    """A client that sends and reads bytes."""
 
     def __init__(self, port: int) -> None:
         self.socket = socket.create_connection(("127.0.0.1", port), 10.0)
@@ -52,7 +52,7 @@ class Wire:
             self._unpacker.feed(data)
 
     def is_closed(self) -> bool:
-        """Whether the server has closed the connection."""
+        """Return whether the server has closed the connection."""
         try:
             return self.socket.recv(1) == b""
         except ConnectionError:

@@ -21,7 +21,7 @@ from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
 from tests.cosim.carla.conftest import client_python, run_client, running_server
 from tests.support.zone_simulators import step_on
 
-# Nobody ticks meanwhile, so the first snapshot may come later than the first call.
+# No client ticks at first, so the first snapshot may come later than the first call.
 DESTROY = """
 import time
 until = time.monotonic() + 10.0
@@ -41,7 +41,7 @@ def carla_zones(
     overrides: Mapping[str, Any] | None = None,
     **server: Any,
 ) -> Iterator[cavmarl.CavVectorEnv]:
-    """Worlds of which servers of their own run some zones."""
+    """Create worlds some of whose zones CARLA servers run."""
     python = client_python(DEFAULT_VERSION)
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         patch.setenv(PYTHON, python)
@@ -65,7 +65,7 @@ def carla_zones(
 
 
 def clients_of(vec: cavmarl.CavVectorEnv) -> list[CarlaZone]:
-    """The clients of all hosted zones."""
+    """Return the clients of all hosted zones."""
     (part,) = (one for one in vec.simulation.attached if isinstance(one, SimulatorComponent))
     found = part.simulators
     assert all(isinstance(one, CarlaZone) for one in found)

@@ -1,4 +1,4 @@
-"""CARLA's own library reads the exports of the bundled maps as the world has them."""
+"""CARLA's own library reads the same roads from the exports of the bundled maps."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from tests.cosim.carla.conftest import client_python
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
-ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush: the map of town
+ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush has the map of town
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def test_it_reads_the_exports_of_a_family_of_maps() -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_the_command_reads_files_and_names_what_is_missing(tmp_path: Path) -> None:
+def test_the_command_reads_files_and_names_missing_parts(tmp_path: Path) -> None:
     target, summary = tmp_path / "grid.xodr", tmp_path / "summary.json"
     write_opendrive(find_map("grid4x4"), target, for_carla=True)
     words = ["check", str(target), "--carla", "--json", str(summary)]

@@ -72,7 +72,7 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 
 def output_after(process: subprocess.Popen[str], mark: str) -> str:
-    """Read the output of a program until a line has a mark; then interrupt it; return all."""
+    """Read the output of a program until a line has a mark, interrupt it, and return all output."""
     watch = threading.Timer(ENDS_S, process.kill)
     watch.start()
     seen = ""
@@ -110,7 +110,7 @@ def test_generate_traffic(port: int) -> None:
 
 @pytest.mark.parametrize("name", ["synchronous_mode.py", "sensor_synchronization.py"])
 def test_frames_of_sensors_come_with_their_ticks(name: str, tmp_path: Path) -> None:
-    """The programs drive on at random, so they need a map without ends."""
+    """The programs drive random routes, so they need a map without dead ends."""
     where = folder("PythonAPI", "examples")
     copy = tmp_path / name
     with running_server(agents=1, background=0, env="ring") as port:

@@ -61,7 +61,7 @@ found["left"] = len(world.get_actors().filter("vehicle.*"))
     assert found["number"] == found["left"] + 1
 
 
-def test_a_client_moves_a_puppet() -> None:
+def test_a_client_sets_the_pose_of_its_vehicle() -> None:
     with running_server(agents=2, background=0) as port:
         found = run_client(
             port,

@@ -22,7 +22,7 @@ def own_session() -> Iterator[CarlaSession]:
 
 
 def ticks(session: CarlaSession, number: int) -> list[list[int]]:
-    """The states of all lights after each of some ticks."""
+    """Return the states of all lights after each of some ticks."""
     found = []
     for _ in range(number):
         session.tick()

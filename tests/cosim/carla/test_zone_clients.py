@@ -1,4 +1,4 @@
-"""The process of CARLA's client: whatever becomes of it is a typed error, and it never remains."""
+"""The process of CARLA's client: each failure is a typed error, and the process always ends."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Exports come back as they went."""
+"""Exported maps are read back equal."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
 @pytest.fixture
 def town(tmp_path: Path) -> Path:
-    """A town on a slope."""
+    """Build a town on a slope."""
     source = tmp_path / "town.osm"
     source.write_text(TOWN)
     model = write_geotiff(tmp_path / "ground.tif", plane(0.02, 0.05))
@@ -38,7 +38,7 @@ def town(tmp_path: Path) -> Path:
     return build_network(source, target, heights=HeightOptions((model,))).path
 
 
-def test_opendrive_comes_back(town: Path, tmp_path: Path) -> None:
+def test_an_opendrive_export_is_read_back_equal(town: Path, tmp_path: Path) -> None:
     target = tmp_path / "town.xodr"
     trip = write_opendrive(town, target)
     assert trip.same
@@ -58,10 +58,12 @@ def test_opendrive_comes_back(town: Path, tmp_path: Path) -> None:
     [
         "net/Town10HD.net.xml",
         "net/bologna_acosta/acosta_buslanes.net.xml",
-        "net/mcity/mcity.net.xml",  # lanes merge, and lie beside others that lead elsewhere
+        "net/mcity/mcity.net.xml",  # lanes that merge, beside lanes that lead elsewhere
     ],
 )
-def test_real_maps_come_back(shared_maps: Path, tmp_path: Path, name: str) -> None:
+def test_exports_of_real_maps_are_read_back_equal(
+    shared_maps: Path, tmp_path: Path, name: str
+) -> None:
     target = tmp_path / "map.xodr"
     trip = write_opendrive(shared_maps / name, target)
     assert trip.same, trip.problems
@@ -73,7 +75,7 @@ def test_real_maps_come_back(shared_maps: Path, tmp_path: Path, name: str) -> No
             [int(one.get("id", "0")) for one in road.iterfind(f"{LANES}/link/{kind}")]
             for kind in ("predecessor", "successor")
         ]
-        for ids in ends:  # neighbours on each road that it joins
+        for ids in ends:  # neighbours on both roads that a link joins
             assert ids == list(range(ids[0], ids[0] - len(ids), -1))
 
 
@@ -175,7 +177,7 @@ def test_the_command_exports(town: Path, tmp_path: Path) -> None:
     assert isinstance(refused.exception, ConfigError)
 
 
-def test_maps_without_a_projection_go_to_no_degrees(tmp_path: Path) -> None:
+def test_maps_without_a_projection_cannot_be_exported_in_degrees(tmp_path: Path) -> None:
     from cavmarl.config.registry import find_entry
 
     path = find_entry("ring") / "map" / "map.net.xml"

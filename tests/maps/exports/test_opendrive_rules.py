@@ -24,7 +24,7 @@ CHECKER = ROOT / ".venv-tools" / "bin" / "python"
 
 @pytest.fixture(scope="module")
 def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A town on a slope, with dead ends where vehicles turn round."""
+    """Export a town on a slope, with dead ends at which vehicles turn round."""
     folder = tmp_path_factory.mktemp("export")
     (folder / "town.osm").write_text(TOWN)
     model = write_geotiff(folder / "ground.tif", plane(0.02, 0.05))
@@ -95,7 +95,7 @@ def test_lanes_over_junctions_begin_and_end_where_roads_do(roads: dict[str, Elem
                 there = int(lane.find(f"link/{kind}").get("id"))
                 mine = border(road, at_start, int(lane.get("id", "0")))
                 assert mine == pytest.approx(border(other, not at_start, there), abs=0.01)
-    assert around > 0  # where vehicles turn round
+    assert around > 0  # at dead ends, vehicles turn round
 
 
 def test_a_quarter_circle_is_as_long_as_it_is() -> None:

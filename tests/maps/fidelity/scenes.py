@@ -1,4 +1,4 @@
-"""Small made clouds."""
+"""Small generated point clouds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Points = NDArray[np.float64]
 
 
 def street(number: int, seed: int = 0) -> Points:
-    """Uneven ground between two walls at right angles, 120 m wide."""
+    """Generate uneven ground of 120 m between two walls at right angles."""
     rng = np.random.default_rng(seed)
     ground = rng.uniform(-60.0, 60.0, (number // 2, 2))
     height = 0.3 * np.sin(ground[:, 0] / 9.0) + 0.2 * np.cos(ground[:, 1] / 7.0)

@@ -29,7 +29,7 @@ def compared(source: np.ndarray, reference: np.ndarray, **options: float):
 
 
 def left_over(found: np.ndarray, known: np.ndarray) -> tuple[float, float]:
-    """Shift in m and rotation in degrees that a found motion leaves of the inverse of a known."""
+    """Return the error of a found motion: shift in m, rotation in degrees."""
     rest = found @ known
     skew = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
     return float(np.linalg.norm(rest[:3, 3])), float(np.degrees(0.5 * np.linalg.norm(skew)))
@@ -79,7 +79,7 @@ def test_distances_equal_brute_force_and_have_a_direction() -> None:
 
 def test_the_trimmed_rmse_leaves_out_points_that_have_no_partner() -> None:
     reference = street(4000)
-    # One point of eleven is 30 m above the street, as leaves that only one of the scans has.
+    # One of eleven points is 30 m above the street, like leaves that only one scan has.
     leaves = reference[:400] + np.array([0.0, 0.0, 30.0])
     found = align(np.vstack([reference, leaves]), Target(reference))
     assert found.converged

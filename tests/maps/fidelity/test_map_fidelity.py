@@ -1,4 +1,4 @@
-"""A cloud beside a map: a made scan of the map's own roads, moved by a known motion."""
+"""A cloud compared with a map: a generated scan of the map's roads, moved by a known motion."""
 
 from __future__ import annotations
 
@@ -25,8 +25,8 @@ pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 MAP = "grid4x4"
 KERB_M = 0.15
-GAP_M = 0.15  # from a road to the points beside it
-BIN_M = 0.1  # in which a border is found
+GAP_M = 0.15  # distance from a road to the points beside it
+BIN_M = 0.1  # size of the bins in which borders are searched
 NUMBER = 300_000  # points beside the roads
 
 
@@ -37,7 +37,7 @@ def network() -> RoadNetwork:
 
 @pytest.fixture(scope="module")
 def scan(network: RoadNetwork) -> np.ndarray:
-    """The roads of a part of the map, and the ground beside them, a kerb higher."""
+    """Generate points of the roads of a part of the map, and of ground that is a kerb higher."""
     box = (140.0, 140.0, 260.0, 260.0)
     roads = map_surface(network, box, 0.2)[0].points
     rng = np.random.default_rng(0)
@@ -55,9 +55,7 @@ def run(*words: object) -> tuple[int, str]:
     return 2 if is_refused else done.exit_code, done.output + str(done.exception or "")
 
 
-def test_edges_and_heights_of_roads_are_found_where_they_were_put(
-    network: RoadNetwork, scan: np.ndarray
-) -> None:
+def test_edges_and_heights_of_roads_are_found(network: RoadNetwork, scan: np.ndarray) -> None:
     shifted = scan + np.array([0.2, -0.1, 0.3])
     fit = fit_roads(network, shifted, network.extent_m)
     assert len(fit.edge_offset_m) > 50
@@ -77,7 +75,7 @@ def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray
     (found,) = json.loads(out.read_text())["comparisons"]
     assert found["converged"] is None  # it was not registered by its points
     assert np.array(found["transform"])[:2, 3] == pytest.approx([-0.2, 0.1], abs=0.1)
-    # At the mouths of junctions a section meets the kerb of the road that crosses.
+    # Near junctions, a cross-section meets the kerb of the crossing road.
     assert 0.0 < found["roads"]["lateral_median_m"] < GAP_M + 2 * BIN_M  # voxels are 5 cm
     assert abs(found["roads"]["height_rmse_m"]) < 0.01
     assert found["mean_distance_m"] != found["mean_distance_reverse_m"]
@@ -85,10 +83,10 @@ def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray
     assert len(written.points) == sum(bin["points"] for bin in found["histogram"])
     text = page.read_text()
     assert "@DATA@" not in text
-    assert "http" not in text  # it asks no other host
+    assert "http" not in text  # the page loads nothing from other hosts
 
 
-def test_what_cannot_be_compared_is_refused(tmp_path: Path) -> None:
+def test_incomparable_files_are_refused(tmp_path: Path) -> None:
     far = tmp_path / "far.csv"
     np.savetxt(far, np.random.default_rng(1).uniform(0, 50, (200, 3)) + 1e6, delimiter=",")
     code, said = run(MAP, far)

@@ -1,4 +1,4 @@
-"""Heights laid under networks: true to the model, continuous, and nothing moves in the plane."""
+"""Heights of networks: equal to the model, continuous, and without movement in the plane."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def off_model(network: RoadNetwork, points: NDArray[np.void], model: Path) -> ND
 
 
 def plane_of(path: Path) -> list[str]:
-    """Ids and places of all junctions and shapes, as they are written, without heights."""
+    """Return ids and positions of all junctions and shapes as written, without heights."""
     text = path.read_text()
     nodes = re.findall(r'<junction id="([^"]*)".*? x="([^"]*)" y="([^"]*)"', text)
     return ["/".join(node) for node in nodes]
@@ -68,7 +68,7 @@ def plane_of(path: Path) -> list[str]:
 def test_heights_are_the_models_and_nothing_moves(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Draping adds points, which the rounding of corners would follow; so it is left out here."""
+    """Draping adds points, which change the rounding of corners; so none are rounded here."""
     monkeypatch.setattr(reader, "round_corners", lambda *_: [])
     rolling = plane(0.02, 0.05)
     model = write_geotiff(
@@ -117,7 +117,7 @@ def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: 
     result = built(town, write_geotiff(tmp_path / "flat.tif", plane(0.0, 0.0)))
     network, report = read_network(result.path), told(result)
     assert report.crossings > 0
-    # A ramp has 62.5 m at 8 %, of which 18.5 m are on the bridge: 44 places at each of its ends.
+    # A ramp has 62.5 m at 8 %, of which 18.5 m are on the bridge: 44 points at each end.
     assert report.ramp_places == pytest.approx(2 * 2 * 44, abs=8)
     assert report.max_grade <= 0.081
     below = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
@@ -138,7 +138,7 @@ def test_a_bridge_over_a_valley_goes_straight(town: Path, tmp_path: Path) -> Non
 
     report = told(built(town, write_geotiff(tmp_path / "valley.tif", valley, step=0.00005)))
     assert report.max_grade < 0.15
-    assert report.heights_m[0] < 481.0  # the road below lies in it
+    assert report.heights_m[0] < 481.0  # the lower road is in the valley
 
 
 def test_voids_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
@@ -187,7 +187,7 @@ def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
             build_network(town, tmp_path / "w.net.xml", origin=wrong)
 
 
-def test_heights_go_under_a_network_too(town: Path, tmp_path: Path) -> None:
+def test_a_network_can_get_heights(town: Path, tmp_path: Path) -> None:
     town.write_text(TOWN.replace('<tag k="bridge" v="yes"/>', ""))
     flat = build_network(town, tmp_path / "flat.net.xml").path
     model = write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05))
@@ -237,7 +237,7 @@ SECOND_LEVEL_WAYS = """\
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["bridges", "tunnels"])
-def test_a_second_level_clears_the_first_where_that_has_been_moved_to(
+def test_a_second_level_clears_the_first_level_at_its_new_height(
     town: Path, tmp_path: Path, sign: float
 ) -> None:
     text = TOWN.replace('lat="48.004" lon="11.0055"', 'lat="48.004" lon="11.0065"')
@@ -254,7 +254,7 @@ def test_a_second_level_clears_the_first_where_that_has_been_moved_to(
         line = line[line[:, axis].argsort()]
         return sign * float(np.interp(place, line[:, axis], line[:, 2]))
 
-    # Ways in a row are one edge: 11 to 13 go east, 18 to 21 go north.
+    # Consecutive ways are one edge: 11 to 13 go east, 18 to 21 go north.
     for east in ("11_0", "-13_0"):
         for north in ("21_0", "-19_0"):
             line = network.lane_polyline(network.lane_ids.index(north))
@@ -276,7 +276,7 @@ def test_a_bridge_that_crosses_no_road_stays_on_flat_ground(town: Path, tmp_path
 
 
 def test_lanes_of_one_road_climb_to_a_bridge_together(built_map: Callable[[str], Path]) -> None:
-    """Where only one of them leads there, the other comes along, in steps of the ramp's grade."""
+    """If only one lane leads to the bridge, the other lane follows at the ramp's grade."""
     network = network_of(built_map("osm/monaco.osm.gz"))
     assert network.points["z"].max() > 4.9
     compared = 0
@@ -322,8 +322,9 @@ def test_real_maps(
     steps = [np.diff(lane.points, axis=0) for lane in NetDocument(result.path).lanes]
     rise, run = np.abs(np.vstack(steps)[:, 2]), np.hypot(*np.vstack(steps)[:, :2].T)
     assert (rise <= 0.151 * run + 0.002).all(), "heights have three digits"
-    # The reader rounds corners. A curve is shorter than its corner, by 2 tan(turn / 2) / turn, and
-    # as high. The sharpest corner on a slope in Monaco turns by less than 100 degrees.
+    # The reader rounds corners. A curve is shorter than its corner by the factor
+    # 2 tan(turn / 2) / turn, but has the same difference in height. The sharpest corner on a slope
+    # in Monaco turns by less than 100 degrees.
     network = read_network(result.path)
     is_road = ~network.lanes["internal"]
     first, num = network.lanes["first_point"][is_road], network.lanes["num_points"][is_road]

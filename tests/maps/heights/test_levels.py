@@ -1,4 +1,4 @@
-"""Levels of the places of a lane of which a part is on a bridge."""
+"""Levels of the points of a lane that is partly on a bridge."""
 
 from __future__ import annotations
 

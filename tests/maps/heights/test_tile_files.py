@@ -1,4 +1,4 @@
-"""Files of heights that cannot be used are refused by a cause and a cure."""
+"""Unusable files of heights are refused with a cause and a remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.terrain import plane, write_geotiff, write_hgt
 
 PLACES = np.array([[11.001, 48.001], [11.012, 48.009], [11.0071, 48.0033]])
 GROUND = plane(0.03, 0.05)
-NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # state plane, in US feet by its code
+NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # state plane, in US feet
 FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
 
 
@@ -63,7 +63,7 @@ def test_a_void_of_one_tile_has_the_height_of_the_next(tmp_path: Path) -> None:
     assert coverage.filled_places == 1
 
 
-def test_tiles_go_on_where_others_end(tmp_path: Path) -> None:
+def test_tiles_continue_each_other(tmp_path: Path) -> None:
     west = write_geotiff(tmp_path / "w.tif", GROUND, (10.995, 47.995, 11.006, 48.015))
     east = write_geotiff(tmp_path / "e.tif", GROUND, (11.006, 47.995, 11.02, 48.015))
     assert np.abs(HeightModel([west, east]).at(PLACES)[0] - GROUND(*PLACES.T)).max() < 0.05

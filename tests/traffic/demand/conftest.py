@@ -1,4 +1,4 @@
-"""A map of SUMO's own making, and files of demand written into a folder."""
+"""A map that SUMO builds, and demand files in a folder."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
 
-# A B C from west to east, two lanes each way, X north of B: AB BC CB BA BX XB.
+# Nodes A, B, C from west to east, two lanes per direction, X north of B: AB BC CB BA BX XB.
 NODES = """<nodes><node id="A" x="0" y="0"/><node id="B" x="200" y="0"/>
 <node id="C" x="400" y="0"/><node id="X" x="200" y="200"/></nodes>"""
 EDGES = (
@@ -50,7 +50,7 @@ Reader = Callable[..., DemandFile]
 
 @pytest.fixture
 def demand(town: RoadNetwork, tmp_path: Path) -> Reader:
-    """Read the inside of a <routes> on the town: `demand("<vehicle …/>")`."""
+    """Return a function that reads the content of a <routes>: `demand("<vehicle …/>")`."""
 
     def read(body: str, *, root: str = "routes", **options: object) -> DemandFile:
         path = tmp_path / "x.rou.xml"

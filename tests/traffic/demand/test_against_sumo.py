@@ -1,4 +1,4 @@
-"""SUMO's own reading of the same files: defaults of types, times of flows, whole scenarios."""
+"""Demand as SUMO reads it: defaults of types, times of flows, whole scenarios."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ VEHICLE = re.compile(
 )
 Way = tuple[float, str]
 
-# What is set in a type, by id: SUMO's rules for what is not set.
+# Attributes of types by id; SUMO's defaults apply to all others.
 TYPES = {f"class_{name}": {"vClass": name} for name in CLASS_DEFAULTS} | {
     "factor": {"speedFactor": "1.2"},
     "factor_dev": {"speedFactor": "normc(1,0.1,0.2,2)", "speedDev": "0.3"},
@@ -36,7 +36,7 @@ TYPES = {f"class_{name}": {"vClass": name} for name in CLASS_DEFAULTS} | {
 
 
 def sumo(folder: Path, *arguments: str | Path) -> dict[str, Way]:
-    """Departures and edges by vehicle of a run."""
+    """Return departures and edges by vehicle of a run of SUMO."""
     command = [
         sumo_binary("sumo"),
         *arguments,
@@ -123,7 +123,7 @@ def test_flows_depart_at_sumos_times(
 def test_bologna_is_read_as_sumo_reads_it(shared_maps: Path, tmp_path: Path) -> None:
     folder = tmp_path / "acosta"
     folder.mkdir()
-    # Detectors write beside themselves.
+    # Detectors write files beside their own files.
     for path in (shared_maps / "net/bologna_acosta").iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
     network = network_of(folder / "acosta_buslanes.net.xml")

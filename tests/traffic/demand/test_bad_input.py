@@ -1,4 +1,4 @@
-"""What cannot be is refused with its place and a cure; what can be spared is counted."""
+"""Invalid demand is refused with place and remedy; ignored parts are counted."""
 
 from __future__ import annotations
 
@@ -118,7 +118,7 @@ def test_bad_routes_can_be_skipped_and_are_counted(demand: Reader) -> None:
     assert tally.first.endswith("line 2")
 
 
-def test_the_ignoring_and_the_allowed_drive_everywhere(demand: Reader) -> None:
+def test_allowed_classes_and_class_ignoring_drive_everywhere(demand: Reader) -> None:
     types = '<vType id="i" vClass="ignoring"/><vType id="b" vClass="bus"/>'
     cars = "".join(
         f'<vehicle id="{t}" type="{t}" depart="0"><route edges="AB BX"/></vehicle>' for t in "ib"
@@ -185,7 +185,7 @@ def test_files_without_demand_are_refused(
         assert word in str(caught.value)
 
 
-def test_missing_files_and_files_that_hold_themselves(town: RoadNetwork, tmp_path: Path) -> None:
+def test_missing_files_and_files_that_include_themselves(town: RoadNetwork, tmp_path: Path) -> None:
     with pytest.raises(DemandError, match="cannot be read"):
         read_demand([tmp_path / "none.rou.xml"], town)
     with pytest.raises(DemandError, match=r"name a \.rou\.xml"):

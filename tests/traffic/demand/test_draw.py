@@ -1,4 +1,4 @@
-"""What is drawn from a demand file: pure functions of the key, with the chances that it states."""
+"""Random draws of a demand file: functions of the key, with the stated probabilities."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_draws_depend_on_the_key_and_on_nothing_else(demand: Reader) -> None:
     assert len(early) == np.count_nonzero(orders["depart"] < 300.0)
 
 
-def test_the_hash_is_of_what_stands_in_records_and_not_of_what_lies_between(demand: Reader) -> None:
+def test_the_hash_covers_fields_and_not_padding(demand: Reader) -> None:
     file = demand('<flow id="f" end="900" period="9"><route edges="AB BC"/></flow>')
     assert file.routes.dtype.itemsize > sum(file.routes.dtype[k].itemsize for k in range(5))
     routes = np.full(len(file.routes), 0xA5, dtype=np.uint8).repeat(file.routes.dtype.itemsize)
@@ -56,7 +56,7 @@ def test_the_hash_is_of_what_stands_in_records_and_not_of_what_lies_between(dema
     assert replace(file, routes=other).content_hash != file.content_hash
 
 
-def test_another_element_behind_changes_nothing(demand: Reader) -> None:
+def test_a_later_element_changes_no_draw(demand: Reader) -> None:
     flow = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
     alone = demand(flow).draw(KEY)
     beside = demand(flow + flow.replace('"f"', '"g"')).draw(KEY)
@@ -129,7 +129,7 @@ def test_trips_name_the_edges_to_pass(demand: Reader) -> None:
     assert names == ["AB", "BC", "CB"]
 
 
-def test_how_a_vehicle_enters_and_leaves(demand: Reader) -> None:
+def test_attributes_of_departure_and_arrival(demand: Reader) -> None:
     file = demand(
         '<vehicle id="a" depart="0" departLane="1" departPos="-20" departSpeed="max" '
         'arrivalPos="30" speedFactor="1.1"><route edges="AB BC"/></vehicle>'
@@ -231,7 +231,7 @@ STOP = '<stop lane="AB_1" endPos="70" duration="5"/>'
 def test_words_for_the_position_of_departures_are_sumos(
     demand: Reader, word: str, stop: str, code: int, position: float
 ) -> None:
-    """SUMO 1.28 inserts these vehicles at 70 m or, with their front, at 5.1 m."""
+    """SUMO 1.28 inserts these vehicles with their fronts at 70 m or at 5.1 m."""
     file = demand(
         f'<vehicle id="a" depart="0" departPos="{word}"><route edges="AB BC"/>{stop}</vehicle>'
     )

@@ -1,4 +1,4 @@
-"""Whatever stands in a file: it is read, or refused with one of our errors."""
+"""Any content of a file is read, or refused with an error of cavmarl."""
 
 from __future__ import annotations
 

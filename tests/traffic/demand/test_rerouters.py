@@ -1,4 +1,4 @@
-"""What is read of <rerouter> and of the rerouting device, and what of it is refused or counted."""
+"""Reading <rerouter> and the rerouting device: used, refused and counted parts."""
 
 from __future__ import annotations
 
@@ -121,7 +121,7 @@ def test_too_many_rules_are_refused(
         (rerouter("", 'edges="AB" file="in.xml"'), "file"),
     ],
 )
-def test_what_is_not_acted_on_is_counted(demand: Reader, body: str, said: str) -> None:
+def test_ignored_parts_are_counted(demand: Reader, body: str, said: str) -> None:
     file = demand(body)
     (what,) = file.report.tolerated
     assert said in what

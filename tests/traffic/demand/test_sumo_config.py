@@ -1,4 +1,4 @@
-"""Options of a configuration: what SUMO's vehicles do by them, and what is said about the rest."""
+"""Options of a configuration: effects on vehicles, and reports about ignored options."""
 
 from __future__ import annotations
 
@@ -151,7 +151,7 @@ def test_options_that_change_traffic_and_are_not_obeyed_are_named(
         '<pedestrian.model value="jupedsim"/><threads value="4"/>',
     ],
 )
-def test_options_that_change_no_traffic_here_are_passed_over(read: Read, option: str) -> None:
+def test_options_without_effect_on_traffic_are_ignored(read: Read, option: str) -> None:
     assert not read(option).report.tolerated
 
 
@@ -176,7 +176,7 @@ def test_a_demand_of_later_begins_with_its_first_departure(read: Read) -> None:
 
 
 @pytest.mark.parametrize("option", ['<begin value="0"/>', '<end value="60"/>'])
-def test_a_demand_without_departures_is_told(read: Read, option: str) -> None:
+def test_a_demand_without_departures_is_reported(read: Read, option: str) -> None:
     file = read(option, LATE).begun(60.0)
     assert file.begin_ms == 0
     (what,) = file.report.tolerated

@@ -1,4 +1,4 @@
-"""Trips that must turn round at a junction, as SUMO's do, and trips that no way leads for."""
+"""Trips that need a U-turn at a junction, as in SUMO, and trips without a route."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import pytest
 import cavmarl
 from tests.traffic.demand.conftest import sumo_binary
 
-# A and B are joined both ways; C can be left by no road.
+# A and B are joined in both directions; no road leaves C.
 NODES = """<nodes><node id="A" x="0" y="0"/><node id="B" x="100" y="0"/>
 <node id="C" x="200" y="0"/></nodes>"""
 EDGES = "".join(
@@ -46,7 +46,7 @@ def world(net: Path, trips: str, on_bad_route: str = "error") -> cavmarl.CavEnv:
     return cavmarl.parallel_env(net, agents=1, background=0, seed=0, overrides=keys)
 
 
-def test_a_trip_turns_round_where_nothing_else_leads_on(net: Path) -> None:
+def test_a_trip_turns_round_if_no_other_movement_exists(net: Path) -> None:
     env = world(net, ROUND)
     env.reset()
     sides = []

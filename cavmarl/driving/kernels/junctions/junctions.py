@@ -411,8 +411,8 @@ def constraint_inside(
     """Return the constraint of foes on the junction on row i, whose front has passed its line.
 
     Of two vehicles in conflict, the vehicle nearer to the shared area goes first; at equal
-    distance, the vehicle with the smaller id. If both drive into the same lane, the other one
-    follows. At a waiting position inside the junction, row i waits until it may go on.
+    distance, the vehicle with the smaller id. If both drive into the same lane, the other
+    vehicle follows. At a waiting position inside the junction, row i waits until it may go on.
 
     Returns:
         The constraint; the reason why the vehicle cannot go on (HOLD_*), including a foe that stays

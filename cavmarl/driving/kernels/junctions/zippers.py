@@ -21,8 +21,8 @@ from cavmarl.driving.kernels.junctions.gaps import (
 from cavmarl.driving.kernels.junctions.stop_line_registration import can_be_ignored
 from cavmarl.driving.kernels.models.following import behind, no_constraint
 
-FALL_BACK_MPS2 = 0.5  # deceleration with which a driver opens the gap until the other one is ahead
-BRAKES_S = 1.0  # a vehicle ahead goes first if the other one can brake for it within this time
+FALL_BACK_MPS2 = 0.5  # deceleration with which a driver opens a gap for the other vehicle
+BRAKES_S = 1.0  # a vehicle ahead goes first if the other can brake for it within this time
 
 
 @inlined_kernel

@@ -122,7 +122,7 @@ def _correct_agent(
     phase: NDArray[np.int32],
     dt: float,
 ) -> None:
-    """Find the place on the lanes anew, as after `move_agent`."""
+    """Find the position on the lanes again, as after `move_agent`."""
     _take_report(row, was, told, dt)
     row["lane"] = was["lane"]
     row["s"] = was["s"]
