@@ -44,7 +44,8 @@ from cavmarl.cli.output import (
     flag,
     print_error,
 )
-from cavmarl.core.errors import CavmarlError
+from cavmarl.config.removed_keys import removed_option
+from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.core.tracebacks import print_traceback
 
 __all__ = ["app", "main"]
@@ -54,11 +55,23 @@ START, TRAIN, MAPS = "Start here", "Train and evaluate", "Maps and demand"
 DIVIDE, COSIM = "Divide worlds", "Co-simulation"
 
 
+REMOVED = {"verify-determinism": "verify determinism"}  # command → its replacement
+
+
 class _Group(TyperGroup):
     """The group of all commands.
 
-    `map` is imported on demand, as its imports take longer than all others.
+    A removed command or option raises ConfigError with its replacement. `map` is imported on
+    demand, as its imports take longer than all others.
     """
+
+    def invoke(self, ctx: Any) -> Any:
+        try:
+            return super().invoke(ctx)
+        except Exception as error:
+            if refusal := removed_option(getattr(error, "option_name", None)):
+                raise ConfigError(refusal) from error
+            raise
 
     def list_commands(self, ctx: Any) -> list[str]:
         names = super().list_commands(ctx)
@@ -66,6 +79,8 @@ class _Group(TyperGroup):
         return names
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        if cmd_name in REMOVED:
+            raise ConfigError(f"{cmd_name} was removed: use cavmarl {REMOVED[cmd_name]}")
         if cmd_name != "map":
             return super().get_command(ctx, cmd_name)
         found = typer.main.get_group(import_module("cavmarl.cli.map").app)

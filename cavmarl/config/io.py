@@ -22,6 +22,7 @@ import yaml
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 from pydantic_core import ErrorDetails
 
+from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 
 T = TypeVar("T")
@@ -188,7 +189,7 @@ def _explain(kind: type[Any], details: ErrorDetails) -> str:
     path = ".".join(keys)
     match details["type"]:
         case "unexpected_keyword_argument":
-            return f"{path}: unknown key; {_nearest(kind, location)}"
+            return removed_key(path) or f"{path}: unknown key; {_nearest(kind, location)}"
         case "missing":
             return f"{path}: missing; this key has no default, add it"
         case "dataclass_type" | "dict_type":

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated
 
 from cavmarl.config.checks import Section, Within, check_finite
+from cavmarl.config.removed_keys import removed_key
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import HOW, REGISTERED_TERMS
 
@@ -75,7 +76,7 @@ class TermsConfig(Section, key="terms"):
 
 
 def _unknown_term(name: str) -> str:
-    return (
+    return removed_key(f"terms.weights.{name}") or (
         f"terms.weights = {name!r}: no such term; must be one of "
         f"{', '.join((*TERMS, *REGISTERED_TERMS))}. If a module registers it with "
         f"cavmarl.register_term, {HOW}"

@@ -9,7 +9,8 @@ from typing import Any, TypedDict, Unpack
 
 from cavmarl.config.driver_form import with_sensors_of
 from cavmarl.config.registry import load_config, load_plugins_of
-from cavmarl.core.errors import UnknownArgumentError
+from cavmarl.config.removed_keys import removed_argument
+from cavmarl.core.errors import ConfigError, UnknownArgumentError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import check_agents, make_world
 from cavmarl.env.drawn_worlds import check_rendering
@@ -84,6 +85,8 @@ def start_worlds(
         UnknownArgumentError: an argument has another name.
         ConfigError, PolicyError, MapError, WorkerError, MissingExtraError: see `make_vec`.
     """
+    if refusal := next(filter(None, map(removed_argument, given)), None):
+        raise ConfigError(refusal)
     known = WorldArguments.__annotations__
     if unknown := [name for name in given if name not in known]:
         close = difflib.get_close_matches(unknown[0], known, n=1)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.driver_names import TOGETHER
 from cavmarl.config.registry import agent_entries
+from cavmarl.config.removed_keys import removed_key
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.core.machine import describe_hardware
@@ -244,11 +245,12 @@ def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]
 
 
 def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> None:
-    """Raise an error if the world is not the result's; new keys do not count."""
+    """Raise an error if the world is not the result's; new and removed keys do not count."""
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
     others = [key for key in _WORLD_KEYS if here[key] != there[key]]
-    others += _differing("config", there["config"], here["config"])
+    differing = _differing("config", there["config"], here["config"])
+    others += [key for key in differing if removed_key(key.removeprefix("config.")) is None]
     if others:
         raise ManifestError(
             f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "

@@ -35,6 +35,13 @@ def test_without_a_check_the_checks_are_named(
     assert f"verify {words[1]}: the name of a check must come first: {CHECKS}" in said
 
 
+def test_a_former_command_name_is_refused_with_its_replacement(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    said = refusal(capsys, "verify-determinism", "merge")
+    assert "use cavmarl verify determinism" in said
+
+
 @pytest.mark.parametrize("check", ["zones", "nodes", "workers", "determinism"])
 def test_each_check_has_the_options_that_apply(
     check: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch

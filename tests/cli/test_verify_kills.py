@@ -71,6 +71,10 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
             ("verify", "workers", "ring", "--kill", "1", "--backend", "nodes:2"),
             ("'nodes:2'", "verify nodes"),
         ),
+        (
+            ("verify", "workers", "ring", "--kill", "1", "--hosts", "ray"),
+            ("--hosts was removed", "--backend"),
+        ),
         (("verify", "workers", "ring", "--kill", "0"), ("kills = 0", "at least 1")),
         (
             ("verify", "workers", "ring", "--kill", "5", "--steps", "7"),

@@ -79,6 +79,7 @@ def test_short_forms_stand_for_backends(arguments: dict[str, Any], text: str) ->
         ({"workers": 2, "backend": "ray:2"}, "leave out workers, or backend"),
         ({"workers": 0, "backend": "ray:2"}, "short for backend = 'local'; leave out workers"),
         ({"nodes": 2, "backend": "nodes:2@10.0.0.1:7600"}, "leave out nodes, or backend"),
+        ({"hosts": "ray"}, "hosts was removed: use backend='ray:N'"),
     ],
 )
 def test_bad_backends_are_refused(arguments: dict[str, Any], words: str) -> None:
