@@ -40,7 +40,7 @@ class Peers:
         """Return a context in which each process has the owned rows of all zones, on `side`.
 
         Changes of rows are kept in the process that owns them. All processes must count the same in
-        `departures.counts` meanwhile.
+        `departures.counts` within the context.
         """
         return nullcontext()
 

@@ -21,7 +21,7 @@ class FaultLine:
     lost: int = 0  # number of lost nodes
     recoveries: int = 0  # number of rollbacks to a kept state
     equal: int = 0  # runs that were equal to the undivided world to the end
-    ended: int = 0  # runs that ended with `WorkerDeathError`: no living node kept some state
+    ended: int = 0  # runs that ended with `WorkerDeathError`: a part of the state was lost
     injected: Counter[str] = field(default_factory=Counter)  # number of faults, by kind
     wrong: list[str] = field(default_factory=list)  # descriptions of all other runs
     wrong_seeds: list[int] = field(default_factory=list)  # seeds of the runs in `wrong`
