@@ -41,6 +41,12 @@ class SignalsConfig(Section, key="signals"):
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
+        sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
+            the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
+            has received. Rewards are those of the truth in any case.
+        camera_range_m: how far from the signal a camera sees, along a lane.
+        camera_height_m: height of a camera above the road.
+        camera_misses: probability that a camera misses a vehicle at a decision.
         overrides: number of links at whose signals the caller may show states of its own in a world
             at the same time (`SignalOverrides`).
     """
@@ -56,6 +62,10 @@ class SignalsConfig(Section, key="signals"):
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
+    sensing: Literal["truth", "camera"] = "truth"
+    camera_range_m: Annotated[float, Within(1.0, 1000.0)] = 50.0
+    camera_height_m: Annotated[float, Within(1.0, 100.0)] = 8.0
+    camera_misses: Annotated[float, Within(0.0, 1.0)] = 0.0
     overrides: Annotated[int, Whole(0, 100_000)] = 0
 
     def __post_init__(self) -> None:

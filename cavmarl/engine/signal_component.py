@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.signals import SIGNAL_TERMS
-from cavmarl.core.compiled.bound_call import bind
+from cavmarl.core.compiled.bound_call import BoundCall, bind
 from cavmarl.shards.shard import Commands
+from cavmarl.signals.kernels.camera_counts import count_by_cameras
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
 from cavmarl.signals.kernels.signal_steps import (
@@ -18,9 +19,11 @@ from cavmarl.signals.kernels.signal_steps import (
     SignalRules,
     SignalWorlds,
     begin_signal_step,
-    end_signal_step,
+    count_truth,
     end_signal_tick,
+    observe_and_reward,
 )
+from cavmarl.signals.sensing import make_cameras
 from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 if TYPE_CHECKING:
@@ -35,8 +38,8 @@ class SignalComponent:
     Attributes:
         table: the signals whose greens are chosen.
         outputs: state of the signals, and results for their agents.
-        end_tick: the call at the end of a tick.
-        end_step: the call at the end of a step, after `end_tick`.
+        tick_calls: the calls at the end of a tick.
+        step_calls: the calls at the end of a step, after `tick_calls`.
     """
 
     def __init__(self, host: ComponentContext) -> None:
@@ -67,6 +70,7 @@ class SignalComponent:
         worlds = SignalWorlds(
             ticks=first.worlds.ticks,
             controllers=first.worlds.controllers,
+            keys=first.worlds.keys,
             signal_phase=first.worlds.signal_phase,
             rows=zoned.rows,
             sides=first.row_sides,
@@ -76,17 +80,29 @@ class SignalComponent:
         self._choices = np.full(signals, KEEP, dtype=np.int64)
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
         self._rewarded = np.ones(1, dtype=np.bool_)
-        self._begin_step = bind(begin_signal_step, rules, worlds, self.outputs, self._choices)
-        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs)
-        self.end_step = bind(
-            end_signal_step,
-            rules,
-            worlds,
-            self.outputs,
-            self._chosen,
-            self._stood,
-            np.zeros(num_worlds, dtype=np.bool_),
-            self._rewarded,
+        known = rules, worlds, self.outputs
+        observed, truth = np.zeros(num_worlds, dtype=np.bool_), self.outputs.counts
+        sense: list[BoundCall[None]] = []
+        if config.sensing == "camera":
+            truth = np.zeros_like(truth)
+            most = zoned.rows.shape[1] * zoned.rows.shape[3]
+            cameras = make_cameras(config, host.network, self.table, most)
+            counts = self.outputs.counts
+            sense.append(bind(count_by_cameras, rules, worlds, cameras, observed, counts))
+        self._begin_step = bind(begin_signal_step, *known, self._choices)
+        self.tick_calls = (bind(end_signal_tick, *known, self._chosen),)
+        self.step_calls = (
+            bind(count_truth, *known, self._chosen, observed, truth),
+            *sense,
+            bind(
+                observe_and_reward,
+                *known,
+                self._chosen,
+                observed,
+                truth,
+                self._stood,
+                self._rewarded,
+            ),
         )
 
     @property
@@ -99,10 +115,10 @@ class SignalComponent:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
         self._stood[chosen] = 0
-        self.end_tick()
         self._chosen[:] = chosen
         self._rewarded[:] = False
-        self.end_step()
+        for call in (*self.tick_calls, *self.step_calls):
+            call()
         self._chosen[:] = self._rewarded[:] = True
 
     def begin(self, commands: Commands) -> None:
@@ -114,9 +130,11 @@ class SignalComponent:
 
     def end(self) -> None:
         """Set the phases of the next tick, count standing vehicles, and observe after a step."""
-        self.end_tick()
+        for call in self.tick_calls:
+            call()
         if self._ticks.item(0) % self._ticks_per_step == 0:
-            self.end_step()
+            for call in self.step_calls:
+                call()
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""

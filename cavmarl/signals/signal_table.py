@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.controlled_signals import ControlledSignals, LanePosts, SignalTicks
 from cavmarl.signals.kernels.green_scores import LaneWeights
 
 
@@ -39,6 +39,7 @@ class SignalTable:
             -1 for the lane behind it.
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
         arrays: the same for kernels.
+        posts: where each of `lanes` is observed.
         sizes: sizes of the arrays.
     """
 
@@ -90,6 +91,7 @@ class SignalTable:
             length_m=network.lanes["length_m"][lane_row],
             speed_mps=network.lanes["speed_mps"][lane_row],
         )
+        self.posts = _posts(incoming, outgoing, network.lanes[lane_row])
         greens_max = int(self.arrays.num_greens.max(initial=0))
         self.served, self.pressure = (
             _weights(self.movements, self.opened, greens_max, of_each)
@@ -168,6 +170,20 @@ def _weights(
         lanes=np.array([lane for each in lists for lane in each], dtype=np.int32),
         weights=np.array([weight for each in lists for weight in each.values()], dtype=np.int64),
     )
+
+
+def _posts(
+    incoming: list[list[int]], outgoing: list[list[int]], lanes: NDArray[np.void]
+) -> LanePosts:
+    """Return where lanes, LANE (N,), are observed; both lists have the lanes of each signal."""
+    signal = np.full(len(lanes), -1, dtype=np.int32)
+    leads_in = np.zeros(len(lanes), dtype=np.bool_)
+    for lists, is_in in ((incoming, True), (outgoing, False)):
+        for s, row in enumerate(lists):
+            new = [lane for lane in row if signal[lane] < 0]
+            signal[new], leads_in[new] = s, is_in
+    line_m = np.where(leads_in, lanes["length_m"] - lanes["stop_back_m"], 0.0)
+    return LanePosts(signal, leads_in, line_m)
 
 
 def _padded(lists: list[list[int]]) -> NDArray[np.int32]:

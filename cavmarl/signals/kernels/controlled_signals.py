@@ -23,6 +23,14 @@ class ControlledSignals(NamedTuple):
     speed_mps: NDArray[np.float64]  # (N,) speed limits
 
 
+class LanePosts(NamedTuple):
+    """Where the watched lanes are observed: at the signal at their end, else at their start."""
+
+    signal: NDArray[np.int32]  # (N,) index of the signal that observes the lane
+    leads_in: NDArray[np.bool_]  # (N,) whether the signal is at the end of the lane
+    line_m: NDArray[np.float64]  # (N,) position of the stop line; 0 if the signal is at the start
+
+
 class SignalTicks(NamedTuple):
     """The durations of a `SignalsConfig` in ticks."""
 

@@ -29,14 +29,36 @@ _LANE_SHIFT = 32
 
 
 @kernel
+def count_vehicle(
+    controlled: ControlledSignals,
+    row: np.void,  # VEHICLE
+    lane: int,  # index of a watched lane
+    counts: NDArray[np.int64],  # (N, COUNTS) updated
+) -> None:
+    """Add a vehicle to the counts of its lane."""
+    found = counts[lane]
+    speed = abs(row["speed"])
+    desired = controlled.speed_mps[lane] * max(row["speed_factor"], 1e-3)
+    found[VEHICLES] += 1
+    found[STANDING] += speed < STANDING_MPS
+    if row["lane_stood"] >= 0:
+        found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
+    found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
+    found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+
+
+@kernel
 def count_standing(
     rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
     num_owned: NDArray[np.int64],  # (k, W)
+    chosen: NDArray[np.bool_],  # (W,) worlds to count in
     lane_index: NDArray[np.int32],  # see `ControlledSignals`
 ) -> None:
     """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
     for zone in range(rows.shape[0]):
         for w in range(rows.shape[1]):
+            if not chosen[w]:
+                continue
             for i in range(num_owned[zone, w]):
                 row = rows[zone, w, i]
                 if is_off_lanes(row) or lane_index[row["lane"]] < 0:
@@ -70,14 +92,5 @@ def count_lanes(
                 if is_off_lanes(row):
                     continue
                 n = controlled.lane_index[row["lane"]]
-                if n < 0:
-                    continue
-                found = counts[w, n]
-                speed = abs(row["speed"])
-                desired = controlled.speed_mps[n] * max(row["speed_factor"], 1e-3)
-                found[VEHICLES] += 1
-                found[STANDING] += speed < STANDING_MPS
-                if row["lane_stood"] >= 0:
-                    found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
-                found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
-                found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+                if n >= 0:
+                    count_vehicle(controlled, row, n, counts[w])

@@ -29,6 +29,7 @@ class SignalWorlds(NamedTuple):
 
     ticks: NDArray[np.int64]  # (W,)
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers)
+    keys: NDArray[np.uint64]  # (W,)
     signal_phase: NDArray[np.int32]  # (W, num_signals)
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
     sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
@@ -38,8 +39,9 @@ class SignalWorlds(NamedTuple):
 class SignalOutputs(NamedTuple):
     """State and outputs of S signals.
 
-    Observations and counts are those of the last decision. G is the number of greens of the signal
-    that has most, N the number of watched lanes, T the number of terms.
+    Observations and counts are those of the last decision, as far as `signals.sensing` knows them.
+    G is the number of greens of the signal that has most, N the number of watched lanes, T the
+    number of terms.
     """
 
     observations: NDArray[np.float32]  # (W, S, D)
@@ -66,28 +68,31 @@ def begin_signal_step(
 
 
 @kernel
-def end_signal_tick(rules: SignalRules, worlds: SignalWorlds, outputs: SignalOutputs) -> None:
+def end_signal_tick(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) worlds whose tick ends
+) -> None:
     """Set the phases of the present tick, and count how long vehicles have stood."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
-    count_standing(rows, worlds.num_owned, rules.controlled.lane_index)
+    count_standing(rows, worlds.num_owned, chosen, rules.controlled.lane_index)
 
 
 @kernel
-def end_signal_step(
+def count_truth(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds to observe, if it is time for a decision
-    stood: NDArray[np.int64],  # (W, S) see `reward_signals`
     observed: NDArray[np.bool_],  # (W,) output
-    rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
+    truth: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the observed worlds
 ) -> None:
-    """Write the outputs of a step, or of a reset."""
-    controlled, durations = rules.controlled, rules.durations
+    """Write what is allowed in the next step, and count all vehicles on the watched lanes."""
     mask_choices(
-        controlled,
-        durations,
+        rules.controlled,
+        rules.durations,
         rules.cyclic,
         worlds.ticks,
         outputs.states,
@@ -97,10 +102,24 @@ def end_signal_step(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(controlled, rows, worlds.num_owned, observed, outputs.counts)
+    count_lanes(rules.controlled, rows, worlds.num_owned, observed, truth)
+
+
+@kernel
+def observe_and_reward(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) as in `count_truth`, like the next two
+    observed: NDArray[np.bool_],  # (W,)
+    truth: NDArray[np.int64],  # (W, N, COUNTS)
+    stood: NDArray[np.int64],  # (W, S) see `reward_signals`
+    rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
+) -> None:
+    """Write the observations from what is known of the lanes, and the rewards from the truth."""
     observe_signals(
-        controlled,
-        durations,
+        rules.controlled,
+        rules.durations,
         worlds.ticks,
         observed,
         outputs.states,
@@ -108,13 +127,13 @@ def end_signal_step(
         outputs.observations,
     )
     reward_signals(
-        controlled,
+        rules.controlled,
         rules.dt,
         rules.weights,
         chosen,
         observed,
         rewarded[0],
-        outputs.counts,
+        truth,
         stood,
         outputs.terms,
         outputs.rewards,
