@@ -44,6 +44,7 @@ class SignalsConfig(Section, key="signals"):
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
             has received. Rewards are those of the truth in any case.
+        loop_upstream_m: distance from the stop line to the loop before it.
         camera_range_m: how far from the signal a camera sees, along a lane.
         camera_height_m: height of a camera above the road.
         camera_misses: probability that a camera misses a vehicle at a decision.
@@ -62,7 +63,8 @@ class SignalsConfig(Section, key="signals"):
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
-    sensing: Literal["truth", "camera"] = "truth"
+    sensing: Literal["truth", "loops", "camera"] = "truth"
+    loop_upstream_m: Annotated[float, Within(5.0, 1000.0)] = 50.0
     camera_range_m: Annotated[float, Within(1.0, 1000.0)] = 50.0
     camera_height_m: Annotated[float, Within(1.0, 100.0)] = 8.0
     camera_misses: Annotated[float, Within(0.0, 1.0)] = 0.0

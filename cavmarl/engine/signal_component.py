@@ -14,6 +14,7 @@ from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.camera_counts import count_by_cameras
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.kernels.loop_counts import DETECTED, estimate_by_loops, read_loops
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
@@ -23,7 +24,7 @@ from cavmarl.signals.kernels.signal_steps import (
     end_signal_tick,
     observe_and_reward,
 )
-from cavmarl.signals.sensing import make_cameras
+from cavmarl.signals.sensing import loops_shape, make_cameras, make_loops
 from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ class SignalComponent:
             decides=host.zeros(num_worlds, dtype=np.bool_),
             counts=host.zeros((num_worlds, sizes.lanes, COUNTS), dtype=np.int64),
             states=host.zeros((*signals, HELD), dtype=np.int64),
+            loops=host.zeros(loops_shape(config, num_worlds, sizes), dtype=np.int64),
         )
         rules = SignalRules(
             controlled=self.table.arrays,
@@ -82,15 +84,24 @@ class SignalComponent:
         self._rewarded = np.ones(1, dtype=np.bool_)
         known = rules, worlds, self.outputs
         observed, truth = np.zeros(num_worlds, dtype=np.bool_), self.outputs.counts
+        counts, readings = self.outputs.counts, self.outputs.loops
+        # State of the loops; without loops, of no lanes
+        self._detected = host.zeros((*readings.shape[:3], DETECTED), dtype=np.int64)
+        read: list[BoundCall[None]] = []
         sense: list[BoundCall[None]] = []
-        if config.sensing == "camera":
-            truth = np.zeros_like(truth)
+        if config.sensing != "truth":
+            truth = np.zeros_like(counts)
+        if config.sensing == "loops":
+            loops = make_loops(config, self.table, rules.dt, self._detected)
+            read.append(bind(read_loops, rules, worlds, loops, self._chosen))
+            estimate = bind(estimate_by_loops, rules, worlds, loops, observed, readings, counts)
+            sense.append(estimate)
+        elif config.sensing == "camera":
             most = zoned.rows.shape[1] * zoned.rows.shape[3]
             cameras = make_cameras(config, host.network, self.table, most)
-            counts = self.outputs.counts
             sense.append(bind(count_by_cameras, rules, worlds, cameras, observed, counts))
         self._begin_step = bind(begin_signal_step, *known, self._choices)
-        self.tick_calls = (bind(end_signal_tick, *known, self._chosen),)
+        self.tick_calls = (bind(end_signal_tick, *known, self._chosen), *read)
         self.step_calls = (
             bind(count_truth, *known, self._chosen, observed, truth),
             *sense,
@@ -107,14 +118,18 @@ class SignalComponent:
 
     @property
     def reads_all(self) -> tuple[str, ...]:
-        """`end` reads the vehicles of all zones before a decision; `reset` always does."""
-        decides: bool = (self._ticks % self._decide_ticks == 0).any()
+        """`end` reads the vehicles of all zones before a decision, with loops in each tick.
+
+        `reset` always reads them.
+        """
+        decides: bool = self._detected.size > 0 or (self._ticks % self._decide_ticks == 0).any()
         return ("reset", "end") if decides else ("reset",)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
-        self._stood[chosen] = 0
+        for array in (self._stood, self._detected, self.outputs.loops, self.outputs.counts):
+            array[chosen] = 0
         self._chosen[:] = chosen
         self._rewarded[:] = False
         for call in (*self.tick_calls, *self.step_calls):
@@ -139,16 +154,19 @@ class SignalComponent:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""
         outputs = self.outputs
-        return iter((outputs.states, self._stood, outputs.observations, outputs.counts))
+        found = [outputs.states, self._stood, outputs.observations, outputs.counts]
+        if self._detected.size:
+            found += [self._detected, outputs.loops]
+        return iter(found)
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with saved arrays; empty if nothing."""
-        states, stood, observations, counts = saved
+        states, stood, observations, counts, *loops = saved
         num_greens = self.table.arrays.num_greens
         for column in (PREVIOUS, GREEN):
             if ((states[..., column] < 0) | (states[..., column] >= num_greens)).any():
                 return "a signal shows a green that it does not have"
-        numbers = states[..., [SINCE, REFUSED]], stood, counts
+        numbers = states[..., [SINCE, REFUSED]], stood, counts, *loops
         if any(((each < 0) | (each > _MOST)).any() for each in numbers):
             return "a time or a count of a signal is negative or too large"
         if not ((observations >= 0.0) & (observations <= 1.0)).all():

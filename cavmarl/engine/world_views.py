@@ -135,6 +135,7 @@ class WorldViews:
             states=outputs.states,
             masks=outputs.masks,
             decides=outputs.decides,
+            loops=outputs.loops,
         )
 
     @property

@@ -33,6 +33,8 @@ class SignalView(NamedTuple):
         states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.
+        loops: (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; without
+            loops, (W, 0, 2, READINGS).
     """
 
     config: SignalsConfig
@@ -44,6 +46,7 @@ class SignalView(NamedTuple):
     states: NDArray[np.int64]
     masks: NDArray[np.bool_]
     decides: NDArray[np.bool_]
+    loops: NDArray[np.int64]
 
 
 class SignalController(Protocol):

@@ -48,6 +48,19 @@ def count_vehicle(
 
 
 @kernel
+def estimate_standing_time(
+    ticks: int,  # since the decision before
+    counts: NDArray[np.int64],  # (COUNTS,) of a lane; STOOD_TICKS is that of the decision before
+) -> None:
+    """Update the sum of standing times, which only a sensor that follows vehicles knows.
+
+    Each vehicle that stands is taken to have stood since the decision before.
+    """
+    stood = counts[STOOD_TICKS] + counts[STANDING] * ticks
+    counts[STOOD_TICKS] = stood if counts[STANDING] > 0 else 0
+
+
+@kernel
 def count_standing(
     rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
     num_owned: NDArray[np.int64],  # (k, W)

@@ -51,6 +51,8 @@ class SignalOutputs(NamedTuple):
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
     counts: NDArray[np.int64]  # (W, N, COUNTS) see `signals.kernels.lane_counts`
     states: NDArray[np.int64]  # (W, S, HELD) see `signals.kernels.green_choices`
+    # (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; (W, 0, …) without
+    loops: NDArray[np.int64]
 
 
 @kernel
