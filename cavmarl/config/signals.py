@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within, check_finite
+from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
@@ -63,7 +64,7 @@ class SignalsConfig(Section, key="signals"):
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
-    sensing: Literal["truth", "loops", "camera"] = "truth"
+    sensing: Literal["truth", "loops", "camera", "v2x"] = "truth"
     loop_upstream_m: Annotated[float, Within(5.0, 1000.0)] = 50.0
     camera_range_m: Annotated[float, Within(1.0, 1000.0)] = 50.0
     camera_height_m: Annotated[float, Within(1.0, 100.0)] = 8.0
@@ -116,6 +117,15 @@ class SignalsConfig(Section, key="signals"):
         for name in ("yellow_s", "all_red_s", "min_green_s", "max_green_s"):
             self._check_multiple(name, "ticks of clock.sim_dt_s", sim_dt_s)
         self._check_multiple("decide_s", "steps of clock.ctrl_dt_s", ctrl_dt_s)
+
+    def check_messages(self, v2x: V2xConfig) -> None:
+        """Raise a ConfigError if signals need messages, but vehicles do not send any."""
+        self.need(
+            "sensing",
+            self.sensing != "v2x" or (v2x.enabled and v2x.cam.rate_hz > 0.0),
+            "vehicles send no messages: set v2x.enabled to true, v2x.cam.rate_hz above 0, and "
+            "v2x.roadside.signals to [all]",
+        )
 
     def _check_multiple(self, name: str, unit: str, unit_s: float) -> None:
         ratio = getattr(self, name) / unit_s

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,11 +11,13 @@ from numpy.typing import NDArray
 
 from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.compiled.bound_call import BoundCall, bind
+from cavmarl.core.errors import ConfigError
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.camera_counts import count_by_cameras
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
 from cavmarl.signals.kernels.loop_counts import DETECTED, estimate_by_loops, read_loops
+from cavmarl.signals.kernels.message_counts import count_by_messages
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
@@ -24,11 +27,15 @@ from cavmarl.signals.kernels.signal_steps import (
     end_signal_tick,
     observe_and_reward,
 )
-from cavmarl.signals.sensing import loops_shape, make_cameras, make_loops
+from cavmarl.signals.sensing import loops_shape, make_cameras, make_loops, make_unit_lanes
 from cavmarl.signals.signal_table import SignalTable, ticks_of
+from cavmarl.v2x.bus import Bus
 
 if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
+    from cavmarl.engine.v2x_component import V2xComponent
+
+log = logging.getLogger(__name__)
 
 _MOST = 1 << 40  # ticks and counts in a saved state
 
@@ -43,7 +50,7 @@ class SignalComponent:
         step_calls: the calls at the end of a step, after `tick_calls`.
     """
 
-    def __init__(self, host: ComponentContext) -> None:
+    def __init__(self, host: ComponentContext, messages: V2xComponent | None) -> None:
         config, num_worlds = host.config.signals, host.num_worlds
         self.table = SignalTable(host.network)
         sizes = self.table.sizes
@@ -78,6 +85,9 @@ class SignalComponent:
             sides=first.row_sides,
             num_owned=zoned.num_owned,
         )
+        self._bus: Bus | None = None
+        self._told = False
+        self._full = np.zeros(1, dtype=np.int64)  # inboxes that were full
         self._decide_ticks = rules.durations.decide
         self._choices = np.full(signals, KEEP, dtype=np.int64)
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
@@ -100,6 +110,12 @@ class SignalComponent:
             most = zoned.rows.shape[1] * zoned.rows.shape[3]
             cameras = make_cameras(config, host.network, self.table, most)
             sense.append(bind(count_by_cameras, rules, worlds, cameras, observed, counts))
+        elif config.sensing == "v2x" and messages is not None:
+            self._bus = messages.bus
+            units = make_unit_lanes(host.network, self.table, self._receivers(messages.bus))
+            self._full = units.full
+            inboxes = messages.bus.mail.objects
+            sense.append(bind(count_by_messages, rules, worlds, units, inboxes, observed, counts))
         self._begin_step = bind(begin_signal_step, *known, self._choices)
         self.tick_calls = (bind(end_signal_tick, *known, self._chosen), *read)
         self.step_calls = (
@@ -130,6 +146,8 @@ class SignalComponent:
         self.outputs.states[chosen] = 0
         for array in (self._stood, self._detected, self.outputs.loops, self.outputs.counts):
             array[chosen] = 0
+        if self._bus is not None:
+            self._bus.reset(chosen)  # messages of the last episode say nothing about this one
         self._chosen[:] = chosen
         self._rewarded[:] = False
         for call in (*self.tick_calls, *self.step_calls):
@@ -150,6 +168,30 @@ class SignalComponent:
         if self._ticks.item(0) % self._ticks_per_step == 0:
             for call in self.step_calls:
                 call()
+            self._tell_of_full_inboxes()
+
+    def _receivers(self, bus: Bus) -> NDArray[np.int64]:
+        """Return the row (S,) of each signal's roadside unit among the inboxes."""
+        unit_of = {signal: unit for unit, signal in enumerate(bus.units["signal"].tolist())}
+        rows = self.table.arrays.row.tolist()
+        missing = [self.table.ids[s] for s, row in enumerate(rows) if row not in unit_of]
+        if missing:
+            raise ConfigError(
+                f"signals.sensing = v2x: {len(missing)} signals with agents have no roadside unit, "
+                f"such as {missing[0]!r}; set v2x.roadside.signals to [all]"
+            )
+        return np.array([bus.receiver_of_unit(unit_of[row]) for row in rows], dtype=np.int64)
+
+    def _tell_of_full_inboxes(self) -> None:
+        """Log once that roadside units may know more vehicles than they can keep."""
+        if self._bus is None or self._told or not self._full[0]:
+            return
+        self._told = True
+        log.warning(
+            "signals.sensing = v2x: %d roadside units have full inboxes of %d vehicles; farther "
+            "vehicles are not counted. Set v2x.inbox.objects higher, up to 64",
+            self._full[0], self._bus.mail.objects.shape[2],
+        )  # fmt: skip
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""

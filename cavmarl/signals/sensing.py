@@ -12,6 +12,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.signal_places import place_of_signal
 from cavmarl.signals.kernels.camera_counts import IN_RANGE, Cameras
 from cavmarl.signals.kernels.loop_counts import CAR_MM, READINGS, Loops
+from cavmarl.signals.kernels.message_counts import UnitLanes
 from cavmarl.signals.kernels.signal_observations import MIN_GAP_M
 from cavmarl.signals.signal_table import SignalSizes, SignalTable
 
@@ -77,4 +78,25 @@ def make_loops(
         standing_ticks=math.ceil(STANDING_S / dt - 1e-9),
         detected=detected,
         covered=np.zeros(begin_m.shape, dtype=np.bool_),
+    )
+
+
+def make_unit_lanes(
+    network: RoadNetwork, table: SignalTable, receivers: NDArray[np.int64]
+) -> UnitLanes:
+    """Return the lanes on which roadside units count vehicles.
+
+    `receivers`: (S,) row of each signal's unit among the inboxes.
+    """
+    order = np.argsort(table.posts.signal, kind="stable")
+    lanes = network.lanes[table.arrays.lane_row]
+    return UnitLanes(
+        receivers=receivers,
+        first=np.searchsorted(table.posts.signal[order], np.arange(len(receivers) + 1)),
+        lanes=order,
+        first_point=lanes["first_point"].copy(),
+        num_points=lanes["num_points"].copy(),
+        half_width_m=0.5 * lanes["width_m"],
+        points=network.arrays.points,
+        full=np.zeros(1, dtype=np.int64),
     )
