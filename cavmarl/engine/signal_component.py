@@ -189,7 +189,7 @@ class SignalComponent:
         self._told = True
         log.warning(
             "signals.sensing = v2x: %d roadside units have full inboxes of %d vehicles; farther "
-            "vehicles are not counted. Set v2x.inbox.objects higher, up to 64",
+            "vehicles are not counted (v2x.inbox.objects, at most 64)",
             self._full[0], self._bus.mail.objects.shape[2],
         )  # fmt: skip
 
