@@ -366,7 +366,8 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
 
 
 def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> None:
-    vec = make("grid4x4", num_envs=2, zones=2, overrides={"signals.agents": "all"})
+    keys = {"signals.agents": "all", "signals.sensing": "loops"}
+    vec = make("grid4x4", num_envs=2, zones=2, overrides=keys)
     vec.reset(seed=1)
     for _ in range(12):
         vec.step(vec.suggest_actions())
@@ -384,6 +385,8 @@ def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> Non
     for wrong in (-0.5, 1.5, np.nan):
         _refused(vec, with_value(seen, (0, 0, 0), wrong))
     _refused(vec, with_value(counts, (0, 0, 0), -1))
+    _refused(vec, with_value(counts + 1, (0, 0, 0, 0), -1))  # state of the loops
+    _refused(vec, with_value(place(outputs.loops), (1, 3, 1, 2), 1 << 41))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
 
     def due(state: State) -> None:
