@@ -345,12 +345,14 @@ SENSING: dict[str, dict[str, Any]] = {
 }
 
 
-def hashes(sensing: str = "truth", kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
+def hashes(
+    sensing: str = "truth", kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any
+) -> list[str]:
     """Hashes of the states and of everything that the agents of signals get."""
     overrides = ALL | SENSING[sensing]
     overrides |= {"horizon_s": 30.0, "sensors.signal.timing": True, "signals.max_green_s": 10.0}
     vec: CavVectorEnv = make_vec(
-        "grid4x4", num_envs=2, agents=4, background=60, overrides=overrides, **more
+        "grid4x4", num_envs=num_envs, agents=4, background=60, overrides=overrides, **more
     )
     with closing(vec):
         vec.reset(seed=1)
@@ -375,7 +377,7 @@ def hashes(sensing: str = "truth", kill_at: tuple[int, ...] = (), **more: Any) -
             ):
                 given.update(np.ascontiguousarray(array).tobytes())
         assert infos["signal_refused"].any()
-        return [*(vec.state_hash(w) for w in range(2)), given.hexdigest()]
+        return [*(vec.state_hash(w) for w in range(num_envs)), given.hexdigest()]
 
 
 @pytest.fixture(scope="module", params=SENSING)
@@ -405,6 +407,9 @@ def test_it_is_the_same_on_workers_of_which_one_is_killed(
 def test_over_nodes_it_is_the_same_too(undivided: tuple[str, list[str]]) -> None:
     sensing, expected = undivided
     assert hashes(sensing, zones=3, nodes=2, kill_at=(24,)) == expected
+    # A single world is divided between the nodes.
+    alone = hashes(sensing, num_envs=1)
+    assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == alone
 
 
 @pytest.mark.parametrize("sensing", SENSING)
