@@ -113,11 +113,12 @@ def run_suite(
     are as in `evaluate`.
     """
     reports = {}
-    keys: dict[str, object] = dict(overrides or {})
+    keys: dict[str, object] = {}
     if suite.agents is not None:
         keys["population.mode"] = "respawn"
     if suite.horizon_s is not None:
         keys["horizon_s"] = suite.horizon_s
+    keys |= overrides or {}
     for world in worlds:
         began(world)
         reports[world.label] = evaluate(
@@ -165,7 +166,7 @@ def run_signals(
         own = dict(keys)
         is_sumo = world.env.endswith(".sumocfg")
         if suite.background is not None or is_sumo:
-            own["population.background"] = 0 if is_sumo else suite.background
+            own.setdefault("population.background", 0 if is_sumo else suite.background)
         figures = {
             controller: run_controller(
                 world.env, controller, seconds=seconds, seeds=seeds, overrides=own

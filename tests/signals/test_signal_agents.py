@@ -387,9 +387,7 @@ def undivided(request: pytest.FixtureRequest) -> tuple[str, list[str]]:
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_a_divided_world_is_the_undivided_one(
-    zones: int, undivided: tuple[str, list[str]]
-) -> None:
+def test_a_divided_world_is_the_undivided_one(zones: int, undivided: tuple[str, list[str]]) -> None:
     sensing, expected = undivided
     assert hashes(sensing, zones=zones) == expected
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import nearest_bodies
 from cavmarl.core.math.walls import Walls, behind_body, is_cut
