@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -10,14 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.signals import SIGNAL_TERMS
-from cavmarl.core.compiled.bound_call import BoundCall, bind
-from cavmarl.core.errors import ConfigError
+from cavmarl.core.compiled.bound_call import bind
+from cavmarl.engine.signal_sensing import SignalSensing
 from cavmarl.shards.shard import Commands
-from cavmarl.signals.kernels.camera_counts import count_by_cameras
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
-from cavmarl.signals.kernels.loop_counts import DETECTED, estimate_by_loops, read_loops
-from cavmarl.signals.kernels.message_counts import count_by_messages
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
@@ -27,15 +23,12 @@ from cavmarl.signals.kernels.signal_steps import (
     end_signal_tick,
     observe_and_reward,
 )
-from cavmarl.signals.sensing import loops_shape, make_cameras, make_loops, make_unit_lanes
+from cavmarl.signals.sensing import loops_shape
 from cavmarl.signals.signal_table import SignalTable, ticks_of
-from cavmarl.v2x.bus import Bus
 
 if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
     from cavmarl.engine.v2x_component import V2xComponent
-
-log = logging.getLogger(__name__)
 
 _MOST = 1 << 40  # ticks and counts in a saved state
 
@@ -85,42 +78,21 @@ class SignalComponent:
             sides=first.row_sides,
             num_owned=zoned.num_owned,
         )
-        self._bus: Bus | None = None
-        self._told = False
-        self._full = np.zeros(1, dtype=np.int64)  # inboxes that were full
         self._decide_ticks = rules.durations.decide
         self._choices = np.full(signals, KEEP, dtype=np.int64)
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
         self._rewarded = np.ones(1, dtype=np.bool_)
         known = rules, worlds, self.outputs
-        observed, truth = np.zeros(num_worlds, dtype=np.bool_), self.outputs.counts
-        counts, readings = self.outputs.counts, self.outputs.loops
-        # State of the loops; without loops, of no lanes
-        self._detected = host.zeros((*readings.shape[:3], DETECTED), dtype=np.int64)
-        read: list[BoundCall[None]] = []
-        sense: list[BoundCall[None]] = []
-        if config.sensing != "truth":
-            truth = np.zeros_like(counts)
-        if config.sensing == "loops":
-            loops = make_loops(config, self.table, rules.dt, self._detected)
-            read.append(bind(read_loops, rules, worlds, loops, self._chosen))
-            estimate = bind(estimate_by_loops, rules, worlds, loops, observed, readings, counts)
-            sense.append(estimate)
-        elif config.sensing == "camera":
-            most = zoned.rows.shape[1] * zoned.rows.shape[3]
-            cameras = make_cameras(config, host.network, self.table, most)
-            sense.append(bind(count_by_cameras, rules, worlds, cameras, observed, counts))
-        elif config.sensing == "v2x" and messages is not None:
-            self._bus = messages.bus
-            units = make_unit_lanes(host.network, self.table, self._receivers(messages.bus))
-            self._full = units.full
-            inboxes = messages.bus.mail.objects
-            sense.append(bind(count_by_messages, rules, worlds, units, inboxes, observed, counts))
+        observed = np.zeros(num_worlds, dtype=np.bool_)
+        self._sensing = SignalSensing(
+            host, messages, self.table, *known, chosen=self._chosen, observed=observed
+        )
+        truth = self._sensing.truth
         self._begin_step = bind(begin_signal_step, *known, self._choices)
-        self.tick_calls = (bind(end_signal_tick, *known, self._chosen), *read)
+        self.tick_calls = (bind(end_signal_tick, *known, self._chosen), *self._sensing.tick_calls)
         self.step_calls = (
             bind(count_truth, *known, self._chosen, observed, truth),
-            *sense,
+            *self._sensing.step_calls,
             bind(
                 observe_and_reward,
                 *known,
@@ -134,20 +106,15 @@ class SignalComponent:
 
     @property
     def reads_all(self) -> tuple[str, ...]:
-        """`end` reads the vehicles of all zones before a decision, with loops in each tick.
-
-        `reset` always reads them.
-        """
-        decides: bool = self._detected.size > 0 or (self._ticks % self._decide_ticks == 0).any()
+        """`end` reads the vehicles of all zones before a decision, or always; `reset` always."""
+        decides: bool = self._sensing.reads_ticks or (self._ticks % self._decide_ticks == 0).any()
         return ("reset", "end") if decides else ("reset",)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
-        for array in (self._stood, self._detected, self.outputs.loops, self.outputs.counts):
-            array[chosen] = 0
-        if self._bus is not None:
-            self._bus.reset(chosen)  # messages of the last episode say nothing about this one
+        self._stood[chosen] = 0
+        self._sensing.reset(chosen)
         self._chosen[:] = chosen
         self._rewarded[:] = False
         for call in (*self.tick_calls, *self.step_calls):
@@ -168,38 +135,13 @@ class SignalComponent:
         if self._ticks.item(0) % self._ticks_per_step == 0:
             for call in self.step_calls:
                 call()
-            self._tell_of_full_inboxes()
-
-    def _receivers(self, bus: Bus) -> NDArray[np.int64]:
-        """Return the row (S,) of each signal's roadside unit among the inboxes."""
-        unit_of = {signal: unit for unit, signal in enumerate(bus.units["signal"].tolist())}
-        rows = self.table.arrays.row.tolist()
-        missing = [self.table.ids[s] for s, row in enumerate(rows) if row not in unit_of]
-        if missing:
-            raise ConfigError(
-                f"signals.sensing = v2x: {len(missing)} signals with agents have no roadside unit, "
-                f"such as {missing[0]!r}; set v2x.roadside.signals to [all]"
-            )
-        return np.array([bus.receiver_of_unit(unit_of[row]) for row in rows], dtype=np.int64)
-
-    def _tell_of_full_inboxes(self) -> None:
-        """Log once that roadside units may know more vehicles than they can keep."""
-        if self._bus is None or self._told or not self._full[0]:
-            return
-        self._told = True
-        log.warning(
-            "signals.sensing = v2x: %d roadside units have full inboxes of %d vehicles; farther "
-            "vehicles are not counted (v2x.inbox.objects, at most 64)",
-            self._full[0], self._bus.mail.objects.shape[2],
-        )  # fmt: skip
+            self._sensing.tell_of_full_inboxes()
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""
         outputs = self.outputs
-        found = [outputs.states, self._stood, outputs.observations, outputs.counts]
-        if self._detected.size:
-            found += [self._detected, outputs.loops]
-        return iter(found)
+        kept = outputs.states, self._stood, outputs.observations, outputs.counts
+        return iter((*kept, *self._sensing.kept))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with saved arrays; empty if nothing."""

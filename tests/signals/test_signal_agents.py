@@ -399,6 +399,9 @@ def test_it_is_the_same_on_workers_of_which_one_is_killed(
     sensing, expected = undivided
     assert hashes(sensing, zones=4, workers=2, kill_at=(7, 22)) == expected
     assert hashes(sensing, workers=2, kill_at=(33,)) == expected
+    # A single world is divided between the workers.
+    alone = hashes(sensing, num_envs=1)
+    assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == alone
 
 
 @pytest.mark.integration

@@ -149,7 +149,7 @@ def test_vehicles_hide_others_from_a_camera() -> None:
             for s, signal in enumerate(table.arrays.row.tolist()):
                 links = network.links[network.links["signal"] == signal]
                 ends = [network.lane_polyline(lane)[-1] for lane in links["from_lane"].tolist()]
-                camera = np.mean(ends, axis=0) + [0.0, 0.0, 5.0]
+                camera = np.mean(ends, axis=0) + np.array([0.0, 0.0, 5.0])
                 own = table.posts.signal[lanes] == s
                 for row, lane in zip(rows[own], lanes[own], strict=True):
                     is_seen = is_in_sight(camera, row, rows[own])

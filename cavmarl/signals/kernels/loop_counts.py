@@ -63,8 +63,8 @@ def read_loops(
 ) -> None:
     """Update the state of the loops at the end of a tick.
 
-    A loop is covered in a tick if a vehicle whose centre is on the lane was over it in this tick. It
-    counts a vehicle when it becomes covered.
+    A loop is covered in a tick if a vehicle whose centre is on the lane was over it in this tick.
+    It counts a vehicle when it becomes covered.
     """
     rows = worlds.rows[worlds.sides[0]]
     for w in range(chosen.size):
