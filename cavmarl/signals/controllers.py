@@ -29,7 +29,8 @@ class SignalView(NamedTuple):
         table: greens, lanes and movements of S signals.
         observations: (W, S, D) as agents get them.
         ticks: (W,) since the reset.
-        counts: (W, N, COUNTS) of the watched lanes; see `signals.kernels.lane_counts`.
+        counts: (W, N, COUNTS) of the watched lanes, as far as `signals.sensing` knows them; see
+            `signals.kernels.lane_counts`.
         states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.

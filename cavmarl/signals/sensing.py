@@ -67,7 +67,7 @@ def make_loops(
         (posts.line_m - away_m, posts.line_m - BEFORE_LINE_M - LOOP_M),
         (posts.line_m, np.minimum(away_m, length_m - LOOP_M)),
     )
-    begin_m = np.maximum(begin_m.T, 0.0)
+    begin_m = np.ascontiguousarray(np.maximum(begin_m, 0.0).T)
     between_m = begin_m[:, 1] - begin_m[:, 0]
     clear_s = between_m / table.arrays.speed_mps + CLEAR_S
     return Loops(
