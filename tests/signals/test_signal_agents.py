@@ -8,6 +8,7 @@ import signal
 import warnings
 from collections import defaultdict
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,11 @@ from numpy.typing import NDArray
 from cavmarl import ActionError, CavEnv, CavVectorEnv, ConfigError, make_vec, parallel_env
 from cavmarl.adapters.gymnasium_env import CavEgoEnv
 from cavmarl.adapters.gymnasium_rows import CavAgentRows
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import PolicyError
+from cavmarl.cosim.carla.carla_server import serve
+from cavmarl.cosim.carla.hosted_world import LoadedWorlds
+from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.policies.loading import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
@@ -381,39 +386,60 @@ def hashes(
 
 
 @pytest.fixture(scope="module", params=SENSING)
-def undivided(request: pytest.FixtureRequest) -> tuple[str, list[str]]:
-    """A kind of sensing, and the hashes of an undivided world with it."""
-    return request.param, hashes(request.param)
+def sensing(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
+
+
+@pytest.fixture(scope="module")
+def undivided(sensing: str) -> list[str]:
+    return hashes(sensing)
+
+
+@pytest.fixture(scope="module")
+def undivided_world(sensing: str) -> list[str]:
+    return hashes(sensing, num_envs=1)
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_a_divided_world_is_the_undivided_one(zones: int, undivided: tuple[str, list[str]]) -> None:
-    sensing, expected = undivided
-    assert hashes(sensing, zones=zones) == expected
+def test_a_divided_world_is_the_undivided_one(
+    zones: int, sensing: str, undivided: list[str]
+) -> None:
+    assert hashes(sensing, zones=zones) == undivided
 
 
 @pytest.mark.integration
 def test_it_is_the_same_on_workers_of_which_one_is_killed(
-    undivided: tuple[str, list[str]],
+    sensing: str, undivided: list[str], undivided_world: list[str]
 ) -> None:
-    sensing, expected = undivided
-    assert hashes(sensing, zones=4, workers=2, kill_at=(7, 22)) == expected
-    assert hashes(sensing, workers=2, kill_at=(33,)) == expected
-    # A single world is divided between the workers.
-    alone = hashes(sensing, num_envs=1)
-    assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == alone
+    # workers share out the zones of one world, but whole worlds of several
+    assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
+    assert hashes(sensing, workers=2, kill_at=(33,)) == undivided
 
 
 @pytest.mark.integration
-def test_over_nodes_it_is_the_same_too(undivided: tuple[str, list[str]]) -> None:
-    sensing, expected = undivided
-    assert hashes(sensing, zones=3, nodes=2, kill_at=(24,)) == expected
-    # A single world is divided between the nodes.
-    alone = hashes(sensing, num_envs=1)
-    assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == alone
+def test_over_nodes_it_is_the_same_too(sensing: str, undivided_world: list[str]) -> None:
+    assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
 
 
-@pytest.mark.parametrize("sensing", SENSING)
+def test_a_reset_of_one_world_changes_no_other_world(sensing: str) -> None:
+    overrides = ALL | SENSING[sensing]
+
+    def second_world(is_first_reset: bool) -> list[Any]:
+        vec = make_vec("grid4x4", num_envs=2, agents=2, background=60, overrides=overrides)
+        with closing(vec):
+            vec.reset(seed=1)
+            found = []
+            for step in range(30):
+                if is_first_reset and step == 17:
+                    vec.reset(options={"reset_mask": np.array([True, False])})
+                vec.step(vec.suggest_actions())
+                found.append(vec.worlds.arrays.signal_counts[1].tolist())
+            assert vec.worlds.arrays.signal_counts[1, :, STOOD_TICKS].any()
+            return [*found, vec.state_hash(1)]
+
+    assert second_world(True) == second_world(False)
+
+
 def test_a_saved_state_continues_with_other_zones(sensing: str) -> None:
     def steps(vec: CavVectorEnv, count: int) -> list[NDArray[Any]]:
         found: list[NDArray[Any]] = []
@@ -499,8 +525,36 @@ def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
 
 @pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
 def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
-    with pytest.raises(ConfigError, match="this adapter gives the agents of vehicles alone"):
+    with pytest.raises(ConfigError, match="this adapter has agents of vehicles alone; set sig"):
         adapter("grid4x4", overrides=ALL)
+
+
+def test_a_followed_world_refuses_agents_of_signals(tmp_path: Path) -> None:
+    with closing(world()) as env, pytest.raises(ConfigError, match="a followed world has agents"):
+        FollowedWorld(env, tmp_path / "socket")
+
+
+def test_a_world_for_clients_of_carla_refuses_agents_of_signals() -> None:
+    message = "a world for CARLA's clients has agents of vehicles"
+    with closing(world()) as env, pytest.raises(ConfigError, match=message):
+        serve(env)
+    source = LoadedWorlds(WorldSpec.of("grid4x4", agents=1, overrides={"signals.agents": "all"}))
+    with closing(source), pytest.raises(ConfigError, match=message):
+        source.load("grid4x4", 0.05)
+
+
+def test_calls_for_vehicles_name_agents_of_signals() -> None:
+    with closing(world()) as env:
+        env.reset()
+        name = env.signals.agents[0]
+        env.check_action(name, 1)
+        for action, message in ((7, "is 7, must be from 0 to 1"), (0.5, "must be one whole num")):
+            with pytest.raises(ActionError, match=message):
+                env.check_action(name, action)
+        with pytest.raises(ActionError, match="signals have no sensors; give a vehicle's id"):
+            env.frames(name)
+        with pytest.raises(ActionError, match=r"give an id of a vehicle from env\.agents"):
+            env.declare_event(name, "obstacle")
 
 
 @pytest.mark.parametrize("change", [(2.0, 1.0), (0.0, 0.0), (3.0, 0.0)])

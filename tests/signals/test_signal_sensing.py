@@ -396,17 +396,3 @@ def test_rewards_are_those_of_the_truth(keys: dict[str, Any]) -> None:
         described = describe_world(world.config, world.network, None, world.partition)
         expected = {"observed": keys["signals.sensing"], "rewarded": "truth"}
         assert described["signals"] == expected
-
-
-def test_a_reset_of_one_world_leaves_the_others_alone() -> None:
-    def run(resets: bool) -> tuple[str, NDArray[np.int64]]:
-        with closing(make(sensing="loops", num_envs=2)) as vec:
-            for tick in ticks(vec, 12.0):
-                if resets and tick == 33:
-                    chosen = np.array([False, True])
-                    vec.reset(options={"reset_mask": chosen})
-            return vec.state_hash(0), vec.signals.view.counts[0].copy()
-
-    one, other = run(False), run(True)
-    assert one[0] == other[0]
-    np.testing.assert_array_equal(one[1], other[1])

@@ -64,8 +64,8 @@ def estimate_standing_time(
 def count_standing(
     rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
     num_owned: NDArray[np.int64],  # (k, W)
-    chosen: NDArray[np.bool_],  # (W,) worlds to count in
     lane_index: NDArray[np.int32],  # see `ControlledSignals`
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has passed
 ) -> None:
     """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
     for zone in range(rows.shape[0]):

@@ -74,12 +74,12 @@ def end_signal_tick(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
-    chosen: NDArray[np.bool_],  # (W,) worlds whose tick ends
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
     """Set the phases of the present tick, and count how long vehicles have stood."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
-    count_standing(rows, worlds.num_owned, chosen, rules.controlled.lane_index)
+    count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
 
 
 @kernel
