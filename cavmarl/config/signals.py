@@ -17,6 +17,7 @@ ALL_SIGNALS = "all"
 
 BY_AGENTS: Literal["agents"] = "agents"
 SIGNAL_CONTROLLERS = ("program", "longest_queue", "max_pressure")  # see `signals.controllers`
+WITH_LONGEST_RED = ("longest_queue", "max_pressure")  # controllers that read `longest_red_s`
 
 
 @dataclass(frozen=True)
@@ -33,6 +34,9 @@ class SignalsConfig(Section, key="signals"):
         all_red_s: duration of red for all links, between yellow and the next green.
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
+        longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
+            been red this long before a standing vehicle; 0: they do not.
+        flow_interval_s: interval in which vehicles are counted for `webster`.
         greens: which phases of a program are greens. `distinct`: those with a green and no yellow
             letter for vehicles; phases with equal letters count once. `all`: as in sumo-rl, each
             phase without the letter `y` that has any letter but `r` and `s`.
@@ -52,6 +56,8 @@ class SignalsConfig(Section, key="signals"):
     all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     min_green_s: Annotated[float, Within(0.0, 3600.0)] = 5.0
     max_green_s: Annotated[float, Within(0.0, 3600.0)] = 60.0
+    longest_red_s: Annotated[float, Within(0.0, 3600.0)] = 0.0
+    flow_interval_s: Annotated[float, Within(1.0, 86400.0)] = 300.0
     greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
@@ -75,6 +81,12 @@ class SignalsConfig(Section, key="signals"):
             "max_green_s",
             self.max_green_s == 0.0 or self.max_green_s >= self.min_green_s,
             f"must be 0, or at least signals.min_green_s = {self.min_green_s:g}",
+        )
+        self.need(
+            "longest_red_s",
+            self.longest_red_s == 0.0 or self.controller in (BY_AGENTS, *WITH_LONGEST_RED),
+            f"has no effect on signals.controller = {self.controller}, only on "
+            f"{' and '.join(WITH_LONGEST_RED)}; set it to 0, or choose one of these",
         )
         for name, weight in self.terms.items():
             if name not in SIGNAL_TERMS:
@@ -101,7 +113,10 @@ class SignalsConfig(Section, key="signals"):
 
     def check_clock(self, sim_dt_s: float, ctrl_dt_s: float) -> None:
         """Raise a ConfigError for a time that is not a whole number of ticks or of steps."""
-        for name in ("yellow_s", "all_red_s", "min_green_s", "max_green_s"):
+        for name in (
+            "yellow_s", "all_red_s", "min_green_s", "max_green_s", "longest_red_s",
+            "flow_interval_s",
+        ):  # fmt: skip
             self._check_multiple(name, "ticks of clock.sim_dt_s", sim_dt_s)
         self._check_multiple("decide_s", "steps of clock.ctrl_dt_s", ctrl_dt_s)
 

@@ -13,6 +13,7 @@ from cavmarl.core.compiled.bound_call import bind
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.kernels.lane_history import FLOW, HISTORY, NOT_MEASURED
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
@@ -56,9 +57,11 @@ class SignalComponent:
             decides=host.zeros(num_worlds, dtype=np.bool_),
             counts=host.zeros((num_worlds, sizes.lanes, COUNTS), dtype=np.int64),
             states=host.zeros((*signals, HELD), dtype=np.int64),
+            history=host.zeros((num_worlds, sizes.lanes, HISTORY), dtype=np.int64),
         )
         rules = SignalRules(
             controlled=self.table.arrays,
+            served=self.table.served,
             durations=ticks_of(config, host.config.clock.sim_dt_s),
             cyclic=config.action == "keep_or_next",
             dt=host.config.clock.sim_dt_s,
@@ -68,6 +71,7 @@ class SignalComponent:
             ticks=first.worlds.ticks,
             controllers=first.worlds.controllers,
             signal_phase=first.worlds.signal_phase,
+            detected_s=first.worlds.detected_s,
             rows=zoned.rows,
             sides=first.row_sides,
             num_owned=zoned.num_owned,
@@ -77,7 +81,7 @@ class SignalComponent:
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
         self._rewarded = np.ones(1, dtype=np.bool_)
         self._begin_step = bind(begin_signal_step, rules, worlds, self.outputs, self._choices)
-        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs)
+        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs, self._chosen)
         self.end_step = bind(
             end_signal_step,
             rules,
@@ -98,9 +102,11 @@ class SignalComponent:
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
+        self.outputs.history[chosen] = 0
+        self.outputs.history[chosen, :, FLOW] = NOT_MEASURED
         self._stood[chosen] = 0
-        self.end_tick()
         self._chosen[:] = chosen
+        self.end_tick()
         self._rewarded[:] = False
         self.end_step()
         self._chosen[:] = self._rewarded[:] = True
@@ -121,16 +127,19 @@ class SignalComponent:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""
         outputs = self.outputs
-        return iter((outputs.states, self._stood, outputs.observations, outputs.counts))
+        return iter(
+            (outputs.states, self._stood, outputs.observations, outputs.counts, outputs.history)
+        )
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with saved arrays; empty if nothing."""
-        states, stood, observations, counts = saved
+        states, stood, observations, counts, history = saved
         num_greens = self.table.arrays.num_greens
         for column in (PREVIOUS, GREEN):
             if ((states[..., column] < 0) | (states[..., column] >= num_greens)).any():
                 return "a signal shows a green that it does not have"
-        numbers = states[..., [SINCE, REFUSED]], stood, counts
+        least = np.where(np.arange(HISTORY) == FLOW, NOT_MEASURED, 0)
+        numbers = states[..., [SINCE, REFUSED]], stood, counts, history - least
         if any(((each < 0) | (each > _MOST)).any() for each in numbers):
             return "a time or a count of a signal is negative or too large"
         if not ((observations >= 0.0) & (observations <= 1.0)).all():

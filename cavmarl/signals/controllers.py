@@ -15,9 +15,10 @@ from numpy.typing import NDArray
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
-from cavmarl.signals.kernels.green_scores import LaneWeights, choose_best
+from cavmarl.signals.kernels.controlled_signals import LaneWeights
+from cavmarl.signals.kernels.green_scores import choose_best
 from cavmarl.signals.kernels.lane_counts import VEHICLES
-from cavmarl.signals.signal_table import SignalTable
+from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 
 class SignalView(NamedTuple):
@@ -33,6 +34,7 @@ class SignalView(NamedTuple):
         states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.
+        history: (W, N, HISTORY) of the watched lanes; see `signals.kernels.lane_history`.
     """
 
     config: SignalsConfig
@@ -44,6 +46,7 @@ class SignalView(NamedTuple):
     states: NDArray[np.int64]
     masks: NDArray[np.bool_]
     decides: NDArray[np.bool_]
+    history: NDArray[np.int64]
 
 
 class SignalController(Protocol):
@@ -114,9 +117,12 @@ def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
     choose_best(
         weights,
         VEHICLES,
+        view.table.served,
+        ticks_of(view.config, view.dt).longest_red,
         view.config.action == "keep_or_next",
         view.table.arrays.num_greens,
         view.counts,
+        view.history,
         view.states,
         view.masks,
         view.decides,

@@ -11,8 +11,11 @@ from numpy.typing import NDArray
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
-from cavmarl.signals.kernels.green_scores import LaneWeights
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LaneWeights,
+    SignalTicks,
+)
 
 
 class SignalSizes(NamedTuple):
@@ -89,6 +92,7 @@ class SignalTable:
             lane_index=lane_index,
             length_m=network.lanes["length_m"][lane_row],
             speed_mps=network.lanes["speed_mps"][lane_row],
+            detector=_detectors(network, incoming, self.movements, self.opened, len(index)),
         )
         greens_max = int(self.arrays.num_greens.max(initial=0))
         self.served, self.pressure = (
@@ -116,6 +120,8 @@ def ticks_of(config: SignalsConfig, sim_dt_s: float) -> SignalTicks:
         all_red=round(config.all_red_s / sim_dt_s),
         min_green=round(config.min_green_s / sim_dt_s),
         max_green=round(config.max_green_s / sim_dt_s),
+        longest_red=round(config.longest_red_s / sim_dt_s),
+        flow_interval=round(config.flow_interval_s / sim_dt_s),
     )
 
 
@@ -136,6 +142,30 @@ def _phases(network: RoadNetwork, row: int) -> NDArray[np.void]:
     program = network.programs[network.signals["program"][row]]
     first = int(program["first_phase"])
     return network.phases[first : first + program["num_phases"]]
+
+
+def _detectors(
+    network: RoadNetwork,
+    incoming: Sequence[Sequence[int]],
+    movements: Sequence[NDArray[np.int64]],
+    opened: Sequence[NDArray[np.bool_]],
+    num_lanes: int,
+) -> NDArray[np.int32]:
+    """Return the DETECTOR row of each watched lane.
+
+    The programs of these signals are the last of the network, so their detectors are too: for each
+    signal, one for each incoming lane that a green opens (`place_detectors`).
+    """
+    detected = [
+        lane
+        for lanes, moves, greens in zip(incoming, movements, opened, strict=True)
+        for lane in lanes
+        if greens[:, moves[:, 0] == lane].any()
+    ]
+    found = np.full(num_lanes, -1, dtype=np.int32)
+    count = len(network.detectors)
+    found[detected] = np.arange(count - len(detected), count)
+    return found
 
 
 def _of_served_lanes(moves: list[tuple[int, int]]) -> dict[int, int]:

@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LaneWeights,
+    SignalTicks,
+)
 from cavmarl.signals.kernels.green_choices import choose_greens, mask_choices, show_greens
 from cavmarl.signals.kernels.lane_counts import count_lanes, count_standing
+from cavmarl.signals.kernels.lane_history import follow_detectors, follow_lanes
 from cavmarl.signals.kernels.signal_observations import observe_signals, reward_signals
 
 
@@ -18,6 +23,7 @@ class SignalRules(NamedTuple):
     """The signals whose greens are chosen, and the rules for choices, for kernels."""
 
     controlled: ControlledSignals
+    served: LaneWeights  # see `SignalTable`
     durations: SignalTicks
     cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
     dt: float
@@ -30,6 +36,7 @@ class SignalWorlds(NamedTuple):
     ticks: NDArray[np.int64]  # (W,)
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers)
     signal_phase: NDArray[np.int32]  # (W, num_signals)
+    detected_s: NDArray[np.float64]  # (W, D)
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
     sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
     num_owned: NDArray[np.int64]  # (k, W)
@@ -49,6 +56,7 @@ class SignalOutputs(NamedTuple):
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
     counts: NDArray[np.int64]  # (W, N, COUNTS) see `signals.kernels.lane_counts`
     states: NDArray[np.int64]  # (W, S, HELD) see `signals.kernels.green_choices`
+    history: NDArray[np.int64]  # (W, N, HISTORY) see `signals.kernels.lane_history`
 
 
 @kernel
@@ -66,11 +74,25 @@ def begin_signal_step(
 
 
 @kernel
-def end_signal_tick(rules: SignalRules, worlds: SignalWorlds, outputs: SignalOutputs) -> None:
-    """Set the phases of the present tick, and count how long vehicles have stood."""
+def end_signal_tick(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) worlds whose vehicles are counted
+) -> None:
+    """Set the phases of the present tick, and count vehicles that stand or are detected."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
-    count_standing(rows, worlds.num_owned, rules.controlled.lane_index)
+    count_standing(rows, worlds.num_owned, chosen, rules.controlled.lane_index)
+    follow_detectors(
+        rules.controlled,
+        rules.durations.flow_interval,
+        rules.dt,
+        chosen,
+        worlds.ticks,
+        worlds.detected_s,
+        outputs.history,
+    )
 
 
 @kernel
@@ -98,6 +120,16 @@ def end_signal_step(
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
     count_lanes(controlled, rows, worlds.num_owned, observed, outputs.counts)
+    follow_lanes(
+        controlled,
+        rules.served,
+        durations,
+        observed,
+        worlds.ticks,
+        outputs.states,
+        outputs.counts,
+        outputs.history,
+    )
     observe_signals(
         controlled,
         durations,
