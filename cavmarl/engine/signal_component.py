@@ -65,6 +65,7 @@ class SignalComponent:
             durations=ticks_of(config, host.config.clock.sim_dt_s),
             cyclic=config.action == "keep_or_next",
             dt=host.config.clock.sim_dt_s,
+            near_m=config.platoon_m,
             weights=np.array(config.weight_of_each),
         )
         worlds = SignalWorlds(

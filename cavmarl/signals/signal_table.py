@@ -40,6 +40,8 @@ class SignalTable:
         served: weight 1 for each lane that a green opens.
         pressure: for each movement that a green opens, weight 1 for the lane before the signal, and
             -1 for the lane behind it.
+        prolonging: weight 1 for each lane whose detector prolongs a green, by the rule of actuated
+            programs (`roads.sumo_net.detectors`).
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
         arrays: the same for kernels.
         sizes: sizes of the arrays.
@@ -99,6 +101,7 @@ class SignalTable:
             _weights(self.movements, self.opened, greens_max, of_each)
             for of_each in (_of_served_lanes, _of_pressure)
         )
+        self.prolonging = _prolonging(network, chosen, self.arrays.detector, greens_max)
         self.green_s = np.zeros((len(chosen), greens_max))
         for s, row in enumerate(chosen):
             phases = _phases(network, row)
@@ -193,6 +196,26 @@ def _weights(
     for moves, greens in zip(movements, opened, strict=True):
         lists += [of_each(list(map(tuple, moves[is_open].tolist()))) for is_open in greens]
         lists += [{}] * (greens_max - len(greens))
+    return _as_table(lists)
+
+
+def _prolonging(
+    network: RoadNetwork, chosen: Sequence[int], detector: NDArray[np.int32], greens_max: int
+) -> LaneWeights:
+    lane_of = {row: lane for lane, row in enumerate(detector.tolist()) if row >= 0}
+    lists: list[dict[int, int]] = []
+    for row in chosen:
+        phases = _phases(network, row)
+        greens = phases[phases["green"]]
+        for first, count in zip(greens["first_detector"], greens["num_detectors"], strict=True):
+            used = network.phase_detectors[first : first + count].tolist()
+            lists.append({lane_of[number]: 1 for number in used})
+        lists += [{}] * (greens_max - len(greens))
+    return _as_table(lists)
+
+
+def _as_table(lists: Sequence[dict[int, int]]) -> LaneWeights:
+    """Return the weights by lane of each green of each signal as one table."""
     return LaneWeights(
         first=np.cumsum([0, *map(len, lists)], dtype=np.int64),
         lanes=np.array([lane for each in lists for lane in each], dtype=np.int32),

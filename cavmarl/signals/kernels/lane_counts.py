@@ -20,7 +20,8 @@ STANDING = 1
 STOOD_TICKS = 2  # sum of the ticks for which vehicles have stood on this lane
 SPEED_PPM = 3  # sum of speeds as shares of the desired speed, in millionths
 LENGTH_MM = 4  # sum of the lengths of vehicles
-COUNTS = 5
+NEAR_LINE = 5  # vehicles whose front is near the end of the lane
+COUNTS = 6
 
 STANDING_MPS = 0.1  # below this speed a vehicle stands, as in SUMO
 NOT_COUNTED = -1
@@ -55,6 +56,7 @@ def count_standing(
 @kernel
 def count_lanes(
     controlled: ControlledSignals,
+    near_m: float,  # distance from the end of a lane, for NEAR_LINE
     rows: NDArray[np.void],  # VEHICLE (k, W, C)
     num_owned: NDArray[np.int64],  # (k, W)
     chosen: NDArray[np.bool_],  # (W,)
@@ -82,3 +84,5 @@ def count_lanes(
                     found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
                 found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
                 found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+                front_m = row["s"] + 0.5 * row["length"]
+                found[NEAR_LINE] += controlled.length_m[n] - front_m <= near_m

@@ -27,6 +27,7 @@ class SignalRules(NamedTuple):
     durations: SignalTicks
     cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
     dt: float
+    near_m: float  # see `count_lanes`
     weights: NDArray[np.float64]  # (T,) of SIGNAL_TERMS
 
 
@@ -119,7 +120,7 @@ def end_signal_step(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(controlled, rows, worlds.num_owned, observed, outputs.counts)
+    count_lanes(controlled, rules.near_m, rows, worlds.num_owned, observed, outputs.counts)
     follow_lanes(
         controlled,
         rules.served,
