@@ -11,7 +11,6 @@ from gymnasium.envs.registration import EnvSpec
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.spaces import named_observation, observation_parts, observation_space
 
@@ -48,12 +47,8 @@ class WithSpec:
 
 def refuse_signal_agents(config: EnvConfig) -> None:
     """Raise a ConfigError if signals have agents, which the adapter would not show."""
-    if config.signals.have_agents:
-        raise ConfigError(
-            "signals.agents: this adapter gives the agents of vehicles alone; set "
-            f"signals.controller to one of {', '.join(SIGNAL_CONTROLLERS)}, or use make_vec or "
-            "parallel_env"
-        )
+    if refusal := config.signals.refusal_of_agents("this adapter"):
+        raise ConfigError(refusal)
 
 
 class ObservationForm:

@@ -121,6 +121,16 @@ class SignalsConfig(Section, key="signals"):
         """Whether agents of the environment choose them."""
         return self.are_controlled and self.controller == BY_AGENTS
 
+    def refusal_of_agents(self, what: str) -> str:
+        """Return why `what` cannot have agents of signals; empty if no signal has an agent."""
+        if not self.have_agents:
+            return ""
+        choices = ", ".join(SIGNAL_CONTROLLERS)
+        return (
+            f"signals.agents = {self.agents!r}: {what} has agents of vehicles alone; set "
+            f"signals.controller to one of {choices}, or use make_vec or parallel_env"
+        )
+
     @property
     def weight_of_each(self) -> tuple[float, ...]:
         """The weights of all terms, in the order of `SIGNAL_TERMS`."""

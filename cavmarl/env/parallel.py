@@ -167,6 +167,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         except (KeyError, TypeError):
             raise self._no_agent(agent) from None
 
+    def _is_signal(self, agent: str) -> bool:
+        return self._signals is not None and agent in self._signals
+
     def _no_agent(self, agent: object) -> ActionError:
         first, last = self.possible_agents[0], self.possible_agents[-1]
         return ActionError(f"no agent {agent!r}: the ids are {first} … {last} (possible_agents)")
@@ -290,9 +293,10 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             ActionError: there is no such agent, or it has left.
             ConfigError: there is no such cause, or this environment sends no messages.
         """
-        if agent not in self.agents:
+        if agent not in self.agents or self._is_signal(agent):
             raise ActionError(
-                f"declare_event({agent!r}, …): not in the episode; give an id from env.agents"
+                f"declare_event({agent!r}, …): not in the episode; give an id of a vehicle from "
+                "env.agents"
             )
         self._session.events.declare(0, self.possible_agents.index(agent), cause)
 
@@ -302,10 +306,12 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         The arrays are those of `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
-            ActionError: there is no such agent.
+            ActionError: there is no such agent, or it is a signal, which has no sensors.
         """
         if agent not in self.possible_agents:
             raise self._no_agent(agent)
+        if self._is_signal(agent):
+            raise ActionError(f"frames({agent!r}): signals have no sensors; give a vehicle's id")
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
@@ -315,7 +321,10 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         Raises:
             ActionError: the shape, the dtype or a value is wrong.
         """
-        self._session.decoder.check(agent, action)
+        if self._signals is not None and agent in self._signals:
+            self._signals.check(agent, action)
+        else:
+            self._session.decoder.check(agent, action)
 
     def state(self) -> NDArray[np.float32]:
         """Return the global state, within `state_space`: see `engine.spaces.global_state`.

@@ -85,6 +85,16 @@ class SignalAgents:
             for agent, count in zip(self.agents, self.num_choices.tolist(), strict=True)
         }
 
+    def check(self, agent: str, action: Any) -> None:
+        """Raise the ActionError of an action that is no choice of the agent's signal."""
+        s = self._index[agent]
+        if np.shape(action) != () or np.asarray(action).dtype.kind not in "iu":
+            raise ActionError(f"{agent}: the action is {action!r}, must be one whole number")
+        if not 0 <= action < self.num_choices[s]:
+            raise ActionError(
+                f"{agent}: the action is {action}, must be from 0 to {self.num_choices[s] - 1}"
+            )
+
     def from_dict(self, actions: Mapping[str, Any]) -> NDArray[np.int64]:
         """Return the choices (1, S) of one world's agents.
 
@@ -99,14 +109,9 @@ class SignalAgents:
                 f"no action for {', '.join(missing)}: pass one for each signal when "
                 "infos[id]['decides'] is 1, or set action.missing_action = hold"
             )
-        given = [actions.get(agent, KEEP) for agent in self.agents]
-        for agent, value in zip(self.agents, given, strict=True):
-            if not isinstance(value, int | np.integer) and np.shape(value) != ():
-                raise ActionError(
-                    f"{agent}: the action has shape {np.shape(value)}: must be one whole number"
-                )
-        is_given = np.array([agent in actions for agent in self.agents])
-        return self._checked(np.array([given]), is_given[None])
+        for agent in filter(actions.__contains__, self.agents):
+            self.check(agent, actions[agent])
+        return self._allowed(np.array([[actions.get(agent, KEEP) for agent in self.agents]]))
 
     def from_array(self, choices: Any) -> NDArray[np.int64]:
         """Return the choices (W, S) of all worlds.
@@ -120,37 +125,34 @@ class SignalAgents:
                 f"choices of signals have shape {found.shape}: must be {self._keep.shape}, "
                 "(num_envs, number of signals)"
             )
-        return self._checked(found, np.ones(found.shape, dtype=np.bool_))
-
-    def _checked(self, choices: NDArray[Any], is_given: NDArray[np.bool_]) -> NDArray[np.int64]:
-        """Return the choices; KEEP in worlds in which it is not time for a decision."""
-        if choices.dtype.kind not in "iu":
+        if found.dtype.kind not in "iu":
             raise ActionError(
-                f"choices of signals have dtype {choices.dtype}: pass whole numbers (int64)"
+                f"choices of signals have dtype {found.dtype}: pass whole numbers (int64)"
             )
-        reads = is_given & self._arrays.signal_decides[:, None]
-        wrong = reads & ((choices < 0) | (choices >= self.num_choices))
+        reads = np.broadcast_to(self._arrays.signal_decides[:, None], found.shape)
+        wrong = reads & ((found < 0) | (found >= self.num_choices))
         if wrong.any():
             w, s = np.argwhere(wrong)[0].tolist()
             raise ActionError(
-                f"world {w}, {self.agents[s]}: the action is {choices[w, s]}, must be from 0 to "
+                f"world {w}, {self.agents[s]}: the action is {found[w, s]}, must be from 0 to "
                 f"{self.num_choices[s] - 1}"
             )
-        decoded = np.where(reads, choices, KEEP).astype(np.int64)
-        if self._config.forbidden == "error":
-            self._refuse_forbidden(decoded)
-        return decoded
+        return self._allowed(np.where(reads, found, KEEP))
 
-    def _refuse_forbidden(self, choices: NDArray[np.int64]) -> None:
-        index = np.maximum(choices, 0)[..., None]
-        allowed = np.take_along_axis(self._arrays.signal_masks, index, axis=2)[..., 0]
-        wrong = (choices != KEEP) & ~allowed
-        if wrong.any():
-            w, s = np.argwhere(wrong)[0].tolist()
-            raise ActionError(
-                f"world {w}, {self.agents[s]}: the action {choices[w, s]} is not allowed now; "
-                "choose one of the action mask, or set signals.forbidden = ignore"
-            )
+    def _allowed(self, choices: NDArray[Any]) -> NDArray[np.int64]:
+        """Return choices; raise an ActionError for one that its mask excludes, if that is set."""
+        found = choices.astype(np.int64)
+        if self._config.forbidden == "error":
+            index = np.maximum(found, 0)[..., None]
+            may = np.take_along_axis(self._arrays.signal_masks, index, axis=2)[..., 0]
+            wrong = (found != KEEP) & ~may
+            if wrong.any():
+                w, s = np.argwhere(wrong)[0].tolist()
+                raise ActionError(
+                    f"world {w}, {self.agents[s]}: the action {found[w, s]} is not allowed now; "
+                    "choose one of the action mask, or set signals.forbidden = ignore"
+                )
+        return found
 
     def infos(self) -> dict[str, dict[str, Any]]:
         """Return the info of each agent of the first world.

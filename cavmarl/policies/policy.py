@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
@@ -29,11 +28,8 @@ class Policy(ABC):
     """
 
     def __init__(self, env: Environment) -> None:
-        if env.config.signals.have_agents:
-            raise PolicyError(
-                "signals.agents: this policy drives vehicles and chooses no greens; set "
-                f"signals.controller to one of {', '.join(SIGNAL_CONTROLLERS)}"
-            )
+        if refusal := env.config.signals.refusal_of_agents("a policy"):
+            raise PolicyError(refusal)
         self.env = env
 
     def reset(self, seed: int | None = None) -> None:  # noqa: B027 - most have nothing to reset

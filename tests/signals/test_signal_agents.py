@@ -8,6 +8,7 @@ import signal
 import warnings
 from collections import defaultdict
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,7 +19,11 @@ from numpy.typing import NDArray
 from cavmarl import ActionError, CavEnv, CavVectorEnv, ConfigError, make_vec, parallel_env
 from cavmarl.adapters.gymnasium_env import CavEgoEnv
 from cavmarl.adapters.gymnasium_rows import CavAgentRows
+from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import PolicyError
+from cavmarl.cosim.carla.carla_server import serve
+from cavmarl.cosim.carla.hosted_world import LoadedWorlds
+from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.policies.loading import load_policy
 from cavmarl.roads.network import SIGNAL_STATES
@@ -319,7 +324,7 @@ def test_maps_without_a_choice_have_no_agents_of_signals() -> None:
 # Exactness
 
 
-def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
+def hashes(kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any) -> list[str]:
     """Hashes of the states and of everything that the agents of signals get."""
     overrides = ALL | {
         "horizon_s": 30.0,
@@ -327,7 +332,7 @@ def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
         "signals.max_green_s": 10.0,
     }
     vec: CavVectorEnv = make_vec(
-        "grid4x4", num_envs=2, agents=4, background=60, overrides=overrides, **more
+        "grid4x4", num_envs=num_envs, agents=4, background=60, overrides=overrides, **more
     )
     with closing(vec):
         vec.reset(seed=1)
@@ -350,12 +355,17 @@ def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
             ):
                 given.update(np.ascontiguousarray(array).tobytes())
         assert infos["signal_refused"].any()
-        return [*(vec.state_hash(w) for w in range(2)), given.hexdigest()]
+        return [*(vec.state_hash(w) for w in range(num_envs)), given.hexdigest()]
 
 
 @pytest.fixture(scope="module")
 def undivided() -> list[str]:
     return hashes()
+
+
+@pytest.fixture(scope="module")
+def undivided_world() -> list[str]:
+    return hashes(num_envs=1)
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
@@ -364,14 +374,34 @@ def test_a_divided_world_is_the_undivided_one(zones: int, undivided: list[str]) 
 
 
 @pytest.mark.integration
-def test_it_is_the_same_on_workers_of_which_one_is_killed(undivided: list[str]) -> None:
-    assert hashes(zones=4, workers=2, kill_at=(7, 22)) == undivided
+def test_it_is_the_same_on_workers_of_which_one_is_killed(
+    undivided: list[str], undivided_world: list[str]
+) -> None:
+    # workers share out the zones of one world, but whole worlds of several
+    assert hashes(num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
     assert hashes(workers=2, kill_at=(33,)) == undivided
 
 
 @pytest.mark.integration
-def test_over_nodes_it_is_the_same_too(undivided: list[str]) -> None:
-    assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
+def test_over_nodes_it_is_the_same_too(undivided_world: list[str]) -> None:
+    assert hashes(num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
+
+
+def test_a_reset_of_one_world_changes_no_other_world() -> None:
+    def second_world(is_first_reset: bool) -> list[Any]:
+        vec = make_vec("grid4x4", num_envs=2, agents=2, background=60, seed=1, overrides=ALL)
+        with closing(vec):
+            vec.reset(seed=1)
+            found = []
+            for step in range(30):
+                if is_first_reset and step == 17:
+                    vec.reset(options={"reset_mask": np.array([True, False])})
+                vec.step(vec.suggest_actions())
+                found.append(vec.worlds.arrays.signal_counts[1].tolist())
+            assert vec.worlds.arrays.signal_counts[1, :, STOOD_TICKS].any()
+            return [*found, vec.state_hash(1)]
+
+    assert second_world(True) == second_world(False)
 
 
 def test_a_saved_state_continues_with_other_zones() -> None:
@@ -458,8 +488,36 @@ def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
 
 @pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
 def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
-    with pytest.raises(ConfigError, match="this adapter gives the agents of vehicles alone"):
+    with pytest.raises(ConfigError, match="this adapter has agents of vehicles alone; set sig"):
         adapter("grid4x4", overrides=ALL)
+
+
+def test_a_followed_world_refuses_agents_of_signals(tmp_path: Path) -> None:
+    with closing(world()) as env, pytest.raises(ConfigError, match="a followed world has agents"):
+        FollowedWorld(env, tmp_path / "socket")
+
+
+def test_a_world_for_clients_of_carla_refuses_agents_of_signals() -> None:
+    message = "a world for CARLA's clients has agents of vehicles"
+    with closing(world()) as env, pytest.raises(ConfigError, match=message):
+        serve(env)
+    source = LoadedWorlds(WorldSpec.of("grid4x4", agents=1, overrides={"signals.agents": "all"}))
+    with closing(source), pytest.raises(ConfigError, match=message):
+        source.load("grid4x4", 0.05)
+
+
+def test_calls_for_vehicles_name_agents_of_signals() -> None:
+    with closing(world()) as env:
+        env.reset()
+        name = env.signals.agents[0]
+        env.check_action(name, 1)
+        for action, message in ((7, "is 7, must be from 0 to 1"), (0.5, "must be one whole num")):
+            with pytest.raises(ActionError, match=message):
+                env.check_action(name, action)
+        with pytest.raises(ActionError, match="signals have no sensors; give a vehicle's id"):
+            env.frames(name)
+        with pytest.raises(ActionError, match=r"give an id of a vehicle from env\.agents"):
+            env.declare_event(name, "obstacle")
 
 
 @pytest.mark.parametrize("change", [(2.0, 1.0), (0.0, 0.0), (3.0, 0.0)])

@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.env import EnvConfig
 from cavmarl.config.registry import entries, load_config, resolve_maps
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
@@ -205,6 +206,7 @@ class GivenWorld:
     """
 
     def __init__(self, env: CavEnv, path: Path) -> None:
+        _refuse_signal_agents(env.config)
         if source_hash(path) != env.network.source_hash:
             raise ConfigError(f"{path}: not the map of {env.config.name}; name its map file")
         self._env = env
@@ -268,6 +270,7 @@ class LoadedWorlds:
         tick_s = round(step_s, _DIGITS)
         ticks = max(1, -int(-tick_s // _LONGEST_TICK_S))
         config, _ = load_config(spec.env, overrides=spec.overrides)
+        _refuse_signal_agents(config)
         if config.traffic.source == "sumo-traffic":
             served = {**SERVED_WORLD, "population.external": 0}  # SUMO would not see such vehicles
         else:
@@ -308,6 +311,11 @@ class LoadedWorlds:
         if self._env is not None:
             self._env.close()
             self._env = None
+
+
+def _refuse_signal_agents(config: EnvConfig) -> None:
+    if refusal := config.signals.refusal_of_agents("a world for CARLA's clients"):
+        raise ConfigError(refusal)
 
 
 def _map_of(env: CavEnv, path: Path, name: str) -> CarlaMap:

@@ -55,8 +55,8 @@ class FollowedWorld:
         address: path or port to which followers connect.
 
     Raises:
-        ConfigError: the address cannot be opened, a port has no secret, or a trace is given for a
-            world that workers run.
+        ConfigError: the address cannot be opened, a port has no secret, signals have agents, or a
+            trace is given for a world that workers run.
         ClockError: the environment already has a master.
     """
 
@@ -75,6 +75,8 @@ class FollowedWorld:
     ) -> None:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
+        if refusal := env.config.signals.refusal_of_agents("a followed world"):
+            raise ConfigError(refusal)
         self.env = env
         self._reception = Reception(address, secret)
         self.address = self._reception.address

@@ -33,13 +33,15 @@ _LANE_SHIFT = 32
 def count_standing(
     rows: NDArray[np.void],  # VEHICLE (k, W, C), "lane_stood" is updated
     num_owned: NDArray[np.int64],  # (k, W)
-    chosen: NDArray[np.bool_],  # (W,)
     lane_index: NDArray[np.int32],  # see `ControlledSignals`
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has passed
 ) -> None:
-    """Count for each vehicle of the chosen worlds how long it has stood on a watched lane."""
+    """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
     for zone in range(rows.shape[0]):
         for w in range(rows.shape[1]):
-            for i in range(num_owned[zone, w] if chosen[w] else 0):
+            if not chosen[w]:
+                continue
+            for i in range(num_owned[zone, w]):
                 row = rows[zone, w, i]
                 if is_off_lanes(row) or lane_index[row["lane"]] < 0:
                     row["lane_stood"] = NOT_COUNTED

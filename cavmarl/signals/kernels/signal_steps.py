@@ -79,12 +79,12 @@ def end_signal_tick(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
-    chosen: NDArray[np.bool_],  # (W,) worlds whose vehicles are counted
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
     """Set the phases of the present tick, and count vehicles that stand or are detected."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
-    count_standing(rows, worlds.num_owned, chosen, rules.controlled.lane_index)
+    count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
     follow_detectors(
         rules.controlled,
         rules.durations.flow_interval,
@@ -120,7 +120,9 @@ def end_signal_step(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(controlled, rules.near_m, rows, worlds.num_owned, observed, outputs.counts)
+    count_lanes(
+        controlled, rules.near_m, rows, worlds.num_owned, observed, outputs.counts
+    )
     follow_lanes(
         controlled,
         rules.served,
