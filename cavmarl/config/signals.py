@@ -16,7 +16,14 @@ NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
 
 BY_AGENTS: Literal["agents"] = "agents"
-SIGNAL_CONTROLLERS = ("program", "webster", "actuated", "sotl", "longest_queue", "max_pressure")  # see `signals.controllers`
+SIGNAL_CONTROLLERS = (
+    "program",
+    "webster",
+    "actuated",
+    "sotl",
+    "longest_queue",
+    "max_pressure",
+)  # see `signals.controllers`
 WITH_LONGEST_RED = ("longest_queue", "max_pressure")  # controllers that read `longest_red_s`
 
 

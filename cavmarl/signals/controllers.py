@@ -1,8 +1,7 @@
 """Controllers of signals: they choose greens from what agents know about the lanes.
 
-Each controller is for W worlds, and keeps no state of its own: what it remembers of lanes is part of
-the worlds' state. Choices that the mask excludes are
-replaced by the present green.
+Each controller is for W worlds, and keeps no state of its own: what is remembered of lanes is part
+of the worlds' state. Choices that the mask excludes are replaced by the present green.
 """
 
 from __future__ import annotations
@@ -15,8 +14,8 @@ from numpy.typing import NDArray
 
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.errors import ConfigError
-from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
 from cavmarl.signals.kernels.controlled_signals import LaneWeights
+from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
 from cavmarl.signals.kernels.green_rules import find_demanded, find_followers, plan_greens
 from cavmarl.signals.kernels.green_scores import choose_best
 from cavmarl.signals.kernels.lane_counts import VEHICLES
@@ -64,7 +63,9 @@ class ProgramController:
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
         """Begin the next green when the present green has lasted as long as in the program."""
-        return _by_durations(view, np.repeat(view.table.green_s[None], len(view.ticks), axis=0), 0.5 * view.dt)
+        return _by_durations(
+            view, np.repeat(view.table.green_s[None], len(view.ticks), axis=0), 0.5 * view.dt
+        )
 
 
 class Webster:

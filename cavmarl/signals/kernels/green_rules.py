@@ -19,7 +19,9 @@ from cavmarl.signals.kernels.lane_history import (
 # Webster's formula of the cycle, and the usual limits of a cycle.
 LOST_FACTOR, LOST_EXTRA_S = 1.5, 5.0
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 30.0, 120.0
-START_LOSS_S = 2.0  # of a green until vehicles leave at the saturation flow (Highway Capacity Manual)
+START_LOSS_S = (
+    2.0  # of a green until vehicles leave at the saturation flow (Highway Capacity Manual)
+)
 
 
 @kernel

@@ -120,9 +120,7 @@ def end_signal_step(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(
-        controlled, rules.near_m, rows, worlds.num_owned, observed, outputs.counts
-    )
+    count_lanes(controlled, rules.near_m, rows, worlds.num_owned, observed, outputs.counts)
     follow_lanes(
         controlled,
         rules.served,
