@@ -17,7 +17,7 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
-from cavmarl.signals.kernels.lane_history import FLOW, NOT_MEASURED, PASSED, RED_TICKS
+from cavmarl.signals.kernels import lane_history as lanes
 from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
 from tests.support.replayed import BUSY
@@ -386,7 +386,7 @@ def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> Non
     for wrong in (-0.5, 1.5, np.nan):
         _refused(vec, with_value(seen, (0, 0, 0), wrong))
     _refused(vec, with_value(counts, (0, 0, 0), -1))
-    for column, least in ((RED_TICKS, 0), (PASSED, 0), (FLOW, NOT_MEASURED)):
+    for column, least in ((lanes.RED_TICKS, 0), (lanes.PASSED, 0), (lanes.FLOW, -1)):
         _refused(vec, with_value(history, (1, 2, column), least - 1))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
 

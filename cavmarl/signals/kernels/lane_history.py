@@ -48,17 +48,18 @@ def follow_detectors(
     for w in range(ticks.size):
         if not chosen[w]:
             continue
-        before_ms = _milliseconds((ticks[w] - 1) * dt)
-        ends = ticks[w] > 0 and ticks[w] % interval == 0
+        before_s = (ticks[w] - 1) * dt
+        before_ms = _milliseconds(before_s)
         for n in range(controlled.detector.size):
-            lane = history[w, n]
-            if controlled.detector[n] >= 0:
-                seen_ms = _milliseconds(detected_s[w, controlled.detector[n]])
-                lane[PASSED] += lane[DETECTED_MS] < before_ms and seen_ms > before_ms
-                lane[DETECTED_MS] = seen_ms
-            if ends:
-                lane[FLOW] = lane[PASSED]
-                lane[PASSED] = 0
+            detector = controlled.detector[n]
+            if detector >= 0 and detected_s[w, detector] > before_s:
+                lane = history[w, n]
+                lane[PASSED] += lane[DETECTED_MS] < before_ms
+                lane[DETECTED_MS] = _milliseconds(detected_s[w, detector])
+        if ticks[w] > 0 and ticks[w] % interval == 0:
+            for n in range(controlled.detector.size):
+                history[w, n, FLOW] = history[w, n, PASSED]
+                history[w, n, PASSED] = 0
 
 
 @kernel
