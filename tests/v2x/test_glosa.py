@@ -10,19 +10,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from benchmarks.glosa import ADVISED, drive, measure
 from cavmarl import ConfigError, load_policy, make_vec
 from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import observation_parts
 from tests.support.actuated import actuated_grid
 
-HEARS = {
-    "v2x.enabled": True,
-    "v2x.roadside.signals": ["all"],
-    "v2x.channel.range_m": 300.0,
-    "sensors.messages.signal": True,
-    "sensors.messages.timing": True,
-    "population.mode": "respawn",
-}
 KNOWN, GO, LINE, CHANGE, RETURN = 0, 1, 4, 5, 6
 
 
@@ -31,7 +24,7 @@ def told(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
 
     The last column is the time until the letter of the next line changes, without messages.
     """
-    keys = HEARS | {"clock.ctrl_dt_s": 0.2, "sensors.signal.range_m": 200.0} | settings
+    keys = {**ADVISED} | {"clock.ctrl_dt_s": 0.2, "sensors.signal.range_m": 200.0} | settings
     keys |= {"sensors.signal.timing": True}
     vec = make_vec(env, num_envs=1, agents=8, background=0, overrides=keys)
     parts = observation_parts(vec.config.sensors)
@@ -93,34 +86,24 @@ def test_of_chosen_greens_no_times_are_told() -> None:
     assert (heard[is_known, LINE] > 0.0).all()
 
 
-def drive(policy: str, **settings: Any) -> tuple[int, float]:
-    """Stops of all agents in five minutes, and the distance in m that they drive."""
-    vec = make_vec("grid4x4", num_envs=2, agents=12, background=0, overrides=HEARS | settings)
-    driver = load_policy(policy, vec)
-    observations, infos = vec.reset(seed=1)
-    speed_at = observation_parts(vec.config.sensors)["ego"].place.start
-    moved = np.ones((2, 12), dtype=np.bool_)
-    stops, distance_m = 0, 0.0
-    for _ in range(1500):
-        speed = 40.0 * observations[..., speed_at]
-        stands = infos["mask"] & (speed < 0.1)
-        stops += int((stands & moved).sum())
-        distance_m += 0.2 * float(speed[infos["mask"]].sum())
-        moved = ~stands
-        observations, *_, infos = vec.step(driver.act_batch(observations, infos["mask"]))
-    return stops, distance_m
-
-
 def test_glosa_halves_the_stops_at_almost_the_same_speed() -> None:
-    (stops, distance_m), (plain, plain_m) = drive("glosa"), drive("idm")
-    assert plain > 100
-    assert stops < 0.65 * plain
-    assert distance_m > 0.95 * plain_m
+    advised, plain = drive("glosa", agents=12), drive("idm", agents=12)
+    assert plain.stops > 100
+    assert advised.stops < 0.65 * plain.stops
+    assert advised.stood_s < 0.7 * plain.stood_s
+    assert advised.distance_m > 0.95 * plain.distance_m
+    assert advised.co2_g < plain.co2_g
 
 
 def test_without_messages_glosa_drives_as_idm() -> None:
     deaf = {"v2x.channel.loss": 1.0}
-    assert drive("glosa", **deaf) == drive("idm", **deaf)
+    found = (drive(name, agents=12, seconds=60, overrides=deaf) for name in ("glosa", "idm"))
+    assert len(set(found)) == 1
+
+
+def test_the_benchmark_has_a_row_for_each_driver() -> None:
+    rows = measure(agents=[2], worlds=1, seconds=20).rows
+    assert [(row["driver"], row["agents"]) for row in rows] == [("idm", 2), ("glosa", 2)]
 
 
 def test_missing_requirements_are_named() -> None:
