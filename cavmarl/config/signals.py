@@ -17,7 +17,15 @@ NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
 
 BY_AGENTS: Literal["agents"] = "agents"
-SIGNAL_CONTROLLERS = ("program", "longest_queue", "max_pressure")  # see `signals.controllers`
+SIGNAL_CONTROLLERS = (
+    "program",
+    "webster",
+    "actuated",
+    "sotl",
+    "longest_queue",
+    "max_pressure",
+)  # see `signals.controllers`
+WITH_LONGEST_RED = ("longest_queue", "max_pressure")  # controllers that read `longest_red_s`
 
 
 @dataclass(frozen=True)
@@ -34,6 +42,17 @@ class SignalsConfig(Section, key="signals"):
         all_red_s: duration of red for all links, between yellow and the next green.
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
+        longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
+            been red this long before a standing vehicle; 0: they do not.
+        saturation_per_h: `webster`: vehicles per hour of green that leave a lane.
+        flow_interval_s: `webster` plans from the vehicles counted in the last interval of this
+            length.
+        max_gap_s: `actuated` ends a green if its detectors have been free for this long.
+        sotl_vehicle_s: `sotl` ends a green if vehicles on the red lanes of another green have
+            waited this long in total.
+        platoon: `sotl` keeps a green while 1 to this number of vehicles are near its lines; 0: it
+            does not.
+        platoon_m: distance from the line within which they are near.
         greens: which phases of a program are greens. `distinct`: those with a green and no yellow
             letter for vehicles; phases with equal letters count once. `all`: as in sumo-rl, each
             phase without the letter `y` that has any letter but `r` and `s`.
@@ -54,12 +73,21 @@ class SignalsConfig(Section, key="signals"):
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
-    controller: Literal["agents", "program", "longest_queue", "max_pressure"] = BY_AGENTS
+    controller: Literal[
+        "agents", "program", "webster", "actuated", "sotl", "longest_queue", "max_pressure"
+    ] = BY_AGENTS
     decide_s: Annotated[float, Within(0.001, 3600.0)] = 5.0
     yellow_s: Annotated[float, Within(0.0, 60.0)] = 2.0
     all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     min_green_s: Annotated[float, Within(0.0, 3600.0)] = 5.0
     max_green_s: Annotated[float, Within(0.0, 3600.0)] = 60.0
+    longest_red_s: Annotated[float, Within(0.0, 3600.0)] = 0.0
+    saturation_per_h: Annotated[float, Within(100.0, 10_000.0)] = 1800.0
+    flow_interval_s: Annotated[float, Within(1.0, 86400.0)] = 300.0
+    max_gap_s: Annotated[float, Within(0.1, 60.0)] = 3.0
+    sotl_vehicle_s: Annotated[float, Within(0.1, 100_000.0)] = 40.0
+    platoon: Annotated[int, Whole(0, 1000)] = 3
+    platoon_m: Annotated[float, Within(0.0, 1000.0)] = 25.0
     greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
@@ -88,6 +116,12 @@ class SignalsConfig(Section, key="signals"):
             "max_green_s",
             self.max_green_s == 0.0 or self.max_green_s >= self.min_green_s,
             f"must be 0, or at least signals.min_green_s = {self.min_green_s:g}",
+        )
+        self.need(
+            "longest_red_s",
+            self.longest_red_s == 0.0 or self.controller in (BY_AGENTS, *WITH_LONGEST_RED),
+            f"has no effect on signals.controller = {self.controller}, only on "
+            f"{' and '.join(WITH_LONGEST_RED)}; set it to 0, or choose one of these",
         )
         for name, weight in self.terms.items():
             if name not in SIGNAL_TERMS:
@@ -124,7 +158,10 @@ class SignalsConfig(Section, key="signals"):
 
     def check_clock(self, sim_dt_s: float, ctrl_dt_s: float) -> None:
         """Raise a ConfigError for a time that is not a whole number of ticks or of steps."""
-        for name in ("yellow_s", "all_red_s", "min_green_s", "max_green_s"):
+        for name in (
+            "yellow_s", "all_red_s", "min_green_s", "max_green_s", "longest_red_s",
+            "flow_interval_s",
+        ):  # fmt: skip
             self._check_multiple(name, "ticks of clock.sim_dt_s", sim_dt_s)
         self._check_multiple("decide_s", "steps of clock.ctrl_dt_s", ctrl_dt_s)
 

@@ -14,6 +14,7 @@ from cavmarl.engine.signal_sensing import SignalSensing
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.kernels.lane_history import FLOW, HISTORY, NOT_MEASURED
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
@@ -60,13 +61,16 @@ class SignalComponent:
             decides=host.zeros(num_worlds, dtype=np.bool_),
             counts=host.zeros((num_worlds, sizes.lanes, COUNTS), dtype=np.int64),
             states=host.zeros((*signals, HELD), dtype=np.int64),
+            history=host.zeros((num_worlds, sizes.lanes, HISTORY), dtype=np.int64),
             loops=host.zeros(loops_shape(config, num_worlds, sizes), dtype=np.int64),
         )
         rules = SignalRules(
             controlled=self.table.arrays,
+            served=self.table.served,
             durations=ticks_of(config, host.config.clock.sim_dt_s),
             cyclic=config.action == "keep_or_next",
             dt=host.config.clock.sim_dt_s,
+            near_m=config.platoon_m,
             weights=np.array(config.weight_of_each),
         )
         worlds = SignalWorlds(
@@ -74,6 +78,7 @@ class SignalComponent:
             controllers=first.worlds.controllers,
             keys=first.worlds.keys,
             signal_phase=first.worlds.signal_phase,
+            detected_s=first.worlds.detected_s,
             rows=zoned.rows,
             sides=first.row_sides,
             num_owned=zoned.num_owned,
@@ -113,6 +118,8 @@ class SignalComponent:
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
+        self.outputs.history[chosen] = 0
+        self.outputs.history[chosen, :, FLOW] = NOT_MEASURED
         self._stood[chosen] = 0
         self._sensing.reset(chosen)
         self._chosen[:] = chosen
@@ -140,17 +147,24 @@ class SignalComponent:
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""
         outputs = self.outputs
-        kept = outputs.states, self._stood, outputs.observations, outputs.counts
+        kept = (
+            outputs.states,
+            self._stood,
+            outputs.observations,
+            outputs.counts,
+            outputs.history,
+        )
         return iter((*kept, *self._sensing.kept))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with saved arrays; empty if nothing."""
-        states, stood, observations, counts, *loops = saved
+        states, stood, observations, counts, history, *loops = saved
         num_greens = self.table.arrays.num_greens
         for column in (PREVIOUS, GREEN):
             if ((states[..., column] < 0) | (states[..., column] >= num_greens)).any():
                 return "a signal shows a green that it does not have"
-        numbers = states[..., [SINCE, REFUSED]], stood, counts, *loops
+        least = np.where(np.arange(HISTORY) == FLOW, NOT_MEASURED, 0)
+        numbers = states[..., [SINCE, REFUSED]], stood, counts, history - least, *loops
         if any(((each < 0) | (each > _MOST)).any() for each in numbers):
             return "a time or a count of a signal is negative or too large"
         if not ((observations >= 0.0) & (observations <= 1.0)).all():

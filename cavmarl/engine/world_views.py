@@ -135,6 +135,7 @@ class WorldViews:
             states=outputs.states,
             masks=outputs.masks,
             decides=outputs.decides,
+            history=outputs.history,
             loops=outputs.loops,
         )
 

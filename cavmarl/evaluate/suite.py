@@ -59,7 +59,12 @@ def load_suite(path: Path) -> Suite:
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     listed = [*_found(suite, maps)]
-    found = {Path(name).name.split(".")[0]: env for name, env in listed}
+    names = [Path(name).name for name, _ in listed]
+    stems = [name.partition(".")[0] for name in names]
+    found = {  # an environment and a file may have the same stem
+        stem if stems.count(stem) == 1 else name: env
+        for stem, name, (_, env) in zip(stems, names, listed, strict=True)
+    }
     if len(found) < len(listed):
         raise ConfigError(f"maps = {suite.maps!r}: two maps have the same name; rename a file")
     if suite.agents is None:

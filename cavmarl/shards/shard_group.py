@@ -327,6 +327,7 @@ class GroupCalls:
             objects=messages.objects,
             events=messages.events,
             signal=messages.signal,
+            timing=messages.timing,
             scale_m=messages.range_m,
             tick_s=self._config.clock.sim_dt_s,
             stack=self._config.sensors.stack,

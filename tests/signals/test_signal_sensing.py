@@ -15,6 +15,7 @@ from cavmarl import CavVectorEnv, ConfigError, make_vec
 from cavmarl.engine.world_description import describe_world
 from cavmarl.signals.kernels.lane_counts import (
     LENGTH_MM,
+    NEAR_LINE,
     SPEED_PPM,
     STANDING,
     STOOD_TICKS,
@@ -83,6 +84,13 @@ def ways_m(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.float64]:
     return np.array(found)
 
 
+def near_line(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Whether the front of each vehicle is within `signals.platoon_m` of the end of its lane."""
+    to_end = vec.network.lanes["length_m"][rows["lane"]] - rows["s"] - 0.5 * rows["length"]
+    near: NDArray[np.bool_] = to_end <= vec.config.signals.platoon_m
+    return near
+
+
 def sums(rows: NDArray[np.void], lanes: NDArray[np.int64], num: int) -> NDArray[np.int64]:
     """Numbers of vehicles and of standing vehicles by lane."""
     standing = lanes[np.abs(rows["speed"]) < 0.1]
@@ -105,6 +113,10 @@ def test_a_camera_counts_the_vehicles_within_its_range() -> None:
             counts = vec.signals.view.counts[0]
             expected = sums(rows[is_near], lanes[is_near], len(counts))
             np.testing.assert_array_equal(counts[:, [VEHICLES, STANDING]], expected)
+            near = lanes[is_near & near_line(vec, rows)]
+            np.testing.assert_array_equal(
+                counts[:, NEAR_LINE], np.bincount(near, minlength=len(counts))
+            )
         assert beyond > 500
 
 
@@ -248,6 +260,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             # A vehicle that stands at the line is known, and the estimate is never more than fits.
             covered = vec.signals.view.loops[0, :, EXIT, FREE_TICKS] == 0
             assert (counts[covered, VEHICLES] > 0).all()
+            np.testing.assert_array_equal(counts[:, NEAR_LINE], covered)
             assert counts[:, VEHICLES].max() <= 7
         for column, least in ((VEHICLES, 0.8), (STANDING, 0.7)):
             one, other = (np.array(each)[..., column].ravel() for each in (guessed, true))
@@ -303,11 +316,12 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
             elif tick % 5 == 0:
                 assert before is not None
                 # The newest message is of the tick before the decision.
-                found = counts[:, [VEHICLES, STANDING]]
+                found = counts[:, [VEHICLES, STANDING, NEAR_LINE]]
                 differing += int(np.abs(found - before).sum())
                 total += int(before.sum())
             rows, lanes = watched(vec)
-            before = sums(rows, lanes, len(counts))
+            near = np.bincount(lanes[near_line(vec, rows)], minlength=len(counts))
+            before = np.column_stack([sums(rows, lanes, len(counts)), near])
         assert total > 500
         assert differing < 0.03 * total  # vehicles that change lanes, or are in two inboxes
 

@@ -72,7 +72,7 @@ def count_by_cameras(
                 uniform(worlds.keys[w], row["id"], worlds.ticks[w], STREAM_CAMERA) < cameras.misses
             )
             if not is_missed and not _is_hidden(cameras, i):
-                count_vehicle(rules.controlled, row, found["lane"], counts[w])
+                count_vehicle(rules.controlled, rules.near_m, row, found["lane"], counts[w])
 
 
 @kernel

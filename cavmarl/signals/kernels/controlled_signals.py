@@ -21,6 +21,15 @@ class ControlledSignals(NamedTuple):
     lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N; -1: not watched
     length_m: NDArray[np.float64]  # (N,)
     speed_mps: NDArray[np.float64]  # (N,) speed limits
+    detector: NDArray[np.int32]  # (N,) DETECTOR rows of lanes before the signals; -1: none
+
+
+class LaneWeights(NamedTuple):
+    """Weights of lanes for each green of each signal, in CSR form."""
+
+    first: NDArray[np.int64]  # (S · G + 1,) entries of green g of signal s: from s · G + g
+    lanes: NDArray[np.int32]  # (num_entries,) indices of watched lanes
+    weights: NDArray[np.int64]  # (num_entries,)
 
 
 class LanePosts(NamedTuple):
@@ -39,3 +48,5 @@ class SignalTicks(NamedTuple):
     all_red: int
     min_green: int
     max_green: int  # 0: no maximum
+    longest_red: int  # 0: no limit
+    flow_interval: int

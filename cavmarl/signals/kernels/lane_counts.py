@@ -20,7 +20,8 @@ STANDING = 1
 STOOD_TICKS = 2  # sum of the ticks for which vehicles have stood on this lane
 SPEED_PPM = 3  # sum of speeds as shares of the desired speed, in millionths
 LENGTH_MM = 4  # sum of the lengths of vehicles
-COUNTS = 5
+NEAR_LINE = 5  # vehicles whose front is near the end of the lane
+COUNTS = 6
 
 STANDING_MPS = 0.1  # below this speed a vehicle stands, as in SUMO
 NOT_COUNTED = -1
@@ -31,6 +32,7 @@ _LANE_SHIFT = 32
 @kernel
 def count_vehicle(
     controlled: ControlledSignals,
+    near_m: float,  # see `count_lanes`
     row: np.void,  # VEHICLE
     lane: int,  # index of a watched lane
     counts: NDArray[np.int64],  # (N, COUNTS) updated
@@ -45,6 +47,8 @@ def count_vehicle(
         found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
     found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
     found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+    front_m = row["s"] + 0.5 * row["length"]
+    found[NEAR_LINE] += controlled.length_m[lane] - front_m <= near_m
 
 
 @kernel
@@ -89,6 +93,7 @@ def count_standing(
 @kernel
 def count_lanes(
     controlled: ControlledSignals,
+    near_m: float,  # distance from the end of a lane, for NEAR_LINE
     rows: NDArray[np.void],  # VEHICLE (k, W, C)
     num_owned: NDArray[np.int64],  # (k, W)
     chosen: NDArray[np.bool_],  # (W,)
@@ -106,4 +111,4 @@ def count_lanes(
                     continue
                 n = controlled.lane_index[row["lane"]]
                 if n >= 0:
-                    count_vehicle(controlled, row, n, counts[w])
+                    count_vehicle(controlled, near_m, row, n, counts[w])

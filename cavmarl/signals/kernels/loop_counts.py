@@ -15,6 +15,7 @@ from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals
 from cavmarl.signals.kernels.lane_counts import (
     LENGTH_MM,
+    NEAR_LINE,
     SPEED_PPM,
     STANDING,
     VEHICLES,
@@ -146,6 +147,7 @@ def estimate_by_loops(
             found[STANDING] = standing
             found[SPEED_PPM] = (vehicles - standing) * 1_000_000
             found[LENGTH_MM] = vehicles * CAR_MM
+            found[NEAR_LINE] = leaves[FREE_TICKS] == 0
             estimate_standing_time(rules.durations.decide, found)
 
 

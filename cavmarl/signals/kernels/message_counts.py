@@ -14,6 +14,7 @@ from cavmarl.core.math.geometry import project
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals
 from cavmarl.signals.kernels.lane_counts import (
     LENGTH_MM,
+    NEAR_LINE,
     SPEED_PPM,
     STANDING,
     STANDING_MPS,
@@ -65,7 +66,7 @@ def count_by_messages(
             box = inboxes[w, units.receivers[s]]
             num = 0
             while num < box.size and box[num]["sender"] >= 0:
-                n = _lane_of(controlled, units, s, box[num])
+                n, along_m = _lane_of(controlled, units, s, box[num])
                 if n >= 0:
                     found, speed = counts[w, n], abs(box[num]["speed"])
                     found[VEHICLES] += 1
@@ -73,6 +74,8 @@ def count_by_messages(
                     share = speed / controlled.speed_mps[n]
                     found[SPEED_PPM] += math.floor(share * 1e6 + 0.5)
                     found[LENGTH_MM] += math.floor(box[num]["length"] * 1e3 + 0.5)
+                    front_m = along_m + 0.5 * box[num]["length"]
+                    found[NEAR_LINE] += controlled.length_m[n] - front_m <= rules.near_m
                 num += 1
             units.full[0] += num == box.size
         for n in range(counts.shape[1]):
@@ -80,10 +83,12 @@ def count_by_messages(
 
 
 @kernel
-def _lane_of(controlled: ControlledSignals, units: UnitLanes, s: int, report: np.void) -> int:
-    """Return the lane among those of signal s on which a reported vehicle is; -1: none."""
+def _lane_of(
+    controlled: ControlledSignals, units: UnitLanes, s: int, report: np.void
+) -> tuple[int, float]:
+    """Return the lane of signal s on which a reported vehicle is, -1: none, and the place in m."""
     cos, sin = cos_sin(report["heading"])
-    found, least_m = -1, math.inf
+    found, place_m, least_m = -1, 0.0, math.inf
     for k in range(units.first[s], units.first[s + 1]):
         n = units.lanes[k]
         along_m, beside_m, lane_cos, lane_sin = project(
@@ -95,5 +100,5 @@ def _lane_of(controlled: ControlledSignals, units: UnitLanes, s: int, report: np
             and abs(beside_m) < least_m
             and cos * lane_cos + sin * lane_sin >= LEAST_ALONG
         ):
-            found, least_m = n, abs(beside_m)
-    return found
+            found, place_m, least_m = n, along_m, abs(beside_m)
+    return found, place_m

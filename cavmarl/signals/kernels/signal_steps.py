@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LaneWeights,
+    SignalTicks,
+)
 from cavmarl.signals.kernels.green_choices import choose_greens, mask_choices, show_greens
 from cavmarl.signals.kernels.lane_counts import count_lanes, count_standing
+from cavmarl.signals.kernels.lane_history import follow_detectors, follow_lanes
 from cavmarl.signals.kernels.signal_observations import observe_signals, reward_signals
 
 
@@ -18,9 +23,11 @@ class SignalRules(NamedTuple):
     """The signals whose greens are chosen, and the rules for choices, for kernels."""
 
     controlled: ControlledSignals
+    served: LaneWeights  # see `SignalTable`
     durations: SignalTicks
     cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
     dt: float
+    near_m: float  # see `count_lanes`
     weights: NDArray[np.float64]  # (T,) of SIGNAL_TERMS
 
 
@@ -31,6 +38,7 @@ class SignalWorlds(NamedTuple):
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers)
     keys: NDArray[np.uint64]  # (W,)
     signal_phase: NDArray[np.int32]  # (W, num_signals)
+    detected_s: NDArray[np.float64]  # (W, D)
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
     sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
     num_owned: NDArray[np.int64]  # (k, W)
@@ -51,6 +59,7 @@ class SignalOutputs(NamedTuple):
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
     counts: NDArray[np.int64]  # (W, N, COUNTS) see `signals.kernels.lane_counts`
     states: NDArray[np.int64]  # (W, S, HELD) see `signals.kernels.green_choices`
+    history: NDArray[np.int64]  # (W, N, HISTORY) see `signals.kernels.lane_history`
     # (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; (W, 0, …) without
     loops: NDArray[np.int64]
 
@@ -76,10 +85,19 @@ def end_signal_tick(
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
-    """Set the phases of the present tick, and count how long vehicles have stood."""
+    """Set the phases of the present tick, and count vehicles that stand or are detected."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
     count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
+    follow_detectors(
+        rules.controlled,
+        rules.durations.flow_interval,
+        rules.dt,
+        chosen,
+        worlds.ticks,
+        worlds.detected_s,
+        outputs.history,
+    )
 
 
 @kernel
@@ -104,7 +122,7 @@ def count_truth(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(rules.controlled, rows, worlds.num_owned, observed, truth)
+    count_lanes(rules.controlled, rules.near_m, rows, worlds.num_owned, observed, truth)
 
 
 @kernel
@@ -119,6 +137,16 @@ def observe_and_reward(
     rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
 ) -> None:
     """Write the observations from what is known of the lanes, and the rewards from the truth."""
+    follow_lanes(
+        rules.controlled,
+        rules.served,
+        rules.durations,
+        observed,
+        worlds.ticks,
+        outputs.states,
+        outputs.counts,
+        outputs.history,
+    )
     observe_signals(
         rules.controlled,
         rules.durations,
