@@ -70,8 +70,8 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 134_100
-REACHABLE_LINES = 83_500  # from `make_vec` and `parallel_env`
+PACKAGE_LINES = 134_700
+REACHABLE_LINES = 84_100  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name, too

@@ -40,25 +40,27 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 # Rules, on a view with values set by hand
 
 
+def view_of(vec: CavVectorEnv) -> SignalView:
+    """The signals after 100 s, of which their first green has lasted for 20 s."""
+    vec.reset(seed=0)
+    given = vec.signals.view
+    states, history = np.zeros_like(given.states), np.zeros_like(given.history)
+    states[..., SINCE] = 500 - 110  # 2 s of yellow, and 20 s of green
+    history[..., FLOW] = NOT_MEASURED
+    return given._replace(
+        ticks=given.ticks + 500,
+        states=states,
+        counts=np.zeros_like(given.counts),
+        history=history,
+        masks=np.ones_like(given.masks),
+        decides=np.ones_like(given.decides),
+    )
+
+
 @pytest.fixture
 def view() -> Iterator[SignalView]:
-    """Signal A0 of grid4x4: 100 s of a run, of which its green 0 has lasted for 20 s."""
-    vec = make_vec("grid4x4", num_envs=1, agents=0, background=0, overrides=ALL)
-    with closing(vec):
-        vec.reset(seed=0)
-        given = vec.signals.view
-        ticks, states = given.ticks + 500, np.zeros_like(given.states)
-        states[..., SINCE] = 500 - 110  # 2 s of yellow, and 20 s of green
-        history = np.zeros_like(given.history)
-        history[..., FLOW] = NOT_MEASURED
-        yield given._replace(
-            ticks=ticks,
-            states=states,
-            counts=np.zeros_like(given.counts),
-            history=history,
-            masks=np.ones_like(given.masks),
-            decides=np.ones_like(given.decides),
-        )
+    with closing(make_vec("grid4x4", num_envs=1, agents=0, background=0, overrides=ALL)) as vec:
+        yield view_of(vec)
 
 
 def lanes_of(view: SignalView, green: int) -> list[int]:
@@ -75,9 +77,9 @@ def lasted(view: SignalView, green_s: float) -> SignalView:
     return view._replace(states=states)
 
 
-def choice(name: str, view: SignalView, **keys: Any) -> int:
+def choice(name: str, view: SignalView, s: int = 0, **keys: Any) -> int:
     config = view.config.__class__(agents="all", **keys)
-    return int(make_controller(name).choose(view._replace(config=config))[0, 0])
+    return int(make_controller(name).choose(view._replace(config=config))[0, s])
 
 
 def test_webster_divides_the_cycle_by_critical_flows(view: SignalView) -> None:
@@ -97,6 +99,27 @@ def test_webster_divides_the_cycle_by_critical_flows(view: SignalView) -> None:
     assert choice("webster", late, decide_s=1.0, saturation_per_h=900.0) == 1
     late = lasted(view, (120.0 - 8.0) / 3.0 + 2.0 - 0.4)
     assert choice("webster", late, decide_s=1.0, saturation_per_h=900.0) == 0
+
+
+def test_webster_counts_a_lane_of_several_greens_in_equal_parts() -> None:
+    with closing(make_vec("town", num_envs=1, agents=0, background=0, overrides=ALL)) as vec:
+        view = view_of(vec)
+        table = view.table
+        s, lane, openers = next(
+            (s, lane, openers.tolist())
+            for s, (moves, opened) in enumerate(zip(table.movements, table.opened, strict=True))
+            for lane in moves[:, 0].tolist()
+            if len(openers := np.flatnonzero(opened[:, moves[:, 0] == lane].any(axis=1))) == 2
+        )
+        view.history[0, :, FLOW] = 0
+        view.history[0, lane, FLOW] = 60  # Y = 0.4, 0.2 for each of the two greens
+        lost_s = 4.0 * len(table.greens[s])
+        cycle_s = max(30.0, (1.5 * lost_s + 5.0) / 0.6)
+        green_s = (cycle_s - lost_s) / 2.0 + 2.0
+        for green in openers:
+            view.states[0, s, GREEN] = green
+            assert choice("webster", lasted(view, green_s - 0.7), s, decide_s=1.0) == green
+            assert choice("webster", lasted(view, green_s - 0.3), s, decide_s=1.0) != green
 
 
 def test_webster_follows_the_program_before_a_flow_is_known(view: SignalView) -> None:
@@ -191,6 +214,24 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
             assert (history[:, PASSED] == counted).all()
             since_ms = history[:, DETECTED_MS] - last  # it may leave between two ticks
             assert ((since_ms >= 0) & (since_ms <= 200)).all()
+
+
+def test_vehicles_near_the_line_are_counted() -> None:
+    keys = ALL | {"signals.platoon_m": 30.0, "signals.decide_s": 1.0}
+    vec = make_vec("grid4x4", num_envs=1, agents=0, background=150, overrides=keys)
+    with closing(vec):
+        vec.reset(seed=2)
+        table, total = vec.signals.table, 0
+        for _ in range(20):
+            vec.step({"signals": np.zeros((1, len(table.ids)), int)})
+            rows = vec.simulation.vehicles(0)
+            n = table.arrays.lane_index[rows["lane"]]
+            rows, n = rows[n >= 0], n[n >= 0]
+            left_m = table.arrays.length_m[n] - rows["s"] - 0.5 * rows["length"]
+            expected = np.bincount(n[left_m <= 30.0], minlength=len(table.lanes))
+            assert (vec.signals.view.counts[0, :, NEAR_LINE] == expected).all()
+            total += expected.sum()
+        assert total > 100
 
 
 def test_red_lanes_are_followed_until_they_open() -> None:
