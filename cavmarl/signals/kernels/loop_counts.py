@@ -117,7 +117,7 @@ def estimate_by_loops(
     loops: Loops,
     chosen: NDArray[np.bool_],  # (W,)
     readings: NDArray[np.int64],  # (W, N, 2, READINGS), overwritten in the chosen worlds
-    counts: NDArray[np.int64],  # (W, N, COUNTS) of the decision before, overwritten likewise
+    counts: NDArray[np.int64],  # (W, N, COUNTS) of the decision before, overwritten, too
 ) -> None:
     """Write the readings of the loops, and estimate the vehicles between the two loops of a lane.
 

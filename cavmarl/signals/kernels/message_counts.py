@@ -1,4 +1,4 @@
-"""Counts of the vehicles of which the roadside units at signals have received messages."""
+"""Counts of the vehicles in the messages that roadside units at signals have received."""
 
 from __future__ import annotations
 
