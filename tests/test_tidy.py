@@ -70,7 +70,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 134_700
+PACKAGE_LINES = 134_800
 REACHABLE_LINES = 84_100  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
