@@ -70,8 +70,8 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 132_700
-REACHABLE_LINES = 82_300  # from `make_vec` and `parallel_env`
+PACKAGE_LINES = 134_800
+REACHABLE_LINES = 84_100  # from `make_vec` and `parallel_env`
 
 # Module names that occur more than once, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name

@@ -22,6 +22,7 @@ from cavmarl.cli.output import (
     Policies,
     Repeats,
     Seed,
+    Settings,
     about,
     grid,
     make_folder,
@@ -66,6 +67,7 @@ def suite(
     episodes: Episodes = 4,
     repeats: Repeats = 5,
     seed: Seed = 0,
+    settings: Settings = None,
     imports: Imports = None,
     out: Annotated[
         Path,
@@ -94,7 +96,7 @@ def suite(
                 worlds,
                 repeats=repeats,
                 seed=seed,
-                overrides=parse_settings(None, imports),
+                overrides=parse_settings(settings, imports),
                 began=lambda world: told(places[world.label], len(worlds)),
             )
         for label, found in figures.items():
@@ -111,7 +113,7 @@ def suite(
             episodes=episodes,
             repeats=repeats,
             seed=seed,
-            overrides=parse_settings(None, imports),
+            overrides=parse_settings(settings, imports),
             began=lambda world: told(places[world.label], len(worlds)),
         )
     console.print(_table(reports))

@@ -161,6 +161,7 @@ class EnvConfig(Section, key=""):
             self.v2x.check_clock(self.clock.sim_dt_s)
         if self.signals.are_controlled:
             self.signals.check_clock(self.clock.sim_dt_s, self.clock.ctrl_dt_s)
+            self.signals.check_messages(self.v2x)
         self._check_messages()
         if self.observation.mode == "messages":
             self._drop_sight()

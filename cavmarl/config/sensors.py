@@ -284,13 +284,19 @@ class MessagesConfig(
         objects: number of vehicles known from messages, the nearest ones; 0: none.
         events: number of events known from messages, the nearest ones; 0: none.
         signal: adds the message of the roadside unit at the next signal on the route.
+        timing: adds to it the distance to the stop line and the times at which its signal changes.
         range_m: distance that is scaled to 1; greater distances are clipped to 1.
     """
 
     objects: Annotated[int, Whole(0, 64)] = 0
     events: Annotated[int, Whole(0, 64)] = 0
     signal: bool = False
+    timing: bool = False
     range_m: Annotated[float, Within(1.0, 10_000.0)] = 100.0
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self.need("timing", self.signal or not self.timing, "needs sensors.messages.signal = true")
 
 
 @dataclass(frozen=True)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within, check_finite
+from cavmarl.config.v2x import V2xConfig
 from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
@@ -16,7 +17,15 @@ NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
 
 BY_AGENTS: Literal["agents"] = "agents"
-SIGNAL_CONTROLLERS = ("program", "longest_queue", "max_pressure")  # see `signals.controllers`
+SIGNAL_CONTROLLERS = (
+    "program",
+    "webster",
+    "actuated",
+    "sotl",
+    "longest_queue",
+    "max_pressure",
+)  # see `signals.controllers`
+WITH_LONGEST_RED = ("longest_queue", "max_pressure")  # controllers that read `longest_red_s`
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,17 @@ class SignalsConfig(Section, key="signals"):
         all_red_s: duration of red for all links, between yellow and the next green.
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
+        longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
+            been red this long before a standing vehicle; 0: they do not.
+        saturation_per_h: `webster`: vehicles per hour of green that leave a lane.
+        flow_interval_s: `webster` plans from the vehicles counted in the last interval of this
+            length.
+        max_gap_s: `actuated` ends a green if its detectors have been free for this long.
+        sotl_vehicle_s: `sotl` ends a green if vehicles on the red lanes of another green have
+            waited this long in total.
+        platoon: `sotl` keeps a green while 1 to this number of vehicles are near its lines; 0: it
+            does not.
+        platoon_m: distance from the line within which they are near.
         greens: which phases of a program are greens. `distinct`: those with a green and no yellow
             letter for vehicles; phases with equal letters count once. `all`: as in sumo-rl, each
             phase without the letter `y` that has any letter but `r` and `s`.
@@ -41,21 +61,42 @@ class SignalsConfig(Section, key="signals"):
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
+        sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
+            the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
+            has received. Rewards are those of the truth in any case.
+        loop_upstream_m: distance from the stop line to the loop before it.
+        camera_range_m: how far from the signal a camera sees, along a lane.
+        camera_height_m: height of a camera above the road.
+        camera_misses: probability that a camera misses a vehicle at a decision.
         overrides: number of links at whose signals the caller may show states of its own in a world
             at the same time (`SignalOverrides`).
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
-    controller: Literal["agents", "program", "longest_queue", "max_pressure"] = BY_AGENTS
+    controller: Literal[
+        "agents", "program", "webster", "actuated", "sotl", "longest_queue", "max_pressure"
+    ] = BY_AGENTS
     decide_s: Annotated[float, Within(0.001, 3600.0)] = 5.0
     yellow_s: Annotated[float, Within(0.0, 60.0)] = 2.0
     all_red_s: Annotated[float, Within(0.0, 60.0)] = 0.0
     min_green_s: Annotated[float, Within(0.0, 3600.0)] = 5.0
     max_green_s: Annotated[float, Within(0.0, 3600.0)] = 60.0
+    longest_red_s: Annotated[float, Within(0.0, 3600.0)] = 0.0
+    saturation_per_h: Annotated[float, Within(100.0, 10_000.0)] = 1800.0
+    flow_interval_s: Annotated[float, Within(1.0, 86400.0)] = 300.0
+    max_gap_s: Annotated[float, Within(0.1, 60.0)] = 3.0
+    sotl_vehicle_s: Annotated[float, Within(0.1, 100_000.0)] = 40.0
+    platoon: Annotated[int, Whole(0, 1000)] = 3
+    platoon_m: Annotated[float, Within(0.0, 1000.0)] = 25.0
     greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
+    sensing: Literal["truth", "loops", "camera", "v2x"] = "truth"
+    loop_upstream_m: Annotated[float, Within(5.0, 1000.0)] = 50.0
+    camera_range_m: Annotated[float, Within(1.0, 1000.0)] = 50.0
+    camera_height_m: Annotated[float, Within(1.0, 100.0)] = 8.0
+    camera_misses: Annotated[float, Within(0.0, 1.0)] = 0.0
     overrides: Annotated[int, Whole(0, 100_000)] = 0
 
     def __post_init__(self) -> None:
@@ -75,6 +116,12 @@ class SignalsConfig(Section, key="signals"):
             "max_green_s",
             self.max_green_s == 0.0 or self.max_green_s >= self.min_green_s,
             f"must be 0, or at least signals.min_green_s = {self.min_green_s:g}",
+        )
+        self.need(
+            "longest_red_s",
+            self.longest_red_s == 0.0 or self.controller in (BY_AGENTS, *WITH_LONGEST_RED),
+            f"has no effect on signals.controller = {self.controller}, only on "
+            f"{' and '.join(WITH_LONGEST_RED)}; set it to 0, or choose one of these",
         )
         for name, weight in self.terms.items():
             if name not in SIGNAL_TERMS:
@@ -111,9 +158,21 @@ class SignalsConfig(Section, key="signals"):
 
     def check_clock(self, sim_dt_s: float, ctrl_dt_s: float) -> None:
         """Raise a ConfigError for a time that is not a whole number of ticks or of steps."""
-        for name in ("yellow_s", "all_red_s", "min_green_s", "max_green_s"):
+        for name in (
+            "yellow_s", "all_red_s", "min_green_s", "max_green_s", "longest_red_s",
+            "flow_interval_s",
+        ):  # fmt: skip
             self._check_multiple(name, "ticks of clock.sim_dt_s", sim_dt_s)
         self._check_multiple("decide_s", "steps of clock.ctrl_dt_s", ctrl_dt_s)
+
+    def check_messages(self, v2x: V2xConfig) -> None:
+        """Raise a ConfigError if signals need messages, but vehicles do not send any."""
+        self.need(
+            "sensing",
+            self.sensing != "v2x" or (v2x.enabled and v2x.cam.rate_hz > 0.0),
+            "vehicles send no messages: set v2x.enabled to true, v2x.cam.rate_hz above 0, and "
+            "v2x.roadside.signals to [all]",
+        )
 
     def _check_multiple(self, name: str, unit: str, unit_s: float) -> None:
         ratio = getattr(self, name) / unit_s

@@ -28,7 +28,8 @@ class CompiledStep:
         for _ in range(group.first.config.clock.ticks_per_step):
             self._add_tick(self._ticks)
         for part in self._signals:
-            self._ticks.call(part.end_step)
+            for call in part.step_calls:
+                self._ticks.call(call)
         if group.calls.has_agents:
             self._add_sense(self._ticks)
 
@@ -60,7 +61,8 @@ class CompiledStep:
         if tick.shared.has_signals:
             sequence.call(tick.shared.signal_switch(tick.common))
         for part in self._signals:
-            sequence.call(part.end_tick)
+            for call in part.tick_calls:
+                sequence.call(call)
 
     def _add_leave(self, sequence: CallSequence) -> None:
         """Append the calls of `Tick.leave`."""

@@ -10,21 +10,26 @@ from numpy.typing import NDArray
 
 from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.compiled.bound_call import bind
+from cavmarl.engine.signal_sensing import SignalSensing
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.green_choices import GREEN, HELD, KEEP, PREVIOUS, REFUSED, SINCE
 from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.kernels.lane_history import FLOW, HISTORY, NOT_MEASURED
 from cavmarl.signals.kernels.signal_steps import (
     SignalOutputs,
     SignalRules,
     SignalWorlds,
     begin_signal_step,
-    end_signal_step,
+    count_truth,
     end_signal_tick,
+    observe_and_reward,
 )
+from cavmarl.signals.sensing import loops_shape
 from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 if TYPE_CHECKING:
     from cavmarl.engine.component import ComponentContext
+    from cavmarl.engine.v2x_component import V2xComponent
 
 _MOST = 1 << 40  # ticks and counts in a saved state
 
@@ -35,11 +40,11 @@ class SignalComponent:
     Attributes:
         table: the signals whose greens are chosen.
         outputs: state of the signals, and results for their agents.
-        end_tick: the call at the end of a tick.
-        end_step: the call at the end of a step, after `end_tick`.
+        tick_calls: the calls at the end of a tick.
+        step_calls: the calls at the end of a step, after `tick_calls`.
     """
 
-    def __init__(self, host: ComponentContext) -> None:
+    def __init__(self, host: ComponentContext, messages: V2xComponent | None) -> None:
         config, num_worlds = host.config.signals, host.num_worlds
         self.table = SignalTable(host.network)
         sizes = self.table.sizes
@@ -56,18 +61,24 @@ class SignalComponent:
             decides=host.zeros(num_worlds, dtype=np.bool_),
             counts=host.zeros((num_worlds, sizes.lanes, COUNTS), dtype=np.int64),
             states=host.zeros((*signals, HELD), dtype=np.int64),
+            history=host.zeros((num_worlds, sizes.lanes, HISTORY), dtype=np.int64),
+            loops=host.zeros(loops_shape(config, num_worlds, sizes), dtype=np.int64),
         )
         rules = SignalRules(
             controlled=self.table.arrays,
+            served=self.table.served,
             durations=ticks_of(config, host.config.clock.sim_dt_s),
             cyclic=config.action == "keep_or_next",
             dt=host.config.clock.sim_dt_s,
+            near_m=config.platoon_m,
             weights=np.array(config.weight_of_each),
         )
         worlds = SignalWorlds(
             ticks=first.worlds.ticks,
             controllers=first.worlds.controllers,
+            keys=first.worlds.keys,
             signal_phase=first.worlds.signal_phase,
+            detected_s=first.worlds.detected_s,
             rows=zoned.rows,
             sides=first.row_sides,
             num_owned=zoned.num_owned,
@@ -76,33 +87,45 @@ class SignalComponent:
         self._choices = np.full(signals, KEEP, dtype=np.int64)
         self._chosen = np.ones(num_worlds, dtype=np.bool_)
         self._rewarded = np.ones(1, dtype=np.bool_)
-        self._begin_step = bind(begin_signal_step, rules, worlds, self.outputs, self._choices)
-        self.end_tick = bind(end_signal_tick, rules, worlds, self.outputs, self._chosen)
-        self.end_step = bind(
-            end_signal_step,
-            rules,
-            worlds,
-            self.outputs,
-            self._chosen,
-            self._stood,
-            np.zeros(num_worlds, dtype=np.bool_),
-            self._rewarded,
+        known = rules, worlds, self.outputs
+        observed = np.zeros(num_worlds, dtype=np.bool_)
+        self._sensing = SignalSensing(
+            host, messages, self.table, *known, chosen=self._chosen, observed=observed
+        )
+        truth = self._sensing.truth
+        self._begin_step = bind(begin_signal_step, *known, self._choices)
+        self.tick_calls = (bind(end_signal_tick, *known, self._chosen), *self._sensing.tick_calls)
+        self.step_calls = (
+            bind(count_truth, *known, self._chosen, observed, truth),
+            *self._sensing.step_calls,
+            bind(
+                observe_and_reward,
+                *known,
+                self._chosen,
+                observed,
+                truth,
+                self._stood,
+                self._rewarded,
+            ),
         )
 
     @property
     def reads_all(self) -> tuple[str, ...]:
-        """`end` reads the vehicles of all zones before a decision; `reset` always does."""
-        decides: bool = (self._ticks % self._decide_ticks == 0).any()
+        """`end` reads the vehicles of all zones before a decision, or always; `reset` always."""
+        decides: bool = self._sensing.reads_ticks or (self._ticks % self._decide_ticks == 0).any()
         return ("reset", "end") if decides else ("reset",)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin with the first green of each signal in the chosen worlds (W,)."""
         self.outputs.states[chosen] = 0
+        self.outputs.history[chosen] = 0
+        self.outputs.history[chosen, :, FLOW] = NOT_MEASURED
         self._stood[chosen] = 0
+        self._sensing.reset(chosen)
         self._chosen[:] = chosen
-        self.end_tick()
         self._rewarded[:] = False
-        self.end_step()
+        for call in (*self.tick_calls, *self.step_calls):
+            call()
         self._chosen[:] = self._rewarded[:] = True
 
     def begin(self, commands: Commands) -> None:
@@ -114,23 +137,34 @@ class SignalComponent:
 
     def end(self) -> None:
         """Set the phases of the next tick, count standing vehicles, and observe after a step."""
-        self.end_tick()
+        for call in self.tick_calls:
+            call()
         if self._ticks.item(0) % self._ticks_per_step == 0:
-            self.end_step()
+            for call in self.step_calls:
+                call()
+            self._sensing.tell_of_full_inboxes()
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the states of the signals, and what their agents saw at the last decision."""
         outputs = self.outputs
-        return iter((outputs.states, self._stood, outputs.observations, outputs.counts))
+        kept = (
+            outputs.states,
+            self._stood,
+            outputs.observations,
+            outputs.counts,
+            outputs.history,
+        )
+        return iter((*kept, *self._sensing.kept))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with saved arrays; empty if nothing."""
-        states, stood, observations, counts = saved
+        states, stood, observations, counts, history, *loops = saved
         num_greens = self.table.arrays.num_greens
         for column in (PREVIOUS, GREEN):
             if ((states[..., column] < 0) | (states[..., column] >= num_greens)).any():
                 return "a signal shows a green that it does not have"
-        numbers = states[..., [SINCE, REFUSED]], stood, counts
+        least = np.where(np.arange(HISTORY) == FLOW, NOT_MEASURED, 0)
+        numbers = states[..., [SINCE, REFUSED]], stood, counts, history - least, *loops
         if any(((each < 0) | (each > _MOST)).any() for each in numbers):
             return "a time or a count of a signal is negative or too large"
         if not ((observations >= 0.0) & (observations <= 1.0)).all():

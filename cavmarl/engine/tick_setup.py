@@ -79,6 +79,7 @@ def make_tick(
 def attach(host: ComponentContext) -> tuple[Component, ...]:
     """Make the components that the environment configures, in the order in which they act."""
     parts: list[Component] = []
+    messages = V2xComponent(host) if host.config.v2x.enabled else None
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.population.external:
@@ -86,11 +87,11 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
     if host.config.signals.overrides:
         parts.append(OverrideComponent(host))
     if host.config.signals.are_controlled:
-        parts.append(SignalComponent(host))
+        parts.append(SignalComponent(host, messages))
     if host.config.rig:
         parts.append(RigComponent(host))
-    if host.config.v2x.enabled:
-        parts.append(V2xComponent(host))
+    if messages is not None:
+        parts.append(messages)
     return tuple(parts)
 
 

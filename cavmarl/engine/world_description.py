@@ -45,6 +45,9 @@ def describe_world(
         "zones": partition.count,
         "zone_simulators": describe_simulators(config.zones.simulators, partition.count),
         "zones_content_sha256": partition.content_hash,
+        "signals": {"observed": config.signals.sensing, "rewarded": "truth"}
+        if config.signals.are_controlled
+        else "their programs",
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled
         else "none: there are no messages between vehicles",

@@ -136,6 +136,8 @@ class WorldViews:
             states=outputs.states,
             masks=outputs.masks,
             decides=outputs.decides,
+            history=outputs.history,
+            loops=outputs.loops,
         )
 
     @property

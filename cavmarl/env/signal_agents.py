@@ -64,6 +64,8 @@ class SignalAgents:
             states=arrays.signal_states,
             masks=arrays.signal_masks,
             decides=arrays.signal_decides,
+            history=arrays.signal_history,
+            loops=arrays.signal_loops,
         )
 
     def suggest(self) -> NDArray[np.int64]:

@@ -59,7 +59,12 @@ def load_suite(path: Path) -> Suite:
 
 def worlds_of(suite: Suite, maps: Path) -> list[SuiteWorld]:
     listed = [*_found(suite, maps)]
-    found = {Path(name).name.split(".")[0]: env for name, env in listed}
+    names = [Path(name).name for name, _ in listed]
+    stems = [name.partition(".")[0] for name in names]
+    found = {  # an environment and a file may have the same stem
+        stem if stems.count(stem) == 1 else name: env
+        for stem, name, (_, env) in zip(stems, names, listed, strict=True)
+    }
     if len(found) < len(listed):
         raise ConfigError(f"maps = {suite.maps!r}: two maps have the same name; rename a file")
     if suite.agents is None:
@@ -113,11 +118,12 @@ def run_suite(
     are as in `evaluate`.
     """
     reports = {}
-    keys: dict[str, object] = dict(overrides or {})
+    keys: dict[str, object] = {}
     if suite.agents is not None:
         keys["population.mode"] = "respawn"
     if suite.horizon_s is not None:
         keys["horizon_s"] = suite.horizon_s
+    keys |= overrides or {}
     for world in worlds:
         began(world)
         reports[world.label] = evaluate(
@@ -165,7 +171,7 @@ def run_signals(
         own = dict(keys)
         is_sumo = world.env.endswith(".sumocfg")
         if suite.background is not None or is_sumo:
-            own["population.background"] = 0 if is_sumo else suite.background
+            own.setdefault("population.background", 0 if is_sumo else suite.background)
         figures = {
             controller: run_controller(
                 world.env, controller, seconds=seconds, seeds=seeds, overrides=own

@@ -252,6 +252,7 @@ class GroupCalls:
             "objects": messages.objects,
             "events": messages.events,
             "signal": messages.signal,
+            "timing": messages.timing,
             "scale_m": messages.range_m,
         }
         return bind_by_name(group_phases.observe_messages_each, self.values | own)

@@ -6,16 +6,15 @@ each ordered pair of greens.
 
 from __future__ import annotations
 
-import hashlib
 import logging
 from collections.abc import Sequence
-from dataclasses import replace
 from functools import cache
 from typing import NamedTuple
 
 from cavmarl.config.signals import ALL_SIGNALS, SignalsConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.roads.sumo_net.signal_plans import remade
 from cavmarl.roads.sumo_net.signal_rows import ControlledPhase, SignalRows
 
 AGENT_PROGRAM = "agent"
@@ -97,12 +96,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
     for name in chosen:
         program = AgentProgram(greens[name], config.yellow_s > 0.0, config.all_red_s > 0.0)
         rows.add_controlled(name, AGENT_PROGRAM, program.phases(config), program.cycle_s(config))
-    words = (network.source_hash, *chosen, repr(config))
-    return replace(
-        network,
-        source_hash=hashlib.sha256("\0".join(words).encode()).hexdigest(),
-        **rows.arrays()._asdict(),
-    )
+    return remade(network, rows, (network.source_hash, *chosen, repr(config)))
 
 
 def greens_of(

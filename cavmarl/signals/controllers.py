@@ -1,7 +1,7 @@
 """Controllers of signals: they choose greens from what agents know about the lanes.
 
-Each controller is for W worlds, and keeps no state of its own. Choices that the mask excludes are
-replaced by the present green.
+Each controller is for W worlds, and keeps no state of its own: what is remembered of lanes is part
+of the worlds' state. Choices that the mask excludes are replaced by the present green.
 """
 
 from __future__ import annotations
@@ -14,10 +14,12 @@ from numpy.typing import NDArray
 
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.errors import ConfigError
+from cavmarl.signals.kernels.controlled_signals import LaneWeights
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP, SINCE
-from cavmarl.signals.kernels.green_scores import LaneWeights, choose_best
+from cavmarl.signals.kernels.green_rules import find_demanded, find_followers, plan_greens
+from cavmarl.signals.kernels.green_scores import choose_best
 from cavmarl.signals.kernels.lane_counts import VEHICLES
-from cavmarl.signals.signal_table import SignalTable
+from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 
 class SignalView(NamedTuple):
@@ -29,10 +31,14 @@ class SignalView(NamedTuple):
         table: greens, lanes and movements of S signals.
         observations: (W, S, D) as agents get them.
         ticks: (W,) since the reset.
-        counts: (W, N, COUNTS) of the watched lanes; see `signals.kernels.lane_counts`.
+        counts: (W, N, COUNTS) of the watched lanes, as far as `signals.sensing` knows them; see
+            `signals.kernels.lane_counts`.
         states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.
+        history: (W, N, HISTORY) of the watched lanes; see `signals.kernels.lane_history`.
+        loops: (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; without
+            loops, (W, 0, 2, READINGS).
     """
 
     config: SignalsConfig
@@ -44,6 +50,8 @@ class SignalView(NamedTuple):
     states: NDArray[np.int64]
     masks: NDArray[np.bool_]
     decides: NDArray[np.bool_]
+    history: NDArray[np.int64]
+    loops: NDArray[np.int64]
 
 
 class SignalController(Protocol):
@@ -59,12 +67,74 @@ class ProgramController:
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
         """Begin the next green when the present green has lasted as long as in the program."""
+        return _by_durations(
+            view, np.repeat(view.table.green_s[None], len(view.ticks), axis=0), 0.5 * view.dt
+        )
+
+
+class Webster:
+    """Follows the order of the greens, with durations from measured flows.
+
+    Until the first `signals.flow_interval_s` has ended, the durations are those of the programs.
+
+    Source: Webster, "Traffic signal settings" (1958).
+    """
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Begin the next green at the decision nearest to the end of the planned duration."""
+        config, table = view.config, view.table
+        green_s = np.repeat(view.table.green_s[None], len(view.ticks), axis=0)
+        saturation = config.saturation_per_h * config.flow_interval_s / 3600.0
+        change_s = config.yellow_s + config.all_red_s
+        plan_greens(
+            table.served,
+            table.arrays.num_greens,
+            np.bincount(table.served.lanes, minlength=len(table.lanes)),
+            saturation,
+            change_s,
+            view.history,
+            green_s,
+        )
+        return _by_durations(view, green_s, 0.5 * config.decide_s)
+
+
+class Actuated:
+    """Follows the order of the greens, and ends a green at a gap between vehicles.
+
+    Its detectors, and the greens that each prolongs, are those of SUMO's actuated programs.
+    """
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Begin the next green if no detector of the present one was occupied for the gap."""
+        follows = np.empty(view.states.shape[:2], dtype=np.bool_)
+        gap_ms = round(1e3 * view.config.max_gap_s)
+        find_followers(
+            view.table.prolonging, gap_ms, view.dt, view.ticks, view.states, view.history, follows
+        )
         green = view.states[..., GREEN]
-        num_greens = view.table.arrays.num_greens
-        change_s = view.config.yellow_s + view.config.all_red_s
-        lasted_s = (view.ticks[:, None] - view.states[..., SINCE]) * view.dt - change_s
-        due_s = view.table.green_s[np.arange(len(num_greens)), green]
-        wanted = np.where(lasted_s >= due_s - 0.5 * view.dt, (green + 1) % num_greens, green)
+        return _choices(view, np.where(follows, green, (green + 1) % view.table.arrays.num_greens))
+
+
+class Sotl:
+    """Lets vehicles at red lights demand a green, unless this separates a platoon (SOTL-platoon).
+
+    Sources: Gershenson, "Self-organizing traffic lights" (2005); Cools, Gershenson and D'Hooghe,
+        "Self-organizing traffic lights: A realistic simulation" (2013).
+    """
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Choose the most demanded green, or keep the present one."""
+        wanted = np.empty(view.states.shape[:2], dtype=np.int64)
+        find_demanded(
+            view.table.served,
+            view.table.arrays.num_greens,
+            round(view.config.sotl_vehicle_s / view.dt),
+            view.config.platoon,
+            view.counts,
+            view.states,
+            view.history,
+            wanted,
+        )
         return _choices(view, wanted)
 
 
@@ -90,6 +160,9 @@ class MaxPressure:
 
 CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # the names of SIGNAL_CONTROLLERS
     "program": ProgramController,
+    "webster": Webster,
+    "actuated": Actuated,
+    "sotl": Sotl,
     "longest_queue": LongestQueue,
     "max_pressure": MaxPressure,
 }
@@ -114,15 +187,33 @@ def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
     choose_best(
         weights,
         VEHICLES,
+        view.table.served,
+        ticks_of(view.config, view.dt).longest_red,
         view.config.action == "keep_or_next",
         view.table.arrays.num_greens,
         view.counts,
+        view.history,
         view.states,
         view.masks,
         view.decides,
         choices,
     )
     return choices
+
+
+def _by_durations(
+    view: SignalView, green_s: NDArray[np.float64], early_s: float
+) -> NDArray[np.int64]:
+    """Begin the next green if the present one has lasted its duration of (W or 1, S, G).
+
+    `early_s`: time before the end of the duration from which the next green may begin.
+    """
+    green = view.states[..., GREEN]
+    change_s = view.config.yellow_s + view.config.all_red_s
+    lasted_s = (view.ticks[:, None] - view.states[..., SINCE]) * view.dt - change_s
+    due_s = np.take_along_axis(green_s, green[..., None], axis=2)[..., 0]
+    is_over = lasted_s >= due_s - early_s
+    return _choices(view, np.where(is_over, (green + 1) % view.table.arrays.num_greens, green))
 
 
 def _keeps(view: SignalView) -> NDArray[np.bool_]:

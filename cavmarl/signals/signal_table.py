@@ -11,8 +11,12 @@ from numpy.typing import NDArray
 from cavmarl.config.signals import SignalsConfig
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.network import RoadNetwork
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
-from cavmarl.signals.kernels.green_scores import LaneWeights
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LanePosts,
+    LaneWeights,
+    SignalTicks,
+)
 
 
 class SignalSizes(NamedTuple):
@@ -37,8 +41,11 @@ class SignalTable:
         served: weight 1 for each lane that a green opens.
         pressure: for each movement that a green opens, weight 1 for the lane before the signal, and
             -1 for the lane behind it.
+        prolonging: weight 1 for each lane whose detector prolongs a green, by the rule of actuated
+            programs (`roads.sumo_net.detectors`).
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
         arrays: the same for kernels.
+        posts: where each of `lanes` is observed.
         sizes: sizes of the arrays.
     """
 
@@ -89,12 +96,15 @@ class SignalTable:
             lane_index=lane_index,
             length_m=network.lanes["length_m"][lane_row],
             speed_mps=network.lanes["speed_mps"][lane_row],
+            detector=_detectors(network, incoming, self.movements, self.opened, len(index)),
         )
+        self.posts = _posts(incoming, outgoing, network.lanes[lane_row])
         greens_max = int(self.arrays.num_greens.max(initial=0))
         self.served, self.pressure = (
             _weights(self.movements, self.opened, greens_max, of_each)
             for of_each in (_of_served_lanes, _of_pressure)
         )
+        self.prolonging = _prolonging(network, chosen, self.arrays.detector, greens_max)
         self.green_s = np.zeros((len(chosen), greens_max))
         for s, row in enumerate(chosen):
             phases = _phases(network, row)
@@ -116,6 +126,8 @@ def ticks_of(config: SignalsConfig, sim_dt_s: float) -> SignalTicks:
         all_red=round(config.all_red_s / sim_dt_s),
         min_green=round(config.min_green_s / sim_dt_s),
         max_green=round(config.max_green_s / sim_dt_s),
+        longest_red=round(config.longest_red_s / sim_dt_s),
+        flow_interval=round(config.flow_interval_s / sim_dt_s),
     )
 
 
@@ -136,6 +148,30 @@ def _phases(network: RoadNetwork, row: int) -> NDArray[np.void]:
     program = network.programs[network.signals["program"][row]]
     first = int(program["first_phase"])
     return network.phases[first : first + program["num_phases"]]
+
+
+def _detectors(
+    network: RoadNetwork,
+    incoming: Sequence[Sequence[int]],
+    movements: Sequence[NDArray[np.int64]],
+    opened: Sequence[NDArray[np.bool_]],
+    num_lanes: int,
+) -> NDArray[np.int32]:
+    """Return the DETECTOR row of each watched lane.
+
+    The programs of these signals are the last of the network, so their detectors are too: for each
+    signal, one for each incoming lane that a green opens (`place_detectors`).
+    """
+    detected = [
+        lane
+        for lanes, moves, greens in zip(incoming, movements, opened, strict=True)
+        for lane in lanes
+        if greens[:, moves[:, 0] == lane].any()
+    ]
+    found = np.full(num_lanes, -1, dtype=np.int32)
+    count = len(network.detectors)
+    found[detected] = np.arange(count - len(detected), count)
+    return found
 
 
 def _of_served_lanes(moves: list[tuple[int, int]]) -> dict[int, int]:
@@ -163,11 +199,45 @@ def _weights(
     for moves, greens in zip(movements, opened, strict=True):
         lists += [of_each(list(map(tuple, moves[is_open].tolist()))) for is_open in greens]
         lists += [{}] * (greens_max - len(greens))
+    return _as_table(lists)
+
+
+def _prolonging(
+    network: RoadNetwork, chosen: Sequence[int], detector: NDArray[np.int32], greens_max: int
+) -> LaneWeights:
+    lane_of = {row: lane for lane, row in enumerate(detector.tolist()) if row >= 0}
+    lists: list[dict[int, int]] = []
+    for row in chosen:
+        phases = _phases(network, row)
+        greens = phases[phases["green"]]
+        for first, count in zip(greens["first_detector"], greens["num_detectors"], strict=True):
+            used = network.phase_detectors[first : first + count].tolist()
+            lists.append({lane_of[number]: 1 for number in used})
+        lists += [{}] * (greens_max - len(greens))
+    return _as_table(lists)
+
+
+def _as_table(lists: Sequence[dict[int, int]]) -> LaneWeights:
+    """Return the weights by lane of each green of each signal as one table."""
     return LaneWeights(
         first=np.cumsum([0, *map(len, lists)], dtype=np.int64),
         lanes=np.array([lane for each in lists for lane in each], dtype=np.int32),
         weights=np.array([weight for each in lists for weight in each.values()], dtype=np.int64),
     )
+
+
+def _posts(
+    incoming: list[list[int]], outgoing: list[list[int]], lanes: NDArray[np.void]
+) -> LanePosts:
+    """Return where lanes, LANE (N,), are observed; both lists have the lanes of each signal."""
+    signal = np.full(len(lanes), -1, dtype=np.int32)
+    leads_in = np.zeros(len(lanes), dtype=np.bool_)
+    for lists, is_in in ((incoming, True), (outgoing, False)):
+        for s, row in enumerate(lists):
+            new = [lane for lane in row if signal[lane] < 0]
+            signal[new], leads_in[new] = s, is_in
+    line_m = np.where(leads_in, lanes["length_m"] - lanes["stop_back_m"], 0.0)
+    return LanePosts(signal, leads_in, line_m)
 
 
 def _padded(lists: list[list[int]]) -> NDArray[np.int32]:

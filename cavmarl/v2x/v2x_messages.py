@@ -34,6 +34,7 @@ from cavmarl.config.v2x import EVERY_SIGNAL, RoadsideConfig, V2xConfig
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.records import record
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.signal_places import links_of_signal, place_of_signal, stop_lines
 from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
@@ -306,29 +307,16 @@ def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]
     units = np.zeros(len(names), UNIT)
     for unit, name in zip(units, names, strict=True):
         signal = known.index(name)
-        ends = _stop_lines(network, signal)
         unit["signal"] = signal
-        if len(ends):
-            unit["x"], unit["y"], unit["z"] = (ends[axis].mean() for axis in ("x", "y", "z"))
+        unit["x"], unit["y"], unit["z"] = place_of_signal(network, signal)
     return units
-
-
-def _links(network: RoadNetwork, signal: int) -> NDArray[np.intp]:
-    return np.flatnonzero(network.links["signal"] == signal)
-
-
-def _stop_lines(network: RoadNetwork, signal: int) -> NDArray[np.void]:
-    """Return the last POINT of the lane before each link of a signal."""
-    lanes = network.lanes[network.links["from_lane"][_links(network, signal)]]
-    ends: NDArray[np.void] = network.points[lanes["first_point"] + lanes["num_points"] - 1]
-    return ends
 
 
 def map_of(network: RoadNetwork, units: NDArray[np.void], unit: int) -> NDArray[np.void]:
     """Return MAP (n,): the approaches to a roadside unit's signal, which never change."""
     signal = int(units[unit]["signal"])
-    rows = _links(network, signal)
-    ends = _stop_lines(network, signal)
+    rows = links_of_signal(network, signal)
+    ends = stop_lines(network, signal)
     found = np.zeros(len(rows), MAP)
     found["sender"] = FIRST_ROADSIDE_ID + unit
     found["signal"] = signal

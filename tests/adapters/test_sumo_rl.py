@@ -613,6 +613,7 @@ def test_arguments_without_an_effect_warn_once(routes: str, name: str, value: An
         ({"additional_sumo_cmd": "-b 7"}, ConfigError, "begin is set by another argument"),
         ({"render_mode": "ansi"}, ConfigError, "render_mode = 'ansi'"),
         ({"overrides": {"signals.wings": 1}}, ConfigError, "signals.wings"),
+        ({"overrides": {"signals.sensing": "loops"}}, ConfigError, "must be truth: sumo-rl's"),
     ],
 )
 def test_impossible_arguments_are_refused(

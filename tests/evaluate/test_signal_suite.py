@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import json
 import os
 import subprocess
 from dataclasses import asdict
@@ -130,3 +131,26 @@ def test_the_suite_prints_a_table(tmp_path: Path) -> None:
         assert f'"{name}"' in content
     refused = CliRunner().invoke(app, ["suite", str(suite), "--policy", "idm"])
     assert refused.exit_code != 0
+
+
+def test_a_suite_takes_further_keys(tmp_path: Path) -> None:
+    suite = tmp_path / "small.yaml"
+    suite.write_text(
+        "maps: [grid4x4]\ncontrollers: [longest_queue]\nbackground: 90\nhorizon_s: 300\n"
+    )
+
+    def delay_s(*keys: str) -> float:
+        path = tmp_path / "figures.json"
+        settings = [word for key in keys for word in ("--set", key)]
+        arguments = ["suite", str(suite), "--repeats", "1", "--json", str(path), *settings]
+        found = CliRunner().invoke(app, arguments)
+        assert found.exit_code == 0, found.output
+        figures = json.loads(path.read_text())["grid4x4"]["longest_queue"]
+        return float(figures[0]["delay_of_all_s"])
+
+    # A camera that misses every vehicle lets the first green stay.
+    blind = ("signals.sensing=camera", "signals.camera_misses=1", "signals.max_green_s=0")
+    assert delay_s(*blind) > 2.0 * delay_s()
+    refused = CliRunner().invoke(app, ["suite", str(suite), "--set", "horizon_s=9"])
+    assert isinstance(refused.exception, ConfigError)
+    assert "horizon_s: the simulated time is given" in str(refused.exception)

@@ -58,6 +58,14 @@ def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
         worlds_of(load_suite(file), ROOT / "envs")
 
 
+def test_a_file_with_the_name_of_an_environment_keeps_its_suffix(tmp_path: Path) -> None:
+    file = tmp_path / "mine.yaml"
+    file.write_text("maps: [merge, ring]\nmore_maps: [ring.net.xml]\n")
+    (tmp_path / "ring.net.xml").write_bytes((ROOT / "envs/ring/map/map.net.xml").read_bytes())
+    found = worlds_of(load_suite(file), tmp_path)
+    assert [world.label for world in found] == ["merge", "ring", "ring.net.xml"]
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -17,6 +17,7 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.signals.kernels import lane_history as lanes
 from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
 from tests.support.replayed import BUSY
@@ -366,7 +367,8 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
 
 
 def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> None:
-    vec = make("grid4x4", num_envs=2, zones=2, overrides={"signals.agents": "all"})
+    keys = {"signals.agents": "all", "signals.sensing": "loops"}
+    vec = make("grid4x4", num_envs=2, zones=2, overrides=keys)
     vec.reset(seed=1)
     for _ in range(12):
         vec.step(vec.suggest_actions())
@@ -377,13 +379,18 @@ def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> Non
         (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(wanted)]
         return at
 
-    at, seen, counts = map(place, (outputs.states, outputs.observations, outputs.counts))
+    found = outputs.states, outputs.observations, outputs.counts, outputs.history
+    at, seen, counts, history = map(place, found)
     for column, value in ((0, -1), (0, 2), (1, 2), (1, MANY), (2, -1), (2, 1 << 41), (3, -1)):
         _refused(vec, with_value(at, (1, 3, column), value))
     _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting
     for wrong in (-0.5, 1.5, np.nan):
         _refused(vec, with_value(seen, (0, 0, 0), wrong))
     _refused(vec, with_value(counts, (0, 0, 0), -1))
+    for column, least in ((lanes.RED_TICKS, 0), (lanes.PASSED, 0), (lanes.FLOW, -1)):
+        _refused(vec, with_value(history, (1, 2, column), least - 1))
+    _refused(vec, with_value(counts + 2, (0, 0, 0, 0), -1))  # state of the loops
+    _refused(vec, with_value(place(outputs.loops), (1, 3, 1, 2), 1 << 41))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
 
     def due(state: State) -> None:

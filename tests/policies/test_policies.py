@@ -119,6 +119,11 @@ NEEDED = {
         "sensors.conflicts.heard": True,
         "sensors.signal.enabled": True,
     },
+    "glosa": {
+        "v2x.enabled": True,
+        "sensors.messages.signal": True,
+        "sensors.messages.timing": True,
+    },
     "reference": {"rig": REFERENCE_RIG},
 }
 

@@ -324,13 +324,38 @@ def test_maps_without_a_choice_have_no_agents_of_signals() -> None:
 # Exactness
 
 
-def hashes(kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any) -> list[str]:
+SENSING: dict[str, dict[str, Any]] = {
+    "truth": {},
+    "loops": {"signals.sensing": "loops", "signals.loop_upstream_m": 40.0},
+    "camera": {
+        "signals.sensing": "camera",
+        "signals.camera_range_m": 120.0,
+        "signals.camera_height_m": 4.0,
+        "signals.camera_misses": 0.2,
+        "population.types": ["car", "truck"],
+    },
+    "v2x": {
+        "signals.sensing": "v2x",
+        "v2x.enabled": True,
+        "v2x.equipped": 0.6,
+        "v2x.cam.rate_hz": 5.0,
+        "v2x.denm.rate_hz": 5.0,
+        "v2x.roadside.signals": ["all"],
+        "v2x.roadside.rate_hz": 5.0,
+        "v2x.channel.range_m": 150.0,
+        "v2x.channel.loss": 0.3,
+        "v2x.channel.latency_ticks": 1,
+        "v2x.inbox.objects": 32,
+    },
+}
+
+
+def hashes(
+    sensing: str = "truth", kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any
+) -> list[str]:
     """Hashes of the states and of everything that the agents of signals get."""
-    overrides = ALL | {
-        "horizon_s": 30.0,
-        "sensors.signal.timing": True,
-        "signals.max_green_s": 10.0,
-    }
+    overrides = ALL | SENSING[sensing]
+    overrides |= {"horizon_s": 30.0, "sensors.signal.timing": True, "signals.max_green_s": 10.0}
     vec: CavVectorEnv = make_vec(
         "grid4x4", num_envs=num_envs, agents=4, background=60, overrides=overrides, **more
     )
@@ -352,44 +377,55 @@ def hashes(kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any) -> lis
                 infos["signal_terms"],
                 infos["signal_refused"],
                 infos["final_observations"]["signals"],
+                vec.signals.view.counts,
+                vec.signals.view.loops,
             ):
                 given.update(np.ascontiguousarray(array).tobytes())
         assert infos["signal_refused"].any()
         return [*(vec.state_hash(w) for w in range(num_envs)), given.hexdigest()]
 
 
-@pytest.fixture(scope="module")
-def undivided() -> list[str]:
-    return hashes()
+@pytest.fixture(scope="module", params=SENSING)
+def sensing(request: pytest.FixtureRequest) -> str:
+    return str(request.param)
 
 
 @pytest.fixture(scope="module")
-def undivided_world() -> list[str]:
-    return hashes(num_envs=1)
+def undivided(sensing: str) -> list[str]:
+    return hashes(sensing)
+
+
+@pytest.fixture(scope="module")
+def undivided_world(sensing: str) -> list[str]:
+    return hashes(sensing, num_envs=1)
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_a_divided_world_is_the_undivided_one(zones: int, undivided: list[str]) -> None:
-    assert hashes(zones=zones) == undivided
+def test_a_divided_world_is_the_undivided_one(
+    zones: int, sensing: str, undivided: list[str]
+) -> None:
+    assert hashes(sensing, zones=zones) == undivided
 
 
 @pytest.mark.integration
 def test_it_is_the_same_on_workers_of_which_one_is_killed(
-    undivided: list[str], undivided_world: list[str]
+    sensing: str, undivided: list[str], undivided_world: list[str]
 ) -> None:
     # workers share out the zones of one world, but whole worlds of several
-    assert hashes(num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
-    assert hashes(workers=2, kill_at=(33,)) == undivided
+    assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
+    assert hashes(sensing, workers=2, kill_at=(33,)) == undivided
 
 
 @pytest.mark.integration
-def test_over_nodes_it_is_the_same_too(undivided_world: list[str]) -> None:
-    assert hashes(num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
+def test_over_nodes_it_is_the_same_too(sensing: str, undivided_world: list[str]) -> None:
+    assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
 
 
-def test_a_reset_of_one_world_changes_no_other_world() -> None:
+def test_a_reset_of_one_world_changes_no_other_world(sensing: str) -> None:
+    overrides = ALL | SENSING[sensing]
+
     def second_world(is_first_reset: bool) -> list[Any]:
-        vec = make_vec("grid4x4", num_envs=2, agents=2, background=60, seed=1, overrides=ALL)
+        vec = make_vec("grid4x4", num_envs=2, agents=2, background=60, overrides=overrides)
         with closing(vec):
             vec.reset(seed=1)
             found = []
@@ -404,16 +440,17 @@ def test_a_reset_of_one_world_changes_no_other_world() -> None:
     assert second_world(True) == second_world(False)
 
 
-def test_a_saved_state_continues_with_other_zones() -> None:
-    def steps(vec: CavVectorEnv, count: int) -> list[NDArray[np.float32]]:
-        found = []
+def test_a_saved_state_continues_with_other_zones(sensing: str) -> None:
+    def steps(vec: CavVectorEnv, count: int) -> list[NDArray[Any]]:
+        found: list[NDArray[Any]] = []
         for _ in range(count):
             observations, rewards, *_ = vec.step(vec.suggest_actions())
-            found += [observations["signals"], rewards["signals"]]
+            found += [observations["signals"], rewards["signals"], vec.signals.view.counts.copy()]
         return found
 
-    first = make_vec("grid4x4", num_envs=2, agents=2, background=60, overrides=ALL)
-    second = make_vec("grid4x4", num_envs=2, agents=2, background=60, zones=4, overrides=ALL)
+    overrides = ALL | SENSING[sensing]
+    first = make_vec("grid4x4", num_envs=2, agents=2, background=60, overrides=overrides)
+    second = make_vec("grid4x4", num_envs=2, agents=2, background=60, zones=4, overrides=overrides)
     with closing(first), closing(second):
         first.reset(seed=4)
         steps(first, 17)

@@ -10,6 +10,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.config.registry import load_config
+from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
 from tests.support.training import TRAIN, load_program
@@ -176,7 +177,7 @@ def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
     assert manifest["program"] == "signals_sb3.py"
     assert set(manifest["results_sha256"]) == {"model.zip", "evaluation.json"}
     figures = json.loads((tmp_path / "a" / "evaluation.json").read_text())
-    assert figures.keys() == {"PPO", "map", "program", "longest_queue", "max_pressure"}
+    assert figures.keys() == {"PPO", "map", *SIGNAL_CONTROLLERS}
     assert figures["PPO"][0]["departed"] >= 20
     again = call("signals_sb3.py", *words, "--runs", tmp_path, "--name", "a")
     assert again.returncode == 2

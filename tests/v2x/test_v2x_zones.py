@@ -12,7 +12,8 @@ from cavmarl.verify.equivalence import verify_zones
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 OBSERVED = {
     "v2x.enabled": True, "sensors.messages.objects": 6, "sensors.messages.events": 2,
-    "sensors.messages.signal": True, "sensors.conflicts.count": 4, "sensors.conflicts.heard": True,
+    "sensors.messages.signal": True, "sensors.messages.timing": True, "sensors.conflicts.count": 4,
+    "sensors.conflicts.heard": True,
 }  # fmt: skip
 LOSSY = {
     "v2x.equipped": 0.7,

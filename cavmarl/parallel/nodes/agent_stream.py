@@ -29,7 +29,7 @@ COMMON = (
     "rewards", "terminations", "truncations", "acted", "vehicle_done", "vehicle_ids", "mask",
     "terms", "arrivals", "ticks", "episode_over", "signal_observations", "signal_rewards",
     "signal_terms", "signal_masks", "signal_decides", "signal_counts", "signal_states",
-    "final_signal_observations",
+    "signal_history", "signal_loops", "final_signal_observations",
 )  # fmt: skip
 
 

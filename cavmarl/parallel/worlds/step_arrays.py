@@ -21,6 +21,8 @@ from cavmarl.sensors.registry import frame_layout, frames_in
 from cavmarl.shards.shard import Commands
 from cavmarl.signals.kernels.green_choices import HELD
 from cavmarl.signals.kernels.lane_counts import COUNTS
+from cavmarl.signals.kernels.lane_history import HISTORY
+from cavmarl.signals.sensing import loops_shape
 from cavmarl.signals.signal_table import SignalSizes
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -55,13 +57,15 @@ class StepArrays(NamedTuple):
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     signal_choices: NDArray[np.int64]  # (W, S)
-    signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next six
+    signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next eight
     signal_rewards: NDArray[np.float32]  # (W, S)
     signal_terms: NDArray[np.float32]  # (W, S, T)
     signal_masks: NDArray[np.bool_]  # (W, S, G)
     signal_decides: NDArray[np.bool_]  # (W,)
     signal_counts: NDArray[np.int64]  # (W, N, COUNTS)
     signal_states: NDArray[np.int64]  # (W, S, HELD)
+    signal_history: NDArray[np.int64]  # (W, N, HISTORY)
+    signal_loops: NDArray[np.int64]  # (W, N, 2, READINGS)
     final_signal_observations: NDArray[np.float32]  # (W, S, D) last ones of an episode that ended
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, S) global states at the last request
@@ -116,6 +120,8 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: Signal
         "signal_decides": ("|b1", (num_worlds,)),
         "signal_counts": ("<i8", (num_worlds, signals.lanes, COUNTS)),
         "signal_states": ("<i8", (*of_signals, HELD)),
+        "signal_history": ("<i8", (num_worlds, signals.lanes, HISTORY)),
+        "signal_loops": ("<i8", loops_shape(config.signals, num_worlds, signals)),
         "suggested": ("<f8", (*agents, 2)),
         "states": ("<f4", (num_worlds, *state_space(capacity).shape)),
         **frame_layout(config, num_worlds),

@@ -57,7 +57,7 @@ def with_programs(
         row = rows.row[signal_id]
         rows.signals[row][0] = _program(network, rows, signal_id, program_id, "map.program")
         rows.switches = [switch for switch in rows.switches if switch[0] != row]
-    return _remade(network, rows, sources)
+    return remade(network, rows, sources)
 
 
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
@@ -81,10 +81,14 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
         earlier = [s for s in rows.switches if s[0] != row or s[1] < at_s]
         rows.switches = [*earlier, (row, at_s, off)]
         sources.append(f"{signal_id} off at {at_s!r}")
-    return _remade(network, rows, sources)
+    return remade(network, rows, sources)
 
 
-def _remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> RoadNetwork:
+def remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> RoadNetwork:
+    """Return a network with other signals, and with the detectors of programs that need them.
+
+    `sources`: texts that the new `source_hash` covers.
+    """
     roads = DetectorRoads(
         network.lanes,
         network.edges,

@@ -154,7 +154,8 @@ class SignalRows:
     ) -> None:
         """Append a program whose phases an agent chooses, and let it run.
 
-        `cycle_s`: duration of a cycle, for estimates of travel times.
+        Its lanes get detectors like those of an actuated program. `cycle_s`: duration of a cycle,
+        for estimates of travel times.
         """
         signal, first = self.row[signal_id], len(self.phases)
         num_links = self.signals[signal][1]
@@ -163,6 +164,16 @@ class SignalRows:
             self.phases.append((duration_s, min_ms, max_ms, first + following, green, state, 0, 0))
             self.letters.extend(map(SIGNAL_STATES.index, letters[:num_links]))
         row = len(self.programs)
+        spec = [
+            ProgramPhase(
+                phase.duration_s,
+                1e-3 * phase.min_ms,
+                math.inf if phase.green else 1e-3 * phase.min_ms,
+                phase.letters,
+            )
+            for phase in phases
+        ]
+        self.specs[row] = SignalProgram(signal_id, program_id, "actuated", 0.0, "", spec)
         controller = self._next_controller()
         self.programs.append(
             (signal, first, len(phases), 0.0, cycle_s, controller, CHOSEN_BY_AGENT, False)

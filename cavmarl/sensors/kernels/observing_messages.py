@@ -9,7 +9,13 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays, Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
+from cavmarl.core.records.codes import (
+    CHOSEN_BY_AGENT,
+    DRIVER_AGENT,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+)
+from cavmarl.roads.kernels.signal_phases import program_at
 from cavmarl.sensors.kernels.frame_stacks import newest_frame
 from cavmarl.v2x.kernels.shown_states import phase_of, shown_at
 from cavmarl.v2x.kernels.v2x_records import (
@@ -29,6 +35,7 @@ AGE_SCALE_S = 1.0
 EVENT_AGE_SCALE_S = 10.0
 SOON_S = 5.0  # a change after this time has a soonness of 0.5
 SIGNAL_RANGE_M = 300.0  # distance within which the next signal is searched for
+SIGNAL_FEATURES = 4
 
 
 @kernel
@@ -94,17 +101,17 @@ def _observe_event(
 
 
 @kernel
-def _next_signal(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> int:
-    """Return the first link with a signal on a vehicle's route, or -1."""
+def _next_signal(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> tuple[int, float]:
+    """Return the first link with a signal on a vehicle's route, or -1, and its distance in m."""
     lane = row["lane"]
     distance = -row["s"]
     while True:
         distance += roads.lanes[lane]["length_m"]
         step = plans[row["goal"], lane]
         if distance > SIGNAL_RANGE_M or step["next"] < 0:
-            return -1
+            return -1, distance
         if step["link"] >= 0 and roads.links[step["link"]]["signal"] >= 0:
-            return int(step["link"])
+            return int(step["link"]), distance
         lane = step["next"]
 
 
@@ -115,6 +122,8 @@ def _observe_signal(
     signals: NDArray[np.void],
     tick: int,
     tick_s: float,
+    timing: bool,
+    distance_m: float,
     out: NDArray[np.float32],
 ) -> None:
     """Write the last message of the roadside unit at a link, if one was received."""
@@ -126,14 +135,63 @@ def _observe_signal(
             age_s = (tick - report["tick"]) * tick_s
             index = roads.links[link]["signal_index"]
             letter = shown_at(report, index)
-            if letter < 0:
+            is_shown = letter >= 0
+            if not is_shown:
                 letter = roads.phase_states[roads.phases[phase_of(report)]["first_state"] + index]
             out[0] = 1.0
             if letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR:
                 out[1] = 1.0
-            out[2] = np.float32(SOON_S / (SOON_S + max(report["left_s"] - age_s, 0.0)))
+            left_s = report["left_s"] - age_s
+            out[2] = _soonness(left_s)
             out[3] = _unit(age_s / AGE_SCALE_S)
+            if timing:
+                part = out[SIGNAL_FEATURES:]
+                part[0] = _unit(distance_m / SIGNAL_RANGE_M)
+                if not is_shown:
+                    program = program_at(roads, report["subject"], tick * tick_s, tick_s)
+                    _observe_timing(roads, program, phase_of(report), index, left_s, part)
             return
+
+
+@kernel
+def _observe_timing(
+    roads: RoadArrays, program: int, row: int, index: int, left_s: float, out: NDArray[np.float32]
+) -> None:
+    """Write the times of the next two changes between green and another state of a link.
+
+    `row`: PHASE row that ends in `left_s`. The receiver knows the program; of actuated phases, it
+    knows the minimum duration. The greens that agents or controllers choose are not known.
+    """
+    plan = roads.programs[program]
+    first, count = plan["first_phase"], plan["num_phases"]
+    if plan["detector_gap_s"] == CHOSEN_BY_AGENT or row < first or row >= first + count:
+        return
+    found, now = 0, _is_green(roads, row, index)
+    for _ in range(2 * count):
+        if plan["controller"] >= 0:
+            row = roads.phases[row]["following"]
+            lasts_s = 1e-3 * roads.phases[row]["min_ms"]
+        else:
+            row = row + 1 if row + 1 < first + count else first
+            lasts_s = roads.phases[row]["duration_s"]
+        if _is_green(roads, row, index) != now:
+            now = not now
+            found += 1
+            out[found] = _soonness(left_s)
+            if found == 2:
+                return
+        left_s += lasts_s
+
+
+@kernel
+def _is_green(roads: RoadArrays, row: int, index: int) -> bool:
+    letter = roads.phase_states[roads.phases[row]["first_state"] + index]
+    return bool(letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR)
+
+
+@kernel
+def _soonness(left_s: float) -> np.float32:
+    return np.float32(SOON_S / (SOON_S + max(left_s, 0.0)))
 
 
 @kernel
@@ -146,6 +204,7 @@ def observe_messages(
     objects: int,
     events: int,
     signal: bool,
+    timing: bool,
     scale_m: float,
     tick_s: float,
     stack: int,
@@ -155,8 +214,9 @@ def observe_messages(
     """Write the inboxes of the owned agents of the chosen worlds.
 
     `mail`: the inboxes. `at`: index of the sensor's part in a frame. `objects`, `events`: number of
-    vehicles and events. `signal`: whether to write the next signal. `scale_m`: distance that is
-    scaled to 1. `observations`: (W, A, D), whose part of the newest frame is 0 before.
+    vehicles and events. `signal`: whether to write the next signal. `timing`: whether to write its
+    times. `scale_m`: distance that is scaled to 1. `observations`: (W, A, D), whose part of the
+    newest frame is 0 before.
     """
     for w in range(chosen.size):
         if not chosen[w]:
@@ -183,7 +243,10 @@ def observe_messages(
                 part = out[k * EVENT_FEATURES :]
                 _observe_event(report, row, cos, sin, scale_m, tick_s, part)
             if signal:
-                link = _next_signal(roads, plans, row)
+                link, distance_m = _next_signal(roads, plans, row)
                 if link >= 0:
                     part = out[events * EVENT_FEATURES :]
-                    _observe_signal(roads, link, mail.signals[w, agent], row["tick"], tick_s, part)
+                    inbox = mail.signals[w, agent]
+                    _observe_signal(
+                        roads, link, inbox, row["tick"], tick_s, timing, distance_m, part
+                    )

@@ -11,12 +11,18 @@ _HEARD_SIGNAL = (
     ("signal_soon", "how soon the phase ends: 5 s / (5 s + time)", ""),
     ("signal_age", "age of the message", "1 s"),
 )
+_TIMING = (
+    ("signal_distance", "distance to the line of that signal; 0: no message", "300 m"),
+    ("signal_change", "how soon it opens or closes: 5 s / (5 s + time); 0: not known", ""),
+    ("signal_return", "the same for the change after that", ""),
+)
 
 
 def features(config: SensorsConfig) -> list[Feature]:
     """List the features of received messages; all are 0 where nothing is known.
 
-    There are eleven numbers per vehicle, eight per event and four of the signal.
+    There are eleven numbers per vehicle, eight per event, four of the signal, and three of its
+    timing.
     """
     messages = config.messages
     scale = f"{messages.range_m:g} m"
@@ -47,6 +53,7 @@ def features(config: SensorsConfig) -> list[Feature]:
         *numbered(messages.objects, "reported vehicle {}", vehicle),
         *numbered(messages.events, "event {}", event),
         *features_of(_HEARD_SIGNAL if messages.signal else ()),
+        *features_of(_TIMING if messages.timing else ()),
     ]
 
 

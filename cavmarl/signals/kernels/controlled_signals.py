@@ -21,6 +21,23 @@ class ControlledSignals(NamedTuple):
     lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N; -1: not watched
     length_m: NDArray[np.float64]  # (N,)
     speed_mps: NDArray[np.float64]  # (N,) speed limits
+    detector: NDArray[np.int32]  # (N,) DETECTOR rows of lanes before the signals; -1: none
+
+
+class LaneWeights(NamedTuple):
+    """Weights of lanes for each green of each signal, in CSR form."""
+
+    first: NDArray[np.int64]  # (S · G + 1,) entries of green g of signal s: from s · G + g
+    lanes: NDArray[np.int32]  # (num_entries,) indices of watched lanes
+    weights: NDArray[np.int64]  # (num_entries,)
+
+
+class LanePosts(NamedTuple):
+    """Where the watched lanes are observed: at the signal at their end, else at their start."""
+
+    signal: NDArray[np.int32]  # (N,) index of the signal that observes the lane
+    leads_in: NDArray[np.bool_]  # (N,) whether the signal is at the end of the lane
+    line_m: NDArray[np.float64]  # (N,) position of the stop line; 0 if the signal is at the start
 
 
 class SignalTicks(NamedTuple):
@@ -31,3 +48,5 @@ class SignalTicks(NamedTuple):
     all_red: int
     min_green: int
     max_green: int  # 0: no maximum
+    longest_red: int  # 0: no limit
+    flow_interval: int

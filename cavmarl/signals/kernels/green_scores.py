@@ -2,30 +2,25 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
+from cavmarl.signals.kernels.controlled_signals import LaneWeights
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP
-
-
-class LaneWeights(NamedTuple):
-    """Weights of lanes for each green of each signal, in CSR form."""
-
-    first: NDArray[np.int64]  # (S · G + 1,) entries of green g of signal s: from s · G + g
-    lanes: NDArray[np.int32]  # (num_entries,) indices of watched lanes
-    weights: NDArray[np.int64]  # (num_entries,)
+from cavmarl.signals.kernels.lane_history import RED_TICKS
 
 
 @kernel
 def choose_best(
     table: LaneWeights,
     column: int,  # of the counts
+    served: LaneWeights,  # see `SignalTable`
+    longest_red: int,  # ticks, see `SignalTicks`
     cyclic: bool,  # see `green_choices.choose_greens`
     num_greens: NDArray[np.int32],  # (S,)
     counts: NDArray[np.int64],  # (W, N, COUNTS)
+    history: NDArray[np.int64],  # (W, N, HISTORY)
     states: NDArray[np.int64],  # (W, S, HELD)
     masks: NDArray[np.bool_],  # (W, S, G)
     decides: NDArray[np.bool_],  # (W,)
@@ -33,7 +28,9 @@ def choose_best(
 ) -> None:
     """Choose the allowed green of the highest score; of equal ones, the first in cyclic order.
 
-    With cyclic choices, the next green begins if any other green has a higher score.
+    A green that opens a lane which has been red for `longest_red` or longer before a standing
+    vehicle comes first; of several, the green of the longest red. With cyclic choices, the next
+    green begins if any other green comes before the present one.
     """
     most = masks.shape[2]
     for w in range(decides.size):
@@ -43,7 +40,7 @@ def choose_best(
                 continue
             green = states[w, s, GREEN]
             keeps = masks[w, s, 0 if cyclic else green]
-            best, best_score = -1, np.int64(0)
+            best, best_red, best_score = -1, np.int64(0), np.int64(0)
             for k in range(num_greens[s]):
                 g = (green + k) % num_greens[s]  # the present green first
                 if not (keeps if k == 0 else masks[w, s, 1 if cyclic else g]):
@@ -52,6 +49,11 @@ def choose_best(
                 at = s * most + g
                 for entry in range(table.first[at], table.first[at + 1]):
                     score += table.weights[entry] * counts[w, table.lanes[entry], column]
-                if best < 0 or score > best_score:
-                    best, best_score = g, score
+                red = np.int64(0)
+                for entry in range(served.first[at], served.first[at + 1]):
+                    red = max(red, history[w, served.lanes[entry], RED_TICKS])
+                if longest_red == 0 or red < longest_red:
+                    red = np.int64(0)
+                if best < 0 or red > best_red or (red == best_red and score > best_score):
+                    best, best_red, best_score = g, red, score
             choices[w, s] = (0 if best == green else 1) if cyclic else best

@@ -20,12 +20,48 @@ STANDING = 1
 STOOD_TICKS = 2  # sum of the ticks for which vehicles have stood on this lane
 SPEED_PPM = 3  # sum of speeds as shares of the desired speed, in millionths
 LENGTH_MM = 4  # sum of the lengths of vehicles
-COUNTS = 5
+NEAR_LINE = 5  # vehicles whose front is near the end of the lane
+COUNTS = 6
 
 STANDING_MPS = 0.1  # below this speed a vehicle stands, as in SUMO
 NOT_COUNTED = -1
 
 _LANE_SHIFT = 32
+
+
+@kernel
+def count_vehicle(
+    controlled: ControlledSignals,
+    near_m: float,  # see `count_lanes`
+    row: np.void,  # VEHICLE
+    lane: int,  # index of a watched lane
+    counts: NDArray[np.int64],  # (N, COUNTS) updated
+) -> None:
+    """Add a vehicle to the counts of its lane."""
+    found = counts[lane]
+    speed = abs(row["speed"])
+    desired = controlled.speed_mps[lane] * max(row["speed_factor"], 1e-3)
+    found[VEHICLES] += 1
+    found[STANDING] += speed < STANDING_MPS
+    if row["lane_stood"] >= 0:
+        found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
+    found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
+    found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+    front_m = row["s"] + 0.5 * row["length"]
+    found[NEAR_LINE] += controlled.length_m[lane] - front_m <= near_m
+
+
+@kernel
+def estimate_standing_time(
+    ticks: int,  # since the decision before
+    counts: NDArray[np.int64],  # (COUNTS,) of a lane; STOOD_TICKS is that of the decision before
+) -> None:
+    """Update the sum of standing times, which only a sensor that follows vehicles knows.
+
+    Each vehicle that stands is taken to have stood since the decision before.
+    """
+    stood = counts[STOOD_TICKS] + counts[STANDING] * ticks
+    counts[STOOD_TICKS] = stood if counts[STANDING] > 0 else 0
 
 
 @kernel
@@ -57,6 +93,7 @@ def count_standing(
 @kernel
 def count_lanes(
     controlled: ControlledSignals,
+    near_m: float,  # distance from the end of a lane, for NEAR_LINE
     rows: NDArray[np.void],  # VEHICLE (k, W, C)
     num_owned: NDArray[np.int64],  # (k, W)
     chosen: NDArray[np.bool_],  # (W,)
@@ -73,14 +110,5 @@ def count_lanes(
                 if is_off_lanes(row):
                     continue
                 n = controlled.lane_index[row["lane"]]
-                if n < 0:
-                    continue
-                found = counts[w, n]
-                speed = abs(row["speed"])
-                desired = controlled.speed_mps[n] * max(row["speed_factor"], 1e-3)
-                found[VEHICLES] += 1
-                found[STANDING] += speed < STANDING_MPS
-                if row["lane_stood"] >= 0:
-                    found[STOOD_TICKS] += row["lane_stood"] & ((1 << _LANE_SHIFT) - 1)
-                found[SPEED_PPM] += math.floor(speed / desired * 1e6 + 0.5)
-                found[LENGTH_MM] += math.floor(row["length"] * 1e3 + 0.5)
+                if n >= 0:
+                    count_vehicle(controlled, near_m, row, n, counts[w])

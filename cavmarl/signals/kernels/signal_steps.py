@@ -8,9 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.signals.kernels.controlled_signals import ControlledSignals, SignalTicks
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LaneWeights,
+    SignalTicks,
+)
 from cavmarl.signals.kernels.green_choices import choose_greens, mask_choices, show_greens
 from cavmarl.signals.kernels.lane_counts import count_lanes, count_standing
+from cavmarl.signals.kernels.lane_history import follow_detectors, follow_lanes
 from cavmarl.signals.kernels.signal_observations import observe_signals, reward_signals
 
 
@@ -18,9 +23,11 @@ class SignalRules(NamedTuple):
     """The signals whose greens are chosen, and the rules for choices, for kernels."""
 
     controlled: ControlledSignals
+    served: LaneWeights  # see `SignalTable`
     durations: SignalTicks
     cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
     dt: float
+    near_m: float  # see `count_lanes`
     weights: NDArray[np.float64]  # (T,) of SIGNAL_TERMS
 
 
@@ -29,7 +36,9 @@ class SignalWorlds(NamedTuple):
 
     ticks: NDArray[np.int64]  # (W,)
     controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers)
+    keys: NDArray[np.uint64]  # (W,)
     signal_phase: NDArray[np.int32]  # (W, num_signals)
+    detected_s: NDArray[np.float64]  # (W, D)
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
     sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
     num_owned: NDArray[np.int64]  # (k, W)
@@ -38,8 +47,9 @@ class SignalWorlds(NamedTuple):
 class SignalOutputs(NamedTuple):
     """State and outputs of S signals.
 
-    Observations and counts are those of the last decision. G is the number of greens of the signal
-    that has most, N the number of watched lanes, T the number of terms.
+    Observations and counts are those of the last decision, as far as `signals.sensing` knows them.
+    G is the number of greens of the signal that has most, N the number of watched lanes, T the
+    number of terms.
     """
 
     observations: NDArray[np.float32]  # (W, S, D)
@@ -49,6 +59,9 @@ class SignalOutputs(NamedTuple):
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
     counts: NDArray[np.int64]  # (W, N, COUNTS) see `signals.kernels.lane_counts`
     states: NDArray[np.int64]  # (W, S, HELD) see `signals.kernels.green_choices`
+    history: NDArray[np.int64]  # (W, N, HISTORY) see `signals.kernels.lane_history`
+    # (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; (W, 0, …) without
+    loops: NDArray[np.int64]
 
 
 @kernel
@@ -72,27 +85,34 @@ def end_signal_tick(
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
-    """Set the phases of the present tick, and count how long vehicles have stood."""
+    """Set the phases of the present tick, and count vehicles that stand or are detected."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
     count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
+    follow_detectors(
+        rules.controlled,
+        rules.durations.flow_interval,
+        rules.dt,
+        chosen,
+        worlds.ticks,
+        worlds.detected_s,
+        outputs.history,
+    )
 
 
 @kernel
-def end_signal_step(
+def count_truth(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds to observe, if it is time for a decision
-    stood: NDArray[np.int64],  # (W, S) see `reward_signals`
     observed: NDArray[np.bool_],  # (W,) output
-    rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
+    truth: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the observed worlds
 ) -> None:
-    """Write the outputs of a step, or of a reset."""
-    controlled, durations = rules.controlled, rules.durations
+    """Write what is allowed in the next step, and count all vehicles on the watched lanes."""
     mask_choices(
-        controlled,
-        durations,
+        rules.controlled,
+        rules.durations,
         rules.cyclic,
         worlds.ticks,
         outputs.states,
@@ -102,10 +122,34 @@ def end_signal_step(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(controlled, rows, worlds.num_owned, observed, outputs.counts)
+    count_lanes(rules.controlled, rules.near_m, rows, worlds.num_owned, observed, truth)
+
+
+@kernel
+def observe_and_reward(
+    rules: SignalRules,
+    worlds: SignalWorlds,
+    outputs: SignalOutputs,
+    chosen: NDArray[np.bool_],  # (W,) as in `count_truth`, like the next two
+    observed: NDArray[np.bool_],  # (W,)
+    truth: NDArray[np.int64],  # (W, N, COUNTS)
+    stood: NDArray[np.int64],  # (W, S) see `reward_signals`
+    rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
+) -> None:
+    """Write the observations from what is known of the lanes, and the rewards from the truth."""
+    follow_lanes(
+        rules.controlled,
+        rules.served,
+        rules.durations,
+        observed,
+        worlds.ticks,
+        outputs.states,
+        outputs.counts,
+        outputs.history,
+    )
     observe_signals(
-        controlled,
-        durations,
+        rules.controlled,
+        rules.durations,
         worlds.ticks,
         observed,
         outputs.states,
@@ -113,13 +157,13 @@ def end_signal_step(
         outputs.observations,
     )
     reward_signals(
-        controlled,
+        rules.controlled,
         rules.dt,
         rules.weights,
         chosen,
         observed,
         rewarded[0],
-        outputs.counts,
+        truth,
         stood,
         outputs.terms,
         outputs.rewards,

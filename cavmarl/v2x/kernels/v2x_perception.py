@@ -4,27 +4,10 @@ from __future__ import annotations
 
 import math
 
-import numpy as np
-
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import nearest_bodies
-from cavmarl.core.math.walls import Walls, is_cut
+from cavmarl.core.math.walls import Walls, behind_body, is_cut
 from cavmarl.v2x.kernels.v2x_records import MAX_NEAR, V2xScratch
-
-
-@kernel
-def _stands_between(body: np.void, x: float, y: float, cos: float, sin: float, far: float) -> bool:
-    """Return whether a body blocks the line of length `far` from (x, y) in direction (cos, sin)."""
-    dx = body["x"] - x
-    dy = body["y"] - y
-    along = dx * cos + dy * sin
-    if along <= 0.0 or along >= far:
-        return False
-    across = abs(dy * cos - dx * sin)
-    turned_cos = body["cos"] * cos + body["sin"] * sin
-    turned_sin = body["sin"] * cos - body["cos"] * sin
-    half = body["half_length"] * abs(turned_sin) + body["half_width"] * abs(turned_cos)
-    return bool(across < half)
 
 
 @kernel
@@ -74,7 +57,7 @@ def visible(
             for k in range(i):
                 if is_hidden:
                     break
-                is_hidden = _stands_between(bodies[scratch.near[k]], x, y, cos, sin, far)
+                is_hidden = behind_body(bodies[scratch.near[k]], x, y, cos, sin, far) > 0.0
         if not is_hidden:
             scratch.seen[found] = body["row"]
             found += 1

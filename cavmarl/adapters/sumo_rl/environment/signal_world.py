@@ -146,6 +146,11 @@ class SignalWorld:
             file = Path(folder) / "world.sumocfg"
             settings.write_config(file)
             config, base_dir = load_config(file, agents=0, overrides=settings.keys)
+            config.signals.need(
+                "sensing",
+                config.signals.sensing == "truth",
+                "must be truth: sumo-rl's observations know all vehicles; leave the key out",
+            )
             backend = find_backend(None, None, None)
             check_rendering(config, settings.render_mode, backend, RENDER_MODES)
             world = make_world(config, base_dir)

@@ -1,0 +1,105 @@
+"""What controllers remember of lanes: detected vehicles, and red lights before vehicles.
+
+All values are whole numbers. They depend on the ticks and on the counts alone, so every process
+that runs a part of a world computes the same ones.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.compiled import kernel
+from cavmarl.signals.kernels.controlled_signals import (
+    ControlledSignals,
+    LaneWeights,
+    SignalTicks,
+)
+from cavmarl.signals.kernels.green_choices import GREEN
+from cavmarl.signals.kernels.lane_counts import STANDING, VEHICLES
+
+# Columns of the history (W, N, HISTORY) of lanes.
+RED_TICKS = 0  # ticks for which the lane has been red before a standing vehicle, see `follow_lanes`
+RED_VEHICLE_TICKS = 1  # the same for each vehicle on the lane, standing or not, as a sum
+DETECTED_MS = 2  # time since the reset at which the lane's detector was last occupied
+PASSED = 3  # vehicles that the detector has counted in the present interval
+FLOW = 4  # vehicles that it counted in the last interval
+HISTORY = 5
+
+NOT_MEASURED = -1  # FLOW: the first interval has not ended
+
+
+@kernel
+def follow_detectors(
+    controlled: ControlledSignals,
+    interval: int,  # ticks of an interval in which vehicles are counted
+    dt: float,
+    chosen: NDArray[np.bool_],  # (W,)
+    ticks: NDArray[np.int64],  # (W,)
+    detected_s: NDArray[np.float64],  # (W, D) see `roads.kernels.signal_phases.detect`
+    history: NDArray[np.int64],  # (W, N, HISTORY) updated
+) -> None:
+    """Count the vehicles that reach the detectors, at each tick.
+
+    As with an induction loop, a vehicle counts if the detector was free at the tick before.
+    """
+    for w in range(ticks.size):
+        if not chosen[w]:
+            continue
+        before_s = (ticks[w] - 1) * dt
+        before_ms = _milliseconds(before_s)
+        for n in range(controlled.detector.size):
+            detector = controlled.detector[n]
+            if detector >= 0 and detected_s[w, detector] > before_s:
+                lane = history[w, n]
+                lane[PASSED] += lane[DETECTED_MS] < before_ms
+                lane[DETECTED_MS] = _milliseconds(detected_s[w, detector])
+        if ticks[w] > 0 and ticks[w] % interval == 0:
+            for n in range(controlled.detector.size):
+                history[w, n, FLOW] = history[w, n, PASSED]
+                history[w, n, PASSED] = 0
+
+
+@kernel
+def follow_lanes(
+    controlled: ControlledSignals,
+    served: LaneWeights,  # see `SignalTable`
+    durations: SignalTicks,
+    chosen: NDArray[np.bool_],  # (W,) worlds in which it is time for a decision
+    ticks: NDArray[np.int64],  # (W,)
+    states: NDArray[np.int64],  # (W, S, HELD)
+    counts: NDArray[np.int64],  # (W, N, COUNTS)
+    history: NDArray[np.int64],  # (W, N, HISTORY) updated
+) -> None:
+    """Add the time since the last decision to the lanes that are red, at each decision.
+
+    A lane is red unless the present green, or the next one during yellow and all red, opens a
+    movement from it. `RED_TICKS` begins again if no vehicle stands on the lane at a decision.
+    """
+    num_signals = controlled.row.size
+    if num_signals == 0:
+        return
+    most = (served.first.size - 1) // num_signals
+    for w in range(chosen.size):
+        if not chosen[w]:
+            continue
+        passed = durations.decide if ticks[w] > 0 else 0
+        for s in range(num_signals):
+            for n in controlled.incoming[s]:
+                if n >= 0:
+                    lane, count = history[w, n], counts[w, n]
+                    lane[RED_TICKS] += passed
+                    if count[STANDING] == 0:
+                        lane[RED_TICKS] = 0
+                    lane[RED_VEHICLE_TICKS] += passed * count[VEHICLES]
+            at = s * most + states[w, s, GREEN]
+            for entry in range(served.first[at], served.first[at + 1]):
+                history[w, served.lanes[entry], RED_TICKS] = 0
+                history[w, served.lanes[entry], RED_VEHICLE_TICKS] = 0
+
+
+@kernel
+def _milliseconds(seconds: float) -> int:
+    return math.floor(seconds * 1e3 + 0.5)
