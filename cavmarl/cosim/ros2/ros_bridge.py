@@ -129,7 +129,7 @@ class RosBridge:
         self.steps, self.wait_wall_s = 0, 0.0
         self._looked_s = 0.0
         self._wanted: frozenset[str] = frozenset()
-        self._is_first = True
+        self._is_first, self._is_commanded = True, False
         commands = {
             topic: kind for each in self._controls.values() for topic, kind in each.topics.items()
         }
@@ -208,6 +208,8 @@ class RosBridge:
             self._looked_s = now_s
             self._look()
         wanted = frozenset(self._topics.kinds) if self._bag is not None else self._wanted
+        if not wanted and not self._topics.has_news(view):
+            return
         steering = {name: each.steering_rad for name, each in self._controls.items()}
         for message in self._topics.messages(view, wanted, steering):
             self._send(message)
@@ -221,8 +223,14 @@ class RosBridge:
 
     def _look(self) -> None:
         """Find the topics with subscribers, and refuse another clock."""
-        found = [topic for topic in self._topics.kinds if self._node.subscribers_of(topic)]
-        self._wanted = frozenset(found)
+        # This node subscribes to the clock itself. Late subscribers get latched topics, too.
+        self._wanted = frozenset(
+            topic
+            for topic in self._topics.kinds
+            if topic not in self._topics.latched
+            and self._node.subscribers_of(topic) > int(topic == CLOCK)
+        )
+        self._is_commanded = any(map(self._has_publisher, self._controls))
         others = self._node.publishers_of(CLOCK) - 1
         if others > 0:
             raise RosError(
@@ -241,7 +249,8 @@ class RosBridge:
                 self._controls[name].forget()
         bases = {name: seen.wheelbase_m for name, seen in snapshot.vehicles.items()}
         due_ns = clock.now_ns - self._options.lag_steps * clock.step_ns
-        self._drain(bases)
+        if self._is_commanded:
+            self._drain(bases)
         if self._options.wait == "stamp" and bases:
             self._await(bases, due_ns)
         return {

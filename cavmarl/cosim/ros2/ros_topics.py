@@ -324,6 +324,11 @@ class WorldTopics:
         now_ns = self.clock.now_ns
         return RosMessage(CLOCK, self.kinds[CLOCK], now_ns, {"clock": time_of(now_ns)})
 
+    def has_news(self, view: FollowerView) -> bool:
+        """Set the clock, and return whether mounts of a snapshot's vehicles have changed."""
+        self.clock.set(view.snapshot.episode, view.snapshot.tick)
+        return self._known(view) != self._mounted
+
     def messages(
         self, view: FollowerView, wanted: frozenset[str], steering_rad: Mapping[str, float]
     ) -> Iterator[RosMessage]:
@@ -360,13 +365,14 @@ class WorldTopics:
             yield RosMessage(SIGNALS, self.kinds[SIGNALS], clock.now_ns, fields)
         yield self.clock_message()
 
+    def _known(self, view: FollowerView) -> dict[str, float]:
+        """Return the wheelbases of all vehicles so far, by vehicle."""
+        present = view.snapshot.vehicles
+        return self._mounted | {name: seen.wheelbase_m for name, seen in present.items()}
+
     def _mounts(self, view: FollowerView) -> list[Fields]:
         """Return the transforms of all vehicles' sensors, if those of a vehicle have changed."""
-        present = view.snapshot.vehicles
-        known = dict(self._mounted)
-        for vehicle in self.vehicles:
-            if vehicle.vehicle in present:
-                known[vehicle.vehicle] = present[vehicle.vehicle].wheelbase_m
+        known = self._known(view)
         if known == self._mounted:
             return []
         self._mounted = known
