@@ -196,7 +196,7 @@ $(ROS)/.ready:
 
 $(OLDEST)/.ready: pyproject.toml constraints/oldest.txt
 	"$(PYTHON)" -m venv --clear $(OLDEST)
-	$(OLDEST)/bin/python -m pip install --editable '.[sumo]' pytest hypothesis \
+	$(OLDEST)/bin/python -m pip install --editable '.[compile,sumo]' pytest hypothesis \
 	    --constraint constraints/oldest.txt
 	@touch $@
 
@@ -204,6 +204,6 @@ $(LIBRARIES)/.ready: pyproject.toml constraints/libraries.txt
 	"$(PYTHON)" -m venv --clear $(LIBRARIES)
 	$(LIBRARIES)/bin/python -m pip install $$(grep '^torch==' constraints/libraries.txt) \
 	    --constraint constraints/libraries.txt
-	$(LIBRARIES)/bin/python -m pip install --editable '.[sumo,train,torchrl,benchmarl,rllib]' pytest \
+	$(LIBRARIES)/bin/python -m pip install --editable '.[compile,sumo,train,torchrl,benchmarl,rllib]' pytest \
 	    hypothesis --constraint constraints/libraries.txt
 	@touch $@

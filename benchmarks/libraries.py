@@ -26,6 +26,7 @@ from cavmarl.bench.harness import (
 from cavmarl.cli.output import about
 from cavmarl.core.errors import MissingExtraError, require
 from cavmarl.env.parallel import parallel_env
+from cavmarl.env.signal_agents import VEHICLES
 from cavmarl.env.vector import make_vec
 
 WARM_STEPS = 3
@@ -135,12 +136,12 @@ def _sb3(env: str, settings: dict[str, Any]) -> Step:
 
 
 def _torchrl(env: str, settings: dict[str, Any]) -> Step:
-    from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
+    from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 
     worlds = CavTorchRLEnv(env, **settings)
     worlds.set_seed(0)
     state = worlds.rand_action(worlds.reset())
-    state[GROUP, "action"].zero_()
+    state[VEHICLES, "action"].zero_()
     return partial(worlds.step, state)
 
 

@@ -28,8 +28,10 @@ from torchrl.modules import IndependentNormal, ProbabilisticActor
 from torchrl.objectives import ClipPPOLoss
 from torchrl.objectives.value import GAE
 
-from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
+from cavmarl.adapters.observations import refuse_signal_agents
+from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 from cavmarl.config.registry import load_config
+from cavmarl.env.signal_agents import VEHICLES
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.log import WINDOW, curve_row
@@ -39,7 +41,7 @@ from cavmarl.policies.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # lower bound on an observation's scale, so that constants are not amplified
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
-    (GROUP, name) for name in ("observation", "mask", "action", "log_prob", "state_value")
+    (VEHICLES, name) for name in ("observation", "mask", "action", "log_prob", "state_value")
 )
 
 
@@ -116,7 +118,7 @@ class Value(nn.Module):
 def make_actor(network: ActorCritic) -> ProbabilisticActor:
     """Create the policy that all agents of a batch of worlds share."""
     names = ("loc", "scale") if network.continuous else ("logits",)
-    numbers = {name: (GROUP, name) for name in names}
+    numbers = {name: (VEHICLES, name) for name in names}
     return ProbabilisticActor(
         TensorDictModule(Policy(network), in_keys=[OBSERVATION], out_keys=list(numbers.values())),
         in_keys=numbers,
@@ -132,7 +134,9 @@ def make_actor(network: ActorCritic) -> ProbabilisticActor:
 def rows_of(batch: TensorDict) -> TensorDict:
     """Convert the (W, T) steps of worlds to (W · A, T) steps of agents."""
     agents = batch[MASK].shape
-    steps = TensorDict({GROUP: batch[GROUP], "next": {GROUP: batch["next", GROUP]}}, agents)
+    steps = TensorDict(
+        {VEHICLES: batch[VEHICLES], "next": {VEHICLES: batch["next", VEHICLES]}}, agents
+    )
     return steps.transpose(1, 2).reshape(-1, agents[1])
 
 
@@ -150,7 +154,7 @@ class Learner:
         self.actor = make_actor(network)
         self._advantages = GAE(gamma=args.gamma, lmbda=args.gae_lambda, value_network=critic)
         self._loss = ClipPPOLoss(self.actor, critic, normalize_advantage=True, entropy_coeff=0.0)
-        ends = {name: (GROUP, name) for name in ("reward", "done", "terminated")}
+        ends = {name: (VEHICLES, name) for name in ("reward", "done", "terminated")}
         self._advantages.set_keys(value=VALUE, **ends)
         self._loss.set_keys(value=VALUE, action=ACTION, sample_log_prob=LOG_PROB, **ends)
         self._network = network
@@ -212,7 +216,7 @@ class Curve:
 
     def write(self, batch: TensorDict, decisions: int) -> None:
         """Add an update's line, with the trips that ended in its (W, T) steps."""
-        after = batch["next", GROUP]
+        after = batch["next", VEHICLES]
         arrived = after["info", "arrival"] > 0.0
         for step in range(batch.shape[1]):
             self._returns = self._returns + after["reward"][:, step]
@@ -239,6 +243,7 @@ def make_worlds(args: Args) -> CavTorchRLEnv:
             "action.out_of_range": "clip",
         },
     )
+    refuse_signal_agents(worlds.vec.config, "this program")
     worlds.set_seed(args.seed)
     return worlds
 

@@ -24,6 +24,7 @@ from gymnasium.vector import AutoresetMode
 from rich.console import Console
 from torch import Tensor, nn
 
+from cavmarl.adapters.observations import refuse_signal_agents
 from cavmarl.cli.output import parse_settings
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ConfigError
@@ -431,6 +432,7 @@ def opened(args: Args) -> Iterator[Run]:
         copy=False,
     )
     try:
+        refuse_signal_agents(vec.config, "this program")
         with RunFolder(args, vec.worlds.world, vec.plans) as folder:
             yield Run(args, vec, folder)
     finally:

@@ -27,6 +27,7 @@ from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 from torch import Tensor
 
+from cavmarl.adapters.observations import refuse_signal_agents
 from cavmarl.adapters.rllib_env import CavRllibEnv
 from cavmarl.env.parallel import parallel_env
 from cavmarl.learning.actor_critic import ActorCritic, save_network
@@ -163,6 +164,7 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more threads slow small networks down
     world = parallel_env(args.env, overrides={"observation.kind": "flat"})
     env = world.config
+    refuse_signal_agents(env, "this program")
     network = NetworkConfig(
         environment=env.name,
         observation_size=world.observation_space("car_0").shape[0],  # type: ignore[index]

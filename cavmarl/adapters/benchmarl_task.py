@@ -9,8 +9,9 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from cavmarl.adapters.observations import refuse_decided
-from cavmarl.adapters.torchrl_env import GROUP, CavTorchRLEnv
-from cavmarl.config.registry import load_config
+from cavmarl.adapters.torchrl_env import CavTorchRLEnv
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.registry import entries, load_config
 from cavmarl.core.errors import missing
 
 try:
@@ -25,13 +26,19 @@ DECIDED = ("num_envs", "device", "action.kind")
 class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separate environment
     """An environment; BenchMARL chooses the number of worlds, the device and the kind of action.
 
+    The groups are `vehicles` and `signals`, each with a policy of its own. If signals have agents,
+    all agents choose: vehicles have meta-actions, because BenchMARL trains either continuous or
+    discrete actions.
+
     In `respawn` worlds, the default, an agent gets a new vehicle when its vehicle has ended.
     BenchMARL's losses have no mask: steps without a vehicle count, too, with an observation and a
-    reward of 0. They are rare in `respawn` worlds, and frequent in `closed` and `open` worlds.
+    reward of 0. They are rare in `respawn` worlds, and frequent in `closed` and `open` worlds. For
+    the same reason, set `clock.ctrl_dt_s` to `signals.decide_s` if only signals have agents, so
+    that each step is a decision.
 
     Args:
-        name: name of the task. Unless `config` has `env`, its lower-case form is the name of the
-            environment.
+        name: name of the task. Unless `config` has `env`, it is the environment's name in upper
+            case, with `_` for `-`.
         config: keyword arguments of `CavTorchRLEnv`.
 
     Raises:
@@ -39,7 +46,8 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
     """
 
     def __init__(self, name: str, config: Mapping[str, Any] | None = None) -> None:
-        super().__init__(name, {"env": name.lower(), **(config or {})})
+        named = {entry.upper().replace("-", "_"): entry for entry in entries()}
+        super().__init__(name, {"env": named.get(name, name.lower()), **(config or {})})
         refuse_decided(DECIDED, self.config, self.config.get("overrides"))
 
     def get_env_fun(
@@ -47,8 +55,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
     ) -> Callable[[], CavTorchRLEnv]:
         """Return a function that makes `num_envs` worlds."""
         overrides = {
-            "population.mode": "respawn",
-            **self.config.get("overrides", {}),
+            **self._overrides,
             "action.kind": "continuous" if continuous_actions else self._choices,
         }
         arguments = {**self.config, "overrides": overrides, "num_envs": num_envs, "device": device}
@@ -61,14 +68,23 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return make
 
     @property
+    def _overrides(self) -> dict[str, Any]:
+        return {"population.mode": "respawn", **self.config.get("overrides", {})}
+
+    @property
     def _choices(self) -> str:
         """The environment's kind of action if it is a choice, otherwise meta-actions."""
-        kind = load_config(self.config["env"])[0].action.kind
+        kind = self._world.action.kind
         return "discrete" if kind == "continuous" else kind
 
+    @property
+    def _world(self) -> EnvConfig:
+        named = {key: self.config.get(key) for key in ("agents", "background", "max_cycles")}
+        return load_config(self.config["env"], overrides=self._overrides, **named)[0]
+
     def supports_continuous_actions(self) -> bool:
-        """Return True: throttle and steering."""
-        return True
+        """Return whether all actions can be continuous: no signal has an agent."""
+        return not self._world.signals.have_agents
 
     def supports_discrete_actions(self) -> bool:
         """Return True: meta-actions, or the grid of an environment with a grid of actions."""
@@ -83,7 +99,7 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return False
 
     def group_map(self, env: CavTorchRLEnv) -> dict[str, list[str]]:
-        """Return one group with all agents."""
+        """Return the ids of the agents of each group."""
         return dict(env.group_map)
 
     def observation_spec(self, env: CavTorchRLEnv) -> Composite:
@@ -101,8 +117,9 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         """Return the action spec of one world."""
         return env.full_action_spec_unbatched
 
-    def action_mask_spec(self, env: CavTorchRLEnv) -> None:
-        """Return None: every agent can take every action."""
+    def action_mask_spec(self, env: CavTorchRLEnv) -> Composite | None:
+        """Return the spec of the action masks of one world; None if no signal has an agent."""
+        return self._of_agents(env, "action_mask") if self._world.signals.have_agents else None
 
     @staticmethod
     def env_name() -> str:
@@ -113,19 +130,32 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
     def _of_agents(env: CavTorchRLEnv, part: str) -> Composite:
         """Return the spec of one world with only the entry `part` of the agents."""
         spec = env.full_observation_spec_unbatched.clone()
-        for other in set(spec[GROUP].keys()) - {part}:
-            del spec[GROUP, other]
+        for group in env.group_map:
+            for other in set(spec[group].keys()) - {part}:
+                del spec[group, other]
         return spec
 
 
 class CavTask(Task):  # type: ignore[misc] # only installed in a separate environment
     """The entries of `envs/`; `CavTaskClass` accepts other folders and maps."""
 
+    BLIND_JUNCTION = None
+    BOTTLENECK = None
+    CITIES = None
+    CITIES_VALIDATION = None
+    EXIT = None
     GRID4X4 = None
+    HIGHWAY = None
+    INTERSECTION = None
     MERGE = None
     RING = None
+    RING22 = None
+    ROUNDABOUT = None
     RUSH = None
+    TOLLGATE = None
     TOWN = None
+    TWO_WAY = None
+    U_TURN = None
 
     @staticmethod
     def associated_class() -> type[CavTaskClass]:

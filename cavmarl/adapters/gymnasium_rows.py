@@ -11,7 +11,13 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 from numpy.typing import NDArray
 
-from cavmarl.adapters.observations import ObservationForm, Observations, WithSpec, refuse_decided
+from cavmarl.adapters.observations import (
+    ObservationForm,
+    Observations,
+    WithSpec,
+    refuse_decided,
+    refuse_signal_agents,
+)
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.vector import CavVectorEnv, make_vec
@@ -57,6 +63,8 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
             or a value is not allowed.
     """
 
+    closed = True  # Gymnasium calls close() on garbage collection, even without an __init__
+
     def __init__(
         self,
         env: str | Path = "merge",
@@ -70,7 +78,6 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
-        self.closed = True  # Gymnasium calls close() on garbage collection, even if __init__ failed
         refuse_decided(DECIDED, overrides, arguments)
         wanted = {"population.mode": "respawn", **(overrides or {})}
         if action_kind is not None:
@@ -88,6 +95,7 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
         self.closed = False
         self._shape = (num_worlds, self._vec.num_agents)
         self._term_names = self._vec.config.terms.names
+        refuse_signal_agents(self._vec.config)
         self._form = ObservationForm(self._vec.config)
         self.autoreset_mode: AutoresetMode = self._vec.metadata["autoreset_mode"]
         self._horizon = self._vec.max_cycles

@@ -45,9 +45,9 @@ class WithSpec:
         self._spec = spec and dataclasses.replace(spec, max_episode_steps=self._horizon)
 
 
-def refuse_signal_agents(config: EnvConfig) -> None:
-    """Raise a ConfigError if signals have agents, which the adapter would not show."""
-    if refusal := config.signals.refusal_of_agents("this adapter"):
+def refuse_signal_agents(config: EnvConfig, what: str = "this adapter") -> None:
+    """Raise a ConfigError if signals have agents, which `what` would ignore."""
+    if refusal := config.signals.refusal_of_agents(what):
         raise ConfigError(refusal)
 
 
@@ -61,12 +61,10 @@ class ObservationForm:
         space: space of one agent: a flat Box, or a Dict with one Box per sensor.
 
     Raises:
-        ConfigError: the observations are sensor samples in a form that is not supported, or signals
-            have agents.
+        ConfigError: the observations are sensor samples in a form that is not supported.
     """
 
     def __init__(self, config: EnvConfig) -> None:
-        refuse_signal_agents(config)
         form = config.observation
         if form.mode != "ground_truth" and form.kind != "flat":
             raise ConfigError(

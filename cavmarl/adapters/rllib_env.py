@@ -8,8 +8,12 @@ from __future__ import annotations
 from collections.abc import Collection, Mapping
 from typing import Any
 
+import numpy as np
+from gymnasium import spaces
+
 from cavmarl.core.errors import missing
 from cavmarl.env.parallel import parallel_env
+from cavmarl.env.signal_agents import PREFIX, SIGNALS, VEHICLES, SignalAgents
 from cavmarl.env.world_copies import OwnWorlds
 
 try:
@@ -18,8 +22,19 @@ except ModuleNotFoundError as error:
     raise missing(error.name, "rllib") from error
 
 Step = tuple[
-    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, float]]
+    dict[str, Any], dict[str, float], dict[str, bool], dict[str, bool], dict[str, dict[str, Any]]
 ]
+
+# Keys of a signal's observation, as RLlib's `ActionMaskingTorchRLModule` expects them.
+ACTION_MASK, OBSERVATIONS = "action_mask", "observations"
+
+
+def policy_of(agent: str, episode: object = None, worker: object = None) -> str:
+    """Return the policy of an agent by its kind: `vehicles` or `signals`.
+
+    A `policy_mapping_fn` for one policy per kind of agents; RLlib's other arguments are not read.
+    """
+    return SIGNALS if agent.startswith(PREFIX) else VEHICLES
 
 
 class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only installed separately
@@ -37,6 +52,14 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
     RLlib's value estimates continue across it. Learning is therefore more exact in `closed` and
     `open` worlds.
 
+    Agents of signals act only when it is time for their decision: other steps have no observation,
+    reward or info of signals. All signals have the same spaces, so that they can share a policy:
+    actions `Discrete(G)` with the largest number of choices G, where a choice that a signal does
+    not have keeps its green, and observations with `action_mask` (G,) and `observations` (D,),
+    padded with 0. If no agent acts next, the world advances until one does.
+
+        PPOConfig().multi_agent(policies={"vehicles", "signals"}, policy_mapping_fn=policy_of)
+
     Each environment of an env runner has its own world, seeded by RLlib.
 
     Args:
@@ -48,27 +71,47 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
 
     def __init__(self, config: Mapping[str, Any] | None = None) -> None:
         self._env = parallel_env(**(config or {}))
-        self.possible_agents = list(self._env.possible_agents)
         self.agents: list[str] = []
         self.observation_spaces = dict(self._env.observation_spaces)
         self.action_spaces = dict(self._env.action_spaces)
+        world = self._env.config
+        self._signals = self._env.signals if world.signals.have_agents else None
+        self.possible_agents = [
+            agent
+            for agent in self._env.possible_agents
+            if world.population.agents or self._is_signal(agent)
+        ]
+        if self._signals is not None:
+            self._pad_spaces(self._signals)
         self.render_mode = self._env.render_mode
         self._entered: tuple[dict[str, Any], dict[str, Any]] | None = None
         super().__init__()
+
+    def _is_signal(self, agent: str) -> bool:
+        return self._signals is not None and agent in self._signals
+
+    def _pad_spaces(self, signals: SignalAgents) -> None:
+        """Give all signals the spaces of the largest one."""
+        most = signals.most_choices
+        mask = spaces.Box(0.0, 1.0, (most,), np.float32)
+        seen = spaces.Dict({ACTION_MASK: mask, OBSERVATIONS: signals.padded_observation_space})
+        self.observation_spaces |= dict.fromkeys(signals.agents, seen)
+        self.action_spaces |= dict.fromkeys(signals.agents, spaces.Discrete(most))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Any], dict[str, Any]]:
         """Begin an episode; without a seed, continue the world if agents have just entered."""
         if self._entered is None or seed is not None:
-            self._entered = self._env.reset(seed=seed, options=options)
+            observations, infos = self._env.reset(seed=seed, options=options)
+            self._entered = self._padded(observations), infos
         (observations, infos), self._entered = self._entered, None
         self.agents = self._env.agents
         return observations, infos
 
     def step(self, action_dict: Mapping[str, Any]) -> Step:
-        """Run one step with the actions of all agents."""
-        known, step = set(self.agents), self._env.step(action_dict)
+        """Run one step with the actions of all agents that act."""
+        known, step = set(self.agents), self._step(action_dict)
         self.agents = self._env.agents
         if self.agents and known.isdisjoint(self.agents):
             observations, _, _, _, infos = (_only(self.agents, part) for part in step)
@@ -82,6 +125,57 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
         ends = {**ended, "__all__": over and not at_horizon}
         return observations, rewards, ends, {**cut, "__all__": at_horizon}, infos
 
+    def _step(self, actions: Mapping[str, Any]) -> Step:
+        """Run steps until an agent acts next; return the results of agents that act or have left.
+
+        Without agents of signals, this is one step.
+        """
+        step = self._shown(self._env.step(self._own_choices(actions)))
+        while self._nobody_acts():
+            step = _joined(step, self._shown(self._env.step({})))
+        return step
+
+    def _nobody_acts(self) -> bool:
+        """Whether the world has no vehicles of agents, and it is not time for a decision."""
+        signals = self._signals
+        return (
+            signals is not None
+            and len(self._env.agents) == len(signals.agents)
+            and not signals.view.decides[0]
+        )
+
+    def _own_choices(self, actions: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return the actions; choices that a signal does not have keep its green."""
+        signals = self._signals
+        if signals is None:
+            return actions
+        choices = np.array([[actions.get(agent, 0) for agent in signals.agents]])
+        own = dict(zip(signals.agents, signals.keep_beyond(choices)[0], strict=True))
+        return {agent: own.get(agent, action) for agent, action in actions.items()}
+
+    def _shown(self, step: Step) -> Step:
+        """Return the results without signals that neither decide next nor end."""
+        signals = self._signals
+        if signals is None:
+            return step
+        observations, rewards, ended, cut, infos = step
+        if not (signals.view.decides[0] or cut[signals.agents[0]]):
+            vehicles = [agent for agent in observations if agent not in signals]
+            observations, rewards, ended, cut, infos = (_only(vehicles, part) for part in step)
+        return self._padded(observations), rewards, ended, cut, infos
+
+    def _padded(self, observations: dict[str, Any]) -> dict[str, Any]:
+        """Return the observations; those of signals with their action masks, padded."""
+        signals = self._signals
+        if signals is None:
+            return observations
+        masks, seen = signals.view.masks[0], signals.view.observations[0]
+        return observations | {
+            agent: {ACTION_MASK: masks[s].astype(np.float32), OBSERVATIONS: seen[s].copy()}
+            for s, agent in enumerate(signals.agents)
+            if agent in observations
+        }
+
     def render(self) -> Any:
         """Draw the world; see `CavEnv.render`."""
         return self._env.render()
@@ -94,3 +188,16 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
 def _only(agents: Collection[str], part: Mapping[str, Any]) -> dict[str, Any]:
     """Return the entries of some agents."""
     return {agent: value for agent, value in part.items() if agent in agents}
+
+
+def _joined(first: Step, second: Step) -> Step:
+    """Return the results of two steps; those of the second one replace equal ids."""
+    observations, rewards, ended, cut, infos = first
+    more = second
+    return (
+        observations | more[0],
+        rewards | more[1],
+        ended | more[2],
+        cut | more[3],
+        infos | more[4],
+    )

@@ -17,7 +17,6 @@ from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.sb3_vec_env import DECIDED, CavSb3VecEnv
 from cavmarl.core.errors import missing
 from cavmarl.env.vector import make_vec
-from cavmarl.signals.kernels.green_choices import GREEN
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -56,15 +55,14 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         refuse_decided(DECIDED, arguments)
         keys = {"signals.agents": "all", **(overrides or {})}
         self._vec = make_vec(env, num_envs=num_worlds, overrides=keys, **{"agents": 0, **arguments})
-        table = self._vec.signals.table
-        self._num_choices = self._vec.signals.num_choices
-        self._shape = (num_worlds, len(table.ids))
+        num_signals = len(self._vec.signals.agents)
+        self._shape = (num_worlds, num_signals)
         self._actions = np.zeros(self._shape, dtype=np.int64)
         VecEnv.__init__(
             self,
-            num_worlds * len(table.ids),
-            spaces.Box(0.0, 1.0, (table.sizes.features,), np.float32),
-            spaces.Discrete(int(self._num_choices.max())),
+            num_worlds * num_signals,
+            self._vec.signals.padded_observation_space,
+            spaces.Discrete(self._vec.signals.most_choices),
         )
         self.metadata = self._vec.metadata
         self.spec = None
@@ -91,12 +89,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Run all steps of the worlds until the next decision, with the stored actions."""
         arrays = self._vec.worlds.arrays
-        keep = (
-            arrays.signal_states[..., GREEN]
-            if self._vec.config.signals.action == "next_phase"
-            else np.zeros(self._shape, dtype=np.int64)
-        )
-        choices = np.where(self._actions < self._num_choices, self._actions, keep)
+        choices = self._vec.signals.keep_beyond(self._actions)
         rewards = np.zeros(self._shape, dtype=np.float32)
         done = np.zeros(self._shape, dtype=np.bool_)
         last = np.zeros((*self._shape, arrays.signal_observations.shape[2]), dtype=np.float32)

@@ -13,7 +13,13 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.adapters.observations import ObservationForm, Observations, WithSpec, refuse_decided
+from cavmarl.adapters.observations import (
+    ObservationForm,
+    Observations,
+    WithSpec,
+    refuse_decided,
+    refuse_signal_agents,
+)
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import missing
 from cavmarl.env.vector import make_vec
@@ -70,6 +76,7 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
             overrides={"population.mode": "respawn", **(overrides or {})},
             **arguments,
         )
+        refuse_signal_agents(self._vec.config)
         self._form = ObservationForm(self._vec.config)
         self._shape = (num_worlds, self._vec.num_agents)
         self._actions: NDArray[Any] = np.zeros(0)

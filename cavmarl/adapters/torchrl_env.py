@@ -1,4 +1,4 @@
-"""W worlds with A agents each as an `EnvBase` of TorchRL: one batch of tensors.
+"""W worlds with their agents as an `EnvBase` of TorchRL: one batch of tensors.
 
 Steps have no Python loop over agents. Importing this module loads TorchRL and torch;
 `import cavmarl` does not import it.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from gymnasium import spaces
@@ -16,8 +16,10 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from cavmarl.adapters.observations import ObservationForm, refuse_decided
+from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.errors import missing
 from cavmarl.core.seeds import check_seed
+from cavmarl.env.signal_agents import SIGNALS, VEHICLES
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.env.world_copies import OwnWorlds
 
@@ -30,27 +32,41 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error.name, "torchrl") from error
 
-GROUP = "car"
+ENDS = ("done", "terminated", "truncated")
 DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps its inputs
 
 
 class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not typed
-    """W worlds with A agents each, of the batch size (W,); all agents are in the group `car`.
+    """W worlds of the batch size (W,), with A agents of vehicles and S agents of signals each.
 
-    Entries of a tensordict; the agents' entries have one axis more than the batch:
+    The groups are `vehicles` and `signals`; a kind without agents has no group. Entries of a
+    tensordict; the entries of a group have one axis more than the batch:
 
-    - `("car", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
-    - `("car", "mask")`: (W, A) whether an agent has a vehicle and acts next. Actions of other
+    - `("vehicles", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
+    - `("vehicles", "mask")`: (W, A) whether an agent has a vehicle and acts next. Actions of other
       agents are not read. Their observations are 0, except for the last observation of an agent
       that has just ended. Use only entries where the mask is True for losses and means;
-    - `("car", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
-    - `("next", "car", "reward")`: (W, A, 1);
-    - `("next", "car", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
+    - `("vehicles", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
+    - `("next", "vehicles", "reward")`: (W, A, 1);
+    - `("next", "vehicles", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
       vehicle ended, or the horizon cut its trip. Use these for value estimators;
-    - `("next", "terminated")`, `"truncated"`, `"done"`: (W, 1) for each world; TorchRL resets
-      worlds that are done. `("next", "car", "observation")` then still has the last observations
-      of the old episode;
-    - `("next", "car", "info", term)`: (W, A, 1) each term by its name.
+    - `("next", "vehicles", "info", term)`: (W, A, 1) each term by its name.
+
+    The group `signals` has the same entries with these differences:
+
+    - `("signals", "observation")`: (W, S, D) padded with 0 to the longest observation;
+    - `("signals", "mask")`: (W, S) whether it is time for a decision. In other steps, actions are
+      not read, and rewards are 0;
+    - `("signals", "action")`: (W, S) choices from 0 to G - 1, where G is the largest number of
+      choices. A choice that a signal does not have keeps its green;
+    - `("signals", "action_mask")`: (W, S, G) choices that are allowed now. At least one is allowed.
+      TorchRL's `ActionMask` and `MaskedCategorical` use it.
+
+    If vehicles choose meta-actions beside signals, `vehicles` has an `action_mask` (W, A, n), too:
+    it allows every action. BenchMARL needs masks of all groups or of none.
+
+    `("next", "terminated")`, `"truncated"`, `"done"` (W, 1) are those of each world; TorchRL resets
+    worlds that are done. Observations of that step are still the last ones of the old episode.
 
     Every population can be used; the mask changes when agents enter and leave. In `respawn` worlds,
     an agent that is done gets another vehicle while its world continues.
@@ -80,38 +96,37 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         vec = make_vec(env, num_envs=num_envs, autoreset_mode=AutoresetMode.NEXT_STEP, **arguments)
         super().__init__(device=device, batch_size=[num_envs])
         self._vec = vec
-        self._form = ObservationForm(vec.config)
         self._next_seed: int | None = None
         self.max_cycles = vec.max_cycles
-        self.group_map = {GROUP: vec.possible_agents}
-        agents = (num_envs, vec.num_agents)
-        self._term_names = vec.config.terms.names
-        self.observation_spec = self._of_agents(
-            observation=_observation_spec(self._form.space, agents),
-            mask=_flags(agents),
-            info=Composite(
-                {term: Unbounded((*agents, 1)) for term in self._term_names}, shape=agents
-            ),
-        )
-        self.action_spec = self._of_agents(action=_action_spec(vec.single_action_space, agents))
-        self.reward_spec = self._of_agents(reward=Unbounded((*agents, 1)))
-        ends = {name: _flags((num_envs, 1)) for name in ("done", "terminated", "truncated")}
-        self.done_spec = Composite(
-            **ends,
-            **{GROUP: Composite({name: _flags((*agents, 1)) for name in ends}, shape=agents)},
-            shape=self.batch_size,
-        )
-        self._no_terms = np.zeros((*agents, len(vec.config.terms.names)), dtype=np.float32)
+        self._has_signals = vec.config.signals.have_agents
+        self._groups: dict[str, _Group] = {}
+        if vec.config.population.agents:
+            self._form = ObservationForm(vec.config)
+            self._groups[VEHICLES] = _vehicles(vec, self._form.space)
+        if self._has_signals:
+            self._groups[SIGNALS] = _signals(vec)
+        self.group_map = {group: list(each.ids) for group, each in self._groups.items()}
+        of_group: dict[str, dict[str, Composite]] = {}
+        for group, each in self._groups.items():
+            shape = (num_envs, len(each.ids))
+            terms = Composite({name: Unbounded((*shape, 1)) for name in each.terms}, shape=shape)
+            entries = {
+                "observation": {**each.observation, "mask": _flags(shape), "info": terms},
+                "action": {"action": each.action},
+                "reward": {"reward": Unbounded((*shape, 1))},
+                "done": {name: _flags((*shape, 1)) for name in ENDS},
+            }
+            for kind, specs in entries.items():
+                of_group.setdefault(kind, {})[group] = Composite(specs, shape=shape)
+        specs_of = {kind: Composite(each, shape=[num_envs]) for kind, each in of_group.items()}
+        specs_of["done"].update({name: _flags((num_envs, 1)) for name in ENDS})
+        self.observation_spec, self.action_spec = specs_of["observation"], specs_of["action"]
+        self.reward_spec, self.done_spec = specs_of["reward"], specs_of["done"]
 
     @property
     def vec(self) -> CavVectorEnv:
         """The worlds behind this view."""
         return self._vec
-
-    def _of_agents(self, **specs: TensorSpec) -> Composite:
-        """Return a spec of the group's entries."""
-        agents = (*self.batch_size, len(self.group_map[GROUP]))
-        return Composite({GROUP: Composite(specs, shape=agents)}, shape=self.batch_size)
 
     def _set_seed(self, seed: int | None) -> None:
         self._next_seed = None if seed is None else check_seed(seed)
@@ -124,44 +139,114 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         else:
             mask = chosen.reshape(-1).cpu().numpy()
             observations, infos = self._vec.reset(options={"reset_mask": mask})
-        none = np.zeros_like(infos["mask"])
-        everywhere = np.zeros(len(none), dtype=np.bool_)
-        return self._tensors(
-            self._agents(observations, infos["mask"], self._no_terms) | _ends(none, none),
-            _ends(everywhere, everywhere),
-        )
+        none, no_terms = {}, {}
+        for group, each in self._groups.items():
+            agents = (*self.batch_size, len(each.ids))
+            none[group] = np.zeros(agents, dtype=np.bool_)
+            no_terms[group] = np.zeros((*agents, len(each.terms)), dtype=np.float32)
+        entries = self._entries(self._by_group(observations), none, none, no_terms, infos)
+        everywhere = np.zeros(len(infos["mask"]), dtype=np.bool_)
+        return self._tensors(entries, _ends(everywhere, everywhere))
 
     def _step(self, tensordict: TensorDictBase) -> TensorDict:
-        actions = tensordict.get((GROUP, "action")).cpu().numpy()
-        observations, rewards, ended, cut, infos = self._vec.step(actions)
-        over = infos["episode_over"]
-        at_horizon = cut.any(axis=1)
-        agents = self._agents(observations, infos["mask"], infos["terms"]) | _ends(ended, cut)
-        agents["reward"] = torch.from_numpy(rewards).unsqueeze(-1)
-        return self._tensors(agents, _ends(over & ~at_horizon, over & at_horizon))
-
-    def _agents(
-        self, flat: NDArray[np.float32], mask: NDArray[np.bool_], terms: NDArray[np.float32]
-    ) -> dict[str, Any]:
-        """Return the entries of the agents; arrays are not copied."""
-        shown = self._form(flat)
-        columns = torch.from_numpy(terms)
-        return {
-            "observation": torch.from_numpy(shown)
-            if isinstance(shown, np.ndarray)
-            else {name: torch.from_numpy(part) for name, part in shown.items()},
-            "mask": torch.from_numpy(mask),
-            "info": {term: columns[..., k : k + 1] for k, term in enumerate(self._term_names)},
+        actions: Any = {
+            group: tensordict.get((group, "action")).cpu().numpy() for group in self.group_map
         }
+        if self._has_signals:
+            actions[SIGNALS] = self._vec.signals.keep_beyond(actions[SIGNALS])
+        else:
+            actions = actions[VEHICLES]
+        *results, infos = self._vec.step(actions)
+        observations, rewards, ended, cut = map(self._by_group, results)
+        terms = {VEHICLES: infos["terms"], SIGNALS: infos.get("signal_terms")}
+        entries = self._entries(observations, ended, cut, terms, infos)
+        for group, found in entries.items():
+            found["reward"] = torch.from_numpy(rewards[group]).unsqueeze(-1)
+        over = infos["episode_over"]
+        at_horizon = np.any([cut[group].any(axis=1) for group in self.group_map], axis=0)
+        return self._tensors(entries, _ends(over & ~at_horizon, over & at_horizon))
 
-    def _tensors(self, agents: Mapping[str, Any], worlds: Mapping[str, Tensor]) -> TensorDict:
-        agent_arrays = TensorDict(agents, (*self.batch_size, self._vec.num_agents))
-        return TensorDict({GROUP: agent_arrays, **worlds}, self.batch_size, device=self.device)
+    def _by_group(self, result: Any) -> Mapping[str, NDArray[Any]]:
+        """Return a result of the worlds by the kind of agents."""
+        return result if self._has_signals else {VEHICLES: result}
+
+    def _entries(
+        self,
+        observations: Mapping[str, NDArray[np.float32]],
+        ended: Mapping[str, NDArray[np.bool_]],
+        cut: Mapping[str, NDArray[np.bool_]],
+        terms: Mapping[str, NDArray[np.float32]],
+        infos: Mapping[str, NDArray[Any]],
+    ) -> dict[str, dict[str, Any]]:
+        """Return the entries of each group without rewards; arrays are not copied."""
+        found: dict[str, dict[str, Any]] = {}
+        for group, each in self._groups.items():
+            columns = torch.from_numpy(terms[group])
+            found[group] = _ends(ended[group], cut[group]) | {
+                "info": {term: columns[..., k : k + 1] for k, term in enumerate(each.terms)}
+            }
+        if VEHICLES in found:
+            shown = self._form(observations[VEHICLES])
+            found[VEHICLES] |= {
+                "observation": torch.from_numpy(shown)
+                if isinstance(shown, np.ndarray)
+                else {name: torch.from_numpy(part) for name, part in shown.items()},
+                "mask": torch.from_numpy(infos["mask"]),
+            }
+            mask = self._groups[VEHICLES].observation.get("action_mask")
+            if mask is not None:
+                found[VEHICLES]["action_mask"] = torch.ones(mask.shape, dtype=torch.bool)
+        if SIGNALS in found:
+            decides = torch.from_numpy(infos["signal_decides"])
+            found[SIGNALS] |= {
+                "observation": torch.from_numpy(observations[SIGNALS]),
+                "mask": decides.unsqueeze(-1).repeat(1, len(self.group_map[SIGNALS])),
+                "action_mask": torch.from_numpy(infos["signal_mask"]),
+            }
+        return found
+
+    def _tensors(
+        self, entries: Mapping[str, Mapping[str, Any]], worlds: Mapping[str, Tensor]
+    ) -> TensorDict:
+        groups = {
+            group: TensorDict(found, (*self.batch_size, len(self.group_map[group])))
+            for group, found in entries.items()
+        }
+        return TensorDict({**groups, **worlds}, self.batch_size, device=self.device)
 
     def close(self, *, raise_if_closed: bool = True) -> None:
         """Close the environment; see `CavVectorEnv.close`."""
         self._vec.close()
         super().close(raise_if_closed=raise_if_closed)
+
+
+class _Group(NamedTuple):
+    """A kind of agents."""
+
+    ids: tuple[str, ...]
+    terms: tuple[str, ...]  # of the reward
+    observation: dict[str, TensorSpec]  # entries of the observation without `mask` and `info`
+    action: TensorSpec
+
+
+def _vehicles(vec: CavVectorEnv, space: spaces.Space[Any]) -> _Group:
+    agents = (vec.num_envs, vec.num_agents)
+    observation = {"observation": _observation_spec(space, agents)}
+    if vec.config.signals.have_agents and isinstance(vec.single_action_space, spaces.Discrete):
+        observation["action_mask"] = _flags((*agents, int(vec.single_action_space.n)))
+    action = _action_spec(vec.single_action_space, agents)
+    return _Group(tuple(vec.possible_agents), vec.config.terms.names, observation, action)
+
+
+def _signals(vec: CavVectorEnv) -> _Group:
+    signals = vec.signals
+    agents = (vec.num_envs, len(signals.agents))
+    observation = {
+        "observation": _observation_spec(signals.padded_observation_space, agents),
+        "action_mask": _flags((*agents, signals.most_choices)),
+    }
+    action = _action_spec(spaces.Discrete(signals.most_choices), agents)
+    return _Group(signals.agents, SIGNAL_TERMS, observation, action)
 
 
 def _ends(terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> dict[str, Tensor]:

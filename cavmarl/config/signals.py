@@ -148,7 +148,8 @@ class SignalsConfig(Section, key="signals"):
         choices = ", ".join(SIGNAL_CONTROLLERS)
         return (
             f"signals.agents = {self.agents!r}: {what} has agents of vehicles alone; set "
-            f"signals.controller to one of {choices}, or use make_vec or parallel_env"
+            f"signals.controller to one of {choices}, or use make_vec, parallel_env or an adapter "
+            "of TorchRL, BenchMARL or RLlib"
         )
 
     @property

@@ -20,6 +20,9 @@ from cavmarl.signals.signal_table import SignalTable
 
 PREFIX = "signal_"  # of the ids of these agents, followed by the id of the signal
 
+# The kinds of agents: keys of the arrays of an environment in which signals have agents.
+VEHICLES, SIGNALS = "vehicles", "signals"
+
 
 class SignalAgents:
     """The agents of S signals in W worlds, and their results.
@@ -85,6 +88,28 @@ class SignalAgents:
             agent: spaces.Discrete(count)
             for agent, count in zip(self.agents, self.num_choices.tolist(), strict=True)
         }
+
+    @property
+    def most_choices(self) -> int:
+        """The number of choices G of the signal with most choices."""
+        return int(self.num_choices.max())
+
+    @property
+    def padded_observation_space(self) -> spaces.Box:
+        """The space of each observation (D,), padded with 0 to the longest one."""
+        return spaces.Box(0.0, 1.0, (self.table.sizes.features,), np.float32)
+
+    def keep_beyond(self, choices: NDArray[Any]) -> NDArray[np.int64]:
+        """Return choices (W, S) in which those that a signal does not have keep its green.
+
+        For policies that choose among `most_choices` for every signal.
+        """
+        keep = (
+            self._arrays.signal_states[..., GREEN]
+            if self._config.action == "next_phase"
+            else np.zeros(choices.shape, dtype=np.int64)
+        )
+        return np.where(choices < self.num_choices, choices, keep)
 
     def check(self, agent: str, action: Any) -> None:
         """Raise the ActionError of an action that is no choice of the agent's signal."""

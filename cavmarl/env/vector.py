@@ -23,7 +23,7 @@ from cavmarl.engine.spaces import (
 )
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
 from cavmarl.env.saved_state import load_session, save_session
-from cavmarl.env.signal_agents import SignalAgents
+from cavmarl.env.signal_agents import SIGNALS, VEHICLES, SignalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
@@ -156,12 +156,13 @@ class CavVectorEnv(WorldsEnvironment):
 
     def _add_signals(self, signals: SignalAgents) -> None:
         """Add the spaces of signals, padded to the largest one."""
-        seen = spaces.Box(0.0, 1.0, (signals.table.sizes.features,), np.float32)
         counts = signals.num_choices.astype(np.int64)
         choices = np.broadcast_to(counts, (self.num_envs, len(counts)))
         self.observation_space = spaces.Dict(
             vehicles=self.observation_space,
-            signals=batch_space(batch_space(seen, len(counts)), self.num_envs),
+            signals=batch_space(
+                batch_space(signals.padded_observation_space, len(counts)), self.num_envs
+            ),
         )
         self.action_space = spaces.Dict(
             vehicles=self.action_space, signals=spaces.MultiDiscrete(choices.copy())
@@ -301,26 +302,24 @@ class CavVectorEnv(WorldsEnvironment):
         over_all = over[:, None].repeat(len(session.signal_agents.agents), axis=1)
         return (
             observations,
-            {"vehicles": rewards, "signals": arrays.signal_rewards.copy()},
-            {"vehicles": terminations, "signals": np.zeros_like(over_all)},
-            {"vehicles": truncations, "signals": over_all},
+            {VEHICLES: rewards, SIGNALS: arrays.signal_rewards.copy()},
+            {VEHICLES: terminations, SIGNALS: np.zeros_like(over_all)},
+            {VEHICLES: truncations, SIGNALS: over_all},
             infos | self._signal_infos(),
         )
 
     def _split(self, actions: Any, signals: SignalAgents) -> tuple[Any, NDArray[np.int64]]:
         """Return the actions of vehicles and the choices of signals."""
-        if not isinstance(actions, Mapping) or actions.keys() - {"vehicles", "signals"}:
+        if not isinstance(actions, Mapping) or actions.keys() - {VEHICLES, SIGNALS}:
             raise ActionError(
                 "with agents of signals, actions must be a dict with the keys 'vehicles' and "
                 "'signals'"
             )
-        if "signals" not in actions or (
-            "vehicles" not in actions and self.config.population.agents
-        ):
-            raise ActionError(f"actions lack {'signals' if 'vehicles' in actions else 'vehicles'}")
-        choices = signals.from_array(actions["signals"])
+        if SIGNALS not in actions or (VEHICLES not in actions and self.config.population.agents):
+            raise ActionError(f"actions lack {SIGNALS if VEHICLES in actions else VEHICLES}")
+        choices = signals.from_array(actions[SIGNALS])
         idle = np.zeros_like(self.worlds.arrays.suggested)  # no agents drive vehicles
-        return actions.get("vehicles", self._session.decoder.encode(idle)), choices
+        return actions.get(VEHICLES, self._session.decoder.encode(idle)), choices
 
     def _signal_infos(self) -> dict[str, NDArray[Any]]:
         arrays = self.worlds.arrays
@@ -335,7 +334,7 @@ class CavVectorEnv(WorldsEnvironment):
         found = self._vehicle_observations()
         if self._session.signal_agents is None:
             return found
-        return {"vehicles": found, "signals": self.worlds.arrays.signal_observations.copy()}
+        return {VEHICLES: found, SIGNALS: self.worlds.arrays.signal_observations.copy()}
 
     def _vehicle_observations(self) -> Observations:
         arrays = self.worlds.arrays
@@ -379,8 +378,8 @@ class CavVectorEnv(WorldsEnvironment):
             return found
         last, over = arrays.final_signal_observations, arrays.episode_over
         return {
-            "vehicles": found,
-            "signals": with_rows(arrays.signal_observations, last, over),
+            VEHICLES: found,
+            SIGNALS: with_rows(arrays.signal_observations, last, over),
         }
 
     def _final_vehicle_observations(self, ended: NDArray[np.bool_]) -> Observations:
@@ -426,7 +425,7 @@ class CavVectorEnv(WorldsEnvironment):
         signals = self._session.signal_agents
         if signals is None:
             return found
-        return {"vehicles": found, "signals": np.maximum(signals.suggest(), 0)}
+        return {VEHICLES: found, SIGNALS: np.maximum(signals.suggest(), 0)}
 
     def state(self) -> NDArray[np.float32]:
         """Return the global states (W, S), each as from `CavEnv.state`; input of a central critic.

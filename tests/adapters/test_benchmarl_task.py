@@ -20,7 +20,12 @@ SMALL = {"agents": 2, "background": 2, "max_cycles": 8}
 
 
 def run(
-    folder: Path, algorithm: str = "Ippo", continuous: bool = True, **overrides: Any
+    folder: Path,
+    algorithm: str = "Ippo",
+    continuous: bool = True,
+    task: str = "MERGE",
+    agents: int = 2,
+    **overrides: Any,
 ) -> tuple[Any, list[float]]:
     """Return an experiment after two iterations and an evaluation, and its logged mean rewards."""
     import benchmarl.algorithms
@@ -36,12 +41,13 @@ def run(
     config.on_policy_n_envs_per_worker = 2
     config.on_policy_collected_frames_per_batch = config.off_policy_collected_frames_per_batch = 32
     config.on_policy_n_minibatch_iters, config.on_policy_minibatch_size = 1, 16
+    config.off_policy_n_optimizer_steps, config.off_policy_train_batch_size = 2, 16
     config.max_n_iters, config.max_n_frames = 2, None
     config.evaluation, config.evaluation_interval, config.evaluation_episodes = True, 32, 2
     config.loggers, config.create_json, config.render = ["csv"], False, False
     config.checkpoint_at_end, config.save_folder = False, str(folder)
     experiment = Experiment(
-        task=CavTask.MERGE.get_task({**SMALL, "overrides": overrides}),
+        task=CavTask[task].get_task({**SMALL, "agents": agents, "overrides": overrides}),
         algorithm_config=getattr(benchmarl.algorithms, f"{algorithm}Config").get_from_yaml(),
         model_config=MlpConfig.get_from_yaml(),
         critic_model_config=MlpConfig.get_from_yaml(),
@@ -49,7 +55,7 @@ def run(
         config=config,
     )
     experiment.run()
-    (table,) = folder.rglob("collection_reward_reward_mean.csv")
+    (table,) = folder.rglob("collection_reward_reward_mean.csv")  # of all groups
     rewards = [float(line.split(",")[1]) for line in table.read_text().splitlines()]
     return experiment, rewards
 
@@ -61,13 +67,36 @@ def test_ippo_runs_two_iterations(tmp_path: Path, mode: str) -> None:
     assert experiment.n_iters_performed == 2
     assert len(rewards) == 2
     assert np.isfinite(rewards).all()
-    assert experiment.group_map == {"car": [f"car_{k}" for k in range(4 if mode == "open" else 2)]}
+    assert experiment.group_map == {
+        "vehicles": [f"car_{k}" for k in range(4 if mode == "open" else 2)]
+    }
 
 
 def test_a_central_critic_meta_actions_and_named_observations_run(tmp_path: Path) -> None:
     keys = {"observation.kind": "dict"}
     experiment, _ = run(tmp_path, "Mappo", continuous=False, **keys)
     assert experiment.n_iters_performed == 2
+
+
+SIGNALS = {"signals.agents": "all", "clock.ctrl_dt_s": 5.0, "population.mode": "respawn"}
+
+
+@pytest.mark.parametrize("algorithm", ["Mappo", "Iql"])
+@pytest.mark.parametrize("agents", [0, 2])
+def test_each_kind_of_agents_is_a_group_that_learns(
+    tmp_path: Path, algorithm: str, agents: int
+) -> None:
+    """Every choice of a signal is one that its action mask allows."""
+    keys = SIGNALS | {"signals.forbidden": "error"}
+    experiment, rewards = run(tmp_path, algorithm, task="GRID4X4", agents=agents, **keys)
+    assert not experiment.continuous_actions
+    groups = ["vehicles", "signals"] if agents else ["signals"]
+    assert list(experiment.group_map) == groups
+    assert len(experiment.group_map["signals"]) == 16
+    assert np.isfinite(rewards).all()
+    for group in groups:
+        optimized = experiment.optimizers[group]
+        assert all(optimizer.state for optimizer in optimized.values()), f"{group} learns"
 
 
 def test_the_seed_determines_the_results(tmp_path: Path) -> None:
@@ -77,7 +106,7 @@ def test_the_seed_determines_the_results(tmp_path: Path) -> None:
 def test_every_entry_is_a_task() -> None:
     from cavmarl.adapters.benchmarl_task import CavTask
 
-    assert {task.name.lower() for task in CavTask} == set(entries())
+    assert {task.get_task().config["env"] for task in CavTask} == set(entries())
     assert CavTask.RING.get_task().config == {"env": "ring"}
 
 

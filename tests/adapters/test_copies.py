@@ -57,9 +57,9 @@ def step_rows(env: Any) -> list[bytes]:
 def step_tensors(env: Any) -> list[bytes]:
     """Return the results of a step of TorchRL, whose worlds reset themselves."""
     tensors = env.full_action_spec.zero()
-    tensors["car", "action"][:] = 0.3
+    tensors["vehicles", "action"][:] = 0.3
     told = env.step(tensors)["next"]
-    return [told["car", name].numpy().tobytes() for name in ("observation", "reward", "done")]
+    return [told["vehicles", name].numpy().tobytes() for name in ("observation", "reward", "done")]
 
 
 VIEWS: dict[str, tuple[Callable[..., Any], Callable[[Any], list[bytes]]]] = {

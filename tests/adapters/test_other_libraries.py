@@ -1,4 +1,4 @@
-"""Run the examples of docs/guides/libraries.md for libraries without an adapter."""
+"""Run the examples of docs/guides/libraries.md that need another library."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "guides" / "libraries.md"
-LIBRARIES = ("supersuit", "tianshou", "skrl", "agilerl")
+LIBRARIES = ("supersuit", "tianshou", "skrl", "agilerl", "ray.rllib")
 
 
 def example(library: str) -> str:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator
 from functools import partial
 from typing import Any
 
+import numpy as np
 import pytest
 
 from cavmarl.core.errors import ConfigError
@@ -152,3 +154,130 @@ def test_wrong_settings_are_refused() -> None:
 
     with pytest.raises(ConfigError, match=r"population\.agents = 0"):
         CavRllibEnv({"env": "merge", "agents": 0})
+
+
+# Agents of signals
+
+TOWN = {"signals.agents": "all", "clock.ctrl_dt_s": 1.0, "signals.decide_s": 2.0, "horizon_s": 9.0}
+
+
+def town(agents: int, mode: str) -> dict[str, Any]:
+    """A world whose signals differ in their lanes and greens."""
+    keys = TOWN | {"population.mode": mode, "population.budget": 4}
+    return {"env": "town", "agents": agents, "background": 20, "overrides": keys}
+
+
+@pytest.mark.parametrize("agents", [0, 2])
+@pytest.mark.parametrize("mode", MODES)
+def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
+    """The results are those of the world; signals are silent between two decisions."""
+    from cavmarl.adapters.rllib_env import CavRllibEnv, policy_of
+
+    env, twin = CavRllibEnv(town(agents, mode)), parallel_env(**town(agents, mode))
+    signals = twin.signals
+    cars = [agent for agent in env.possible_agents if policy_of(agent) == "vehicles"]
+    assert bool(cars) == bool(agents)
+    assert env.possible_agents == [*cars, *signals.agents]
+    action_space = env.get_action_space(signals.agents[0])
+    assert action_space.n == max(twin.action_space(agent).n for agent in signals.agents)
+    for agent in env.possible_agents:
+        env.get_action_space(agent).seed(len(agent))
+    observations, infos = env.reset(seed=3)
+    theirs, told = twin.reset(seed=3)
+    first, kept = observations, copy.deepcopy(observations)
+    calls, beyond, decisions = 0, 0, 0
+    while True:
+        for agent, seen in observations.items():
+            assert env.get_observation_space(agent).contains(seen)
+            if agent in signals.agents:
+                own = theirs[agent]
+                size, num = len(own), len(told[agent]["action_mask"])
+                assert seen["observations"][:size].tolist() == own.tolist()
+                assert not seen["observations"][size:].any()
+                assert seen["action_mask"][:num].tolist() == told[agent]["action_mask"].tolist()
+                assert not seen["action_mask"][num:].any()
+            else:
+                assert seen.tolist() == theirs[agent].tolist()
+            assert infos[agent].keys() == told[agent].keys()
+        if not twin.agents:
+            break
+        acting = [agent for agent in env.agents if agent in observations]
+        actions = {agent: env.get_action_space(agent).sample() for agent in acting}
+        own_actions = dict(actions)
+        for agent in set(acting) & set(signals.agents):
+            decisions += 1
+            if actions[agent] >= twin.action_space(agent).n:
+                own_actions[agent] = told[agent]["green"]
+                beyond += 1
+        observations, rewards, ended, cut, infos = env.step(actions)
+        calls += 1
+        theirs, paid, over, left, told = twin.step(own_actions)
+        decides = told[signals.agents[0]]["decides"]
+        while not decides and twin.agents == list(signals.agents):
+            more = twin.step({})
+            theirs, paid, over, left, told = (
+                old | new for old, new in zip((theirs, paid, over, left, told), more, strict=True)
+            )
+            decides = told[signals.agents[0]]["decides"]
+        is_shown = decides or not twin.agents
+        expected = {agent for agent in theirs if is_shown or agent not in signals.agents}
+        assert observations.keys() == rewards.keys() == infos.keys() == expected
+        assert ended.pop("__all__") is False
+        assert cut.pop("__all__") == (not twin.agents)
+        assert rewards == {agent: paid[agent] for agent in expected}
+        assert ended == {agent: over[agent] for agent in expected}
+        assert cut == {agent: left[agent] for agent in expected}
+        assert env.agents == twin.agents
+    for agent in signals.agents:  # later steps do not overwrite what RLlib keeps
+        np.testing.assert_equal(first[agent], kept[agent])
+    assert beyond > 0
+    assert decisions == 9 * 5  # every 2 of 9 s
+    if not agents:
+        assert calls == 5
+    elif mode == "respawn":  # seats act in each step
+        assert calls == 9
+
+
+@pytest.mark.usefixtures("cluster")
+@pytest.mark.parametrize("agents", [0, 2])
+def test_each_kind_of_agents_trains_its_policy(agents: int) -> None:
+    """RLlib's own module masks actions; every choice that it makes is allowed."""
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
+    from ray.rllib.core.rl_module.rl_module import RLModuleSpec
+    from ray.rllib.examples.rl_modules.classes.action_masking_rlm import (
+        ActionMaskingTorchRLModule,
+    )
+
+    from cavmarl.adapters.rllib_env import CavRllibEnv, policy_of
+
+    modules = {"signals": RLModuleSpec(module_class=ActionMaskingTorchRLModule)}
+    if agents:
+        modules["vehicles"] = RLModuleSpec()
+    world = town(agents, "open")
+    world["overrides"] |= {
+        "action.out_of_range": "clip",
+        "signals.forbidden": "error",
+        "horizon_s": 40.0,
+    }
+    algorithm = (
+        PPOConfig()
+        # RLlib's check of an environment acts at random.
+        .environment(CavRllibEnv, env_config=world, disable_env_checking=True)
+        .env_runners(num_env_runners=0, rollout_fragment_length=64)
+        .multi_agent(policies=set(modules), policy_mapping_fn=policy_of)
+        .rl_module(rl_module_spec=MultiRLModuleSpec(rl_module_specs=modules))
+        .training(train_batch_size_per_learner=128, minibatch_size=64, num_epochs=1)
+        .learners(num_learners=0)
+        .debugging(seed=0, log_level="ERROR")
+        .build_algo()
+    )
+    before = algorithm.get_weights()
+    found = algorithm.train()
+    after = algorithm.get_weights()
+    algorithm.stop()
+    assert found["env_runners"]["num_episodes"] > 0
+    for policy in modules:
+        changes = [(after[policy][name] != each).any() for name, each in before[policy].items()]
+        assert any(changes), f"{policy} learns"
+        assert np.isfinite(found["learners"][policy]["total_loss"])

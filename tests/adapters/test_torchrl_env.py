@@ -7,10 +7,12 @@ from typing import Any
 import numpy as np
 import pytest
 
+from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import ActionError, ConfigError
 from cavmarl.engine.spaces import flat_observation, observation_parts
 from cavmarl.env.vector import make_vec
+from cavmarl.signals.kernels.green_choices import GREEN
 
 torch = pytest.importorskip("torch", reason="needs the extra: torchrl")
 torchrl = pytest.importorskip("torchrl", reason="needs the extra: torchrl")
@@ -23,7 +25,8 @@ pytestmark = [
 
 MODES = ("closed", "open", "respawn")
 WORLDS, AGENTS, BUDGET, HORIZON = 2, 3, 5, 12
-CAR = "car"
+UPDATES, STEPS = 6, 25
+VEHICLES = "vehicles"
 
 
 def settings(mode: str = "respawn", **overrides: Any) -> dict[str, Any]:
@@ -42,10 +45,12 @@ def make(mode: str = "respawn", **overrides: Any) -> Any:
 
 def wild(tensordict: Any) -> Any:
     """Return a policy of full throttle: vehicles leave the road, or their trips are truncated."""
-    random = torch.Generator().manual_seed(int(tensordict[CAR, "observation"].sum() * 1e3) % 2**31)
-    actions = 2.0 * torch.rand((*tensordict[CAR, "mask"].shape, 2), generator=random) - 1.0
+    random = torch.Generator().manual_seed(
+        int(tensordict[VEHICLES, "observation"].sum() * 1e3) % 2**31
+    )
+    actions = 2.0 * torch.rand((*tensordict[VEHICLES, "mask"].shape, 2), generator=random) - 1.0
     actions[..., 0] = 1.0
-    return tensordict.set((CAR, "action"), actions)
+    return tensordict.set((VEHICLES, "action"), actions)
 
 
 @pytest.mark.parametrize("action", ["continuous", "discrete", "grid"])
@@ -56,7 +61,7 @@ def test_torchrls_own_check_passes(mode: str, kind: str, action: str) -> None:
 
     env = make(mode, **{"observation.kind": kind, "action.kind": action})
     assert env.batch_size == (WORLDS,)
-    assert env.group_map == {CAR: env.vec.possible_agents}
+    assert env.group_map == {VEHICLES: env.vec.possible_agents}
     check_env_specs(env, seed=0, break_when_any_done="both")
 
 
@@ -71,23 +76,25 @@ def test_the_tensors_are_the_worlds_arrays(mode: str) -> None:
     after = rollout["next"]
     for step in range(80):
         now, then = rollout[:, step], after[:, step]
-        np.testing.assert_array_equal(now[CAR, "observation"], seen)
-        np.testing.assert_array_equal(now[CAR, "mask"], infos["mask"])
-        seen, rewards, ended, cut, infos = vec.step(now[CAR, "action"].numpy())
-        np.testing.assert_array_equal(then[CAR, "observation"], infos["final_observations"])
-        np.testing.assert_array_equal(then[CAR, "reward"][..., 0], rewards)
-        np.testing.assert_array_equal(then[CAR, "terminated"][..., 0], ended)
-        np.testing.assert_array_equal(then[CAR, "truncated"][..., 0], cut)
-        np.testing.assert_array_equal(then[CAR, "done"][..., 0], ended | cut)
+        np.testing.assert_array_equal(now[VEHICLES, "observation"], seen)
+        np.testing.assert_array_equal(now[VEHICLES, "mask"], infos["mask"])
+        seen, rewards, ended, cut, infos = vec.step(now[VEHICLES, "action"].numpy())
+        np.testing.assert_array_equal(then[VEHICLES, "observation"], infos["final_observations"])
+        np.testing.assert_array_equal(then[VEHICLES, "reward"][..., 0], rewards)
+        np.testing.assert_array_equal(then[VEHICLES, "terminated"][..., 0], ended)
+        np.testing.assert_array_equal(then[VEHICLES, "truncated"][..., 0], cut)
+        np.testing.assert_array_equal(then[VEHICLES, "done"][..., 0], ended | cut)
         np.testing.assert_array_equal(then["done"][:, 0], infos["episode_over"])
         np.testing.assert_array_equal(then["truncated"][:, 0], cut.any(axis=1))
         for k, term in enumerate(TERMS):
-            np.testing.assert_array_equal(then[CAR, "info", term][..., 0], infos["terms"][..., k])
+            np.testing.assert_array_equal(
+                then[VEHICLES, "info", term][..., 0], infos["terms"][..., k]
+            )
         if (ended & ~infos["episode_over"][:, None]).any():
             seen = np.where(ended[..., None], infos["final_observations"], seen)
-    assert after[CAR, "terminated"].any()
-    assert after[CAR, "truncated"].any()
-    assert not rollout[CAR, "mask"].all()
+    assert after[VEHICLES, "terminated"].any()
+    assert after[VEHICLES, "truncated"].any()
+    assert not rollout[VEHICLES, "mask"].all()
 
 
 def test_agents_end_singly_and_their_world_goes_on() -> None:
@@ -95,7 +102,7 @@ def test_agents_end_singly_and_their_world_goes_on() -> None:
     env.set_seed(0)
     rollout = env.rollout(HORIZON, wild, break_when_any_done=True)
     assert rollout.shape == (WORLDS, HORIZON)
-    assert rollout["next", CAR, "terminated"].any()
+    assert rollout["next", VEHICLES, "terminated"].any()
     assert not rollout["next", "done"][:, :-1].any()
     assert rollout["next", "truncated"][:, -1].all()
 
@@ -110,8 +117,10 @@ def test_the_seed_determines_the_results() -> None:
     assert (episode(env, 3) == first).all()
     assert (episode(make(), 3) == first).all()
     other = episode(env, 4)
-    assert not torch.equal(other[CAR, "observation"], first[CAR, "observation"])
-    assert not torch.equal(env.reset()[CAR, "observation"], other[:, 0][CAR, "observation"])
+    assert not torch.equal(other[VEHICLES, "observation"], first[VEHICLES, "observation"])
+    assert not torch.equal(
+        env.reset()[VEHICLES, "observation"], other[:, 0][VEHICLES, "observation"]
+    )
 
 
 def test_a_world_can_be_reset_before_it_is_over() -> None:
@@ -121,8 +130,8 @@ def test_a_world_can_be_reset_before_it_is_over() -> None:
     before = env.step(wild(env.reset()))["next"]
     mask = torch.tensor([[False], [True]])
     again = env.reset(before.clone().set("_reset", mask))
-    assert torch.equal(again[0][CAR, "observation"], before[0][CAR, "observation"])
-    assert not torch.equal(again[1][CAR, "observation"], before[1][CAR, "observation"])
+    assert torch.equal(again[0][VEHICLES, "observation"], before[0][VEHICLES, "observation"])
+    assert not torch.equal(again[1][VEHICLES, "observation"], before[1][VEHICLES, "observation"])
     if torchrl.__version__.startswith("0.11."):
         pytest.skip("this TorchRL's StepCounter cannot cut agents of a batch")
     counted = TransformedEnv(env, StepCounter(max_steps=5))
@@ -145,7 +154,7 @@ def test_observations_may_be_named_by_sensor() -> None:
     for env in (named, flat):
         env.set_seed(1)
     parts = observation_parts(named.vec.config.sensors)
-    shown, wanted = named.reset()[CAR, "observation"], flat.reset()[CAR, "observation"]
+    shown, wanted = named.reset()[VEHICLES, "observation"], flat.reset()[VEHICLES, "observation"]
     assert list(shown.keys()) == list(parts)
     one = {name: part[1, 2].numpy() for name, part in shown.items()}
     np.testing.assert_array_equal(flat_observation(parts, one, stack=1), wanted[1, 2])
@@ -158,7 +167,7 @@ def test_torchrls_collector_gathers_whole_batches() -> None:
     batches = list(collector)
     collector.shutdown()
     assert [batch.numel() for batch in batches] == [20, 20]
-    assert batches[1]["next", CAR, "reward"].shape == (WORLDS, 10, AGENTS, 1)
+    assert batches[1]["next", VEHICLES, "reward"].shape == (WORLDS, 10, AGENTS, 1)
 
 
 def test_wrong_use_is_refused() -> None:
@@ -170,6 +179,160 @@ def test_wrong_use_is_refused() -> None:
     with pytest.raises(ConfigError, match="seed"):
         make().set_seed(-1)
     env = make()
-    beyond = env.reset().set((CAR, "action"), torch.full((WORLDS, AGENTS, 2), 3.0))
+    beyond = env.reset().set((VEHICLES, "action"), torch.full((WORLDS, AGENTS, 2), 3.0))
     with pytest.raises(ActionError, match="must be within"):
         env.step(beyond)
+
+
+# Agents of signals
+
+TOWN = {"signals.agents": "all", "clock.ctrl_dt_s": 1.0, "signals.decide_s": 2.0, "horizon_s": 9.0}
+
+
+def town(agents: int = 2, **overrides: Any) -> Any:
+    """Worlds whose signals differ in their lanes and greens."""
+    from cavmarl.adapters.torchrl_env import CavTorchRLEnv
+
+    keys = TOWN | overrides
+    return CavTorchRLEnv("town", num_envs=WORLDS, agents=agents, background=20, overrides=keys)
+
+
+@pytest.mark.parametrize("action", ["continuous", "discrete"])
+def test_vehicles_and_signals_are_two_groups(action: str) -> None:
+    from torchrl.envs.utils import check_env_specs
+
+    env = town(**{"action.kind": action, "observation.kind": "dict"})
+    signals = env.vec.signals
+    assert env.group_map == {
+        "vehicles": env.vec.possible_agents,
+        "signals": list(signals.agents),
+    }
+    check_env_specs(env, seed=0, break_when_any_done="both")
+    assert len(set(signals.num_choices.tolist())) > 1
+    assert len(set(signals.table.features)) > 1
+    first = env.reset()
+    assert ("action_mask" in first["vehicles"].keys()) == (action == "discrete")
+    if action == "discrete":
+        assert first["vehicles", "action_mask"].all()
+    assert first["signals", "action_mask"].any(-1).all()
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_the_tensors_of_signals_are_the_worlds_arrays(mode: str) -> None:
+    """Choices that a signal does not have keep its green; all others are passed on."""
+    keys = {"population.mode": mode, "population.budget": 4}
+    env = town(**keys)
+    vec = make_vec("town", num_envs=WORLDS, agents=2, background=20, overrides=TOWN | keys)
+    random = torch.Generator().manual_seed(0)
+    most = env.action_spec["signals", "action"].n
+    beyond = 0
+
+    def policy(tensordict: Any) -> Any:
+        shape = tensordict["signals", "mask"].shape
+        tensordict["signals", "action"] = torch.randint(most, shape, generator=random)
+        cars = 2.0 * torch.rand((*tensordict["vehicles", "mask"].shape, 2), generator=random) - 1.0
+        return tensordict.set(("vehicles", "action"), cars)
+
+    env.set_seed(7)
+    rollout = env.rollout(30, policy, break_when_any_done=False)
+    after = rollout["next"]
+    seen, infos = vec.reset(seed=7)
+    for step in range(30):
+        now, then = rollout[:, step], after[:, step]
+        np.testing.assert_array_equal(now["signals", "observation"], seen["signals"])
+        np.testing.assert_array_equal(now["signals", "action_mask"], infos["signal_mask"])
+        decides = infos["signal_decides"]
+        np.testing.assert_array_equal(now["signals", "mask"], decides[:, None].repeat(9, 1))
+        choices = now["signals", "action"].numpy()
+        greens = vec.signals.view.states[..., GREEN]
+        own = np.where(choices < vec.signals.num_choices, choices, greens)
+        beyond += int((own != choices).sum())
+        actions = {"vehicles": now["vehicles", "action"].numpy(), "signals": own}
+        seen, rewards, ended, cut, infos = vec.step(actions)
+        last = infos["final_observations"]
+        for group in ("vehicles", "signals"):
+            np.testing.assert_array_equal(then[group, "observation"], last[group])
+            np.testing.assert_array_equal(then[group, "reward"][..., 0], rewards[group])
+            np.testing.assert_array_equal(then[group, "terminated"][..., 0], ended[group])
+            np.testing.assert_array_equal(then[group, "truncated"][..., 0], cut[group])
+        np.testing.assert_array_equal(then["done"][:, 0], infos["episode_over"])
+        np.testing.assert_array_equal(then["truncated"][:, 0], infos["episode_over"])
+        for k, term in enumerate(SIGNAL_TERMS):
+            found = then["signals", "info", term][..., 0]
+            np.testing.assert_array_equal(found, infos["signal_terms"][..., k])
+        left = ended["vehicles"] & ~infos["episode_over"][:, None]
+        if left.any():
+            seen["vehicles"] = np.where(left[..., None], last["vehicles"], seen["vehicles"])
+    assert beyond > 0
+    assert after["signals", "reward"].any()
+    assert int(after["done"].sum()) == 6
+    assert env.vec.state_hash() == vec.state_hash()
+
+
+def test_torchrls_action_mask_leaves_the_choices_that_are_allowed() -> None:
+    from torchrl.envs import ActionMask, TransformedEnv
+
+    env = town(agents=0, **{"signals.forbidden": "error", "signals.max_green_s": 10.0})
+    assert list(env.group_map) == ["signals"]
+    masked = TransformedEnv(env, ActionMask(("signals", "action"), ("signals", "action_mask")))
+    rollout = masked.rollout(40, break_when_any_done=False)
+    assert len(rollout["signals", "action"].unique()) > 4
+    with pytest.raises(ActionError, match="is not allowed now"):
+        env.rollout(40, break_when_any_done=False)
+
+
+@pytest.mark.filterwarnings("ignore:size_average and reduce args")  # of TorchRL 0.11 itself
+def test_ppo_learns_to_open_the_longest_queues() -> None:
+    """One network for all signals, by TorchRL's masked distribution, advantages and loss."""
+    from tensordict import TensorDict
+    from tensordict.nn import TensorDictModule
+    from torchrl.envs import ExplorationType, set_exploration_type
+    from torchrl.modules import MLP, MaskedCategorical, ProbabilisticActor
+    from torchrl.objectives import ClipPPOLoss
+    from torchrl.objectives.value import GAE
+
+    from cavmarl.adapters.torchrl_env import CavTorchRLEnv
+
+    torch.manual_seed(0)
+    keys = {
+        "signals.agents": "all", "signals.terms": {"queue": 0.1}, "signals.max_green_s": 0.0,
+        "clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 5.0, "horizon_s": 5.0 * STEPS,
+        "population.mode": "open",
+    }  # fmt: skip
+    env = CavTorchRLEnv("grid4x4", num_envs=2, agents=0, background=150, overrides=keys)
+    seen, mask, action = (("signals", name) for name in ("observation", "action_mask", "action"))
+    size, choices = env.observation_spec[seen].shape[-1], int(env.action_spec[action].n)
+    logits, value = ("signals", "logits"), ("signals", "state_value")
+    actor = ProbabilisticActor(
+        TensorDictModule(MLP(size, choices, num_cells=[32]), [seen], [logits]),
+        in_keys={"logits": logits, "mask": mask},
+        out_keys=[action],
+        distribution_class=MaskedCategorical,
+        return_log_prob=True,
+        log_prob_key=("signals", "log_prob"),
+    )
+    critic = TensorDictModule(MLP(size, 1, num_cells=[32]), [seen], [value])
+    ends = {name: ("signals", name) for name in ("reward", "done", "terminated")}
+    advantages = GAE(gamma=0.9, lmbda=0.9, value_network=critic)
+    loss = ClipPPOLoss(actor, critic, normalize_advantage=True, entropy_coeff=0.01)
+    advantages.set_keys(value=value, **ends)
+    loss.set_keys(value=value, action=action, sample_log_prob=("signals", "log_prob"), **ends)
+    optimizer = torch.optim.Adam(loss.parameters(), lr=5e-3)
+    returns = []
+    for _ in range(UPDATES):
+        env.set_seed(0)
+        with torch.no_grad(), set_exploration_type(ExplorationType.RANDOM):
+            batch = env.rollout(STEPS, actor, break_when_any_done=False)
+            returns.append(float(batch["next", "signals", "reward"].mean()))
+            rows = TensorDict(
+                {"signals": batch["signals"], "next": {"signals": batch["next", "signals"]}},
+                batch["signals"].shape,
+            )
+            rows = rows.transpose(1, 2).reshape(-1, STEPS)
+            advantages(rows)
+        for _ in range(4):
+            losses = loss(rows.reshape(-1))
+            optimizer.zero_grad()
+            (losses["loss_objective"] + losses["loss_critic"] + losses["loss_entropy"]).backward()
+            optimizer.step()
+    assert np.mean(returns[-2:]) > 0.9 * np.mean(returns[:2])

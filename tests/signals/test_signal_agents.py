@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from cavmarl import ActionError, CavEnv, CavVectorEnv, ConfigError, make_vec, parallel_env
 from cavmarl.adapters.gymnasium_env import CavEgoEnv
 from cavmarl.adapters.gymnasium_rows import CavAgentRows
+from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import PolicyError
 from cavmarl.cosim.carla.carla_server import serve
@@ -231,6 +232,58 @@ def test_the_parallel_environment_keeps_its_contract() -> None:
             assert env.observation_space(agent).contains(observations[agent])
             assert infos[agent]["decides"] == 1
         assert env.agents[-1] == "signal_D3"
+
+
+@pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
+@pytest.mark.parametrize("agents", [0, 2])
+def test_dicts_and_arrays_have_the_same_trajectories(mode: str, agents: int) -> None:
+    keys = ALL | {"population.mode": mode, "population.budget": 4, "horizon_s": 40.0}
+    settings: dict[str, Any] = {"agents": agents, "background": 30, "overrides": keys}
+    env = parallel_env("town", **settings)
+    vec = make_vec("town", num_envs=1, autoreset_mode="NextStep", **settings)
+    with closing(env), closing(vec):
+        signals, rng = vec.signals, np.random.default_rng(0)
+        seen, infos = vec.reset(seed=2)
+        observations, told = env.reset(seed=2)
+        rewards: dict[str, float] = {}
+        truncations: dict[str, bool] = {}
+        steps = 0
+        while True:
+            for s, agent in enumerate(signals.agents):
+                size, count = signals.table.features[s], signals.num_choices[s]
+                assert observations[agent].tolist() == seen["signals"][0, s, :size].tolist()
+                assert not seen["signals"][0, s, size:].any()
+                mask = infos["signal_mask"][0, s].tolist()
+                assert told[agent]["action_mask"].tolist() == mask[:count]
+                assert not any(mask[count:])
+                assert told[agent]["decides"] == infos["signal_decides"][0]
+                terms = [told[agent][name] for name in SIGNAL_TERMS]
+                assert terms == infos["signal_terms"][0, s].tolist()
+            for k, agent in enumerate(vec.possible_agents):
+                if agent in observations:
+                    assert observations[agent].tolist() == seen["vehicles"][0, k].tolist()
+            assert env.state_hash() == vec.state_hash()
+            if not env.agents:
+                break
+            actions: dict[str, Any] = {
+                "vehicles": vec.suggest_actions()["vehicles"],
+                "signals": rng.integers(0, signals.num_choices)[None],
+            }
+            acting = dict(zip(vec.possible_agents, actions["vehicles"][0], strict=True))
+            acting |= zip(signals.agents, actions["signals"][0], strict=True)
+            observations, rewards, _, truncations, told = env.step(
+                {agent: acting[agent] for agent in env.agents}
+            )
+            seen, paid, _, cut, infos = vec.step(actions)
+            steps += 1
+            for s, agent in enumerate(signals.agents):
+                assert rewards[agent] == paid["signals"][0, s]
+                assert truncations[agent] == cut["signals"][0, s]
+            for k, agent in enumerate(vec.possible_agents):
+                if agent in rewards:
+                    assert rewards[agent] == paid["vehicles"][0, k]
+        assert steps == 40
+        assert infos["signal_refused"].any()
 
 
 def test_signals_are_truncated_at_the_horizon_and_never_terminated() -> None:

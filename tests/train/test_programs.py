@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from cavmarl.config.registry import load_config
+from cavmarl.config.registry import entries, load_config
 from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
@@ -118,6 +118,25 @@ def test_wrong_use_of_a_librarys_program_is_refused(
 ) -> None:
     pytest.importorskip(module)
     assert message in refusal(capsys, program, *words, "--runs", tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("program", "module"),
+    [("ppo.py", "torch"), ("ippo_torchrl.py", "torchrl"), ("ppo_rllib.py", "ray.rllib")],
+)
+@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+def test_programs_for_drivers_refuse_agents_of_signals(
+    tmp_path: Path, program: str, module: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip(module)
+    source = entries()["grid4x4"] / "map" / "map.net.xml"
+    settings = {
+        "name": "lights", "version": 1, "map": {"source": str(source)},
+        "signals": {"agents": "all"},
+    }  # fmt: skip
+    (tmp_path / "env.yaml").write_text(json.dumps(settings), encoding="utf-8")
+    said = refusal(capsys, program, "--env", tmp_path, "--runs", tmp_path / "runs")
+    assert "this program has agents of vehicles alone" in said
 
 
 def test_five_seeds_trains_what_is_missing_and_writes_the_table(tmp_path: Path) -> None:
