@@ -10,7 +10,7 @@ from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
 # (`signals/kernels/signal_observations.py`).
-SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure")
+SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure", "delay", "wait")
 
 NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
@@ -40,6 +40,9 @@ class SignalsConfig(Section, key="signals"):
             begins the next one in the order of the program.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
+        range_m: scores of controllers and rewards count the vehicles on lanes that lead to a signal
+            within this distance of its stop line; 0: on the last lane before the signal alone, as
+            in sumo-rl. A lane counts as a whole.
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         overrides: number of links at whose signals the caller may show states of its own in a world
             at the same time (`SignalOverrides`).
@@ -55,6 +58,7 @@ class SignalsConfig(Section, key="signals"):
     greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
+    range_m: Annotated[float, Within(0.0, 1000.0)] = 0.0
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
     overrides: Annotated[int, Whole(0, 100_000)] = 0
 

@@ -434,7 +434,7 @@ def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    sizes = sizes_of(simulation.network)
+    sizes = sizes_of(simulation.network, simulation.config.signals.range_m)
     layout = layout_of(simulation.config, simulation.capacity, num_worlds, sizes)
     sensed = frame_layout(simulation.config, num_worlds)
     made = {
