@@ -7,16 +7,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from gymnasium import spaces
+from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.sb3_vec_env import DECIDED, CavSb3VecEnv
-from cavmarl.core.errors import missing
+from cavmarl.core.errors import ConfigError, missing
 from cavmarl.env.vector import make_vec
+from cavmarl.signals.green_features import MOST, GreenFeatures
 from cavmarl.signals.kernels.green_choices import GREEN
 
 try:
@@ -38,6 +40,11 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     Args:
         env: see `make_vec`.
         num_worlds: W.
+        features: `lanes`: observations as the agents get them. `greens`: the rows of
+            `GreenFeatures`, for `sb3_green_policy.GreenPolicy`.
+        spread: whether the first episodes of the worlds have different lengths, so that the worlds
+            are at different times of their episodes. Before the first decision, signals then follow
+            the durations of their programs for an episode.
         overrides: values of any other keys; `signals.agents` is `all` by default.
         arguments: other keyword arguments of `make_vec`; `agents` is 0 by default.
 
@@ -50,20 +57,33 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         env: str | Path = "grid4x4",
         *,
         num_worlds: int = 1,
+        features: Literal["lanes", "greens"] = "lanes",
+        spread: bool = False,
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         refuse_decided(DECIDED, arguments)
+        if features not in ("lanes", "greens"):
+            raise ConfigError(f"features = {features!r}: must be 'lanes' or 'greens'")
         keys = {"signals.agents": "all", **(overrides or {})}
-        self._vec = make_vec(env, num_envs=num_worlds, overrides=keys, **{"agents": 0, **arguments})
+        self._vec = make_vec(
+            env,
+            num_envs=num_worlds,
+            overrides=keys,
+            **{"agents": 0, **arguments, "autoreset_mode": AutoresetMode.DISABLED},
+        )
         table = self._vec.signals.table
+        self._features = GreenFeatures(table) if features == "greens" else None
+        self._spreads = spread
         self._num_choices = self._vec.signals.num_choices
         self._shape = (num_worlds, len(table.ids))
         self._actions = np.zeros(self._shape, dtype=np.int64)
         VecEnv.__init__(
             self,
             num_worlds * len(table.ids),
-            spaces.Box(0.0, 1.0, (table.sizes.features,), np.float32),
+            spaces.Box(0.0, 1.0, (table.sizes.features,), np.float32)
+            if self._features is None
+            else spaces.Box(-MOST, MOST, (self._features.size,), np.float32),
             spaces.Discrete(int(self._num_choices.max())),
         )
         self.metadata = self._vec.metadata
@@ -71,11 +91,33 @@ class CavSb3SignalEnv(CavSb3VecEnv):
 
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in every world; all seeds are derived from the seed of the first row."""
-        observations, _ = self._vec.reset(seed=self._seeds[0])
+        self._vec.reset(seed=self._seeds[0])
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
-        return self._signal_rows(observations["signals"])
+        if self._spreads:
+            self._spreads = False
+            self._spread()
+        return self._signal_rows()
+
+    def _spread(self) -> None:
+        """Begin new episodes one after the other, over the length of an episode."""
+        worlds = self._shape[0]
+        per_decision = round(self._vec.config.signals.decide_s / self._vec.config.clock.ctrl_dt_s)
+        between = self._vec.max_cycles // per_decision // worlds * per_decision
+        for world in range(worlds - 1):
+            for _ in range(between):
+                self._vec.step(self._vec.suggest_actions())
+            self._vec.reset(options={"reset_mask": np.arange(worlds) == world})
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """The sizes of `GreenNetwork`: greens, and values of a row that do not belong to a green."""
+        if self._features is None:
+            raise ConfigError(
+                "sizes: rows of lanes have none; make the rows with features='greens'"
+            )
+        return self._features.num_greens, self._features.num_shared
 
     def action_masks(self) -> NDArray[np.bool_]:
         """Return the allowed actions (W · S, G) of the next step."""
@@ -99,28 +141,31 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         choices = np.where(self._actions < self._num_choices, self._actions, keep)
         rewards = np.zeros(self._shape, dtype=np.float32)
         done = np.zeros(self._shape, dtype=np.bool_)
-        last = np.zeros((*self._shape, arrays.signal_observations.shape[2]), dtype=np.float32)
+        last = np.zeros((self.num_envs, *self.observation_space.shape), dtype=np.float32)
         while True:
             actions = {"signals": choices}
             if self._vec.config.population.agents:
                 actions["vehicles"] = self._vec.suggest_actions()["vehicles"]
-            observations, gained, _, over, infos = self._vec.step(actions)
+            _, gained, _, over, infos = self._vec.step(actions)
             rewards += gained["signals"]
-            ends = over["signals"]
-            last[ends] = infos["final_observations"]["signals"][ends]
-            done |= ends
-            if infos["signal_decides"].all():
+            if infos["episode_over"].any():
+                done |= over["signals"]
+                ends = over["signals"].reshape(-1)
+                last[ends] = self._signal_rows()[ends]
+                self._vec.reset(options={"reset_mask": infos["episode_over"]})
+            if arrays.signal_decides.all():
                 break
         masks = self.action_masks()
         shown: list[dict[str, Any]] = [{"action_mask": mask} for mask in masks]
         for row in np.flatnonzero(done):
             shown[row] |= {
-                "terminal_observation": last.reshape(self.num_envs, -1)[row],
+                "terminal_observation": last[row],
                 "TimeLimit.truncated": True,
             }
-        rows = self._signal_rows(observations["signals"])
-        return rows, rewards.reshape(-1), done.reshape(-1), shown
+        return self._signal_rows(), rewards.reshape(-1), done.reshape(-1), shown
 
-    def _signal_rows(self, batch: NDArray[np.float32]) -> NDArray[np.float32]:
-        """Reshape (W, S, D) to (W · S, D)."""
-        return batch.reshape(self.num_envs, -1)
+    def _signal_rows(self) -> NDArray[np.float32]:
+        """Return the present observations (W · S, D)."""
+        view = self._vec.signals.view
+        found = view.observations.copy() if self._features is None else self._features.of(view)
+        return found.reshape(self.num_envs, -1)

@@ -67,7 +67,12 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
         rows["speed"], rows["free_s"] = speed, 0.25
         meter.sample(rows, 2 * second, due, codes)
     figures = meter.result(
-        arrived=0, trip_s=0.0, delay_s=0.0, waiting_s=np.array([7.0]), switches_per_h=None
+        arrived=0,
+        trip_s=0.0,
+        delay_s=0.0,
+        waiting_s=np.array([7.0]),
+        switches_per_h=None,
+        jams=None,
     )
     assert figures.waiting_s == 5.0
     assert figures.stops == 2.0
@@ -126,7 +131,7 @@ def test_the_suite_prints_a_table(tmp_path: Path) -> None:
     assert "left out: none.sumocfg" in found.output
     assert "longest queue" in found.output
     content = (tmp_path / "all.json").read_text()
-    for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 5)):
+    for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 6)):
         assert f'"{name}"' in content
     refused = CliRunner().invoke(app, ["suite", str(suite), "--policy", "idm"])
     assert refused.exit_code != 0
