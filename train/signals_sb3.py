@@ -4,8 +4,8 @@
 
 The network scores each green of a signal with the same weights, so signals may have any number of
 greens and lanes. Afterwards, the network and the scripted controllers run in worlds of other seeds,
-and a table shows their figures. The run's folder has stable-baselines3's `model.zip`, the figures as
-`evaluation.json`, and `manifest.json` with the conditions of the training.
+and a table shows their figures. The run's folder has stable-baselines3's `model.zip`, the figures
+as `evaluation.json`, and `manifest.json` with the conditions of the training.
 """
 
 from __future__ import annotations

@@ -112,11 +112,9 @@ class CavSb3SignalEnv(CavSb3VecEnv):
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """The sizes of `GreenNetwork`: greens, and values of a row that do not belong to a green."""
+        """The number of greens, and of values of a row that do not belong to a green."""
         if self._features is None:
-            raise ConfigError(
-                "sizes: rows of lanes have none; make the rows with features='greens'"
-            )
+            raise ConfigError("sizes: rows of lanes have none; pass features='greens'")
         return self._features.num_greens, self._features.num_shared
 
     def action_masks(self) -> NDArray[np.bool_]:
