@@ -135,7 +135,7 @@ def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
         n_epochs=args.epochs,
         gamma=args.gamma,
         ent_coef=args.entropy,
-        policy_kwargs={"sizes": (*rows.sizes, args.hidden)},
+        policy_kwargs={"net_arch": [*rows.sizes, args.hidden]},
         seed=args.seed,
         device="cpu",
     )

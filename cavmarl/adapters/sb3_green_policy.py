@@ -41,7 +41,8 @@ class GreenNetwork(nn.Module):
         inputs = len(GREEN_FEATURES) + num_shared
         self.embed = nn.Sequential(nn.Linear(inputs, width), nn.ReLU())
         self.embed_value = nn.Sequential(nn.Linear(inputs, width), nn.ReLU())
-        self.score = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU(), nn.Linear(width, 1))
+        self.score = nn.Sequential(nn.Linear(3 * width, width), nn.ReLU())
+        self.last = nn.Linear(width, 1)
         self.value = nn.Sequential(nn.Linear(2 * width + num_shared, width), nn.ReLU())
 
     def forward(self, rows: Tensor) -> tuple[Tensor, Tensor]:
@@ -54,7 +55,7 @@ class GreenNetwork(nn.Module):
         embedded = self.embed(inputs)
         pooled = _pooled(embedded, greens[..., EXISTS, None])
         every = torch.cat([embedded, pooled[:, None].expand(-1, self._shape[0], -1)], dim=-1)
-        logits = self.score(every)[..., 0]
+        logits = self.last(self.score(every))[..., 0]
         return torch.where(greens[..., ALLOWED] > 0.5, logits, torch.full_like(logits, FORBIDDEN))
 
     def forward_critic(self, rows: Tensor) -> Tensor:
@@ -74,25 +75,16 @@ class GreenNetwork(nn.Module):
 
 
 class GreenPolicy(ActorCriticPolicy):
-    """The policy of `GreenNetwork`; `policy_kwargs` must have its arguments as `sizes`."""
-
-    def __init__(self, *arguments: Any, sizes: tuple[int, int, int], **more: Any) -> None:
-        self._sizes = sizes
-        super().__init__(*arguments, **more)
-
-    def _get_constructor_parameters(self) -> dict[str, Any]:
-        return super()._get_constructor_parameters() | {"sizes": self._sizes}
+    """The policy of `GreenNetwork`, whose arguments are the option `net_arch` of the policy."""
 
     def _build_mlp_extractor(self) -> None:
-        self.mlp_extractor = GreenNetwork(*self._sizes)
+        self.add_module("mlp_extractor", GreenNetwork(*self.net_arch))
 
     def _build(self, lr_schedule: Any) -> None:
         super()._build(lr_schedule)
-        nn.init.orthogonal_(self.mlp_extractor.score[-1].weight, FIRST_GAIN)
+        network = self.get_submodule("mlp_extractor.last")
+        self.init_weights(network, FIRST_GAIN)
         self.action_net = nn.Identity()  # the network's outputs are the logits
-        self.optimizer = self.optimizer_class(
-            self.parameters(), lr=lr_schedule(1), **self.optimizer_kwargs
-        )
 
 
 def _pooled(embedded: Tensor, exists: Tensor) -> Tensor:

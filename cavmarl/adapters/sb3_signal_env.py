@@ -75,15 +75,16 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         table = self._vec.signals.table
         self._features = GreenFeatures(table) if features == "greens" else None
         self._spreads = spread
+        self._size = table.sizes.features if self._features is None else self._features.size
         self._num_choices = self._vec.signals.num_choices
         self._shape = (num_worlds, len(table.ids))
         self._actions = np.zeros(self._shape, dtype=np.int64)
         VecEnv.__init__(
             self,
             num_worlds * len(table.ids),
-            spaces.Box(0.0, 1.0, (table.sizes.features,), np.float32)
+            spaces.Box(0.0, 1.0, (self._size,), np.float32)
             if self._features is None
-            else spaces.Box(-MOST, MOST, (self._features.size,), np.float32),
+            else spaces.Box(-MOST, MOST, (self._size,), np.float32),
             spaces.Discrete(int(self._num_choices.max())),
         )
         self.metadata = self._vec.metadata
@@ -139,7 +140,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         choices = np.where(self._actions < self._num_choices, self._actions, keep)
         rewards = np.zeros(self._shape, dtype=np.float32)
         done = np.zeros(self._shape, dtype=np.bool_)
-        last = np.zeros((self.num_envs, *self.observation_space.shape), dtype=np.float32)
+        last = np.zeros((self.num_envs, self._size), dtype=np.float32)
         while True:
             actions = {"signals": choices}
             if self._vec.config.population.agents:

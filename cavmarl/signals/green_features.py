@@ -133,16 +133,20 @@ class GreenFeatures:
     def _allowed(self, view: SignalView) -> NDArray[np.bool_]:
         """Return which greens (W, S, G) may be chosen; the present one if none may."""
         shown = np.arange(self.num_greens) == view.states[..., GREEN, None]
-        return np.where(view.masks.any(axis=2, keepdims=True), view.masks, shown)
+        some = view.masks.any(axis=2, keepdims=True)
+        found: NDArray[np.bool_] = np.where(some, view.masks, shown)
+        return found
 
     def _sums(self, weights: NDArray[np.float32], lanes: NDArray[Any]) -> NDArray[Any]:
         """Return the weighted sum for each green (W, S, G) of values of lanes (W, N)."""
-        return (lanes @ weights.T).reshape(len(lanes), *self._shape)
+        found: NDArray[Any] = lanes @ weights.T
+        return found.reshape(len(lanes), *self._shape)
 
     def _most(self, lanes: NDArray[Any]) -> NDArray[Any]:
         """Return the largest value for each green (W, S, G) of values of lanes (W, N)."""
         padded = np.pad(lanes, ((0, 0), (0, 1)))
-        return padded[:, self._lanes].max(axis=2).reshape(len(lanes), *self._shape)
+        found: NDArray[Any] = padded[:, self._lanes].max(axis=2)
+        return found.reshape(len(lanes), *self._shape)
 
 
 def _dense(weights: LaneWeights, num_lanes: int) -> NDArray[np.float32]:
