@@ -49,7 +49,7 @@ class Args:
     program: ClassVar[str] = "signals_sb3.py"
 
     env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
-    num_worlds: Annotated[int, "number of parallel worlds"] = 8
+    num_worlds: Annotated[int, "number of parallel worlds"] = 4
     background: Annotated[int, "vehicles of the generator; 0: those of the demand alone"] = 0
     horizon_s: Annotated[int, "seconds of an episode"] = 3600
     seed: Annotated[int, "root of all random numbers"] = 0
@@ -62,6 +62,7 @@ class Args:
     entropy: Annotated[float, "weight of the entropy in the loss"] = 0.01
     delay_weight: Annotated[float, "weight of the reward's term delay"] = 0.1
     wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
+    entry_weight: Annotated[float, "reward for each vehicle that need not wait to enter"] = 1.0
     decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
     range_m: Annotated[float, "signals see the lanes before them at least this far"] = 50.0
     hidden: Annotated[int, "width of the hidden layers"] = 64
@@ -124,6 +125,7 @@ def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
         num_worlds=args.num_worlds,
         features="greens",
         spread=True,
+        entry_weight=args.entry_weight,
         overrides=args.overrides | clock,
     )
     model = PPO(

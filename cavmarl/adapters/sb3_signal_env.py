@@ -18,8 +18,11 @@ from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.sb3_vec_env import DECIDED, CavSb3VecEnv
 from cavmarl.core.errors import ConfigError, missing
 from cavmarl.env.vector import make_vec
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.signals.green_features import MOST, GreenFeatures
 from cavmarl.signals.kernels.green_choices import GREEN
+from cavmarl.signals.signal_table import SignalTable
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -45,6 +48,8 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         spread: whether the first episodes of the worlds have different lengths, so that the worlds
             are at different times of their episodes. Before the first decision, signals then follow
             the durations of their programs for an episode.
+        entry_weight: reward of a signal for each vehicle less that waits to enter the world on the
+            lanes before it, compared with the last decision. Needs worlds in this process.
         overrides: values of any other keys; `signals.agents` is `all` by default.
         arguments: other keyword arguments of `make_vec`; `agents` is 0 by default.
 
@@ -59,6 +64,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         num_worlds: int = 1,
         features: Literal["lanes", "greens"] = "lanes",
         spread: bool = False,
+        entry_weight: float = 0.0,
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
@@ -75,6 +81,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         table = self._vec.signals.table
         self._features = GreenFeatures(table) if features == "greens" else None
         self._spreads = spread
+        self._entries = _Entries(self._vec.worlds, table, entry_weight) if entry_weight else None
         self._size = table.sizes.features if self._features is None else self._features.size
         self._num_choices = self._vec.signals.num_choices
         self._shape = (num_worlds, len(table.ids))
@@ -99,6 +106,8 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         if self._spreads:
             self._spreads = False
             self._spread()
+        if self._entries is not None:
+            self._entries.gained()
         return self._signal_rows()
 
     def _spread(self) -> None:
@@ -147,11 +156,15 @@ class CavSb3SignalEnv(CavSb3VecEnv):
                 actions["vehicles"] = self._vec.suggest_actions()["vehicles"]
             _, gained, _, over, infos = self._vec.step(actions)
             rewards += gained["signals"]
+            if self._entries is not None:
+                rewards += self._entries.gained()
             if infos["episode_over"].any():
                 done |= over["signals"]
                 ends = over["signals"].reshape(-1)
                 last[ends] = self._signal_rows()[ends]
                 self._vec.reset(options={"reset_mask": infos["episode_over"]})
+                if self._entries is not None:
+                    self._entries.gained()
             if arrays.signal_decides.all():
                 break
         masks = self.action_masks()
@@ -168,3 +181,34 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         view = self._vec.signals.view
         found = view.observations.copy() if self._features is None else self._features.of(view)
         return found.reshape(self.num_envs, -1)
+
+
+class _Entries:
+    """Rewards for vehicles that enter the worlds on lanes before signals."""
+
+    def __init__(self, worlds: SteppedWorlds, table: SignalTable, weight: float) -> None:
+        if not isinstance(worlds, LocalWorlds):
+            raise ConfigError(
+                f"entry_weight = {weight}: only worlds in this process count the vehicles that "
+                "wait to enter; leave workers and nodes out, or give 0"
+            )
+        self._simulation = worlds.simulation
+        arrays = table.arrays
+        self._lane_index = arrays.lane_index
+        self._before = np.zeros((len(table.ids), len(table.lanes) + 1), dtype=np.float32)
+        for s, lanes in enumerate(arrays.approach):
+            self._before[s, lanes[lanes >= 0]] = weight
+        self._last: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
+
+    def gained(self) -> NDArray[np.float32]:
+        """Return the rewards (W, S) since the last call."""
+        departures = self._simulation.departures
+        waiting = departures.num_queue
+        rows = departures.queue[:, : waiting.max()]
+        lanes = self._lane_index[rows["lane"]]
+        lanes = np.where(np.arange(rows.shape[1]) < waiting[:, None], lanes, -1)
+        counts = np.zeros((len(waiting), self._before.shape[1]), dtype=np.float32)
+        np.add.at(counts, (np.arange(len(waiting))[:, None], lanes), 1.0)
+        counts[:, -1] = 0.0  # lanes that do not lead to a signal
+        before, self._last = self._last, counts @ self._before.T
+        return before - self._last if len(before) else np.zeros_like(self._last)
