@@ -221,7 +221,7 @@ def test_the_table_of_training_seeds_is_that_of_the_figures(
 ) -> None:
     program = load_program("signal_seeds")
     assert program.main(["--table", "docs/figures/signal_control.json"]) == 0
-    check_block(Path("docs/figures/learning.md"), "signals", capsys.readouterr().out.rstrip())
+    check_block(Path("docs/guides/signal_control.md"), "signals", capsys.readouterr().out.rstrip())
 
 
 def test_training_seeds_without_maps_are_refused(
