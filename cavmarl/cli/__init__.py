@@ -28,6 +28,7 @@ from cavmarl.cli import (
     node,
     plan,
     replay,
+    ros2,
     scenario,
     service,
     suite,
@@ -225,6 +226,15 @@ add_command(
     carla.carla,
     "cavmarl carla grid4x4 --port 2000",
     "cavmarl carla town --agents 20 --client-version 0.10.0",
+    panel=COSIM,
+)
+add_command(
+    app,
+    "ros2",
+    ros2.ros2,
+    "cavmarl ros2 town --rig ten_sensors --truth",
+    "cavmarl ros2 town --vehicle car_0 --vehicle car_1 --domain 5 --wait newest --pace 1",
+    "cavmarl ros2 --join town.sock --vehicle car_0",
     panel=COSIM,
 )
 add_command(

@@ -21,6 +21,7 @@ from cavmarl.cli.output import (
     Workers,
     Zones,
     about,
+    flag,
     grid,
     print_error,
     with_world,
@@ -117,6 +118,9 @@ def lead(
         Literal["none", "reference", "camera"],
         about("Mount the sensors that the reference driving stack needs.", panel=WORLD),
     ] = "none",
+    truth: Annotated[
+        bool, flag("Give the true state of all vehicles to followers that request it.")
+    ] = False,
     zones: Zones = None,
     backend: Backend = None,
     workers: Workers = None,
@@ -149,19 +153,20 @@ def lead(
             own_ticks=own_ticks,
             bad_controls=bad_controls,
             pacer=pacer,
+            truth=truth,
         ) as led,
     ):
         console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
         led.wait_for(followers, joins_s)
-        found = _run(led, world.seed, steps, on_lost)
+        found = run_episode(led, world.seed, steps, on_lost)
         if pacer is not None:
             found["lateness"] = vars(pacer.lateness)
         console.print(_table(found))
     write_json(json_path, found)
 
 
-def _run(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
-    """Run one episode and return its figures."""
+def run_episode(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
+    """Run one episode and return its figures; the arguments are those of `lead`."""
     master, lost = world.master, []
 
     def go_on(act: Callable[[], object]) -> None:

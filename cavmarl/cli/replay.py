@@ -56,6 +56,10 @@ def replay(
     fcd: Annotated[Path | None, about_file("Write floating car data as SUMO does.")] = None,
     csv: Annotated[Path | None, about_file("Write one line per vehicle and frame.")] = None,
     mcap: Annotated[Path | None, about_file("Write an MCAP file for Foxglove.")] = None,
+    rosbag2: Annotated[
+        Path | None,
+        about("Write a bag of ROS 2, a new folder.", metavar="FOLDER", panel=OUTPUT),
+    ] = None,
     web: Annotated[
         bool, flag("Serve a page that shows the whole recording in a browser.", panel=PAGE)
     ] = False,
@@ -73,12 +77,15 @@ def replay(
     """
     from cavmarl.core.errors import ConfigError, RecordingError, require_all
 
-    shows = video is not None or not (web or fcd or csv or mcap)
+    given = {"fcd": fcd, "csv": csv, "mcap": mcap, "rosbag2": rosbag2}
+    wanted = {name: file for name, file in given.items() if file}
+    shows = video is not None or not (web or wanted)
     require_all(
         RECORD_EXTRAS
         | (WEB_EXTRAS if web else {})
         | (VIDEO_EXTRAS if video else WINDOW_EXTRAS if shows else {})
         | ({"mcap": "record"} if mcap else {})
+        | ({"rosbags": "ros2"} if rosbag2 else {})
     )
     from cavmarl.recordings.recording import Recording, recordings_in
     from cavmarl.recordings.recording_exports import EXPORTS
@@ -86,7 +93,7 @@ def replay(
     if web and video is not None:
         raise ConfigError(f"--web and --video {video}: use only one of the two")
     if folders := recordings_in(path):
-        if web or video or fcd or csv or mcap:
+        if web or video or wanted:
             raise ConfigError(f"{path}: holds {len(folders)} recordings; name one: {folders[0]}")
         _list(folders, json_path)
         return
@@ -100,11 +107,15 @@ def replay(
     console = Console()
     if not recording.is_whole:
         console.print(f"{path}: was not closed; shown up to its last complete part", markup=False)
-    wanted = {name: file for name, file in {"fcd": fcd, "csv": csv, "mcap": mcap}.items() if file}
+    exports = dict(EXPORTS)
+    if rosbag2:
+        from cavmarl.cosim.ros2.recording_bag import write_recording_bag
+
+        exports["rosbag2"] = write_recording_bag
     for name, file in wanted.items():
         with progress_bar(console) as bar:
             track = partial(bar.track, total=len(ticks), description=f"{name}: {file}")
-            frames = EXPORTS[name](recording, file, world, episode, track)
+            frames = exports[name](recording, file, world, episode, track)
         console.print(f"{name}: {file}, {frames} frames", markup=False)
     if web:
         from cavmarl.viewer.show_world import show_recording

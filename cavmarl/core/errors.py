@@ -258,6 +258,10 @@ class FollowerLostError(FollowerError):
         self.is_late = is_late
 
 
+class RosError(CavmarlError):
+    """DDS cannot be started, a topic cannot be written, or another node publishes the clock."""
+
+
 class ZoneSimulatorError(CavmarlError):
     """Another simulator that runs a zone cannot start or continue, or sends invalid data.
 

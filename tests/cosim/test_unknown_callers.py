@@ -19,6 +19,7 @@ from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
+    VERSION,
     ArrayView,
     Control,
     FollowerSnapshot,
@@ -60,7 +61,7 @@ def hello_in(version: int) -> bytes:
 
 
 def oversized() -> bytes:
-    raw = bytearray(hello_in(1))
+    raw = bytearray(hello_in(VERSION))
     raw[16:20] = (1 << 31).to_bytes(4, "little")
     return bytes(raw)
 
@@ -69,9 +70,9 @@ def oversized() -> bytes:
     ("raw", "match"),
     [
         (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "does not begin a frame"),
-        (hello_in(2), "a frame has version 2, this end has 1: install the same version"),
+        (hello_in(1), "a frame has version 1, this end has 2: install the same version"),
         (oversized(), "bytes is too large"),
-        (hello_in(1)[:-3] + b"\xff\xff\xff", "does not match its checksum"),
+        (hello_in(VERSION)[:-3] + b"\xff\xff\xff", "does not match its checksum"),
     ],
     ids=["another protocol", "another version", "too large", "damaged"],
 )
@@ -100,7 +101,7 @@ def test_a_silent_caller_is_dropped(address: Path, monkeypatch: pytest.MonkeyPat
 def test_a_slow_caller_does_not_block_the_world(
     address: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    words = hello_in(1)
+    words = hello_in(VERSION)
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         slow = call(address)
@@ -125,7 +126,7 @@ def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
         crowd = [call(address) for _ in range(reception.MAX_CALLERS)]
         world.admit(0.0)
         late = call(address)
-        late.sendall(hello_in(1))
+        late.sendall(hello_in(VERSION))
         world.admit(0.0)  # takes the place of the first of the crowd
         world.admit(0.0)
         assert [follower.name for follower in world.master.followers] == ["x"]
@@ -139,7 +140,7 @@ def test_without_descriptors_the_oldest_caller_is_dropped(address: Path) -> None
         world.reset(seed=1)
         first = call(address)
         world.admit(0.0)
-        later, words = call(address), hello_in(1)
+        later, words = call(address), hello_in(VERSION)
         with without_descriptors():
             world.admit(0.0)
             assert "no descriptors" in refusal(first)

@@ -49,6 +49,7 @@ class FollowedWorld:
             `FollowerError`; `hold`: the vehicle's last controls are used, and counted.
         pacer: pace by the wall clock; None: as fast as possible.
         trace: records the phases of each step.
+        truth: whether followers may receive the true state of all vehicles.
 
     Attributes:
         master: the time master.
@@ -72,6 +73,7 @@ class FollowedWorld:
         bad_controls: BadControls = "error",
         pacer: Pacer | None = None,
         trace: StepTrace | None = None,
+        truth: bool = False,
     ) -> None:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
@@ -87,7 +89,7 @@ class FollowedWorld:
         except BaseException:
             self.close_reception()
             raise
-        self._timeout_s = timeout_s
+        self._timeout_s, self._truth = timeout_s, truth
         self._barrier = Barrier(env, timeout_s, bad_controls)
         self._trace = trace
         self._seats: list[FollowerSeat] = []
@@ -204,9 +206,15 @@ class FollowedWorld:
 
     def _seat(self, line: FollowerConnection, hello: Hello) -> None:
         agents = self._indices(hello.vehicles)
+        if hello.truth and not self._truth:
+            raise FollowerError(
+                f"'{hello.name[:80]}' requests the true state of all vehicles, which this world "
+                "does not give; start it with truth=True (cavmarl lead --truth)"
+            )
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
         line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
-        self._seats.append(FollowerSeat(line, self.master.follow(hello.name), agents))
+        clock = self.master.follow(hello.name)
+        self._seats.append(FollowerSeat(line, clock, agents, truth=hello.truth))
         self._seats.sort(key=lambda each: each.rank)
 
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:

@@ -27,6 +27,7 @@ class FollowerSeat:
     line: FollowerConnection
     clock: TimeFollower  # its view of the master's clock
     agents: tuple[int, ...]  # indices of the agents that it drives, ascending
+    truth: bool = False  # whether it receives the true state of all vehicles
     frame: int = -1  # of the last snapshot sent to it; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
@@ -71,7 +72,7 @@ class Barrier:
         found = BarrierOutcome()
         asked: dict[FollowerSeat, list[str]] = {}
         for seat in seats:
-            snapshot, arrays = take_snapshot(self._env, seat.agents, moment)
+            snapshot, arrays = take_snapshot(self._env, seat.agents, moment, truth=seat.truth)
             seat.frame = moment.frame
             asked[seat] = list(snapshot.vehicles)
             try:

@@ -54,7 +54,8 @@ class Follower:
     `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
     it only follows the clock and answers with {}. `joins_s`: maximum time for the world to accept
     the follower, which it does between two steps; None: no limit. `secret`: of the world, if it
-    listens at a port.
+    listens at a port. `truth`: whether snapshots contain all vehicles of the world, which the world
+    has to allow.
 
     Attributes:
         welcome: the world's clock and sensors.
@@ -71,10 +72,11 @@ class Follower:
         name: str = "follower",
         joins_s: float | None = 60.0,
         secret: str = "",
+        truth: bool = False,
     ) -> None:
         self._line = call(address, CALL_S)
         try:
-            self._line.say(Say.HELLO, Hello(name, list(vehicles), secret), within_s=CALL_S)
+            self._line.say(Say.HELLO, Hello(name, list(vehicles), secret, truth), within_s=CALL_S)
             self.welcome = read_payload(Welcome, self._expect(joins_s, Say.WELCOME).payload)
         except BaseException:
             self._line.close()

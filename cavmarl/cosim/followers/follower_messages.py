@@ -31,7 +31,7 @@ _msgpack: Any = require("msgpack", "followers")
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to construct
 _CLOSED = ConfigDict(extra="forbid")
 
-VERSION = 1
+VERSION = 2
 MAX_LETTER = 1 << 22
 MAX_DATA = 1 << 28
 MAX_VEHICLES = 4096
@@ -71,6 +71,7 @@ class Hello:
     # agents to drive; none: it only follows the clock
     vehicles: list[StrictStr] = field(default_factory=list)
     secret: StrictStr = ""  # of the world, if it listens at a port
+    truth: StrictBool = False  # whether its snapshots are to contain all vehicles of the world
 
 
 @with_config(_CLOSED)
@@ -109,8 +110,8 @@ class Welcome:
 class ArrayView:
     """One array of a snapshot; its bytes are in the frame's data, in the order of the list."""
 
-    # agent of the vehicle; empty: the array is about the whole map, such as `signals`: (1, links)
-    # the SIGNAL_* code of each link's signal (255: no signal)
+    # agent of the vehicle; empty: the array is about the whole map: `signals`: (1, links) the
+    # SIGNAL_* code of each link's signal (255: no signal); `truth`: (1, n, columns of TRUTH)
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr  # NumPy's notation, little-endian
@@ -128,6 +129,7 @@ class VehicleView:
     vclass: StrictStr  # SUMO's class
     length_m: StrictFloat  # length of its body
     width_m: StrictFloat  # width of its body
+    wheelbase_m: StrictFloat  # each axle is half of it from the centre of the body
     goal_edge: StrictStr  # destination, an edge of the map
     goal_m: list[StrictFloat]  # end of the destination edge: x and y on the map
 

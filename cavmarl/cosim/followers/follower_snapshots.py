@@ -25,6 +25,11 @@ from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.mounted.frames import SensorFrames
 
 NO_SIGNAL = 255
+# Columns of the array `truth`: those of `engine.world_frame.SEEN`, one row for each vehicle.
+TRUTH = (
+    "id", "agent", "vclass", "x", "y", "z", "heading", "pitch", "speed", "accel", "steering",
+    "length", "width", "height",
+)  # fmt: skip
 
 
 def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -> Welcome:
@@ -61,12 +66,16 @@ class SnapshotTime(NamedTuple):
 
 
 def take_snapshot(
-    env: CavEnv | CavVectorEnv, agents: Sequence[int], moment: SnapshotTime, world: int = 0
+    env: CavEnv | CavVectorEnv,
+    agents: Sequence[int],
+    moment: SnapshotTime,
+    world: int = 0,
+    truth: bool = False,
 ) -> tuple[FollowerSnapshot, list[NDArray[Any]]]:
     """Return the snapshot for a follower, and its arrays.
 
     `env`: the world or worlds. `agents`: indices of the follower's agents. `moment`: time of the
-    snapshot.
+    snapshot. `truth`: whether it contains all vehicles of the world.
     """
     worlds = env.worlds.arrays
     due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]
@@ -74,6 +83,11 @@ def take_snapshot(
     views: list[ArrayView] = []
     arrays: list[NDArray[Any]] = []
     time_s = moment.tick * env.config.clock.sim_dt_s
+    if truth:
+        rows = env.world_frames([world])[0].vehicles
+        true = np.stack([rows[name].astype(np.float64) for name in TRUTH], axis=-1)[np.newaxis]
+        views.append(_array("", "truth", true, np.array([time_s]), np.zeros(1, np.bool_)))
+        arrays.append(true)
     if due:
         by_agent = {vehicle.agent: vehicle for vehicle in env.worlds.driven(world, due)}
         for k in due:
@@ -137,6 +151,7 @@ def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:
         vclass=VEHICLE_CLASSES[vehicle.vclass],
         length_m=vehicle.length_m,
         width_m=vehicle.width_m,
+        wheelbase_m=vehicle.wheelbase_m,
         goal_edge=network.edge_ids[vehicle.goal_edge],
         goal_m=[float(end[0]), float(end[1])],
     )

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,22 @@ def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) ->
     range of used echoes.
     """
     settings = lidar.settings
+    points, _ = sensor_points(settings, scan, range_m)
+    turn = np.zeros((3, 3))
+    yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
+    rotation(yaw, pitch, roll, turn)
+    place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
+    found: Points = points @ turn.T + place_m
+    return found
+
+
+def sensor_points(
+    settings: Mapping[str, Any], scan: Points, range_m: float = math.inf
+) -> tuple[Points, NDArray[np.int64]]:
+    """Return echoes (n, 3) in the sensor's frame, and the layer (n,) of each, from 0.
+
+    `settings`: keys of the lidar. `scan`, `range_m`: see `lidar_points`.
+    """
     layers, rays = scan.shape
     fov = math.radians(settings["fov_deg"])
     around = settings["fov_deg"] == 360.0
@@ -40,9 +58,4 @@ def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) ->
         axis=-1,
     )
     hit = scan < min(float(settings["range_m"]) - RANGE_MARGIN_M, range_m)
-    turn = np.zeros((3, 3))
-    yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
-    rotation(yaw, pitch, roll, turn)
-    place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
-    found: Points = (rays_of[hit] * scan[hit][:, None]) @ turn.T + place_m
-    return found
+    return rays_of[hit] * scan[hit][:, None], np.nonzero(hit)[0]

@@ -235,6 +235,7 @@ class LocalWorlds:
             rows["width"].astype(np.float64),
             simulation.goal_edges[simulation.network.lanes["map"][rows["lane"]], rows["goal"]],
             rows["speed"].astype(np.float64),
+            simulation.types["wheelbase"][rows["vtype"]],
         )
         found = [Driven(*row) for row in zip(*(each.tolist() for each in columns), strict=True)]
         return [row._replace(heard=self._heard(world, row.agent)) for row in found]

@@ -133,6 +133,7 @@ class Driven(NamedTuple):
     width_m: float
     goal_edge: int  # EDGE row of the goal
     speed_mps: float
+    wheelbase_m: float
     # last SPAT received from each signal: SIGNAL row, PHASE row, ticks since it was sent; None:
     # there are no messages
     heard: list[list[int]] | None = None

@@ -1,0 +1,216 @@
+"""The clocks of a world and of a node of ROS 2 that drives in it, through the bridge.
+
+The node is one of `rclpy`, in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two).
+The bridge can tick by itself in a share of the steps, as that of the co-simulation paper does.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import threading
+import time
+from collections.abc import Mapping
+from dataclasses import asdict
+from fractions import Fraction
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Annotated, Any, Literal
+
+from benchmarks import ros2_clock_node
+from benchmarks.carla_clock_client import is_due
+from benchmarks.clock_drift import ClockDrift, rows_of
+from benchmarks.program import run
+from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
+from cavmarl.cli.output import OptionalEnvironment, about, with_world
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import CavmarlError, ClockError, ConfigError, EvaluationError
+from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.ros2.ros_bridge import RosBridge, RosOptions
+from cavmarl.cosim.time_master import OwnTicks
+from cavmarl.env.parallel import parallel_env
+
+PYTHON = "CAVMARL_RCLPY_PYTHON"
+JOINS_S = 60.0
+STEP_S = 0.05
+RIG = {"wheels": {"type": "odometry", "rate_hz": 20}}
+# Fast DDS does not read the type objects of Cyclone DDS.
+PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
+<dds><profiles xmlns="http://www.eprosima.com">
+<participant profile_name="cavmarl" is_default_profile="true"><rtps><propertiesPolicy><properties>
+<property><name>fastdds.type_propagation</name><value>disabled</value></property>
+</properties></propertiesPolicy></rtps></participant></profiles></dds>
+"""
+
+
+@with_world("agents", "background", "seed", "settings")
+def measure(
+    world: WorldSpec,
+    env: OptionalEnvironment = "grid4x4",
+    steps: Annotated[int, about("Steps of the world; a step is one tick.")] = 5000,
+    rogue: Annotated[float, about("Share of steps in which the bridge also ticks.")] = 0.0,
+    own_ticks: Annotated[
+        Literal["obey", "refuse", "ignore"], about("What the world does with such a tick.")
+    ] = "obey",
+    domain: Annotated[int, about("ROS_DOMAIN_ID.")] = 90,
+    say: Say = silent,
+) -> BenchmarkReport:
+    """Compare the clocks of a world and of a node of ROS 2, in lock step (Table II)."""
+    say(f"{steps} steps")
+    found, report = measure_ros_drift(
+        world, steps=steps, rogue=rogue, own_ticks=own_ticks, domain=domain
+    )
+    counts = ", ".join(f"{count} {name}" for name, count in report["controls"].items() if count)
+    return BenchmarkReport(
+        f"{found.environment}, rclpy, {1000.0 * found.dt_s:g} ms per step",
+        {
+            "step": "step",
+            "world, s": "master_s:.1f",
+            "node, s": "follower_s:.1f",
+            "normalised, s": "normalised_s:.1f",
+            "Δ, s": "delta_s:.1f",
+            "ratio": "ratio:.2f",
+        },
+        [asdict(row) for row in found.rows],
+        notes=[
+            f"{report['steps_per_s']:.0f} steps/s of the wall clock; commands: {counts}",
+            f"the bridge ticked {found.own_ticks} times ({found.answer}); the world noticed "
+            f"{found.drift_events} times that it had advanced",
+        ],
+        facts={**asdict(found), **report, "holds": found.holds},
+        holds=found.holds,
+    )
+
+
+class _RogueFollower(Follower):
+    """A follower that also ticks in a share of its steps."""
+
+    share = Fraction(0)
+    answers = own_ticks = 0
+
+    def answer(self, controls: Mapping[str, Any]) -> None:
+        self.answers += 1
+        if is_due(self.answers, self.share):
+            self.own_ticks += 1
+            try:
+                self.tick()
+            except ClockError:
+                pass
+        super().answer(controls)
+
+
+def measure_ros_drift(
+    spec: WorldSpec, *, steps: int, rogue: float, own_ticks: OwnTicks, domain: int
+) -> tuple[ClockDrift, dict[str, Any]]:
+    """Run a world, a bridge in a thread, and a node of `rclpy` in a process.
+
+    Raises:
+        ConfigError: no Python with `rclpy` is named.
+        EvaluationError: the node or the bridge fails.
+    """
+    check_range(steps=(steps, 1, float("inf")), rogue=(rogue, 0.0, 1.0))
+    python = os.environ.get(PYTHON, "").split(":")[0]
+    if not python:
+        raise ConfigError(f"{PYTHON}: name a Python with rclpy; `make ros2` makes one")
+    overrides = {
+        "population.mode": "respawn",
+        "rig": RIG,
+        **spec.overrides,
+        "clock.sim_dt_s": STEP_S,
+        "clock.ctrl_dt_s": STEP_S,
+        "horizon_s": STEP_S * (2 * steps + 2),
+    }
+    keywords = {**spec.keywords, "overrides": overrides}
+    found: dict[str, Any] = {}
+    errors: list[CavmarlError] = []
+
+    def follow(address: str) -> None:
+        try:
+            options = RosOptions(domain=domain, deadline_s=10.0, ready_s=JOINS_S)
+            with _RogueFollower(address, ["car_0"], "ros2") as follower:
+                follower.share = Fraction(str(rogue))
+                bridge = RosBridge(follower, options)
+                bridge.run()
+                found.update(bridge.report(), own_ticks=follower.own_ticks)
+        except CavmarlError as error:
+            errors.append(error)
+
+    with (
+        TemporaryDirectory() as folder,
+        FollowedWorld(
+            parallel_env(spec.env, **keywords),
+            str(Path(folder) / "world.sock"),
+            timeout_s=JOINS_S + 30.0,
+            own_ticks=own_ticks,
+            on_drift="record",
+        ) as world,
+        _node(python, domain, Path(folder)) as node,
+    ):
+        thread = threading.Thread(target=follow, args=(str(world.address),), daemon=True)
+        thread.start()
+        try:
+            world.wait_for(1, JOINS_S)
+            world.reset(spec.seed)
+            clock = [world.master.tick]
+            began_s = time.monotonic()
+            for _ in range(steps):
+                world.step()
+                clock.append(world.master.tick)
+            wall_s = time.monotonic() - began_s
+            world.master.look_for_drift()
+            world.close()
+            thread.join(JOINS_S)
+            output, _ = node.communicate(timeout=JOINS_S)
+        finally:
+            node.kill()
+    if errors or node.returncode:
+        raise EvaluationError(f"the bridge or the node has failed: {errors}") from None
+    stamps = [ns for ns, last in zip(*_pairs(json.loads(output)), strict=True) if ns != last]
+    heard = [round(ns / (1e9 * STEP_S)) for ns in stamps]
+    # With a tick of its own, the world is one tick ahead in the next snapshot.
+    master = world.master
+    own, drifts = (
+        [event.tick for event in master.events if event.kind == kind]
+        for kind in ("own_tick", "drift")
+    )
+    drift = ClockDrift(
+        environment=Path(spec.env).name,
+        dt_s=STEP_S,
+        rogue=rogue,
+        answer=own_ticks,
+        pace=None,
+        rows=rows_of([tick - clock[0] for tick in clock], heard, STEP_S),
+        own_ticks=found["own_ticks"],
+        counted=master.own_ticks,
+        drift_events=master.drifts,
+        noticed_ticks=drifts[0] - own[0] if own and drifts else None,
+    )
+    return drift, {
+        "steps_per_s": steps / wall_s,
+        "controls": found["controls"]["car_0"],
+        "wait_wall_s": found["wait_wall_s"],
+    }
+
+
+def _pairs(heard: list[int]) -> tuple[list[int], list[int]]:
+    return heard, [-1, *heard[:-1]]
+
+
+def _node(python: str, domain: int, folder: Path) -> subprocess.Popen[str]:
+    profile = folder / "fast_dds.xml"
+    profile.write_text(PROFILE, encoding="utf-8")
+    environment = {
+        **{name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
+        "FASTDDS_DEFAULT_PROFILES_FILE": str(profile),
+        "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),
+        "ROS_DOMAIN_ID": str(domain),
+        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
+    }
+    command = [python, str(ros2_clock_node.__file__)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
+
+
+if __name__ == "__main__":
+    run(measure)

@@ -1,0 +1,228 @@
+"""`cavmarl ros2`: publishes a world over ROS 2, and drives its vehicles by ROS messages."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from threading import Thread
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+from rich.console import Console
+from rich.table import Table
+
+from cavmarl.cli.lead import SecretFile, address_of, read_secret, run_episode
+from cavmarl.cli.output import (
+    OUTPUT,
+    WORLD,
+    JsonPath,
+    OptionalEnvironment,
+    about,
+    flag,
+    grid,
+    with_world,
+    write_json,
+)
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import CavmarlError, ConfigError
+
+if TYPE_CHECKING:
+    from cavmarl.cosim.ros2.ros_bridge import RosOptions
+
+
+@with_world()
+def ros2(
+    world: WorldSpec,
+    env: OptionalEnvironment = "",
+    join: Annotated[
+        str | None,
+        about("Attach to a world of `cavmarl lead` at this socket or port.", metavar="ADDRESS"),
+    ] = None,
+    vehicle: Annotated[
+        list[str] | None,
+        about("Agent to publish and drive; repeat it for more [default: car_0].", metavar="NAME"),
+    ] = None,
+    domain: Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")] = 0,
+    profile: Annotated[
+        Literal["plain", "autoware"],
+        about("Names: topics begin with the vehicle (plain), or are Autoware's (one vehicle)."),
+    ] = "plain",
+    distro: Annotated[
+        Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
+    ] = "jazzy",
+    wait: Annotated[
+        Literal["stamp", "newest"],
+        about(
+            "Each step waits for a command whose time is that of the step (stamp), or takes the "
+            "newest command and never waits (newest)."
+        ),
+    ] = "stamp",
+    deadline_s: Annotated[
+        float, about("Seconds that a step waits for a command, real time.", metavar="S")
+    ] = 1.0,
+    lag_steps: Annotated[int, about("A command may be this many steps old.", metavar="N")] = 0,
+    ready_s: Annotated[
+        float,
+        about("Seconds that the first step waits for a publisher of commands.", metavar="S"),
+    ] = 30.0,
+    truth: Annotated[
+        bool, flag("Publish the true state of the vehicles and of all vehicles around.")
+    ] = False,
+    names: Annotated[
+        Path | None,
+        about("Other names of topics and frames, by sensor.", metavar="FILE", exists=True),
+    ] = None,
+    bag: Annotated[
+        Path | None,
+        about(
+            "Write all messages to a bag of rosbag2, a new folder.",
+            "--record-rosbag2",
+            metavar="FOLDER",
+            panel=OUTPUT,
+        ),
+    ] = None,
+    rig: Annotated[
+        str | None,
+        about(
+            "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
+            "the environment, or reference].",
+            metavar="RIG",
+            panel=WORLD,
+        ),
+    ] = None,
+    steps: Annotated[
+        int | None, about("Maximum number of steps [default: one episode].", metavar="N")
+    ] = None,
+    pace: Annotated[
+        float | None,
+        about(
+            "Simulated seconds per second of real time [default: as fast as possible].", metavar="X"
+        ),
+    ] = None,
+    secret_file: SecretFile = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Publish a world over ROS 2 and drive its vehicles by ROS messages, without ROS installed.
+
+    The bridge follows the clock of the world. It starts the world ENV, or joins a running one.
+    """
+    from cavmarl.cosim.ros2 import ros_bridge
+    from cavmarl.cosim.ros2.ros_topics import read_names
+
+    if bool(env) == (join is not None):
+        raise ConfigError("name either an environment to start, or a running world with --join")
+    chosen = tuple(vehicle or ["car_0"])
+    options = ros_bridge.RosOptions(
+        profile=profile,
+        distro=distro,
+        domain=domain,
+        wait=wait,
+        deadline_s=deadline_s,
+        lag_steps=lag_steps,
+        ready_s=ready_s,
+        truth=truth,
+        names=read_names(names),
+        bag=bag,
+    )
+    if join is not None:
+        _refuse_world_options(world, rig, pace)
+        secret = read_secret(secret_file)
+        found = ros_bridge.join(address_of(join), chosen, options, secret=secret, steps=steps)
+    else:
+        found = _start(_with_rig(world, rig), chosen, options, steps, pace)
+    Console().print(_table(found))
+    write_json(json_path, found)
+
+
+def _refuse_world_options(world: WorldSpec, rig: str | None, pace: float | None) -> None:
+    given = {
+        "--agents": world.agents,
+        "--background": world.background,
+        "--set": world.overrides,
+        "--seed": world.seed,
+        "--rig": rig,
+        "--pace": pace,
+    }
+    wrong = [name for name, value in given.items() if value]
+    if wrong:
+        raise ConfigError(
+            f"{wrong[0]}: a bridge that joins makes no world; give it to `cavmarl lead`"
+        )
+
+
+def _with_rig(world: WorldSpec, rig: str | None) -> WorldSpec:
+    """Return the world with the sensors, and with steps of 0.05 s unless it says otherwise."""
+    from cavmarl.config.registry import load_config
+    from cavmarl.cosim.stack.stack import RIGS
+
+    if rig is None:
+        if load_config(world.env, **world.keywords)[0].rig:
+            return world
+        rig = "reference"
+    given = {"clock.ctrl_dt_s": 0.05, "rig": RIGS.get(rig, rig), **world.overrides}
+    return replace(world, overrides=given)
+
+
+def _start(
+    world: WorldSpec,
+    vehicles: tuple[str, ...],
+    options: RosOptions,
+    steps: int | None,
+    pace: float | None,
+) -> dict[str, Any]:
+    """Run a world and its bridge, which is another thread of this process."""
+    from cavmarl.cosim.followers.followed_world import FollowedWorld
+    from cavmarl.cosim.ros2 import ros_bridge
+    from cavmarl.cosim.time_master import RealTime
+    from cavmarl.env.parallel import parallel_env
+
+    reports: list[dict[str, Any]] = []
+    errors: list[CavmarlError] = []
+
+    def follow(address: str | int) -> None:
+        try:
+            reports.append(ros_bridge.join(address, vehicles, options))
+        except CavmarlError as error:
+            errors.append(error)
+
+    timeout_s = options.ready_s + options.deadline_s + 30.0
+    pacer = None if pace is None else RealTime(pace)
+    with (
+        closing(parallel_env(world.env, **world.keywords)) as made,
+        TemporaryDirectory(prefix="cavmarl-ros2-") as folder,
+        FollowedWorld(
+            made, f"{folder}/world.sock", timeout_s=timeout_s, pacer=pacer, truth=options.truth
+        ) as led,
+    ):
+        thread = Thread(target=follow, args=(led.address,), daemon=True)
+        thread.start()
+        try:
+            while not led.seats and thread.is_alive():
+                led.admit(0.2)
+            if errors:
+                raise errors[0]
+            run = run_episode(led, world.seed, steps, "end")
+        except CavmarlError:
+            thread.join(options.deadline_s + 10.0)
+            if errors:  # the reason for which the bridge has ended
+                raise errors[0] from None
+            raise
+        led.close()
+        thread.join(options.deadline_s + 10.0)
+    if errors:
+        raise errors[0]
+    return {**reports[0], "state_hash": run["state_hash"]}
+
+
+def _table(found: dict[str, Any]) -> Table:
+    rows = [
+        (topic, f"{count:,}", f"{count / max(found['time_s'], 1e-9):.1f}")
+        for topic, count in sorted(found["sent"].items())
+    ]
+    counts = "; ".join(
+        f"{vehicle}: " + ", ".join(f"{number} {name}" for name, number in each.items() if number)
+        for vehicle, each in found["controls"].items()
+    )
+    title = f"{found['steps']} steps, {found['time_s']:g} s"
+    return grid(("topic", "messages", "per second"), rows, title, f"commands of {counts}")

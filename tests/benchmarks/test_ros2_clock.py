@@ -1,0 +1,44 @@
+"""Table II with a node of ROS 2: real `rclpy`, in lock step with a world through the bridge."""
+
+from __future__ import annotations
+
+import os
+
+import pytest
+
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ConfigError
+from cavmarl.cosim.time_master import OwnTicks
+
+pytest.importorskip("rosbags", reason="needs the extra 'ros2'")
+pytest.importorskip("cyclonedds", reason="needs the extra 'ros2'")
+
+from benchmarks.ros2_clock import PYTHON, measure_ros_drift
+
+SPEC = WorldSpec.of("grid4x4", agents=1, background=0, seed=0)
+DOMAIN = 10 + os.getpid() % 80
+
+
+def test_a_python_with_rclpy_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv(PYTHON, raising=False)
+    with pytest.raises(ConfigError, match=f"{PYTHON}: name a Python with rclpy; `make ros2`"):
+        measure_ros_drift(SPEC, steps=5, rogue=0.0, own_ticks="refuse", domain=DOMAIN)
+
+
+@pytest.mark.integration
+@pytest.mark.skipif(not os.environ.get(PYTHON), reason=f"rclpy is not installed: set {PYTHON}")
+@pytest.mark.parametrize("own_ticks", ["obey", "refuse"])
+def test_a_bridge_that_ticks_is_noticed_and_can_be_held(own_ticks: OwnTicks) -> None:
+    found, report = measure_ros_drift(
+        SPEC, steps=100, rogue=0.92, own_ticks=own_ticks, domain=DOMAIN
+    )
+    (row,) = found.rows
+    assert (found.own_ticks, found.counted) == (92, 92)
+    assert report["controls"]["late"] == 0
+    assert row.master_s == 5.0
+    if own_ticks == "obey":
+        assert row.delta_s == pytest.approx(4.6)
+        assert row.ratio == 1.92
+    else:
+        assert (row.delta_s, row.ratio) == (0.0, 1.0)
+    assert found.holds
