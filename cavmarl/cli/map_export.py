@@ -10,7 +10,16 @@ import typer
 from rich.console import Console
 from rich.text import Text
 
-from cavmarl.cli.output import Environment, JsonPath, about_file, flag, grid, write_json
+from cavmarl.cli.output import (
+    OUTPUT,
+    Environment,
+    JsonPath,
+    about,
+    about_file,
+    flag,
+    grid,
+    write_json,
+)
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
@@ -21,6 +30,8 @@ from cavmarl.maps.exports.opendrive_trip import MOST_OFF, CarRoads, RoundTrip
 from cavmarl.roads.cache import load_network
 
 _LOAD, _LANELETS, _LINES = "map", "Lanelet2", "GeoJSON"
+# Points have local_x and local_y, so Autoware's frame `map` is that of the map file.
+_PROJECTOR = "projector_type: Local\n"
 
 
 def export(
@@ -34,6 +45,14 @@ def export(
     lanelet2: Annotated[
         Path | None, about_file("Write Lanelet2 (.osm), and check it by reading it back.")
     ] = None,
+    autoware: Annotated[
+        Path | None,
+        about(
+            "Write a map folder of Autoware: lanelet2_map.osm and map_projector_info.yaml.",
+            metavar="FOLDER",
+            panel=OUTPUT,
+        ),
+    ] = None,
     geojson: Annotated[Path | None, about_file("Write the lanes as GeoJSON.")] = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -41,8 +60,19 @@ def export(
 
     If a written file differs when it is read back, exit with 1.
     """
+    if autoware is not None:
+        if lanelet2 is not None:
+            raise ConfigError("--autoware and --lanelet2: use only one of them")
+        try:
+            autoware.mkdir(parents=True, exist_ok=True)
+            (autoware / "map_projector_info.yaml").write_text(_PROJECTOR, encoding="utf-8")
+        except OSError as error:
+            raise ConfigError(f"--autoware {autoware}: cannot be written ({error})") from error
+        lanelet2 = autoware / "lanelet2_map.osm"
     if opendrive is None and lanelet2 is None and geojson is None:
-        raise ConfigError("the format is missing: give --opendrive, --lanelet2 or --geojson")
+        raise ConfigError(
+            "the format is missing: give --opendrive, --lanelet2, --autoware or --geojson"
+        )
     if carla and opendrive is None:
         raise ConfigError("--carla goes with --opendrive; add --opendrive FILE")
     console = Console()
@@ -62,7 +92,8 @@ def export(
         if lanelet2 is not None:
             told(_LANELETS)
             document["lanelet2"] = found = write_lanelet2(network, lanelet2)
-            console.print(Text(f"{lanelet2}: {found['read back']} lanelets read back"))
+            told_back = f"{found['read back']} lanelets and {found['rules read back']} rules"
+            console.print(Text(f"{lanelet2}: {told_back} read back"))
         if geojson is not None:
             told(_LINES)
             document["geojson"] = {"lanes": write_geojson(network, geojson, path)}

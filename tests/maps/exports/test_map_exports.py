@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -12,13 +13,15 @@ from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
 from cavmarl.core.errors import ConfigError, MapError
+from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.exports.geojson import write_geojson
-from cavmarl.maps.exports.lanelet import write_lanelet2
+from cavmarl.maps.exports.lanelet import FIRST_LIGHT, FIRST_RIGHT, write_lanelet2
 from cavmarl.maps.exports.opendrive import write_opendrive
 from cavmarl.maps.exports.opendrive_lanes import LANES
 from cavmarl.maps.heights.draping import HeightOptions
 from cavmarl.maps.netconvert import build_network
 from cavmarl.maps.projection import project
+from cavmarl.roads.cache import load_network
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.terrain import TOWN, plane, write_geotiff
 
@@ -94,7 +97,7 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     target = tmp_path / "town_lanelets.osm"
     counts = write_lanelet2(network, target)
-    assert counts == {"lanelets": len(network.lanes), "read back": len(network.lanes)}
+    assert counts["lanelets"] == counts["read back"] == len(network.lanes)
     longitude, latitude = 11.0, 48.0
     projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(latitude, longitude))
     back = lanelet2.io.load(str(target), projector)
@@ -103,6 +106,62 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
         lanes = (link["from_lane"], link["next_lane"])
         one, other = (by_name[network.lane_ids[lane]] for lane in lanes)
         assert lanelet2.geometry.follows(one, other)
+
+
+def test_lanelets_have_lights_rights_of_way_and_turns(tmp_path: Path) -> None:
+    lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
+    network = load_network(find_map("town"))
+    links, lanes = network.links, network.lanes
+    target = tmp_path / "town.osm"
+    counts = write_lanelet2(network, target)
+    projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(52.4, 13.5))
+    back = lanelet2.io.load(str(target), projector)
+    by_name = {one.attributes["name"]: one for one in back.laneletLayer}
+    rules = {one.id: one for one in back.regulatoryElementLayer}
+    lights = [n for n, link in enumerate(links) if link["signal"] >= 0]
+    assert {id for id in rules if id < FIRST_RIGHT} == {FIRST_LIGHT + n for n in lights}
+    for n in lights[:20]:
+        own = by_name[network.lane_ids[links["first_internal"][n]]]
+        (light,) = (one for one in own.trafficLights() if one.id == FIRST_LIGHT + n)
+        end = network.lane_polyline(links["from_lane"][n])[-1]
+        ends = [(float(p.attributes["local_x"]), float(p.attributes["local_y"]), p.z)
+                for p in light.stopLine]  # fmt: skip
+        # the stop line is the end of the lane before, and the light is above it
+        np.testing.assert_allclose(np.mean(ends, axis=0)[:2], end[:2], atol=0.3)
+        assert math.dist(*(each[:2] for each in ends)) == pytest.approx(
+            lanes["width_m"][links["from_lane"][n]], abs=0.6
+        )
+        assert [p.z for p in light.trafficLights[0]] == pytest.approx(
+            [each[2] + 5.0 for each in ends], abs=0.01
+        )
+    rights = [one for id, one in rules.items() if id >= FIRST_RIGHT]
+    assert counts["rules"] == len(lights) + len(rights) == len(rules)
+    assert rights
+    for rule in rights[:50]:
+        n = rule.id - FIRST_RIGHT
+        conflicts = network.conflicts[links["first_conflict"][n] :][: links["num_conflicts"][n]]
+        foes = links["first_internal"][conflicts["foe"][conflicts["must_yield"]]]
+        names = {one.attributes["name"] for one in rule.rightOfWayLanelets()}
+        assert names == {network.lane_ids[foe] for foe in foes}
+        (own,) = rule.yieldLanelets()
+        assert own.attributes["name"] == network.lane_ids[links["first_internal"][n]]
+    turns = {"s": "straight", "l": "left", "t": "left", "r": "right", "L": "left", "R": "right"}
+    for link in links:
+        lane = by_name[network.lane_ids[link["first_internal"]]]
+        assert lane.attributes["turn_direction"] == turns[chr(link["direction"])]
+        assert "turn_direction" not in by_name[network.lane_ids[link["to_lane"]]].attributes
+
+
+def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
+    pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
+    folder = tmp_path / "maps" / "town"
+    result = CliRunner().invoke(app, ["export", str(town), "--autoware", str(folder)])
+    assert result.exit_code == 0, result.output
+    assert (folder / "map_projector_info.yaml").read_text() == "projector_type: Local\n"
+    assert 'k="turn_direction"' in (folder / "lanelet2_map.osm").read_text()
+    words = ["export", str(town), "--autoware", str(folder), "--lanelet2", "x.osm"]
+    refused = CliRunner().invoke(app, words)
+    assert isinstance(refused.exception, ConfigError)
 
 
 def test_the_command_exports(town: Path, tmp_path: Path) -> None:
