@@ -1,10 +1,11 @@
 """stable-baselines3's PPO for signals: all signals of all worlds share one network.
 
-    python train/signals_sb3.py --env grid4x4.sumocfg --updates 160
+    python train/signals_sb3.py --env grid4x4.sumocfg
 
-Afterwards, the network and the scripted controllers run in worlds of other seeds, and a table shows
-their figures. The run's folder has stable-baselines3's `model.zip`, the figures as
-`evaluation.json`, and `manifest.json` with the conditions of the training.
+The network scores each green of a signal with the same weights, so signals may have any number of
+greens and lanes. Afterwards, the network and the scripted controllers run in worlds of other seeds,
+and a table shows their figures. The run's folder has stable-baselines3's `model.zip`, the figures
+as `evaluation.json`, and `manifest.json` with the conditions of the training.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from stable_baselines3 import PPO
 
+from cavmarl.adapters.sb3_green_policy import GreenPolicy
 from cavmarl.adapters.sb3_signal_env import CavSb3SignalEnv
 from cavmarl.cli.suite import signal_table
 from cavmarl.core.progress import counting
@@ -32,7 +34,8 @@ from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.signals.controllers import CONTROLLERS, SignalController, SignalView
-from cavmarl.signals.kernels.green_choices import GREEN, KEEP
+from cavmarl.signals.green_features import GreenFeatures
+from cavmarl.signals.kernels.green_choices import KEEP
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
 FIRST_SEED = 1000  # of the evaluation
@@ -46,18 +49,24 @@ class Args:
     program: ClassVar[str] = "signals_sb3.py"
 
     env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
-    num_worlds: Annotated[int, "number of parallel worlds"] = 8
+    num_worlds: Annotated[int, "number of parallel worlds"] = 4
     background: Annotated[int, "vehicles of the generator; 0: those of the demand alone"] = 0
     horizon_s: Annotated[int, "seconds of an episode"] = 3600
     seed: Annotated[int, "root of all random numbers"] = 0
-    updates: Annotated[int, "updates of the network"] = 160
+    updates: Annotated[int, "updates of the network"] = 60
     num_steps: Annotated[int, "decisions of a signal per update"] = 90
     epochs: Annotated[int, "passes over the decisions of an update"] = 4
     minibatches: Annotated[int, "minibatches per pass"] = 10
     learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 1e-3
     gamma: Annotated[float, "discount per decision"] = 0.95
-    queue_weight: Annotated[float, "weight of the reward's term queue"] = 0.1
-    hidden: Annotated[int, "width of the two hidden layers"] = 64
+    entropy: Annotated[float, "weight of the entropy in the loss"] = 0.01
+    delay_weight: Annotated[float, "weight of the reward's term delay"] = 0.1
+    wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
+    entry_weight: Annotated[float, "reward for each vehicle that need not wait to enter"] = 1.0
+    decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
+    range_m: Annotated[float, "signals see the lanes before them at least this far"] = 50.0
+    hidden: Annotated[int, "width of the hidden layers"] = 64
+    compare: Annotated[bool, "run the scripted controllers, too"] = True
     evaluations: Annotated[int, "worlds of the evaluation"] = 5
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_signals_SEED"] = ""
@@ -78,44 +87,57 @@ class Args:
             "clock.sim_dt_s": TICK_S,
             "population.mode": "open",
             "population.background": self.background,
+            "signals.decide_s": self.decide_s,
             "signals.max_green_s": 0.0,
-            "signals.terms": {"queue": self.queue_weight},
+            "signals.range_m": self.range_m,
+            "signals.terms": {"delay": self.delay_weight, "wait": self.wait_weight},
         }
 
 
 class SharedNetwork:
-    """A controller of signals: the most likely action of one network for all of them.
+    """A controller of signals: the most likely green of one network for all of them.
 
     Args:
-        model: as trained on the rows of `CavSb3SignalEnv`.
+        model: as trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
     """
 
     def __init__(self, model: PPO) -> None:
         self._model = model
+        self._features: GreenFeatures | None = None
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Return the choice (W, S) of each agent."""
+        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
         shape = view.states.shape[:2]
-        rows = view.observations.reshape(shape[0] * shape[1], -1)
+        if not view.decides.any():
+            return np.full(shape, KEEP)
+        if self._features is None:
+            self._features = GreenFeatures(view.table)
+        rows = self._features.of(view).reshape(shape[0] * shape[1], -1)
         actions = self._model.predict(rows, deterministic=True)[0].reshape(shape)
-        actions = np.where(actions < view.table.arrays.num_greens, actions, view.states[..., GREEN])
         return np.where(view.decides[:, None], actions, KEEP)
 
 
 def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
     """Create the library's PPO on the signals of all worlds."""
-    keys = {**args.overrides, "clock.ctrl_dt_s": 5.0, "horizon_s": float(args.horizon_s)}
-    rows = CavSb3SignalEnv(args.env, num_worlds=args.num_worlds, overrides=keys)
+    clock = {"clock.ctrl_dt_s": args.decide_s, "horizon_s": float(args.horizon_s)}
+    rows = CavSb3SignalEnv(
+        args.env,
+        num_worlds=args.num_worlds,
+        features="greens",
+        spread=True,
+        entry_weight=args.entry_weight,
+        overrides=args.overrides | clock,
+    )
     model = PPO(
-        "MlpPolicy",
+        GreenPolicy,
         rows,
         learning_rate=lambda left: args.learning_rate * left,
         n_steps=args.num_steps,
         batch_size=max(args.num_steps * rows.num_envs // args.minibatches, 2),
         n_epochs=args.epochs,
         gamma=args.gamma,
-        ent_coef=0.01,
-        policy_kwargs={"net_arch": [args.hidden, args.hidden]},
+        ent_coef=args.entropy,
+        policy_kwargs={"net_arch": [*rows.sizes, args.hidden]},
         seed=args.seed,
         device="cpu",
     )
@@ -125,8 +147,9 @@ def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
 def evaluate(args: Args, model: PPO) -> dict[str, list[SignalFigures]]:
     """Run the network and the scripted controllers in worlds of equal seeds."""
     controllers: dict[str, str | SignalController]
-    controllers = {"PPO": SharedNetwork(model), OWN_PROGRAM: OWN_PROGRAM}
-    controllers |= {name: name for name in CONTROLLERS}
+    controllers = {"PPO": SharedNetwork(model)}
+    if args.compare:
+        controllers |= {name: name for name in (OWN_PROGRAM, *CONTROLLERS)}
     found = {}
     with counting(Console(), "controllers") as told:
         for done, (name, controller) in enumerate(controllers.items()):

@@ -51,6 +51,7 @@ SIGNAL_FIGURES = {
     "co2_g_per_km": "CO₂, g/km",
     "switches_per_h": "switches/h",
     "longest_red_s": "longest red, s",
+    "jams": "runs that jam",
 }
 SHOWN = ("success", "collision", "off_road", "delay_s")  # metrics that fit eighty columns
 
@@ -138,6 +139,8 @@ def _mean_cell(runs: Sequence[SignalFigures], name: str) -> str:
     values = np.array([getattr(run, name) for run in runs], dtype=np.float64)
     if np.isnan(values).all():
         return "-"
+    if name == "jams":
+        return f"{values.sum():.0f} of {len(values)}"
     interval, mean = mean_interval(values), values.mean()
     half = 0.0 if interval is None else 0.5 * (interval.high - interval.low)
     digits = 1 if max(abs(mean), half) < 100.0 else 0

@@ -11,7 +11,7 @@ from cavmarl.core.errors import ConfigError
 
 # The named terms of a signal's reward, in the order of every array of signal terms
 # (`signals/kernels/signal_observations.py`).
-SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure")
+SIGNAL_TERMS = ("diff_wait", "average_speed", "queue", "pressure", "delay", "wait")
 
 NO_SIGNALS = "none"
 ALL_SIGNALS = "all"
@@ -60,6 +60,9 @@ class SignalsConfig(Section, key="signals"):
             begins the next one in the order of the program.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
+        range_m: scores of controllers and rewards count the vehicles on lanes that lead to a signal
+            within this distance of its stop line; 0: on the last lane before the signal alone, as
+            in sumo-rl. A lane counts as a whole. Needs `sensing: truth`.
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
@@ -91,6 +94,7 @@ class SignalsConfig(Section, key="signals"):
     greens: Literal["distinct", "all"] = "distinct"
     action: Literal["next_phase", "keep_or_next"] = "next_phase"
     forbidden: Literal["ignore", "error"] = "ignore"
+    range_m: Annotated[float, Within(0.0, 1000.0)] = 0.0
     terms: dict[str, float] = field(default_factory=lambda: {"diff_wait": 1.0})
     sensing: Literal["truth", "loops", "camera", "v2x"] = "truth"
     loop_upstream_m: Annotated[float, Within(5.0, 1000.0)] = 50.0
@@ -101,6 +105,11 @@ class SignalsConfig(Section, key="signals"):
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        self.need(
+            "range_m",
+            self.range_m == 0.0 or self.sensing == "truth",
+            f"must be 0 with signals.sensing = {self.sensing}, whose sensors are on the last lanes",
+        )
         self.need(
             "agents",
             self.agents in (NO_SIGNALS, ALL_SIGNALS) or isinstance(self.agents, tuple),

@@ -46,7 +46,7 @@ class SignalComponent:
 
     def __init__(self, host: ComponentContext, messages: V2xComponent | None) -> None:
         config, num_worlds = host.config.signals, host.num_worlds
-        self.table = SignalTable(host.network)
+        self.table = SignalTable(host.network, config.range_m)
         sizes = self.table.sizes
         signals = (num_worlds, sizes.signals)
         first, zoned = host.shards[0], host.division.zoned

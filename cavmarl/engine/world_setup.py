@@ -73,7 +73,11 @@ class World(NamedTuple):
     @property
     def signal_sizes(self) -> SignalSizes:
         """Sizes of the arrays about signals with agents."""
-        return sizes_of(self.network) if self.config.signals.are_controlled else SignalSizes()
+        return (
+            sizes_of(self.network, self.config.signals.range_m)
+            if self.config.signals.are_controlled
+            else SignalSizes()
+        )
 
     @property
     def capacity(self) -> int:

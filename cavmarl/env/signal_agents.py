@@ -42,7 +42,7 @@ class SignalAgents:
         self._dt = config.clock.sim_dt_s
         self._is_strict = config.action.missing_action == "error"
         self._arrays = arrays
-        self.table = SignalTable(network)
+        self.table = SignalTable(network, self._config.range_m)
         self.agents = tuple(f"{PREFIX}{name}" for name in self.table.ids)
         self._index = {agent: s for s, agent in enumerate(self.agents)}
         cyclic = self._config.action == "keep_or_next"

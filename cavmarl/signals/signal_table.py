@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -49,7 +49,7 @@ class SignalTable:
         sizes: sizes of the arrays.
     """
 
-    def __init__(self, network: RoadNetwork) -> None:
+    def __init__(self, network: RoadNetwork, range_m: float = 0.0) -> None:
         programs = network.programs
         chosen = [
             row
@@ -81,6 +81,15 @@ class SignalTable:
             is_green = (greens == SIGNAL_GREEN_MAJOR) | (greens == SIGNAL_GREEN_MINOR)
             opened = [is_green[:, letters].any(axis=1) for letters in moves.values()]
             self.opened.append(np.array(opened, dtype=np.bool_).T)
+        upstream = {
+            n: [index.setdefault(lane, len(index)) for lane in lanes_before(network, row, range_m)]
+            for row, n in [*index.items()]
+            if any(n in lanes for lanes in incoming)
+        }
+        approach = [
+            [*dict.fromkeys([*lanes, *(up for n in lanes for up in upstream[n])])]
+            for lanes in incoming
+        ]
         lane_row = np.array([*index], dtype=np.int32)
         lane_index = np.full(len(network.lanes), -1, dtype=np.int32)
         lane_index[lane_row] = np.arange(len(lane_row))
@@ -92,6 +101,7 @@ class SignalTable:
             num_greens=np.array([len(greens) for greens in self.greens], dtype=np.int32),
             incoming=_padded(incoming),
             outgoing=_padded(outgoing),
+            approach=_padded(approach),
             lane_row=lane_row,
             lane_index=lane_index,
             length_m=network.lanes["length_m"][lane_row],
@@ -101,7 +111,7 @@ class SignalTable:
         self.posts = _posts(incoming, outgoing, network.lanes[lane_row])
         greens_max = int(self.arrays.num_greens.max(initial=0))
         self.served, self.pressure = (
-            _weights(self.movements, self.opened, greens_max, of_each)
+            _weights(self.movements, self.opened, greens_max, of_each, upstream)
             for of_each in (_of_served_lanes, _of_pressure)
         )
         self.prolonging = _prolonging(network, chosen, self.arrays.detector, greens_max)
@@ -118,6 +128,30 @@ class SignalTable:
         self.sizes = SignalSizes(len(chosen), greens_max, len(index), max(features, default=0))
 
 
+def lanes_before(network: RoadNetwork, lane: int, range_m: float) -> list[int]:
+    """Return the LANE rows that lead to a lane without a signal in between, nearest first.
+
+    Each begins less than `range_m` before the end of the lane, along the way, and counts once.
+    """
+    found: dict[int, None] = {}
+    ends = [(lane, 0.0)]
+    for row, end_m in ends:
+        begin_m = end_m + float(network.lanes["length_m"][row])
+        if begin_m >= range_m:
+            continue
+        for link in network.links[network.links["to_lane"] == row]:
+            before = int(link["from_lane"])
+            if link["signal"] >= 0 or before in found or before == lane:
+                continue
+            inside = int(link["next_lane"])
+            while inside != row:
+                found[inside] = None
+                inside = int(network.lanes["successor"][inside])
+            found[before] = None
+            ends.append((before, begin_m + float(link["length_m"])))
+    return [*found]
+
+
 def ticks_of(config: SignalsConfig, sim_dt_s: float) -> SignalTicks:
     """Return the durations of a configuration in ticks."""
     return SignalTicks(
@@ -131,9 +165,9 @@ def ticks_of(config: SignalsConfig, sim_dt_s: float) -> SignalTicks:
     )
 
 
-def sizes_of(network: RoadNetwork) -> SignalSizes:
+def sizes_of(network: RoadNetwork, range_m: float) -> SignalSizes:
     """Return the sizes of the arrays about the signals that agents control."""
-    return SignalTable(network).sizes
+    return SignalTable(network, range_m).sizes
 
 
 def _greens(network: RoadNetwork, row: int) -> NDArray[np.uint8]:
@@ -193,11 +227,27 @@ def _weights(
     opened: Sequence[NDArray[np.bool_]],
     greens_max: int,
     of_each: Callable[[list[tuple[int, int]]], dict[int, int]],
+    upstream: Mapping[int, Sequence[int]],
 ) -> LaneWeights:
-    """Return the weights of lanes for each green, from the movements that the green opens."""
+    """Return the weights of lanes for each green, from the movements that the green opens.
+
+    Lanes `upstream` of a lane with a positive weight have its weight, the largest if several.
+    """
+
+    def extended(found: dict[int, int]) -> dict[int, int]:
+        more: dict[int, int] = {}
+        for lane, weight in found.items():
+            for up in upstream.get(lane, ()) if weight > 0 else ():
+                more[up] = max(weight, more.get(up, 0))
+        for up, weight in more.items():
+            found[up] = found.get(up, 0) + weight
+        return found
+
     lists: list[dict[int, int]] = []
     for moves, greens in zip(movements, opened, strict=True):
-        lists += [of_each(list(map(tuple, moves[is_open].tolist()))) for is_open in greens]
+        lists += [
+            extended(of_each(list(map(tuple, moves[is_open].tolist())))) for is_open in greens
+        ]
         lists += [{}] * (greens_max - len(greens))
     return _as_table(lists)
 

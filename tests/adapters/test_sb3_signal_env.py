@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,8 @@ KEYS = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 2.5, "horizon_s": 40.0}
 def make(env: str = "grid4x4", **more: Any) -> Any:
     from cavmarl.adapters.sb3_signal_env import CavSb3SignalEnv
 
-    return CavSb3SignalEnv(env, num_worlds=2, background=60, **{"overrides": KEYS, **more})
+    keys = {"background": 60, "overrides": KEYS, **more}
+    return CavSb3SignalEnv(env, num_worlds=2, **keys)
 
 
 def test_a_step_lasts_from_decision_to_decision() -> None:
@@ -76,6 +78,54 @@ def test_ppo_learns_from_the_rows() -> None:
         model = sb3.PPO("MlpPolicy", rows, n_steps=8, batch_size=64, n_epochs=1, device="cpu")
         model.learn(8 * 32)
         assert model.num_timesteps == 8 * 32
+
+
+def test_a_signal_is_rewarded_for_vehicles_that_enter_before_it(tmp_path: Path) -> None:
+    demand = tmp_path / "many.rou.xml"
+    demand.write_text(
+        '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
+        '<flow id="f" route="r" begin="0" end="60" period="0.4"/></routes>'
+    )
+    keys = {"traffic.demand": [str(demand)], "horizon_s": 200.0, "signals.terms": {"queue": 0.0}}
+    rows = make(background=0, entry_weight=0.5, overrides=KEYS | keys)
+    with closing(rows):
+        rows.seed(1)
+        rows.reset()
+        before, first = 0, rows.get_attr("signals")[0].table.ids.index("A0")
+        most = 0
+        for _ in range(36):
+            _, rewards, _, _ = rows.step(np.zeros(32, int))
+            waiting = rows.get_attr("traffic_stats")[0](1)["waiting"]
+            assert rewards[16 + first] == 0.5 * (before - waiting)
+            assert np.count_nonzero(rewards[16:]) <= 1
+            before, most = waiting, max(most, waiting)
+        assert most > 50
+        assert waiting < most
+    with pytest.raises(ConfigError, match="entry_weight"):
+        make(entry_weight=1.0, workers=1)
+
+
+def test_rows_of_greens_have_their_own_size_and_worlds_begin_apart() -> None:
+    with pytest.raises(ConfigError, match="features"):
+        make(features="cars")
+    with closing(make()) as rows, pytest.raises(ConfigError, match="sizes"):
+        assert rows.sizes
+    rows = make(features="greens", spread=True)
+    with closing(rows):
+        rows.seed(2)
+        seen = rows.reset()
+        greens, others = rows.sizes
+        assert greens == 2
+        assert others == 5 + 16
+        assert rows.observation_space.contains(seen[0])
+        assert rows.get_attr("signals")[0].view.ticks.tolist() == [0, 200]
+        done = np.zeros(32, np.bool_)
+        for _ in range(8):
+            _, _, ended, infos = rows.step(np.zeros(32, int))
+            done |= ended
+            for row in np.flatnonzero(ended):
+                assert infos[row]["terminal_observation"].shape == seen[row].shape
+        assert done.all()
 
 
 def test_arguments_that_the_adapter_sets_are_refused() -> None:

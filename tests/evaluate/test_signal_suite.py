@@ -17,7 +17,7 @@ from cavmarl import ConfigError
 from cavmarl.cli import app
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.evaluate.signals.emissions import co2_mg_per_s
-from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
+from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter, is_jammed
 from cavmarl.evaluate.signals.signal_runs import run_controller, run_sumo
 from cavmarl.evaluate.traffic.sumo_side import SumoJob
 from cavmarl.roads.cache import load_network
@@ -68,7 +68,12 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
         rows["speed"], rows["free_s"] = speed, 0.25
         meter.sample(rows, 2 * second, due, codes)
     figures = meter.result(
-        arrived=0, trip_s=0.0, delay_s=0.0, waiting_s=np.array([7.0]), switches_per_h=None
+        arrived=0,
+        trip_s=0.0,
+        delay_s=0.0,
+        waiting_s=np.array([7.0]),
+        switches_per_h=None,
+        jams=None,
     )
     assert figures.waiting_s == 5.0
     assert figures.stops == 2.0
@@ -79,6 +84,39 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
     assert figures.delay_s is None
     # Lost time: (20 - 8) / 2 - 0.25 s on the way and 2 s before it; 7 s of the waiting vehicle.
     assert figures.delay_of_all_s == pytest.approx((6.0 - 0.25 + 2.0 + 7.0) / 2)
+
+
+@pytest.mark.parametrize(
+    ("arrived", "late", "seconds", "expected"),
+    [
+        (600, 100, 3600, False),  # 500 in 50 minutes, 100 in ten
+        (550, 50, 3600, False),  # half as many as before
+        (549, 49, 3600, True),
+        (0, 0, 3600, False),
+        (549, 49, 1199, None),
+        (100, 20, 1200, True),
+    ],
+)
+def test_a_run_jams_if_half_as_many_arrive_in_the_last_ten_minutes(
+    arrived: int, late: int, seconds: int, expected: bool | None
+) -> None:
+    assert is_jammed(arrived, late, seconds) is expected
+
+
+def test_a_run_whose_exit_is_closed_jams(tmp_path: Path) -> None:
+    demand = tmp_path / "closed.rou.xml"
+    demand.write_text(
+        '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
+        '<flow id="f" route="r" begin="0" end="1200" period="6"/>'
+        '<vehicle id="x" route="r" depart="300"><stop lane="C0D0_0" duration="9999"/></vehicle>'
+        '<vehicle id="y" route="r" depart="300"><stop lane="C0D0_1" duration="9999"/></vehicle>'
+        "</routes>"
+    )
+    keys = {"traffic.demand": [str(demand)], "population.background": 0}
+    (jammed,) = run_controller("grid4x4", "map", seconds=1200, seeds=[1], overrides=keys)
+    sumo = run_sumo(SumoJob(MAP, read_input([demand]), 1200, 0.2, 1))
+    assert jammed.jams is True
+    assert sumo.jams is True
 
 
 def test_controllers_and_sumo_are_measured_alike(tmp_path: Path) -> None:
@@ -103,6 +141,7 @@ def test_controllers_and_sumo_are_measured_alike(tmp_path: Path) -> None:
     assert chosen[0].switches_per_h is not None
     assert chosen[0].switches_per_h > 0.0
     assert sumo.queue is None
+    assert ours[0].jams is None  # the run is too short
 
 
 def test_a_step_of_another_length_and_an_unknown_controller_are_refused() -> None:
@@ -126,8 +165,9 @@ def test_the_suite_prints_a_table(tmp_path: Path) -> None:
     assert found.exit_code == 0, found.output
     assert "left out: none.sumocfg" in found.output
     assert "longest queue" in found.output
+    assert "runs that jam" in found.output
     content = (tmp_path / "all.json").read_text()
-    for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 5)):
+    for name in asdict(SignalFigures(0, 0, 0, None, 0.0, None, 0.0, 0.0, *[None] * 6)):
         assert f'"{name}"' in content
     refused = CliRunner().invoke(app, ["suite", str(suite), "--policy", "idm"])
     assert refused.exit_code != 0

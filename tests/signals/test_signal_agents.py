@@ -149,18 +149,23 @@ def test_signals_without_an_agent_keep_their_programs() -> None:
 # Observations and rewards
 
 
-def expected_counts(env: CavEnv, stood: dict[int, tuple[int, int]]) -> dict[str, NDArray[np.int64]]:
+def expected_counts(
+    env: CavEnv, stood: dict[int, tuple[int, int]]
+) -> dict[str, NDArray[np.float64]]:
     """Counts by lane from all vehicles; `stood` has the lane and the ticks by vehicle."""
-    found: dict[str, NDArray[np.int64]] = defaultdict(lambda: np.zeros(3, dtype=np.int64))
+    found: dict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(4))
+    speed_mps = env.network.lanes["speed_mps"]
     for row in env.simulation.vehicles(0):
         lane = env.network.lane_ids[row["lane"]]
         standing = abs(row["speed"]) < 0.1
-        found[lane] += [1, standing, stood[int(row["id"])][1]]
+        lost = 1.0 - abs(row["speed"]) / (speed_mps[row["lane"]] * row["speed_factor"])
+        found[lane] += [1, standing, stood[int(row["id"])][1], lost]
     return found
 
 
 def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
     weights = {"diff_wait": 1.0, "average_speed": 0.5, "queue": 0.25, "pressure": 0.125}
+    weights |= {"delay": 0.1, "wait": 0.2}
     ticks = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2}
     overrides = ALL | ticks | {"signals.terms": weights, "signals.decide_s": 1.0}
     env = parallel_env("grid4x4", agents=2, background=150, seed=3, overrides=overrides)
@@ -182,7 +187,9 @@ def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
                 counts = expected_counts(env, stood)
                 for k, lane_id in enumerate(table.lanes):
                     columns = [VEHICLES, STANDING, STOOD_TICKS]
-                    assert arrays.signal_counts[0, k, columns].tolist() == counts[lane_id].tolist()
+                    assert (
+                        arrays.signal_counts[0, k, columns].tolist() == counts[lane_id][:3].tolist()
+                    )
                 for s, agent in enumerate(env.signals.agents):
                     incoming = [k for k in table.arrays.incoming[s].tolist() if k >= 0]
                     outgoing = [k for k in table.arrays.outgoing[s].tolist() if k >= 0]
@@ -198,13 +205,16 @@ def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
                         )
                     if step == 0:
                         continue
-                    vehicles, standing, waited = np.sum([counts[name] for name in names], axis=0)
+                    sums = np.sum([counts[name] for name in names], axis=0)
+                    vehicles, standing, waited, lost = sums
                     waits += waited > 0
                     beyond = sum(counts[table.lanes[k]][0] for k in outgoing)
                     terms = dict(zip(weights, arrays.signal_terms[0, s].tolist(), strict=True))
                     assert terms["queue"] == -standing
                     assert terms["pressure"] == beyond - vehicles
                     wait_s = 0.2 * waited
+                    assert terms["wait"] == pytest.approx(-wait_s / 100.0)
+                    assert terms["delay"] == pytest.approx(-lost, abs=1e-4)
                     assert terms["diff_wait"] == pytest.approx(
                         (waited_before[s] - wait_s) / 100.0, abs=1e-6
                     )

@@ -5,14 +5,18 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 
+import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from cavmarl.config.registry import entries, load_config
 from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
+from tests.support.generated import check_block
 from tests.support.training import TRAIN, load_program
 
 pytest.importorskip("torch", reason="needs the extra: train")
@@ -201,3 +205,47 @@ def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
     again = call("signals_sb3.py", *words, "--runs", tmp_path, "--name", "a")
     assert again.returncode == 2
     assert "contains a run" in again.stderr
+
+
+@pytest.mark.filterwarnings("ignore")  # what the library warns of itself
+def test_a_network_scores_signals_of_any_shape(tmp_path: Path) -> None:
+    """Learning changes the weights, and forbidden greens are never chosen."""
+    pytest.importorskip("stable_baselines3", reason="needs the extra: train")
+    program = load_program("signals_sb3")
+    args = program.Args(
+        env="town", num_worlds=2, num_steps=16, minibatches=2, hidden=8, background=60
+    )
+    model, rows = program.make_model(args)
+    with closing(rows):
+        assert len({len(greens) for greens in rows.get_attr("signals")[0].table.greens}) > 1
+        allowed = []
+        accept = rows.step_async
+
+        def check_and_accept(actions: NDArray[np.int64]) -> None:
+            allowed.append(rows.action_masks()[np.arange(len(actions)), actions])
+            accept(actions)
+
+        rows.step_async = check_and_accept
+        before = [each.detach().clone() for each in model.policy.parameters()]
+        model.learn(2 * 16 * rows.num_envs)
+        changed = [
+            not np.array_equal(old, new.detach())
+            for old, new in zip(before, model.policy.parameters(), strict=True)
+        ]
+    assert all(changed)
+    assert np.all(allowed)
+
+
+def test_the_table_of_training_seeds_is_that_of_the_figures(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    program = load_program("signal_seeds")
+    assert program.main(["--table", "docs/figures/signal_control.json"]) == 0
+    check_block(Path("docs/guides/signal_control.md"), "signals", capsys.readouterr().out.rstrip())
+
+
+def test_training_seeds_without_maps_are_refused(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert "has no file" in refusal(capsys, "signal_seeds.py", "--maps", tmp_path)
+    assert "--maps FOLDER" in refusal(capsys, "signal_seeds.py")

@@ -12,6 +12,7 @@ from cavmarl.evaluate.signals.emissions import co2_mg_per_s
 from cavmarl.roads.network import RoadNetwork
 
 STANDING_MPS = 0.1
+LATE_S = 600  # arrivals in the last ten minutes tell whether a run jams
 
 # By vehicle id, of all vehicles that have departed.
 _TRIP = np.dtype(
@@ -46,6 +47,23 @@ class SignalFigures:
     co2_g_per_km: float | None  # of a petrol car, see `co2_mg_per_s`
     switches_per_h: float | None  # changes of the green of a signal, mean over signals
     longest_red_s: float | None  # longest time for which a lane was red while a vehicle stood on it
+    jams: bool | None  # see `is_jammed`
+
+
+def is_jammed(arrived: int, arrived_late: int, seconds: float) -> bool | None:
+    """Return whether traffic had broken down at the end of a run.
+
+    This is so if fewer than half as many vehicles per second arrived in the last `LATE_S` as
+    before. None: the run is shorter than twice that time.
+
+    Args:
+        arrived: vehicles that arrived in the run.
+        arrived_late: those that arrived in the last `LATE_S`.
+        seconds: length of the run.
+    """
+    if seconds < 2 * LATE_S:
+        return None
+    return 2 * arrived_late * (seconds - LATE_S) < (arrived - arrived_late) * LATE_S
 
 
 class SignalMeter:
@@ -132,6 +150,7 @@ class SignalMeter:
         delay_s: float,
         waiting_s: NDArray[np.float64],
         switches_per_h: float | None,
+        jams: bool | None,
     ) -> SignalFigures:
         """Return the figures.
 
@@ -141,6 +160,7 @@ class SignalMeter:
             delay_s: mean of their delays.
             waiting_s: (n,) for each vehicle that is due but has not departed, the time since then.
             switches_per_h: mean over signals.
+            jams: see `is_jammed`.
         """
         trips = self._trips[~np.isnan(self._trips["departed_s"])]
         count = len(trips) + len(waiting_s)
@@ -159,4 +179,5 @@ class SignalMeter:
             co2_g_per_km=self._co2_mg / self._metres if self._metres else None,
             switches_per_h=switches_per_h,
             longest_red_s=self._longest_red_s,
+            jams=jams,
         )

@@ -14,7 +14,7 @@ import defusedxml.ElementTree
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.evaluate.signals.signal_meter import SignalFigures, SignalMeter
+from cavmarl.evaluate.signals.signal_meter import LATE_S, SignalFigures, SignalMeter, is_jammed
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.evaluate.traffic.sumo_side import SumoJob, start_sumo, sumo_process
 from cavmarl.roads.shown_signals import signal_codes
@@ -82,12 +82,14 @@ def _measured(
     commands, view = idle_commands(simulation), None
     if controller is not None:
         view = simulation.signal_view()
-    switches = 0
+    switches = arrived_before = 0
     for second in range(1, seconds + 1):
         if view is not None and controller is not None:
             since = view.states[..., SINCE].copy()
             commands = replace(commands, signal_choices=controller.choose(view))
         simulation.step(commands)
+        if second == seconds - LATE_S:
+            arrived_before = simulation.traffic_stats().arrived
         if view is not None:
             switches += int((view.states[..., SINCE] != since).sum())
         meter.sample(
@@ -105,6 +107,7 @@ def _measured(
         delay_s=stats.mean_delay_s,
         waiting_s=(seconds * ticks_per_s - queue["due"]) * config.clock.sim_dt_s,
         switches_per_h=None if view is None else 3600.0 * switches / seconds / len(view.table.ids),
+        jams=is_jammed(stats.arrived, stats.arrived - arrived_before, seconds),
     )
 
 
@@ -127,6 +130,7 @@ def _trips_of_sumo(job: SumoJob) -> SignalFigures:
         )
         for _ in range(round(job.seconds / job.dt_s)):
             libsumo.simulationStep()
+        end_s = libsumo.simulation.getTime()
         libsumo.close()
         trips = [
             trip
@@ -145,6 +149,7 @@ def _trips_of_sumo(job: SumoJob) -> SignalFigures:
         for emissions in trip.iter("emissions")
     )
     metres = math.fsum(values("routeLength", departed))
+    late = sum(second >= end_s - LATE_S for second in values("arrival", arrived))
     lost_s = math.fsum(values("timeLoss", departed)) + math.fsum(values("departDelay", trips))
     return SignalFigures(
         departed=len(departed),
@@ -160,6 +165,7 @@ def _trips_of_sumo(job: SumoJob) -> SignalFigures:
         co2_g_per_km=co2_mg / metres if metres else None,
         switches_per_h=None,
         longest_red_s=None,
+        jams=is_jammed(len(arrived), late, job.seconds),
     )
 
 

@@ -181,17 +181,22 @@ class LocalWorlds:
 
     def _begin(self, chosen: NDArray[np.bool_]) -> None:
         self.simulation.reset(chosen)
-        self._show(chosen)
+        self._show(chosen, begins=True)
         self._steps[chosen] = 0
         self._waiting[chosen] = False
 
-    def _show(self, chosen: NDArray[np.bool_]) -> None:
-        """Write what the agents of the chosen worlds (W,) observe."""
+    def _show(self, chosen: NDArray[np.bool_], begins: bool = False) -> None:
+        """Write what the agents of the chosen worlds (W,) observe.
+
+        At the begin of an episode, signals keep the rewards of the step that ended the last one.
+        """
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
         if self._shows_signals:
             found = self.simulation.signals.outputs
             for name, values in found._asdict().items():
+                if begins and name in ("rewards", "terms"):
+                    continue
                 getattr(self.arrays, f"signal_{name}")[chosen] = values[chosen]
 
     def suggest(self) -> None:
@@ -435,7 +440,7 @@ def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    sizes = sizes_of(simulation.network)
+    sizes = sizes_of(simulation.network, simulation.config.signals.range_m)
     layout = layout_of(simulation.config, simulation.capacity, num_worlds, sizes)
     sensed = frame_layout(simulation.config, num_worlds)
     made = {

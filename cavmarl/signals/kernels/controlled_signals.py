@@ -17,6 +17,7 @@ class ControlledSignals(NamedTuple):
     num_greens: NDArray[np.int32]  # (S,)
     incoming: NDArray[np.int32]  # (S, I) lanes before the signal, indices of lanes; -1: none
     outgoing: NDArray[np.int32]  # (S, O) lanes behind the signal
+    approach: NDArray[np.int32]  # (S, A) incoming lanes, and lanes that lead to them
     lane_row: NDArray[np.int32]  # (N,) LANE rows
     lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N; -1: not watched
     length_m: NDArray[np.float64]  # (N,)

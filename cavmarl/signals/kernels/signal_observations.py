@@ -21,7 +21,7 @@ from cavmarl.signals.kernels.lane_counts import (
 )
 
 MIN_GAP_M = 2.5  # between standing vehicles, for the number of vehicles that a lane holds
-WAIT_SCALE_S = 100.0  # of the term diff_wait
+WAIT_SCALE_S = 100.0  # of the terms diff_wait and wait
 
 
 @kernel
@@ -90,8 +90,8 @@ def reward_signals(
             if not (observed[w] and ends):
                 continue
             vehicles, standing, waited, speed, beyond = 0, 0, 0, 0, 0
-            for k in range(controlled.incoming.shape[1]):
-                lane = controlled.incoming[s, k]
+            for k in range(controlled.approach.shape[1]):
+                lane = controlled.approach[s, k]
                 if lane >= 0:
                     vehicles += counts[w, lane, VEHICLES]
                     standing += counts[w, lane, STANDING]
@@ -106,6 +106,8 @@ def reward_signals(
             values[1] = speed * 1e-6 / vehicles if vehicles > 0 else 1.0
             values[2] = -standing
             values[3] = beyond - vehicles
+            values[4] = speed * 1e-6 - vehicles
+            values[5] = -waited * dt / WAIT_SCALE_S
             stood[w, s] = waited
             total = 0.0
             for t in range(weights.size):
