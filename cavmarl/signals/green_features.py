@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.signals.controllers import SignalView
+from cavmarl.signals.kernels.controlled_signals import LaneWeights
 from cavmarl.signals.kernels.green_choices import GREEN, SINCE
-from cavmarl.signals.kernels.green_scores import LaneWeights
 from cavmarl.signals.kernels.lane_counts import SPEED_PPM, STANDING, STOOD_TICKS, VEHICLES
 from cavmarl.signals.signal_table import SignalTable
 

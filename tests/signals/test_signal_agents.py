@@ -370,6 +370,10 @@ def test_a_missing_choice_is_an_error_when_it_counts() -> None:
         ({"signals.yellow_s": 0.3}, r"whole number of ticks of clock.sim_dt_s = 0.2; try 0.2"),
         ({"signals.max_green_s": 3.0}, r"must be 0, or at least signals.min_green_s = 5"),
         ({"signals.terms": {"speed": 1.0}}, "no such term; must be one of diff_wait"),
+        (
+            {"signals.range_m": 50.0, "signals.sensing": "camera"},
+            "must be 0 with signals.sensing = camera",
+        ),
     ],
 )
 def test_wrong_settings_have_clear_errors(overrides: dict[str, Any], message: str) -> None:
