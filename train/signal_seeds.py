@@ -121,7 +121,7 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
 
 
 def table(maps: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table: delay of all trips, and the runs that jam."""
+    """Yield the lines of the table: mean and median delay of all trips, and runs that jam."""
     yield f"| map | seeds | trained | {' | '.join(f'`{name}`' for name in SCRIPTED)} |"
     yield f"| --- {'| ---: ' * (len(SCRIPTED) + 2)}|"
     for name, found in maps.items():
@@ -140,7 +140,9 @@ def _cell(values: Sequence[Any], runs: Runs) -> str:
     interval = mean_interval(np.array(values, dtype=np.float64))
     spread = "" if interval is None else f" [{interval.low:.1f}, {interval.high:.1f}]"
     jams = sum(run["jams"] for run in runs)
-    return f"{np.mean(values):.1f}{spread}" + (f", {jams} of {len(runs)} jam" if jams else "")
+    median = np.median([run["delay_of_all_s"] for run in runs])
+    jammed = f", {jams} of {len(runs)} jam" if jams else ""
+    return f"{np.mean(values):.1f}{spread} ({median:.1f}){jammed}"
 
 
 def main(words: Sequence[str] | None = None) -> int:
