@@ -70,7 +70,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two by what it needs; the commit says why.
-PACKAGE_LINES = 133_300
+PACKAGE_LINES = 133_850
 REACHABLE_LINES = 83_300  # from `make_vec` and `parallel_env`
 
 # Modules of one name, outside of cli/ and config/.
