@@ -111,7 +111,7 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
         else:
             found[name][kind][each] = train(envs[name], int(each), runs)
         content = {
-            "command": "python train/signal_seeds.py --maps nets/RESCO",
+            "command": f"python train/signal_seeds.py --maps RESCO --seeds {' '.join(map(str, seeds))}",
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
             "evaluation_seeds": [*range(FIRST_SEED, FIRST_SEED + NUM_RUNS)],
             "maps": found,
