@@ -110,8 +110,9 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
             found[name][kind][each] = script(envs[name], each)
         else:
             found[name][kind][each] = train(envs[name], int(each), runs)
+        words = " ".join(map(str, seeds))
         content = {
-            "command": f"python train/signal_seeds.py --maps RESCO --seeds {' '.join(map(str, seeds))}",
+            "command": f"python train/signal_seeds.py --maps RESCO --seeds {words}",
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
             "evaluation_seeds": [*range(FIRST_SEED, FIRST_SEED + NUM_RUNS)],
             "maps": found,
