@@ -110,8 +110,9 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
             found[name][kind][each] = script(envs[name], each)
         else:
             found[name][kind][each] = train(envs[name], int(each), runs)
+        words = " ".join(map(str, seeds))
         content = {
-            "command": "python train/signal_seeds.py --maps nets/RESCO",
+            "command": f"python train/signal_seeds.py --maps RESCO --seeds {words}",
             "date": f"{datetime.now(UTC):%Y-%m-%d}",
             "evaluation_seeds": [*range(FIRST_SEED, FIRST_SEED + NUM_RUNS)],
             "maps": found,
@@ -121,7 +122,7 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
 
 
 def table(maps: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table: delay of all trips, and the runs that jam."""
+    """Yield the lines of the table: mean and median delay of all trips, and runs that jam."""
     yield f"| map | seeds | trained | {' | '.join(f'`{name}`' for name in SCRIPTED)} |"
     yield f"| --- {'| ---: ' * (len(SCRIPTED) + 2)}|"
     for name, found in maps.items():
@@ -140,7 +141,9 @@ def _cell(values: Sequence[Any], runs: Runs) -> str:
     interval = mean_interval(np.array(values, dtype=np.float64))
     spread = "" if interval is None else f" [{interval.low:.1f}, {interval.high:.1f}]"
     jams = sum(run["jams"] for run in runs)
-    return f"{np.mean(values):.1f}{spread}" + (f", {jams} of {len(runs)} jam" if jams else "")
+    median = np.median([run["delay_of_all_s"] for run in runs])
+    jammed = f", {jams} of {len(runs)} jam" if jams else ""
+    return f"{np.mean(values):.1f}{spread} ({median:.1f}){jammed}"
 
 
 def main(words: Sequence[str] | None = None) -> int:

@@ -32,7 +32,7 @@ GREEN_FEATURES = (
     "pressure",  # see `SignalTable`, / 10
     "behind",  # vehicles on the lanes behind the signal, / 20
     "standing_behind",  # / 10
-    "most_filled",  # vehicles as a share of those that a lane holds
+    "most_filled",  # vehicles as a share of the vehicles that a lane holds
     "movements",  # that it opens, / 5
 )
 SIGNAL_FEATURES = (

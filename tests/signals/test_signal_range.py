@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pytest
 
+from cavmarl.env.vector import make_vec
 from cavmarl.evaluate.signals.signal_runs import run_controller
 from cavmarl.roads.cache import load_network
 from cavmarl.signals.signal_table import lanes_before
@@ -53,6 +57,38 @@ def test_the_lanes_within_the_range_lead_to_the_last_lane(crossing: Path) -> Non
     assert names("ms_0", 50.0) == ["am_0"]
     assert names("ms_0", 200.0) == ["am_0", "wa_0"]
     assert names("se_0", 1000.0) == []  # beyond a signal
+
+
+def test_a_divided_world_sees_the_same_vehicles_within_the_range(crossing: Path) -> None:
+    demand = crossing.with_name("few.rou.xml")
+    demand.write_text(
+        '<routes><route id="x" edges="wa am ms se"/>'
+        '<flow id="a" route="x" begin="0" end="200" period="4"/></routes>'
+    )
+    keys: dict[str, Any] = {
+        "traffic.demand": [str(demand)],
+        "population.mode": "open",
+        "signals.agents": "all",
+        "signals.max_green_s": 0.0,
+        "signals.range_m": 200.0,
+        "signals.terms": {"delay": 1.0, "wait": 1.0},
+    }
+
+    def run(zones: int) -> list[Any]:
+        vec = make_vec(crossing, agents=0, background=0, zones=zones, overrides=keys)
+        found = []
+        with closing(vec):
+            vec.reset(seed=1)
+            steps = round(60.0 / vec.config.clock.ctrl_dt_s)
+            for green in np.repeat([0, 1], steps):  # one of them stops this road
+                _, rewards, *_ = vec.step({"signals": np.array([[green]])})
+                found.append((rewards["signals"].tolist(), vec.state_hash()))
+        assert min(rewards[0][0] for rewards, _ in found) < -2.0
+        return found
+
+    undivided = run(1)
+    assert run(2) == undivided
+    assert run(4) == undivided
 
 
 def test_controllers_serve_a_road_whose_last_lane_is_short(crossing: Path) -> None:

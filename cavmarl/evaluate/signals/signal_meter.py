@@ -58,7 +58,7 @@ def is_jammed(arrived: int, arrived_late: int, seconds: float) -> bool | None:
 
     Args:
         arrived: vehicles that arrived in the run.
-        arrived_late: those that arrived in the last `LATE_S`.
+        arrived_late: vehicles that arrived in the last `LATE_S`.
         seconds: length of the run.
     """
     if seconds < 2 * LATE_S:

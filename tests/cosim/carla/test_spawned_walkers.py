@@ -67,7 +67,7 @@ def test_the_official_client_uses_walkers() -> None:
             SYNCHRONOUS
             + """
 library = world.get_blueprint_library()
-kinds = library.filter("walker.pedestrian.*")
+kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda one: one.id)
 start = world.get_map().get_spawn_points()[10]
 beside = start.location + 5.0 * start.get_right_vector()
 Spawn, Control = carla.command.SpawnActor, carla.command.ApplyWalkerControl
@@ -156,7 +156,7 @@ def test_walkers_of_the_client_walk_on_the_navigation_mesh() -> None:
 library = world.get_blueprint_library()
 world.set_pedestrians_seed(7)
 world.set_pedestrians_cross_factor(1.0)
-kinds = library.filter("walker.pedestrian.*")
+kinds = sorted(library.filter("walker.pedestrian.*"), key=lambda one: one.id)
 places = [world.get_random_location_from_navigation() for _ in range(8)]
 road_map = world.get_map()
 def off_road(place):
