@@ -159,7 +159,7 @@ def resets(folder: Path, number: int) -> None:
         quarter = len(sizes) // 4
         first, last = np.median(sizes[:quarter], axis=0), np.median(sizes[-quarter:], axis=0)
         assert last[0] - first[0] < 4e6
-        assert (last[1:] == first[1:]).all()
+        assert (last[1:] <= first[1:]).all()
         assert len(here.children()) == children
 
 
