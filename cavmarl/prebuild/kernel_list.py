@@ -74,10 +74,17 @@ def _is_made(statement: ast.stmt) -> TypeGuard[ast.Assign]:
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
+    """Yield module and name of all that a file imports, or uses of a module that it imports."""
+    modules: dict[str, str] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:
             for alias in node.names:
                 yield node.module, alias.name
+                modules[alias.asname or alias.name] = f"{node.module}.{alias.name}"
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name):
+            if node.value.id in modules:
+                yield modules[node.value.id], node.attr
 
 
 def _called_by_plain(tree: ast.Module, kernels: set[str]) -> Iterator[str]:

@@ -153,7 +153,7 @@ def _is_ours() -> bool:
     frame: Any = sys._getframe(1)
     while frame is not None:
         module = frame.f_globals.get("__name__", "")
-        if not module.startswith(_COMPILED):
+        if not module.startswith((_COMPILED, "functools")):  # a cached property binds a call
             return bool(module.startswith(_PACKAGE))
         frame = frame.f_back
     return False
