@@ -14,6 +14,7 @@ import time
 from collections.abc import Mapping
 from dataclasses import asdict
 from fractions import Fraction
+from itertools import groupby
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
@@ -28,6 +29,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import CavmarlError, ClockError, ConfigError, EvaluationError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.ros2 import FAST_DDS_PROFILE
 from cavmarl.cosim.ros2.ros_bridge import RosBridge, RosOptions
 from cavmarl.cosim.time_master import OwnTicks
 from cavmarl.env.parallel import parallel_env
@@ -36,13 +38,6 @@ PYTHON = "CAVMARL_RCLPY_PYTHON"
 JOINS_S = 60.0
 STEP_S = 0.05
 RIG = {"wheels": {"type": "odometry", "rate_hz": 20}}
-# Fast DDS does not read the type objects of Cyclone DDS.
-PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
-<dds><profiles xmlns="http://www.eprosima.com">
-<participant profile_name="cavmarl" is_default_profile="true"><rtps><propertiesPolicy><properties>
-<property><name>fastdds.type_propagation</name><value>disabled</value></property>
-</properties></propertiesPolicy></rtps></participant></profiles></dds>
-"""
 
 
 @with_world("agents", "background", "seed", "settings")
@@ -146,7 +141,7 @@ def measure_ros_drift(
             own_ticks=own_ticks,
             on_drift="record",
         ) as world,
-        _node(python, domain, Path(folder)) as node,
+        _node(python, domain) as node,
     ):
         thread = threading.Thread(target=follow, args=(str(world.address),), daemon=True)
         thread.start()
@@ -167,7 +162,8 @@ def measure_ros_drift(
             node.kill()
     if errors or node.returncode:
         raise EvaluationError(f"the bridge or the node has failed: {errors}") from None
-    stamps = [ns for ns, last in zip(*_pairs(json.loads(output)), strict=True) if ns != last]
+    # The bridge repeats a clock while it waits.
+    stamps = [ns for ns, _ in groupby(json.loads(output))]
     heard = [round(ns / (1e9 * STEP_S)) for ns in stamps]
     # With a tick of its own, the world is one tick ahead in the next snapshot.
     master = world.master
@@ -194,21 +190,21 @@ def measure_ros_drift(
     }
 
 
-def _pairs(heard: list[int]) -> tuple[list[int], list[int]]:
-    return heard, [-1, *heard[:-1]]
-
-
-def _node(python: str, domain: int, folder: Path) -> subprocess.Popen[str]:
-    profile = folder / "fast_dds.xml"
-    profile.write_text(PROFILE, encoding="utf-8")
-    environment = {
+def ros_environment(domain: int) -> dict[str, str]:
+    """Return the environment of a process of ROS 2 that reaches bridges of this machine."""
+    profile = str(FAST_DDS_PROFILE)
+    return {
         **{name: value for name, value in os.environ.items() if name != "PYTHONPATH"},
-        "FASTDDS_DEFAULT_PROFILES_FILE": str(profile),
-        "FASTRTPS_DEFAULT_PROFILES_FILE": str(profile),
+        "FASTDDS_DEFAULT_PROFILES_FILE": profile,
+        "FASTRTPS_DEFAULT_PROFILES_FILE": profile,  # its name in Jazzy
         "ROS_DOMAIN_ID": str(domain),
         "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
     }
+
+
+def _node(python: str, domain: int) -> subprocess.Popen[str]:
     command = [python, str(ros2_clock_node.__file__)]
+    environment = ros_environment(domain)
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
 

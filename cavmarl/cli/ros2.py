@@ -178,12 +178,12 @@ def _start(
     from cavmarl.env.parallel import parallel_env
 
     reports: list[dict[str, Any]] = []
-    errors: list[CavmarlError] = []
+    errors: list[Exception] = []
 
     def follow(address: str | int) -> None:
         try:
             reports.append(ros_bridge.join(address, vehicles, options))
-        except CavmarlError as error:
+        except Exception as error:  # raised below, in the thread that runs the world
             errors.append(error)
 
     timeout_s = options.ready_s + options.deadline_s + 30.0

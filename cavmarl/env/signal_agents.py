@@ -100,7 +100,7 @@ class SignalAgents:
         return spaces.Box(0.0, 1.0, (self.table.sizes.features,), np.float32)
 
     def keep_beyond(self, choices: NDArray[Any]) -> NDArray[np.int64]:
-        """Return choices (W, S) in which those that a signal does not have keep its green.
+        """Return choices (W, S); a choice beyond a signal's greens keeps its green.
 
         For policies that choose among `most_choices` for every signal.
         """
@@ -166,7 +166,7 @@ class SignalAgents:
         return self._allowed(np.where(reads, found, KEEP))
 
     def _allowed(self, choices: NDArray[Any]) -> NDArray[np.int64]:
-        """Return choices; raise an ActionError for one that its mask excludes, if that is set."""
+        """Return choices; with `forbidden: error`, raise an ActionError for an excluded choice."""
         found = choices.astype(np.int64)
         if self._config.forbidden == "error":
             index = np.maximum(found, 0)[..., None]

@@ -1,8 +1,8 @@
 """Exports Lanelet2 files (.osm), written and read back by the package lanelet2.
 
-The tags are those that Autoware needs (autoware-documentation, vector map requirements): turn
-directions of lanelets inside junctions, `local_x` and `local_y` of points in the map's own
-coordinates, and traffic lights, stop lines and rights of way as regulatory elements.
+Autoware needs these tags (autoware-documentation, vector map requirements): turn directions of
+lanelets inside junctions, `local_x` and `local_y` of points in the map's own coordinates, and
+traffic lights, stop lines and rights of way as regulatory elements.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,21 +96,14 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
     except RuntimeError as error:
         raise MapError(f"{target}: cannot be written as Lanelet2 ({error})") from error
     counts = {"lanelets": len(made.laneletLayer), "read back": len(back.laneletLayer)}
-    counts |= {"rules": sum(rules), "rules read back": len(back.regulatoryElementLayer)}
+    counts |= {"rules": rules, "rules read back": len(back.regulatoryElementLayer)}
     if counts["lanelets"] != counts["read back"] or counts["rules"] != counts["rules read back"]:
         raise MapError(f"{target}: numbers of elements differ ({counts}): export it again")
     return counts
 
 
-class _Rules(NamedTuple):
-    """Numbers of regulatory elements."""
-
-    lights: int
-    rights: int
-
-
-def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) -> _Rules:
-    """Add traffic lights and rights of way to the lanelets of the links inside junctions."""
+def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) -> int:
+    """Add traffic lights and rights of way inside junctions, and return their number."""
     from lanelet2.core import (
         AttributeMap,
         LineString3d,
@@ -142,7 +135,7 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
             lights[lane] = LineString3d(next(ids), points, AttributeMap(kind))
         return lights[lane]
 
-    num_lights = num_rights = 0
+    count_rules = 0
     for number, link in enumerate(network.links):
         own, before = int(link["first_internal"]), int(link["from_lane"])
         if own < 0:
@@ -152,7 +145,7 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
                 FIRST_LIGHT + number, AttributeMap(), [light(before)], stop_line(before)
             )
             lanelets[own].addRegulatoryElement(rule)
-            num_lights += 1
+            count_rules += 1
             continue
         first, count = int(link["first_conflict"]), int(link["num_conflicts"])
         conflicts = network.conflicts[first : first + count]
@@ -168,8 +161,8 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
             )
             for one in (own, *foes):
                 lanelets[one].addRegulatoryElement(rule)
-            num_rights += 1
-    return _Rules(num_lights, num_rights)
+            count_rules += 1
+    return count_rules
 
 
 class _Joints:

@@ -10,29 +10,15 @@ import json
 import os
 import subprocess
 import textwrap
-from pathlib import Path
 from typing import Any
 
 import pytest
 
+from benchmarks.ros2_clock import ros_environment
 from cavmarl.cosim.ros2.ros_bridge import RosOptions
 from tests.cosim.ros2.conftest import Run
 
 PYTHONS = list(filter(None, os.environ.get("CAVMARL_RCLPY_PYTHON", "").split(":")))
-
-# Fast DDS does not read the type objects of Cyclone DDS, and its sockets lose a cloud in one burst.
-PROFILE = """<?xml version="1.0" encoding="UTF-8"?>
-<dds><profiles xmlns="http://www.eprosima.com">
-<transport_descriptors><transport_descriptor><transport_id>udp</transport_id><type>UDPv4</type>
-<receiveBufferSize>4194304</receiveBufferSize><sendBufferSize>4194304</sendBufferSize>
-</transport_descriptor></transport_descriptors>
-<participant profile_name="cavmarl" is_default_profile="true"><rtps>
-<propertiesPolicy><properties><property><name>fastdds.type_propagation</name>
-<value>disabled</value></property></properties></propertiesPolicy>
-<useBuiltinTransports>false</useBuiltinTransports>
-<userTransports><transport_id>udp</transport_id></userTransports>
-</rtps></participant></profiles></dds>
-"""
 
 NODE = """
 import json, sys, time
@@ -79,31 +65,18 @@ print(json.dumps({**heard, "nodes": sorted(nodes)}))
 """
 
 
-def start(python: str, domain: int, folder: Path) -> subprocess.Popen[str]:
-    profile = folder / "fast_dds.xml"
-    profile.write_text(PROFILE)
-    named = dict.fromkeys(
-        ("FASTDDS_DEFAULT_PROFILES_FILE", "FASTRTPS_DEFAULT_PROFILES_FILE"), str(profile)
-    )
-    environment = {
-        **os.environ,
-        **named,
-        "ROS_DOMAIN_ID": str(domain),
-        "ROS_AUTOMATIC_DISCOVERY_RANGE": "LOCALHOST",
-        "PYTHONPATH": "",
-    }
+def start(python: str, domain: int) -> subprocess.Popen[str]:
     command = [python, "-c", textwrap.dedent(NODE)]
+    environment = ros_environment(domain)
     return subprocess.Popen(command, stdout=subprocess.PIPE, text=True, env=environment)
 
 
 @pytest.mark.integration
 @pytest.mark.skipif(not PYTHONS, reason="rclpy is not installed: set CAVMARL_RCLPY_PYTHON")
 @pytest.mark.parametrize("python", PYTHONS)
-def test_a_node_of_ros_drives_in_lock_step(
-    python: str, domain: int, run_bridge: Run, tmp_path: Path
-) -> None:
+def test_a_node_of_ros_drives_in_lock_step(python: str, domain: int, run_bridge: Run) -> None:
     steps = 400
-    with start(python, domain, tmp_path) as node:
+    with start(python, domain) as node:
         options = RosOptions(domain=domain, truth=True, deadline_s=10.0)
         report, _ = run_bridge(options, steps)
         output, _ = node.communicate(timeout=60.0)
