@@ -65,7 +65,6 @@ def export(
             raise ConfigError("--autoware and --lanelet2: use only one of them")
         try:
             autoware.mkdir(parents=True, exist_ok=True)
-            (autoware / "map_projector_info.yaml").write_text(_PROJECTOR, encoding="utf-8")
         except OSError as error:
             raise ConfigError(f"--autoware {autoware}: cannot be written ({error})") from error
         lanelet2 = autoware / "lanelet2_map.osm"
@@ -94,6 +93,9 @@ def export(
             document["lanelet2"] = found = write_lanelet2(network, lanelet2)
             told_back = f"{found['read back']} lanelets and {found['rules read back']} rules"
             console.print(Text(f"{lanelet2}: {told_back} read back"))
+            if autoware is not None:
+                projector = autoware / "map_projector_info.yaml"
+                projector.write_text(_PROJECTOR, encoding="utf-8")
         if geojson is not None:
             told(_LINES)
             document["geojson"] = {"lanes": write_geojson(network, geojson, path)}

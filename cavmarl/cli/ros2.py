@@ -25,7 +25,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import CavmarlError, ConfigError
+from cavmarl.core.errors import CavmarlError, ConfigError, require_all
 
 if TYPE_CHECKING:
     from cavmarl.cosim.ros2.ros_bridge import RosOptions
@@ -107,6 +107,7 @@ def ros2(
 
     The bridge follows the clock of the world. It starts the world ENV, or joins a running one.
     """
+    require_all(dict.fromkeys(("msgpack", "cyclonedds", "rosbags"), "ros2"))
     from cavmarl.cosim.ros2 import ros_bridge
     from cavmarl.cosim.ros2.ros_topics import read_names
 

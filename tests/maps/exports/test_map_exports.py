@@ -164,6 +164,9 @@ def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
     words = ["export", str(town), "--autoware", str(folder), "--lanelet2", "x.osm"]
     refused = CliRunner().invoke(app, words)
     assert isinstance(refused.exception, ConfigError)
+    without = CliRunner().invoke(app, ["export", "ring", "--autoware", str(tmp_path / "ring")])
+    assert isinstance(without.exception, MapError)
+    assert not list((tmp_path / "ring").iterdir())
 
 
 def test_the_command_exports(town: Path, tmp_path: Path) -> None:
