@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 import typer
 
@@ -21,8 +22,9 @@ def run(measure: Callable[..., BenchmarkReport], words: Sequence[str] | None = N
     """Run a benchmark as a program; an expected error prints one line and exits with code 2."""
     app = typer.Typer(pretty_exceptions_enable=False)
     app.command()(report_command(measure))
+    name = Path(sys.argv[0]).name.removesuffix(".py").removeprefix("benchmarks.")
     try:
-        app(args=None if words is None else list(words))
+        app(args=None if words is None else list(words), prog_name=f"python -m benchmarks {name}")
     except CavmarlError as error:
         print_error(str(error))
         sys.exit(2)

@@ -209,7 +209,7 @@ def main(words: Sequence[str] | None = None) -> None:
     """
     try:
         with _ended_by_sigterm():
-            app(args=None if words is None else list(words))
+            app(args=None if words is None else list(words), prog_name="cavmarl")
     except CavmarlError as error:
         print_error(str(error))
         sys.exit(2)

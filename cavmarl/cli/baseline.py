@@ -14,12 +14,16 @@ from cavmarl.cli.output import (
     OUTPUT,
     PAGE_EXTRAS,
     Agents,
+    Backend,
     Background,
     Imports,
     JsonPath,
     MapName,
     Seed,
+    Workers,
+    Zones,
     about,
+    backend_text,
     grid,
     make_folder,
     parse_settings,
@@ -40,6 +44,9 @@ def baseline(
     agents: Agents = None,
     background: Background = None,
     seed: Seed = 0,
+    zones: Zones = None,
+    backend: Backend = None,
+    workers: Workers = None,
     imports: Imports = None,
     out: Annotated[
         Path | None,
@@ -79,6 +86,8 @@ def baseline(
             seed=seed,
             progress=show,
             overrides=parse_settings(None, imports),
+            zones=zones,
+            backend=backend_text(backend, workers),
         )
     drivers = baseline_drivers(found)
     rows = [

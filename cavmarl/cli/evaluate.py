@@ -21,14 +21,18 @@ from cavmarl.cli.output import (
     PAGE_EXTRAS,
     RECORD_EXTRAS,
     WEB_EXTRAS,
+    Backend,
     Episodes,
     JsonPath,
     Policies,
     RecordAlso,
     RecordPath,
     Repeats,
+    Workers,
+    Zones,
     about,
     about_file,
+    backend_text,
     check_extras,
     flag,
     grid,
@@ -63,6 +67,9 @@ def evaluate(
     policy: Policies = None,
     episodes: Episodes = 32,
     repeats: Repeats = 1,
+    zones: Zones = None,
+    backend: Backend = None,
+    workers: Workers = None,
     out: Annotated[
         Path | None,
         about(
@@ -107,6 +114,8 @@ def evaluate(
         "repeats": repeats,
         "record": recorded(record, record_also),
         "failures": failures,
+        "zones": zones,
+        "backend": backend_text(backend, workers),
     }
     with ExitStack() as stack:
         if page:
@@ -205,6 +214,26 @@ def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     return grid(heads, lines, escape(f"{Path(policy).name} near borders and inside"), wraps=True)
 
 
+def resource_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
+    """Return a table of what each process of a run used."""
+    heads = ["process", "CPU, %", "MB", "wait, %", "kB/tick", "frames/tick", "slowest, %", "moved"]
+    lines = [
+        [
+            str(row["process"]),
+            number(row["cpu_share"], 100.0),
+            number(row["memory_mb"]),
+            number(row["wait_share"], 100.0),
+            number(row["bytes_per_tick"], 1e-3),
+            number(row["frames_per_tick"]),
+            number(row["straggler_share"], 100.0),
+            number(row["migrations"]),
+        ]
+        for row in rows
+    ]
+    title = escape(f"processes of {Path(policy).name}, {rows[0]['windows']} windows")
+    return grid(heads, lines, title, "-: not measured; moved: vehicles between zones", wraps=True)
+
+
 def map_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
     """Return a table of a driver's results on each map, worst first."""
     from cavmarl.evaluate.map_table import SHOWN
@@ -263,6 +292,8 @@ def _show(
         console.print(difference_table(found))
     for name, of_maps in found.by_map.items():
         console.print(map_table(name, of_maps))
+    for name, used in found.resources.items():
+        console.print(resource_table(name, used))
     from cavmarl.evaluate.evaluation import load_places
 
     for name, rows in load_places(folder).items():

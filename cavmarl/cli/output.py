@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from contextvars import ContextVar
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -29,6 +30,18 @@ if TYPE_CHECKING:
     from cavmarl.verify.differences import Difference
 
 Made = TypeVar("Made")
+
+
+_WRITER: ContextVar[str] = ContextVar("command whose results are written as JSON")
+
+
+def _json_file(
+    context: typer.Context, option: typer.CallbackParam, path: Path | None
+) -> Path | None:
+    """Note the command for `write_json`, and check the file."""
+    program, *words = context.command_path.split()
+    _WRITER.set(" ".join(word for word in words if not word.startswith("-")) or program)
+    return _writable(option, path)
 
 
 def _writable(option: typer.CallbackParam, path: Path | None) -> Path | None:
@@ -229,7 +242,16 @@ Repeats = Annotated[
     int,
     about("Number of independent runs, each in a new process.", "--repeats", "-r", metavar="N"),
 ]
-JsonPath = Annotated[Path | None, about_file("Write the result to this file as JSON.", "--json")]
+JsonPath = Annotated[
+    Path | None,
+    about(
+        "Write the result to this file as JSON.",
+        "--json",
+        metavar="FILE",
+        callback=_json_file,
+        panel=OUTPUT,
+    ),
+]
 RecordPath = Annotated[
     Path | None,
     about(
@@ -257,6 +279,13 @@ AtLeast = Annotated[
         panel=OUTPUT,
     ),
 ]
+
+
+def backend_text(backend: str | None, workers: int | None) -> str:
+    """Return where worlds run, from an option and its short form. Raises ConfigError."""
+    from cavmarl.parallel.backends import find_backend
+
+    return str(find_backend(backend, workers))
 
 
 def recorded(path: Path | None, also: str) -> RecordOptions | None:
@@ -388,11 +417,15 @@ def make_folder(path: Path) -> None:
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:
-    """Write `document` to the file given by `--json`, if there is one."""
+    """Write `document` to the file given by `--json`, if there is one.
+
+    The first entry, `kind`, is the command that wrote it, for example `bench step`.
+    """
     if path is None:
         return
+    kinded = {"kind": _WRITER.get(), **document}
     try:
-        path.write_text(json.dumps(document, indent=2) + "\n", encoding="utf-8")
+        path.write_text(json.dumps(kinded, indent=2) + "\n", encoding="utf-8")
     except OSError as error:
         raise _unwritable(path, error) from error
 

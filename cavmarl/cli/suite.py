@@ -16,6 +16,7 @@ from rich.table import Table
 from cavmarl.cli.evaluate import report_cell
 from cavmarl.cli.output import (
     OUTPUT,
+    Backend,
     Episodes,
     Imports,
     JsonPath,
@@ -23,7 +24,10 @@ from cavmarl.cli.output import (
     Repeats,
     Seed,
     Settings,
+    Workers,
+    Zones,
     about,
+    backend_text,
     grid,
     make_folder,
     parse_settings,
@@ -68,6 +72,9 @@ def suite(
     episodes: Episodes = 4,
     repeats: Repeats = 5,
     seed: Seed = 0,
+    zones: Zones = None,
+    backend: Backend = None,
+    workers: Workers = None,
     settings: Settings = None,
     imports: Imports = None,
     out: Annotated[
@@ -91,6 +98,11 @@ def suite(
     if loaded.controllers is not None:
         if policy:
             raise ConfigError(f"--policy: the suite {name} evaluates controllers of signals")
+        if (zones, backend, workers) != (None, None, None):
+            raise ConfigError(
+                f"--zones, --backend and --workers: the suite {name} runs controllers of signals "
+                "in this process; leave these options out"
+            )
         with counting(console, f"worlds of {name}") as told:
             figures = run_signals(
                 loaded,
@@ -115,6 +127,8 @@ def suite(
             repeats=repeats,
             seed=seed,
             overrides=parse_settings(settings, imports),
+            zones=zones,
+            backend=backend_text(backend, workers),
             began=lambda world: told(places[world.label], len(worlds)),
         )
     console.print(_table(reports))

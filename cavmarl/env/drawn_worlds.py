@@ -21,7 +21,7 @@ from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.placement.backend_name import BackendName
 from cavmarl.parallel.worlds.journaled_worlds import without_journals
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.worlds.step_arrays import StepArrays, SteppedWorlds
 
 RENDER_MODES = ("human", "rgb_array")
@@ -51,13 +51,22 @@ def check_rendering(
         return
     if render_mode not in modes:
         raise ConfigError(f"render_mode = {render_mode!r}: must be {' or '.join(modes)}, or None")
-    with_sumo = config.traffic.source != "native"
-    if not backend.is_local and (with_sumo or not shows_state(backend)):
-        what = f" and traffic.source = {config.traffic.source!r}" if with_sumo else ""
+    if obstacle := why_not_copied(config, backend):
         raise ConfigError(
-            f"render_mode = {render_mode!r} with backend = '{backend}'{what}: such worlds can only "
-            "be drawn in the caller's process; use backend='local'"
+            f"render_mode = {render_mode!r} with {obstacle}: such worlds can only be drawn in the "
+            "caller's process; use backend='local'"
         )
+
+
+def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
+    """Return the settings because of which this process cannot copy the worlds; else ""."""
+    if backend.is_local:
+        return ""
+    with_sumo = config.traffic.source != "native"
+    key = f"traffic.source = {config.traffic.source!r}" if with_sumo else kept_elsewhere(config)
+    if key:
+        return f"backend = '{backend}' and {key}"
+    return "" if shows_state(backend) else f"backend = '{backend}'"
 
 
 class WorldCopy:

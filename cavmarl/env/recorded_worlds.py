@@ -17,10 +17,10 @@ from cavmarl.core.machine import describe_machine
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.env.drawn_worlds import why_not_copied
 from cavmarl.env.recorded_extras import RecordedExtras, check_extras
-from cavmarl.parallel.backends import shows_state
 from cavmarl.parallel.placement.backend_name import BackendName
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_writer import RecordingWriter
@@ -43,16 +43,10 @@ def check_recording(
         return
     options = RecordOptions.of(record)
     check_extras(config, options.include, backend.is_local)
-    if backend.is_local:
-        return
-    key = kept_elsewhere(config)
-    if not key and config.traffic.source != "native":
-        key = f"traffic.source = {config.traffic.source!r}"
-    if key or not shows_state(backend):
-        what = f" and {key}" if key else ""
+    if obstacle := why_not_copied(config, backend):
         raise ConfigError(
-            f"record = {str(options.path)!r} with backend = '{backend}'{what}: such worlds can "
-            "only be recorded in the caller's process; use backend='local'"
+            f"record = {str(options.path)!r} with {obstacle}: such worlds can only be recorded in "
+            "the caller's process; use backend='local'"
         )
 
 

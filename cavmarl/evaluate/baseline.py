@@ -8,6 +8,7 @@ row estimates the cost of traffic. It is no bound: another driver can be better.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ from cavmarl.evaluate.evaluation import evaluate, load_map, load_tables, load_tr
 from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS, Metric
 from cavmarl.evaluate.provenance.manifest import write_text
 from cavmarl.evaluate.report import EvaluationReport, PolicyReport
+from cavmarl.parallel.placement.backend_name import LOCAL
 
 RULES = "cities"  # the environment whose rules and trained driver are used
 GENERALIST = "cities_ippo"
@@ -50,6 +52,8 @@ def run_baseline(
     seed: int = 0,
     progress: Progress | None = None,
     overrides: Mapping[str, Any] | None = None,
+    zones: int | None = None,
+    backend: str = LOCAL,
 ) -> dict[str, EvaluationReport]:
     """Evaluate `random_actions`, `idm` and a trained driver in traffic, and `idm` alone.
 
@@ -64,6 +68,8 @@ def run_baseline(
         seed: of the episodes.
         progress: as in `evaluate`.
         overrides: values of further keys of the environment.
+        zones: as in `evaluate`.
+        backend: as in `evaluate`.
 
     Raises the errors of `evaluate`, for example for a map that cannot be driven.
     """
@@ -74,11 +80,10 @@ def run_baseline(
     empty = WorldSpec(env=RULES, agents=1, background=0, seed=seed, overrides=keys)
     drivers = {Path(name).name: name for name in ("random_actions", "idm", policy)}
     alone = min(64, 8 * episodes)
+    run = partial(evaluate, zones=zones, backend=backend, progress=progress)
     return {
-        AMONG: evaluate(busy, drivers, episodes=episodes, out=out / AMONG, progress=progress),
-        ALONE: evaluate(
-            empty, {FREE_ROAD: "idm"}, episodes=alone, out=out / ALONE, progress=progress
-        ),
+        AMONG: run(busy, drivers, episodes=episodes, out=out / AMONG),
+        ALONE: run(empty, {FREE_ROAD: "idm"}, episodes=alone, out=out / ALONE),
     }
 
 

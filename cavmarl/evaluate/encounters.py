@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.records.arrays import Worlds
+from cavmarl.engine.simulation import Simulation
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.kernels.near_misses import locate_agents, watch_encroachments
 from cavmarl.evaluate.recorder import MESSAGE_COLUMNS, Recorder
@@ -34,6 +36,7 @@ class EncounterWatch:
 
     def __init__(self, vec: CavVectorEnv, recorder: Recorder) -> None:
         self._vec = vec
+        self._ids = vec.worlds.arrays.vehicle_ids
         self._recorder = recorder
         self._mirror = mirrored_conflicts(vec.network)
         shape = (vec.num_envs, len(self._mirror))
@@ -41,22 +44,34 @@ class EncounterWatch:
         self._seen_id = np.full(shape, -1, dtype=np.int64)
         self._seen_agent = np.full(shape, -1, dtype=np.int32)
 
-    def locate(self) -> None:
-        worlds = self._vec.simulation.worlds
+    def locate(self, worlds: Worlds) -> None:
+        """Note the places of the agents in the present state of the worlds."""
         locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
 
-    def encounters(self, now_s: float, running: NDArray[np.bool_], mask: NDArray[np.bool_]) -> None:
-        """Record a step of the `running` worlds (W,); `mask` (W, A) marks agents that drive."""
+    def encounters(
+        self,
+        worlds: Worlds,
+        now_s: float,
+        running: NDArray[np.bool_],
+        mask: NDArray[np.bool_],
+    ) -> None:
+        """Record a step.
+
+        Args:
+            worlds: their state after the step.
+            now_s: time of the step.
+            running: (W,) the worlds to watch.
+            mask: (W, A) agents that drive.
+        """
         if not self._mirror.size:
             return
-        worlds = self._vec.simulation.worlds
         watch_encroachments(
             self._vec.network.arrays,
             self._mirror,
             worlds.rows,
             worlds.num_owned,
             running,
-            np.where(mask, self._vec.simulation.outputs.vehicle_ids, -1),
+            np.where(mask, self._ids, -1),
             now_s,
             self._vec.step_s,
             self._seen_s,
@@ -70,15 +85,15 @@ class MessageRecord:
     """Keeps the message counts of each world up to the last step of its episode."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
-        self._bus = vec.simulation.messages if vec.config.v2x.enabled else None
+        self._sends = vec.config.v2x.enabled
         self._values = np.full((vec.num_envs, len(MESSAGE_COLUMNS)), np.nan)
 
-    def add(self, running: NDArray[np.bool_]) -> None:
+    def add(self, simulation: Simulation, running: NDArray[np.bool_]) -> None:
         """Record the worlds (W,) whose episode continues."""
-        if self._bus is None:
+        if not self._sends:
             return
         for world in np.flatnonzero(running).tolist():
-            found = self._bus.statistics(world).to_dict()
+            found = simulation.messages.statistics(world).to_dict()
             self._values[world] = [found[name] for name in MESSAGE_COLUMNS]
 
     def write(self, episodes: NDArray[np.void]) -> None:

@@ -11,19 +11,28 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.registry import load_config
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ActionError, PolicyError
 from cavmarl.engine.shard_clock import ShardClock
-from cavmarl.engine.world_setup import load_world
+from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_setup import make_world
+from cavmarl.env.drawn_worlds import WorldCopy
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.border_terms import BorderTerms
 from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
 from cavmarl.evaluate.failure_clips import Failure
 from cavmarl.evaluate.recorder import SLOWEST, Recorder
+from cavmarl.evaluate.resources import ResourceWatch
 from cavmarl.evaluate.run_extras import RunWatch, recording_path
 from cavmarl.evaluate.stuck_trips import StandingWatch
 from cavmarl.evaluate.tables import EPISODE, TRACK, TRANSFER, TRIP
 from cavmarl.evaluate.transfer_rows import TransferRecorder
+from cavmarl.ownership.transfers import TransferLog
+from cavmarl.parallel.backends import find_backend, make_worlds
+from cavmarl.parallel.nodes.node_groups import NodeGroups
+from cavmarl.parallel.nodes.node_worlds import NodeWorlds
+from cavmarl.parallel.placement.backend_name import LOCAL
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.policies.policy import Policy
@@ -53,6 +62,7 @@ class EpisodeJob(WorldSpec):
     runs: int = 1  # number of runs
     record: RecordOptions | None = None  # options of recordings; None: no recording
     failures: int = 0  # number of failed trips kept for each policy
+    backend: str = LOCAL  # where the worlds run, as in `make_vec`
 
 
 @dataclass(frozen=True)
@@ -79,6 +89,7 @@ class RunData:
     # TRANSFER records; empty for undivided worlds
     transfers: NDArray[np.void]
     transfer_counts: Mapping[str, int]  # counts of a `TransferLog`, summed over the episodes
+    resources: NDArray[np.void]  # RESOURCE records; empty for worlds of this process
     failures: Sequence[Failure] = ()  # failed trips that are kept
     borders: Sequence[BorderTerms] = ()  # terms by zone and place
 
@@ -92,19 +103,27 @@ def worlds_at_once(episodes: int, vehicles: int) -> int:
 def drive_run(
     job: EpisodeJob, progress: Progress | None = None, watcher: Watcher | None = None
 ) -> dict[str, RunData]:
-    world = load_world(job.env, **job.keywords)
-    population = world.config.population
+    config, base_dir = load_config(job.env, **job.keywords)
+    population = config.population
     num_envs = worlds_at_once(job.episodes, population.agents + population.background)
-    vec = CavVectorEnv(LocalWorlds(world, num_envs))
-    drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
-    look = None if watcher is None else watcher(vec)
-    return {
-        name: _drive(vec, driver, name, job, progress, look) for name, driver in drivers.items()
-    }
+    world = make_world(config, base_dir)
+    vec = CavVectorEnv(make_worlds(world, base_dir, num_envs, find_backend(job.backend)))
+    copy = WorldCopy()
+    try:
+        drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
+        look = None if watcher is None else watcher(vec)
+        return {
+            name: _drive(vec, copy, driver, name, job, progress, look)
+            for name, driver in drivers.items()
+        }
+    finally:
+        copy.close()
+        vec.close()
 
 
 def _drive(
     vec: CavVectorEnv,
+    copy: WorldCopy,
     driver: Policy,
     name: str,
     job: EpisodeJob,
@@ -112,18 +131,21 @@ def _drive(
     look: Callable[[], None] | None,
 ) -> RunData:
     parts: list[_Part] = []
-    clock = _zone_clock(vec)
+    standing = copy.standing(vec.worlds)
+    clock = _zone_clock(vec, standing)
+    resources = ResourceWatch(vec)
     count = math.ceil(job.episodes / vec.num_envs)
     path = recording_path(job.record, name, job.run, len(job.policies) == job.runs == 1)
-    watch = RunWatch(vec, name, job.run, job.seed, path, job.failures, look)
+    watch = RunWatch(vec, standing, name, job.run, job.seed, path, job.failures, look)
     for k in range(count):
         first = k * vec.num_envs
 
         def step_done(steps: int, most: int, before: int = k) -> None:
+            resources.step()
             if progress is not None:
                 progress(name, before * most + steps, count * most)
 
-        part = _Part(vec, watch, min(vec.num_envs, job.episodes - first), tracked=k == 0)
+        part = _Part(vec, copy, watch, min(vec.num_envs, job.episodes - first), tracked=k == 0)
         try:
             part.drive(driver, job.seed, first, derived_seed(job.seed, k), step_done)
         except ActionError as error:
@@ -137,12 +159,19 @@ def _drive(
     counts: Counter[str] = Counter()
     for part in parts:
         counts.update(part.transfer_counts)
-    for table in (trips, episodes, transfers):
+    used = resources.rows()
+    for table in (trips, episodes, transfers, used):
         table["run"] = job.run
-    speed = _speed(parts, vec.num_envs, clock)
-    tracks, borders = parts[0].tracks, [part.borders for part in parts]
     return RunData(
-        trips, episodes, tracks, speed, transfers, dict(counts), list(watch.failures), borders
+        trips,
+        episodes,
+        tracks=parts[0].tracks,
+        speed=_speed(parts, vec.num_envs, clock),
+        transfers=transfers,
+        transfer_counts=dict(counts),
+        failures=list(watch.failures),
+        borders=[part.borders for part in parts],
+        resources=used,
     )
 
 
@@ -156,8 +185,11 @@ def derived_seed(seed: int, number: int) -> int:
 class _Part:
     """The episodes of worlds that are stepped together; only the first `count` are evaluated."""
 
-    def __init__(self, vec: CavVectorEnv, seen: RunWatch, count: int, *, tracked: bool) -> None:
+    def __init__(
+        self, vec: CavVectorEnv, copy: WorldCopy, seen: RunWatch, count: int, *, tracked: bool
+    ) -> None:
         self._vec = vec
+        self._copy = copy
         self._seen = seen
         self._count = count
         self._recorder = Recorder(
@@ -172,7 +204,7 @@ class _Part:
         self._watch = EncounterWatch(vec, self._recorder)
         self._standing = StandingWatch(vec, self._recorder)
         self._tracked = tracked
-        self.borders = BorderTerms(vec.simulation.partition, vec.step_s)
+        self.borders = BorderTerms(vec.worlds.world.partition, vec.step_s)
         self._tracks: list[NDArray[np.void]] = [np.zeros(0, TRACK)]
         self.policy_s = self.simulation_s = 0.0
         self.decisions = self.timed_steps = 0
@@ -197,19 +229,20 @@ class _Part:
         vec = self._vec
         observations, infos = vec.reset(seed=seed, options={"first_world": first})
         driver.reset(policy_seed)
-        keys, maps = vec.simulation.worlds.keys, len(vec.network.maps)
+        present = self._copy.present(vec.worlds)
+        keys, maps = present.worlds.keys, len(vec.network.maps)
         self._recorder.maps[:] = [map_of(key, maps) for key in keys]
-        handed_over = TransferRecorder(vec.simulation.transfers)
+        handed_over = TransferRecorder(transfer_logs(vec))
         imbalance, messages = _Imbalance(vec), MessageRecord(vec)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
         self._seen.begin(first, running)
         steps = 0
         while running.any():
-            self._watch.locate()
+            self._watch.locate(present.worlds)
             self._standing.look(steps, infos["mask"])
-            imbalance.add(running)
-            messages.add(running)
+            imbalance.add(present, running)
+            messages.add(present, running)
             if self._tracked and running[0] and steps % every == 0:
                 self._note_track(steps, infos["mask"][0])
             before = time.perf_counter()
@@ -217,6 +250,7 @@ class _Part:
             between = time.perf_counter()
             observations, rewards, _, _, infos = vec.step(actions)
             after = time.perf_counter()
+            present = self._copy.present(vec.worlds)
             if steps:  # the first step loads or compiles the kernels
                 self.policy_s += between - before
                 self.simulation_s += after - between
@@ -232,7 +266,7 @@ class _Part:
             handed_over.collect(np.flatnonzero(running).tolist(), over)
             running &= ~over
             steps += 1
-            self._watch.encounters(steps * vec.step_s, running, infos["mask"])
+            self._watch.encounters(present.worlds, steps * vec.step_s, running, infos["mask"])
             step_done(steps, vec.max_cycles)
         self.trips = self._recorder.trips()
         self.episodes = self._recorder.episodes()[: self._count]
@@ -256,15 +290,14 @@ class _Imbalance:
     """Imbalance of vehicles over zones, world by world."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
-        self._simulation = vec.simulation
-        self._is_divided = vec.simulation.partition.count > 1
+        self._is_divided = vec.worlds.world.partition.count > 1
         self._sums = np.zeros(vec.num_envs)
         self._steps = np.zeros(vec.num_envs, dtype=np.int64)
 
-    def add(self, running: NDArray[np.bool_]) -> None:
+    def add(self, simulation: Simulation, running: NDArray[np.bool_]) -> None:
         """Sample the running worlds (W,) before a step."""
         if self._is_divided:
-            self._sums[running] += self._simulation.zones.loads().imbalance()[running]
+            self._sums[running] += simulation.zones.loads().imbalance()[running]
             self._steps[running] += 1
 
     def means(self) -> NDArray[np.float64]:
@@ -272,11 +305,17 @@ class _Imbalance:
         return np.where(self._steps > 0, self._sums / np.maximum(self._steps, 1), np.nan)
 
 
-def _zone_clock(vec: CavVectorEnv) -> ShardClock | None:
-    """Return a clock for the zones of divided worlds, or None."""
-    if vec.simulation.partition.count == 1:
+def transfer_logs(vec: CavVectorEnv) -> Sequence[TransferLog]:
+    """Return the log of each world; empty for undivided worlds and for worker processes."""
+    worlds = vec.worlds
+    return worlds.transfers if isinstance(worlds, (LocalWorlds, NodeWorlds, NodeGroups)) else ()
+
+
+def _zone_clock(vec: CavVectorEnv, standing: Simulation) -> ShardClock | None:
+    """Return a clock for the zones of divided worlds in this process, or None."""
+    if standing.partition.count == 1 or not isinstance(vec.worlds, LocalWorlds):
         return None
-    return vec.simulation.zones.measure_costs(TIMED_TICKS)
+    return standing.zones.measure_costs(TIMED_TICKS)
 
 
 def _speed(parts: list[_Part], worlds: int, clock: ShardClock | None) -> Speed:

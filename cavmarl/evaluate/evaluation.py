@@ -25,6 +25,7 @@ from cavmarl.core.errors import (
 )
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_setup import load_world
+from cavmarl.env.drawn_worlds import why_not_copied
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.border_terms import place_rows
 from cavmarl.evaluate.episodes import (
@@ -46,10 +47,12 @@ from cavmarl.evaluate.provenance.manifest import (
     write_text,
 )
 from cavmarl.evaluate.report import EvaluationReport, make_report
+from cavmarl.evaluate.resources import summaries_of
 from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.evaluate.tables import (
     EPISODE,
     METRICS_VERSION,
+    RESOURCE,
     TRACK,
     TRANSFER,
     TRIP,
@@ -60,6 +63,8 @@ from cavmarl.evaluate.tables import (
 from cavmarl.evaluate.transfer_rows import transfers_of
 from cavmarl.handoff.coordinator.coordinator_setup import journal_path
 from cavmarl.ownership.transfer_summary import TransferSummary
+from cavmarl.parallel.backends import find_backend
+from cavmarl.parallel.placement.backend_name import LOCAL
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
 from cavmarl.recordings.extra_tables import RecordOptions
@@ -80,8 +85,9 @@ FAILURES_FILE = "failures.html"
 TRANSFERS_FILE = "transfers.csv"
 TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
-PLACES_FILE = "places.json"
-TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE, PLACES_FILE]  # only for divided worlds
+PLACES_FILE = "places.json"  # only for divided worlds
+TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # the same, if the backend logs transfers
+RESOURCES_FILE = "resources.csv"  # only for worlds in other processes
 
 
 def evaluate(
@@ -93,6 +99,8 @@ def evaluate(
     out: Path | None = None,
     record: RecordOptions | str | Path | None = None,
     failures: int = 0,
+    zones: int | None = None,
+    backend: str = LOCAL,
     progress: Progress | None = None,
     watcher: Watcher | None = None,
     **keys: Unpack[WorldKeys],
@@ -113,6 +121,11 @@ def evaluate(
             with several policies or runs, recordings are in subfolders POLICY/run-N
             (docs/guides/recordings.md).
         failures: number of failed trips on the page `failures.html` in `out`; 0: no page.
+        zones: sets zones.count, as in `make_vec`.
+        backend: where the worlds run, as in `make_vec`. Results do not depend on it, except for
+            `zone_imbalance`, since nodes change owners only between steps. If other processes run
+            the worlds, this process copies their state after each step, and the report lists what
+            each process used.
         progress: called after every step of a run with the policy's name, the steps done in this
             run, and the maximum number of steps.
         watcher: called with the worlds that are stepped together; it returns a function that is
@@ -120,8 +133,8 @@ def evaluate(
         keys: of the world; the seed is that of the first run and determines the others.
 
     Raises:
-        ConfigError: a wrong number or key, an override that contradicts a trained driver, or `out`
-            cannot be created.
+        ConfigError: a wrong number or key, an override that contradicts a trained driver, `out`
+            cannot be created, or the state of such worlds cannot be copied from the backend.
         PolicyError: a policy cannot be loaded or does not fit, two have the same name, or two
             trained drivers need different sensors.
         ManifestError: `out` already holds results.
@@ -138,6 +151,8 @@ def evaluate(
         )
     named = _named(policies)
     spec = with_sensors_of_drivers(WorldSpec.of(env, **keys), named.values())
+    if zones is not None:
+        spec = replace(spec, overrides={**spec.overrides, "zones.count": zones})
     if failures:
         check_count("failures", failures, MAX_FAILURES)
         require("jinja2", "report")
@@ -148,6 +163,7 @@ def evaluate(
         runs=repeats,
         record=_record_options(record),
         failures=failures,
+        backend=backend,
     )
     with TemporaryDirectory() as room:
         folder = Path(room) if out is None else out
@@ -180,7 +196,8 @@ def load_report(folder: Path) -> EvaluationReport:
     manifest = read_evaluation(folder)
     speeds = json.loads((folder / SPEED_FILE).read_text(encoding="utf-8"))
     timed = {name: tuple(Speed(**run) for run in speeds[name]) for name in manifest["policies"]}
-    return make_report(load_tables(folder), timed, manifest, load_transfers(folder))
+    transfers, used = load_transfers(folder), load_resources(folder)
+    return make_report(load_tables(folder), timed, manifest, transfers, summaries_of(used))
 
 
 def read_evaluation(folder: Path) -> dict[str, Any]:
@@ -228,6 +245,16 @@ def load_transfers(folder: Path) -> dict[str, TransferSummary]:
         name: TransferSummary.of(transfers_of(rows.get(name, none)), counts[name])
         for name in manifest["policies"]
     }
+
+
+def load_resources(folder: Path) -> dict[str, Rows]:
+    """Return RESOURCE records by policy, empty if the caller's process ran the worlds.
+
+    Raises as `load_report`.
+    """
+    if RESOURCES_FILE not in read_closed(folder)["results_sha256"]:
+        return {}
+    return read_table(folder / RESOURCES_FILE, RESOURCE)
 
 
 def load_places(folder: Path) -> dict[str, list[dict[str, Any]]]:
@@ -279,6 +306,11 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
     world.tell_tolerated()
     policies = describe_policies(job.policies)
     config, network, demand, partition = world
+    if obstacle := why_not_copied(config, find_backend(job.backend)):
+        raise ConfigError(
+            f"evaluate with {obstacle}: such worlds can only be evaluated in the caller's process; "
+            "use backend='local'"
+        )
     unlogged = replace(config, zones=replace(config.zones, journal=""))
     one_world = CavVectorEnv(LocalWorlds(world._replace(config=unlogged), 1))
     for policy in job.policies.values():
@@ -297,7 +329,7 @@ def _prepare(folder: Path, job: EpisodeJob, repeats: int) -> tuple[list[EpisodeJ
         "seeds": seeds,
         "job": asdict(job),
         "metrics_version": METRICS_VERSION,
-        "plan": {"processes": processes, "worlds_at_once": worlds},
+        "plan": {"processes": processes, "worlds_at_once": worlds, "backend": job.backend},
         "world": describe_world(config, network, demand, partition),
     }
     open_manifest(folder, document)
@@ -343,8 +375,15 @@ def _drive_all(
     write_text(folder / SPEED_FILE, json.dumps(speeds, indent=2))
     files = list(RESULT_FILES)
     if is_divided:
+        _write_places(folder, names, runs)
+        files.append(PLACES_FILE)
+    if is_divided and find_backend(jobs[0].backend).logs_transfers:
         _write_transfers(folder, names, runs)
         files += TRANSFER_FILES
+    used = {name: _all(runs, name, "resources") for name in names}
+    if any(map(len, used.values())):
+        write_table(folder / RESOURCES_FILE, used, RESOURCE)
+        files.append(RESOURCES_FILE)
     if jobs[0].failures:
         _write_failures(folder, jobs[0], [data for run in runs for data in run.values()])
         files.append(FAILURES_FILE)
@@ -376,6 +415,9 @@ def _write_transfers(folder: Path, names: list[str], runs: list[dict[str, RunDat
     transfers = {name: _all(runs, name, "transfers") for name in names}
     write_table(folder / TRANSFERS_FILE, transfers, TRANSFER)
     write_text(folder / TRANSFER_COUNTS_FILE, json.dumps(counts, indent=2))
+
+
+def _write_places(folder: Path, names: list[str], runs: list[dict[str, RunData]]) -> None:
     places = {
         name: place_rows(part for run in runs for part in run[name].borders) for name in names
     }

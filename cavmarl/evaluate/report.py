@@ -110,6 +110,8 @@ class EvaluationReport:
     manifest: Mapping[str, Any]  # closed manifest of the results
     # rows of `rows_by_map` by policy; empty for one map
     by_map: Mapping[str, Sequence[Mapping[str, Any]]]
+    # rows of `summary_of` by policy; empty if the caller's process ran the worlds
+    resources: Mapping[str, Sequence[Mapping[str, Any]]]
 
     def __getitem__(self, policy: str) -> PolicyReport:
         return self.policies[policy]
@@ -134,10 +136,12 @@ def make_report(
     speeds: Mapping[str, tuple[Speed, ...]],
     manifest: Mapping[str, Any],
     transfers: Mapping[str, TransferSummary],
+    resources: Mapping[str, Sequence[Mapping[str, Any]]],
 ) -> EvaluationReport:
     """Return the report of raw tables: TRIP and EPISODE records of all runs, by policy.
 
-    `speeds` has the speed of each run; `transfers` is empty for undivided worlds.
+    `speeds` has the speed of each run; `transfers` is empty for undivided worlds, `resources` for
+    worlds of the caller's process.
     """
     seeds = tuple(manifest["seeds"])
     found = {
@@ -158,7 +162,8 @@ def make_report(
         for name, metrics in found.items()
     }
     by_map = rows_by_map(tables, manifest["world"]["maps"])
-    return EvaluationReport(policies, len(seeds), manifest["episodes"], seeds, manifest, by_map)
+    episodes = manifest["episodes"]
+    return EvaluationReport(policies, len(seeds), episodes, seeds, manifest, by_map, resources)
 
 
 def _find(metric: Metric, trips: NDArray[np.void], episodes: NDArray[np.void], runs: int) -> Found:

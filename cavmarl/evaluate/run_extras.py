@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.engine.simulation import Simulation
 from cavmarl.env.recorded_worlds import WorldRecorder
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.failure_clips import Failure, FailureClips
@@ -20,6 +21,7 @@ class RunWatch:
 
     Args:
         vec: the worlds.
+        standing: the worlds, or a copy of remote ones.
         policy: name of the policy in the results.
         run: number of the run.
         seed: of the run.
@@ -31,6 +33,7 @@ class RunWatch:
     def __init__(
         self,
         vec: CavVectorEnv,
+        standing: Simulation,
         policy: str,
         run: int,
         seed: int,
@@ -44,7 +47,7 @@ class RunWatch:
         about = {"policy": policy, "run": run, "seed": seed}
         self._writer = None
         if record is not None:
-            self._writer = WorldRecorder(record, vec.worlds, vec.simulation, **about)
+            self._writer = WorldRecorder(record, vec.worlds, standing, **about)
         observations = vec.worlds.arrays.observations
         self._clips = FailureClips(failures, vec.config, about, observations) if failures else None
 

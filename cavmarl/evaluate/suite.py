@@ -15,6 +15,7 @@ from cavmarl.evaluate.signals.signal_meter import SignalFigures
 from cavmarl.evaluate.signals.signal_runs import TICK_S, run_controller, run_sumo
 from cavmarl.evaluate.traffic.sumo_side import SumoJob
 from cavmarl.maps.netconvert import map_file
+from cavmarl.parallel.placement.backend_name import LOCAL
 from cavmarl.traffic.sumo.sumo_input import read_input
 
 SUMO = "SUMO"  # name of SUMO's row, with the map's own programs
@@ -109,13 +110,15 @@ def run_suite(
     seed: int,
     began: Callable[[SuiteWorld], None],
     overrides: Mapping[str, object] | None = None,
+    zones: int | None = None,
+    backend: str = LOCAL,
 ) -> dict[str, EvaluationReport]:
     """Evaluate the policies in every world, each in its own folder in `out`.
 
     If the suite sets the number of agents, trips that end are replaced (respawn), so that the
     number stays the same. `began` is called before each world. `overrides` are values of further
-    keys of every world. Policies, episodes, repeats and seed
-    are as in `evaluate`.
+    keys of every world. Policies, episodes, repeats,
+    seed, zones and backend are as in `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {}
@@ -136,6 +139,8 @@ def run_suite(
             agents=world.agents,
             background=suite.background,
             overrides=keys,
+            zones=zones,
+            backend=backend,
         )
     return reports
 

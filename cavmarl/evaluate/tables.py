@@ -108,6 +108,25 @@ TRANSFER = np.dtype(
     ]
 )
 
+RESOURCE = np.dtype(
+    [
+        ("run", np.int64),
+        ("process", np.int64),  # number of the worker or node; -1: the caller
+        ("begin_s", np.float64),  # simulated time of the run at the begin of the window
+        ("ticks", np.int64),  # length of the window
+        ("wall_s", np.float64),  # the same as wall time
+        ("cpu_s", np.float64),  # processor time in the window
+        ("memory_bytes", np.float64),  # resident at the end of the window
+        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown, like the others
+        ("sent_bytes", np.float64),  # to other nodes and to the caller
+        ("sent_frames", np.float64),
+        ("vehicles", np.float64),  # owned at the end of the window, in all worlds
+        ("ghosts", np.float64),  # copies of vehicles of other zones
+        ("slowest", np.float64),  # 1: the other nodes waited for this one
+        ("migrations", np.float64),  # changes of owner in the window, in the row of the caller
+    ]
+)
+
 
 def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -> None:
     """Write the records of several policies into one CSV file; the first column is the policy."""

@@ -47,7 +47,11 @@ def test_the_command_prints_the_owners_of_a_tick(
     out = tmp_path / "owners.json"
     assert run("journal", str(written), "--at", "4", "--json", str(out)) == 0
     assert "7 1 1 0 8 1 0 2" in words(capsys)
-    assert json.loads(out.read_text()) == {"tick": 4, "owners": [[7, 1, 1, 0], [8, 1, 0, 2]]}
+    assert json.loads(out.read_text()) == {
+        "kind": "journal",
+        "tick": 4,
+        "owners": [[7, 1, 1, 0], [8, 1, 0, 2]],
+    }
 
 
 def test_a_dropped_incomplete_line_is_named(

@@ -45,7 +45,7 @@ def made_up(runs: int = 1, collisions: int = 1) -> EvaluationReport:
     rows["delay_s"] = 3.0 + rows["run"]
     rows["distance_m"] = 40_000.0
     manifest = {"seeds": [*range(runs)], "episodes": 2, "world": {"maps": ["east", "west"]}}
-    return make_report({"driver": (rows, episodes)}, {"driver": ()}, manifest, {})
+    return make_report({"driver": (rows, episodes)}, {"driver": ()}, manifest, {}, {})
 
 
 def test_each_trained_driver_has_a_table_of_scores_in_its_card() -> None:

@@ -19,6 +19,7 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import prepare_runs
 from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.parallel.nodes.node_loads import NodeLoad
 from cavmarl.parallel.nodes.node_starters import Route, Start, start_nodes, straight
 from cavmarl.parallel.nodes.node_supply import NodeSupply
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
@@ -133,6 +134,11 @@ class NodeGroups(CommandedWorlds):
     def transfers(self) -> tuple[TransferLog, ...]:
         """Changes of owner of each world."""
         return tuple(chain.from_iterable(group.transfers for group in self.groups))
+
+    def node_loads(self) -> list[NodeLoad]:
+        """Return the load of each node since the previous call, in rising order."""
+        found = self._run_jobs(NodeWorlds.node_loads, self.groups, _ignore)
+        return [load._replace(node=k) for k, loads in enumerate(found) for load in loads]
 
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
         """Return the vehicles of a world whose next zone has their state already."""

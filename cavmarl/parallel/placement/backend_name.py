@@ -48,6 +48,11 @@ class BackendName:
         return self.kind == LOCAL
 
     @property
+    def logs_transfers(self) -> bool:
+        """True if the worlds have a log of the changes of owner between zones."""
+        return self.kind in (LOCAL, NODES, RAY)
+
+    @property
     def is_mpi(self) -> bool:
         """True if the nodes are the other ranks of an MPI run."""
         return self.address == MPI
