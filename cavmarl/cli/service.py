@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -33,6 +34,8 @@ from cavmarl.core.private_files import check_private, write_private
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
+    from rich.progress import Progress
+
     from cavmarl.client import Client
 
 URL_VARIABLE = "CAVMARL_SERVICE"
@@ -191,6 +194,13 @@ def submit(
         float | None,
         about("Fail if no node has started the job after S seconds.", metavar="S", min=0.0),
     ] = None,
+    spread: Annotated[
+        bool,
+        flag(
+            "Submit each run as a job of its own, so that the nodes share them, and merge the "
+            "results."
+        ),
+    ] = False,
     out: Annotated[
         Path | None,
         about("Folder for the results [default: runs/submit/JOB].", metavar="DIR", panel=OUTPUT),
@@ -201,39 +211,59 @@ def submit(
     plain_http: PlainHttp = False,
     json_path: JsonPath = None,
 ) -> None:
-    """Evaluate drivers on a node of the service, and show the results."""
+    """Evaluate drivers on the nodes of the service, and show the results."""
     from cavmarl.cli.evaluate import report_table
     from cavmarl.evaluate import load_report
+    from cavmarl.evaluate.evaluation import run_seeds
+    from cavmarl.evaluate.merging import merge_runs
 
     console = Console()
-    keys = {**world.keywords, "seed": world.seed, "overrides": dict(world.overrides)}
+    keys = {**world.keywords, "overrides": dict(world.overrides)}
     del keys["max_cycles"]
+    seeds = run_seeds(world.seed, repeats) if spread else [world.seed]
     with connect(service, secret_file, authority, plain_http) as client:
-        job = client.submit(
-            world.env, policies=policy or ["idm"], episodes=episodes, repeats=repeats,
-            wait_s=wait_s, **keys,
-        )  # fmt: skip
-        folder = out or Path("runs/submit") / job
-        make_folder(folder)
-        with progress_bar(console) as bar:
-            task = bar.add_task(job)
-            told_reasons = {""}
-
-            def show(found: dict[str, Any]) -> None:
-                if found["waits_for"] not in told_reasons:
-                    told_reasons.add(found["waits_for"])
-                    bar.console.print(f"{job} waits: {found['waits_for']}", markup=False)
-                done, total = found["progress"] or (0, None)
-                what = f"{job}: {found['state']}"
-                bar.update(task, description=what, completed=done, total=total)
-
-            client.wait(job, folder, told=show)
-        told = "".join(json.dumps(event) + "\n" for event in client.events(job))
-        (folder / "service_events.jsonl").write_text(told, encoding="utf-8")
+        jobs = [
+            client.submit(
+                world.env, policies=policy or ["idm"], episodes=episodes,
+                repeats=1 if spread else repeats, wait_s=wait_s, seed=seed, **keys,
+            )
+            for seed in seeds
+        ]  # fmt: skip
+        folder = out or Path("runs/submit") / jobs[0]
+        parts = [folder / "runs" / str(run) for run in range(repeats)] if spread else [folder]
+        try:
+            with progress_bar(console) as bar:
+                for job, part in zip(jobs, parts, strict=True):
+                    _collect(client, job, part, bar)
+        except BaseException:
+            for job in jobs:
+                with suppress(ServiceError):  # it has ended
+                    client.delete(f"/sessions/{job}")
+            raise
+    if spread:
+        merge_runs(parts, folder)
     found = load_report(folder)
     console.print(report_table(found))
     write_json(json_path, found.to_dict())
-    _print(f"job: {job}\nresults: {folder} (`cavmarl report` shows them again)")
+    _print(f"job: {', '.join(jobs)}\nresults: {folder} (`cavmarl report` shows them again)")
+
+
+def _collect(client: Client, job: str, folder: Path, bar: Progress) -> None:
+    """Wait for a job while showing its progress, and write its results and events to a folder."""
+    make_folder(folder)
+    task = bar.add_task(job)
+    told_reasons = {""}
+
+    def show(found: dict[str, Any]) -> None:
+        if found["waits_for"] not in told_reasons:
+            told_reasons.add(found["waits_for"])
+            bar.console.print(f"{job} waits: {found['waits_for']}", markup=False)
+        done, total = found["progress"] or (0, None)
+        bar.update(task, description=f"{job}: {found['state']}", completed=done, total=total)
+
+    client.wait(job, folder, told=show)
+    told = "".join(json.dumps(event) + "\n" for event in client.events(job))
+    (folder / "service_events.jsonl").write_text(told, encoding="utf-8")
 
 
 def nodes(

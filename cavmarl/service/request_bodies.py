@@ -6,6 +6,7 @@ from typing import Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
+from cavmarl.core.seeds import SEED_BITS
 from cavmarl.service.service_records import Role
 
 Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$")]
@@ -16,6 +17,7 @@ Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON represents these integers exactly
+Seed = Annotated[int, Field(ge=0, lt=1 << SEED_BITS)]  # exact in Python's JSON; not in every reader
 Words = Annotated[list[Word], Field(max_length=64)]
 
 
@@ -75,7 +77,7 @@ class ConfigurationBody(_Body):
         None  # number of nodes that host the zones; None: one
     )
     num_envs: Annotated[int, Field(ge=1, le=MOST_WORLDS)] = 1
-    seed: Whole = 0
+    seed: Seed = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
 
 

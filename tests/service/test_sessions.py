@@ -18,10 +18,12 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
 import cavmarl
+from cavmarl.cli import app
 from cavmarl.client import AsyncClient, Client, RemoteWorld
 from cavmarl.core.errors import ServiceError
 from cavmarl.evaluate import evaluate, load_report
@@ -181,6 +183,28 @@ def test_a_job_gives_the_results_of_an_evaluation_here(client: Client, tmp_path:
     manifest = json.loads((tmp_path / "there" / "manifest.json").read_text())
     assert manifest["status"] == "closed"
     assert there.episodes == 1
+
+
+def test_the_runs_of_a_job_are_spread_over_nodes(
+    cluster: Cluster, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("CAVMARL_SECRET", cluster.service.grant("spreader", "client"))
+    monkeypatch.chdir(tmp_path)
+    words = "submit ring --agents 2 --background 4 --seed 3 --episodes 1 --repeats 2 --spread"
+    options = ["--set", "horizon_s=4", "--service", cluster.service.url, "--out", "there"]
+    shown = CliRunner().invoke(app, [*words.split(), *options], catch_exceptions=False)
+    assert shown.exit_code == 0, shown.output
+    here = evaluate(
+        "ring", "idm", episodes=1, repeats=2, agents=2, background=4, seed=3,
+        overrides={"horizon_s": 4.0}, out=Path("here"),
+    )  # fmt: skip
+    for name in ("trips.csv", "episodes.csv", "tracks.csv", "map.json"):
+        assert Path("there", name).read_bytes() == Path("here", name).read_bytes()
+    assert load_report(Path("there"))["idm"].metrics == here["idm"].metrics
+    for run in ("0", "1"):
+        events = Path("there", "runs", run, "service_events.jsonl").read_text().splitlines()
+        kinds = [json.loads(line)["kind"] for line in events]
+        assert "session.assigned" in kinds
 
 
 def test_a_job_that_cannot_run_fails_with_its_cause(client: Client) -> None:
