@@ -142,6 +142,14 @@ class EnvConfig(Section, key=""):
         if self.horizon_s != BY_MAP:
             self._check_horizon()
         check_rig(self.rig, self.clock.sim_dt_s, self.clock.ticks_per_step)
+        for k, part in enumerate(self.population.fleet):
+            unknown = [name for name in part.rig or () if name not in self.rig]
+            check(
+                not unknown,
+                f"population.fleet.{k}.rig",
+                part.rig,
+                f"must name sensors of rig: {', '.join(self.rig) or 'there are none; mount some'}",
+            )
         self.need(
             "workers.sensors",
             not self.workers.sensors or bool(self.rig),
@@ -245,7 +253,7 @@ class EnvConfig(Section, key=""):
             )
         self.need(
             "population.types",
-            set(self.population.types) == {"car"},
+            set(self.population.agent_types) == {"car"},
             f"traffic.source = {source}: SUMO only knows cavmarl's car; leave the key out",
         )
         self.need(

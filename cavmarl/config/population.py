@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Annotated, Literal
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.config.checks import Section, Whole
+from cavmarl.config.fleet import FleetPart, OwnType, check_fleet, parts_in_turn
 
 MAX_IDS = 1_000_000  # agents per episode; each has a space and rows in every output
 
@@ -25,6 +30,9 @@ class PopulationConfig(Section, key="population"):
             agents); not used in the other modes.
         types: vehicle types of the agents, from `car`, `truck` and `bus`. Agent k has type
             k modulo the length of the list.
+        own_types: further vehicle types, by name; see `config.fleet.OwnType`.
+        fleet: parts of the agents, each with its vehicle type, its sensors and its driver; see
+            `config.fleet.FleetPart`. It replaces `types`.
         insertions: number of vehicles that may be inserted into a world during an episode
             (`insert_vehicle`, `close_road`); memory is reserved for them.
         external: number of vehicles that the caller may pose or drive in a world at the same time
@@ -36,18 +44,46 @@ class PopulationConfig(Section, key="population"):
     background: Annotated[int, Whole(0, 1_000_000)] = 20
     budget: int | None = None
     types: tuple[Literal["car", "truck", "bus"], ...] = ("car",)
+    own_types: dict[str, OwnType] = field(default_factory=dict)
+    fleet: tuple[FleetPart, ...] = ()
     insertions: Annotated[int, Whole(0, 10_000)] = 0
     external: Annotated[int, Whole(0, 10_000)] = 0
 
     def __post_init__(self) -> None:
         super().__post_init__()
         self.need("types", bool(self.types), "must name at least one of car, truck, bus")
+        check_fleet(self.own_types, self.fleet)
+        self.need(
+            "types",
+            not self.fleet or self.types == ("car",),
+            "population.fleet sets the types; leave this key out",
+        )
         if self.budget is not None and self.mode == "open":
             self.need(
                 "budget",
                 self.agents <= self.budget <= MAX_IDS,
                 f"must be at least population.agents = {self.agents}, and at most {MAX_IDS}",
             )
+
+    @property
+    def agent_types(self) -> tuple[str, ...]:
+        """Type of each agent by its number, repeated in order."""
+        if not self.fleet:
+            return self.types
+        return tuple(self.fleet[part].type for part in self.part_of_agents.tolist()) or ("car",)
+
+    @cached_property
+    def part_of_agents(self) -> NDArray[np.int64]:
+        """(num_ids,) part of the fleet of each agent; 0 without a fleet."""
+        return parts_in_turn(self.fleet or (FleetPart(),), self.num_ids)
+
+    def carriers(self, sensor: str) -> NDArray[np.bool_]:
+        """Return (num_ids,) the agents that carry a sensor of `rig`."""
+        if not self.fleet:
+            return np.ones(self.num_ids, dtype=np.bool_)
+        has = np.array([part.rig is None or sensor in part.rig for part in self.fleet])
+        carried: NDArray[np.bool_] = has[self.part_of_agents]
+        return carried
 
     @property
     def num_ids(self) -> int:

@@ -6,12 +6,14 @@ from a running SUMO in the tests.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.fleet import OwnType
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.idm import (
@@ -171,6 +173,20 @@ AGENT_TYPES = {
 EXTERNAL_TYPES = AGENT_TYPES | {
     "pedestrian": AgentType("pedestrian", 0.5, 0.5, 1.75, 1.5, 2.0, 4.0, 0.5, 5.0, 0.5, 0.7),
 }
+# Fields of VTYPE that each key of a type of an environment sets.
+_OWN_FIELDS = {
+    "length_m": ["length"],
+    "width_m": ["width"],
+    "height_m": ["height"],
+    "wheelbase_m": ["wheelbase"],
+    "most_steering_rad": ["most_steering"],
+    "accel_mps2": ["accel", "most_accel"],
+    "decel_mps2": ["decel"],
+    "emergency_decel_mps2": ["emergency_decel", "most_decel"],
+    "min_gap_m": ["min_gap"],
+    "max_speed_mps": ["max_speed", "desired_max_speed"],
+}
+NO_OWN_TYPES: Mapping[str, OwnType] = MappingProxyType({})
 CAR_WHEELBASE_M = 5.0  # the axles of highway-env's car are at its bumpers
 NO_LIMIT = 1e9  # the type does not limit a policy; `action` does
 
@@ -181,11 +197,22 @@ def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
     types["as_sumo"] = any(known.as_sumo for known in MODELS if known.code == model)
 
 
-def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void]:
-    """Return VTYPE (n,) of types by name: `car` and those of `EXTERNAL_TYPES`."""
+def agent_types(
+    names: Iterable[str], model: int = MODEL_IDM, own: Mapping[str, OwnType] = NO_OWN_TYPES
+) -> NDArray[np.void]:
+    """Return VTYPE (n,) of types by name.
+
+    Args:
+        names: `car`, or keys of `EXTERNAL_TYPES` or `own`.
+        model: car-following model (MODEL_*) of the types.
+        own: types of the environment, by name.
+    """
     chosen = list(names)
     types = generated_types(model).repeat(len(chosen))
     for record, name in zip(types, chosen, strict=True):
+        if name in own:
+            _write_own(record, own[name], model)
+            continue
         if name == "car":
             continue
         kind = EXTERNAL_TYPES[name]
@@ -201,6 +228,21 @@ def agent_types(names: Iterable[str], model: int = MODEL_IDM) -> NDArray[np.void
         record["most_accel"], record["most_decel"] = kind.accel, kind.emergency_decel
     types.setflags(write=False)
     return types
+
+
+def _write_own(record: np.void, own: OwnType, model: int) -> None:
+    """Write a type of an environment to its VTYPE record."""
+    like = agent_types([own.like], model)[0]
+    for name in VTYPE.names or ():
+        record[name] = like[name]
+    for key, names in _OWN_FIELDS.items():
+        value = getattr(own, key)
+        if value is not None:
+            for name in names:
+                record[name] = value
+    # What is left out may contradict what is given.
+    record["wheelbase"] = min(record["wheelbase"], record["length"])
+    record["decel"] = min(record["decel"], record["emergency_decel"])
 
 
 def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:

@@ -8,7 +8,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.driving.vehicle_types import generated_types
+from cavmarl.config.population import PopulationConfig
+from cavmarl.driving.vehicle_types import agent_types
 from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.sensors.mounted.backdrop import make_backdrop
 from cavmarl.sensors.mounted.mounted_sensor import Platform, SensedScene
@@ -27,7 +28,8 @@ class RigComponent(Component):
         config = host.config
         self.platform = Platform(
             network=host.network,
-            body=generated_types()[0],
+            bodies=_bodies(config.population),
+            population=config.population,
             num_worlds=host.num_worlds,
             num_agents=config.population.num_ids,
             sim_dt_s=config.clock.sim_dt_s,
@@ -67,3 +69,10 @@ class RigComponent(Component):
             )
             for shard in self._host.shards
         ]
+
+
+def _bodies(population: PopulationConfig) -> NDArray[np.void]:
+    """Return VTYPE (A,) of the agents' vehicles."""
+    rows = {name: row for row, name in enumerate(dict.fromkeys(population.agent_types))}
+    chosen = np.array([rows[name] for name in population.agent_types], dtype=np.int64)
+    return agent_types(rows, own=population.own_types)[np.resize(chosen, population.num_ids)]

@@ -51,12 +51,36 @@ def flat_observation_space(config: EnvConfig) -> spaces.Box:
     return _feature_box(features * stack, (stack * len(features),), np.float32)
 
 
-def frames_space(config: EnvConfig) -> spaces.Dict:
+def frames_space(config: EnvConfig, sensors: Iterable[str] | None = None) -> spaces.Dict:
     """Return a Dict with one Box per sensor of the rig, for its latest samples.
 
     If a sensor takes several samples in a step, they are the first axis.
+
+    `sensors`: names of the sensors; None: all sensors of the rig.
     """
-    return spaces.Dict({name: _frame_box(config, name) for name in config.rig})
+    names = config.rig if sensors is None else sensors
+    return spaces.Dict({name: _frame_box(config, name) for name in names})
+
+
+def observation_spaces(
+    config: EnvConfig, agents: Sequence[str]
+) -> dict[str, spaces.Box | spaces.Dict]:
+    """Return the space of each agent's observation, by agent.
+
+    They differ only if `population.fleet` gives them different sensors and an observation is a Dict
+    of samples. A flat observation has zeros for sensors that a vehicle does not carry.
+    """
+    form = config.observation
+    if not (config.population.fleet and form.mode == "sensors" and form.kind == "dict"):
+        return dict.fromkeys(agents, observation_space(config))
+    parts = [
+        frames_space(config, [n for n in config.rig if part.rig is None or n in part.rig])
+        for part in config.population.fleet
+    ]
+    return {
+        agent: parts[part]
+        for agent, part in zip(agents, config.population.part_of_agents.tolist(), strict=True)
+    }
 
 
 def _frame_box(config: EnvConfig, name: str) -> spaces.Box:

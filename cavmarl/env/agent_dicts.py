@@ -29,6 +29,10 @@ class AgentDicts:
     def __init__(self, config: EnvConfig) -> None:
         form = config.observation
         self._senses = form.mode == "sensors" and form.kind == "dict"
+        population = config.population
+        self._carriers = (
+            {name: population.carriers(name) for name in config.rig} if population.fleet else None
+        )
         self._parts = (
             observation_parts(config.sensors)
             if form.kind == "dict" and form.mode != "sensors"
@@ -48,8 +52,14 @@ class AgentDicts:
                 name: data[0, listed].copy()
                 for name, data in sensed_observation(arrays.frames).items()
             }
+            if self._carriers is None:
+                return {
+                    agent: {name: data[k] for name, data in sensed.items()}
+                    for k, agent in enumerate(agents)
+                }
+            carried = {name: carriers[listed] for name, carriers in self._carriers.items()}
             return {
-                agent: {name: data[k] for name, data in sensed.items()}
+                agent: {name: data[k] for name, data in sensed.items() if carried[name][k]}
                 for k, agent in enumerate(agents)
             }
         found = arrays.observations[0].copy()[listed]

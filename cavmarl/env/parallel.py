@@ -17,7 +17,7 @@ from cavmarl.core.seeds import check_seed
 from cavmarl.engine.spaces import (
     STATE_FEATURES,
     action_space,
-    observation_space,
+    observation_spaces,
     state_space,
 )
 from cavmarl.env.actions import LENIENT
@@ -107,9 +107,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         config = self.config
         self.metadata = {**type(self).metadata, **self.metadata}
         self.ghosts_of: int | None = None
-        one_observation, one_action = observation_space(config), action_space(config.action)
-        cars = self.possible_agents
-        self.observation_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_observation)
+        one_action, cars = action_space(config.action), self.possible_agents
+        self.observation_spaces: dict[str, spaces.Space[Any]] = {**observation_spaces(config, cars)}
         self.action_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_action)
         self._signals = self._session.signal_agents
         if self._signals is not None:
@@ -146,7 +145,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._max_cycles = int(steps)
 
     def observation_space(self, agent: str) -> spaces.Space[Any]:
-        """Return the observation space: the same object for all vehicles and calls.
+        """Return the observation space: the same object for all calls.
+
+        All vehicles have the same space, unless `population.fleet` gives them different sensors.
 
         Raises:
             ActionError: there is no such agent.

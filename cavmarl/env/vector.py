@@ -174,6 +174,11 @@ class CavVectorEnv(WorldsEnvironment):
         return self.config.max_steps
 
     @property
+    def carriers(self) -> dict[str, NDArray[np.bool_]]:
+        """(A,) the agents that carry each sensor of `rig`; the frames of the others are 0."""
+        return {name: self.config.population.carriers(name) for name in self.config.rig}
+
+    @property
     def state_size(self) -> int:
         """Length of the global state of a world."""
         return int(self.worlds.arrays.states.shape[1])

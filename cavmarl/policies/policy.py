@@ -93,11 +93,21 @@ class NetworkPolicy(Policy):
 
 
 class SharedPolicy(Policy):
-    """Several drivers in one world: agent k has driver k modulo the number of drivers."""
+    """Several drivers in one world.
 
-    def __init__(self, env: Environment, drivers: Sequence[Policy]) -> None:
+    Args:
+        env: the environment.
+        drivers: the drivers.
+        turns: index of each agent's driver; None: agent k has driver k modulo their number.
+    """
+
+    def __init__(
+        self, env: Environment, drivers: Sequence[Policy], turns: Sequence[int] | None = None
+    ) -> None:
         super().__init__(env)
         self.drivers = tuple(drivers)
+        in_turn = np.arange(env.config.population.num_ids) % len(self.drivers)
+        self._turns = in_turn if turns is None else np.array(turns, dtype=np.int64)
 
     def reset(self, seed: int | None = None) -> None:
         """Start a new episode; all drivers get the same seed."""
@@ -106,7 +116,7 @@ class SharedPolicy(Policy):
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """Return each driver's actions for its agents."""
-        turn = np.arange(mask.shape[1]) % len(self.drivers)
+        turn = self._turns
         actions: NDArray[Any] | None = None
         for k, driver in enumerate(self.drivers):
             own = driver.act_batch(observations, mask & (turn == k))

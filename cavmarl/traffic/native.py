@@ -140,10 +140,10 @@ class NativeTraffic:
     @cached_property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L): for each goal, the way from each lane of the same map."""
-        names = dict.fromkeys(self.population.types)
+        names = dict.fromkeys(self.population.agent_types)
         bodies = tuple(
             TurningBody(*(float(kind[name]) for name in TurningBody._fields))
-            for kind in agent_types(names)
+            for kind in agent_types(names, own=self.population.own_types)
         )
         roads = with_tight_turns(self.network, ActionConfig().steering_rad, bodies)
         maps = self.network.maps
@@ -182,7 +182,8 @@ class NativeTraffic:
 
         Most agents drive a car, which is a generated type.
         """
-        more = agent_types(self._other_types, model_code(self.traffic.model))
+        model = model_code(self.traffic.model)
+        more = agent_types(self._other_types, model, self.population.own_types)
         found = self._travel_of_others
         found = found._replace(trip_horizon=self.traffic.trip_horizon, tick_s=self.dt)
         return found._replace(types=np.concatenate([found.types, more])) if len(more) else found
@@ -190,7 +191,10 @@ class NativeTraffic:
     @property
     def _other_types(self) -> list[str]:
         """Names of the types of agents' and of the caller's vehicles, without the car."""
-        names = [*self.population.types, *(EXTERNAL_TYPES if self.population.external else ())]
+        names = [
+            *self.population.agent_types,
+            *(EXTERNAL_TYPES if self.population.external else ()),
+        ]
         return [name for name in dict.fromkeys(names) if name != "car"]
 
     @cached_property
@@ -203,7 +207,7 @@ class NativeTraffic:
     def _agent_type_rows(self) -> NDArray[np.int32]:
         """VTYPE row of each agent's type, repeated in order."""
         rows = self.type_rows
-        return np.array([rows[name] for name in self.population.types], dtype=np.int32)
+        return np.array([rows[name] for name in self.population.agent_types], dtype=np.int32)
 
     @cached_property
     def _travel_of_others(self) -> TripTables:

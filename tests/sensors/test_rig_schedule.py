@@ -24,7 +24,7 @@ def test_samples_are_due_at_the_listed_ticks(rate: Fraction, phase: int) -> None
     steps, slots = 4, -(-4 * rate.numerator // rate.denominator)
     schedule = SensorSchedule(rate.numerator, rate.denominator, phase, steps, slots)
     wanted = sample_ticks(rate, phase, 200)
-    due = Due(*(np.zeros(1, dtype=np.int64) for _ in range(3)))
+    due = Due(*(np.zeros(1, dtype=np.int64) for _ in range(3)), np.ones(1, dtype=np.bool_))
     everywhere = np.ones(1, dtype=np.bool_)
     for tick in range(200):
         assert taken(schedule, tick) == sum(at <= tick for at in wanted)

@@ -43,7 +43,13 @@ class SensorJob(Job):
         self._worlds = scene.worlds
         self._scenes = [scene._replace(before=shared.before)]
         self._sensors = [
-            (place, sensor, shared.due_of(place), frames[sensor.name], shared.lines[number, place])
+            (
+                place,
+                sensor,
+                shared.due_of(place, sensor.carriers),
+                frames[sensor.name],
+                shared.lines[number, place],
+            )
             for place, sensor in enumerate(mounted.rig.sensors)
             if not sensor.stamps_itself
         ]

@@ -26,6 +26,7 @@ from cavmarl.parallel.sensor_workers.sensor_shares import (
     share_by_cost,
     share_in_turn,
 )
+from cavmarl.sensors.kernels.rig_frames import NUM_COUNTS
 from cavmarl.sensors.kernels.sensor_share import gather_rows
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
@@ -195,7 +196,7 @@ class SensorWorkers:
         shared.before[:] = scenes[0].before
         shared.due[:, 0] = 0
         for turn in turns:
-            shared.due[turn.place] = turn.due
+            shared.due[turn.place] = turn.due[:NUM_COUNTS]
         shared.delivered[:] = NEVER
         shared.spent_s[:] = 0.0
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.parallel.memory.shared_memory import Layout, Segment, arrays_in
-from cavmarl.sensors.kernels.rig_frames import POSE, Due
+from cavmarl.sensors.kernels.rig_frames import NUM_COUNTS, POSE, Due
 
 NEVER = -1  # no tick
 
@@ -39,7 +39,7 @@ class SceneShape(NamedTuple):
             "keys": ("<u8", (w,)),
             "signal_phase": ("<i4", (w, signals)),
             "before": ("|u1", (w, a, POSE.itemsize)),
-            "due": ("<i8", (s, len(Due._fields), w)),
+            "due": ("<i8", (s, NUM_COUNTS, w)),
             "lines": ("<i4", (n, s, w, a, 2)),
             "delivered": ("<i8", (n, s, w)),
             "spent_s": ("<f8", (n, s)),
@@ -57,7 +57,7 @@ class SceneArrays(NamedTuple):
     keys: NDArray[np.uint64]  # (W,) see `Worlds`
     signal_phase: NDArray[np.int32]  # (W, columns) see `Worlds`
     before: NDArray[np.void]  # POSE (W, A) of the tick before
-    due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`
+    due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`, without the carriers
     lines: NDArray[np.int32]  # (n, S, W, A, 2) lines [first, last) of each frame for each worker
     delivered: NDArray[np.int64]  # (n, S, W) tick of the last frames of each worker
     spent_s: NDArray[np.float64]  # (n, S) processor time of each worker for each sensor
@@ -71,5 +71,5 @@ class SceneArrays(NamedTuple):
             arrays[name] = arrays[name].view(record)[..., 0]
         return cls(**arrays)
 
-    def due_of(self, sensor: int) -> Due:
-        return Due(*self.due[sensor])
+    def due_of(self, sensor: int, carriers: NDArray[np.bool_]) -> Due:
+        return Due(*self.due[sensor], carriers)

@@ -174,12 +174,24 @@ class SensorSchedule(NamedTuple):
     slots: int  # largest number of samples in a step
 
 
+NUM_COUNTS = 3  # fields of `Due` that change from tick to tick
+
+
 class Due(NamedTuple):
     """The samples that one sensor must deliver in the present tick of each world."""
 
     num: NDArray[np.int64]  # (W,) number of samples
     first: NDArray[np.int64]  # (W,) index of the first sample since the reset
     slot: NDArray[np.int64]  # (W,) slot of the first; the last sample of a step has the last slot
+    carriers: NDArray[np.bool_]  # (A,) agents whose vehicles carry the sensor
+
+
+@kernel
+def carries(due: Due, row: np.void) -> bool:
+    """Return whether a vehicle is an agent's and carries the sensor."""
+    if row["driver"] != DRIVER_AGENT:
+        return False
+    return due.carriers[row["agent"]]
 
 
 @kernel
@@ -305,7 +317,7 @@ def deliver(
         tick = worlds.ticks[w]
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             agent = row["agent"]
             fresh[w, agent] += due.num[w]

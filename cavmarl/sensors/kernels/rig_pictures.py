@@ -18,7 +18,6 @@ from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.math.scanlines import row_span
 from cavmarl.core.records.arrays import Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.camera_picture import (
     LEAST_DEPTH_M,
@@ -39,7 +38,7 @@ from cavmarl.sensors.kernels.panorama import (
     gather,
 )
 from cavmarl.sensors.kernels.polygon_fill import CameraPose, PixelRows
-from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
+from cavmarl.sensors.kernels.rig_frames import Due, Noise, carries, error_of, sensor_key
 
 
 class BirdsEye(NamedTuple):
@@ -229,7 +228,7 @@ def take_pictures(
         fill_grid(rows, worlds.num_rows[w], grid)
         for i in range(worlds.num_owned[w]):
             row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
             num = find_faces(camera, panorama, counts, picture)
@@ -307,7 +306,7 @@ def fill_grids(
         fill_grid(rows, worlds.num_rows[w], grid)
         for i in range(worlds.num_owned[w]):
             row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, True, panorama)
             look_down(view, panorama, counts, data[w, row["agent"], due.slot[w]])

@@ -15,11 +15,10 @@ from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.roads.kernels.backdrop_pieces import Backdrop
 from cavmarl.sensors.kernels.panorama import Panorama, gather
 from cavmarl.sensors.kernels.ray_caster import WALL_HIT, Fan, cast
-from cavmarl.sensors.kernels.rig_frames import Due, Noise, error_of, sensor_key
+from cavmarl.sensors.kernels.rig_frames import Due, Noise, carries, error_of, sensor_key
 
 TARGET = record(
     ("range", np.float64),  # m
@@ -144,7 +143,7 @@ def measure_lidar(
         fill_grid(rows, worlds.num_rows[w], grid)
         for i in range(worlds.num_owned[w]):
             row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
             first, last = lines[w, row["agent"], 0], lines[w, row["agent"], 1]
@@ -213,7 +212,7 @@ def measure_radar(
         fill_grid(rows, worlds.num_rows[w], grid)
         for i in range(worlds.num_owned[w]):
             row = rows[i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             counts = gather(rows, i, grid, backdrop, reach_m, False, panorama)
             cast(

@@ -11,8 +11,16 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import atan2, cos_sin, tangent
 from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT, EVENT_COLLIDED
-from cavmarl.sensors.kernels.rig_frames import Due, Mount, Noise, add_errors, is_lost, sensor_pose
+from cavmarl.core.records.codes import EVENT_COLLIDED
+from cavmarl.sensors.kernels.rig_frames import (
+    Due,
+    Mount,
+    Noise,
+    add_errors,
+    carries,
+    is_lost,
+    sensor_pose,
+)
 
 GRAVITY_MPS2 = 9.80665  # standard gravity
 
@@ -88,7 +96,7 @@ def measure_inertia(
             continue
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             agent = row["agent"]
             for k in range(num):
@@ -119,7 +127,7 @@ def measure_places(
             continue
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             place = places[w, row["agent"]]
             place[0], place[1], place[2] = sensor_pose(row, mount, scratch[0], scratch[1])
@@ -150,7 +158,7 @@ def measure_odometry(
             continue
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             agent = row["agent"]
             pose = before[w, agent]
@@ -225,7 +233,7 @@ def measure_lane_boundary(
             continue
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             x, y, _ = sensor_pose(row, mount, axes[0], axes[1])
             lane = roads.lanes[row["lane"]]
@@ -284,7 +292,7 @@ def report_events(
         begins_step = (tick - 1) % ticks_per_step == 0
         for i in range(worlds.num_owned[w]):
             row = worlds.rows[w, i]
-            if row["driver"] != DRIVER_AGENT:
+            if not carries(due, row):
                 continue
             agent = row["agent"]
             pose = before[w, agent]

@@ -35,14 +35,17 @@ def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
     return np.column_stack([mount.turn, mount.place])
 
 
-def check_place(name: str, config: MountedConfig, body: np.void) -> None:
-    """Refuse a sensor that lies outside the body on which it is mounted.
+def check_place(name: str, config: MountedConfig, bodies: NDArray[np.void]) -> None:
+    """Refuse a sensor that lies outside a body on which it is mounted.
 
-    `body`: VTYPE of agents' vehicles.
+    `bodies`: VTYPE (n,) of the vehicles that carry it.
 
     Raises ConfigError: the sensor lies outside; the message has the nearest valid position.
     """
-    half_m, half_width_m, height_m = 0.5 * body["length"], 0.5 * body["width"], body["height"]
+    if not len(bodies):
+        return
+    half_m, half_width_m = 0.5 * bodies["length"].min(), 0.5 * bodies["width"].min()
+    height_m = bodies["height"].min()
     for key, low, high in (
         ("x_m", -half_m, half_m),
         ("y_m", -half_width_m, half_width_m),

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from cavmarl.config.population import PopulationConfig
 from cavmarl.config.rig import MountedConfig, SampledConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.math.neighbors import Grid
@@ -42,7 +43,8 @@ class Platform(NamedTuple):
     """The vehicles that carry the sensors, and their worlds."""
 
     network: RoadNetwork
-    body: np.void  # VTYPE of agents' vehicles
+    bodies: NDArray[np.void]  # VTYPE (A,) of agents' vehicles
+    population: PopulationConfig  # it says which agents carry which sensors
     num_worlds: int
     num_agents: int
     sim_dt_s: float
@@ -59,6 +61,7 @@ class MountedSensor(ABC, Generic[C]):
         config: settings of the sensor.
         mount: pose on the vehicle.
         frame: name of the frame of its directions.
+        carriers: (A,) the agents whose vehicles carry it.
         lines: (W, A, 2) lines [first, last) of each agent's frame that `sense` writes: all, unless
             other processes write the rest.
     """
@@ -74,7 +77,8 @@ class MountedSensor(ABC, Generic[C]):
         self.frame = SENSOR_FRAME.format(name=name)
         self.lines = np.zeros((platform.num_worlds, platform.num_agents, 2), dtype=np.int32)
         self.lines[..., 1] = self.num_lines(config)
-        check_place(name, config, platform.body)
+        self.carriers = platform.population.carriers(name)
+        check_place(name, config, platform.bodies[self.carriers])
         self._measure = specialized(type(self).kernel)
 
     @cached_property

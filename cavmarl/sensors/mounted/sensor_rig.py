@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.config.rig import MountedConfig, SampledConfig, cadence
 from cavmarl.core.compiled import specialized
 from cavmarl.sensors.kernels.rig_frames import (
+    NUM_COUNTS,
     POSE,
     Due,
     SensorSchedule,
@@ -140,7 +141,8 @@ class _Mounted:
         self, place: int, sensor: MountedSensor[Any], frames: SensorFrames, platform: Platform
     ) -> None:
         self.frames = frames
-        due = Due(*(np.zeros(platform.num_worlds, dtype=np.int64) for _ in Due._fields))
+        counts = (np.zeros(platform.num_worlds, dtype=np.int64) for _ in range(NUM_COUNTS))
+        due = Due(*counts, sensor.carriers)
         self.turn = Turn(place, sensor, due, frames)
         self._schedule = _schedule_of(sensor.config, platform, frames.lost.shape[2])
         self._sim_dt_s = platform.sim_dt_s
@@ -157,7 +159,7 @@ class _Mounted:
     def rehearse(self, scenes: Sequence[SensedScene]) -> None:
         """Take a sample in every world, then restore the frames."""
         kept = self.frames.copy()
-        for array, value in zip(self.turn.due, (1, 0, 0), strict=True):
+        for array, value in zip(self.turn.due[:NUM_COUNTS], (1, 0, 0), strict=True):
             array[:] = value
         sense_here(scenes, [self.turn])
         self.deliver(scenes)
