@@ -1,4 +1,4 @@
-"""Agents as rows of a Gymnasium vector environment: equal to their worlds; with wrappers."""
+"""Agents as rows of a Gymnasium vector environment, compared with their worlds, and in wrappers."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_gymnasium_records_the_trips_of_all_rows(mode: str, autoreset: Autoreset
 
 
 @pytest.mark.parametrize("autoreset", AUTORESET)
-def test_a_row_may_show_a_dict(autoreset: AutoresetMode) -> None:
+def test_observations_of_rows_can_be_dicts(autoreset: AutoresetMode) -> None:
     named = make(kind="dict", autoreset_mode=autoreset)
     flat = make(autoreset_mode=autoreset)
     parts = observation_parts(named.unwrapped.vec.config.sensors)

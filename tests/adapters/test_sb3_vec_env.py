@@ -131,7 +131,7 @@ def test_every_population_trains(mode: str, kind: str) -> None:
     assert model.ep_info_buffer
 
 
-def test_a_row_may_show_a_dict() -> None:
+def test_observations_of_rows_can_be_dicts() -> None:
     named, flat = wild(make(kind="dict"), 5), wild(make(), 5)
     parts = observation_parts(load_config("merge")[0].sensors)
 

@@ -97,7 +97,7 @@ def test_the_tensors_are_the_worlds_arrays(mode: str) -> None:
     assert not rollout[VEHICLES, "mask"].all()
 
 
-def test_agents_end_singly_and_their_world_goes_on() -> None:
+def test_a_world_continues_when_single_agents_end() -> None:
     env = make()
     env.set_seed(0)
     rollout = env.rollout(HORIZON, wild, break_when_any_done=True)

@@ -67,7 +67,7 @@ def test_shards_that_are_not_in_the_plan_are_refused(
 
 
 @pytest.mark.parametrize("keeps_one", [False, True])
-def test_a_busy_worker_keeps_its_last_shard_if_the_rule_says_so(keeps_one: bool) -> None:
+def test_with_keeps_one_a_busy_worker_keeps_its_last_shard(keeps_one: bool) -> None:
     rule = BalanceRule(tolerance=0.0, move_s=0.0, keeps_one=keeps_one)
     first = Problem(equal_costs(1, 4), grid(2, 2), idle_snapshot(2), rule)
     balancer = Balancer(first)

@@ -40,7 +40,7 @@ def run(*words: str) -> int:
 
 
 def trains_at_once(command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
-    """Put a trained driver where the training program would write one; run other programs."""
+    """Replace the training program: copy a trained driver to its output; run other programs."""
     if Path(command[1]).name != "ppo.py":
         return RUN(command, **options)
     words = dict(zip(command[2::2], command[3::2], strict=True))

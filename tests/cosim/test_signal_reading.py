@@ -48,7 +48,7 @@ def test_received_signal_states_equal_the_signals() -> None:
         equal += int((heard == told).all())
         assert ToldSignals().read({}, told) is told
         seen |= set(told[told != SIGNAL_NONE].tolist())
-    assert len(seen) > 1  # red and green
+    assert len(seen) > 1  # both red and green occurred
     assert equal > 0.6 * len(found)
 
 
@@ -86,7 +86,7 @@ def test_without_messages_there_is_no_spat() -> None:
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
 def test_the_stack_stops_at_red_with_each(stage: str) -> None:
-    """Without any state of a signal, `spat` stops, and `told` follows the right of way."""
+    """If a signal has no state, `spat` makes the stack stop, and `told` uses the right of way."""
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.stack.route_planning import LaneRoute
     from cavmarl.cosim.stack.stack_types import EgoPose, Mission

@@ -33,7 +33,7 @@ from tests.support.traffic import on_lane, travel
 
 __all__ = ["crossing"]
 
-SPEED_MPS = 10.0  # of both vehicles; it is also the speed limit
+SPEED_MPS = 10.0  # speed of both vehicles, and the speed limit
 HALF_M = 2.5
 FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
@@ -157,7 +157,7 @@ def test_a_foe_that_stays_on_the_junction_blocks_others(
     )
 
 
-def test_a_foe_on_a_separate_path_counts_only_before_its_line(
+def test_a_foe_on_a_separate_path_blocks_only_before_its_line(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
     assert blocks(0.2, "enter", -6.0)

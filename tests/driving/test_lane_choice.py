@@ -44,7 +44,7 @@ def test_each_further_lane_change_has_its_own_room(
 
 @pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
 def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> None:
-    """Whether such a leader is known depends on the zones."""
+    """Whether a driver knows of such a leader depends on the division into zones."""
     roads = network("merge")
     tables = travel("merge")._replace(view_m=view_m)
     lane = int(roads.lanes["length_m"].argmax())
