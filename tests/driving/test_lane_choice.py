@@ -100,8 +100,10 @@ def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
     ("driver", "speed", "stays"),
     [(DRIVER_AGENT, 1.1, True), (DRIVER_AGENT, 0.9, False), (DRIVER_BACKGROUND, 0.9, True)],
 )
-def test_a_slow_steered_vehicle_changes_lanes_there(driver: int, speed: float, stays: bool) -> None:
-    """On a lane of 20 m, the place where it waits to change is that close to the junction."""
+def test_a_slow_steered_vehicle_may_change_lanes_close_to_a_junction(
+    driver: int, speed: float, stays: bool
+) -> None:
+    """On a lane of 20 m, a vehicle that waits for a lane change stands close to the junction."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed

@@ -355,7 +355,7 @@ def test_meta_actions_change_lanes(action: int, side: str) -> None:
     assert abs(vehicle["d"]) < 0.3
 
 
-def test_a_change_to_where_no_lane_is_asks_for_nothing() -> None:
+def test_a_change_to_a_missing_lane_has_no_effect() -> None:
     env = make("merge", agents=1, background=0, overrides={"action.kind": "discrete"})
     lanes = env.network.lanes
     for seed in range(100):

@@ -101,7 +101,7 @@ def test_a_signal_shows_letters_until_it_is_released() -> None:
     env.reset(seed=1)
     before = env.signal_overrides.letters("B1")
     env.signal_overrides.show("B1", 4, "Y")
-    assert env.signal_overrides.letters("B1") == before, "not before the next step"
+    assert env.signal_overrides.letters("B1") == before, "the signal changes in the next step"
     env.step(env.suggest_actions())
     assert env.signal_overrides.letters("B1") == before[:4] + "Y" + before[5:]
     env.signal_overrides.release("B1", 4)

@@ -37,12 +37,12 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(subprocess_calls, "start_python", start_python)  # no fork, as in other tests
+        patch.setattr(subprocess_calls, "start_python", start_python)  # other tests fork
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 
 
-def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
+def test_the_shares_of_trip_ends_sum_to_one(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
     ends = [found[name].mean for name in ("arrived", "collision", "off_road", "unfinished")]
     assert sum(end or 0.0 for end in ends) == pytest.approx(1.0)
@@ -50,7 +50,7 @@ def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
     assert (found["off_road"].mean or 0.0) > 0.5
 
 
-def test_the_parts_of_the_return_add_up(by_chance: EvaluationReport) -> None:
+def test_the_parts_of_the_return_sum_to_the_return(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
     parts = [found[m.name].mean or 0.0 for m in METRICS if m.name.startswith("reward_")]
     assert sum(parts) == pytest.approx(found["episode_return"].mean, rel=1e-4)

@@ -89,15 +89,15 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
 @pytest.mark.parametrize(
     ("arrived", "late", "seconds", "expected"),
     [
-        (600, 100, 3600, False),  # 500 in 50 minutes, 100 in ten
-        (550, 50, 3600, False),  # half as many as before
+        (600, 100, 3600, False),  # 500 vehicles in 50 minutes, and 100 in the last ten
+        (550, 50, 3600, False),  # half as many in the last ten minutes as before
         (549, 49, 3600, True),
         (0, 0, 3600, False),
         (549, 49, 1199, None),
         (100, 20, 1200, True),
     ],
 )
-def test_a_run_jams_if_half_as_many_arrive_in_the_last_ten_minutes(
+def test_a_run_jams_if_less_than_half_as_many_arrive_in_the_last_ten_minutes(
     arrived: int, late: int, seconds: int, expected: bool | None
 ) -> None:
     assert is_jammed(arrived, late, seconds) is expected

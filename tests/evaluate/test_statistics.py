@@ -65,7 +65,7 @@ def test_wilson_equals_the_textbook() -> None:
 
 
 @pytest.mark.parametrize("hits", [0, 10])
-def test_wilson_stays_a_share(hits: int) -> None:
+def test_wilson_intervals_stay_between_0_and_1(hits: int) -> None:
     found = share_interval(hits, 10)
     assert found is not None
     assert 0.0 <= found.low < found.high <= 1.0
@@ -95,7 +95,7 @@ def test_equal_runs_have_the_interval_of_their_trips() -> None:
 @pytest.mark.parametrize("runs", [2, 3, 5])
 @pytest.mark.parametrize("share", [0.02, 0.3])
 @pytest.mark.parametrize("alike", [1e9, 20.0], ids=["like one run", "runs differ"])
-def test_an_interval_of_shares_covers_and_stays_inside(
+def test_an_interval_of_shares_has_its_coverage_and_stays_between_0_and_1(
     runs: int, share: float, alike: float
 ) -> None:
     """Each run has 50 trips and a success probability from a beta distribution."""
@@ -106,7 +106,7 @@ def test_an_interval_of_shares_covers_and_stays_inside(
         assert found is not None
         assert 0.0 <= found.low < found.high <= 1.0
         hits += found.low <= share <= found.high
-    assert hits >= 900  # of 950; shares near 0 are far from normally distributed
+    assert hits >= 900  # 950 expected; shares near 0 are far from normally distributed
 
 
 def test_an_interval_of_evenness_stays_within_its_bounds() -> None:

@@ -134,7 +134,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
     return found
 
 
-def test_both_sides_run_the_same_demand_as_long_and_write_nothing(
+def test_both_sides_run_the_same_demand_for_equal_times_and_write_nothing(
     still: StillSumo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worlds: list[Simulation] = []
@@ -159,7 +159,7 @@ def test_both_sides_run_the_same_demand_as_long_and_write_nothing(
     assert found.sumo_vehicles == 7.0
 
 
-def test_a_turn_counts_each_vehicle_once_a_step_on_both_sides(still: StillSumo) -> None:
+def test_both_sides_count_each_vehicle_once_per_step(still: StillSumo) -> None:
     moved: list[None] = []
     world: Any = SimpleNamespace(
         outputs=SimpleNamespace(present=np.zeros((1, 2))),

@@ -57,7 +57,7 @@ def test_a_world_has_one_digest_however_it_is_divided() -> None:
 
 
 @pytest.mark.parametrize("name", VEHICLE.names or ())
-def test_every_field_of_the_state_counts_and_no_other(name: str) -> None:
+def test_a_digest_depends_on_every_field_of_the_state_and_no_other(name: str) -> None:
     rows, of = cars(3), RowDigests().of
     before = of(rows)
     field = rows[name]

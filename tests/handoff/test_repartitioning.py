@@ -123,7 +123,7 @@ def test_worlds_that_cannot_be_repartitioned_are_refused(
         make_vec("grid4x4", zones=2, overrides=overrides)
 
 
-def test_zones_of_one_world_over_workers_stay() -> None:
+def test_repartitioning_of_a_world_over_workers_is_refused() -> None:
     with pytest.raises(ConfigError, match="over workers needs zones that do not change"):
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
 

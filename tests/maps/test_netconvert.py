@@ -57,7 +57,7 @@ def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
     assert str(tmp_path).encode() not in one
 
 
-def test_an_extension_does_not_matter(town: Path, tmp_path: Path) -> None:
+def test_the_kind_of_a_source_does_not_depend_on_its_extension(town: Path, tmp_path: Path) -> None:
     odd = town.rename(tmp_path / "download.bin")
     assert build_network(odd, tmp_path / "town.net.xml").kind == "osm"
 
@@ -224,7 +224,7 @@ def test_map_file_builds_once(town: Path, tmp_path: Path, monkeypatch: pytest.Mo
         map_file(town)
 
 
-def test_map_file_takes_networks_as_they_are(tmp_path: Path) -> None:
+def test_map_file_returns_networks_unchanged(tmp_path: Path) -> None:
     assert map_file(tmp_path / "x.net.xml") == tmp_path / "x.net.xml"
     plain = tmp_path / "x.xml"
     plain.write_text("<net/>")

@@ -21,7 +21,7 @@ from tests.maps.fidelity.scenes import motion, street
 
 pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
-KNOWN = motion(0.5, -0.5, 0.25, 2.0)  # 0.75 m and 2°
+KNOWN = motion(0.5, -0.5, 0.25, 2.0)  # a shift of 0.75 m and a rotation of 2°
 
 
 def compared(source: np.ndarray, reference: np.ndarray, **options: float):
@@ -59,7 +59,7 @@ def test_identical_clouds_have_no_distance_and_a_moved_copy_is_brought_back() ->
 
 
 def test_noise_gives_the_rmse_of_theory() -> None:
-    reference = 3.0 * np.random.default_rng(3).uniform(-10.0, 10.0, (2000, 3))  # far apart
+    reference = 3.0 * np.random.default_rng(3).uniform(-10.0, 10.0, (2000, 3))  # points far apart
     noise = np.random.default_rng(4).normal(0.0, 0.02, reference.shape)
     found = compared(reference + noise, reference, registered=False)
     assert found.rmse_m == pytest.approx(0.02 * np.sqrt(3.0), rel=0.05)
