@@ -18,7 +18,7 @@ from tests.cli.test_main import refusal, run
     [
         (5, 1, ["measured"]),
         (2, 4, ["length of lanes", "measured"]),
-    ],  # first case: each world is on one worker
+    ],  # in the first case, each world is on one worker
 )
 def test_plans_are_recomputed_from_the_manifest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], worlds: int, zones: int, sources: list[str]

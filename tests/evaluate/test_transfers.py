@@ -123,9 +123,8 @@ def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
     names = {"run.0.jsonl", "run.1.jsonl", "run.run-1.0.jsonl", "run.run-1.1.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == names
     switches = sum(summarize(tmp_path / name)[0].switches for name in names)
-    assert (
-        switches >= found.transfers > 0
-    )  # switches in the last step of an episode may be missing, because a reset follows
+    # Transfers in the last step of an episode may be missing, because a reset follows.
+    assert switches >= found.transfers > 0
     (tmp_path / "run.0.jsonl").unlink()
     (tmp_path / "run.1.jsonl").unlink()
     out = tmp_path / "out"

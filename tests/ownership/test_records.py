@@ -68,7 +68,7 @@ def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
                     records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
 
 
-def test_every_added_byte_is_noticed_where_json_means_the_same(log: str) -> None:
+def test_an_added_byte_is_noticed_even_if_the_json_value_is_the_same(log: str) -> None:
     lines = log.splitlines(keepends=True)
     line, before = lines[8], lines[:8]
     for at in range(len(line)):

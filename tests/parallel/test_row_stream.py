@@ -22,7 +22,7 @@ from tests.support.traffic import network
 
 CAPACITY = 40
 WORLDS = 2
-ROOM = 6  # for vehicles that pass a departure queue
+ROOM = 6  # room for vehicles that pass a departure queue
 ROADS = network("merge")
 MINE, THEIRS = np.array([0]), np.array([1, 2])
 GHOSTS = 1 + 3 * WORLDS  # word of a frame at which the numbers of ghosts start
@@ -203,7 +203,7 @@ def test_bad_frames_are_refused(harm: str) -> None:
     clear(far.zoned)
     with pytest.raises(MessageError, match=f"^{len(data)} bytes are no"):
         far.read(data)
-    assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
+    assert (far.zoned.num_rows[THEIRS] == 2).all(), "no part of the frame was used"
     assert not far.departures.num_passing.any()
     assert not far.departures.counts.any()
 

@@ -193,7 +193,9 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
         ("action__steering_rad", 0.3),
     ],
 )
-def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) -> None:
+def test_a_network_refuses_an_environment_with_other_sensors_or_actions(
+    checkpoint: Path, key: str, value: Any
+) -> None:
     vec = small_vec(**{key: value})
     name = key.replace("__", ".")
     with pytest.raises(PolicyError, match=rf"expects different .*overrides: .*'{name}'") as caught:
@@ -299,7 +301,7 @@ def test_choices_cannot_be_corrected(tmp_path: Path) -> None:
         save_driver(tmp_path, small_vec(action__kind="discrete"), residual=True)
 
 
-def test_a_shield_compares_throttles() -> None:
+def test_a_shield_refuses_discrete_actions() -> None:
     vec = small_vec(action__kind="discrete")
     observations, infos = vec.reset(seed=0)
     with pytest.raises(PolicyError, match=r"action\.kind = discrete: this driver needs throttle"):
@@ -362,4 +364,4 @@ def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
         observations, _, _, _, infos = vec.step(driver.act_batch(observations, infos["mask"]))
         stood_s = max(stood_s, *vec.simulation.vehicles(0)["wait_s"], 0.0)
     vec.close()
-    assert 0.0 < stood_s < 60.0  # at a red light
+    assert 0.0 < stood_s < 60.0  # the vehicle stood at a red light only

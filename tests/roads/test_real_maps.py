@@ -160,7 +160,7 @@ def check_against_sumolib(network: RoadNetwork, net: Any) -> None:
         for foe in np.flatnonzero(links["junction"] == link["junction"]) if node._foes else ():
             a, b = int(link["index"]), int(links["index"][foe])
             either = foe != mine and (node.areFoes(a, b) or node.areFoes(b, a))
-            # Links that pass too closely are foes besides the map's, so there are never fewer.
+            # All foes of the map are listed, and also links that pass too closely.
             assert foe in listed or not either
             if either:
                 assert listed[foe] == node.forbids(connections[foe], connections[mine])

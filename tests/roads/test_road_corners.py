@@ -50,11 +50,11 @@ def test_a_corner_becomes_a_tangent_curve_in_which_a_car_keeps_within_its_lane(
     assert find_corners(shape) == []
 
 
-def test_lanes_keep_their_distance() -> None:
+def test_rounded_lanes_keep_their_distance() -> None:
     shapes = [
         line((0, -3.2 * k), (100 + 3.2 * k, -3.2 * k), (100 + 3.2 * k, 100)) for k in range(3)
     ]
-    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # lanes of the other direction
+    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # a lane of the other direction
     assert round_corners(shapes, [3.2] * 4, [range(3), range(3, 4)]) == [0, 1, 2, 3]
     for one, other in ((0, 1), (1, 2), (3, 0)):
         own, far = (

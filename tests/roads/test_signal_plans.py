@@ -134,7 +134,7 @@ def test_a_selected_program_overrides_all_others(
     assert states(with_programs(plain, chosen={"c": "off"}), [0, 50]) == ["Ooo", "Ooo"]
 
 
-def test_a_signal_goes_dark_and_stays_so(
+def test_a_signal_goes_dark_and_stays_dark(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())

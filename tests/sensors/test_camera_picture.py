@@ -110,7 +110,7 @@ def test_pixels_equal_twin(
         ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
         exact = naive.trace(rows, 0, walls, start, ray, range_m, 0.0)
         if exact.distance < 0.02:
-            continue  # inside of a body, where a camera sees no face, or touching a body
+            continue  # the camera is inside a body, where it sees no face, or touches a body
         is_equal = depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
         if is_equal and classes[j, i] == CLASS_OF[exact.what[0]]:
             continue
