@@ -135,9 +135,8 @@ def test_a_ratio_of_pairs_has_a_confidence_interval() -> None:
     draws = random.Random(0)
     within = 0
     for _ in range(200):
-        others = [
-            math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)
-        ]  # one effect on both values of a pair
+        # One effect on both values of a pair.
+        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]
         ones = [1.3 * x * math.exp(draws.gauss(0.0, 0.2)) for x in others]
         ratio, interval = paired_interval(ones, others)
         within += abs(ratio - 1.3) < interval

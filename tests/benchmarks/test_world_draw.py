@@ -127,9 +127,8 @@ def test_a_cut_is_a_piece_of_a_real_map(tmp_path: Path) -> None:
     draw = first_with("cut")
     net, routes = make_files(draw, tmp_path, SECONDS, cut_maps(None))
     west, south, east, north = load_network(net).extent_m
-    reach = (
-        2.0 * draw.net.length_m + 600.0
-    )  # an edge that begins inside the cut may end outside of it
+    # An edge that begins inside the cut may end outside of it.
+    reach = 2.0 * draw.net.length_m + 600.0
     assert east - west < reach
     assert north - south < reach
     assert "<vehicle " in routes.read_text()

@@ -157,10 +157,8 @@ def test_a_success_takes_three_times_the_free_time_at_most() -> None:
     worlds.add(delay=(STEP_S, STEP_S))
     worlds.add(done=(True, True), arrival=(1.0, 1.0), delay=(0.0, 0.01 * STEP_S))
     assert worlds.trips["arrived"].tolist() == [True, True]
-    assert worlds.trips["success"].tolist() == [
-        True,
-        False,
-    ]  # free times: 1 and 0.99 steps
+    # Free times: 1 and 0.99 steps.
+    assert worlds.trips["success"].tolist() == [True, False]
 
 
 def test_trips_of_the_second_half_do_not_count_however_they_end() -> None:

@@ -54,7 +54,7 @@ def test_noise_and_bias_are_as_large_as_they_are_set() -> None:
     assert abs(np.corrcoef(bias[0, :, 0], bias[0, :, 1])[0, 1]) < 0.6
 
 
-def test_sensors_have_numbers_of_their_own_whatever_else_is_mounted() -> None:
+def test_the_random_numbers_of_a_sensor_do_not_depend_on_other_sensors() -> None:
     noisy = {**CLEAN, "noise": [1.0]}
     two = _speeds({"a": noisy, "b": noisy})
     assert not np.array_equal(two["a"], two["b"])

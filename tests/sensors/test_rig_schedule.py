@@ -103,11 +103,11 @@ def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> 
 
 
 @pytest.mark.parametrize("rate", [2.85714, 3.33333])
-def test_rates_that_are_proposed_are_taken(rate: float) -> None:
+def test_rates_that_errors_propose_are_accepted(rate: float) -> None:
     load_config("merge", overrides={"rig": {"a": {"type": "gnss", "rate_hz": rate}}})
 
 
 @pytest.mark.parametrize("name", ["Roof", "a.b", "", "9a", "a" * 65])
-def test_names_are_plain(name: str) -> None:
+def test_names_with_other_characters_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="a sensor's name"):
         load_config("merge", overrides={"rig": {name: {"type": "collision"}}})

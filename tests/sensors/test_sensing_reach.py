@@ -146,7 +146,7 @@ def test_a_crowd_beyond_the_reach_changes_nothing(env: str, sensor: str, seed: i
 
 
 @pytest.mark.parametrize("sensor", sorted(set(ON) - BLIND))
-def test_the_reach_is_not_too_long(sensor: str) -> None:
+def test_the_declared_reach_is_at_most_half_a_metre_too_long(sensor: str) -> None:
     env = "grid4x4"
     simulation = world(env, sensor)
     agent = agent_of(simulation)

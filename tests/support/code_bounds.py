@@ -31,7 +31,7 @@ class PackageCode:
 
     @property
     def lines(self) -> int:
-        """The number of lines of all files."""
+        """Return the number of lines of all files."""
         return sum(self._lines.values())
 
     def classes(self) -> Iterator[tuple[str, ast.ClassDef]]:

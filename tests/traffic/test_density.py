@@ -89,7 +89,7 @@ def test_vehicles_that_start_in_one_zone_cause_imbalance(vehicles: int, seed: in
     assert imbalance(anywhere) < SHARE * ZONES
 
 
-def test_low_density_crosses_now_and_then() -> None:
+def test_in_low_density_vehicles_rarely_cross_borders() -> None:
     simulation = world(LOW)
     at_once: Counter[tuple[int, int]] = Counter()
     for _ in first_minute(simulation):
@@ -115,7 +115,7 @@ def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
     for _ in first_minute(simulation):
         in_flight.append(len({transfer.vehicle for transfer in simulation.zones.view().transfers}))
         ids = simulation.vehicles()["id"]
-        assert len(set(ids.tolist())) == len(ids), "no vehicle twice"
+        assert len(set(ids.tolist())) == len(ids), "no vehicle is duplicated"
         stats = simulation.traffic_stats()
         assert stats.departed - stats.arrived - stats.removed == len(ids), "no vehicle is lost"
     assert max(in_flight) >= 10

@@ -81,7 +81,7 @@ def test_the_reference_driver_passes_and_a_driver_that_never_yields_fails(
     careless = played(name, "never_yield", seed, params=params)
     assert careless.verdict == "collided"
     assert (careless.min_ttc_s, careless.pet_s) == (0.0, 0.0)
-    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # it kept its speed
+    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # the driver kept its speed
     assert careless.place == found.place
 
 

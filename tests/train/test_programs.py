@@ -40,10 +40,10 @@ def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], program: str, *words: object) -> str:
-    """Return the message of a program that refuses arguments; run it here: torch loads slowly."""
+    """Return a program's message about wrong arguments; run it here, because torch loads slowly."""
     try:
         code = load_program(program.removesuffix(".py")).main([*map(str, words)])
-    except SystemExit as end:  # the errors of argparse
+    except SystemExit as end:  # argparse writes its errors there
         code = end.code
     assert code == 2
     return capsys.readouterr().err
@@ -236,7 +236,7 @@ def test_a_network_scores_signals_of_any_shape(tmp_path: Path) -> None:
     assert np.all(allowed)
 
 
-def test_the_table_of_training_seeds_is_that_of_the_figures(
+def test_the_table_of_training_seeds_on_the_page_is_current(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     program = load_program("signal_seeds")

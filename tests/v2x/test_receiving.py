@@ -83,7 +83,7 @@ def drift(random: np.random.Generator, places: NDArray[np.float64]) -> NDArray[n
 
 @pytest.mark.parametrize("seen", [False, True], ids=["cams", "cpms"])
 @pytest.mark.parametrize("name", CHANNELS)
-def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
+def test_inboxes_agree_with_the_definitions(name: str, seen: bool) -> None:
     settings = CHANNELS[name] | {"inbox__objects": 5, "inbox__memory_s": 0.4, "cam__rate_hz": 5.0}
     world = Standing(AGENTS, perception__rate_hz=2.5 if seen else 0.0, **settings)
     random = np.random.default_rng(1)
@@ -197,7 +197,7 @@ def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert there[there >= 0].tolist() == [10]  # the only other sender of this tick
+    assert there[there >= 0].tolist() == [10]  # the only other station that sends in this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

@@ -59,7 +59,7 @@ def test_lanes_are_sampled_whole(cross: RoadNetwork) -> None:
     assert not east[:, 1].any()
 
 
-def test_junctions_have_their_inside_s_box(cross: RoadNetwork) -> None:
+def test_the_box_of_a_junction_contains_its_internal_lanes(cross: RoadNetwork) -> None:
     half = 0.5 * cross.lanes["width_m"][0]
     assert junction_boxes(cross) == pytest.approx(
         np.array([[-5.0 - half, -5.0 - half, 5.0 + half, 5.0 + half]])
@@ -84,7 +84,7 @@ def test_zones_can_have_equal_density_instead_of_lane_length(cross: RoadNetwork)
         cut_map(cross, "bisection", 2, density=crowd * np.nan)
 
 
-def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
+def test_an_unknown_weight_is_refused(cross: RoadNetwork) -> None:
     with pytest.raises(ConfigError, match="weight 'speed' does not exist; use lane_length"):
         cut_map(cross, "bisection", 2, weight="speed")
 
