@@ -61,6 +61,18 @@ def test_help_describes_the_value_of_each_option(words: str) -> None:
             )
 
 
+@pytest.mark.parametrize("words", COMMANDS)
+def test_flags_have_no_value_and_optional_arguments_one_pair_of_brackets(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        COMMANDS[words](["--help"])
+    shown = capsys.readouterr().out
+    assert "--help" in shown
+    assert "<bool>" not in shown
+    assert "[[" not in shown
+
+
 def test_the_commands_are_grouped_by_task(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
         whole_command()(["--help"])

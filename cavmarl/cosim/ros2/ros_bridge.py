@@ -189,14 +189,14 @@ class RosBridge:
             self._bag.close()
 
     def _get_ready(self, view: FollowerView) -> None:
-        """Wait for publishers of commands before the first messages, so that they miss no message."""
+        """Wait for publishers of commands before the first messages, so that none is missed."""
         bases = {name: seen.wheelbase_m for name, seen in view.snapshot.vehicles.items()}
         self._topics.clock.set(view.snapshot.episode, view.snapshot.tick)
         self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
-                "no node publishes commands of %s on domain %d: the vehicles brake until a node does; "
-                "topics: %s",
+                "no node publishes commands of %s on domain %d: the vehicles brake until a node "
+                "publishes commands; topics: %s",
                 ", ".join(silent),
                 self._options.domain,
                 ", ".join(self._controls[silent[0]].topics),

@@ -334,8 +334,8 @@ class WorldTopics:
     ) -> Iterator[RosMessage]:
         """Yield the wanted messages of a snapshot, in a fixed order; the clock comes last.
 
-        `/tf_static` is always included when it has changed. `steering_rad`: steering angle of the last
-        control of each vehicle.
+        `/tf_static` is always included when it has changed. `steering_rad`: steering angle of
+        the last control of each vehicle.
         """
         snapshot, clock = view.snapshot, self.clock
         clock.set(snapshot.episode, snapshot.tick)
