@@ -85,7 +85,7 @@ SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 UNDERSCORED = {"_asdict", "_exit", "_fields", "_foes", "_multiarray_umath", "_replace"}
 UNDERSCORED |= {"_repr_html_"}
 
-# Words for persons, where the field says vehicle, zone or worker; two texts are about pedestrians.
+# Words for persons; the field says vehicle, zone or worker. Two texts are about pedestrians.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
 PERSONS_AT_MOST = {"cavmarl": 2, "docs": 2}
 

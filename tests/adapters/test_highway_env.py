@@ -31,7 +31,7 @@ def make() -> Iterator[Any]:
         env.close()
 
 
-def test_the_ids_are_those_of_the_tasks() -> None:
+def test_each_task_has_an_id() -> None:
     assert set(HIGHWAY_TASKS) == set(TASKS)
 
 

@@ -228,7 +228,7 @@ def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
         assert ended == {agent: over[agent] for agent in expected}
         assert cut == {agent: left[agent] for agent in expected}
         assert env.agents == twin.agents
-    for agent in signals.agents:  # later steps do not overwrite what RLlib keeps
+    for agent in signals.agents:  # later steps do not overwrite observations that RLlib keeps
         np.testing.assert_equal(first[agent], kept[agent])
     assert beyond > 0
     assert decisions == 9 * 5  # one every 2 s, in 9 s

@@ -80,7 +80,7 @@ def test_ppo_learns_from_the_rows() -> None:
         assert model.num_timesteps == 8 * 32
 
 
-def test_a_signal_is_rewarded_for_vehicles_that_enter_before_it(tmp_path: Path) -> None:
+def test_a_signal_is_rewarded_for_vehicles_that_enter_its_lanes(tmp_path: Path) -> None:
     demand = tmp_path / "many.rou.xml"
     demand.write_text(
         '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'

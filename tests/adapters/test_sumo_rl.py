@@ -72,7 +72,7 @@ def drive(env: SumoEnvironment, steps: int, every: int = 4) -> list[Any]:
 # Signals
 
 
-def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
+def test_signals_lanes_and_phases_equal_those_of_the_map_file(routes: str) -> None:
     net = sumolib.net.readNet(str(NET), withPrograms=True)
     with closing(grid(routes, yellow_time=3)) as env:
         assert env.ts_ids == sorted(light.getID() for light in net.getTrafficLights())
@@ -576,7 +576,7 @@ def test_a_missing_folder_of_maps_is_named(
         make(nets=tmp_path)
 
 
-# What is ignored, and what is refused
+# Ignored and refused arguments
 
 
 @pytest.mark.parametrize(

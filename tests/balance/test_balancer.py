@@ -18,7 +18,7 @@ def balancer() -> Balancer:
     return Balancer(Problem(equal_costs(4, 4), grid(2, 2), idle_snapshot(2)))
 
 
-def test_unmeasured_worlds_are_distributed_whole(balancer: Balancer) -> None:
+def test_unmeasured_worlds_are_distributed_without_splits(balancer: Balancer) -> None:
     homes = balancer.plan.homes
     assert [len({*homes[first : first + 4]}) for first in (0, 4, 8, 12)] == [1, 1, 1, 1]
     assert homes.count(0) == homes.count(1) == 8

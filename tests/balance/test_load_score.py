@@ -34,7 +34,7 @@ def fleet(*uses: tuple[float, float, float]) -> list[Candidate]:
     return [Candidate(number, Utilisation(*use)) for number, use in enumerate(uses)]
 
 
-def test_the_default_rule_is_that_of_the_paper() -> None:
+def test_the_default_rule_equals_the_papers() -> None:
     assert LoadRule().weights == (0.6, 0.2, 0.2)
     assert LoadRule().thresholds == (0.85, 0.90, 0.95)
 

@@ -117,7 +117,7 @@ def test_a_crowd_is_a_function_of_its_seed(network: RoadNetwork) -> None:
     assert one.rounds[0].snapshot.gpu_source == "simulated"
 
 
-def test_costs_of_zones_are_those_of_their_vehicles(network: RoadNetwork) -> None:
+def test_the_cost_of_a_zone_is_the_cost_of_its_vehicles(network: RoadNetwork) -> None:
     crowd = Crowd(vehicles=50, vehicle_s=1.0, agent_s=10.0, migration_s=0.0, noise=0.0)
     partition = cut_map(network, "bisection", 3)
     trace = generated_trace(network, partition, rounds=3, workers=2, seed=0, crowd=crowd)

@@ -65,7 +65,7 @@ def test_a_program_prints_a_table_and_writes_json(
     assert found["hardware"]["usable_cores"] >= 1
 
 
-def test_driver_networks_are_measured_beside_torch() -> None:
+def test_driver_networks_are_compared_with_torch() -> None:
     pytest.importorskip("torch")
     found = inference.measure(rows=20, inputs=9, hidden=16, repeats=3, most_ratio=1e-6)
     assert not found.holds
@@ -120,7 +120,7 @@ def test_the_effect_of_score_weights_is_measured() -> None:
 
 
 @pytest.mark.slow
-def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
+def test_a_coupled_world_is_compared_with_libsumo(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     found = sumo.measure("grid4x4", [tiny_file(tmp_path)], after=5, repeats=1, agents=1)
     alone, coupled = found.rows
@@ -155,7 +155,7 @@ def test_channels_are_measured_on_the_same_vehicles() -> None:
     assert not found.holds
 
 
-def test_frames_of_the_viewer_are_small_and_clients_get_them() -> None:
+def test_frames_of_the_viewer_are_small_and_reach_clients() -> None:
     found = viewer.measure("ring", vehicles=10_000, clients=2, seconds=1.0, rate_hz=5.0)
     assert found.row("publishing")["kb"] <= 100.0
     assert found.row("2 clients, 5 Hz")["fps"] > 2.0

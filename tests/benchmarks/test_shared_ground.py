@@ -1,4 +1,4 @@
-"""Maps that draw roads over each other, or have lanes too short for a lane change."""
+"""Detection of maps with overlapping roads, or with lanes too short for a lane change."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_a_broken_row_is_named(tmp_path: Path) -> None:
         (("--out", "/proc/nowhere"), "/proc/nowhere: cannot be written"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_errors_of_bad_input_have_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
 ) -> None:
     out = () if "--out" in words else ("--out", str(tmp_path))

@@ -87,7 +87,7 @@ def test_a_broken_bound_is_reported() -> None:
     assert not one.holds
 
 
-def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
+def test_vehicles_that_stand_at_red_or_behind_another_vehicle_have_a_cause() -> None:
     world = load_world("grid4x4", agents=2, background=0)
     vec = CavVectorEnv(LocalWorlds(world, 1))
     vec.reset(seed=1)

@@ -271,7 +271,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("list", "--json", "/dev/null/list.json"), "cannot be written"),
     ],
 )
-def test_wrong_use_is_one_line_and_exit_code_2(
+def test_wrong_use_prints_one_line_and_exits_with_2(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -361,7 +361,7 @@ def test_the_package_runs_as_a_program() -> None:
     assert "merge" in out.stdout
 
 
-def test_an_error_is_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_is_printed_as_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluate", "nowhere") == 2
     said = capsys.readouterr()
     assert said.err.startswith("error: no environment")
@@ -403,7 +403,7 @@ def test_train_lists_its_programs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_train_runs_a_program_with_its_own_options(
     config: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The program is found outside of the checkout, whatever the working directory contains."""
+    """The program is found outside of the checkout, for any content of the working directory."""
     ran: list[str] = []
     monkeypatch.setattr("os.execv", lambda _, words: ran.extend(words))
     (tmp_path / "train").mkdir()

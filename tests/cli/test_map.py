@@ -42,7 +42,7 @@ def test_build_names_its_target_after_the_source(
     assert (tmp_path / "laufamholz.net.xml").exists()
 
 
-def test_build_lists_what_was_dropped(shared_maps: Path, tmp_path: Path) -> None:
+def test_build_lists_dropped_elements(shared_maps: Path, tmp_path: Path) -> None:
     source = str(shared_maps / "xodr" / "newmarket.xodr")
     out = str(tmp_path / "out.net.xml")
 

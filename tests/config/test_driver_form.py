@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_form_of_a_trained_driver_is_that_of_its_file(name: str) -> None:
+def test_the_form_of_a_trained_driver_comes_from_its_file(name: str) -> None:
     raw = json.loads((TRAINED[name] / "config.json").read_text())
     defaults = {"sensors": asdict(SensorsConfig()), "action": asdict(ActionConfig())}
     form = form_of_driver(name)
@@ -196,7 +196,7 @@ def test_a_spec_keeps_the_sensors_as_overrides() -> None:
     assert WorldSpec(**json.loads(json.dumps(asdict(spec)))).env == "ring"
 
 
-def test_a_world_gets_the_sensors_of_the_drivers_and_reports_it(
+def test_a_world_gets_the_sensors_of_the_drivers_and_logs_them(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     spec = WorldSpec.of("ring", agents=2)

@@ -93,7 +93,7 @@ def test_all_commands_that_make_worlds_import_plugins(words: tuple[str, ...]) ->
     assert (code, said.count("there is no module 'absent'")) == (2, 1), said
 
 
-def test_processes_of_a_suite_import_plugins_too() -> None:
+def test_processes_of_a_suite_import_plugins() -> None:
     Path("own.yaml").write_text("maps: [ring]\n", encoding="utf-8")
     words = ["-n", "1", "-r", "2", "--out", "found"]
     code, said = run("suite", "own.yaml", "--import", "my_plugin", *words)

@@ -63,7 +63,7 @@ def test_project_equals_twin(corners: NDArray[np.float64], x: float, y: float) -
     clamped = min(max(s, 0.0), length)
     foot = naive.lane_pose(corners, clamped)
     assert math.hypot(x - foot[0], y - foot[1]) == pytest.approx(distance, abs=1e-9)
-    # Equally near places may differ in `s` where rounding tells them apart.
+    # If two places are equally near, rounding decides which `s` is found.
     assert clamped == pytest.approx(nearest_s, abs=1e-6) or clamped > nearest_s
     if 0.0 <= s <= length:
         assert abs(d) == pytest.approx(distance, abs=1e-9)

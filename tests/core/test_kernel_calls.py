@@ -1,4 +1,4 @@
-"""Calls of compiled kernels: arguments of any type, results, and what a call refers to."""
+"""Calls of compiled kernels: arguments of any type, results, and released arguments."""
 
 from __future__ import annotations
 
@@ -127,7 +127,7 @@ def test_a_call_refers_to_no_array_afterwards(call: Any) -> None:
     assert gone() is None
 
 
-def test_an_array_that_has_changed_in_place_is_read_anew() -> None:
+def test_changes_of_an_array_are_read_in_the_next_call() -> None:
     call = specialized(total_of)
     values = np.ones(4)
     assert call(values) == 4.0
@@ -156,7 +156,7 @@ def test_threads_call_one_kernel_at_the_same_time() -> None:
     assert not wrong
 
 
-def test_a_specialized_kernel_does_the_same_with_other_arrays_of_the_same_types() -> None:
+def test_a_specialized_kernel_works_on_other_arrays_of_the_same_types() -> None:
     call = specialized(rise)
     for number in (1, 3):
         counts = np.arange(number)

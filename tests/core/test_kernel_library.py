@@ -69,7 +69,7 @@ def _digest() -> str:
 
 
 @compiled_only
-def test_a_kernel_of_the_library_computes_what_numba_compiles(built: Path) -> None:
+def test_a_kernel_of_the_library_gives_the_results_of_numba(built: Path) -> None:
     found = Library(built).find(NAME, TYPES, _digest())
     assert found is not None
     words = Words(3)
@@ -177,7 +177,9 @@ def test_without_a_library_kernels_are_compiled_or_refused(
 
 
 @compiled_only
-def test_prebuilt_refuses_what_the_library_lacks(copied: Path, anew: pytest.MonkeyPatch) -> None:
+def test_in_mode_prebuilt_a_missing_kernel_is_refused(
+    copied: Path, anew: pytest.MonkeyPatch
+) -> None:
     anew.setattr(Library.__init__, "__defaults__", (copied,))
     anew.setenv("CAVMARL_KERNELS", "prebuilt")
     function: Any = rough_atan2
@@ -253,7 +255,7 @@ def test_the_list_is_written_as_it_is_read(tmp_path: Path) -> None:
 
 
 @compiled_only
-def test_calls_from_the_package_are_recorded_and_those_of_tests_are_not(
+def test_calls_from_the_package_are_recorded_but_not_calls_from_tests(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from cavmarl.core.math import rng

@@ -12,7 +12,7 @@ KEYS = st.integers(0, 2**64 - 1)
 NUMBERS = st.integers(0, 2**48 - 1)
 STREAMS = st.integers(0, 2**32 - 1)
 
-# SplitMix64 computes modulo 2**64, of which NumPy warns if nothing is compiled.
+# SplitMix64 computes modulo 2**64. Without the compiler, NumPy warns of the overflow.
 wraps_around = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 

@@ -76,7 +76,7 @@ def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> 
 def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
     driver: int, length_m: float, waits: bool
 ) -> None:
-    """On lanes too short for two cars, it changes where it waits."""
+    """On lanes too short for two cars, a vehicle changes lanes at the place where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
@@ -132,7 +132,7 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
 
 @pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
 def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, safe: bool) -> None:
-    """Krauss's model brakes to its speed within a reaction time, whatever the gap: -3.5 m/s²."""
+    """Krauss's model brakes to its safe speed within a reaction time, for any gap: -3.5 m/s²."""
     roads, types = network("merge"), generated_types().copy()
     set_model(types, MODEL_KRAUSS)
     types["tau"] = 1.0

@@ -71,7 +71,7 @@ def test_a_steered_car_stops_at_its_lane_end_until_its_front_has_left(
 
 
 def test_a_steered_car_changes_lanes_slowly_near_the_end_of_its_lane(tmp_path: Path) -> None:
-    """At a higher speed it would be too late for the change, brake, and start again."""
+    """At a higher speed, the car would be too late for the change, brake, and start again."""
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
     rows = world.vehicles(0)
     end = float(world.network.lanes["length_m"][right])

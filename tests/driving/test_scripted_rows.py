@@ -130,10 +130,10 @@ def entries(
     }
 
 
-def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
+def test_drivers_see_a_body_on_every_lane_that_it_covers_now_or_soon() -> None:
     tables, rows = scripted(crossing())
     row = rows[0]
-    assert entries(tables, rows) == {}  # it waits beside the road
+    assert entries(tables, rows) == {}  # the actor waits beside the road
     soon = round(FORESIGHT_S / DT)
     for ticks in (2, 20, 40, 40, 60):
         follow(tables, row, True, ticks)

@@ -372,7 +372,7 @@ def test_no_vehicle_touches_a_turning_bus(path: Path, tmp_path: Path) -> None:
 def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
     network: RoadNetwork,
 ) -> None:
-    """The rear of a bus is on the lane, so a follower must stop there, whatever the bus's route."""
+    """The rear of a bus is on the lane, so a follower must stop there for any route of the bus."""
     link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
     lane = int(network.links[link]["from_lane"])
     length_m = float(network.lanes[lane]["length_m"])

@@ -64,10 +64,10 @@ def test_a_u_turn_does_not_conflict_with_the_adjacent_lane(
 
 
 @pytest.mark.parametrize(("size", "reaches"), [(0, False), (BUS, True)])
-def test_only_long_vehicles_wait_in_a_u_turn_for_vehicles_beside_them(
+def test_only_long_vehicles_wait_in_a_u_turn_for_adjacent_vehicles(
     network: RoadNetwork, size: int, reaches: bool
 ) -> None:
-    """A long vehicle drives back beside them, on the adjacent target lane."""
+    """A long vehicle drives back next to these vehicles, on the adjacent target lane."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)

@@ -140,7 +140,7 @@ def test_the_vehicle_ahead_goes_first_then_the_faster_then_the_smaller_id(
         ({"to_go": (2.0, np.inf)}, False),  # the vehicle ends its trip before the line
     ],
 )
-def test_no_driver_lets_a_vehicle_go_first_that_does_not_go(
+def test_no_driver_waits_for_a_vehicle_that_does_not_drive(
     roads: RoadNetwork, fields: dict[str, object], goes: bool
 ) -> None:
     two = pair(roads, (1.0, 6.0), (0.0, 3.0), **fields)

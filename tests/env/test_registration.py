@@ -1,4 +1,4 @@
-"""The ids of environments in Gymnasium and PettingZoo, and what the ids create."""
+"""The ids of environments in Gymnasium and PettingZoo, and the environments that they create."""
 
 from __future__ import annotations
 

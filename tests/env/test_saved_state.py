@@ -141,7 +141,7 @@ EXTERNAL_COMMANDS, EXTERNAL_USED = 10, 11
 
 
 def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
-    """Return worlds in which a vehicle of the caller waits, and their state."""
+    """Return worlds in which a vehicle of the caller waits to enter, and their saved state."""
     vec = make(overrides={"population.external": 3}, **arguments)
     vec.reset(seed=0)
     min_x, min_y, _, _ = vec.network.extent_m

@@ -161,7 +161,7 @@ def test_a_success_takes_three_times_the_free_time_at_most() -> None:
     assert worlds.trips["success"].tolist() == [True, False]
 
 
-def test_trips_of_the_second_half_do_not_count_however_they_end() -> None:
+def test_trips_that_begin_in_the_second_half_do_not_count() -> None:
     worlds = Worlds(max_steps=4)
     for _ in range(2):
         worlds.add(acted=(False, True))

@@ -27,7 +27,7 @@ MAP = Path("envs/grid4x4/map/map.net.xml")
 NUMBERS = np.random.default_rng(0)
 
 
-def test_co2_is_that_of_sumo(tmp_path: Path) -> None:
+def test_co2_equals_sumos(tmp_path: Path) -> None:
     sumo = pytest.importorskip("sumo")
     speed, accel = NUMBERS.uniform(0.0, 40.0, 3000), NUMBERS.uniform(-4.0, 3.0, 3000)
     # SUMO prints five digits. Near the limits of coasting, rounding may put a value on the other
@@ -119,7 +119,7 @@ def test_a_run_whose_exit_is_closed_jams(tmp_path: Path) -> None:
     assert sumo.jams is True
 
 
-def test_controllers_and_sumo_are_measured_alike(tmp_path: Path) -> None:
+def test_controllers_and_sumo_are_measured_in_the_same_way(tmp_path: Path) -> None:
     demand = tmp_path / "regular.rou.xml"
     demand.write_text(
         '<routes><vType id="car" sigma="0" speedDev="0"/>'

@@ -154,7 +154,7 @@ def test_gini_equals_the_sum_over_all_pairs(values: np.ndarray) -> None:
     assert found == pytest.approx(pairs / (2.0 * values.size**2 * values.mean()), abs=1e-9)
 
 
-def test_jain_is_one_where_all_have_the_same_and_falls_to_one_over_n() -> None:
+def test_jains_index_is_one_for_equal_values_and_one_over_n_for_a_single_value() -> None:
     assert jain_index(np.full(5, 3.0)) == pytest.approx(1.0)
     assert jain_index(np.array([7.0, 0.0, 0.0, 0.0])) == pytest.approx(0.25)
     # Jain, Chiu and Hawe 1984: if k of n users get equal shares, the index is k/n.

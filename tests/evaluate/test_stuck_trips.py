@@ -65,7 +65,7 @@ class Worlds:
         )
 
 
-def test_a_vehicle_stands_below_a_tenth_of_a_metre_a_second() -> None:
+def test_a_vehicle_below_a_tenth_of_a_metre_per_second_counts_as_standing() -> None:
     worlds = Worlds([0.0, 0.0, 0.0])
     worlds.drive(5, 0.0, 0.09, 0.11)
     # The first sample has no earlier position.

@@ -57,7 +57,7 @@ def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
     return TrafficComparison("town", 900, 0.1, 1, ours, theirs, ("a", "b"))
 
 
-def test_a_ratio_is_cavmarl_over_sumo_if_it_is_defined() -> None:
+def test_a_ratio_is_cavmarls_figure_over_sumos_if_both_are_defined() -> None:
     found = comparison(side(6, 3.0), side(8, None))
     assert found.ratio("arrived") == 0.75
     assert found.ratio("mean_speed_mps") is None

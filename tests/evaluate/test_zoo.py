@@ -85,7 +85,7 @@ def test_a_result_is_recorded_again(entry: Path) -> None:
     assert sorted(found.name for found in entry.iterdir()) == FILES
 
 
-def test_a_result_stays_if_recording_it_again_fails(entry: Path) -> None:
+def test_the_old_result_is_kept_if_recording_fails(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"]["overrides"] = {"sensors.neighbors.range_m": 30.0}

@@ -76,7 +76,7 @@ PROCESSORS = {
     ),
     "kernels for Haswell": Processor({**_KERNELS, "NUMBA_CPU_NAME": "haswell"}),
     "all for Nehalem": Processor({**_KERNELS, "NUMBA_CPU_NAME": "nehalem", **_OLD_LIBRARIES}),
-    # QEMU 7.2 computes NumPy's sort with AVX2 wrongly. The kernels are those of the row above.
+    # QEMU 7.2 computes NumPy's sort with AVX2 wrongly. The kernels are as in the row above.
     "emulated EPYC": Processor(
         {**_KERNELS, "NUMBA_CPU_NAME": "haswell", **_numpy_without(*_AVX2)}, emulated="EPYC"
     ),

@@ -48,7 +48,7 @@ def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
     ]
 
 
-def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
+def test_each_vehicle_has_one_owner_and_a_ghost_in_each_near_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # less than the whole map

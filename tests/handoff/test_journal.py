@@ -237,7 +237,7 @@ def test_a_full_disk_is_an_error_after_which_the_journal_can_be_resumed(tmp_path
     assert list(JournalReader(path)) == log
 
 
-def test_memory_stays_flat(tmp_path: Path) -> None:
+def test_the_memory_of_a_journal_does_not_grow(tmp_path: Path) -> None:
     idle = [Begin(0, 1), Begin(0, 2)]
     with Journal(tmp_path / "run.journal") as journal:
         journal.append(idle)

@@ -155,7 +155,7 @@ def test_a_residual_driver_observes_the_actions_of_the_built_in_driver() -> None
 
 
 @pytest.mark.parametrize("name", ["", "gentle"])
-def test_imitated_actions_are_those_of_the_driver(name: str) -> None:
+def test_imitated_actions_equal_those_of_the_driver(name: str) -> None:
     vec = make_vec("ring22", num_envs=2)
     collector = make_collector(vec, 0, imitate=name)
     teacher = load_policy(name or "idm", vec)

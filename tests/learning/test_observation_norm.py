@@ -36,7 +36,7 @@ def test_batches_together_have_the_deviation_of_all_observations() -> None:
     assert observer.deviation[1].item() == pytest.approx(0.02), "a constant is not amplified"
 
 
-def test_a_driver_counts_as_many_decisions_as_it_has_learned_from(
+def test_the_weight_of_a_drivers_scales_is_its_number_of_decisions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observer = network()

@@ -74,7 +74,7 @@ def test_errors_of_netconvert_are_shown(shared_maps: Path, tmp_path: Path, name:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_tolerant_builds_list_what_was_dropped(
+def test_tolerant_builds_list_dropped_elements(
     shared_maps: Path, tmp_path: Path, name: str
 ) -> None:
     result = build_network(shared_maps / name, tmp_path / "out.net.xml", tolerant=True)
@@ -117,7 +117,7 @@ def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
     box = (11.153, 49.464, 11.159, 49.468)
     result = build_network(whole, tmp_path / "part.net.xml", bbox=box)
     min_x, min_y, max_x, max_y = read_network(result.path).extent_m
-    assert 700.0 < max_x - min_x < 1200.0  # a road of which a part lies within stays whole
+    assert 700.0 < max_x - min_x < 1200.0  # a road that lies partly within the box is kept whole
     assert 300.0 < max_y - min_y < 600.0
 
 

@@ -201,7 +201,7 @@ def answer_again() -> None:
 
 
 def tick_never_resets() -> None:
-    """H15: a reset begins an episode, and the ticks go on."""
+    """H15: a reset begins an episode, and ticks continue to count."""
     bench = Bench()
     late = [bench.give(step)[0] for step in bench.begin()]
     for done in late:
@@ -282,7 +282,7 @@ def segment_per_incarnation() -> None:
 
 
 def digest_before_commit() -> None:
-    """H28: the stored rows are those that DONE has reported."""
+    """H28: the stored rows equal the rows that DONE has reported."""
     bench = Bench()
     for step in bench.begin():
         bench.give(bench.give(step)[0])

@@ -113,7 +113,7 @@ def test_acknowledgements_in_a_quiet_tick_take_effect() -> None:
     assert not both.zones[0].retained
 
 
-def test_an_episode_that_begins_in_a_quiet_tick_goes_on_from_it() -> None:
+def test_an_episode_that_begins_in_a_quiet_tick_continues() -> None:
     both = Both()
     both.leave_alone()
     both.directory.reset()

@@ -37,7 +37,7 @@ def test_a_line_has_its_schema_sequence_and_kind(log: str) -> None:
         assert {"kind", "episode", "tick", "checksum"} <= set(content)
 
 
-def test_records_come_back_equal(log: str) -> None:
+def test_records_are_read_as_they_were_written(log: str) -> None:
     records = records_from_lines(log)
     assert "".join(lines_of(records)) == log
     written, read = LogChain(), LogChain()
@@ -51,7 +51,7 @@ def test_every_prefix_can_be_replayed(log: str) -> None:
     assert ticks[-1] == 15
 
 
-def test_a_torn_last_line_is_named_and_what_precedes_it_is_whole(log: str) -> None:
+def test_a_torn_last_line_is_named_and_earlier_lines_are_read(log: str) -> None:
     torn = log[:-7]
     with pytest.raises(JournalError, match=f"line {len(log.splitlines())} "):
         records_from_lines(torn)

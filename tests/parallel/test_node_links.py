@@ -1,4 +1,4 @@
-"""Frames between nodes: their bytes, bad frames, and which node may send what."""
+"""Frames between nodes: their bytes, bad frames, and frames that a node may not send."""
 
 from __future__ import annotations
 

@@ -184,7 +184,7 @@ def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
     env.close()
 
 
-def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
+def test_errors_equal_those_of_one_process(make: Make, cluster: Any) -> None:
     with pytest.raises(CapacityError, match=r"population\.agents"):
         make("ring", num_envs=2, backend="ray:1", agents=4, background=400)
     with pytest.raises(ConfigError, match=r"backend = 'ray:4'.*3 free CPUs on 2 nodes"):

@@ -1,4 +1,4 @@
-"""Ghosts between two nodes: they arrive as they were sent, whatever has changed."""
+"""Ghosts between two nodes arrive as they were sent, after any changes of rows."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def clear(zoned: ZoneState) -> None:
 
 
 def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
-    """Return the ghosts of each zone and world, in no order, near ones apart."""
+    """Return the ghosts of each zone and world as sets; near ghosts are in separate sets."""
     parts = []
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
@@ -127,7 +127,7 @@ def test_ghosts_arrive_as_they_were_sent() -> None:
 
 
 def test_forecast_words_are_not_sent() -> None:
-    """For a moving vehicle, few words beside acceleration and position are sent."""
+    """For a moving vehicle, few words other than acceleration and position are sent."""
     near, far = nodes()
     vec = make_vec("merge", agents=1, background=20, overrides={"clock.ctrl_dt_s": 0.05}, seed=0)
     vec.reset()

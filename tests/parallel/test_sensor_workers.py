@@ -84,7 +84,7 @@ def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
 
 @pytest.fixture(scope="module")
 def alone() -> list[list[bytes | str]]:
-    """Return what this process senses without sensor workers."""
+    """Return the samples of this process without sensor workers."""
     return _drive()
 
 
@@ -334,7 +334,7 @@ def test_a_run_continues_after_an_interrupted_step() -> None:
         vec.close()
 
 
-def test_parallel_env_has_sensor_workers_too() -> None:
+def test_parallel_env_can_have_sensor_workers() -> None:
     def drive(count: int) -> list[str]:
         overrides = {"rig": SMALL}
         env = cavmarl.parallel_env("merge", agents=2, sensor_workers=count, overrides=overrides)

@@ -1,4 +1,4 @@
-"""Arrays are read from an image as they were written, whatever the image contained before."""
+"""Arrays are read from an image as they were written, for any earlier content of the image."""
 
 from __future__ import annotations
 

@@ -53,7 +53,7 @@ def test_more_ticks_than_were_logged_are_refused() -> None:
 
 
 @pytest.mark.parametrize("most_bytes", [0, 100, 4000])
-def test_a_log_that_is_too_long_is_given_up_until_its_restart(most_bytes: int) -> None:
+def test_a_log_that_is_too_long_is_discarded_until_its_restart(most_bytes: int) -> None:
     log = log_of(200, most_bytes)
     assert log.words.nbytes < 100
     with pytest.raises(SumoError, match=r"exceeds .* MiB.*sumo\.replay_mib"):

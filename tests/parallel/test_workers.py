@@ -163,7 +163,7 @@ def test_an_action_that_is_refused_changes_nothing(make: Make) -> None:
     assert [vec.state_hash(w) for w in range(3)] == before
 
 
-def test_errors_are_those_of_one_process(make: Make) -> None:
+def test_errors_equal_those_of_one_process(make: Make) -> None:
     with pytest.raises(CapacityError, match=r"population\.agents"):
         make("ring", num_envs=2, workers=1, agents=4, background=400)
     with pytest.raises(ConfigError, match="backend='local'"):

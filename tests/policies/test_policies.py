@@ -64,7 +64,9 @@ def drive(env: CavEnv, policy: Policy, steps: int) -> None:
 
 
 @pytest.mark.parametrize("form", ["flat", "dict"])
-def test_a_network_does_the_same_in_dicts_as_in_batches(checkpoint: Path, form: str) -> None:
+def test_a_network_gives_the_same_actions_for_dicts_and_batches(
+    checkpoint: Path, form: str
+) -> None:
     vec = make_vec("merge", num_envs=1, agents=3, background=4)
     env = parallel_env("merge", agents=3, background=4, overrides={"observation.kind": form})
     one, many = load_policy(checkpoint, env), load_policy(checkpoint, vec)
@@ -259,7 +261,7 @@ def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vec = make_vec("merge", num_envs=1, agents=5)
-    # The built-in driver accelerates less, coasts, brakes a little, as hard, and harder.
+    # The built-in driver accelerates less, coasts, or brakes: a little, equally hard, or harder.
     built_in = np.array([[(0.2, 0.5), (0.0, 0.5), (-0.3, 0.5), (-0.4, 0.5), (-0.9, 0.5)]])
     own = np.array([[(1.0, -0.1), (0.8, -0.1), (-0.6, -0.1), (-0.4, -0.1), (-0.2, -0.1)]])
     monkeypatch.setattr(shield, "built_in_actions", lambda env, mask: built_in)

@@ -123,7 +123,7 @@ def test_left_blinker_is_at_the_left(ring: RoadNetwork, car: Car) -> None:
     assert count(left[120:200], palette.BLINKER) == 0
 
 
-def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
+def test_signal_letters_equal_those_of_the_phase(grid: RoadNetwork) -> None:
     phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     codes = signal_codes(grid, phases)
     signalled = grid.links["signal"] >= 0

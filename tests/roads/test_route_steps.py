@@ -198,7 +198,7 @@ def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_edges_of_a_way_are_those_of_its_lanes(name: str) -> None:
+def test_the_edges_of_a_way_are_the_edges_of_its_lanes(name: str) -> None:
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"]).tolist()
     room = np.zeros(len(outside) + 1, np.int32)

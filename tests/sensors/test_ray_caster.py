@@ -21,7 +21,7 @@ LEVEL = np.zeros(1)
 def scan(
     rows: NDArray[np.void], fan: Fan, row: int = 0, walls: NDArray[np.void] = NO_WALLS
 ) -> NDArray[np.void]:
-    """Return HIT (A, E); `what` of bodies and walls is their own number, not the panorama's."""
+    """Return HIT (A, E); `what` is the number of the body or wall, not of its panorama entry."""
     panorama, counts = look_around(rows, row, backdrop(walls), fan.range_m + 3.0)
     hits = np.zeros(fan.rays.shape[:2], HIT)
     cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)

@@ -50,9 +50,7 @@ def test_samples_are_due_at_the_listed_ticks(rate: Fraction, phase: int) -> None
         (0.05, 3.0, "accumulate"),
     ],
 )
-def test_a_minute_has_as_many_samples_as_the_rate_says(
-    dt: float, rate: float, schedule: str
-) -> None:
+def test_a_minute_has_sixty_times_the_rate_samples(dt: float, rate: float, schedule: str) -> None:
     rig = {"a": {"type": "odometry", "rate_hz": rate, "schedule": schedule}}
     settings = {
         "rig": rig, "clock.sim_dt_s": dt, "clock.ctrl_dt_s": 1.0, "horizon_s": 60.0,

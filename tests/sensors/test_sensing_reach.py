@@ -62,7 +62,7 @@ TOLD = {"messages"}
 
 @cache
 def world(env: str, sensor: str) -> Simulation:
-    """Return a world after one step, whose agents have one sensor beside `ego`."""
+    """Return a world after one step, whose agents have one sensor in addition to `ego`."""
     overrides = {**OFF, **ON[sensor]}
     simulation = make_simulation(env, mode="closed", agents=1, background=MOST, overrides=overrides)
     start(simulation, seed=4)

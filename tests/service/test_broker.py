@@ -36,7 +36,7 @@ def reasons(fleet: Fleet, **given: object) -> dict[str, str]:
     return {one.node: one.reason for one in refused.value.exclusions}
 
 
-def test_a_node_that_misses_its_beats_is_down_and_comes_back_with_the_next(fleet: Fleet) -> None:
+def test_a_node_without_heartbeats_is_down_until_its_next_heartbeat(fleet: Fleet) -> None:
     fleet.join("a")
     fleet.now_s += 3.0
     fleet.broker.sweep()
@@ -146,7 +146,7 @@ def test_one_overloaded_resource_excludes_a_node(
     assert fleet.open().node == "a"
 
 
-def test_a_job_that_waits_says_which_limit_it_waits_for(fleet: Fleet) -> None:
+def test_a_waiting_job_names_the_limit_that_it_waits_for(fleet: Fleet) -> None:
     fleet.join("a", slots=1)
     fleet.beat("a", cpu=0.97)
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})

@@ -64,7 +64,7 @@ def history(where: str | Path) -> tuple[list[str], EventLog]:
     return kinds, again
 
 
-def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Path) -> None:
+def test_postgresql_keeps_the_same_data_as_sqlite(empty_postgresql: str, tmp_path: Path) -> None:
     kinds, log = history(empty_postgresql)
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(empty_postgresql)
@@ -135,7 +135,7 @@ def test_the_store_s_file_is_its_owner_s_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_what_was_acknowledged_outlives_a_kill(
+def test_acknowledged_requests_survive_a_kill(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     where: str | Path = tmp_path / "store.sqlite"

@@ -97,7 +97,7 @@ def test_a_request_that_is_repeated_is_carried_out_once(fleet: Fleet) -> None:
         fleet.open(key="k-1")
 
 
-def test_a_world_reports_each_transfer_once_and_prepared_ones() -> None:
+def test_a_world_reports_each_transfer_once_and_prepared_transfers() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})

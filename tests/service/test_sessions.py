@@ -146,7 +146,7 @@ def test_a_refused_step_changes_nothing(client: Client) -> None:
     remote.close()
 
 
-def test_the_client_that_awaits_does_the_same(cluster: Cluster) -> None:
+def test_the_async_client_gives_the_same_results(cluster: Cluster) -> None:
     secret = cluster.service.grant("awaiting", "client")
 
     async def run() -> tuple[str, int]:

@@ -266,7 +266,7 @@ def test_any_record_is_unpacked_as_it_was_packed(record: bytes, apart: bytes, ag
     assert other.pack(there, 0, 0, TICK) == state
 
 
-# What is refused
+# Refused states
 
 RECORD_AT = 44
 

@@ -163,7 +163,7 @@ def expected_counts(
     return found
 
 
-def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
+def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
     weights = {"diff_wait": 1.0, "average_speed": 0.5, "queue": 0.25, "pressure": 0.125}
     weights |= {"delay": 0.1, "wait": 0.2}
     ticks = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2}
@@ -468,7 +468,7 @@ def undivided_world(sensing: str) -> list[str]:
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_a_divided_world_is_the_undivided_one(
+def test_a_divided_world_equals_the_undivided_one(
     zones: int, sensing: str, undivided: list[str]
 ) -> None:
     assert hashes(sensing, zones=zones) == undivided

@@ -157,7 +157,7 @@ def test_sotl_gives_a_green_on_demand_but_keeps_platoons(view: SignalView) -> No
 
 
 @pytest.mark.parametrize("name", ["longest_queue", "max_pressure"])
-def test_the_longest_red_comes_before_the_queue(name: str, view: SignalView) -> None:
+def test_the_longest_red_takes_precedence_over_the_queue(name: str, view: SignalView) -> None:
     view.counts[0, lanes_of(view, 0), VEHICLES] = 9
     view.history[0, lanes_of(view, 1)[0], RED_TICKS] = 300
     assert choice(name, view) == 0
@@ -234,7 +234,7 @@ def test_vehicles_near_the_line_are_counted() -> None:
         assert total > 100
 
 
-def test_red_lanes_are_followed_until_they_open() -> None:
+def test_counts_of_red_lanes_last_until_the_lanes_get_green() -> None:
     keys = ALL | {"signals.min_green_s": 30.0, "signals.max_green_s": 30.0}
     vec = make_vec("grid4x4", num_envs=1, agents=0, background=150, overrides=keys)
     with closing(vec):
@@ -307,7 +307,9 @@ def undivided(request: pytest.FixtureRequest) -> tuple[str, list[str]]:
 
 
 @pytest.mark.parametrize("zones", [2, 4])
-def test_a_divided_world_is_the_undivided_one(zones: int, undivided: tuple[str, list[str]]) -> None:
+def test_a_divided_world_equals_the_undivided_one(
+    zones: int, undivided: tuple[str, list[str]]
+) -> None:
     name, expected = undivided
     assert drive(name, zones=zones) == expected
 

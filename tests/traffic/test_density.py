@@ -129,12 +129,14 @@ def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
-def test_a_divided_city_is_the_undivided_one(vehicles: int) -> None:
+def test_a_divided_city_equals_the_undivided_city(vehicles: int) -> None:
     equal("rush", vehicles, steps=60)
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
-def test_a_divided_town_of_carla_is_the_undivided_one(vehicles: int, shared_maps: Path) -> None:
+def test_a_divided_town_of_carla_equals_the_undivided_town(
+    vehicles: int, shared_maps: Path
+) -> None:
     # There is no room for all hundred agents: the others wait.
     equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"})
 

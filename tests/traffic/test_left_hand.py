@@ -31,7 +31,7 @@ ROUTES = """<routes>
 MIRRORED = {"x": 1.0, "y": -1.0, "s": 1.0, "d": -1.0, "speed": 1.0, "to_go": 1.0}
 
 
-def test_neighbours_lie_on_the_side_that_the_map_says(tmp_path: Path) -> None:
+def test_neighbour_lanes_are_on_the_side_given_by_the_map(tmp_path: Path) -> None:
     network = read_network(netgenerate(tmp_path / "left.net.xml", *NETS["random"]))
     assert network.left_hand
     beside = np.flatnonzero(network.lanes["right"] >= 0)

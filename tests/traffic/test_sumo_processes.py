@@ -181,7 +181,7 @@ def test_a_second_start_in_one_process_is_refused(tmp_path: Path) -> None:
         free_libsumo()
 
 
-def test_traci_does_the_same_as_libsumo(tmp_path: Path) -> None:
+def test_traci_gives_the_same_results_as_libsumo(tmp_path: Path) -> None:
     hashes = []
     for interface in ("libsumo", "traci"):
         own = {"sumo.interface": interface}

@@ -40,7 +40,7 @@ def names(simulation: Simulation) -> list[str]:
 
 
 def test_positions_speeds_and_signals_equal_those_of_sumo_alone(tmp_path: Path) -> None:
-    """Without agents, the coupled SUMO runs as it does alone; rows equal SUMO at every tick."""
+    """Without agents, the coupled SUMO runs as if it were alone; rows equal SUMO at every tick."""
     turned = False
     with (
         coupled("grid4x4", [tiny_file(tmp_path)]) as simulation,

@@ -36,7 +36,7 @@ def behind_a_truck(**settings: Any) -> Standing:
 
 def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
     world = behind_a_truck(perception__rate_hz=10.0)
-    # The CPM of the agent lists what it sees itself, without the hidden car.
+    # The CPM of the agent lists the vehicles that the agent sees, without the hidden car.
     world.tick()
     mail = world.bus.mail
     reports = mail.reports[0, 0, : mail.num_reports[0, 0]]
@@ -91,7 +91,7 @@ def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
     assert known(world) == {1: (FIRST_ROADSIDE_ID + 5, KIND_CPM)}
 
 
-def test_buildings_weaken_packets_through_them() -> None:
+def test_packets_through_buildings_are_weaker() -> None:
     ratios = []
     for building_db in (0.0, 12.0, 60.0):
         world = Standing(

@@ -131,7 +131,7 @@ def test_receptions_have_the_configured_probability() -> None:
         assert abs(band - distance) <= 13.0
 
 
-def test_packets_beyond_the_capacity_are_those_of_the_larger_ids() -> None:
+def test_packets_of_the_larger_ids_exceed_the_capacity() -> None:
     world = Standing(1, capacity=10)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (30, 2)))
     world.tick()

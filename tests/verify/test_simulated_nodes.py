@@ -217,7 +217,7 @@ def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_frames_without_a_sequence_number_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A frame arrives twice. Missing frames are detected by the content of others."""
+    """A frame arrives twice. Missing frames are detected by the content of other frames."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     assert one_line("duplicate", seeds=8).wrong
@@ -264,7 +264,7 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
 def test_a_silent_connection_between_two_nodes_loses_one_of_them(
     monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int, mix: str
 ) -> None:
-    """All nodes answer the caller; one of the two is given up, whatever the other node awaits."""
+    """All nodes answer the caller. One of the two is given up, whichever frame the other awaits."""
     seen = silenced(monkeypatch, kind, nth)
     keys: dict[str, Any] = {"agents": 12, "background": 20, "zones": 8, "steps": 24}
     found = verify_simulated_nodes(

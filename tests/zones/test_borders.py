@@ -70,7 +70,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # the square of such a small distance is 0
+        if depth_m * depth_m == 0.0:  # the square of this small distance is 0
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)

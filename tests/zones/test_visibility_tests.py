@@ -88,7 +88,7 @@ def test_the_kernel_equals_its_twin(
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On these maps, only vans, buses and steered cars sweep over paths beside theirs.
+    # On these maps, only vans, buses and steered cars sweep over adjacent paths.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
 

@@ -51,7 +51,7 @@ def test_the_hash_depends_on_the_division_only() -> None:
     assert plain.content_hash == four().content_hash
     assert plain.content_hash != four(np.nextafter(10.0, 11.0)).content_hash
     assert plain.content_hash != ZonePartition(BOUNDS, plain.rects[::-1]).content_hash
-    # Points have the same owners, whatever box was cut.
+    # Points have the same owners for any box that was cut.
     wider = np.where(plain.rects == -40.0, -45.0, plain.rects)
     assert plain.content_hash == ZonePartition((-45.0, *BOUNDS[1:]), wider).content_hash
     assert four(0.0).content_hash == four(-0.0).content_hash

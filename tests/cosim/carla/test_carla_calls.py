@@ -1,4 +1,4 @@
-"""Each call answers in CARLA's form, whatever its arguments are, and faults change nothing."""
+"""Each call answers in CARLA's form for any arguments, and faults change nothing."""
 
 from __future__ import annotations
 

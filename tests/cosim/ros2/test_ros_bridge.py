@@ -201,7 +201,7 @@ def test_two_bridges_cannot_drive_one_vehicle(domain: int, tmp_path: Path) -> No
     assert "car_0 is driven by 'ros2'" in str(errors[1])
 
 
-def test_the_truth_is_given_only_if_the_world_allows_it(domain: int, tmp_path: Path) -> None:
+def test_true_states_are_refused_unless_the_world_allows_them(domain: int, tmp_path: Path) -> None:
     errors: list[str] = []
     with closing(make_env()) as env, FollowedWorld(env, tmp_path / "s") as world:
 

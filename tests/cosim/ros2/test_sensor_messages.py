@@ -208,7 +208,7 @@ def test_sensors_without_a_message_are_named_once(caplog: pytest.LogCaptureFixtu
     assert "1 sensors have no ROS message and are not published: grid (bev_grid)" in caplog.text
 
 
-def test_ros_time_goes_on_over_episodes_and_is_whole_ns() -> None:
+def test_ros_time_increases_across_episodes_in_whole_ns() -> None:
     clock = RosClock(0.05, 2)
     clock.set(0, 0)
     for tick in (3, 7):
@@ -220,7 +220,7 @@ def test_ros_time_goes_on_over_episodes_and_is_whole_ns() -> None:
 
 
 @pytest.mark.parametrize("distro", ["humble", "jazzy", "kilted"])
-def test_messages_are_those_of_the_distribution(distro: str) -> None:
+def test_message_types_equal_the_distributions(distro: str) -> None:
     types = RosTypes(distro)
     image, info = made("rgb_camera", np.zeros((2, 4, 3), np.uint8), fov_deg=90.0)
     for kind, fields in (

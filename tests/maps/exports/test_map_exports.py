@@ -79,7 +79,7 @@ def test_exports_of_real_maps_are_read_back_equal(
             assert ids == list(range(ids[0], ids[0] - len(ids), -1))
 
 
-def test_geojson_has_each_lane_where_it_is(town: Path, tmp_path: Path) -> None:
+def test_geojson_has_each_lane_at_its_position(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     target = tmp_path / "town.geojson"
     count = write_geojson(network, target, town)

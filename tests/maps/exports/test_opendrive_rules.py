@@ -54,7 +54,7 @@ def _polyline(geometry: Element) -> np.ndarray:
     return np.stack([x + u * cos - v * sin, y + u * sin + v * cos], axis=1)
 
 
-def test_lengths_are_those_of_the_curves(roads: dict[str, Element]) -> None:
+def test_lengths_equal_those_of_the_curves(roads: dict[str, Element]) -> None:
     curves = 0
     for road in roads.values():
         s = 0.0
@@ -71,7 +71,7 @@ def test_lengths_are_those_of_the_curves(roads: dict[str, Element]) -> None:
     assert curves > 10
 
 
-def test_lanes_over_junctions_begin_and_end_where_roads_do(roads: dict[str, Element]) -> None:
+def test_lanes_over_junctions_join_the_roads_without_a_gap(roads: dict[str, Element]) -> None:
     def border(road: Element, at_start: bool, lane: int) -> np.ndarray:
         geometry = road.findall("planView/geometry")[0 if at_start else -1]
         line = _polyline(geometry)

@@ -147,7 +147,7 @@ def test_clouds_far_from_zero_keep_their_digits() -> None:
     assert thin_out(Cloud("far", cloud), 0.5).points.mean(axis=0) == pytest.approx(middle, abs=2.0)
 
 
-def test_filters_count_what_they_remove() -> None:
+def test_filters_count_removed_points() -> None:
     cloud = Cloud("c", np.vstack([street(5000), [(0.0, 0.0, 900.0)]]), {"read": 5001})
     thin = thin_out(cloud, 1.0)
     assert 0 < len(thin.points) < 5001
