@@ -13,7 +13,7 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 
 
 def trips(*distances_m: float) -> NDArray[np.void]:
-    """Return counting trips without infractions."""
+    """Return trips that count, without infractions."""
     rows = np.zeros(len(distances_m), TRIP)
     rows["distance_m"], rows["counted"] = distances_m, True
     return rows

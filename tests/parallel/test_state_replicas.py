@@ -18,7 +18,7 @@ from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
 class Worlds:
-    """Worlds with two zones, of which a state has the numbers and the rows of each zone."""
+    """Worlds with two zones. Their state has numbers, and rows of each zone."""
 
     simulation = SimpleNamespace(num_worlds=1)
     world = SimpleNamespace(partition=SimpleNamespace(count=2))

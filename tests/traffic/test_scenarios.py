@@ -176,7 +176,7 @@ def test_signals_that_fail_are_dark_from_then_on() -> None:
     assert shown[-1] == {"o", "O"}
 
 
-def test_the_seed_draws_the_place_and_its_name_repeats_it() -> None:
+def test_the_seed_draws_the_place_and_the_name_of_the_place_repeats_the_run() -> None:
     places = {seed: played("pedestrian_crossing", "never_yield", seed).place for seed in range(4)}
     assert len(set(places.values())) > 1
     again = played("pedestrian_crossing", "never_yield", 0, place=places[3])
