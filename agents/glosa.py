@@ -22,9 +22,9 @@ from cavmarl.engine.spaces import observation_parts
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
 SLOWEST_MPS = 3.0
-MARGIN_S = 1.0  # after the begin of a green
-REACT_S = 2.0  # to reach the advised speed
-BRISK_MPS2 = 2.0  # acceleration to the limit
+MARGIN_S = 1.0  # arrival after the beginning of a green
+REACT_S = 2.0  # time to reach the advised speed
+BRISK_MPS2 = 2.0  # assumed acceleration to the speed limit
 BRAKE_MPS2 = 1.5
 YELLOW_MPS2 = 4.5  # a driver who would have to brake harder passes at yellow
 HALF_M = 2.5  # from the centre of the vehicle to its front
@@ -62,12 +62,12 @@ def advised_mps(
         line_m: (…) distance to the line.
         speed: (…) present speed in m/s.
         limit: (…) highest speed in m/s.
-        is_go: (…) whether it is green now.
-        change_s: (…) time until it changes between green and red.
-        return_s: (…) time until it changes back.
+        is_go: (…) whether the signal is green now.
+        change_s: (…) time until the signal changes between green and red.
+        return_s: (…) time until the signal changes back.
 
     Returns:
-        (…) `limit` if the line is beyond the greens that are known.
+        (…) m/s; `limit` if the line cannot be reached before the last known change.
     """
     soonest_s = line_m / limit + (limit - speed) ** 2 / (2.0 * BRISK_MPS2 * limit)
     is_in_first = is_go & (soonest_s <= change_s + limit / (2.0 * YELLOW_MPS2))

@@ -29,7 +29,7 @@ COPIED = (
     "pyproject.toml",
 )
 LIMIT_S = 1800.0  # time limit of the tests of a row, in s
-# Random numbers are products that wrap around; of that Python warns where nothing is compiled.
+# Random numbers are products that wrap around. Without the compiler, NumPy warns of that.
 WRAPS = "ignore:overflow encountered:RuntimeWarning"
 
 

@@ -12,12 +12,13 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "cavmarl"
 MAX_WORDS = 1_500
-ELSEWHERE = {"cavmarl/data/", "kernels/"}  # a folder of the wheel; a name in many folders
+ELSEWHERE = {"cavmarl/data/", "kernels/"}  # a folder of the wheel; a folder in many domains
 QUESTIONS = re.findall(r"^\| ([^|]+\?) \| (.+) \|$", PAGE, re.MULTILINE)
 
 
 def test_the_page_is_short() -> None:
-    words = [word for word in PAGE.split() if re.search(r"\w", word)]  # without bars of tables
+    # Words without the bars of tables.
+    words = [word for word in PAGE.split() if re.search(r"\w", word)]
     assert len(words) <= MAX_WORDS
 
 
@@ -34,7 +35,7 @@ def test_the_table_of_the_package_has_each_folder_once() -> None:
     assert sorted(rows) == sorted(folders)
 
 
-def test_there_are_twenty_questions() -> None:
+def test_there_are_at_least_twenty_questions() -> None:
     assert len(QUESTIONS) >= 20
 
 

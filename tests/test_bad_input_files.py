@@ -166,7 +166,7 @@ def test_vehicles_without_a_way_can_be_skipped_and_are_counted(write: Write) -> 
 
 
 @pytest.mark.parametrize("body", ["", '<vType id="t"/>', '<vType id="t" vClass="rail"/>'])
-def test_demand_without_vehicles_is_a_world_without_them(write: Write, body: str) -> None:
+def test_demand_without_vehicles_gives_a_world_without_vehicles(write: Write, body: str) -> None:
     env = demanding(write, body)
     env.reset()
     env.step(env.suggest_actions())

@@ -86,7 +86,7 @@ def test_the_readme_is_one_page_and_its_first_example_runs() -> None:
     assert not names["env"].agents
 
 
-def test_installing_is_from_a_checkout_as_long_as_no_index_has_cavmarl() -> None:
+def test_pages_and_errors_install_from_a_checkout() -> None:
     by_name = re.compile(r"pip install[^`\n]*\bcavmarl\[")
     texts = [*PAGES, *ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("train/*.py")]
     assert [path.name for path in texts if by_name.search(path.read_text(encoding="utf-8"))] == []
@@ -114,7 +114,7 @@ def test_lines_are_short(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_pages_speak_of_things_and_not_of_persons(page: Path) -> None:
+def test_pages_use_no_words_for_persons(page: Path) -> None:
     """Pages say vehicle, zone or worker; generated blocks are not checked."""
     text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
     words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"

@@ -148,7 +148,9 @@ def test_actuated_signals_switch_as_in_one_zone(tmp_path: Path) -> None:
     equal(actuated_grid(tmp_path), crossings=20, zones=(4, 9), steps=60)
 
 
-def test_a_real_map_with_its_demand(shared_maps: Path, trembling: Path) -> None:
+def test_a_real_map_with_its_demand_does_not_depend_on_zones(
+    shared_maps: Path, trembling: Path
+) -> None:
     folder = shared_maps / "net" / "mcity"
     demand = [str(folder / "mcity.rou.xml"), str(folder / "mcity.add.xml")]
     equal(

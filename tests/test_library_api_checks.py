@@ -168,7 +168,7 @@ def test_the_seed_decides_every_step(make: Make) -> None:
 
 
 @in_few_worlds
-def test_resets_without_a_seed_go_on_and_repeat(make: Make) -> None:
+def test_resets_without_a_seed_continue_a_repeatable_sequence(make: Make) -> None:
     env = make()
     runs = []
     for seed in (7, None, None, 7, None):

@@ -25,7 +25,7 @@ def test_when_time_is_over_only_the_first_file_runs(pytester: pytest.Pytester) -
     assert count.tests == 2
 
 
-def test_it_is_an_error_if_no_test_ran(tmp_path: Path) -> None:
+def test_a_run_without_a_test_is_an_error(tmp_path: Path) -> None:
     file = tmp_path / "test_skipped.py"
     file.write_text("import pytest\ndef test_one(): pytest.skip('why')\n", encoding="utf-8")
     run = (

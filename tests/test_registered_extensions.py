@@ -77,7 +77,7 @@ def same_bytes(overrides: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
     return whole[2], whole[3]
 
 
-def test_a_term_from_outside(examples: dict[str, ModuleType]) -> None:
+def test_a_registered_term_is_part_of_the_reward_terms(examples: dict[str, ModuleType]) -> None:
     weights = {"progress": 0.1, "headway": -0.5}
     terms, _ = same_bytes({"terms.weights": weights})
     assert terms.shape == (len(cavmarl.TERMS) + 1,)
@@ -130,16 +130,16 @@ def test_a_batched_function_must_return_a_number_for_each_agent() -> None:
     env.close()
 
 
-def test_a_sensor_from_outside(examples: dict[str, ModuleType]) -> None:
+def test_a_registered_sensor_is_observed_last(examples: dict[str, ModuleType]) -> None:
     _, seen = same_bytes({"sensors.registered": ["crowd"]})
-    assert np.abs(seen[..., -2:]).sum() > 0.0, "its features come last"
+    assert np.abs(seen[..., -2:]).sum() > 0.0, "features of registered sensors come last"
     assert "crowd" in sensor_names()
     assert REGISTERED_SENSORS["crowd"].name == "crowd"
     with pytest.raises(ConfigError, match=r"cavmarl\.register_sensor"):
         REGISTERED_SENSORS["cloud"]
 
 
-def test_a_driver_model_from_outside(examples: dict[str, ModuleType]) -> None:
+def test_a_registered_driver_model_drives_in_its_own_way(examples: dict[str, ModuleType]) -> None:
     whole = run({"traffic.model": "relaxed"})
     same_bytes({"traffic.model": "relaxed"})
     others = [run({"traffic.model": model})[1] for model in ("IDM", "Krauss", "ACC")]
@@ -147,7 +147,7 @@ def test_a_driver_model_from_outside(examples: dict[str, ModuleType]) -> None:
     assert len({tuple(one) for one in hashes}) == len(hashes), "every model drives in its own way"
 
 
-def test_a_backend_from_outside(examples: dict[str, ModuleType]) -> None:
+def test_a_registered_backend_gives_the_same_results(examples: dict[str, ModuleType]) -> None:
     assert run({}, backend="at_most_two")[:2] == run({})[:2]
 
 

@@ -42,7 +42,7 @@ def test_the_citation_has_what_its_format_requires() -> None:
         ("python", [c.removeprefix(PYTHON) for c in PROJECT["classifiers"] if PYTHON in c]),
     ],
 )
-def test_a_badge_shows_what_the_package_says(name: str, values: list[str]) -> None:
+def test_badges_agree_with_the_package(name: str, values: list[str]) -> None:
     badge = (ROOT / f"docs/images/badge_{name}.svg").read_text("utf-8")
     assert f"<title>{name}: {' | '.join(values)}</title>" in badge
     assert badge.count(" | ".join(values)) == 3

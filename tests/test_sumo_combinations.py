@@ -85,7 +85,9 @@ def test_sensor_workers_and_workers(tmp_path: Path, source: str) -> None:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_worker_dies_beside_all_sensors_and_messages(tmp_path: Path, source: str) -> None:
+def test_a_worker_that_dies_with_all_sensors_and_messages_changes_no_result(
+    tmp_path: Path, source: str
+) -> None:
     """The commands to SUMO are repeated; sensors and messages resume from the image."""
     made: dict[str, Any] = {"num_envs": 2, "overrides": settings(tmp_path, source), **PEOPLE}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
@@ -126,7 +128,7 @@ def followed(source: str, folder: Path, zones: int, address: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_follower_drives_whatever_the_zones(tmp_path: Path, source: str) -> None:
+def test_a_follower_gives_the_same_results_for_any_zones(tmp_path: Path, source: str) -> None:
     """Views and controls are equal; other controls would give another world."""
     alone = followed(source, tmp_path, 1, tmp_path / "s")
     assert followed(source, tmp_path, 4, tmp_path / "s") == alone

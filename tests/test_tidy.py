@@ -30,10 +30,10 @@ ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
 
 # Bounds of properties that make code hard to follow. Sets list exactly the present exceptions.
-PUBLIC_METHODS = 25  # of a class with its bases, properties not counted
+PUBLIC_METHODS = 25  # of a class with its bases, without properties
 WIDE_CLASSES: set[str] = set()
 
-ATTRIBUTES = 20  # that a class and its bases set
+ATTRIBUTES = 20  # attributes that a class and its bases set
 LARGE_CLASSES = {
     "cavmarl.handoff.division.ZonedShards",
     "cavmarl.ownership.trace_check.TraceChecker",
@@ -45,7 +45,9 @@ LARGE_CLASSES = {
     "cavmarl.traffic.sumo.sumo_child.SumoSimulation",
 }
 
-PARAMETERS = 10  # keyword-only ones of public functions, and those of kernels, not counted
+PARAMETERS = (
+    10  # without keyword-only parameters of public functions, and without parameters of kernels
+)
 WIDE_FUNCTIONS: set[str] = set()
 
 # Functions with untyped `*arguments`, which are arguments of a kernel or of another library.
@@ -69,9 +71,9 @@ PASSED_ON = {
     "cavmarl.render.topdown.TopDownRenderer.frame",
 }
 
-# A new capability raises these two by what it needs; the commit says why.
+# A new capability raises these two bounds by the lines that it needs; the commit says why.
 PACKAGE_LINES = 134_800
-REACHABLE_LINES = 84_100  # from `make_vec` and `parallel_env`
+REACHABLE_LINES = 84_100  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name
@@ -83,7 +85,7 @@ SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 UNDERSCORED = {"_asdict", "_exit", "_fields", "_foes", "_multiarray_umath", "_replace"}
 UNDERSCORED |= {"_repr_html_"}
 
-# Words for persons, where the field says vehicle, zone or worker; two texts are about pedestrians.
+# Words for persons; the field says vehicle, zone or worker. Two texts are about pedestrians.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
 PERSONS_AT_MOST = {"cavmarl": 2, "docs": 2}
 
@@ -234,7 +236,7 @@ def test_expensive_tests_are_slow_unless_they_are_listed() -> None:
     assert rare_tests([*costs, "b[3]"], costs | {"b[3]": 0.5}) == {"a[3]", "b[3]", "c"}
 
 
-def test_slow_tests_come_up_in_turn_unless_they_take_too_long() -> None:
+def test_each_slow_test_runs_in_one_turn_unless_it_is_long() -> None:
     names = [f"tests/a.py::test[{number}]" for number in range(3000)]
     never = ["tests/a.py::others[1]", "tests/b.py::test", "tests/b.py::test[2]"]
     long = frozenset({"tests/a.py::others", "tests/b.py"})

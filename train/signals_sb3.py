@@ -38,7 +38,7 @@ from cavmarl.signals.green_features import GreenFeatures
 from cavmarl.signals.kernels.green_choices import KEEP
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
-FIRST_SEED = 1000  # of the evaluation
+FIRST_SEED = 1000  # first seed of the evaluation
 TICK_S = 0.2
 
 
@@ -50,7 +50,7 @@ class Args:
 
     env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
     num_worlds: Annotated[int, "number of parallel worlds"] = 4
-    background: Annotated[int, "vehicles of the generator; 0: those of the demand alone"] = 0
+    background: Annotated[int, "vehicles of the generator; 0: only vehicles of the demand"] = 0
     horizon_s: Annotated[int, "seconds of an episode"] = 3600
     seed: Annotated[int, "root of all random numbers"] = 0
     updates: Annotated[int, "updates of the network"] = 60
@@ -64,7 +64,7 @@ class Args:
     wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
     entry_weight: Annotated[float, "reward for each vehicle that need not wait to enter"] = 1.0
     decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
-    range_m: Annotated[float, "signals see the lanes before them at least this far"] = 50.0
+    range_m: Annotated[float, "signals observe lanes at least this far before them"] = 50.0
     hidden: Annotated[int, "width of the hidden layers"] = 64
     compare: Annotated[bool, "run the scripted controllers, too"] = True
     evaluations: Annotated[int, "worlds of the evaluation"] = 5
@@ -95,10 +95,10 @@ class Args:
 
 
 class SharedNetwork:
-    """A controller of signals: the most likely green of one network for all of them.
+    """A controller that selects the most likely green of each signal by one shared network.
 
     Args:
-        model: as trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
+        model: a model trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
     """
 
     def __init__(self, model: PPO) -> None:

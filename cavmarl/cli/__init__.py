@@ -13,7 +13,6 @@ from importlib.metadata import version
 from typing import Annotated, Any
 
 import typer
-from typer.core import TyperGroup
 
 from cavmarl.cli import (
     baseline,
@@ -40,6 +39,7 @@ from cavmarl.cli import (
 )
 from cavmarl.cli.output import (
     SERVICE,
+    CliGroup,
     add_command,
     flag,
     print_error,
@@ -58,7 +58,7 @@ DIVIDE, COSIM = "Divide worlds", "Co-simulation"
 REMOVED = {"verify-determinism": "verify determinism"}  # command → its replacement
 
 
-class _Group(TyperGroup):
+class _Group(CliGroup):
     """The group of all commands.
 
     A removed command or option raises ConfigError with its replacement. `map` is imported on

@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from cavmarl.cli.output import (
+    CliGroup,
     JsonPath,
     MapName,
     Seed,
@@ -16,7 +17,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 
-app = typer.Typer(help="Generate demand files.", no_args_is_help=True)
+app = typer.Typer(cls=CliGroup, help="Generate demand files.", no_args_is_help=True)
 
 
 @app.callback()

@@ -136,7 +136,9 @@ def _watched(stack: ExitStack, options: WebOptions, vec: CavVectorEnv) -> Callab
 
 
 def report(
-    folder: Annotated[Path, typer.Argument(help="Results folder of `cavmarl evaluate`.")],
+    folder: Annotated[
+        Path, typer.Argument(metavar="FOLDER", help="Results folder of `cavmarl evaluate`.")
+    ],
     html: HtmlPath = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -7,9 +7,10 @@ from functools import partial
 import typer
 
 from cavmarl.cli import map_build, map_check, map_export, map_fidelity, map_survey, map_zones
-from cavmarl.cli.output import add_command
+from cavmarl.cli.output import CliGroup, add_command
 
 app = typer.Typer(
+    cls=CliGroup,
     help="Build, check, export, compare and divide road networks.",
     no_args_is_help=True,
 )

@@ -29,7 +29,10 @@ from cavmarl.roads.sumo_net.reader import map_name
 Source = Annotated[
     Path,
     typer.Argument(
-        help="Map file: a SUMO network or .sumocfg, OSM or OpenDRIVE.", exists=True, dir_okay=False
+        metavar="MAP",
+        help="Map file: a SUMO network or .sumocfg, OSM or OpenDRIVE.",
+        exists=True,
+        dir_okay=False,
     ),
 ]
 

@@ -33,7 +33,8 @@ _MARGIN_M = 5.0  # points this far outside of the map are kept, and the map this
 
 Reference = Annotated[str, typer.Argument(metavar="MAP", help="Reference: a map or a point cloud.")]
 Measured = Annotated[
-    Path, typer.Argument(help="Point cloud: csv, ply, pcd, las or laz.", dir_okay=False)
+    Path,
+    typer.Argument(metavar="CLOUD", help="Point cloud: csv, ply, pcd, las or laz.", dir_okay=False),
 ]
 
 
@@ -42,7 +43,9 @@ def fidelity(
     cloud: Measured,
     cloud2: Annotated[
         Path | None,
-        typer.Argument(help="Second point cloud, shown in its own column.", dir_okay=False),
+        typer.Argument(
+            metavar="OTHER", help="Second point cloud, shown in its own column.", dir_okay=False
+        ),
     ] = None,
     frame: Annotated[
         str, about(f"Frame of the clouds: {', '.join(FRAMES)}.", metavar="FRAME")

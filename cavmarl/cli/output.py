@@ -16,6 +16,7 @@ from rich import box
 from rich.console import Console
 from rich.table import Table
 from rich.text import Text
+from typer.core import TyperCommand, TyperGroup
 
 from cavmarl.bench.harness import check_positive
 from cavmarl.config.driver_names import ONNX_FILE, SB3_FILE, TORCH_SCRIPT_FILES, drivers_in
@@ -117,6 +118,31 @@ def about_file(text: str, *names: str, metavar: str = "FILE") -> Any:
     return about(text, *names, metavar=metavar, callback=_writable, panel=OUTPUT)
 
 
+class CliCommand(TyperCommand):
+    """A command whose help shows flags without a value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, and `--help`."""
+        return _without_flag_values(super().get_params(ctx))
+
+
+class CliGroup(TyperGroup):
+    """A group of commands whose help shows flags without a value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """Return the parameters, and `--help`."""
+        return _without_flag_values(super().get_params(ctx))
+
+
+def _without_flag_values(params: Iterable[Any]) -> list[Any]:
+    """Return the parameters of a command; Typer would show `--help` with the value `<bool>`."""
+    found = list(params)
+    for each in found:
+        if getattr(each, "is_flag", False) and each.metavar is None:
+            each.metavar = ""
+    return found
+
+
 def add_command(
     app: typer.Typer,
     name: str,
@@ -127,7 +153,9 @@ def add_command(
 ) -> None:
     """Add a command whose help ends with examples; `panel` is its group in the help of `app`."""
     end = "\n\n".join(("Examples:", *examples))
-    app.command(name, rich_help_panel=panel, epilog=end, context_settings=settings)(command)
+    app.command(name, cls=CliCommand, rich_help_panel=panel, epilog=end, context_settings=settings)(
+        command
+    )
 
 
 Backend = Annotated[
@@ -152,7 +180,7 @@ Environment = Annotated[
 OptionalEnvironment = Annotated[
     str,
     typer.Argument(
-        metavar="[ENV]", help="Environment: its name, its folder, a map file or a .sumocfg."
+        metavar="ENV", help="Environment: its name, its folder, a map file or a .sumocfg."
     ),
 ]
 MapName = Annotated[

@@ -37,7 +37,7 @@ def plan(
     env: Annotated[
         str | None,
         typer.Argument(
-            metavar="[ENV]",
+            metavar="ENV",
             help="Environment: its name, its folder, a map file or a .sumocfg; not with --again.",
         ),
     ] = None,

@@ -38,7 +38,8 @@ if TYPE_CHECKING:
 
 def replay(
     path: Annotated[
-        Path, typer.Argument(help="The folder that --record wrote, or a folder of such folders.")
+        Path,
+        typer.Argument(metavar="RECORDING", help="Folder of --record, or a folder of recordings."),
     ],
     world: Annotated[int, about("Number of the world, from 0.", metavar="N")] = 0,
     episode: Annotated[int, about("Number of the episode, from 0.", metavar="N")] = 0,

@@ -46,7 +46,7 @@ def ros2(
     domain: Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")] = 0,
     profile: Annotated[
         Literal["plain", "autoware"],
-        about("Names: topics begin with the vehicle (plain), or are Autoware's (one vehicle)."),
+        about("Topic names: `/car_0/…` (plain), or the names of Autoware, for one vehicle."),
     ] = "plain",
     distro: Annotated[
         Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
@@ -59,24 +59,24 @@ def ros2(
         ),
     ] = "stamp",
     deadline_s: Annotated[
-        float, about("Seconds that a step waits for a command, real time.", metavar="S")
+        float, about("Maximum real time that a step waits for a command, in s.", metavar="S")
     ] = 1.0,
     lag_steps: Annotated[int, about("A command may be this many steps old.", metavar="N")] = 0,
     ready_s: Annotated[
         float,
-        about("Seconds that the first step waits for a publisher of commands.", metavar="S"),
+        about("Maximum time that the first step waits for a publisher of commands.", metavar="S"),
     ] = 30.0,
     truth: Annotated[
-        bool, flag("Publish the true state of the vehicles and of all vehicles around.")
+        bool, flag("Publish the true states of the driven and of all other vehicles.")
     ] = False,
     names: Annotated[
         Path | None,
-        about("Other names of topics and frames, by sensor.", metavar="FILE", exists=True),
+        about("File with names of topics and frames by sensor.", metavar="FILE", exists=True),
     ] = None,
     bag: Annotated[
         Path | None,
         about(
-            "Write all messages to a bag of rosbag2, a new folder.",
+            "Write all messages to a rosbag2 bag in a new folder.",
             "--record-rosbag2",
             metavar="FOLDER",
             panel=OUTPUT,
@@ -153,7 +153,7 @@ def _refuse_world_options(world: WorldSpec, rig: str | None, pace: float | None)
 
 
 def _with_rig(world: WorldSpec, rig: str | None) -> WorldSpec:
-    """Return the world with the sensors, and with steps of 0.05 s unless it says otherwise."""
+    """Return the world with a rig, and with steps of 0.05 s unless its overrides set another."""
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.stack.stack import RIGS
 
@@ -172,7 +172,7 @@ def _start(
     steps: int | None,
     pace: float | None,
 ) -> dict[str, Any]:
-    """Run a world and its bridge, which is another thread of this process."""
+    """Run a world in this thread and its bridge in another one; return the figures."""
     from cavmarl.cosim.followers.followed_world import FollowedWorld
     from cavmarl.cosim.ros2 import ros_bridge
     from cavmarl.cosim.time_master import RealTime
@@ -206,7 +206,7 @@ def _start(
             run = run_episode(led, world.seed, steps, "end")
         except CavmarlError:
             thread.join(options.deadline_s + 10.0)
-            if errors:  # the reason for which the bridge has ended
+            if errors:  # the error that ended the bridge
                 raise errors[0] from None
             raise
         led.close()

@@ -19,6 +19,7 @@ from cavmarl.cli.output import (
     VIDEO_EXTRAS,
     WINDOW_EXTRAS,
     WORLD,
+    CliGroup,
     Imports,
     JsonPath,
     Zones,
@@ -40,7 +41,9 @@ if TYPE_CHECKING:
 
 WIDTH = 140  # columns of the table of a sweep; it is pasted into pages and must not be cut off
 
-app = typer.Typer(help="List safety scenarios, and test drivers in them.", no_args_is_help=True)
+app = typer.Typer(
+    cls=CliGroup, help="List safety scenarios, and test drivers in them.", no_args_is_help=True
+)
 
 
 def list_scenarios(json_path: JsonPath = None) -> None:
@@ -139,7 +142,7 @@ def run(
 def sweep(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="[NAME]...", help="Names of scenarios.", show_default="all"),
+        typer.Argument(metavar="NAME", help="Names of scenarios.", show_default="all"),
     ] = None,
     map_names: Annotated[
         list[str] | None,

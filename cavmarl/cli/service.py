@@ -141,7 +141,9 @@ def serve(
 
 
 def grant(
-    name: Annotated[str, typer.Argument(help="Name of the person, program or node.")],
+    name: Annotated[
+        str, typer.Argument(metavar="NAME", help="Name of the person, program or node.")
+    ],
     role: Annotated[
         str, about("Role: viewer, client, operator, admin or node.", metavar="ROLE")
     ] = "client",

@@ -12,6 +12,7 @@ from rich.table import Table
 
 from cavmarl.cli.listing import sentence_about
 from cavmarl.cli.output import (
+    CliGroup,
     Imports,
     JsonPath,
     about,
@@ -37,7 +38,9 @@ SHORT = {
     "red_light": "red",
 }
 
-app = typer.Typer(help="List, verify and compare trained drivers.", no_args_is_help=True)
+app = typer.Typer(
+    cls=CliGroup, help="List, verify and compare trained drivers.", no_args_is_help=True
+)
 
 
 def list_drivers(json_path: JsonPath = None) -> None:

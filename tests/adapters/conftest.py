@@ -1,4 +1,4 @@
-"""A substitute for moviepy, with which the recorders of libraries write videos."""
+"""A substitute for moviepy, which recorders of other libraries use to write videos."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def run(
         config=config,
     )
     experiment.run()
-    (table,) = folder.rglob("collection_reward_reward_mean.csv")  # of all groups
+    (table,) = folder.rglob("collection_reward_reward_mean.csv")  # means over all groups
     rewards = [float(line.split(",")[1]) for line in table.read_text().splitlines()]
     return experiment, rewards
 
@@ -86,7 +86,7 @@ SIGNALS = {"signals.agents": "all", "clock.ctrl_dt_s": 5.0, "population.mode": "
 def test_each_kind_of_agents_is_a_group_that_learns(
     tmp_path: Path, algorithm: str, agents: int
 ) -> None:
-    """Every choice of a signal is one that its action mask allows."""
+    """Signals choose only actions that their masks allow."""
     keys = SIGNALS | {"signals.forbidden": "error"}
     experiment, rewards = run(tmp_path, algorithm, task="GRID4X4", agents=agents, **keys)
     assert not experiment.continuous_actions

@@ -68,7 +68,7 @@ def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
         ({"overrides": {"population.agents": 2}}, r"population\.agents"),
     ],
 )
-def test_one_vehicle_is_one_vehicle(arguments: dict[str, Any], key: str) -> None:
+def test_other_numbers_of_agents_are_refused(arguments: dict[str, Any], key: str) -> None:
     with pytest.raises(ConfigError, match=f"^{key}: this view sets it"):
         gymnasium.make("cavmarl/ring-v5", **arguments)
 

@@ -1,4 +1,4 @@
-"""Agents as rows of a Gymnasium vector environment: equal to their worlds; with wrappers."""
+"""Agents as rows of a Gymnasium vector environment, compared with their worlds, and in wrappers."""
 
 from __future__ import annotations
 
@@ -115,7 +115,7 @@ def test_gymnasium_records_the_trips_of_all_rows(mode: str, autoreset: Autoreset
 
 
 @pytest.mark.parametrize("autoreset", AUTORESET)
-def test_a_row_may_show_a_dict(autoreset: AutoresetMode) -> None:
+def test_observations_of_rows_can_be_dicts(autoreset: AutoresetMode) -> None:
     named = make(kind="dict", autoreset_mode=autoreset)
     flat = make(autoreset_mode=autoreset)
     parts = observation_parts(named.unwrapped.vec.config.sensors)
@@ -191,7 +191,7 @@ def test_invalid_rows_are_refused(arguments: dict[str, Any], message: str) -> No
         gymnasium.make_vec("cavmarl/mergeAgents-v6", num_envs=ROWS, **arguments)
 
 
-def test_rows_without_autoreset_begin_anew_on_reset() -> None:
+def test_rows_without_autoreset_start_an_episode_on_reset() -> None:
     """With one row per world, each row is reset alone, and other rows continue."""
     rows = make(num_worlds=ROWS, autoreset_mode="Disabled")
     assert rows.autoreset_mode is AutoresetMode.DISABLED
@@ -210,7 +210,7 @@ def test_rows_without_autoreset_begin_anew_on_reset() -> None:
     assert ended > ROWS
 
 
-def test_rows_of_a_world_begin_anew_together() -> None:
+def test_rows_of_a_world_start_an_episode_together() -> None:
     rows = make(autoreset_mode="Disabled")
     rows.reset(seed=5)
     first = np.arange(ROWS) == 0
@@ -287,7 +287,7 @@ def test_gymnasium_records_a_video_of_the_rows(tmp_path: Any, recorded: Any) -> 
     assert video.fps == rows.metadata["render_fps"] == 5
 
 
-def test_rows_without_a_render_mode_warn_when_they_are_to_be_drawn() -> None:
+def test_rendering_rows_without_a_render_mode_warns() -> None:
     rows = make()
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert rows.render() is None

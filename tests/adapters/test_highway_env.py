@@ -31,7 +31,7 @@ def make() -> Iterator[Any]:
         env.close()
 
 
-def test_the_ids_are_those_of_the_tasks() -> None:
+def test_each_task_has_an_id() -> None:
     assert set(HIGHWAY_TASKS) == set(TASKS)
 
 
@@ -143,6 +143,6 @@ def test_unsupported_features_are_refused(config: dict[str, Any], told: str, mak
         make("highway", config=config)
 
 
-def test_settings_of_its_drawing_are_taken_and_change_nothing(make: Any) -> None:
+def test_rendering_settings_of_highway_env_are_accepted_and_ignored(make: Any) -> None:
     env = make("highway", config={"screen_width": 640, "show_trajectories": True})
     assert "screen_width" not in env.unwrapped.config

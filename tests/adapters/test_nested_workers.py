@@ -1,6 +1,6 @@
-"""Worlds inside workers of other libraries, which may not start `multiprocessing` children.
+"""Worlds inside workers of other libraries have the same results as worlds of this process.
 
-Their results equal those in this process.
+Such a worker may not start `multiprocessing` children.
 """
 
 from __future__ import annotations

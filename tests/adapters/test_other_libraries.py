@@ -29,7 +29,7 @@ def test_each_library_has_an_example(library: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("library", LIBRARIES)
-def test_its_example_runs(library: str, tmp_path: Path) -> None:
+def test_the_example_of_each_library_runs(library: str, tmp_path: Path) -> None:
     pytest.importorskip(library, reason="no extra of cavmarl: install it to try it")
     if library == "supersuit":
         pytest.importorskip("stable_baselines3", reason="needs the extra: train")

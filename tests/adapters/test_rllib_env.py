@@ -170,7 +170,7 @@ def town(agents: int, mode: str) -> dict[str, Any]:
 @pytest.mark.parametrize("agents", [0, 2])
 @pytest.mark.parametrize("mode", MODES)
 def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
-    """The results are those of the world; signals are silent between two decisions."""
+    """The results equal those of the world; between two decisions, signals have no results."""
     from cavmarl.adapters.rllib_env import CavRllibEnv, policy_of
 
     env, twin = CavRllibEnv(town(agents, mode)), parallel_env(**town(agents, mode))
@@ -228,13 +228,13 @@ def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
         assert ended == {agent: over[agent] for agent in expected}
         assert cut == {agent: left[agent] for agent in expected}
         assert env.agents == twin.agents
-    for agent in signals.agents:  # later steps do not overwrite what RLlib keeps
+    for agent in signals.agents:  # later steps do not overwrite observations that RLlib keeps
         np.testing.assert_equal(first[agent], kept[agent])
     assert beyond > 0
-    assert decisions == 9 * 5  # every 2 of 9 s
+    assert decisions == 9 * 5  # one every 2 s, in 9 s
     if not agents:
         assert calls == 5
-    elif mode == "respawn":  # seats act in each step
+    elif mode == "respawn":  # vehicles act in each step
         assert calls == 9
 
 

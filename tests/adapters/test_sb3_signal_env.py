@@ -80,7 +80,7 @@ def test_ppo_learns_from_the_rows() -> None:
         assert model.num_timesteps == 8 * 32
 
 
-def test_a_signal_is_rewarded_for_vehicles_that_enter_before_it(tmp_path: Path) -> None:
+def test_a_signal_is_rewarded_for_vehicles_that_enter_its_lanes(tmp_path: Path) -> None:
     demand = tmp_path / "many.rou.xml"
     demand.write_text(
         '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
@@ -105,7 +105,7 @@ def test_a_signal_is_rewarded_for_vehicles_that_enter_before_it(tmp_path: Path) 
         make(entry_weight=1.0, workers=1)
 
 
-def test_rows_of_greens_have_their_own_size_and_worlds_begin_apart() -> None:
+def test_with_features_of_greens_rows_differ_in_size_and_worlds_in_their_start() -> None:
     with pytest.raises(ConfigError, match="features"):
         make(features="cars")
     with closing(make()) as rows, pytest.raises(ConfigError, match="sizes"):

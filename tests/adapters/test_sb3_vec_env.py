@@ -44,7 +44,7 @@ def wild(rows: Any, seed: int) -> list[Any]:
     return found
 
 
-def test_sb3_finds_spaces_that_it_knows(rows: Any) -> None:
+def test_sb3_accepts_the_spaces(rows: Any) -> None:
     from stable_baselines3.common.utils import check_for_correct_spaces
     from stable_baselines3.common.vec_env import VecCheckNan, VecMonitor
 
@@ -131,7 +131,7 @@ def test_every_population_trains(mode: str, kind: str) -> None:
     assert model.ep_info_buffer
 
 
-def test_a_row_may_show_a_dict() -> None:
+def test_observations_of_rows_can_be_dicts() -> None:
     named, flat = wild(make(kind="dict"), 5), wild(make(), 5)
     parts = observation_parts(load_config("merge")[0].sensors)
 
@@ -155,7 +155,7 @@ def test_the_same_seed_gives_the_same_rows(rows: Any) -> None:
     assert not np.array_equal(first[0], other[0])
 
 
-def test_attributes_and_methods_are_those_of_the_worlds(rows: Any) -> None:
+def test_attributes_and_methods_of_the_worlds_can_be_used(rows: Any) -> None:
     rows.reset()
     assert rows.get_attr("max_cycles") == [20] * rows.num_envs
     assert rows.get_attr("max_cycles", 1) == [20]

@@ -72,7 +72,7 @@ def drive(env: SumoEnvironment, steps: int, every: int = 4) -> list[Any]:
 # Signals
 
 
-def test_signals_lanes_and_phases_are_those_of_the_file(routes: str) -> None:
+def test_signals_lanes_and_phases_equal_those_of_the_map_file(routes: str) -> None:
     net = sumolib.net.readNet(str(NET), withPrograms=True)
     with closing(grid(routes, yellow_time=3)) as env:
         assert env.ts_ids == sorted(light.getID() for light in net.getTrafficLights())
@@ -153,7 +153,7 @@ def test_greens_change_at_the_times_of_sumo_rl(routes: str) -> None:
                 assert signal.next_action_time == env.sim_step
 
 
-def test_max_green_is_only_held_if_asked_for(routes: str) -> None:
+def test_max_green_is_enforced_only_on_request(routes: str) -> None:
     def last_green(**more: Any) -> int:
         with closing(grid(routes, max_green=20, **more)) as env:
             env.reset()
@@ -268,7 +268,7 @@ def test_a_csv_file_is_written_for_each_episode(routes: str, tmp_path: Path) -> 
         assert [row["step"] for row in rows] == [f"{t:.1f}" for t in range(55, 151, 5)]
 
 
-def test_rewards_and_observations_of_the_user(routes: str) -> None:
+def test_users_can_define_rewards_and_observations(routes: str) -> None:
     class Queues(sumo_rl.ObservationFunction):
         def __call__(self) -> NDArray[np.float32]:
             return np.array(self.ts.get_lanes_queue(), dtype=np.float32)
@@ -476,7 +476,7 @@ def test_q_learning_with_a_table_for_each_signal(routes: str) -> None:
         assert any(agent.acc_reward for agent in agents.values())
 
 
-def test_q_learning_updates_and_explores_as_it_should() -> None:
+def test_q_learning_follows_its_update_rule_and_explores() -> None:
     space = spaces.Discrete(2)
     agent = QLAgent("a", None, space, alpha=0.5, gamma=0.5)
     with pytest.raises(ValueError, match="choose an action first"):
@@ -576,7 +576,7 @@ def test_a_missing_folder_of_maps_is_named(
         make(nets=tmp_path)
 
 
-# What is ignored, and what is refused
+# Ignored and refused arguments
 
 
 @pytest.mark.parametrize(

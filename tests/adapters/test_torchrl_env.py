@@ -97,7 +97,7 @@ def test_the_tensors_are_the_worlds_arrays(mode: str) -> None:
     assert not rollout[VEHICLES, "mask"].all()
 
 
-def test_agents_end_singly_and_their_world_goes_on() -> None:
+def test_a_world_continues_when_single_agents_end() -> None:
     env = make()
     env.set_seed(0)
     rollout = env.rollout(HORIZON, wild, break_when_any_done=True)
@@ -219,7 +219,7 @@ def test_vehicles_and_signals_are_two_groups(action: str) -> None:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_the_tensors_of_signals_are_the_worlds_arrays(mode: str) -> None:
-    """Choices that a signal does not have keep its green; all others are passed on."""
+    """A choice that a signal does not have keeps its green; other choices reach the world."""
     keys = {"population.mode": mode, "population.budget": 4}
     env = town(**keys)
     vec = make_vec("town", num_envs=WORLDS, agents=2, background=20, overrides=TOWN | keys)

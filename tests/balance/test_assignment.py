@@ -101,7 +101,7 @@ def test_shards_without_cost_are_divided_by_number() -> None:
     assert plan.imbalance == 1.0
 
 
-def test_worlds_stay_whole_if_that_is_about_as_fast() -> None:
+def test_worlds_are_not_split_if_a_split_is_hardly_faster() -> None:
     plan = make_plan(Problem(row([1.0] * 64, worlds=16), grid(2, 2), idle_snapshot(2)))
     assert plan.placement.cut_pairs == 0
     assert plan.imbalance == 1.0

@@ -52,7 +52,7 @@ def test_another_snapshot_gives_another_plan(plan: Plan) -> None:
     assert replan(first, idle_snapshot(1)).homes == (0,) * 8
 
 
-def test_values_that_are_derived_from_a_plan(plan: Plan) -> None:
+def test_the_document_of_a_plan_has_derived_values(plan: Plan) -> None:
     document = plan.to_dict()
     assert [worker["worker"] for worker in document["workers"]] == [0, 1, 2]
     assert sum(worker["load_s"] for worker in document["workers"]) == pytest.approx(0.014)
@@ -62,7 +62,7 @@ def test_values_that_are_derived_from_a_plan(plan: Plan) -> None:
     assert document["imbalance"] == plan.imbalance > 0.0
 
 
-def test_a_plan_can_be_read(plan: Plan) -> None:
+def test_the_text_of_a_plan_has_its_scores_exclusions_and_moves(plan: Plan) -> None:
     text = describe_plan(plan)
     assert text.startswith("8 shards on 4 workers, moved from the slowest\n")
     assert "score = 0.5 CPU + 0.25 RAM + 0.25 GPU; workers generated, GPU: none" in text

@@ -18,7 +18,7 @@ def balancer() -> Balancer:
     return Balancer(Problem(equal_costs(4, 4), grid(2, 2), idle_snapshot(2)))
 
 
-def test_unmeasured_worlds_are_distributed_whole(balancer: Balancer) -> None:
+def test_unmeasured_worlds_are_distributed_without_splits(balancer: Balancer) -> None:
     homes = balancer.plan.homes
     assert [len({*homes[first : first + 4]}) for first in (0, 4, 8, 12)] == [1, 1, 1, 1]
     assert homes.count(0) == homes.count(1) == 8
@@ -67,7 +67,7 @@ def test_shards_that_are_not_in_the_plan_are_refused(
 
 
 @pytest.mark.parametrize("keeps_one", [False, True])
-def test_a_busy_worker_keeps_its_last_shard_if_the_rule_says_so(keeps_one: bool) -> None:
+def test_with_keeps_one_a_busy_worker_keeps_its_last_shard(keeps_one: bool) -> None:
     rule = BalanceRule(tolerance=0.0, move_s=0.0, keeps_one=keeps_one)
     first = Problem(equal_costs(1, 4), grid(2, 2), idle_snapshot(2), rule)
     balancer = Balancer(first)

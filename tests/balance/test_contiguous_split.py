@@ -63,7 +63,7 @@ def test_the_first_plan_is_contiguous_and_nearly_optimal(problem: Problem) -> No
 
 
 @given(problems())
-def test_rounds_move_little_and_get_near_the_best_row(problem: Problem) -> None:
+def test_rounds_with_few_moves_approach_the_best_contiguous_split(problem: Problem) -> None:
     plan = make_plan(replace(problem, shards=equal_costs(len(problem.shards), 1)))
     problem = replace(problem, present=plan.homes)
     plan = Plan(problem, plan.homes, "")
@@ -98,23 +98,23 @@ def test_equal_worlds_are_shared_out_evenly() -> None:
 def test_an_excluded_worker_gets_no_more_shards() -> None:
     present = (0, 0, 0, 0, 1, 2)
     problem = replace(worlds([1.0] * 6, busy(0.0, 0.9, 0.0)), present=present)
-    assert make_plan(problem).homes == present  # the way to worker 2 leads through worker 1
+    assert make_plan(problem).homes == present  # shards reach worker 2 only through worker 1
     with pytest.raises(NoAdmissibleWorkerError, match=r"worker 1: cpu .* fewer workers"):
         make_plan(replace(problem, present=None))
 
 
-def test_the_loss_of_a_worker_starts_a_new_row() -> None:
+def test_after_the_loss_of_a_worker_a_new_split_is_made() -> None:
     balancer = Balancer(worlds([1.0] * 6, idle_snapshot(3)))
     left = LoadSnapshot(idle_snapshot(3).workers[1:], "none", "")
     assert balancer.round(left).homes == (1, 1, 1, 2, 2, 2)
 
 
-def test_workers_that_are_in_no_row_are_refused() -> None:
+def test_a_present_assignment_that_is_not_contiguous_is_refused() -> None:
     with pytest.raises(ConfigError, match="must be ascending"):
         replace(worlds([1.0] * 3, idle_snapshot(2)), present=(0, 1, 0))
 
 
-def test_a_plan_in_a_row_is_read_as_it_was_written() -> None:
+def test_a_contiguous_plan_is_read_as_it_was_written() -> None:
     problem = replace(
         worlds([1.0, 1.0, 4.0], idle_snapshot(2)), present=(0, 1, 1), cost_source="number"
     )

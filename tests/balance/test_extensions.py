@@ -62,7 +62,9 @@ def test_zones_do_not_change_if_the_gain_is_small(town: tuple[object, np.ndarray
 
 
 @pytest.mark.parametrize("costs", [[1.0] * 3, [1.0, 1.0, 1.0, float("nan")], [1.0, 1.0, 1.0, -1.0]])
-def test_zones_need_a_cost_each(town: tuple[object, np.ndarray], costs: list[float]) -> None:
+def test_a_missing_cost_of_a_zone_is_refused(
+    town: tuple[object, np.ndarray], costs: list[float]
+) -> None:
     network, places = town
     with pytest.raises(ConfigError, match="for each of 4 zones"):
         propose_zones(network, cut_map(network, "grid", 4), places, costs)  # type: ignore[arg-type]

@@ -34,7 +34,7 @@ def fleet(*uses: tuple[float, float, float]) -> list[Candidate]:
     return [Candidate(number, Utilisation(*use)) for number, use in enumerate(uses)]
 
 
-def test_the_default_rule_is_that_of_the_paper() -> None:
+def test_the_default_rule_equals_the_papers() -> None:
     assert LoadRule().weights == (0.6, 0.2, 0.2)
     assert LoadRule().thresholds == (0.85, 0.90, 0.95)
 
@@ -54,7 +54,7 @@ def test_scores_of_the_paper(use: tuple[float, float, float], score: float) -> N
     assert load_score(Utilisation(*use)) == pytest.approx(score, abs=1e-15)
 
 
-def test_one_critical_resource_cannot_hide_behind_free_ones() -> None:
+def test_one_resource_above_its_threshold_excludes_a_worker_with_other_free_resources() -> None:
     found = select(fleet((0.10, 0.91, 0.05), (0.80, 0.80, 0.80)))
     assert found.worker == 1
     assert found.rejections == (Rejection(0, "ram", 0.91, 0.90),)
@@ -109,13 +109,13 @@ def test_a_score_is_a_share_and_rises_with_use(use: Utilisation, first: float, r
     assert score <= load_score(Utilisation(1.0, use.ram, use.gpu), weights)
 
 
-def test_of_equal_scores_fewer_shards_win_then_the_lower_number() -> None:
+def test_with_equal_scores_the_worker_with_fewer_shards_or_the_lower_number_is_chosen() -> None:
     use = Utilisation(0.5, 0.5, 0.5)
     assert select([Candidate(2, use), Candidate(1, use), Candidate(3, use)]).worker == 1
     assert select([Candidate(1, use, hosted=2), Candidate(3, use, hosted=1)]).worker == 3
 
 
-def test_shards_that_are_counted_do_not_all_go_to_one_worker() -> None:
+def test_when_shards_are_counted_equal_workers_get_equal_numbers() -> None:
     hosted = dict.fromkeys(range(5), 0)
     for _ in range(50):
         workers = [Candidate(n, Utilisation(0.0, 0.0), hosted[n]) for n in hosted]
@@ -148,7 +148,7 @@ def test_a_preferred_worker_is_kept_within_the_margin(
     }
 
 
-def test_the_margin_itself_is_near_enough() -> None:
+def test_the_margin_includes_its_end() -> None:
     workers = fleet((0.0, 0.0, 0.0), (0.0, 0.5, 0.0))
     assert select(workers, LoadRule(margin=0.1), preferred=1).worker == 1
     assert select(workers, LoadRule(margin=math.nextafter(0.1, 0.0)), preferred=1).worker == 0
@@ -183,7 +183,7 @@ def test_a_repeated_worker_is_refused() -> None:
 
 @pytest.mark.parametrize("value", [-0.01, 1.01, 50.0, math.nan, math.inf, -math.inf])
 @pytest.mark.parametrize("resource", RESOURCES)
-def test_only_shares_are_utilisations(resource: str, value: float) -> None:
+def test_utilisations_outside_of_0_to_1_are_refused(resource: str, value: float) -> None:
     shares = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0, resource: value}
     with pytest.raises(ConfigError, match=f"utilisation {resource} = "):
         Utilisation(**shares)

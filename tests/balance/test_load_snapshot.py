@@ -19,7 +19,7 @@ from cavmarl.balance.probe import Watch, take_snapshot
 from cavmarl.core.errors import ConfigError
 
 
-def test_a_snapshot_of_this_machine_is_of_shares() -> None:
+def test_a_snapshot_of_this_machine_has_shares_between_0_and_1() -> None:
     found = take_snapshot({1: os.getpid(), 0: None}, interval_s=0.05)
     assert [worker.worker for worker in found.workers] == [0, 1]
     assert all(worker.available for worker in found.workers)

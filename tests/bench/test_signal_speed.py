@@ -34,7 +34,7 @@ def config_in(folder: Path) -> Path:
 def test_rates_are_decisions_of_all_worlds_per_second(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The program for comparison reports half a second for each turn."""
+    """A script takes the place of sumo-rl; it reports half a second for each turn."""
     program = tmp_path / "python"
     program.write_text(SIDE)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)

@@ -25,7 +25,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 
 
-def test_every_row_is_measured_each_turn() -> None:
+def test_every_row_is_measured_in_each_turn() -> None:
     pytest.importorskip("highway_env")
     told: list[str] = []
     found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
@@ -41,7 +41,7 @@ def test_every_row_is_measured_each_turn() -> None:
     ]
 
 
-def test_both_sides_drive_as_many_vehicles_by_the_same_clock_and_look_alike(tmp_path: Path) -> None:
+def test_both_sides_have_equal_vehicles_time_steps_and_observations(tmp_path: Path) -> None:
     pytest.importorskip("highway_env")
     theirs = {seen["type"]: highway_env(5, seen) for seen in (THEIR_LIDAR, THEIR_KINEMATICS)}
     road_m = max(map(length_m, theirs.values()))
@@ -92,7 +92,7 @@ class Clocked:
         return (None, dict.fromkeys(self.agents, 0.0), None, None, acted)
 
 
-def test_rates_are_agent_steps_a_second_of_steps_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rates_are_agent_steps_per_second_without_resets(monkeypatch: pytest.MonkeyPatch) -> None:
     world: Any = Clocked(monkeypatch)
     assert step_speed.their_rate(world, agents=3) == 3 / 0.5
     assert step_speed.dicts_rate(world) == 3 / 0.5

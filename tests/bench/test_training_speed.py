@@ -16,7 +16,7 @@ from tests.cli.test_main import run
 pytestmark = pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 
 
-def test_both_sides_learn_from_the_same_numbers(
+def test_both_sides_learn_from_equal_numbers_of_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for module in ("torch", "highway_env", "stable_baselines3"):
@@ -39,7 +39,7 @@ def test_both_sides_learn_from_the_same_numbers(
     assert "without learning" in capsys.readouterr().out
 
 
-def test_ratios_are_of_the_same_turn() -> None:
+def test_ratios_compare_rates_of_the_same_turn() -> None:
     def row(name: str, *rates: float) -> TrainingRow:
         return TrainingRow(name, 2, 100, rates, {})
 

@@ -79,7 +79,7 @@ def test_moves_that_do_not_pay_back_are_not_made(network: RoadNetwork) -> None:
     assert row_of(dear, "balanced").moves == 0.0
 
 
-def test_a_giant_zone_is_cut_where_moving_does_not_help(network: RoadNetwork) -> None:
+def test_a_giant_zone_is_divided_if_moving_zones_does_not_help(network: RoadNetwork) -> None:
     trace = still(network, [4, 4, 4, 400], idle_snapshot(4), rounds=24)
     places = trace.rounds[0].places.copy()
     low, high = trace.partition.rects[3][:2], trace.partition.rects[3][2:]
@@ -91,7 +91,9 @@ def test_a_giant_zone_is_cut_where_moving_does_not_help(network: RoadNetwork) ->
     assert row_of(found, "repartitioned").handoffs > 0.0
 
 
-def test_weights_are_learnt_from_what_slows_workers_down(network: RoadNetwork) -> None:
+def test_calibration_gives_the_weight_to_the_resource_that_slows_workers_down(
+    network: RoadNetwork,
+) -> None:
     uses = [Utilisation(0.8, 0.1, 0.1), Utilisation(0.1, 0.8, 0.1), Utilisation(0.1, 0.1, 0.9)]
     workers = tuple(Candidate(n, use) for n, use in enumerate(uses))
     trace = still(network, [20] * 9, LoadSnapshot(workers, "simulated", "generated"), rounds=12)
@@ -115,7 +117,7 @@ def test_a_crowd_is_a_function_of_its_seed(network: RoadNetwork) -> None:
     assert one.rounds[0].snapshot.gpu_source == "simulated"
 
 
-def test_costs_of_zones_are_those_of_their_vehicles(network: RoadNetwork) -> None:
+def test_the_cost_of_a_zone_is_the_cost_of_its_vehicles(network: RoadNetwork) -> None:
     crowd = Crowd(vehicles=50, vehicle_s=1.0, agent_s=10.0, migration_s=0.0, noise=0.0)
     partition = cut_map(network, "bisection", 3)
     trace = generated_trace(network, partition, rounds=3, workers=2, seed=0, crowd=crowd)

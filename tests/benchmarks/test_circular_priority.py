@@ -29,7 +29,7 @@ def crossroads(folder: Path, kind: str = "priority", **priorities: int) -> Path:
     return netconvert(folder, "cross")
 
 
-def test_of_four_priorities_three_ways_stop_one_another(tmp_path: Path) -> None:
+def test_with_four_priorities_three_movements_yield_in_a_circle(tmp_path: Path) -> None:
     network = read_network(crossroads(tmp_path, N=3, S=3, W=4, E=1))
     found = circular_priority(network)
     ways = network.links[["from_lane", "to_lane"]][found].tolist()
@@ -42,14 +42,12 @@ def test_of_four_priorities_three_ways_stop_one_another(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "allway_stop", "traffic_light"])
-def test_a_road_with_the_right_of_way_and_equals_and_signals_have_none(
-    tmp_path: Path, kind: str
-) -> None:
+def test_priority_roads_equal_roads_and_signals_have_no_circle(tmp_path: Path, kind: str) -> None:
     network = read_network(crossroads(tmp_path, kind, N=1, S=1, W=4, E=4))
     assert not circular_priority(network).size
 
 
-def test_netgenerate_draws_them_by_random_priorities(tmp_path: Path) -> None:
+def test_random_priorities_of_netgenerate_make_circles(tmp_path: Path) -> None:
     options = ("--random-priority=true", "--default.priority=4", "--grid", "--grid.number=4")
     network = read_network(netgenerate(tmp_path / "random.net.xml", *options))
     assert circular_priority(network).size

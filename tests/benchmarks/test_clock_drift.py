@@ -28,7 +28,7 @@ def test_the_table_of_the_paper_from_raw_ticks() -> None:
     assert rows[-1].follower_s == pytest.approx(482.0)
 
 
-def test_rows_stand_at_their_steps_and_the_last_step_once() -> None:
+def test_the_last_step_has_one_row() -> None:
     random = np.random.default_rng(0)
     master, follower = (np.cumsum(random.integers(1, 9, 1001)).tolist() for _ in range(2))
     for last, steps in ((100, [100]), (101, [100, 101]), (7, [7]), (1000, [100, 500, 1000])):
@@ -42,7 +42,7 @@ def test_rows_stand_at_their_steps_and_the_last_step_once() -> None:
             assert row.ratio == pytest.approx(seen / master[row.step])
 
 
-def test_what_is_measured_holds_only_if_own_ticks_are_noticed_or_change_nothing() -> None:
+def test_a_measurement_holds_only_if_own_ticks_are_noticed_or_change_nothing() -> None:
     even = rows_of([0, 1, 2], [5, 6, 7], 0.1)
     found = ClockDrift("ring", 0.1, 0.5, "obey", None, even, 4, 4, 4, 0)
     assert found.holds
@@ -62,7 +62,7 @@ def test_own_ticks_are_spread_evenly(share: str) -> None:
 
 
 @pytest.mark.parametrize("answer", ["obey", "refuse", "ignore"])
-def test_a_rogue_follower(answer: OwnTicks, tmp_path: Path) -> None:
+def test_own_ticks_of_a_follower_are_counted(answer: OwnTicks, tmp_path: Path) -> None:
     found = measure_drift("ring", steps=100, rogue=0.92, answer=answer)
     assert (found.own_ticks, found.counted) == (92, 92)
     assert found.holds
@@ -83,10 +83,10 @@ def test_a_rogue_follower(answer: OwnTicks, tmp_path: Path) -> None:
     assert float(read["ratio"]) == row.ratio
 
 
-def test_a_clock_of_its_own_is_compared_with_the_masters() -> None:
+def test_the_own_clock_of_a_follower_is_compared_with_the_masters() -> None:
     rows = rows_of([0, 1, 2, 3], [7, 8, 9, 10], 0.5, [0.0, 0.4, 1.2, 1.75])
     assert [row.own_delta_s for row in rows] == [0.25]
-    found = measure_drift("ring", steps=20, pace=1e6)  # faster than any machine
+    found = measure_drift("ring", steps=20, pace=1e6)  # the pace is faster than any machine
     (row,) = found.rows
     assert (row.delta_s, found.holds) == (0.0, True)
     assert row.own_delta_s is not None
@@ -94,7 +94,7 @@ def test_a_clock_of_its_own_is_compared_with_the_masters() -> None:
     assert measure_drift("ring", steps=2).rows[0].own_delta_s is None
 
 
-def test_a_follower_that_only_follows() -> None:
+def test_a_follower_without_own_ticks_does_not_drift() -> None:
     found = measure_drift("ring", steps=40)
     assert found.holds
     assert [(row.step, row.delta_s, row.ratio) for row in found.rows] == [(40, 0.0, 1.0)]
@@ -102,6 +102,6 @@ def test_a_follower_that_only_follows() -> None:
 
 
 @pytest.mark.parametrize(("steps", "rogue"), [(0, 0.0), (10, 1.5), (10, -0.1), (10, float("nan"))])
-def test_impossible_measurements(steps: int, rogue: float) -> None:
+def test_impossible_measurements_are_refused(steps: int, rogue: float) -> None:
     with pytest.raises(ConfigError):
         measure_drift("ring", steps=steps, rogue=rogue)

@@ -25,11 +25,11 @@ def test_all_programs_step_and_end() -> None:
     assert found.facts()["ratio"] == found.ratio
 
 
-def test_the_ratio_is_that_of_the_middle_turn() -> None:
+def test_the_ratio_comes_from_the_median_turn() -> None:
     assert CoreCeiling(2, (4.0, 8.0, 6.0), (2.0, 5.0, 6.0)).ratio == 1.6
 
 
-def test_more_programs_than_worlds() -> None:
+def test_more_programs_than_worlds_are_refused() -> None:
     with pytest.raises(ConfigError, match="3 programs, 2 worlds"):
         measure_ceiling("ring", worlds=2, programs=3)
 

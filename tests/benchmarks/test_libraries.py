@@ -6,7 +6,7 @@ from benchmarks import libraries
 from benchmarks.libraries import measure
 
 
-def test_every_view_is_measured_or_says_how_to_install_it() -> None:
+def test_every_view_is_measured_or_its_extra_is_named() -> None:
     found = measure("merge", agents=3, steps=2, at_most=1e-9)
     assert [row["view"] for row in found.rows] == list(libraries.VIEWS)
     for row in found.rows:

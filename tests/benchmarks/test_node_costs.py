@@ -60,14 +60,14 @@ def test_the_parameters_are_found() -> None:
     assert costs.tick(10**6, 16, 1e-3, 64) == pytest.approx(KNOWN.tick(10**6, 16, 1e-3, 64))
 
 
-def test_negative_estimates_become_none() -> None:
+def test_negative_estimates_become_zero() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
     cheap = [replace(s, caller_s=1e-4 / max(s.nodes, 1)) for s in samples]
     assert fitted(cheap, KNOWN.caches).caller_node_s == 0.0
 
 
 def test_latency_counts_once_for_each_hop() -> None:
-    """The hops of a step of two ticks: command, one exchange per tick, one of agents, report."""
+    """A step of two ticks has five hops: command, two exchanges, exchange of agents, report."""
     for vehicles, offers in ((100, 0.0), (10**10, 1.0)):
         near, far = (KNOWN.tick(vehicles, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
         assert far - near == pytest.approx(1e-3 * (5.0 + offers) / 2.0, rel=0.05)
@@ -86,7 +86,7 @@ def test_rows_beyond_the_caches_cost_more() -> None:
     assert work(10_000, busy=2) - work(10_000) == pytest.approx(4_000 * 5e-7)
 
 
-def test_rows_that_caches_of_this_machine_hold(
+def test_the_capacity_of_caches_in_rows_is_read_from_the_system(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(node_costs, "CACHES", tmp_path)
@@ -103,7 +103,7 @@ def test_nodes_beyond_the_cores_take_turns() -> None:
 
 
 @pytest.mark.parametrize("side", [2, 3, 4])
-def test_borders_of_a_square_of_zones(side: int) -> None:
+def test_the_mean_number_of_borders_in_a_square_of_zones(side: int) -> None:
     inner = 2 * side * (side - 1)
     assert borders(side * side) == pytest.approx(2 * inner / side**2)
     assert borders(1) == 0.0
@@ -121,6 +121,6 @@ def test_too_few_runs_are_refused() -> None:
     ("vehicles", "nodes"),
     [("2500", "1,2"), ("2500,2500", "1,2"), ("100,2500", "1,2"), ("2500,9000", "2")],
 )
-def test_too_few_runs_are_refused_before_the_first(vehicles: str, nodes: str) -> None:
+def test_too_few_runs_are_refused_before_any_run(vehicles: str, nodes: str) -> None:
     with pytest.raises(ConfigError, match="two sizes of at least 400, and the nodes 1 and 2"):
         benchmark.measure(vehicles, nodes)

@@ -26,7 +26,7 @@ def test_an_empty_tick_and_a_killed_node_are_timed() -> None:
     assert [row["times"] for row in found.rows] == [1, 1, 1, 1]
 
 
-def test_two_halves_run_beside_one_another() -> None:
+def test_two_halves_of_a_city_run_at_the_same_time() -> None:
     least = PER_JUNCTION * 32
     found = node_limit.measure(vehicles=least, steps=1, repeats=1)
     assert [row["world"] for row in found.rows] == [
@@ -38,13 +38,13 @@ def test_two_halves_run_beside_one_another() -> None:
     assert all(row["cpu_ms"] > 0.0 for row in found.rows)
 
 
-def test_a_city_over_nodes_takes_turns(tmp_path: Path) -> None:
+def test_a_city_over_nodes_is_measured_in_turns(tmp_path: Path) -> None:
     least = PER_JUNCTION * 16
     latency_s = 2e-3
     with closing(WorldProcess(make_city(tmp_path, least), least, 2, latency_s)) as city:
         turn = city.turn(steps=1)
     assert turn.latency_s > latency_s / 2.0
-    assert turn.tick_s > 2.0 * latency_s  # a step of two ticks has five hops at least
+    assert turn.tick_s > 2.0 * latency_s  # a step of two ticks has at least five hops
     assert 0.0 < turn.node_s < turn.tick_s
     # The node that takes the most time need not have the most vehicles.
     assert 0.4 * least < turn.own < 0.6 * least

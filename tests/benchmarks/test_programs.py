@@ -51,7 +51,9 @@ def test_all_programs_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
         main(["nothing"])
 
 
-def test_a_program_shows_and_writes(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_program_prints_a_table_and_writes_json(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     path = tmp_path / "profile.json"
     words = ["ring", "--agents", "2", "--steps", "3", "--repeats", "1", "--json", str(path)]
     with pytest.raises(SystemExit) as ended:
@@ -63,7 +65,7 @@ def test_a_program_shows_and_writes(capsys: pytest.CaptureFixture[str], tmp_path
     assert found["hardware"]["usable_cores"] >= 1
 
 
-def test_driver_networks_are_measured_beside_torch() -> None:
+def test_driver_networks_are_compared_with_torch() -> None:
     pytest.importorskip("torch")
     found = inference.measure(rows=20, inputs=9, hidden=16, repeats=3, most_ratio=1e-6)
     assert not found.holds
@@ -73,7 +75,7 @@ def test_driver_networks_are_measured_beside_torch() -> None:
     assert inference.measure(rows=20, inputs=9, hidden=16, repeats=1).holds
 
 
-def test_a_bound_that_does_not_hold_is_exit_code_1() -> None:
+def test_a_violated_bound_gives_exit_code_1() -> None:
     def measure(say: Any) -> BenchmarkReport:
         return BenchmarkReport("a", {"name": "name"}, [{"name": "b"}], holds=False)
 
@@ -82,14 +84,14 @@ def test_a_bound_that_does_not_hold_is_exit_code_1() -> None:
     assert ended.value.code == 1
 
 
-def test_an_error_is_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_prints_one_line_and_gives_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         run(balance.measure, ["grid4x4", "--workers", "0"])
     assert ended.value.code == 2
     assert "workers = 0: must be at least 1" in capsys.readouterr().err
 
 
-def test_what_is_in_scope_holds_and_stands_on_its_page() -> None:
+def test_every_claim_of_the_scope_holds_and_is_on_the_page() -> None:
     found = scope.measure(steps=25, seed=0)
     assert [row["what"] for row in found.rows if not row["holds"]] == []
     page = Path(__file__).parents[2] / "docs/explanation/papers.md"
@@ -98,7 +100,7 @@ def test_what_is_in_scope_holds_and_stands_on_its_page() -> None:
         assert f"| {row['what']} | {row['A']} | " in text
 
 
-def test_worlds_that_move_are_measured() -> None:
+def test_worlds_that_move_between_workers_are_measured() -> None:
     small = {"worlds": 2, "lead": 4, "every": 2, "steps": 2, "repeats": 1}
     found = moving.measure("grid4x4", **small, at_least=1e9)  # type: ignore[arg-type]
     assert [row["name"] for row in found.rows] == ["fixed", "moving"]
@@ -106,7 +108,7 @@ def test_worlds_that_move_are_measured() -> None:
     assert not found.holds
 
 
-def test_weights_of_the_score_are_studied() -> None:
+def test_the_effect_of_score_weights_is_measured() -> None:
     found = selection.measure(choices=100)
     assert found.facts["choices"] == 100
     for row in found.rows:
@@ -118,7 +120,7 @@ def test_weights_of_the_score_are_studied() -> None:
 
 
 @pytest.mark.slow
-def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
+def test_a_coupled_world_is_compared_with_libsumo(tmp_path: Path) -> None:
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     found = sumo.measure("grid4x4", [tiny_file(tmp_path)], after=5, repeats=1, agents=1)
     alone, coupled = found.rows
@@ -126,14 +128,15 @@ def test_a_coupled_world_is_measured_beside_libsumo(tmp_path: Path) -> None:
     assert coupled["median_ms"] > 0.0
 
 
-def test_a_ratio_by_pairs_has_an_interval() -> None:
+def test_a_ratio_of_pairs_has_a_confidence_interval() -> None:
     turns = [1.0, 3.0, 2.0, 5.0]
     assert paired_interval([2.0 * x for x in turns], turns) == pytest.approx((2.0, 0.0))
     assert paired_interval([3.0], [2.0]) == (pytest.approx(1.5), math.inf)
     draws = random.Random(0)
     within = 0
     for _ in range(200):
-        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]  # effects on both sides
+        # One effect on both values of a pair.
+        others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]
         ones = [1.3 * x * math.exp(draws.gauss(0.0, 0.2)) for x in others]
         ratio, interval = paired_interval(ones, others)
         within += abs(ratio - 1.3) < interval
@@ -152,13 +155,13 @@ def test_channels_are_measured_on_the_same_vehicles() -> None:
     assert not found.holds
 
 
-def test_frames_of_the_viewer_are_small_and_clients_get_them() -> None:
+def test_frames_of_the_viewer_are_small_and_reach_clients() -> None:
     found = viewer.measure("ring", vehicles=10_000, clients=2, seconds=1.0, rate_hz=5.0)
     assert found.row("publishing")["kb"] <= 100.0
     assert found.row("2 clients, 5 Hz")["fps"] > 2.0
 
 
-def test_the_phases_are_the_step() -> None:
+def test_the_times_of_phases_sum_to_the_step() -> None:
     found = profile.measure("ring", worlds=2, agents=3, background=2, steps=5, repeats=2)
     phases = {row["name"]: row["ns"] for row in found.rows}
     assert {"advance", "resolve", "commit", "sense", "view"} <= set(phases)
@@ -180,7 +183,7 @@ def test_worlds_over_several_zones_are_measured() -> None:
     assert splits.split_line([few, many]) == 100
 
 
-def test_a_crowd_of_fifty_is_shared_out() -> None:
+def test_repartitioning_balances_a_crowd_of_fifty() -> None:
     settings = ["population.agents=50"]
     found = repartition.measure("rush", zones=4, every=10, steps=60, seeds=3, settings=settings)
     static, repartitioned = found.row("static"), found.row("repartitioned")

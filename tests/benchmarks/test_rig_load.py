@@ -19,7 +19,7 @@ from cavmarl.core.errors import ConfigError
 LIDAR = {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6}
 
 
-def test_a_load_is_found_beyond_which_sensors_take_much_longer_at_once(
+def test_a_load_is_found_despite_a_jump_of_the_cost(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     """Beyond the cache, sensors take 2.4 times as long, so no load lies between 10 and 24 ms."""

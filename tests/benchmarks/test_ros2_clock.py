@@ -28,7 +28,7 @@ def test_a_python_with_rclpy_must_be_named(monkeypatch: pytest.MonkeyPatch) -> N
 @pytest.mark.integration
 @pytest.mark.skipif(not os.environ.get(PYTHON), reason=f"rclpy is not installed: set {PYTHON}")
 @pytest.mark.parametrize("own_ticks", ["obey", "refuse"])
-def test_a_bridge_that_ticks_is_noticed_and_can_be_held(own_ticks: OwnTicks) -> None:
+def test_own_ticks_of_a_bridge_are_noticed_and_can_be_refused(own_ticks: OwnTicks) -> None:
     found, report = measure_ros_drift(
         SPEC, steps=100, rogue=0.92, own_ticks=own_ticks, domain=DOMAIN
     )

@@ -33,7 +33,7 @@ def found() -> SensorBench:
     )
 
 
-def test_every_run_is_on_record(found: SensorBench) -> None:
+def test_the_result_contains_every_run(found: SensorBench) -> None:
     assert sorted((turn.repeat, turn.workers) for turn in found.turns) == [(1, 1), (1, 2)]
     assert [turn.place for turn in found.turns] == [1, 2]
     assert all(len(turn.run.step_ms) == 6 for turn in found.turns)
@@ -41,7 +41,7 @@ def test_every_run_is_on_record(found: SensorBench) -> None:
     assert all(len(turn.run.digests) == 3 for turn in found.turns)
 
 
-def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> None:
+def test_the_ceiling_of_the_machine_is_measured_with_the_workers(found: SensorBench) -> None:
     if len(usable_cores()) < 2:
         assert found.ceiling is None
         return
@@ -50,7 +50,7 @@ def test_the_ceiling_of_the_machine_is_measured_beside(found: SensorBench) -> No
     assert 0.0 < found.ceiling.ratio == found.facts()["ceiling"]["ratio"]
 
 
-def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
+def test_the_parts_of_a_step_sum_to_at_most_the_step(found: SensorBench) -> None:
     # Their share is not tested here, because other programs disturb the measurement.
     for row in found.rows:
         parts = found.parts_ms(row.workers)
@@ -60,7 +60,7 @@ def test_the_parts_of_a_step_are_within_it(found: SensorBench) -> None:
         assert row.wait_ms < row.step_ms
 
 
-def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> None:
+def test_the_time_of_sumo_is_listed_separately(found: SensorBench, tmp_path: Path) -> None:
     """SUMO's step and the wait for it are listed for both kinds of coupling, and only there."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     assert found.parts_ms(1)["SUMO"] == 0.0
@@ -79,13 +79,13 @@ def test_the_time_of_sumo_is_named_apart(found: SensorBench, tmp_path: Path) -> 
         assert "SUMO" in coupled.facts()["parts_ms"][1]
 
 
-def test_resources_are_those_of_all_processes(found: SensorBench) -> None:
+def test_resources_of_all_processes_are_reported(found: SensorBench) -> None:
     ticks = 6 * found.turns[0].run.ticks_per_step
     for number in (1, 2):
         (window,) = found.windows(number)
         assert window.steps == 6
         assert len(window.worker_cpu_s) == len(window.worker_rss_mb) == number
-        assert window.messages == 2 * number * ticks  # both directions
+        assert window.messages == 2 * number * ticks  # messages in both directions
         assert window.got_bytes > 6 * 32 * 18 * 3
 
 
@@ -104,7 +104,7 @@ def test_the_result_is_json_with_every_sensor(found: SensorBench) -> None:
     assert found.rows[0].ci95_between_runs is None
 
 
-def test_the_rig_of_ten_lists_what_it_is() -> None:
+def test_the_description_of_the_rig_lists_ten_sensors() -> None:
     rig = load_rig(find_settings("rig", "ten_sensors"))
     config, _ = load_config("grid4x4", overrides={"rig": rig})
     told = describe_rig(config)
@@ -137,7 +137,7 @@ def test_the_program_writes_every_step_and_a_figure(
 
 
 @pytest.mark.parametrize("option", ["--csv", "--plot", "--json"])
-def test_files_are_tried_before_any_work(
+def test_an_unwritable_file_is_refused_before_any_work(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], option: str
 ) -> None:
     missing = tmp_path / "missing" / "x.png"

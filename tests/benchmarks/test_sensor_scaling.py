@@ -53,21 +53,21 @@ def test_the_printed_gains_are_reproduced(printed: list[ScalingRow]) -> None:
     assert [row.step_gain_pct for row in printed[:3]] == [0.0, -46.00, -54.58]
 
 
-def test_figures_are_not_rounded_unless_asked_for() -> None:
+def test_figures_are_rounded_only_on_request() -> None:
     efficiencies = [round(row.efficiency_pct, 2) for row in scaling_table(MEASURED)]
     assert efficiencies == [100.0, 92.59, 73.39, 49.13]
 
 
-def test_the_best_is_marked_and_need_not_be_the_last(printed: list[ScalingRow]) -> None:
+def test_the_best_row_is_marked_and_need_not_be_the_last(printed: list[ScalingRow]) -> None:
     assert [row.is_best for row in printed] == [False, False, True, False]
 
 
-def test_only_what_was_measured_is_in_the_table(printed: list[ScalingRow]) -> None:
+def test_the_table_has_only_measured_numbers_of_workers(printed: list[ScalingRow]) -> None:
     assert [row.workers for row in scaling_table(MEASURED[::2])] == [1, 3]
 
 
 @given(st.lists(st.tuples(times, times), min_size=1, max_size=6))
-def test_figures_belong_together(drawn: list[tuple[float, float]]) -> None:
+def test_figures_of_a_row_agree_with_each_other(drawn: list[tuple[float, float]]) -> None:
     measured = [
         Measured(n, max(pair), 0.1 * max(pair), min(pair)) for n, pair in enumerate(drawn, 1)
     ]
@@ -86,13 +86,13 @@ def test_figures_belong_together(drawn: list[tuple[float, float]]) -> None:
 
 
 @given(st.lists(st.lists(times, min_size=3, max_size=3), min_size=1, max_size=MIN_RUNS + 2))
-def test_spread_within_runs_and_between_them(drawn: list[list[float]]) -> None:
+def test_spreads_within_runs_and_between_runs(drawn: list[list[float]]) -> None:
     (row,) = summarize({2: [Series(run, [0.5 * step for step in run]) for run in drawn]})
     means = [statistics.fmean(run) for run in drawn]
     variances = [statistics.variance(run) for run in drawn]
     assert row.step_ms == pytest.approx(statistics.fmean(means))
     assert row.wait_ms == pytest.approx(0.5 * row.step_ms)
-    rounding = 1e-12 * row.step_ms  # error of the mean of equal times
+    rounding = 1e-12 * row.step_ms  # rounding error of the mean of equal times
     assert row.sd_within_run == pytest.approx(statistics.fmean(variances) ** 0.5, abs=rounding)
     if len(drawn) < MIN_RUNS:
         assert row.ci95_between_runs is None
@@ -103,7 +103,7 @@ def test_spread_within_runs_and_between_them(drawn: list[list[float]]) -> None:
     assert row.ci95_between_runs.low == pytest.approx(row.step_ms - half, abs=1e-9 * half)
 
 
-def test_runs_that_differ_in_the_mean_do_not_widen_the_spread_within() -> None:
+def test_different_means_of_runs_do_not_change_the_spread_within_runs() -> None:
     (row,) = summarize({1: [Series([10.0, 12.0], [1.0, 1.0]), Series([90.0, 92.0], [1.0, 1.0])]})
     assert row.sd_within_run == pytest.approx(2.0**0.5)
 

@@ -29,7 +29,7 @@ def make(demand: Path) -> Callable[[int], Simulation]:
     return world_maker("grid4x4", [demand], seconds=60, seed=1)
 
 
-def test_the_phases_are_the_tick(make: Callable[[int], Simulation]) -> None:
+def test_the_times_of_phases_sum_to_the_tick(make: Callable[[int], Simulation]) -> None:
     found = measure_sharding(make, [4, 2], after_s=20, repeats=2)
     assert [row["zones"] for row in found.rows] == [1, 2, 4]
     assert found.facts["state_hash"] == _at_end(make, 40).state_hash()
@@ -58,7 +58,7 @@ def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulati
     assert four["migration_us"] is not None
 
 
-def test_agents_are_driven_and_their_policy_is_no_phase() -> None:
+def test_agents_are_driven_and_their_policy_is_not_a_phase() -> None:
     make = world_maker("ring", agents=3, background=2, seconds=60)
     (found,) = measure_sharding(make, [1], after_s=1, repeats=1).rows
     assert found["vehicles"] == 5.0
@@ -66,7 +66,7 @@ def test_agents_are_driven_and_their_policy_is_no_phase() -> None:
     assert found["phases"]["sense"] > 0.0
 
 
-def test_what_the_monitor_costs_is_measured_on_request(
+def test_the_cost_of_the_monitor_is_measured_on_request(
     make: Callable[[int], Simulation], demand: Path
 ) -> None:
     checked = world_maker(

@@ -1,4 +1,4 @@
-"""Maps that draw roads over each other, or have lanes too short for a lane change."""
+"""Detection of maps with overlapping roads, or with lanes too short for a lane change."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_both_directions_on_one_lane_share_their_ground(
 
 
 @pytest.mark.parametrize(("apart_m", "meet"), [(2.0, True), (12.0, False)])
-def test_two_junctions_share_the_ground_of_the_ways_over_them(
+def test_close_junctions_share_the_ground_of_their_internal_lanes(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
     """Two bends lie back to back: from west to south, and from east to north."""
@@ -50,7 +50,7 @@ def test_two_junctions_share_the_ground_of_the_ways_over_them(
 
 
 @pytest.mark.parametrize(("apart_m", "meet"), [(0.0, True), (12.0, False)])
-def test_a_road_over_a_junction_elsewhere_shares_its_ground(
+def test_a_road_over_another_junction_shares_ground_with_it(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
     """The road passes the outer side of a bend."""

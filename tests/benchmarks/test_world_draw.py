@@ -39,7 +39,7 @@ def first_with(*features: str) -> WorldDraw:
     return next(draw for draw in draw_all() if set(features) <= set(draw.features))
 
 
-def test_a_world_is_a_function_of_its_seed_and_of_what_is_left_out() -> None:
+def test_a_world_is_a_function_of_its_seed_and_its_excluded_features() -> None:
     assert draw_world(7) == draw_world(7)
     assert draw_world(7, ("lefthand",)) == draw_world(7, ("lefthand",))
     assert len({draw_world(seed).net.options for seed in range(50)}) > 40
@@ -68,7 +68,7 @@ def test_a_world_has_one_of_each_kind_of_feature() -> None:
         assert not plain or not set(features) & set(SHARES)
 
 
-def test_narrow_places_leave_the_other_worlds_as_they_are() -> None:
+def test_leaving_out_narrow_places_does_not_change_other_worlds() -> None:
     narrow = [draw for draw in draw_all() if draw.net.kind in NARROW]
     assert 0.05 < len(narrow) / len(SEEDS) < 0.15
     others = {draw.seed: draw for draw in draw_all(tuple(NARROW))}
@@ -127,7 +127,8 @@ def test_a_cut_is_a_piece_of_a_real_map(tmp_path: Path) -> None:
     draw = first_with("cut")
     net, routes = make_files(draw, tmp_path, SECONDS, cut_maps(None))
     west, south, east, north = load_network(net).extent_m
-    reach = 2.0 * draw.net.length_m + 600.0  # edges that begin inside end where they end
+    # An edge that begins inside the cut may end outside of it.
+    reach = 2.0 * draw.net.length_m + 600.0
     assert east - west < reach
     assert north - south < reach
     assert "<vehicle " in routes.read_text()

@@ -48,18 +48,18 @@ def a_row(seed: int = 0, **ours: Any) -> Row:
     return own | {"ours": FIGURES | ours, "sumo": FIGURES, "sumo_spread": SPREAD}
 
 
-def test_a_deviation_is_ours_over_the_mean_of_sumos_seeds() -> None:
+def test_a_deviation_is_relative_to_the_mean_of_sumos_seeds() -> None:
     assert deviation(a_row(mean_speed_mps=11.5), "mean_speed_mps") == pytest.approx(0.15)
     assert deviation(a_row(arrived=60), "arrived") == pytest.approx(-0.25)
     assert deviation(a_row(mean_delay_s=None), "mean_delay_s") is None
 
 
-def test_worlds_that_differ_by_design_are_identified_by_their_features() -> None:
+def test_worlds_that_differ_by_design_are_not_comparable() -> None:
     rows = [a_row() | {"features": ["grid", name]} for name in ("priority_stop", "stub_lanes")]
     assert comparable(rows) == rows[:1]
 
 
-def test_near_is_within_a_share_or_sumos_own_spread() -> None:
+def test_a_metric_is_near_within_a_share_or_within_sumos_spread() -> None:
     assert in_spread(a_row(mean_speed_mps=9.0), "mean_speed_mps")
     assert not in_spread(a_row(mean_speed_mps=8.9), "mean_speed_mps")
     assert is_near(a_row(mean_speed_mps=8.9), "mean_speed_mps", 0.15)
@@ -70,18 +70,18 @@ def test_near_is_within_a_share_or_sumos_own_spread() -> None:
 @pytest.mark.parametrize(
     ("delay_s", "near"), [(23.0, True), (25.0, True), (25.1, False), (14.9, False), (None, False)]
 )
-def test_a_delay_is_near_by_share_or_by_seconds(delay_s: float | None, near: bool) -> None:
+def test_a_delay_is_near_within_a_share_or_some_seconds(delay_s: float | None, near: bool) -> None:
     assert is_delay_near(a_row(mean_delay_s=delay_s)) == near
 
 
-def test_a_lock_counts_where_sumo_has_none() -> None:
+def test_a_deadlock_counts_if_sumo_has_none() -> None:
     assert has_own_lock(a_row(longest_lock_s=121.0))
     assert not has_own_lock(a_row(longest_lock_s=120.0))
     both = a_row(longest_lock_s=200.0) | {"sumo_spread": SPREAD | {"longest_lock_s": [9.0, 121.0]}}
     assert not has_own_lock(both)
 
 
-def test_sumos_seeds_are_set_beside_one_another_as_ours_are_beside_them() -> None:
+def test_each_seed_of_sumo_is_compared_with_the_others_as_our_seeds_are() -> None:
     row = a_row() | {"sumo_spread": SPREAD | {"arrived": [100, 104, 120]}}
     peers = sumo_beside_itself(row)
     assert [peer["ours"]["arrived"] for peer in peers] == [100, 104, 120]
@@ -110,13 +110,13 @@ def test_the_summary_of_hand_made_rows() -> None:
     assert summary([failed]) == {"worlds": 1, "failed": 1}
 
 
-def test_the_worst_are_failed_ones_then_contacts_then_speeds() -> None:
+def test_the_worst_worlds_are_failures_then_contacts_then_speed_deviations() -> None:
     rows = [a_row(0), a_row(1, mean_speed_mps=6.0), a_row(2, contacts=1)]
     rows.append({"seed": 3, "features": [], "error": "x"})
     assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
 
 
-def test_the_table_of_the_worst_keeps_its_words_whole_on_a_narrow_terminal(tmp_path: Path) -> None:
+def test_the_table_of_the_worst_breaks_no_word_on_a_narrow_terminal(tmp_path: Path) -> None:
     features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
     row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
     console = Console(width=80, record=True)
@@ -147,7 +147,7 @@ def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     return ran
 
 
-def test_a_run_goes_on_where_it_ended_and_keeps_the_files_of_the_worst(
+def test_a_run_resumes_and_keeps_the_files_of_the_worst_worlds(
     tmp_path: Path, stubbed: list[int]
 ) -> None:
     told: list[tuple[int, int]] = []
@@ -184,7 +184,7 @@ def test_a_broken_row_is_named(tmp_path: Path) -> None:
         (("--out", "/proc/nowhere"), "/proc/nowhere: cannot be written"),
     ],
 )
-def test_bad_input_is_one_line(
+def test_errors_of_bad_input_have_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], says: str
 ) -> None:
     out = () if "--out" in words else ("--out", str(tmp_path))

@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
 
 
-def test_trips_on_a_good_map_hold() -> None:
+def test_the_bound_holds_on_a_good_map() -> None:
     found = yardstick.measure(["merge"], agents="2", models="IDM", seconds=30)
     assert found.holds
     (own, total) = found.rows
@@ -30,7 +30,7 @@ def test_trips_on_a_good_map_hold() -> None:
     assert own["off_road"] == own["collision"] == own["stands"] == 0
 
 
-def test_maps_have_their_names_without_folders_unless_two_are_alike() -> None:
+def test_labels_of_maps_are_file_names_or_paths_if_two_are_equal() -> None:
     here, there = "/some/long/folder/Town01.xodr", "/another/Town01.net.xml"
     assert yardstick.labels(["town", here]) == {"town": "town", here: "Town01"}
     assert yardstick.labels([here, there]) == {here: here, there: there}
@@ -87,7 +87,7 @@ def test_a_broken_bound_is_reported() -> None:
     assert not one.holds
 
 
-def test_a_vehicle_that_stands_has_a_cause_at_red_and_behind_another() -> None:
+def test_vehicles_that_stand_at_red_or_behind_another_vehicle_have_a_cause() -> None:
     world = load_world("grid4x4", agents=2, background=0)
     vec = CavVectorEnv(LocalWorlds(world, 1))
     vec.reset(seed=1)

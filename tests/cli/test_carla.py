@@ -15,7 +15,7 @@ from cavmarl.cli import main
 COMMAND = [sys.executable, "-m", "cavmarl", "carla", "grid4x4", "--agents", "2", "--port", "0"]
 
 
-def test_it_listens_until_it_is_interrupted() -> None:
+def test_the_server_listens_until_it_is_interrupted() -> None:
     # In the background of a shell, SIGINT is ignored, here and in children.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True)

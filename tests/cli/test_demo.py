@@ -40,7 +40,7 @@ def run(*words: str) -> int:
 
 
 def trains_at_once(command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
-    """Put a trained driver where the training program would write one; run other programs."""
+    """Replace the training program: copy a trained driver to its output; run other programs."""
     if Path(command[1]).name != "ppo.py":
         return RUN(command, **options)
     words = dict(zip(command[2::2], command[3::2], strict=True))
@@ -79,7 +79,7 @@ class Printed:
         self.text += " ".join(map(str, parts)) + "\n"
 
 
-def test_it_estimates_its_duration_before_it_trains(
+def test_the_demo_estimates_its_duration_before_it_trains(
     made: tuple[Path, dict[str, Any], str],
 ) -> None:
     _, document, text = made
@@ -89,7 +89,7 @@ def test_it_estimates_its_duration_before_it_trains(
     assert "300,000 decisions" in text[training:]
 
 
-def test_it_compares_four_drivers_in_the_same_episodes(
+def test_the_demo_compares_four_drivers_in_the_same_episodes(
     made: tuple[Path, dict[str, Any], str],
 ) -> None:
     folder, document, _ = made
@@ -99,7 +99,7 @@ def test_it_compares_four_drivers_in_the_same_episodes(
     assert (next(folder.glob("evaluation-*")) / "failures.html").is_file()
 
 
-def test_its_page_has_the_story_the_pictures_and_the_commands(
+def test_the_page_has_the_story_the_pictures_and_the_commands(
     made: tuple[Path, dict[str, Any], str],
 ) -> None:
     folder, document, _ = made
@@ -112,7 +112,7 @@ def test_its_page_has_the_story_the_pictures_and_the_commands(
     assert page.index('id="compared"') < page.index('id="results"')
 
 
-def test_it_names_all_packages_that_are_missing(
+def test_the_demo_names_all_missing_packages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr("cavmarl.core.errors.find_spec", lambda _: None)
@@ -133,7 +133,7 @@ def test_it_names_all_packages_that_are_missing(
         ((0.94, 0.95), (None, 12.0), "cannot be compared"),
     ],
 )
-def test_the_story_says_what_was_measured(
+def test_the_story_has_the_measured_figures(
     success: tuple[float, float], delay: tuple[float | None, float], words: str
 ) -> None:
     found: Any = {
@@ -154,7 +154,7 @@ def test_the_environment_of_the_demo_is_in_the_package() -> None:
 
 
 @pytest.mark.slow
-def test_it_trains(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_demo_trains_a_driver(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "EPISODES", 1)
     monkeypatch.setattr(demo, "MEASURED", 20_000)
     document = tmp_path / "demo.json"

@@ -40,7 +40,7 @@ def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         ("scenario run cut_in --picture a.png", "'pygame' is", "render"),
     ],
 )  # fmt: skip
-def test_a_command_names_all_that_it_lacks(
+def test_a_command_names_all_its_missing_modules(
     bare: Path, words: str, modules: str, extras: str
 ) -> None:
     with pytest.raises(MissingExtraError) as refusal:

@@ -34,7 +34,7 @@ def test_each_entry_has_a_sentence(path: Path) -> None:
     assert not set("[]`*") & set(found)
 
 
-def test_an_entry_without_a_sentence_has_its_path(tmp_path: Path) -> None:
+def test_an_entry_without_a_docstring_is_described_by_its_path(tmp_path: Path) -> None:
     script = tmp_path / "mine.py"
     assert sentence_about(tmp_path) == str(tmp_path)
     script.write_text("def make_policy(env): ...")
@@ -82,7 +82,9 @@ def test_kilometres_without_an_infraction_are_a_lower_bound() -> None:
     assert driver_cell(metric, report(km_per_infraction=None)) == "-"
 
 
-def test_an_environment_is_shown_twice(capsys: pytest.CaptureFixture[str]) -> None:
+def test_two_viewers_of_one_environment_share_an_address(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     pytest.importorskip("starlette")
     env: Any = cavmarl.parallel_env("ring", agents=1)
     env.reset(seed=0)

@@ -26,7 +26,7 @@ COMMANDS = dict(commands())
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_help_ends_with_examples_that_are_understood(words: str) -> None:
+def test_help_ends_with_valid_examples(words: str) -> None:
     title, *examples = COMMANDS[words].epilog.split("\n\n")
     assert title == "Examples:"
     assert examples
@@ -35,7 +35,7 @@ def test_help_ends_with_examples_that_are_understood(words: str) -> None:
         check_command(line[line.index("cavmarl") :])
 
 
-def test_submit_promises_only_what_a_service_takes() -> None:
+def test_the_help_of_submit_offers_no_files_or_folders() -> None:
     """A service refuses files, folders and modules of its callers."""
     command = COMMANDS["cavmarl submit"]
     options = {word for one in command.params for word in one.opts}
@@ -59,6 +59,18 @@ def test_help_describes_the_value_of_each_option(words: str) -> None:
             assert not value or "|" in value or not value.startswith("<"), (
                 f"{parameter.name}: name the value"
             )
+
+
+@pytest.mark.parametrize("words", COMMANDS)
+def test_flags_have_no_value_and_optional_arguments_one_pair_of_brackets(
+    words: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit):
+        COMMANDS[words](["--help"])
+    shown = capsys.readouterr().out
+    assert "--help" in shown
+    assert "<bool>" not in shown
+    assert "[[" not in shown
 
 
 def test_the_commands_are_grouped_by_task(capsys: pytest.CaptureFixture[str]) -> None:

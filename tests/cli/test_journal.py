@@ -64,7 +64,7 @@ def test_a_dropped_incomplete_line_is_named(
     assert "is cut short" in said
 
 
-def test_damage_and_unknown_ticks_are_one_line(
+def test_errors_of_damage_and_unknown_ticks_have_one_line(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert "tick 99 was not committed" in refusal(capsys, "journal", str(written), "--at", "99")

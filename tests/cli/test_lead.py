@@ -1,4 +1,4 @@
-"""`cavmarl lead` continues, whatever a follower sends."""
+"""`cavmarl lead` continues for any bytes that a follower sends."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def led(address: Path, fault: Callable[[str], None], *words: str) -> int:
         while True:
             try:
                 return fault(str(address))
-            except Exception as error:  # it got the reason, or called before the world listened
+            except Exception as error:  # the world refused the follower, or did not listen yet
                 if "does not answer (" not in str(error):
                     return None
             time.sleep(0.01)

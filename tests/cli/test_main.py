@@ -74,7 +74,7 @@ def test_an_unknown_command_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> 
     assert "No such command" in refusal(capsys, "evalute")
 
 
-def test_list_shows_what_there_is(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_list_shows_all_entries(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     path = tmp_path / "list.json"
     assert run("list", "--json", str(path)) == 0
     shown = capsys.readouterr().out
@@ -163,7 +163,7 @@ def test_verify_takes_the_zones_of_a_file(
     assert "has 3 zones; use 3" in refusal(capsys, *words, "--zones", "4")
 
 
-def test_verify_fails_and_names_the_first_difference_of_each(
+def test_verify_fails_and_names_the_first_difference_of_each_division(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 1.0)
@@ -271,7 +271,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("list", "--json", "/dev/null/list.json"), "cannot be written"),
     ],
 )
-def test_wrong_use_is_one_line_and_exit_code_2(
+def test_wrong_use_prints_one_line_and_exits_with_2(
     capsys: pytest.CaptureFixture[str],
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
@@ -284,7 +284,7 @@ def test_wrong_use_is_one_line_and_exit_code_2(
 
 
 @pytest.mark.parametrize("command", COMMANDS)
-def test_a_json_path_is_tried_before_any_work(
+def test_an_unwritable_json_path_is_refused_before_any_work(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, command: str
 ) -> None:
     network = tmp_path / "broken.net.xml"
@@ -314,14 +314,14 @@ def test_a_json_path_is_tried_before_any_work(
         (("scenario", "run", "nowhere"), "--picture"),
     ],
 )
-def test_other_files_are_tried_before_any_work_too(
+def test_other_unwritable_files_are_refused_before_any_work(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, words: tuple[str, ...], option: str
 ) -> None:
     missing = tmp_path / "missing" / "x.png"
     assert f"{option} {missing}: cannot be written" in refusal(capsys, *words, option, str(missing))
 
 
-def test_trying_a_json_path_leaves_no_trace(
+def test_checking_a_json_path_creates_no_file(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     new, old = tmp_path / "new.json", tmp_path / "old.json"
@@ -361,7 +361,7 @@ def test_the_package_runs_as_a_program() -> None:
     assert "merge" in out.stdout
 
 
-def test_an_error_is_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_error_is_printed_as_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert run("evaluate", "nowhere") == 2
     said = capsys.readouterr()
     assert said.err.startswith("error: no environment")
@@ -369,7 +369,7 @@ def test_an_error_is_one_red_line(capsys: pytest.CaptureFixture[str]) -> None:
     assert not said.out.strip()
 
 
-def test_view_films_a_drive(tmp_path: Path) -> None:
+def test_view_writes_a_video(tmp_path: Path) -> None:
     pytest.importorskip("imageio_ffmpeg")
     video, stats = tmp_path / "film.mp4", tmp_path / "stats.json"
     words = ("view", "merge", "--seconds", "1.5", "--video", str(video), *QUICK)
@@ -403,7 +403,7 @@ def test_train_lists_its_programs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_train_runs_a_program_with_its_own_options(
     config: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The program is found outside of the checkout, whatever the working directory contains."""
+    """The program is found outside of the checkout, for any content of the working directory."""
     ran: list[str] = []
     monkeypatch.setattr("os.execv", lambda _, words: ran.extend(words))
     (tmp_path / "train").mkdir()

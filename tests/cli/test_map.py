@@ -42,7 +42,7 @@ def test_build_names_its_target_after_the_source(
     assert (tmp_path / "laufamholz.net.xml").exists()
 
 
-def test_build_lists_what_was_dropped(shared_maps: Path, tmp_path: Path) -> None:
+def test_build_lists_dropped_elements(shared_maps: Path, tmp_path: Path) -> None:
     source = str(shared_maps / "xodr" / "newmarket.xodr")
     out = str(tmp_path / "out.net.xml")
 
@@ -88,7 +88,7 @@ def test_check_fails_on_a_map_that_cannot_be_driven(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("box", ["1,2,3", "a,b,c,d", ""])
-def test_a_malformed_box_is_wrong_use(shared_maps: Path, tmp_path: Path, box: str) -> None:
+def test_a_malformed_box_is_refused(shared_maps: Path, tmp_path: Path, box: str) -> None:
     source = str(shared_maps / "xodr" / "fabriksgatan.xodr")
 
     result = runner.invoke(app, ["build", source, "-o", str(tmp_path / "x.net.xml"), "--bbox", box])
@@ -97,7 +97,9 @@ def test_a_malformed_box_is_wrong_use(shared_maps: Path, tmp_path: Path, box: st
 
 
 @pytest.mark.parametrize("name", ["x.txt", "x.xml", "x", "x.net.xml.bz2"])
-def test_a_network_has_a_networks_name(tmp_path: Path, name: str) -> None:
+def test_a_network_file_without_the_suffix_of_networks_is_refused(
+    tmp_path: Path, name: str
+) -> None:
     source, out = tmp_path / "source.osm", tmp_path / name
     source.write_text("<osm/>")
     result = runner.invoke(app, ["build", str(source), "-o", str(out)])
@@ -166,7 +168,7 @@ def test_zones_are_cut_written_and_read_again(shared_maps: Path, tmp_path: Path)
     assert json.loads(again.read_text()) == found
 
 
-def test_zones_narrower_than_the_halo_are_noted(shared_maps: Path) -> None:
+def test_zones_narrower_than_the_halo_are_reported(shared_maps: Path) -> None:
     source = str(shared_maps / "net" / "Town10HD.net.xml")
     words = ["zones", source, "--layout", "strips", "--count", "3", "--halo", "200"]
     assert "narrower than the halo of 200 m: zones 1;" in runner.invoke(app, words).output
@@ -200,7 +202,7 @@ def test_more_zones_than_the_map_can_hold_are_refused(shared_maps: Path) -> None
 
 
 @pytest.mark.parametrize("command", ["check", "zones"])
-def test_an_entry_is_taken_by_its_name(command: str) -> None:
+def test_commands_accept_the_name_of_an_environment(command: str) -> None:
     result = runner.invoke(app, [command, "grid4x4"])
     assert result.exit_code == 0, result.output
     assert "grid4x4" in result.output or "map" in result.output

@@ -12,7 +12,7 @@ from tests.cli.test_main import refusal, run
 QUICK = ("--steps", "5", "--before", "1", "--agents", "2", "--background", "8")
 
 
-def test_a_plan_is_printed_kept_and_made_again(
+def test_a_plan_is_printed_stored_and_recomputed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "plan.json"

@@ -53,7 +53,7 @@ def test_an_uncommon_exception_of_a_policy_shows_its_lines(
     _see_the_one_line(capsys.readouterr().err)
 
 
-def test_a_fault_of_a_policy_in_a_process_of_verify_determinism_does_too(
+def test_a_process_of_verify_determinism_shows_the_lines_of_the_policy(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     script = policy_that(tmp_path, "return 1 / 0")
@@ -66,7 +66,7 @@ def test_a_fault_of_a_policy_in_a_process_of_verify_determinism_does_too(
     _see_the_one_line(capsys.readouterr().err)
 
 
-def test_actions_that_cannot_be_taken_name_their_driver(
+def test_the_error_for_invalid_actions_names_the_driver(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     script = policy_that(tmp_path, "return observations[0]")

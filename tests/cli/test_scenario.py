@@ -17,7 +17,7 @@ def code(*words: str) -> int:
     return int(end.value.code or 0)
 
 
-def test_the_list_names_all_with_their_parameters(
+def test_the_list_has_all_scenarios_with_their_parameters(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code("scenario", "list", "--json", str(tmp_path / "list.json")) == 0
@@ -71,7 +71,7 @@ def test_a_sweep_prints_which_drivers_pass_on_each_map(
     assert code(*words, "--seeds", "1", "--fails", "idm") == 1
 
 
-def test_a_run_is_played_to_several_agents(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_scenario_runs_for_several_agents(capsys: pytest.CaptureFixture[str]) -> None:
     assert code("scenario", "run", "signal_outage", "--agents", "2") == 0
     said = capsys.readouterr().out
     assert "passed, passed" in said

@@ -53,7 +53,7 @@ def _text(node: ast.AST) -> str:
     return "".join(map(_text, ast.iter_child_nodes(node)))
 
 
-def test_each_command_of_a_cure_is_there_and_has_its_options(errors: list[tuple[str, str]]) -> None:
+def test_each_suggested_command_exists_with_its_options(errors: list[tuple[str, str]]) -> None:
     found = 0
     for place, text in errors:
         for first, second, rest in _COMMAND.findall(text):
@@ -65,7 +65,7 @@ def test_each_command_of_a_cure_is_there_and_has_its_options(errors: list[tuple[
     assert found > 5
 
 
-def test_each_option_of_a_cure_is_one_of_a_command_or_a_program(
+def test_each_suggested_option_belongs_to_a_command_or_a_program(
     errors: list[tuple[str, str]],
 ) -> None:
     programs = "".join(path.read_text("utf-8") for path in (PACKAGE / "learning").glob("*.py"))
@@ -81,7 +81,7 @@ def test_each_option_of_a_cure_is_one_of_a_command_or_a_program(
     assert found > 50
 
 
-def test_each_variable_of_a_cure_is_read(errors: list[tuple[str, str]]) -> None:
+def test_each_suggested_environment_variable_is_read(errors: list[tuple[str, str]]) -> None:
     texts = [path.read_text("utf-8") for path in PACKAGE.rglob("*.py")]
     variables = set(re.findall(r"CAVMARL_[A-Z_]+", str(errors)))
     assert variables

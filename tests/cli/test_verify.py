@@ -102,7 +102,7 @@ def test_a_campaign_prints_and_writes_its_figures(
     assert re.search(rf"injected faults +{figures['faults']}", said)
 
 
-def test_a_wrong_run_is_done_again_by_the_command_that_is_printed(
+def test_the_printed_command_repeats_a_wrong_run(
     capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("cavmarl.parallel.nodes.node_watch.PONG_S", 0.01)

@@ -30,7 +30,7 @@ def refusal(folder: Path, text: str | bytes) -> str:
     return message
 
 
-def test_the_shortest_file_is_a_name_and_a_map(tmp_path: Path) -> None:
+def test_the_shortest_file_has_a_name_and_a_map(tmp_path: Path) -> None:
     config = load(tmp_path, MINIMAL)
     assert (config.name, config.map.source) == ("mine", "m.net.xml")
 
@@ -53,7 +53,7 @@ terms: {weights: {progress: 1}, team_share: 1}
     assert config.terms.weights == {"progress": 1.0}
 
 
-def test_reading_again_gives_the_present_file(tmp_path: Path) -> None:
+def test_reading_again_returns_the_present_content(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text("a: [1, 2]")
     first = read_yaml(path)

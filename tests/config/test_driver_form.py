@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_form_of_a_trained_driver_is_that_of_its_file(name: str) -> None:
+def test_the_form_of_a_trained_driver_comes_from_its_file(name: str) -> None:
     raw = json.loads((TRAINED[name] / "config.json").read_text())
     defaults = {"sensors": asdict(SensorsConfig()), "action": asdict(ActionConfig())}
     form = form_of_driver(name)
@@ -56,7 +56,7 @@ def test_the_form_of_a_trained_driver_is_that_of_its_file(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_an_environment_with_the_form_differs_in_no_key(name: str) -> None:
+def test_an_environment_with_the_form_of_a_driver_differs_in_no_key(name: str) -> None:
     home = json.loads((TRAINED[name] / "config.json").read_text())["environment"]
     form = form_of_driver(name)
     config, _ = load_config(home, overrides=with_sensors_of(None, name))
@@ -80,7 +80,7 @@ def test_actions_have_the_keys_of_their_kind() -> None:
     assert kinds["grid"] == {"kind", *scales, "grid_throttle", "grid_steering"}
 
 
-def test_shared_and_shielded_policies_count_as_their_drivers() -> None:
+def test_drivers_of_shared_and_shielded_policies_are_listed() -> None:
     assert drivers_in("merge_ippo+shielded:idm+blind") == ["merge_ippo", "idm", "blind"]
     assert list(forms_in(["idm+merge_ippo", "shielded:merge_ippo"])) == ["merge_ippo"]
     assert form_of_driver("shielded:merge_ippo+idm") == form_of_driver("merge_ippo")
@@ -103,7 +103,7 @@ def test_the_error_for_different_forms_names_the_keys() -> None:
 
 
 @pytest.mark.parametrize("name", ["idm", "idm+random_actions", "shielded:never_yield"])
-def test_scripts_bring_no_sensors(name: str) -> None:
+def test_scripts_have_no_form(name: str) -> None:
     with pytest.raises(
         PolicyError, match=r"is a script.*accepts those of the env.*cities_residual"
     ):
@@ -170,7 +170,7 @@ def test_overrides_that_contradict_a_form_are_refused(overrides: dict[str, Any])
         {"action.out_of_range": "clip"},
     ],
 )
-def test_other_overrides_stay(overrides: dict[str, Any] | None) -> None:
+def test_overrides_of_other_keys_are_kept(overrides: dict[str, Any] | None) -> None:
     before = None if overrides is None else dict(overrides)
     assert with_form(overrides, FORM, "mine") == {**(overrides or {}), **FORM}
     assert overrides == before
@@ -196,7 +196,7 @@ def test_a_spec_keeps_the_sensors_as_overrides() -> None:
     assert WorldSpec(**json.loads(json.dumps(asdict(spec)))).env == "ring"
 
 
-def test_a_world_gets_the_sensors_of_the_drivers_and_reports_it(
+def test_a_world_gets_the_sensors_of_the_drivers_and_logs_them(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     spec = WorldSpec.of("ring", agents=2)

@@ -93,7 +93,7 @@ def test_all_commands_that_make_worlds_import_plugins(words: tuple[str, ...]) ->
     assert (code, said.count("there is no module 'absent'")) == (2, 1), said
 
 
-def test_processes_of_a_suite_import_plugins_too() -> None:
+def test_processes_of_a_suite_import_plugins() -> None:
     Path("own.yaml").write_text("maps: [ring]\n", encoding="utf-8")
     words = ["-n", "1", "-r", "2", "--out", "found"]
     code, said = run("suite", "own.yaml", "--import", "my_plugin", *words)
@@ -165,7 +165,7 @@ def test_a_plugin_that_cannot_be_imported(module: str, text: str | None, message
         CliRunner().invoke(app, ["plan", "ring", "--import", module], catch_exceptions=False)
 
 
-def test_a_name_is_one_function() -> None:
+def test_a_second_function_for_a_registered_name_is_refused() -> None:
     def one(view: cavmarl.AgentView) -> float:
         return 1.0
 
@@ -181,7 +181,7 @@ def test_a_name_is_one_function() -> None:
         cavmarl.register_term("plugged", lambda view: 0.0)
 
 
-def test_a_notebook_defines_its_function_again() -> None:
+def test_a_notebook_can_redefine_its_function() -> None:
     for weight in (1.0, 2.0):
         names: dict[str, object] = {"__name__": "notebook"}
         exec(f"def constant(view):\n    return {weight}", names)
@@ -189,7 +189,7 @@ def test_a_notebook_defines_its_function_again() -> None:
     assert REGISTERED_TERMS["plugged"].function(None) == 2.0
 
 
-def test_a_backend_name_is_one_function() -> None:
+def test_a_second_backend_for_a_registered_name_is_refused() -> None:
     registry = extensions.REGISTERED_BACKENDS
     cavmarl.register_backend("plugged", lambda *_: None)  # type: ignore[arg-type]
     with pytest.raises(ConfigError, match=r"backend 'plugged': already registered"):

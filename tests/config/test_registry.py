@@ -74,7 +74,7 @@ def test_a_bare_map_file_gets_a_default_environment(here: Path, suffix: str) -> 
     assert resolve_map(config, base_dir) == path
 
 
-def test_the_error_for_an_unknown_name_names_the_nearest_and_all(here: Path) -> None:
+def test_the_error_for_an_unknown_name_lists_the_nearest_name_and_all_names(here: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match=r"'twon'; did you mean town\?") as told:
         load_config("twon")
     assert str(told.value).split("Environments: ")[1].split(", ") == sorted(entries())
@@ -129,7 +129,7 @@ def test_a_key_cannot_be_given_twice() -> None:
         load_config("ring", max_cycles=3, overrides={"horizon_s": 4})
 
 
-def test_an_override_cannot_go_through_a_value() -> None:
+def test_an_override_of_a_key_inside_a_value_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"horizon_s\.minutes: horizon_s has no keys inside"):
         load_config("ring", overrides={"horizon_s.minutes": 1})
 
@@ -181,7 +181,7 @@ def test_agents_are_single_files_and_folders_with_weights(here: Path) -> None:
 
 
 @pytest.mark.parametrize("written", ["play.py", "play.py/", "play.py/.", "./play.py//"])
-def test_a_folder_of_data_runs_no_code(here: Path, written: str) -> None:
+def test_an_env_file_cannot_name_code_to_run(here: Path, written: str) -> None:
     name = f"cool/{written}"
     entry = make_entry(
         here / "mine", f"name: mine\nmap: {{source: m.net.xml}}\nscenario: {{name: {name}}}\n"

@@ -1,4 +1,4 @@
-"""Removed keys and options are refused with one line that says what replaced them."""
+"""Removed keys and options are refused with one line that names their replacement."""
 
 from __future__ import annotations
 

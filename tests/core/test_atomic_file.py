@@ -59,7 +59,7 @@ def test_the_next_draft_removes_drafts_of_killed_processes_only(
             process.communicate()
 
 
-def test_a_draft_that_is_locked_is_not_removed_within_one_process_either(tmp_path: Path) -> None:
+def test_a_locked_draft_of_the_same_process_is_not_removed(tmp_path: Path) -> None:
     with draft_folder(tmp_path) as first, draft_folder(tmp_path) as second:
         assert _drafts(tmp_path) == {first, second}
     assert not _drafts(tmp_path)
@@ -103,7 +103,7 @@ def test_a_draft_that_is_removed_before_its_lock_is_made_again(
         assert folder.is_dir()
 
 
-def test_without_locks_a_file_is_written_and_no_draft_is_taken_for_dead(
+def test_without_locks_files_are_written_and_no_draft_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def none(*_: object) -> None:

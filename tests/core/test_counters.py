@@ -13,7 +13,9 @@ def test_a_second_begins_in_some_world(ticks: list[int], expected: bool) -> None
 
 @pytest.mark.parametrize("tick", [4, 20])
 @pytest.mark.parametrize("through", [[[0, 0], [0, 0]], [[0, 0], [3, 0]]])
-def test_occasions_before_the_exchange(tick: int, through: list[list[int]]) -> None:
+def test_begun_seconds_and_arrived_vehicles_are_noticed(
+    tick: int, through: list[list[int]]
+) -> None:
     found = occasions(np.array([tick, 7]), 10, np.array(through))
     assert found == (tick == 20, bool(np.any(through)))
 

@@ -78,7 +78,7 @@ def fill(x: Numbers, y: Numbers, out: Numbers) -> None:
 
 
 def compiled(x: Numbers, y: Numbers) -> Numbers:
-    """Return what `fill` writes, (n, 16)."""
+    """Return the rows that `fill` writes, (n, 16)."""
     out = np.zeros((len(x), 16))
     fill(x, y, out)
     return out
@@ -92,7 +92,7 @@ def plain(x: float, y: float) -> list[float]:
 
 
 def bits(numbers: Any) -> list[int]:
-    """Return the bits of numbers; those of every NaN are the same."""
+    """Return the bits of numbers; every NaN has the same bits."""
     values = np.array(numbers, np.float64)
     values[np.isnan(values)] = np.nan
     return values.view(np.int64).tolist()  # type: ignore[no-any-return]
@@ -142,7 +142,7 @@ def test_arrays_keep_their_shape_and_their_content() -> None:
 @example(value=math.inf)
 @example(value=-math.inf)
 @example(value=math.nan)
-def test_results_are_those_of_the_c_library_but_for_rounding(name: str, value: float) -> None:
+def test_results_equal_the_c_librarys_except_for_rounding(name: str, value: float) -> None:
     with np.errstate(all="ignore"):
         expected = math.erf(value) if name == "erf" else float(getattr(np, _NUMPY[name])(value))
     found = FUNCTIONS[name](value)

@@ -63,7 +63,7 @@ def test_project_equals_twin(corners: NDArray[np.float64], x: float, y: float) -
     clamped = min(max(s, 0.0), length)
     foot = naive.lane_pose(corners, clamped)
     assert math.hypot(x - foot[0], y - foot[1]) == pytest.approx(distance, abs=1e-9)
-    # Equally near places may differ in `s` where rounding tells them apart.
+    # If two places are equally near, rounding decides which `s` is found.
     assert clamped == pytest.approx(nearest_s, abs=1e-6) or clamped > nearest_s
     if 0.0 <= s <= length:
         assert abs(d) == pytest.approx(distance, abs=1e-9)
@@ -88,7 +88,7 @@ def test_project_ties_go_to_the_smaller_s() -> None:
     assert geometry.project(points, 0, 4, 40.0, 5.0) == (40.0, 5.0, 1.0, 0.0)
 
 
-def test_project_near_stays_on_its_branch() -> None:
+def test_project_near_a_given_s_stays_on_the_same_side_of_a_u_turn() -> None:
     points = points_of(U_TURN)
     s, d, cos, _ = geometry.project_near(points, 0, 4, 40.0, 4.0, 160.0, 20.0)
     assert (s, d, cos) == (170.0, 6.0, -1.0)

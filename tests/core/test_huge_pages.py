@@ -34,7 +34,7 @@ def test_records_in_huge_pages_are_aligned() -> None:
         assert array.ctypes.data % 64 == 0
 
 
-def test_a_copy_has_every_byte_and_may_be_written_as_before() -> None:
+def test_a_copy_has_every_byte_and_the_same_write_protection() -> None:
     """Padding is copied too, because hashes of maps include it."""
     array = np.frombuffer(bytes(range(256)) * 16 * 64, dtype=RECORD)
     copy = huge_copy(array)

@@ -1,4 +1,4 @@
-"""Calls of compiled kernels: arguments of any type, results, and what a call refers to."""
+"""Calls of compiled kernels: arguments of any type, results, and released arguments."""
 
 from __future__ import annotations
 
@@ -101,7 +101,7 @@ def test_a_record_is_read_in_place() -> None:
     assert [read_record(record) for record in records] == [10.5, 21.5, 32.5]
 
 
-def test_arguments_may_be_named_and_left_out() -> None:
+def test_arguments_can_be_named_or_have_defaults() -> None:
     assert with_defaults(1) == 101.0
     assert with_defaults(1, 2) == 71.0
     assert with_defaults(c=1.0, a=3) == 153.0
@@ -127,7 +127,7 @@ def test_a_call_refers_to_no_array_afterwards(call: Any) -> None:
     assert gone() is None
 
 
-def test_an_array_that_has_changed_in_place_is_read_anew() -> None:
+def test_changes_of_an_array_are_read_in_the_next_call() -> None:
     call = specialized(total_of)
     values = np.ones(4)
     assert call(values) == 4.0
@@ -156,7 +156,7 @@ def test_threads_call_one_kernel_at_the_same_time() -> None:
     assert not wrong
 
 
-def test_a_specialized_kernel_does_the_same_with_other_arrays_of_the_same_types() -> None:
+def test_a_specialized_kernel_works_on_other_arrays_of_the_same_types() -> None:
     call = specialized(rise)
     for number in (1, 3):
         counts = np.arange(number)
@@ -219,7 +219,7 @@ def test_arguments_have_the_same_type_exactly_if_numba_agrees() -> None:
         (np.arange(3), 0.5),
     ],
 )
-def test_another_type_is_an_error_and_nothing_is_written(other: Any) -> None:
+def test_an_argument_of_another_type_is_an_error_and_nothing_is_written(other: Any) -> None:
     call = specialized(rise)
     call(Pair(np.arange(2), 0.5), 1)
     before = other[0].copy()
@@ -232,7 +232,7 @@ def test_another_type_is_an_error_and_nothing_is_written(other: Any) -> None:
 
 
 @compiled_only
-def test_an_array_that_cannot_be_written_is_an_error_where_the_first_one_could() -> None:
+def test_a_read_only_array_in_place_of_a_writable_one_is_an_error() -> None:
     call = specialized(rise)
     call(Pair(np.arange(2), 0.5), 1)
     counts = np.arange(2)

@@ -34,7 +34,7 @@ from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.linking import link
 
 compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-pytestmark = pytest.mark.integration  # the linker runs as a process
+pytestmark = pytest.mark.integration  # building starts the linker as a process
 
 NAME = "cavmarl.core.math.bearings.rough_atan2"
 TYPES = "float64;float64"
@@ -55,7 +55,7 @@ def copied(built: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Reset the memory of this process about the sources of kernels, before and after the test."""
+    """Clear the cached sources of kernels in this process, before and after the test."""
     for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch
@@ -69,7 +69,7 @@ def _digest() -> str:
 
 
 @compiled_only
-def test_a_kernel_of_the_library_computes_what_numba_compiles(built: Path) -> None:
+def test_a_kernel_of_the_library_gives_the_results_of_numba(built: Path) -> None:
     found = Library(built).find(NAME, TYPES, _digest())
     assert found is not None
     words = Words(3)
@@ -80,7 +80,7 @@ def test_a_kernel_of_the_library_computes_what_numba_compiles(built: Path) -> No
 
 
 @compiled_only
-def test_a_kernel_of_other_types_or_other_sources_is_not_in_the_library(built: Path) -> None:
+def test_a_kernel_with_other_types_or_sources_is_not_found(built: Path) -> None:
     opened = Library(built)
     assert opened.find(NAME, "float64;int64", _digest()) is None
     assert opened.find(NAME, TYPES, "0" * 16) is None
@@ -177,7 +177,9 @@ def test_without_a_library_kernels_are_compiled_or_refused(
 
 
 @compiled_only
-def test_prebuilt_refuses_what_the_library_lacks(copied: Path, anew: pytest.MonkeyPatch) -> None:
+def test_in_mode_prebuilt_a_missing_kernel_is_refused(
+    copied: Path, anew: pytest.MonkeyPatch
+) -> None:
     anew.setattr(Library.__init__, "__defaults__", (copied,))
     anew.setenv("CAVMARL_KERNELS", "prebuilt")
     function: Any = rough_atan2
@@ -238,7 +240,7 @@ def test_each_call_of_the_list_can_be_made_again() -> None:
     assert not can_be_made(KernelCall(name, json.dumps([departures, worlds]))), "another bundle"
 
 
-def test_a_plain_world_needs_some_of_them() -> None:
+def test_kernels_of_a_plain_world_are_marked_in_the_list() -> None:
     names = {call.name.rpartition(".")[2] for call in read_manifest() if call.is_plain}
     assert {"advance_each", "sense_each", "populate"} <= names
     assert "mirror" not in names
@@ -253,7 +255,7 @@ def test_the_list_is_written_as_it_is_read(tmp_path: Path) -> None:
 
 
 @compiled_only
-def test_calls_from_the_package_are_recorded_and_those_of_tests_are_not(
+def test_calls_from_the_package_are_recorded_but_not_calls_from_tests(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from cavmarl.core.math import rng
@@ -284,7 +286,7 @@ def test_calls_from_the_package_are_recorded_and_those_of_tests_are_not(
         ("<f8[1C]", "<f8[1C unaligned]", False),
     ],
 )
-def test_code_takes_arrays_that_it_makes_no_assumption_about(
+def test_code_accepts_arrays_that_satisfy_its_assumptions(
     compiled: str, called: str, fits: bool
 ) -> None:
     assert accepts(compiled, called) == fits
@@ -299,7 +301,7 @@ def test_calls_that_differ_in_read_only_arrays_are_compiled_once() -> None:
 
 
 @compiled_only
-def test_a_read_only_array_is_taken_by_code_that_does_not_write_to_it() -> None:
+def test_code_that_does_not_write_accepts_a_read_only_array() -> None:
     @kernel
     def total(values: Any) -> float:
         found = 0.0

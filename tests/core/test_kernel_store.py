@@ -54,7 +54,7 @@ def test_every_folder_of_kernels_is_read() -> None:
     assert {"core.math.rng", "core.records.codes", "core.compiled.compiler"} <= SOURCES.keys()
 
 
-def test_a_change_moves_the_kernels_that_call_what_has_changed_and_no_others(
+def test_a_change_affects_only_kernels_that_call_the_changed_code(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     before = _digests(monkeypatch)
@@ -135,7 +135,7 @@ def _adder(step: Any) -> Any:
 
 
 @compiled_only
-def test_values_that_a_function_closes_over_are_part_of_what_is_kept(
+def test_values_that_a_function_closes_over_are_part_of_the_cache_key(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
@@ -143,7 +143,7 @@ def test_values_that_a_function_closes_over_are_part_of_what_is_kept(
     assert len(list(tmp_path.rglob("*.kernel"))) == 2
 
 
-def test_a_function_that_closes_over_an_object_is_not_kept() -> None:
+def test_a_function_that_closes_over_an_object_is_not_cached() -> None:
     file = KernelFile(_adder(object()), "int64")
     assert file.load() is None
     with file.locked():
@@ -166,7 +166,7 @@ print(rough_atan2(1.0, 2.0))
 
 
 @compiled_only
-def test_of_processes_that_need_a_kernel_at_once_one_compiles_it(tmp_path: Path) -> None:
+def test_if_several_processes_need_a_kernel_only_one_compiles_it(tmp_path: Path) -> None:
     environment = {
         **os.environ,
         "CAVMARL_CACHE_DIR": str(tmp_path),

@@ -32,7 +32,7 @@ def test_an_array_is_a_view_of_the_file_and_not_copied(tmp_path: Path) -> None:
     assert (array.reshape(-1) == NUMBERS[2:]).all()
 
 
-def test_other_arrays_belong_to_no_file() -> None:
+def test_arrays_that_are_not_mapped_belong_to_no_file() -> None:
     assert file_of(NUMBERS) is None
     assert file_of(huge_copy(NUMBERS)) is None
 

@@ -74,7 +74,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
         assert ids == again
 
 
-def test_equal_distances_are_ordered_by_id_and_other_levels_left_out() -> None:
+def test_equal_distances_are_ordered_by_id_and_other_road_levels_are_ignored() -> None:
     rows = vehicles(
         [(0.0, 0.0, 0.0), (9.0, 0.0, 0.0), (0.0, 9.0, 0.0), (-9.0, 0.0, 0.0), (0.0, 5.0, 0.0)],
         id=[4, 9, 2, 7, 1],
@@ -83,7 +83,7 @@ def test_equal_distances_are_ordered_by_id_and_other_levels_left_out() -> None:
     assert nearest(rows, 0, 9.0, 2) == [(81.0, 2), (81.0, 3)]
 
 
-def test_searches_need_no_vehicle_at_the_place() -> None:
+def test_a_search_works_at_a_place_without_a_vehicle() -> None:
     rows = vehicles([(1.0, 0.0, 0.0)])
     out_row, out_squared = np.zeros(4, np.int32), np.zeros(4)
     assert k_nearest(grid_of(rows), -1, 0.0, 0.0, 0.0, 5.0, 4, out_row, out_squared) == 1

@@ -37,7 +37,7 @@ def test_prefetching_changes_no_result(ahead: int, stride: int) -> None:
     assert records.tobytes() == before
 
 
-def test_an_array_without_records_has_places_too() -> None:
+def test_prefetching_an_empty_array_has_no_effect() -> None:
     assert total(np.zeros(0, dtype=RECORD), np.zeros(0, dtype=np.int64), 5) == 0.0
 
 

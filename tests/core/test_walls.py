@@ -1,4 +1,4 @@
-"""Lines of sight are blocked exactly if a test of every wall says so."""
+"""A line of sight is blocked if and only if a test of every wall finds a wall on it."""
 
 from __future__ import annotations
 

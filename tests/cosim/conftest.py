@@ -69,7 +69,7 @@ def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Follo
 def seated(
     world: FollowedWorld, vehicles: list[str], name: str = "driver", secret: str = ""
 ) -> Follower:
-    """Return a follower of this process, which has joined."""
+    """Return a follower in this process that has joined the world."""
     found: list[Follower] = []
     caller = threading.Thread(
         target=lambda: found.append(Follower(world.address, vehicles, name, 10.0, secret))

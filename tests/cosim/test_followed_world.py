@@ -101,14 +101,14 @@ def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, st
         world.reset(seed=1)
         found = hashes(world, 4)
         ids = sorted(env.simulation.vehicles()["id"].tolist())
-        start(lambda: drive(address, []))  # it follows the clock only
+        start(lambda: drive(address, []))  # this follower drives no vehicle
         world.wait_for(1, 10.0)
         found += hashes(world, 4)
         assert sorted(env.simulation.vehicles()["id"].tolist()) == ids
         start(lambda: drive(address, ["car_1"]))
         world.wait_for(2, 10.0)
         world.step()
-        assert world.seats[0].answers == 2  # for this frame and the next
+        assert world.seats[0].answers == 2  # an answer to this frame and one to the next
     assert found == reference(8, {})
 
 
@@ -226,7 +226,7 @@ def test_the_end_of_an_episode_is_shown_and_needs_no_answer(address: Path, start
         ({"car_0": [0.0, 0.0], "car_1": [0.0, 0.0]}, "car_1, which is not in the frame"),
     ],
 )
-def test_bad_controls_are_refused_and_the_world_goes_on(
+def test_bad_controls_are_refused_and_the_world_continues(
     address: Path, start: Start, controls: dict[str, Any], match: str
 ) -> None:
     told = []
@@ -269,7 +269,7 @@ def test_bad_controls_can_be_held_and_counted(address: Path, start: Start) -> No
 
 
 @pytest.mark.parametrize("own_ticks", ["refuse", "ignore"])
-def test_own_ticks_of_a_follower_change_nothing(
+def test_own_ticks_of_a_follower_do_not_change_the_world(
     address: Path, start: Start, own_ticks: Any
 ) -> None:
     refused = []
@@ -318,7 +318,7 @@ def test_a_vehicle_has_one_follower(address: Path) -> None:
                 assert match in outcome[0]
 
 
-def test_answers_to_other_frames(address: Path) -> None:
+def test_answers_to_other_frames_are_dropped_or_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address, timeout_s=1.0) as world:
         line = call(address, 10.0)
         line.say(Say.HELLO, Hello("x", ["car_0"]))

@@ -121,14 +121,14 @@ def test_garbage_is_refused(raw: bytes) -> None:
         read(raw)
 
 
-def test_a_frame_that_is_cut_short() -> None:
+def test_a_frame_that_is_cut_short_is_refused() -> None:
     whole = sent_bytes(arrays=ARRAYS)
     for size in range(0, len(whole), 7):
         with pytest.raises(EOFError):
             read(whole[:size])
 
 
-def test_other_versions_and_sizes() -> None:
+def test_frames_of_other_versions_or_sizes_are_refused() -> None:
     whole = sent_bytes(arrays=ARRAYS)
     with pytest.raises(MessageError, match="version 9"):
         read(whole[:4] + b"\x09" + whole[5:])

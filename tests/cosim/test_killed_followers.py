@@ -46,7 +46,7 @@ def test_followers_are_killed_at_random_ticks(address: Path) -> None:
             assert lost == 1
             assert world.seats == ()
             assert [world.master.world_ticks[0], world.master.drifts] == [STEPS, 0]
-            # It has driven up to the step in which it died, which used its last controls.
+            # The killed follower drove up to the step of its death, which used its last controls.
             driven = reference(STEPS, {"car_0": None})
             assert found[: death + 1] == driven[: death + 1]
             assert found[death + 1 :] != driven[death + 1 :] or death == STEPS - 1

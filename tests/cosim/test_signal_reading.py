@@ -19,7 +19,7 @@ AIR = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.inbox.signals"
 
 
 def looks(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]]:
-    """Return the received signal states of car_0 and the true ones, over some steps."""
+    """Return the received and the true signal states of car_0, over some steps."""
     env = cavmarl.parallel_env(
         "grid4x4", agents=2, background=0, workers=workers, overrides=AIR | more
     )
@@ -48,7 +48,7 @@ def test_received_signal_states_equal_the_signals() -> None:
         equal += int((heard == told).all())
         assert ToldSignals().read({}, told) is told
         seen |= set(told[told != SIGNAL_NONE].tolist())
-    assert len(seen) > 1  # red and green
+    assert len(seen) > 1  # both red and green occurred
     assert equal > 0.6 * len(found)
 
 
@@ -69,7 +69,7 @@ def test_a_signal_that_is_not_heard_is_red() -> None:
     assert (stage.read({}, None) == heard).all()
 
 
-def test_signals_out_of_reach_are_red_and_near_ones_are_heard() -> None:
+def test_signals_out_of_reach_are_red_and_near_signals_are_received() -> None:
     found = looks(**{"v2x.channel.range_m": 150.0})
     readings, told, env = found[-1]
     heard = SpatSignals(HdMap(env.network)).read(readings, None)
@@ -86,7 +86,7 @@ def test_without_messages_there_is_no_spat() -> None:
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
 def test_the_stack_stops_at_red_with_each(stage: str) -> None:
-    """Without any state of a signal, `spat` stops, and `told` follows the right of way."""
+    """If a signal has no state, `spat` makes the stack stop, and `told` uses the right of way."""
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.stack.route_planning import LaneRoute
     from cavmarl.cosim.stack.stack_types import EgoPose, Mission

@@ -72,7 +72,7 @@ def test_a_bend_of_50_m_is_held_at_8_mps(vclass: str, length_m: float, bound_m: 
     ring = Trajectory(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), 0.0)
     mission = Mission(0, vclass, length_m, 2.4)
     control = PurePursuit(TICK_S)
-    x, y, heading, speed = 0.0, -radius - 0.5, 0.0, 8.0  # half a metre off
+    x, y, heading, speed = 0.0, -radius - 0.5, 0.0, 8.0  # starts half a metre off the circle
     off = []
     for _ in range(600):
         driven = control.control(EgoPose(x, y, heading, speed), ring, mission)

@@ -156,7 +156,7 @@ class WallClock:
         self.time_s += seconds
 
 
-def test_real_time_waits_and_measures_how_late_it_is() -> None:
+def test_real_time_pacing_waits_and_measures_delays() -> None:
     wall = WallClock()
     pacer = RealTime(2.0, wall.now, wall.pass_by)
     starts = []
@@ -232,7 +232,7 @@ def test_an_action_takes_effect_after_the_latency() -> None:
         assert throttles[1] < -1.0
 
 
-def test_worlds_of_worker_processes_have_a_master_too() -> None:
+def test_worlds_of_worker_processes_have_a_master() -> None:
     found = []
     for workers in (0, 2):
         vec = cavmarl.make_vec("ring", num_envs=2, workers=workers, agents=2, background=2)

@@ -176,7 +176,7 @@ def test_a_follower_with_invalid_messages_is_dropped(
         wire.close()
 
 
-def test_a_hello_for_too_many_is_refused(address: Path) -> None:
+def test_a_hello_with_too_many_vehicles_is_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         line = FollowerConnection(call(address), "world")
         line.say(Say.HELLO, Hello("greedy", ["car_0"] * 5000))

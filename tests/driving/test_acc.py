@@ -20,7 +20,7 @@ from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, set_model
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5
 START_MPS, START_GAP_M, LIMIT_MPS = 20.0, 22.5, 30.0
 SPEED_MPS, GAP_M = 0.2, 0.3  # largest differences of any vehicle in any step
-MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # means of these differences
+MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # mean differences
 
 # Run in a child process: a process can load libsumo only once.
 RUN = """

@@ -51,7 +51,9 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
 
 
 @pytest.mark.parametrize("stand", [False, True])
-def test_every_link_lists_the_vehicles_on_it_and_before_it(world: Simulation, stand: bool) -> None:
+def test_every_link_lists_the_vehicles_on_the_link_and_before_its_line(
+    world: Simulation, stand: bool
+) -> None:
     """Vehicles that cannot move are listed as well."""
     travel, roads = world.travel, world.network
     for step in range(0, 12, 2):

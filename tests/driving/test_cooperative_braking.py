@@ -17,7 +17,7 @@ FREE = 2.0  # m/s², acceleration without cooperative braking
 
 
 def crossing() -> tuple[int, int, list[int]]:
-    """Find a lane, its left neighbour, and the lanes that lead over a junction to that one."""
+    """Find a lane, its left neighbour, and the lanes that lead over a junction to the neighbour."""
     roads = network(NAME)
     for lane, row in enumerate(roads.lanes):
         left = int(row["left"])

@@ -15,7 +15,7 @@ OVER_M = 1.5
 
 
 def test_a_car_that_creeps_over_a_red_line_waits_for_green() -> None:
-    """All cars creep where they should stand at lines, until their fronts are well beyond."""
+    """All cars creep at lines instead of standing, until their fronts are well beyond the lines."""
     vec = cavmarl.make_vec(
         "grid4x4",
         agents=12,

@@ -98,7 +98,7 @@ def queue(crossing: Callable[[str], Path]) -> Callable[..., Queue]:
         ("WSE", LEFT, True),  # a left turn from the east yields to the vehicle from the west
     ],
 )
-def test_a_deadlock_leads_back_to_the_own_lane(
+def test_a_chain_of_waiting_vehicles_is_a_deadlock_if_it_returns_to_the_own_lane(
     queue: Callable[..., Queue], arms: str, goals: dict[str, str], circle: bool
 ) -> None:
     assert queue(arms, goals).is_circle() == circle

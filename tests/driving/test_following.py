@@ -167,7 +167,7 @@ def test_a_follower_stops_behind_a_leader_that_brakes_hard(name: str) -> None:
 
 
 @given(allowed=SPEEDS, further=st.floats(-40.0, 40.0), gap=st.floats(-2.0, 2.4), share=SHARES)
-def test_close_behind_a_standing_leader_a_driver_waits_whatever_is_ahead(
+def test_close_behind_a_standing_leader_a_driver_ignores_other_constraints(
     allowed: float, further: float, gap: float, share: float
 ) -> None:
     # For this reason, `drivers` does not look further ahead.

@@ -33,7 +33,7 @@ from tests.support.traffic import on_lane, travel
 
 __all__ = ["crossing"]
 
-SPEED_MPS = 10.0  # of both vehicles; it is also the speed limit
+SPEED_MPS = 10.0  # speed of both vehicles, and the speed limit
 HALF_M = 2.5
 FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
 
@@ -129,7 +129,7 @@ def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
 def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # It needs over a second to the area. A vehicle that has started goes on.
+    # The vehicle needs over a second to the area. A vehicle that has started continues.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -157,7 +157,7 @@ def test_a_foe_that_stays_on_the_junction_blocks_others(
     )
 
 
-def test_a_foe_on_a_separate_path_counts_only_before_its_line(
+def test_a_foe_on_a_separate_path_blocks_only_before_its_line(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
     assert blocks(0.2, "enter", -6.0)

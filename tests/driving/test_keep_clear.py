@@ -73,7 +73,7 @@ def ahead(folder: Path, light: int, *, may_block: bool = False, apart_m: float =
 
 
 def is_blocked(scene: Ahead, *others: tuple[float, float, int]) -> bool:
-    """Return whether cars (place, speed, reason to stop) on the road between block the way."""
+    """Return whether cars (place, speed, reason to stop) between the signals block the way."""
     network = scene.network
     goal = network.edge_ids.index("jw2")
     travel = travel_by(make_plans(network, [goal]))
@@ -108,7 +108,7 @@ def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_pat
 def test_on_a_road_shorter_than_a_vehicle_red_blocks(
     tmp_path: Path, light: int, blocked: bool
 ) -> None:
-    # At green it cannot wait on that road until others let it turn, so it does not wait before.
+    # At green, a vehicle that is too long to wait on that road need not wait before it either.
     assert is_blocked(ahead(tmp_path, light, apart_m=14.0)) == blocked
 
 

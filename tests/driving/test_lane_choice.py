@@ -44,7 +44,7 @@ def test_each_further_lane_change_has_its_own_room(
 
 @pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
 def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> None:
-    """Whether such a leader is known depends on the zones."""
+    """Whether a driver knows of such a leader depends on the division into zones."""
     roads = network("merge")
     tables = travel("merge")._replace(view_m=view_m)
     lane = int(roads.lanes["length_m"].argmax())
@@ -76,7 +76,7 @@ def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> 
 def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
     driver: int, length_m: float, waits: bool
 ) -> None:
-    """On lanes too short for two cars, it changes where it waits."""
+    """On lanes too short for two cars, a vehicle changes lanes at the place where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
@@ -100,8 +100,10 @@ def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
     ("driver", "speed", "stays"),
     [(DRIVER_AGENT, 1.1, True), (DRIVER_AGENT, 0.9, False), (DRIVER_BACKGROUND, 0.9, True)],
 )
-def test_a_slow_steered_vehicle_changes_lanes_there(driver: int, speed: float, stays: bool) -> None:
-    """On a lane of 20 m, the place where it waits to change is that close to the junction."""
+def test_a_slow_steered_vehicle_may_change_lanes_close_to_a_junction(
+    driver: int, speed: float, stays: bool
+) -> None:
+    """On a lane of 20 m, a vehicle that waits for a lane change stands close to the junction."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed
@@ -130,7 +132,7 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
 
 @pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
 def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, safe: bool) -> None:
-    """Krauss's model brakes to its speed within a reaction time, whatever the gap: -3.5 m/s²."""
+    """Krauss's model brakes to its safe speed within a reaction time, for any gap: -3.5 m/s²."""
     roads, types = network("merge"), generated_types().copy()
     set_model(types, MODEL_KRAUSS)
     types["tau"] = 1.0

@@ -38,12 +38,12 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
     roads, plans, tables = world.network, world.plans, world.travel
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
-    assert plans["link"][goal, right] >= 0, "its lane continues as well"
+    assert plans["link"][goal, right] >= 0, "the lane of the car continues as well"
     assert [misses_last_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
     inside = int(roads.links["first_internal"][plans["link"][goal, right]])
     assert not misses_last_change(roads.arrays, tables, inside, way)
 
-    rows = world.vehicles(0)  # side by side before the end
+    rows = world.vehicles(0)  # two cars side by side before the lane end
     end = float(roads.lanes["length_m"][right])
     for row, lane in zip(rows, (right, left), strict=True):
         put(world, row, lane, end - 16.0, 8.0, goal)
@@ -71,7 +71,7 @@ def test_a_steered_car_stops_at_its_lane_end_until_its_front_has_left(
 
 
 def test_a_steered_car_changes_lanes_slowly_near_the_end_of_its_lane(tmp_path: Path) -> None:
-    """At a higher speed it would be too late for the change, brake, and start again."""
+    """At a higher speed, the car would be too late for the change, brake, and start again."""
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
     rows = world.vehicles(0)
     end = float(world.network.lanes["length_m"][right])
@@ -162,7 +162,7 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
 
 
 @pytest.mark.parametrize(("askew", "hidden"), [(0.5, False), (0.5, True), (0.0, False)])
-def test_a_car_that_sticks_out_beyond_the_border_of_a_lane_is_a_leader(
+def test_a_car_that_reaches_over_the_border_of_a_lane_is_a_leader(
     askew: float, hidden: bool
 ) -> None:
     """`hidden`: another car stands straight behind it on its lane."""

@@ -25,7 +25,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
 def test_a_fast_vehicle_brakes_early_for_a_vehicle_that_turns_into_its_lane(
     merging: bool, front_m: float
 ) -> None:
-    # If only the shared area counted, it would brake too late.
+    # If only the shared area counted, the vehicle would brake too late.
     roads, kind = network("intersection"), generated_types()[0]
     own = np.repeat(np.arange(len(roads.links)), roads.links["num_conflicts"])
     picked = int(np.flatnonzero(roads.conflicts["merging"] == merging)[0])

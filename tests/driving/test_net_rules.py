@@ -81,11 +81,11 @@ def test_a_yielding_driver_can_stop_until_it_sees_its_foes(
     limit = float(network.lanes["speed_mps"].max())
     assert minor == slows or junctions == "priority"
     assert (slowest < 0.75 * limit) == minor
-    assert slowest > 1.0, "there is no foe, so it need not stop"
+    assert slowest > 1.0, "without a foe, the car need not stop"
 
 
 def test_a_left_turn_approaches_its_waiting_position_ready_to_stop(tmp_path: Path) -> None:
-    """As in SUMO: it is slowest 4.5 m before the position, where it sees that there is no foe."""
+    """As in SUMO, the car is slowest 4.5 m before the position, where it sees that no foe comes."""
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", "traffic_light")
     network = read_network(path)
     links = network.links

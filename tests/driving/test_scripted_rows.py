@@ -97,7 +97,7 @@ def test_an_actor_waits_for_its_cue_and_then_walks() -> None:
 
 
 def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, float]]:
-    """Twin of `Shadows`: for each lane, the range that a fine grid of points of a body covers."""
+    """Return the range of each lane that a body covers, by a fine grid of points of the body."""
     found: dict[int, list[float]] = {}
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
     lanes, room_m = ROADS.lanes, 3.0 + row["length"]
@@ -130,10 +130,10 @@ def entries(
     }
 
 
-def test_drivers_see_a_body_on_every_lane_that_it_covers_or_soon_will() -> None:
+def test_drivers_see_a_body_on_every_lane_that_it_covers_now_or_soon() -> None:
     tables, rows = scripted(crossing())
     row = rows[0]
-    assert entries(tables, rows) == {}  # it waits beside the road
+    assert entries(tables, rows) == {}  # the actor waits beside the road
     soon = round(FORESIGHT_S / DT)
     for ticks in (2, 20, 40, 40, 60):
         follow(tables, row, True, ticks)
@@ -232,12 +232,12 @@ def test_cues_come_at_their_time_or_when_an_agent_is_near() -> None:
     assert told(7) == [7, 7]
     rows["x"][1, 0, 0] = 50.0
     assert told(8) == [7, 7]
-    rows["driver"][0, 0, 2] = DRIVER_AGENT  # not one of the owned rows
+    rows["driver"][0, 0, 2] = DRIVER_AGENT  # the row of a ghost
     came[:] = -1
     assert told(2) == [-1, -1]
 
 
-def test_arcs_turn_about_one_place() -> None:
+def test_arcs_turn_about_one_centre() -> None:
     for turn, backwards in ((1.0, False), (-0.7, False), (1.2, True), (-2.0, True)):
         line = arc((3.0, 4.0, 0.4), 5.0, turn, backwards=backwards)
         assert line[0] == pytest.approx([3.0, 4.0, 0.4])

@@ -9,7 +9,7 @@ import pytest
 from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from tests.support.netgenerate import netconvert
 
-JUNCTION_M = 8.0  # length of an edge that the junctions at its ends take
+JUNCTION_M = 8.0  # the junctions at both ends shorten an edge by this length
 NODES = """<nodes><node id="w" x="-100" y="0"/><node id="u" x="0" y="100"/>
 <node id="j" x="0" y="0" type="unregulated"/><node id="k" x="{x}" y="0" type="unregulated"/>
 <node id="n" x="{x}" y="100"/><node id="e" x="{east}" y="0"/></nodes>"""
@@ -45,5 +45,5 @@ def test_on_a_short_lane_a_vehicle_changes_when_it_can(tmp_path: Path, length_m:
         for row in world.vehicles():
             if row["lane"] == lane:
                 stood = max(stood, float(row["wait_s"]))
-    assert stood > 5.0, "the adjacent lane was not free at once"
-    assert len(world.vehicles()) == 0, "both have arrived"
+    assert stood > 5.0, "at first, the adjacent lane was occupied"
+    assert len(world.vehicles()) == 0, "both vehicles have arrived"

@@ -61,7 +61,7 @@ def test_a_corner_over_the_adjacent_lane_leaves_no_room(
 def test_a_vehicle_between_lanes_moves_until_it_would_touch(
     d: float, speed: float, stays: bool
 ) -> None:
-    """It comes from the right; a corner of the bus on the left lane is over the middle lane."""
+    """The car comes from the right. The bus on the left lane has a corner over the middle lane."""
     roads, tables = network("merge"), travel("merge")
     _, middle, left = lanes()
     own = on_lane(roads, middle, 40.0, tables, id=0, length=5.0, width=1.8, d=d, speed=speed,

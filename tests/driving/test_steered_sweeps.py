@@ -50,7 +50,7 @@ def test_rows_of_background_vehicles_stay_unchanged(path: Path, network: RoadNet
     assert len(network.sweeps) > len(plain.sweeps)
     for name in ("swept_m", "fork_m", "num_conflicts", "wait_m"):
         np.testing.assert_array_equal(network.links[name], plain.links[name])
-    again = load_steered(path)  # from the cache
+    again = load_steered(path)  # read from the cache
     assert again.sweeps.tobytes() == network.sweeps.tobytes()
 
 
@@ -67,7 +67,9 @@ def test_each_area_of_two_steered_cars_has_a_row_on_both_links(network: RoadNetw
 
 
 @pytest.mark.parametrize("agents", [0, 1])
-def test_maps_of_worlds_without_agents_have_no_such_rows(path: Path, agents: int) -> None:
+def test_maps_of_worlds_without_agents_have_no_rows_of_steered_cars(
+    path: Path, agents: int
+) -> None:
     roads = load_world(str(path), agents=agents, background=4).network
     assert (roads.sweeps["own"] == STEERED).any() == (agents > 0)
 

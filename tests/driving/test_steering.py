@@ -115,9 +115,9 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
     ("speed", "d", "askew", "straightens"),
     [
         (0.3, -0.5, 0.6, True),  # the front would be beyond the far side of the lane
-        (0.3, -0.5, 0.4, False),  # it has room to reach the middle
+        (0.3, -0.5, 0.4, False),  # the car has room to reach the middle
         (0.3, -1.5, 0.5, False),
-        (8.0, -0.5, 0.6, True),  # at this speed it returns anyway
+        (8.0, -0.5, 0.6, True),  # at this speed, the controller straightens the car anyway
     ],
 )
 def test_a_slow_car_that_changes_lanes_keeps_its_front_on_the_lane(

@@ -59,9 +59,9 @@ def test_a_vehicle_that_stands_without_a_reason_is_ignored(
 def test_a_yielding_vehicle_behind_a_standing_leader_is_ignored(
     tmp_path: Path, more_m: float, hold: int, turn: str
 ) -> None:
-    """At the line of a side road, with slightly less or more room than the driver keeps anyway.
+    """The gap at the line of a side road is slightly less or more than the driver keeps anyway.
 
-    Its leader takes the same link as the vehicle, or another one.
+    The leader takes the same link as the vehicle, or another one.
     """
     roads = read_network(build_crossing(tmp_path, "priority"))
     ways = [

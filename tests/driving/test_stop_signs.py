@@ -82,7 +82,7 @@ def test_without_stop_signs_no_stop_is_noted(maps: dict[str, Path]) -> None:
 def test_a_vehicle_that_waits_before_a_stop_sign_has_stopped_there(
     maps: dict[str, Path], stub: bool, to_line_m: float, wait_s: float, notes: bool
 ) -> None:
-    # It leaves room for vehicles that sweep over its line; the lane before the sign may be short.
+    # It waits well before its line, over which vehicles sweep; its lane may be short.
     roads = read_network(maps["allway_stop"])
     link = next(
         k

@@ -142,7 +142,7 @@ def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
 ) -> None:
     meeting = Meeting(network)
     assert meeting.stop(0, (-2.0, -1.0)) == 0.0
-    meeting.rows["speed"][1] = 3.0  # the bus goes, so the car stops where it would be in its path
+    meeting.rows["speed"][1] = 3.0  # the bus drives, so the car stops before the area of the bus
     assert meeting.stop(0, (-2.0, -1.0)) == meeting.sweep["enter_m"]
     assert meeting.stop(0, (-2.0, 30.0)) == np.inf
 
@@ -154,8 +154,8 @@ def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwor
     red, inside = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_YIELD)
     assert meeting.stop(1, (-20.0, -12.0), red) == enter_m
     assert meeting.stop(1, (-40.0, -12.0), red) == np.inf
-    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "the car cannot go back later"
-    meeting.rows["speed"][0] = 15.0  # from the same distance, it arrives soon
+    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "inside, the car cannot move back"
+    meeting.rows["speed"][0] = 15.0  # a fast bus arrives soon from the same distance
     assert meeting.stop(1, (-40.0, -12.0), red) == enter_m
     meeting.rows["speed"][0] = 0.0
     assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "the car drives on if nothing else stops it"
@@ -190,7 +190,7 @@ def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> N
 def test_a_car_that_stops_for_a_bus_is_ready_to_stop_inside(
     network: RoadNetwork,
 ) -> None:
-    """The bus sweeps beyond that position, and may have left when the car arrives."""
+    """The bus sweeps beyond the waiting position, and may have left when the car arrives."""
     links, sweeps, conflicts = network.links, network.sweeps.copy(), network.conflicts.copy()
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     picked = (sweeps["own"] == CAR) & (sweeps["other"] == BUS)
@@ -236,7 +236,7 @@ def test_before_an_area_the_vehicle_further_along_goes_first(network: RoadNetwor
     places = (bus_enter_m - 1.0, enter_m - 1.0)
     assert meeting.stop(1, places) == enter_m
     assert meeting.stop(0, places) == np.inf
-    meeting.rows["speed"][1] = 15.0  # it can no longer stop
+    meeting.rows["speed"][1] = 15.0  # the vehicle can no longer stop
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
 
 
@@ -256,7 +256,7 @@ def test_if_both_are_late_the_vehicle_that_brakes_less_waits(
 def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
     network: RoadNetwork,
 ) -> None:
-    """Its leader may wait for the own vehicle, so otherwise none of the three would go."""
+    """The foe's leader may wait for the own vehicle: otherwise, none of the three would go."""
     meeting = Meeting(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["wait_s"][0] = 4.0
@@ -273,7 +273,7 @@ def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
 def test_a_vehicle_behind_the_junction_waits_before_an_area_there(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
 ) -> None:
-    """`front_m`, `bus_m`: how far the fronts of the car and of the bus are in the area."""
+    """`front_m`, `bus_m`: positions of the fronts of car and bus beyond the area's start."""
     meeting = Meeting(network)
     link, bus_link = int(meeting.sweep["foe"]), meeting.link
     row, sweeps = network.links[link], network.sweeps.copy()
@@ -372,7 +372,7 @@ def test_no_vehicle_touches_a_turning_bus(path: Path, tmp_path: Path) -> None:
 def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
     network: RoadNetwork,
 ) -> None:
-    """The rear of a bus is on the lane, so a follower must stop there, whatever the bus's route."""
+    """The rear of a bus is on the lane, so a follower must stop there for any route of the bus."""
     link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
     lane = int(network.links[link]["from_lane"])
     length_m = float(network.lanes[lane]["length_m"])
@@ -386,5 +386,5 @@ def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
     kind = generated_types()[0]
     constraint = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
     assert constraint == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
-    room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # its rear has left
+    room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # the rear of the bus has left the lane
     assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_constraint(kind)

@@ -1,4 +1,4 @@
-"""Turns and bends of steered cars: they stay on the road, and trips avoid too tight turns."""
+"""Turns and bends: steered cars stay on the road, and trips avoid turns that are too tight."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_a_car_can_take_each_corner_of_a_grid() -> None:
     assert (blunt["direction"] != roads.links["direction"]).any()
 
 
-def test_too_tight_turns_are_sharp_and_in_no_trip(tmp_path: Path) -> None:
+def test_turns_that_are_too_tight_are_sharp_and_in_no_trip(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM)
     world = make_simulation(path, mode="respawn", agents=4, background=0)
     roads = world.network

@@ -64,10 +64,10 @@ def test_a_u_turn_does_not_conflict_with_the_adjacent_lane(
 
 
 @pytest.mark.parametrize(("size", "reaches"), [(0, False), (BUS, True)])
-def test_only_long_vehicles_wait_in_a_u_turn_for_vehicles_beside_them(
+def test_only_long_vehicles_wait_in_a_u_turn_for_adjacent_vehicles(
     network: RoadNetwork, size: int, reaches: bool
 ) -> None:
-    """A long vehicle drives back beside them, on the adjacent target lane."""
+    """A long vehicle drives back next to these vehicles, on the adjacent target lane."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -79,7 +79,7 @@ def test_only_long_vehicles_wait_in_a_u_turn_for_vehicles_beside_them(
 
 
 def test_a_bus_in_a_u_turn_reaches_far_over_the_adjacent_lane(network: RoadNetwork) -> None:
-    """Up to a vehicle whose rear is 5 m behind the junction, which is still registered."""
+    """A vehicle whose rear is up to 5 m behind the junction is still registered for the bus."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -144,15 +144,15 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_but_not_behind(
 def test_a_rear_that_moves_back_reaches_followers_on_its_lane(
     network: RoadNetwork,
 ) -> None:
-    """A car's rear does not, because its chord is hardly shorter than its path."""
+    """A car's rear does not move back, because the car's chord is hardly shorter than its path."""
     _, turn = beside(network)
     sweeps = sweeps_of(network, turn)
     behind = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == 0)]
     (bus,) = behind[behind["other"] == BUS]
     assert not (behind["other"] == 0).any()
-    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "the rear is still before the line"
+    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "the rear of the bus is still before the line"
     assert bus["enter_m"] < bus["foe_enter_m"] - BUS_M + 1.0, (
-        "up to the previous position of the rear"
+        "the area extends to the previous position of the rear"
     )
 
 
@@ -167,7 +167,7 @@ def test_the_gap_to_a_bus_in_a_u_turn_is_larger(network: RoadNetwork, turns: boo
     kind = generated_types()[0]
 
     def stands_m(length: float) -> float:
-        """Return the gap, to 0.25 m, below which it does not start from rest."""
+        """Return the gap, to 0.25 m, below which a vehicle at rest does not start."""
         for gap_m in np.arange(0.25, 9.0, 0.25):
             rear_m = length_m - 1.0 - length
             places = [(rear_m - gap_m - 2.5, 5.0), (rear_m + 0.5 * length, length)]
@@ -182,7 +182,7 @@ def test_the_gap_to_a_bus_in_a_u_turn_is_larger(network: RoadNetwork, turns: boo
             decide(network.arrays, travel, rows, 1, DRIVER_BACKGROUND, 0, 0.1, phase, step, room)
             if room.accel[0] > 0.1:
                 return float(gap_m)
-        raise AssertionError("it never goes")
+        raise AssertionError("the vehicle never starts")
 
     further_m = stands_m(BUS_M) - stands_m(kind["length"])
     assert further_m == pytest.approx(3.0 if turns else 0.0, abs=0.3)

@@ -70,7 +70,7 @@ def _files(folder: Path, per_h: int, kind: str) -> tuple[Path, list[Path]]:
     return net, [routes]
 
 
-def test_the_flow_is_that_of_sumo(tmp_path: Path) -> None:
+def test_the_flow_equals_sumos(tmp_path: Path) -> None:
     net, routes = _files(tmp_path, 500, "car")
     found = compare_traffic(net, routes, seconds=300, seed=1)
     assert found.ours.figures.contacts == 0
@@ -136,11 +136,11 @@ def test_the_vehicle_ahead_goes_first_then_the_faster_then_the_smaller_id(
     [
         ({"hold": (HOLD_EXIT_BLOCKED, HOLD_NONE)}, False),
         ({"hold": (HOLD_YIELD, HOLD_NONE)}, True),
-        ({"wait_s": (4.0, 0.0)}, False),  # it stands without a reason
-        ({"to_go": (2.0, np.inf)}, False),  # it ends its trip before the line
+        ({"wait_s": (4.0, 0.0)}, False),  # the vehicle stands without a reason
+        ({"to_go": (2.0, np.inf)}, False),  # the vehicle ends its trip before the line
     ],
 )
-def test_no_driver_lets_a_vehicle_go_first_that_does_not_go(
+def test_no_driver_waits_for_a_vehicle_that_does_not_drive(
     roads: RoadNetwork, fields: dict[str, object], goes: bool
 ) -> None:
     two = pair(roads, (1.0, 6.0), (0.0, 3.0), **fields)

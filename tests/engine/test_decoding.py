@@ -26,7 +26,7 @@ def slowly(actions: NDArray[Any]) -> NDArray[Any]:
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_pairs_are_decoded(dtype: type) -> None:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 2)).astype(dtype)
-    actions[~MASK] = np.nan  # no agent reads it
+    actions[~MASK] = np.nan  # actions of agents without a vehicle are not read
     config = ActionConfig(kind="continuous")
     found = ActionDecoder(config, 2, AGENTS).from_array(actions, MASK)
     expected = ActionDecoder(config, 2, AGENTS).from_array(slowly(actions), MASK)

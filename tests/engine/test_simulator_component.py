@@ -169,7 +169,7 @@ def test_a_vehicle_that_is_refused_for_too_long_is_an_error() -> None:
         assert all(one.is_closed for one in OwnKinematics.made)
 
 
-def test_cavmarl_takes_a_zone_back_that_refuses_vehicles_for_too_long() -> None:
+def test_cavmarl_takes_back_a_zone_whose_simulator_refuses_vehicles_for_too_long() -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {"zones.simulator_failure": "return", "zones.check_invariants": True}
     with registered(Unwilling) as name:
@@ -418,7 +418,7 @@ def test_the_simulator_of_the_guide_is_exact() -> None:
         REGISTERED_ZONE_SIMULATORS.remove("echo")
 
 
-def test_verify_says_that_a_simulator_is_not_exact() -> None:
+def test_verify_reports_that_a_simulator_is_not_exact() -> None:
     with registered(Drifting, tolerance_m=0.1) as name:
         found = verify_zones(
             ENV, [4], steps=5, agents=2, background=10, overrides={"zones.simulators": {1: name}}

@@ -28,7 +28,7 @@ def _frames(zones: int, workers: int, steps: int = 25) -> list[WorldFrame]:
 
 
 @pytest.mark.parametrize(("zones", "workers"), [(4, 0), (4, 2), (1, 1)])
-def test_frames_are_those_of_the_undivided_world(zones: int, workers: int) -> None:
+def test_frames_equal_those_of_the_undivided_world(zones: int, workers: int) -> None:
     for whole, divided in zip(_frames(1, 0), _frames(zones, workers), strict=True):
         assert (whole.tick, whole.time_s) == (divided.tick, divided.time_s)
         np.testing.assert_array_equal(whole.vehicles[_WHAT], divided.vehicles[_WHAT])

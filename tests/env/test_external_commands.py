@@ -1,6 +1,6 @@
 """Vehicles that the caller poses or drives: motion, visibility, and saved states.
 
-In a divided world, they equal those of the undivided world bit for bit.
+Such vehicles are the same, bit for bit, in a divided and in an undivided world.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
 
 
-def test_unused_places_change_no_vehicle() -> None:
+def test_unused_slots_for_external_vehicles_change_nothing() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("ring", agents=1, background=8, overrides=overrides)) as env:
@@ -193,7 +193,7 @@ def test_a_jump_is_a_new_vehicle_and_no_trip() -> None:
             assert after[name] == before[name], name
 
 
-def test_drivers_stop_behind_a_vehicle_on_their_lane_and_pass_one_beside_the_road() -> None:
+def test_drivers_stop_behind_a_vehicle_on_their_lane_and_pass_a_vehicle_beside_the_road() -> None:
     standing = []
     for aside_m in (0.0, 25.0):
         with closing(ring()) as env:
@@ -286,7 +286,7 @@ def test_sensors_messages_and_moving_borders_change_nothing() -> None:
     assert hashes(overrides=moving, zones=3) == undivided
 
 
-def test_sumo_s_traffic_refuses_them() -> None:
+def test_worlds_with_sumos_traffic_refuse_external_vehicles() -> None:
     sumo = {"traffic.source": "sumo-traffic", "traffic.demand": ["any.sumocfg"]}
     overrides = {**ROOM, **sumo, "sensors.signal.timing": False}
     with pytest.raises(ConfigError, match=r"population\.external = 4: .*SUMO would not see"):

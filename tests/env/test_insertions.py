@@ -59,7 +59,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_unused_places_change_nothing() -> None:
+def test_unused_slots_for_insertions_change_nothing() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
@@ -147,7 +147,7 @@ def test_barriers_that_wait_for_a_gap_never_enter_a_road_that_is_opened() -> Non
         for lane in lanes.tolist():
             env.insert_vehicle(env.network.lane_ids[lane], 6.0)
         env.close_road(edge)
-        env.step(env.suggest_actions())  # their places are taken
+        env.step(env.suggest_actions())  # at each place stands a vehicle, so the barriers wait
         assert env.traffic_stats()["waiting"] == len(lanes)
         env.open_road(edge)
         env.step(env.suggest_actions())

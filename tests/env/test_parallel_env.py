@@ -33,7 +33,7 @@ def wild(env: CavEnv, rng: np.random.Generator) -> dict[str, Any]:
 # Populations
 
 
-def test_a_closed_world_starts_with_all_agents_and_only_loses_them() -> None:
+def test_a_closed_world_starts_with_all_agents_and_gets_no_others() -> None:
     env = make("ring", "closed")
     observations, _ = env.reset()
     assert list(observations) == env.agents == env.possible_agents
@@ -47,7 +47,7 @@ def test_a_closed_world_starts_with_all_agents_and_only_loses_them() -> None:
         assert set(env.agents) == before
 
 
-def test_entering_agents_come_once_and_no_more_than_declared() -> None:
+def test_each_declared_agent_enters_at_most_once() -> None:
     env = make("merge", "open", agents=3, overrides={"population.budget": 9})
     assert len(env.possible_agents) == 9
     observations, infos = env.reset()
@@ -73,7 +73,7 @@ def test_entering_agents_come_once_and_no_more_than_declared() -> None:
     assert len(set(vehicles.values())) == 9
 
 
-def test_an_empty_world_goes_on_until_the_next_agent_enters() -> None:
+def test_an_empty_world_continues_until_the_next_agent_enters() -> None:
     env = make("merge", "open", agents=1, background=0, overrides={"population.budget": 3})
     env.reset()
     rng = np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
     assert env.simulation.ticks()[0] <= 200 * env.config.clock.ticks_per_step
 
 
-def test_seats_stay_and_get_new_vehicles() -> None:
+def test_in_respawn_mode_agents_remain_and_get_new_vehicles() -> None:
     env = make("merge", "respawn")
     _, infos = env.reset()
     rng = np.random.default_rng(2)
@@ -355,7 +355,7 @@ def test_meta_actions_change_lanes(action: int, side: str) -> None:
     assert abs(vehicle["d"]) < 0.3
 
 
-def test_a_change_to_where_no_lane_is_asks_for_nothing() -> None:
+def test_a_change_to_a_missing_lane_has_no_effect() -> None:
     env = make("merge", agents=1, background=0, overrides={"action.kind": "discrete"})
     lanes = env.network.lanes
     for seed in range(100):

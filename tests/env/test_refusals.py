@@ -64,7 +64,7 @@ def test_an_unknown_agent_has_no_space(agent: Any) -> None:
 
 
 @pytest.mark.parametrize("kind", [np.int64, np.int8, np.uint8, np.bool_])
-def test_whole_numbers_are_no_throttle_and_steering(kind: Any) -> None:
+def test_integer_arrays_are_refused_as_throttle_and_steering(kind: Any) -> None:
     message = rf"dtype is {np.dtype(kind)}; .*pass floats \(float32 or float64\)"
     env = cavmarl.parallel_env("ring", agents=2)
     env.reset(seed=0)
@@ -85,7 +85,7 @@ def drive(vec: cavmarl.CavVectorEnv) -> None:
 
 
 @pytest.mark.parametrize("answer", ["fast", None, [1.0, "a"], [[1.0], [1.0, 2.0]]])
-def test_a_registered_function_returns_numbers(answer: Any) -> None:
+def test_a_registered_function_that_returns_no_numbers_is_refused(answer: Any) -> None:
     def text(view: cavmarl.AgentView) -> Any:
         return answer
 
@@ -100,7 +100,7 @@ def test_a_registered_function_returns_numbers(answer: Any) -> None:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_an_error_names_the_agent_whose_term_is_no_number(batched: bool) -> None:
+def test_an_error_names_the_agent_whose_term_is_not_a_number(batched: bool) -> None:
     def bad(view: Any) -> Any:
         return np.where(view.own["agent"] == 6, -np.inf, 1.5)
 
@@ -114,7 +114,7 @@ def test_an_error_names_the_agent_whose_term_is_no_number(batched: bool) -> None
         REGISTERED_TERMS.remove("bad")
 
 
-def test_an_error_names_the_number_of_a_sensor_that_is_none() -> None:
+def test_an_error_names_the_index_of_a_sensor_value_that_is_not_a_number() -> None:
     def sense(view: Any) -> list[float]:
         return [0.0, float("nan")] if view.own["agent"] == 5 else [0.0, 1.0]
 

@@ -1,4 +1,4 @@
-"""The ids of environments in Gymnasium and PettingZoo, and what the ids create."""
+"""The ids of environments in Gymnasium and PettingZoo, and the environments that they create."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_the_discrete_ids_always_have_meta_actions() -> None:
     assert rows.single_action_space == five
 
 
-def test_the_aec_form_refuses_a_wrong_action_and_goes_on() -> None:
+def test_the_aec_form_refuses_a_wrong_action_and_continues() -> None:
     world = cavmarl.env("ring", agents=2, background=0)
     world.reset(seed=0)
     before = world.agent_selection
@@ -74,7 +74,7 @@ def test_without_a_seed_no_two_first_resets_agree() -> None:
     assert check_seed(np.uint64(9)) == 9
 
 
-def test_numpy_numbers_are_numbers() -> None:
+def test_numpy_numbers_are_accepted_as_settings() -> None:
     world = cavmarl.parallel_env(
         "ring",
         agents=np.int64(3),

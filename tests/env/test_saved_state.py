@@ -123,7 +123,9 @@ SIZES = -2
         (SIZES, 0, -1, "a world has a negative size"),
     ],
 )
-def test_values_beside_the_worlds(place: int, at: int, value: float, message: str) -> None:
+def test_invalid_values_outside_of_the_worlds_are_refused(
+    place: int, at: int, value: float, message: str
+) -> None:
     vec = make(overrides={"population.insertions": 3})
     vec.reset(seed=0)
     lane = next(name for name in vec.network.lane_ids if not name.startswith(":"))
@@ -139,7 +141,7 @@ EXTERNAL_COMMANDS, EXTERNAL_USED = 10, 11
 
 
 def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
-    """Return worlds in which a vehicle of the caller waits, and their state."""
+    """Return worlds in which a vehicle of the caller waits to enter, and their saved state."""
     vec = make(overrides={"population.external": 3}, **arguments)
     vec.reset(seed=0)
     min_x, min_y, _, _ = vec.network.extent_m
@@ -158,7 +160,9 @@ def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
         ("length", 90.0, "larger than all types"),
     ],
 )
-def test_waiting_commands_to_external_vehicles(name: str, value: float, message: str) -> None:
+def test_invalid_waiting_commands_to_external_vehicles_are_refused(
+    name: str, value: float, message: str
+) -> None:
     vec, saved = with_external()
     item = (EXTERNAL.names or ()).index(name)
     with pytest.raises(ConfigError, match=message):
@@ -167,7 +171,7 @@ def test_waiting_commands_to_external_vehicles(name: str, value: float, message:
     assert vec.save_state() == saved
 
 
-def test_a_command_to_a_vehicle_that_only_the_session_knows() -> None:
+def test_a_command_to_a_vehicle_that_is_only_in_the_session_is_refused() -> None:
     vec, saved = with_external()
     vec.load_state(forged(vec, saved, EXTERNAL_USED, True, item=2))
     vec.external.drive(2, 1.0, 0.0)

@@ -20,7 +20,7 @@ SMALL: dict[str, Any] = {"agents": 2, "background": 2}
 
 
 @pytest.mark.parametrize("name", ["cities_residual", "u_turn_ippo"])
-def test_a_driver_fits_an_environment_without_training_there(name: str) -> None:
+def test_a_trained_driver_drives_in_an_environment_with_its_sensors(name: str) -> None:
     pytest.importorskip("torch")
     one = parallel_env("merge", sensors_of=name, **SMALL)
     driver = load_policy(name, one)
@@ -33,7 +33,7 @@ def test_a_driver_fits_an_environment_without_training_there(name: str) -> None:
     assert by_overrides.config == vec.config == one.config
 
 
-def test_the_refusal_of_a_driver_names_the_way_out() -> None:
+def test_the_refusal_of_a_driver_names_the_remedy() -> None:
     pytest.importorskip("torch")
     with pytest.raises(PolicyError) as caught:
         load_policy("cities_residual", make_vec("merge", **SMALL))

@@ -1,6 +1,6 @@
 """Signals that show states of the caller: visibility, saved states, and refused commands.
 
-In a divided world, they equal those of the undivided world bit for bit.
+Such signals are the same, bit for bit, in a divided and in an undivided world.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def test_a_signal_shows_letters_until_it_is_released() -> None:
     env.reset(seed=1)
     before = env.signal_overrides.letters("B1")
     env.signal_overrides.show("B1", 4, "Y")
-    assert env.signal_overrides.letters("B1") == before, "not before the next step"
+    assert env.signal_overrides.letters("B1") == before, "the signal changes in the next step"
     env.step(env.suggest_actions())
     assert env.signal_overrides.letters("B1") == before[:4] + "Y" + before[5:]
     env.signal_overrides.release("B1", 4)
@@ -139,7 +139,7 @@ def test_drivers_wait_while_all_signals_are_red() -> None:
     assert crossings("g") > 0
 
 
-def test_observed_signals_are_those_shown() -> None:
+def test_agents_observe_overridden_states_of_signals() -> None:
     overrides = {"signals.overrides": 400, "sensors.signal.enabled": True}
     seen = []
     for letter in "Gr":
@@ -181,7 +181,7 @@ def test_messages_have_the_states_that_are_shown() -> None:
     assert (heard["left_s"] == 0.0).all()
 
 
-def test_recordings_and_drawings_show_them(tmp_path: Path) -> None:
+def test_recordings_and_drawings_show_overridden_signals(tmp_path: Path) -> None:
     path = tmp_path / "shown"
     env = parallel_env("grid4x4", overrides=ROOM, record=str(path))
     env.reset(seed=1)
@@ -235,7 +235,7 @@ def test_wrong_commands_are_refused_with_a_fix() -> None:
         without.signal_overrides.show("A0", 0, "G")
 
 
-def test_sumo_s_traffic_refuses_them() -> None:
+def test_worlds_with_sumos_traffic_refuse_overrides() -> None:
     sumo = {"traffic.source": "sumo-traffic", "traffic.demand": ["any.sumocfg"]}
     overrides = {**ROOM, **sumo, "sensors.signal.timing": False}
     with pytest.raises(ConfigError, match=r"signals\.overrides = 40: .*SUMO runs the signals"):

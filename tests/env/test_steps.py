@@ -9,7 +9,7 @@ from cavmarl import ConfigError, make_vec, parallel_env
 
 
 @pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
-def test_fewer_steps_than_the_environment_was_made_for(mode: str) -> None:
+def test_max_cycles_can_be_reduced_later(mode: str) -> None:
     env = parallel_env("ring", agents=3, max_cycles=20, overrides={"population.mode": mode})
     env.max_cycles = 7
     for seed in range(2):

@@ -35,7 +35,7 @@ def wild(rng: np.random.Generator, vec: CavVectorEnv) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("mode", MODES)
 @pytest.mark.parametrize("env", ["merge", "grid4x4"])
-def test_the_first_world_of_many_is_the_world_alone(mode: str, env: str) -> None:
+def test_the_first_of_many_worlds_equals_a_single_world(mode: str, env: str) -> None:
     many, alone = make(3, mode, env), make(1, mode, env)
     rng = np.random.default_rng(0)
     (observations, infos), (lone, lone_infos) = many.reset(seed=11), alone.reset(seed=11)
@@ -54,7 +54,7 @@ def test_the_first_world_of_many_is_the_world_alone(mode: str, env: str) -> None
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
+def test_a_vectorized_world_equals_the_parallel_environment(mode: str) -> None:
     vec = make(2, mode)
     env = parallel_env(
         "merge",
@@ -71,7 +71,7 @@ def test_a_world_of_arrays_is_the_parallel_environment(mode: str) -> None:
         for agent in active:
             np.testing.assert_array_equal(arrays[0, int(agent[4:])], dicts[agent])
         if not active:
-            break  # the step of the parallel form waits for the next agent
+            break  # a step of the parallel environment lasts until the next agent enters
         actions = wild(rng, vec)
         arrays, rewards, terminations, truncations, infos = vec.step(actions)
         dicts, paid, ended, cut, told = env.step({a: actions[0, int(a[4:])] for a in active})

@@ -82,7 +82,7 @@ def test_a_copy_is_independent_of_the_original(how: str) -> None:
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_a_copy_before_the_first_reset(how: str) -> None:
+def test_a_copy_before_the_first_reset_equals_the_original(how: str) -> None:
     env = cavmarl.parallel_env("ring", seed=5)
     other = COPIES[how](env)
     with pytest.raises(cavmarl.EpisodeError):
@@ -93,7 +93,7 @@ def test_a_copy_before_the_first_reset(how: str) -> None:
 
 @pytest.mark.parametrize("copied", [True, False])
 @pytest.mark.parametrize("how", COPIES)
-def test_a_batch_of_worlds(how: str, copied: bool) -> None:
+def test_a_copied_batch_of_worlds_continues_like_the_original(how: str, copied: bool) -> None:
     def step(vec: cavmarl.CavVectorEnv, number: int) -> tuple[bytes, ...]:
         actions = np.full(vec.action_space.shape, 0.1 * (number % 5), dtype=np.float32)
         observations, rewards, ended, cut, infos = vec.step(actions)
@@ -133,7 +133,7 @@ def test_a_copy_of_a_single_vehicle_environment_continues() -> None:
         assert flat(other.step(np.zeros(2, np.float32))) == flat(one.step(np.zeros(2, np.float32)))
 
 
-def test_a_world_that_is_sent_to_another_process() -> None:
+def test_a_world_that_is_sent_to_another_process_continues() -> None:
     env = cavmarl.parallel_env("ring")
     env.reset(seed=3)
     drive(env, 0, 5)
@@ -154,7 +154,7 @@ def test_worlds_with_processes_are_refused(how: str) -> None:
     env.close()
 
 
-def test_a_copy_goes_on_without_the_journal(tmp_path: Any) -> None:
+def test_a_copy_continues_without_the_journal(tmp_path: Any) -> None:
     path = tmp_path / "journal"
     journal = {"zones.journal": str(path), "zones.check_invariants": True}
     env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, overrides=journal)

@@ -25,9 +25,9 @@ def ttc(one: NDArray[np.void], other: NDArray[np.void]) -> float:
 def test_times_to_collision_of_simple_cases() -> None:
     assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 0)) == pytest.approx(2.0)  # behind a queue
     assert ttc(body(0, 0, 0, 10), body(45, 0, math.pi, 10)) == pytest.approx(2.0)  # head on
-    assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 10)) == math.inf  # as fast
-    assert ttc(body(0, 0, 0, 10), body(25, 3, 0, 0)) == math.inf  # beside
-    assert ttc(body(0, 0, 0, 10), body(-25, 0, 0, 0)) == math.inf  # behind
+    assert ttc(body(0, 0, 0, 10), body(25, 0, 0, 10)) == math.inf  # at equal speeds
+    assert ttc(body(0, 0, 0, 10), body(25, 3, 0, 0)) == math.inf  # the other car is on another lane
+    assert ttc(body(0, 0, 0, 10), body(-25, 0, 0, 0)) == math.inf  # the other car is behind
     assert ttc(body(0, 0, 0, 10), body(3, 0, 0, 0)) == 0.0
     # Both centres need 2 s to the crossing; the fronts are 2.5 m nearer, the flanks 1 m.
     crossing = ttc(body(-20, 0, 0, 10), body(0, -20, 0.5 * math.pi, 10))

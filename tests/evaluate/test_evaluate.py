@@ -37,12 +37,12 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(subprocess_calls, "start_python", start_python)  # no fork, as in other tests
+        patch.setattr(subprocess_calls, "start_python", start_python)  # other tests fork
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 
 
-def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
+def test_the_shares_of_trip_ends_sum_to_one(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
     ends = [found[name].mean for name in ("arrived", "collision", "off_road", "unfinished")]
     assert sum(end or 0.0 for end in ends) == pytest.approx(1.0)
@@ -50,7 +50,7 @@ def test_the_ends_of_trips_add_up(by_chance: EvaluationReport) -> None:
     assert (found["off_road"].mean or 0.0) > 0.5
 
 
-def test_the_parts_of_the_return_add_up(by_chance: EvaluationReport) -> None:
+def test_the_parts_of_the_return_sum_to_the_return(by_chance: EvaluationReport) -> None:
     found = by_chance["random_actions"]
     parts = [found[m.name].mean or 0.0 for m in METRICS if m.name.startswith("reward_")]
     assert sum(parts) == pytest.approx(found["episode_return"].mean, rel=1e-4)
@@ -108,7 +108,7 @@ def test_episodes_do_not_depend_on_how_many_worlds_run_together(
     assert results(apart) == results(together)
 
 
-def test_memory_stays_flat_however_many_episodes() -> None:
+def test_memory_does_not_grow_with_the_number_of_episodes() -> None:
     most = max(worlds_at_once(count, 20) for count in range(1, 2000))
     assert worlds_at_once(100_000, 20) <= most == episodes.MAX_WORLDS
     assert worlds_at_once(100_000, 1_000_000) == 1
@@ -134,7 +134,7 @@ def test_a_run_in_a_fresh_process_is_the_run_in_this_one(
     assert load_report(compared)["driver"]["episode_return"].within_run[2] == mine
 
 
-def test_the_interval_between_runs_is_that_of_the_run_means(compared: Path) -> None:
+def test_the_interval_between_runs_is_computed_from_the_run_means(compared: Path) -> None:
     found = load_report(compared)["driver"]["episode_return"]
     means = np.array([run.mean for run in found.within_run])
     half = student_quantile(2) * means.std(ddof=1) / np.sqrt(3.0)
@@ -184,7 +184,7 @@ def test_raw_tables_hold_every_trip_and_episode(compared: Path) -> None:
 
 @pytest.mark.parametrize("key", ["episodes", "repeats"])
 @pytest.mark.parametrize("value", [0, -1, 10**9, 2.0, True, "3"])
-def test_counts_must_be_counts(key: str, value: Any) -> None:
+def test_counts_that_are_not_positive_whole_numbers_are_refused(key: str, value: Any) -> None:
     with pytest.raises(ConfigError, match=f"{key} = "):
         evaluate("merge", "idm", **{key: value})
 
@@ -202,7 +202,7 @@ def test_unknown_names_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5, 2**63])
-def test_a_seed_is_a_whole_number(seed: Any) -> None:
+def test_a_seed_that_is_not_a_whole_number_is_refused(seed: Any) -> None:
     with pytest.raises(ConfigError, match="seed"):
         evaluate("merge", "idm", episodes=1, seed=seed)
 

@@ -221,7 +221,7 @@ def test_failed_trips_have_the_right_cause(marks: list[str], cause: str) -> None
     assert cause in CAUSES
 
 
-def test_a_recording_that_is_there_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_an_existing_recording_folder_is_refused_before_anything_runs(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").write_text("kept")
     with pytest.raises(RecordingError, match="name a new folder"):

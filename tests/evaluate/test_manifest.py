@@ -110,7 +110,7 @@ def test_a_closed_manifest_lists_its_results(folder: Path) -> None:
         assert hash_of_file(folder / name) == known
 
 
-def test_results_without_one_are_refused(folder: Path) -> None:
+def test_results_without_a_manifest_are_refused(folder: Path) -> None:
     (folder / MANIFEST_FILE).unlink()
     with pytest.raises(ManifestError, match=r"no manifest\.json"):
         load_report(folder)
@@ -140,7 +140,7 @@ def test_results_that_were_changed_are_refused(folder: Path) -> None:
         load_report(folder)
 
 
-def test_a_folder_is_used_once(folder: Path) -> None:
+def test_a_folder_with_results_is_refused(folder: Path) -> None:
     before = {path.name: hash_of_file(path) for path in folder.iterdir()}
     with pytest.raises(ManifestError, match="name a new folder"):
         evaluate("merge", "idm", out=folder, **SMALL)

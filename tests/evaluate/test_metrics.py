@@ -13,7 +13,7 @@ BY_NAME = {metric.name: metric for metric in METRICS}
 
 
 def trips(*distances_m: float) -> NDArray[np.void]:
-    """Return counting trips without infractions."""
+    """Return trips that count, without infractions."""
     rows = np.zeros(len(distances_m), TRIP)
     rows["distance_m"], rows["counted"] = distances_m, True
     return rows
@@ -24,9 +24,9 @@ def values(name: str, rows: NDArray[np.void]) -> list[float]:
 
 
 @pytest.mark.parametrize("infraction", ["collision", "off_road", "red_light", "wrong_way"])
-def test_each_infraction_shortens_the_way_between_two(infraction: str) -> None:
+def test_each_infraction_reduces_the_kilometres_per_infraction(infraction: str) -> None:
     rows = trips(4000.0, 1500.0, 500.0)
-    assert values("km_per_infraction", rows) == [6.0], "none: all kilometres"
+    assert values("km_per_infraction", rows) == [6.0], "without an infraction: all kilometres"
     rows[infraction][0] = True
     rows["red_light"][1] = True
     assert values("km_per_infraction", rows) == [3.0]

@@ -119,7 +119,7 @@ def test_only_the_last_vehicle_that_has_passed_counts() -> None:
     assert (second, third) == pytest.approx(alone, abs=1e-6)
 
 
-def test_vehicles_in_an_area_together_have_no_time_between_them() -> None:
+def test_vehicles_that_share_an_area_at_once_have_no_post_encroachment_time() -> None:
     one, conflict = crossing()
     middle = 0.5 * (conflict["enter_m"] + conflict["leave_m"])
     foe_middle = 0.5 * (conflict["foe_enter_m"] + conflict["foe_leave_m"])
@@ -141,7 +141,7 @@ def test_areas_mirror_each_other_except_where_paths_merge() -> None:
     assert (MIRROR[merging] == -1).all()
 
 
-def test_positions_are_those_of_the_agents_vehicles() -> None:
+def test_positions_equal_those_of_the_agents_vehicles() -> None:
     rows = np.zeros((2, 3), VEHICLE)
     rows["agent"] = [[1, -1, 0], [0, 1, -1]]
     rows["x"] = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]

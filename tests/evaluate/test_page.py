@@ -109,14 +109,14 @@ def test_a_browser_shows_the_page_without_errors_and_other_files(told: dict[str,
     assert told["loaded"] == []
 
 
-def test_its_tables_are_filled(told: dict[str, Any]) -> None:
+def test_the_tables_of_the_page_are_filled(told: dict[str, Any]) -> None:
     assert {"results", "differences", "rewards", "runs"} == told["rows"].keys()
     assert told["rows"]["results"] > 12
     assert min(told["rows"].values()) >= 3
     assert told["empty"] == 0
 
 
-def test_its_pictures_have_a_size_and_text(told: dict[str, Any]) -> None:
+def test_the_pictures_of_the_page_have_a_size_and_text(told: dict[str, Any]) -> None:
     assert len(told["svgs"]) == 3 + 2  # the plots, and one map per policy
     assert all(width > 600 and height > 60 for width, height in told["svgs"])
     assert told["texts"] > 40
@@ -148,7 +148,7 @@ def test_names_are_text_and_not_markup(page: Path) -> None:
     assert "&lt;b&gt;chance" in text
 
 
-def test_its_ids_are_unique(page: Path) -> None:
+def test_the_ids_of_the_page_are_unique(page: Path) -> None:
     ids: list[str] = []
 
     class Ids(HTMLParser):

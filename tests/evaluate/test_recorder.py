@@ -73,7 +73,7 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     assert trips["mean_speeding"] == pytest.approx([0.1, 0.0])
     assert trips["mean_jerk_mps3"] == pytest.approx([4.0 / 3.0, 0.0])
     assert trips["least_ttc_s"] == pytest.approx([1.2, 4.0])
-    # 0.7 is 1.2 s and 0.25 is 3 s: one step of three lies below 1.5 s.
+    # The term 0.7 means 1.2 s and 0.25 means 3 s, so one of three steps is below 1.5 s.
     assert trips["short_ttc_share"] == pytest.approx([1.0 / 3.0, 0.0])
     assert np.isnan(trips["least_pet_s"]).all()
 
@@ -143,7 +143,7 @@ def test_a_trip_that_the_horizon_truncates_has_neither_arrived_nor_failed() -> N
 
 
 @pytest.mark.parametrize("fault", ["red_light", "wrong_way"])
-def test_a_success_keeps_the_rules(fault: str) -> None:
+def test_a_trip_that_breaks_a_rule_is_no_success(fault: str) -> None:
     worlds = Worlds()
     worlds.add(**{fault: (1.0, 0.0)})
     worlds.add(done=(True, True), arrival=(1.0, 1.0))
@@ -157,10 +157,11 @@ def test_a_success_takes_three_times_the_free_time_at_most() -> None:
     worlds.add(delay=(STEP_S, STEP_S))
     worlds.add(done=(True, True), arrival=(1.0, 1.0), delay=(0.0, 0.01 * STEP_S))
     assert worlds.trips["arrived"].tolist() == [True, True]
-    assert worlds.trips["success"].tolist() == [True, False]  # 3 steps, of which 1 and 0.99 free
+    # Free times: 1 and 0.99 steps.
+    assert worlds.trips["success"].tolist() == [True, False]
 
 
-def test_trips_of_the_second_half_do_not_count_however_they_end() -> None:
+def test_trips_that_begin_in_the_second_half_do_not_count() -> None:
     worlds = Worlds(max_steps=4)
     for _ in range(2):
         worlds.add(acted=(False, True))

@@ -1,4 +1,4 @@
-"""What the page of scenarios shows works."""
+"""The examples on the page of scenarios work."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def test_the_example_of_training_runs() -> None:
     exec(compile(example, str(PAGE), "exec"), {})
 
 
-def test_the_example_of_a_scenario_is_one(tmp_path: Path) -> None:
+def test_the_example_of_a_scenario_distinguishes_drivers(tmp_path: Path) -> None:
     (example,) = blocks("scenario")
     path = tmp_path / "van.py"
     path.write_text(example, encoding="utf-8")

@@ -27,7 +27,7 @@ MAP = Path("envs/grid4x4/map/map.net.xml")
 NUMBERS = np.random.default_rng(0)
 
 
-def test_co2_is_that_of_sumo(tmp_path: Path) -> None:
+def test_co2_equals_sumos(tmp_path: Path) -> None:
     sumo = pytest.importorskip("sumo")
     speed, accel = NUMBERS.uniform(0.0, 40.0, 3000), NUMBERS.uniform(-4.0, 3.0, 3000)
     # SUMO prints five digits. Near the limits of coasting, rounding may put a value on the other
@@ -89,15 +89,15 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
 @pytest.mark.parametrize(
     ("arrived", "late", "seconds", "expected"),
     [
-        (600, 100, 3600, False),  # 500 in 50 minutes, 100 in ten
-        (550, 50, 3600, False),  # half as many as before
+        (600, 100, 3600, False),  # 500 vehicles in 50 minutes, and 100 in the last ten
+        (550, 50, 3600, False),  # half as many in the last ten minutes as before
         (549, 49, 3600, True),
         (0, 0, 3600, False),
         (549, 49, 1199, None),
         (100, 20, 1200, True),
     ],
 )
-def test_a_run_jams_if_half_as_many_arrive_in_the_last_ten_minutes(
+def test_a_run_jams_if_less_than_half_as_many_arrive_in_the_last_ten_minutes(
     arrived: int, late: int, seconds: int, expected: bool | None
 ) -> None:
     assert is_jammed(arrived, late, seconds) is expected
@@ -119,7 +119,7 @@ def test_a_run_whose_exit_is_closed_jams(tmp_path: Path) -> None:
     assert sumo.jams is True
 
 
-def test_controllers_and_sumo_are_measured_alike(tmp_path: Path) -> None:
+def test_controllers_and_sumo_are_measured_in_the_same_way(tmp_path: Path) -> None:
     demand = tmp_path / "regular.rou.xml"
     demand.write_text(
         '<routes><vType id="car" sigma="0" speedDev="0"/>'

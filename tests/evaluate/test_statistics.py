@@ -65,7 +65,7 @@ def test_wilson_equals_the_textbook() -> None:
 
 
 @pytest.mark.parametrize("hits", [0, 10])
-def test_wilson_stays_a_share(hits: int) -> None:
+def test_wilson_intervals_stay_between_0_and_1(hits: int) -> None:
     found = share_interval(hits, 10)
     assert found is not None
     assert 0.0 <= found.low < found.high <= 1.0
@@ -95,7 +95,7 @@ def test_equal_runs_have_the_interval_of_their_trips() -> None:
 @pytest.mark.parametrize("runs", [2, 3, 5])
 @pytest.mark.parametrize("share", [0.02, 0.3])
 @pytest.mark.parametrize("alike", [1e9, 20.0], ids=["like one run", "runs differ"])
-def test_an_interval_of_shares_covers_and_stays_inside(
+def test_an_interval_of_shares_has_its_coverage_and_stays_between_0_and_1(
     runs: int, share: float, alike: float
 ) -> None:
     """Each run has 50 trips and a success probability from a beta distribution."""
@@ -106,7 +106,7 @@ def test_an_interval_of_shares_covers_and_stays_inside(
         assert found is not None
         assert 0.0 <= found.low < found.high <= 1.0
         hits += found.low <= share <= found.high
-    assert hits >= 900  # of 950; shares near 0 are far from normally distributed
+    assert hits >= 900  # 950 expected; shares near 0 are far from normally distributed
 
 
 def test_an_interval_of_evenness_stays_within_its_bounds() -> None:
@@ -154,7 +154,7 @@ def test_gini_equals_the_sum_over_all_pairs(values: np.ndarray) -> None:
     assert found == pytest.approx(pairs / (2.0 * values.size**2 * values.mean()), abs=1e-9)
 
 
-def test_jain_is_one_where_all_have_the_same_and_falls_to_one_over_n() -> None:
+def test_jains_index_is_one_for_equal_values_and_one_over_n_for_a_single_value() -> None:
     assert jain_index(np.full(5, 3.0)) == pytest.approx(1.0)
     assert jain_index(np.array([7.0, 0.0, 0.0, 0.0])) == pytest.approx(0.25)
     # Jain, Chiu and Hawe 1984: if k of n users get equal shares, the index is k/n.

@@ -51,7 +51,7 @@ class Worlds:
             self.step += 1
 
     def cut(self) -> NDArray[np.void]:
-        """Return the trips, which the horizon truncates."""
+        """Truncate the trips at the horizon, and return them."""
         agents = self.mask.shape[1]
         nothing = np.zeros((1, agents))
         return self.recorder.add(
@@ -65,7 +65,7 @@ class Worlds:
         )
 
 
-def test_a_vehicle_stands_below_a_tenth_of_a_metre_a_second() -> None:
+def test_a_vehicle_below_a_tenth_of_a_metre_per_second_counts_as_standing() -> None:
     worlds = Worlds([0.0, 0.0, 0.0])
     worlds.drive(5, 0.0, 0.09, 0.11)
     # The first sample has no earlier position.
@@ -91,7 +91,9 @@ def test_an_agent_that_was_away_has_not_stood() -> None:
     ("kind", "goes", "waits"),
     [("continuous", 0.6, 0.4), ("discrete", ACTION_FASTER, ACTION_IDLE)],
 )
-def test_ten_seconds_count_as_blocked_or_stood(kind: str, goes: float, waits: float) -> None:
+def test_a_stop_of_ten_seconds_counts_as_blocked_or_stood(
+    kind: str, goes: float, waits: float
+) -> None:
     worlds = Worlds([goes, waits, goes], kind)
     worlds.drive(21, 0.0, 0.0, 5.0)
     rows = worlds.cut()
@@ -102,7 +104,7 @@ def test_ten_seconds_count_as_blocked_or_stood(kind: str, goes: float, waits: fl
     assert worlds.asked == 2
 
 
-def test_less_than_ten_seconds_do_not() -> None:
+def test_a_stop_of_less_than_ten_seconds_does_not_count() -> None:
     worlds = Worlds([0.6])
     worlds.drive(20, 0.0)
     assert worlds.cut()["out_of_time"].tolist() == [True]

@@ -20,7 +20,7 @@ def test_the_standard_suite_has_its_maps_and_numbers_of_agents() -> None:
     assert suite.agents == (1, 25, 50, 100)
 
 
-def test_its_maps_are_there_and_each_world_has_its_own_name(shared_maps: Path) -> None:
+def test_the_maps_of_the_suite_exist_and_each_world_has_its_own_name(shared_maps: Path) -> None:
     suite = load_suite(find_settings("suite", "standard"))
     labels = [world.label for world in worlds_of(suite, shared_maps)]
     assert len(set(labels)) == len(suite.maps) * len(suite.agents)

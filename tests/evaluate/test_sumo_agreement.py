@@ -54,16 +54,16 @@ def compare(folder: Path, case: Case, seconds: int = 900) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
-def test_on_real_maps_traffic_is_as_sumos(shared_maps: Path, name: str) -> None:
+def test_traffic_on_real_maps_agrees_with_sumos(shared_maps: Path, name: str) -> None:
     compare(shared_maps, REAL[name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WHEEL)
-def test_on_the_wheels_maps_traffic_is_as_sumos(name: str) -> None:
+def test_traffic_on_maps_of_the_wheel_agrees_with_sumos(name: str) -> None:
     compare(GAME, WHEEL[name])
 
 
-def test_for_three_minutes_traffic_is_as_sumos() -> None:
+def test_traffic_of_three_minutes_agrees_with_sumos() -> None:
     """The short variant, which is part of every run of the tests."""
     compare(GAME, WHEEL["kuehne"], 180)

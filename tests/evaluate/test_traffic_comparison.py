@@ -57,7 +57,7 @@ def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
     return TrafficComparison("town", 900, 0.1, 1, ours, theirs, ("a", "b"))
 
 
-def test_a_ratio_is_cavmarl_over_sumo_if_it_is_defined() -> None:
+def test_a_ratio_is_cavmarls_figure_over_sumos_if_both_are_defined() -> None:
     found = comparison(side(6, 3.0), side(8, None))
     assert found.ratio("arrived") == 0.75
     assert found.ratio("mean_speed_mps") is None
@@ -134,7 +134,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
     return found
 
 
-def test_both_sides_run_the_same_demand_as_long_and_write_nothing(
+def test_both_sides_run_the_same_demand_for_equal_times_and_write_nothing(
     still: StillSumo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worlds: list[Simulation] = []
@@ -159,7 +159,7 @@ def test_both_sides_run_the_same_demand_as_long_and_write_nothing(
     assert found.sumo_vehicles == 7.0
 
 
-def test_a_turn_counts_each_vehicle_once_a_step_on_both_sides(still: StillSumo) -> None:
+def test_both_sides_count_each_vehicle_once_per_step(still: StillSumo) -> None:
     moved: list[None] = []
     world: Any = SimpleNamespace(
         outputs=SimpleNamespace(present=np.zeros((1, 2))),

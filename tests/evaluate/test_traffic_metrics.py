@@ -82,7 +82,9 @@ def test_mean_speed_is_over_all_vehicles_of_all_samples(network: RoadNetwork, li
     assert figures.mean_speed_mps == pytest.approx(7.0)
 
 
-def test_the_queue_stands_on_lanes_that_end_at_a_signal(network: RoadNetwork, link: int) -> None:
+def test_the_queue_has_the_vehicles_that_stand_on_lanes_to_a_signal(
+    network: RoadNetwork, link: int
+) -> None:
     lane = int(network.links["from_lane"][link])
     free = int(np.flatnonzero(~network.lanes["internal"] & (network.lanes["num_links"] == 0))[0])
     queued = rows(
@@ -142,7 +144,7 @@ def test_moving_vehicles_and_vehicles_off_the_line_do_not_wait(
     assert measure(network, [way] * 3).locks_s == {}
 
 
-def test_flow_and_density_are_those_defined_by_edie(network: RoadNetwork, link: int) -> None:
+def test_flow_and_density_follow_edies_definitions(network: RoadNetwork, link: int) -> None:
     lane = int(network.links["from_lane"][link])
     edge = network.edges[network.lanes["edge"][lane]]
     lane_km = edge["length_m"] * edge["num_lanes"] / 1000.0
@@ -157,7 +159,7 @@ def test_flow_and_density_are_those_defined_by_edie(network: RoadNetwork, link: 
     assert found["length_m"] == pytest.approx([edge["length_m"]] * 2)
 
 
-def test_a_vehicle_off_the_map_counts_for_speed_alone(network: RoadNetwork) -> None:
+def test_a_vehicle_off_the_map_counts_only_for_the_mean_speed(network: RoadNetwork) -> None:
     lost = car(network, 0, 0, speed=2.0)
     lost["lane"] = -1
     run = measure(network, [rows(lost)])

@@ -15,7 +15,8 @@ from tests.cli.test_main import refusal, run
 @pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 @pytest.mark.parametrize(
     ("worlds", "zones", "sources"),
-    [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],  # each world is on one worker
+    # In the first case, each world is on one worker.
+    [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],
 )
 def test_plans_are_recomputed_from_the_manifest(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], worlds: int, zones: int, sources: list[str]

@@ -38,7 +38,7 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     assert set(rows["run"].tolist()) == {0, 1}
     assert set(rows["episode"].tolist()) == {0, 1, 2}
     assert (rows["source"] != rows["target"]).all()
-    assert (rows["switch_depth_m"] > 2.0).all()  # the hysteresis
+    assert (rows["switch_depth_m"] > 2.0).all()  # the hysteresis is 2 m
     prepared = rows[rows["approached"] >= 0]
     assert (prepared["prepare_depth_m"] < prepared["switch_depth_m"]).all()
     staying = rows[~rows["removed"]]
@@ -87,7 +87,7 @@ def test_each_episode_has_the_imbalance_of_its_zones(folder: Path, tmp_path: Pat
     assert len(set(rows["zone_imbalance"].tolist())) == 6
     found = load_report(folder)["idm"]["zone_imbalance"].mean
     assert found == pytest.approx(rows["zone_imbalance"].mean())
-    # Three slivers at the rim of the map, and one zone that has all vehicles.
+    # Three narrow zones at the edge of the map, and one zone with all vehicles.
     low_x, low_y, high_x, high_y = load_world("grid4x4").network.extent_m
     cuts = [low_x - 9.0, low_x - 8.0, low_x - 7.0, low_x - 6.0, high_x + 9.0]
     rects = [(a, low_y - 9.0, b, high_y + 9.0) for a, b in pairwise(cuts)]
@@ -123,7 +123,8 @@ def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
     names = {"run.0.jsonl", "run.1.jsonl", "run.run-1.0.jsonl", "run.run-1.1.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == names
     switches = sum(summarize(tmp_path / name)[0].switches for name in names)
-    assert switches >= found.transfers > 0  # the last step of an episode is followed by a reset
+    # Transfers in the last step of an episode may be missing, because a reset follows.
+    assert switches >= found.transfers > 0
     (tmp_path / "run.0.jsonl").unlink()
     (tmp_path / "run.1.jsonl").unlink()
     out = tmp_path / "out"

@@ -32,7 +32,7 @@ def test_each_entry_equals_its_recorded_result(found) -> None:  # type: ignore[n
     assert found.weights_bytes <= 1_000_000
     assert found.trips >= 50
     config, *_ = load_config(found.environment.rpartition("-")[0])
-    if config.traffic.endless:  # no vehicle arrives
+    if config.traffic.endless:  # on endless roads, no vehicle arrives
         assert found.shares["collision"] == 0.0
     else:
         assert 0.5 < found.shares["success"] <= 1.0
@@ -85,7 +85,7 @@ def test_a_result_is_recorded_again(entry: Path) -> None:
     assert sorted(found.name for found in entry.iterdir()) == FILES
 
 
-def test_a_result_stays_if_recording_it_again_fails(entry: Path) -> None:
+def test_the_old_result_is_kept_if_recording_fails(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"]["overrides"] = {"sensors.neighbors.range_m": 30.0}
@@ -105,7 +105,7 @@ def test_unknown_entries_are_refused(entry: Path, tmp_path: Path) -> None:
         verify_entry(entry)
 
 
-def test_drivers_among_each_other() -> None:
+def test_a_matrix_has_the_trips_of_each_driver_among_each_other_driver() -> None:
     found = cross("merge", ["idm", "random_actions"], episodes=1, seed=2)
     assert found.drivers == ("idm", "random_actions")
     for driver in found.drivers:

@@ -2,12 +2,12 @@
 
     python -m tests.golden.portability [--quick|--emulated]
 
-drives the rows of `worlds.py` and the episodes of some trained drivers, first without settings,
-then with each setting of `PROCESSORS`, each time with maps that are read anew. It prints
-a line for each run. The exit code is 1 if the bytes of a run differ from those of the first one.
-Recorded hashes are not used. `--quick` leaves out what takes longer than a minute. `--emulated`
-drives one step on the processors that `qemu-x86_64` emulates, and on the one whose kernels they
-have.
+This command runs the rows of `worlds.py` and episodes of some trained drivers: first without
+settings, then with each setting of `PROCESSORS`. Each run reads the maps anew. The command prints
+a line for each run. The exit code is 1 if the bytes of a run differ from those of the first run.
+Recorded hashes are not used. `--quick` leaves out runs of more than a minute. `--emulated` runs
+one step on the processors that `qemu-x86_64` emulates, and on the processor for which their
+kernels are compiled.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tests.golden import worlds
 
 
 def _numpy_without(*names: str) -> dict[str, str]:
-    """Return the setting that switches off what NumPy uses here of the processor's features."""
+    """Return the setting that switches off the processor features that NumPy uses here."""
     used = [name for name in numpy_core.__cpu_dispatch__ if numpy_core.__cpu_features__[name]]
     return {_NUMPY: " ".join(name for name in used if name.startswith(names))}
 
@@ -41,7 +41,7 @@ def _numpy_without(*names: str) -> dict[str, str]:
 _NUMPY = "NPY_DISABLE_CPU_FEATURES"
 _AVX512 = ("AVX512", "X86_V4")
 _AVX2 = (*_AVX512, "AVX2", "FMA3", "X86_V3")
-_KERNELS = {"CAVMARL_KERNELS": "native", "NUMBA_CPU_FEATURES": ""}  # only those of the named CPU
+_KERNELS = {"CAVMARL_KERNELS": "native", "NUMBA_CPU_FEATURES": ""}  # only features of the named CPU
 _OLD_LIBRARIES = {
     **_numpy_without(*_AVX2),
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2,-AVX512F",
@@ -76,7 +76,7 @@ PROCESSORS = {
     ),
     "kernels for Haswell": Processor({**_KERNELS, "NUMBA_CPU_NAME": "haswell"}),
     "all for Nehalem": Processor({**_KERNELS, "NUMBA_CPU_NAME": "nehalem", **_OLD_LIBRARIES}),
-    # QEMU 7.2 computes NumPy's sort with AVX2 wrongly. The kernels are those of the row above.
+    # QEMU 7.2 computes NumPy's sort with AVX2 wrongly. The kernels are as in the row above.
     "emulated EPYC": Processor(
         {**_KERNELS, "NUMBA_CPU_NAME": "haswell", **_numpy_without(*_AVX2)}, emulated="EPYC"
     ),

@@ -16,7 +16,7 @@ def test_numpy_and_the_c_library_do_not_matter(capsys: pytest.CaptureFixture[str
 @pytest.mark.slow
 def test_the_processor_does_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare(PROCESSORS, TASKS) == 0, capsys.readouterr().out
-    with capsys.disabled():  # what was skipped belongs to the result
+    with capsys.disabled():  # the result names the skipped processors
         print(capsys.readouterr().out)
 
 

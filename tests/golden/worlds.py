@@ -2,9 +2,10 @@
 
     python -m tests.golden.worlds [ROW ...]
 
-writes `worlds.json`; `test_golden.py` compares. A row is a world that is driven for some steps. The
-bytes of its results, in a fixed order and without names, give one hash for each part. `WAYS`
-divide the world, and must give the same hashes. Names of cavmarl that may change are at the top.
+This command writes `worlds.json`; `test_golden.py` compares results with it. A row is a world that
+is driven for some steps. The bytes of its results, in a fixed order and without names, give one
+hash per part. `WAYS` are divisions of the world with the same hashes. Names of cavmarl that may
+change are at the top.
 """
 
 from __future__ import annotations

@@ -2,9 +2,9 @@
 
     python -m tests.golden.zoo [DRIVER ...]
 
-evaluates each driver (all, if none is named) with the job in the manifest of its result: the same
-world, seed, episodes and runs. It is the part `zoo` of `make record` (CONTRIBUTING.md). The first
-driver that cannot be recorded ends it.
+This command evaluates the named drivers, or all drivers. It takes the job of each driver (world,
+seed, episodes, runs) from the manifest of the driver's result. The command is the part `zoo` of
+`make record` (CONTRIBUTING.md). It stops at the first driver that cannot be recorded.
 """
 
 from __future__ import annotations

@@ -19,7 +19,7 @@ WORDS = st.integers(0, (1 << 64) - 1)
 
 
 @given(st.lists(st.tuples(WORDS, WORDS, WORDS), max_size=12), st.tuples(WORDS, WORDS, WORDS))
-def test_the_digest_is_that_of_its_plain_twin(
+def test_the_digest_equals_its_plain_twin(
     rows: list[tuple[int, int, int]], masks: tuple[int, int, int]
 ) -> None:
     factors = [0x9E3779B97F4A7C15, 1, (1 << 64) - 1]
@@ -48,7 +48,7 @@ def cars(number: int) -> np.ndarray:
     return rows
 
 
-def test_a_world_has_one_digest_however_it_is_divided() -> None:
+def test_the_digest_of_a_world_is_the_same_in_all_divisions() -> None:
     rows, of = cars(20), RowDigests().of
     rng = np.random.default_rng(4)
     for cut in (0, 1, 7, 20):
@@ -57,7 +57,7 @@ def test_a_world_has_one_digest_however_it_is_divided() -> None:
 
 
 @pytest.mark.parametrize("name", VEHICLE.names or ())
-def test_every_field_of_the_state_counts_and_no_other(name: str) -> None:
+def test_a_digest_depends_on_every_field_of_the_state_and_no_other(name: str) -> None:
     rows, of = cars(3), RowDigests().of
     before = of(rows)
     field = rows[name]

@@ -48,7 +48,7 @@ def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
     ]
 
 
-def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
+def test_each_vehicle_has_one_owner_and_a_ghost_in_each_near_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # less than the whole map
@@ -80,7 +80,7 @@ def test_each_vehicle_has_one_owner_and_is_seen_wherever_it_is_near(
     assert moved > 20
 
 
-def test_a_vehicle_that_a_zone_has_not_seen_come_is_an_error() -> None:
+def test_a_vehicle_that_enters_a_zone_without_a_ghost_is_an_error() -> None:
     simulation = divided()
     drive(simulation)
     here, there = (int(owned(simulation, 0)[zone]["id"][0]) for zone in (0, 3))
@@ -128,7 +128,7 @@ def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:
     assert len(over_borders) > 1
 
 
-def test_all_shards_together_are_the_world() -> None:
+def test_all_shards_together_equal_the_undivided_world() -> None:
     whole, parts = divided(1), divided(4)
     for _ in range(5):
         drive(whole)
@@ -142,7 +142,7 @@ def test_all_shards_together_are_the_world() -> None:
     assert set(PLACEMENT_FIELDS).isdisjoint(STATE_FIELDS)
 
 
-def test_what_is_changed_in_all_next_rows_goes_back_to_their_shards() -> None:
+def test_changes_in_the_rows_of_all_shards_return_to_the_shards() -> None:
     simulation = divided()
     drive(simulation)
     for shard in simulation.shards:

@@ -116,7 +116,7 @@ class Looks:
         return wrong
 
     def entered(self) -> list[int]:
-        """Return the vehicles that are new since the check before."""
+        """Return the vehicles that are new since the previous check."""
         return sorted(self.strays.entered[: self.found["entered"].item()].tolist())
 
 
@@ -174,7 +174,7 @@ def test_the_check_of_a_run_equals_its_plain_twin(seed: int, stay: float) -> Non
 
 
 @pytest.mark.parametrize("name", ["x", "y"])
-def test_a_vehicle_that_is_nowhere_is_found(name: str) -> None:
+def test_a_vehicle_without_a_valid_position_is_found(name: str) -> None:
     looks, rng, rows = started(7)
     zones = dealt(moved(rng, rows, 1.0))
     lost = zones[2].owned[0]

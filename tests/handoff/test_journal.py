@@ -69,7 +69,7 @@ def test_appended_records_are_read_back(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("sync", ["flush", "fsync"])
-def test_an_append_is_there_when_it_returns(tmp_path: Path, sync: Sync) -> None:
+def test_an_appended_record_is_in_the_file_when_append_returns(tmp_path: Path, sync: Sync) -> None:
     path = tmp_path / "run.journal"
     with Journal(path, sync=sync) as journal:
         for number, record in enumerate(eventful().log):
@@ -78,7 +78,7 @@ def test_an_append_is_there_when_it_returns(tmp_path: Path, sync: Sync) -> None:
 
 
 @pytest.mark.parametrize("sync", ["flush", "fsync"])
-def test_only_with_fsync_an_append_is_written_out(
+def test_appended_records_are_synced_to_disk_only_with_fsync(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, sync: Sync
 ) -> None:
     path, there = tmp_path / "run.journal", list[int]()
@@ -92,14 +92,14 @@ def test_only_with_fsync_an_append_is_written_out(
     assert there == ([2, 3, 4] if sync == "fsync" else [])
 
 
-def test_a_file_that_exists_is_not_begun_anew(written: Path) -> None:
+def test_an_existing_file_is_not_overwritten(written: Path) -> None:
     before = written.read_bytes()
     with pytest.raises(JournalError, match=re.escape(f"{written}: the journal exists already")):
         Journal(written)
     assert written.read_bytes() == before
 
 
-def test_a_journal_goes_on_behind_what_is_there(tmp_path: Path) -> None:
+def test_a_resumed_journal_appends_to_its_file(tmp_path: Path) -> None:
     log, path = eventful().log, tmp_path / "run.journal"
     for at in range(0, len(log), 3):
         with Journal(path, resume=at > 0) as journal:
@@ -221,7 +221,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
 
 
-def test_a_full_disk_is_an_error_that_leaves_a_journal_to_go_on_with(tmp_path: Path) -> None:
+def test_a_full_disk_is_an_error_after_which_the_journal_can_be_resumed(tmp_path: Path) -> None:
     log, path = eventful().log, tmp_path / "run.journal"
     journal = Journal(path)
     journal.append(log[:2])
@@ -237,7 +237,7 @@ def test_a_full_disk_is_an_error_that_leaves_a_journal_to_go_on_with(tmp_path: P
     assert list(JournalReader(path)) == log
 
 
-def test_memory_stays_flat(tmp_path: Path) -> None:
+def test_the_memory_of_a_journal_does_not_grow(tmp_path: Path) -> None:
     idle = [Begin(0, 1), Begin(0, 2)]
     with Journal(tmp_path / "run.journal") as journal:
         journal.append(idle)
@@ -249,7 +249,7 @@ def test_memory_stays_flat(tmp_path: Path) -> None:
     assert grown < 20_000
 
 
-def test_a_coordinator_goes_on_with_its_journal(written: Path) -> None:
+def test_a_coordinator_continues_with_its_journal(written: Path) -> None:
     bench = eventful()
     records = tuple(JournalReader(written))
     directory = Directory.restore(records, range(2), bench, bench.limits)
@@ -260,7 +260,7 @@ def test_a_coordinator_goes_on_with_its_journal(written: Path) -> None:
 # Contents
 
 
-def test_a_summary_counts_what_was_committed(written: Path) -> None:
+def test_a_summary_counts_committed_events(written: Path) -> None:
     summary, table = summarize(written)
     assert summary.to_dict() == {
         "run": bytes(range(16)).hex(), "lines": len(eventful().log), "episodes": 1,
@@ -379,7 +379,7 @@ def independent_replay(journal: Path) -> Any:
 
 
 @pytest.mark.parametrize("seed", [4, 11])
-def test_the_replay_of_the_page_comes_to_the_same_owners(tmp_path: Path, seed: int) -> None:
+def test_the_replay_of_the_page_finds_the_same_owners(tmp_path: Path, seed: int) -> None:
     simulator = campaign(seed, "corner")
     simulator.run(30)
     path = tmp_path / "run.journal"

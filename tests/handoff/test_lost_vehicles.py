@@ -100,7 +100,7 @@ def test_a_lost_vehicle_blocks_no_lane_in_any_division(
     assert away_m > divided.zones.loads().halo_m
     street = whole.vehicles(0)
     passed = (street["driver"] != DRIVER_AGENT) & (street["s"] > row["s"])
-    assert passed.sum() >= 3, "where the agent's lane still is, others drive on"
+    assert passed.sum() >= 3, "other vehicles pass on the lane of the agent"
 
 
 def test_the_built_in_driver_looks_for_its_lane(worlds: tuple[Simulation, Simulation]) -> None:

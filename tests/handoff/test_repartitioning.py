@@ -91,7 +91,7 @@ def test_balanced_zones_do_not_change() -> None:
     assert calm.partition is before
 
 
-def test_worlds_of_workers_are_repartitioned_too() -> None:
+def test_worlds_of_workers_are_repartitioned() -> None:
     overrides = {"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.0}
     alone, shared = (
         make_vec("grid4x4", num_envs=2, zones=4, workers=workers, overrides=overrides)
@@ -123,7 +123,7 @@ def test_worlds_that_cannot_be_repartitioned_are_refused(
         make_vec("grid4x4", zones=2, overrides=overrides)
 
 
-def test_zones_of_one_world_over_workers_stay() -> None:
+def test_repartitioning_of_a_world_over_workers_is_refused() -> None:
     with pytest.raises(ConfigError, match="over workers needs zones that do not change"):
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
 
@@ -131,7 +131,7 @@ def test_zones_of_one_world_over_workers_stay() -> None:
 def test_zones_that_swap_places_hand_over_distant_vehicles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Vehicles whose new zone is far away count as teleports; all else is equal."""
+    """Vehicles whose new zone is far away count as teleports; all other results are equal."""
     path = tmp_path / "run.jsonl"
     strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
     strips["zones.repartition_steps"] = 6

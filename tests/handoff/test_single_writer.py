@@ -78,9 +78,7 @@ def agents_of(shard: Shard) -> NDArray[np.int64]:
 
 
 @pytest.mark.parametrize(("kind", "strangers"), [("continuous", np.nan), ("discrete", 1e9)])
-def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
-    kind: str, strangers: float
-) -> None:
+def test_only_the_owner_of_a_vehicle_uses_its_control(kind: str, strangers: float) -> None:
     plain, watched = divided(kind), divided(kind)
     strict = Strict(watched, strangers)
     use_executor(watched, strict)
@@ -95,7 +93,7 @@ def test_a_control_counts_where_the_vehicle_is_owned_and_nowhere_else(
     assert strict.controlled > STEPS * AGENTS
 
 
-def test_a_control_that_its_owner_does_not_get_is_missed() -> None:
+def test_if_the_owner_gets_no_control_the_world_differs() -> None:
     plain, watched = divided("continuous"), divided("continuous")
     use_executor(watched, Strict(watched, 0.0))
     shard = watched.shards[0]

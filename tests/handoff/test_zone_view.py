@@ -28,7 +28,9 @@ def divided(monkeypatch: pytest.MonkeyPatch) -> Simulation:
     return simulation
 
 
-def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Simulation) -> None:
+def test_a_view_has_the_owner_of_each_vehicle_and_the_ghosts_near_zones(
+    divided: Simulation,
+) -> None:
     rects = divided.partition.reaching
     for _ in range(10):
         drive(divided)
@@ -46,7 +48,7 @@ def test_owners_stand_beside_the_vehicles_and_ghosts_are_those_near(divided: Sim
     assert view.halo_m == HALO_M
 
 
-def test_a_view_stays_what_it_was(divided: Simulation) -> None:
+def test_a_view_does_not_change_later(divided: Simulation) -> None:
     view = divided.zones.view()
     before = [ghosts.copy() for ghosts in view.ghosts]
     for _ in range(20):

@@ -40,7 +40,7 @@ def test_choices_have_the_probabilities_of_their_logits() -> None:
     assert distance.item() == pytest.approx(-math.log(0.4))
 
 
-def test_corrections_of_throttle_count_whole_and_of_steering_a_tenth() -> None:
+def test_corrections_are_added_in_full_to_throttle_and_by_a_tenth_to_steering() -> None:
     observations = torch.tensor([[9.0, 9.0, 0.3, -0.5]])
     given = network("continuous", residual=True).given(torch.tensor([[0.2, 1.0]]), observations)
     assert given[0].tolist() == pytest.approx([0.5, -0.4])

@@ -53,7 +53,7 @@ def test_advantages_by_hand() -> None:
     assert found == pytest.approx([first, ends, 0.0, fourth, cut])
 
 
-def test_what_the_next_vehicle_gets_is_not_credited_to_the_one_before() -> None:
+def test_rewards_of_the_next_vehicle_are_not_credited_to_the_previous_one() -> None:
     # Without a step between: one vehicle ends in step 0, the next has the seat from step 1 on.
     batch = batch_of_one_seat(
         rewards=[1.0, 50.0, -7.0],

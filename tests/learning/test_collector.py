@@ -44,7 +44,7 @@ def make_collector(
 
 
 @pytest.mark.parametrize("central", [False, True])
-def test_what_is_collected_is_cut_at_ends_and_at_the_horizon(central: bool) -> None:
+def test_collected_trajectories_are_cut_at_ends_and_at_the_horizon(central: bool) -> None:
     vec = make_worlds("NextStep" if central else "SameStep")
     batch = make_collector(vec, vec.state_size if central else 0).collect(with_suggested=False)
     boundary = batch.acted & ~batch.goes_on
@@ -58,7 +58,7 @@ def test_what_is_collected_is_cut_at_ends_and_at_the_horizon(central: bool) -> N
     assert batch.acted[1:][batch.goes_on[:-1]].all()
 
 
-def test_values_are_of_the_state_that_the_world_was_in() -> None:
+def test_values_use_the_state_of_their_step_also_at_the_horizon() -> None:
     vec = make_worlds("NextStep")
     collector = make_collector(vec, vec.state_size)
     first = torch.from_numpy(vec.state())
@@ -99,7 +99,7 @@ def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
     assert batch.acted[:, ~theirs].float().mean() > 0.5
 
 
-def test_worlds_that_go_on_have_the_mask_that_they_were_saved_with(
+def test_resumed_worlds_have_the_mask_of_the_saved_state(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     one, other = (make_collector(make_worlds("SameStep"), 0) for _ in range(2))
@@ -124,7 +124,7 @@ def test_worlds_that_go_on_have_the_mask_that_they_were_saved_with(
     np.testing.assert_array_equal(given[0], masks[-1])
 
 
-def test_no_return_is_expected_after_a_red_light() -> None:
+def test_the_value_after_a_red_light_violation_is_zero() -> None:
     found = {}
     for end_at_red in (False, True):
         vec = make_vec("grid4x4", num_envs=4, seed=0)
@@ -155,7 +155,7 @@ def test_a_residual_driver_observes_the_actions_of_the_built_in_driver() -> None
 
 
 @pytest.mark.parametrize("name", ["", "gentle"])
-def test_imitated_actions_are_those_of_the_driver(name: str) -> None:
+def test_imitated_actions_equal_those_of_the_driver(name: str) -> None:
     vec = make_vec("ring22", num_envs=2)
     collector = make_collector(vec, 0, imitate=name)
     teacher = load_policy(name or "idm", vec)

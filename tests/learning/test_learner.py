@@ -51,7 +51,7 @@ def batch(rewards: list[float]) -> Any:
 
 
 @pytest.mark.parametrize(("anneal", "rate"), [(True, 0.5), (False, 2.0)])
-def test_the_learning_rate_falls_with_what_is_left(anneal: bool, rate: float) -> None:
+def test_the_learning_rate_falls_with_the_remaining_updates(anneal: bool, rate: float) -> None:
     found = learner(learning_rate=2.0, anneal=anneal, epochs=1, minibatches=1)
     found.update(batch([1.0, 2.0, 3.0]), 0.25)
     assert [group["lr"] for group in found.optimizer.param_groups] == [rate]

@@ -36,7 +36,7 @@ def test_batches_together_have_the_deviation_of_all_observations() -> None:
     assert observer.deviation[1].item() == pytest.approx(0.02), "a constant is not amplified"
 
 
-def test_a_driver_counts_as_many_decisions_as_it_has_learned_from(
+def test_the_weight_of_a_drivers_scales_is_its_number_of_decisions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observer = network()
@@ -55,7 +55,7 @@ def test_a_driver_counts_as_many_decisions_as_it_has_learned_from(
     assert observer.deviation[0].item() == pytest.approx(math.sqrt(57.0 / 12.0))
 
 
-def test_scales_go_on_where_they_were_saved() -> None:
+def test_saved_scales_continue() -> None:
     first, second = torch.tensor([[0.0, 1.0], [2.0, 5.0]]), torch.tensor([[10.0, 9.0]])
     whole, cut = network(), network()
     scales = Scales(whole)

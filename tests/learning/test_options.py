@@ -82,7 +82,7 @@ def test_wrong_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture
 
 
 @pytest.mark.parametrize("name", ["gpu", "meta", "cuda:99", ""])
-def test_a_device_that_is_not_there_is_refused_with_a_cure(name: str) -> None:
+def test_a_missing_device_is_refused_with_a_remedy(name: str) -> None:
     check_device("cpu")
     with pytest.raises(ConfigError, match=f"--device {name}: .*give cpu, or cuda"):
         check_device(name)

@@ -33,12 +33,12 @@ def test_a_trip_is_the_sum_of_its_steps_and_red_lights_are_remembered() -> None:
     assert (found["trips"], found["trip_return"], found["success"]) == (1, 7.0, 1.0)
     assert found["red_light"] == 1.0
     found = step(trips, (8.0, 80.0), "aa")
-    # The next trip of the first agent has 8 and no red light; that of the second has 150.
+    # The next trip of the first agent has return 8 and no red light; the second agent's has 150.
     assert found["trip_return"] == pytest.approx((7.0 + 8.0 + 150.0) / 3.0)
     assert found["red_light"] == pytest.approx(1.0 / 3.0)
 
 
-def test_a_trip_that_is_cut_counts_for_nothing() -> None:
+def test_truncated_trips_do_not_count() -> None:
     trips = Trips(1, 2)
     step(trips, (100.0, 1.0), red=True)
     assert step(trips, (100.0, 1.0), "c-")["trips"] == 0
@@ -46,7 +46,7 @@ def test_a_trip_that_is_cut_counts_for_nothing() -> None:
     assert (found["trips"], found["trip_return"], found["red_light"]) == (1, 3.0, 0.0)
 
 
-def test_trips_go_on_where_they_were_saved() -> None:
+def test_saved_trips_continue() -> None:
     trips, again = Trips(1, 2), Trips(1, 2)
     step(trips, (1.0, 5.0), "-a")
     again.load(trips.save())

@@ -147,7 +147,7 @@ def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
     assert set(report.dead_ends) == ends
 
 
-def test_a_poorly_connected_map_is_drivable_and_noted(built_map: BuiltMap) -> None:
+def test_a_poorly_connected_map_is_drivable_and_reported(built_map: BuiltMap) -> None:
     report = check_map(network_of(built_map("osm/berlin_siegessaeule.osm.gz")))
     assert report.drivable
     assert any("only 26% of the edges" in note for note in report.notes)
@@ -198,7 +198,7 @@ def test_unusual_places_are_named(check: Callable[..., MapReport]) -> None:
     assert report.lanes_without_successor == ("a_1",)
     assert report.self_loops == ("x",)
     assert report.speed_outliers == ("a_1", "x_0")
-    assert len(report.notes) == 6  # with a_1 and b_0, which share a strip
+    assert len(report.notes) == 6  # one note says that a_1 and b_0 share a strip
 
 
 def test_merging_without_a_rule_is_named(check: Callable[..., MapReport]) -> None:

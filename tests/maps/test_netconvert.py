@@ -57,7 +57,7 @@ def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
     assert str(tmp_path).encode() not in one
 
 
-def test_an_extension_does_not_matter(town: Path, tmp_path: Path) -> None:
+def test_the_kind_of_a_source_does_not_depend_on_its_extension(town: Path, tmp_path: Path) -> None:
     odd = town.rename(tmp_path / "download.bin")
     assert build_network(odd, tmp_path / "town.net.xml").kind == "osm"
 
@@ -74,7 +74,7 @@ def test_errors_of_netconvert_are_shown(shared_maps: Path, tmp_path: Path, name:
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_tolerant_builds_list_what_was_dropped(
+def test_tolerant_builds_list_dropped_elements(
     shared_maps: Path, tmp_path: Path, name: str
 ) -> None:
     result = build_network(shared_maps / name, tmp_path / "out.net.xml", tolerant=True)
@@ -117,7 +117,7 @@ def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
     box = (11.153, 49.464, 11.159, 49.468)
     result = build_network(whole, tmp_path / "part.net.xml", bbox=box)
     min_x, min_y, max_x, max_y = read_network(result.path).extent_m
-    assert 700.0 < max_x - min_x < 1200.0  # a road of which a part lies within stays whole
+    assert 700.0 < max_x - min_x < 1200.0  # a road that lies partly within the box is kept whole
     assert 300.0 < max_y - min_y < 600.0
 
 
@@ -224,7 +224,7 @@ def test_map_file_builds_once(town: Path, tmp_path: Path, monkeypatch: pytest.Mo
         map_file(town)
 
 
-def test_map_file_takes_networks_as_they_are(tmp_path: Path) -> None:
+def test_map_file_returns_networks_unchanged(tmp_path: Path) -> None:
     assert map_file(tmp_path / "x.net.xml") == tmp_path / "x.net.xml"
     plain = tmp_path / "x.xml"
     plain.write_text("<net/>")

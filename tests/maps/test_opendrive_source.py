@@ -48,7 +48,7 @@ def test_limits_of_roads_hold_on_their_lanes(tmp_path: Path, speed: str, mps: fl
     }
 
 
-def test_limits_change_along_a_road_and_those_of_lanes_win(tmp_path: Path) -> None:
+def test_limits_change_along_a_road_and_limits_of_lanes_take_precedence(tmp_path: Path) -> None:
     types = (
         '<type s="0" type="town"><speed max="36" unit="km/h"/></type>'
         '<type s="120" type="rural"><speed max="72" unit="km/h"/></type>'

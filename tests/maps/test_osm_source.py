@@ -47,7 +47,7 @@ def turns(network: RoadNetwork) -> dict[int, str]:
         ({11: ([2, 1], TURNS), 13: ([1, 3], THREE)}, ()),
     ],
 )
-def test_turn_lanes_lead_where_they_say(
+def test_turn_lanes_lead_in_their_tagged_directions(
     tmp_path: Path, ways: dict[int, tuple[list[int], dict[str, str]]], notes: tuple[str, ...]
 ) -> None:
     network, result = built(tmp_path, ways)

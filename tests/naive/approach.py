@@ -13,7 +13,7 @@ Entry = tuple[int, int, float]  # link, vehicle's id, m from its centre to the l
 
 
 def link_into(roads: RoadNetwork, row: np.void) -> int:
-    """Return the link into the vehicle's lane or a lane beside, preferably its own; -1: none."""
+    """Return the link into the vehicle's lane, or else into an adjacent lane; -1: none."""
     if row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == row["lane"]:
         return int(row["link"])
     own = roads.lanes[row["lane"]]

@@ -46,7 +46,7 @@ def relu(values: Floats) -> Floats:
 def exact_outputs(
     weights: Mapping[str, NDArray[np.float32]], config: NetworkConfig, observations: Floats
 ) -> Floats:
-    """Compute what `DriverNetwork.outputs` returns in float64, with NumPy's functions."""
+    """Compute the results of `DriverNetwork.outputs` in float64, with NumPy's functions."""
     w = {name: tensor.astype(np.float64) for name, tensor in weights.items()}
     values = (observations.astype(np.float64) - w["mean"]) / w["deviation"]
     values = values.clip(-5.0, 5.0)
@@ -64,7 +64,7 @@ def exact_outputs(
 
 
 def exact_actions(outputs: Floats, config: NetworkConfig, observations: Floats) -> Floats:
-    """Compute continuous actions from what the actor gives."""
+    """Compute continuous actions from the actor's outputs."""
     if config.residual:
         outputs = outputs * np.array([1.0, 0.1]) + observations[:, -2:]
     return outputs.clip(-1.0, 1.0)

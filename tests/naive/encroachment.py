@@ -19,7 +19,7 @@ class Passage(NamedTuple):
 
 
 def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> list[float]:
-    """Return each vehicle's least time between its stay in a shared area and another's; inf: none.
+    """Return each vehicle's least time between its and another's stay in a shared area; inf: none.
 
     Vehicles on crossing paths share the area of their conflict; on paths into one lane they do not.
     """

@@ -1,4 +1,4 @@
-"""What rays and pixels hit, by testing each object; a body is six half-spaces.
+"""The objects that rays and pixels hit, found by testing each object; a body is six half-spaces.
 
 The frame is the vehicle's. `margin` makes each body and wall larger, to find the cases in which
 rounding decides.

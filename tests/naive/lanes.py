@@ -27,7 +27,7 @@ def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry
 
 
 def beside_s(roads: RoadNetwork, lane: int, neighbour: int, s: float) -> float:
-    """Map a position to the lane beside, by interpolation between the mapped points."""
+    """Map a position to the adjacent lane, by interpolation between the mapped points."""
     row = roads.lanes[lane]
     side = "left_s" if row["left"] == neighbour else "right_s"
     points = roads.points[row["first_point"] : row["first_point"] + row["num_points"]]

@@ -1,4 +1,4 @@
-"""The lanes that the drivers of a zone may look at, as sets: the slow twin of `kernels.looks`."""
+"""The lanes that the drivers of a zone may look at, as sets: a slow twin of `find_looks`."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ class Looks:
     Args:
         network: the map.
         rect: min_x, min_y, max_x, max_y of the area of the zone's drivers.
-        view_m: as `kernels.looks.find_looks` takes it.
-        see_m: the same.
-        half_m: the same.
+        view_m: how far drivers look along the road.
+        see_m: distance to a line at which a driver considers the junction.
+        half_m: half the length of the longest vehicle.
     """
 
     def __init__(

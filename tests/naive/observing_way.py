@@ -195,7 +195,7 @@ def approach(
 def goes_first(
     roads: RoadNetwork, way: list[Stretch], reach_m: float, other: np.void, shown: dict[int, str]
 ) -> float:
-    """Return 1 if the other has priority at the next junction, -1 if it must yield, else 0."""
+    """Return 1 if the other vehicle has priority at the next junction, -1 if it yields, else 0."""
     here = roads.lanes[way[0].lane]
     ahead = [int(here["link"])] if here["internal"] else []
     for stretch in way:

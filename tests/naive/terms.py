@@ -27,7 +27,7 @@ def ttc_risk(rows: NDArray[np.void], i: int, larger_m: float = 0.0) -> float:
 
 
 def time_to_collision_s(one: Body, other: Body, horizon_s: float = HORIZON_S) -> float:
-    """Return when the free distance of two bodies is used up; inf: not within the horizon.
+    """Return the time until the free distance of two bodies is 0; inf: not within the horizon.
 
     The free distance of bodies that keep their velocities is convex in time: it has one minimum,
     and reaches 0 at most once before.

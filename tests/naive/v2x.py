@@ -31,7 +31,7 @@ class Said:
 
     @property
     def rank(self) -> tuple[int, int, int]:
-        """The order of reports: newest first, then reports of oneself, then the smallest sender."""
+        """Return the sort key of a report: newest first, then own reports, then smallest sender."""
         return (-self.tick, 0 if self.cam else 1, self.sender)
 
 

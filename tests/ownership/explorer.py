@@ -146,7 +146,7 @@ class Explorer:
                     visit(following, number)
         return len(before), len(_reached(before, ends))
 
-    # What can happen
+    # Possible events
 
     def _first(self) -> Node:
         small = self.small

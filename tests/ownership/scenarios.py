@@ -86,7 +86,7 @@ def ack_freshness() -> None:
 
 
 def ack_incarnation() -> None:
-    """H8, H26: an ACK of a dead process counts for nothing."""
+    """H8, H26: an ACK of a dead process is ignored."""
     bench = approached(Bench())
     bench.crash(1)
     bench.begin(movers=[(7, 1)])
@@ -145,7 +145,7 @@ def fence_stays() -> None:
     bench.give(bench.give(step)[0])
     (abort,) = bench.offer(0)
     bench.give(abort)
-    assert not bench.give(prepare), "an approach that is over is not acknowledged"
+    assert not bench.give(prepare), "an ended approach is not acknowledged"
     assert 7 not in bench.endpoints[1].replicas.held
 
 
@@ -164,9 +164,7 @@ def replica_slot() -> None:
 def replica_lifetime() -> None:
     """I8: a replica that is not refreshed expires."""
     bench = approached(Bench(limits=Limits(lifetime=3)))
-    bench.endpoints[
-        0
-    ].offers.open.clear()  # as for a source that died and has forgotten the transfer
+    bench.endpoints[0].offers.open.clear()  # a source that died has forgotten the transfer
     for _ in range(5):
         bench.tick()
     assert not bench.endpoints[1].replicas.held
@@ -182,7 +180,7 @@ def log_before_send() -> None:
 
 
 def done_incarnation() -> None:
-    """H12: a DONE of a fenced process counts for nothing."""
+    """H12: a DONE of a fenced process is ignored."""
     explored(ticks=2, false_alarms=1)
 
 
@@ -203,7 +201,7 @@ def answer_again() -> None:
 
 
 def tick_never_resets() -> None:
-    """H15: a reset begins an episode, and the ticks go on."""
+    """H15: a reset begins an episode, and ticks continue to count."""
     bench = Bench()
     late = [bench.give(step)[0] for step in bench.begin()]
     for done in late:
@@ -284,7 +282,7 @@ def segment_per_incarnation() -> None:
 
 
 def digest_before_commit() -> None:
-    """H28: the stored rows are those that DONE has reported."""
+    """H28: the stored rows equal the rows that DONE has reported."""
     bench = Bench()
     for step in bench.begin():
         bench.give(bench.give(step)[0])

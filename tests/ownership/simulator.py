@@ -248,7 +248,7 @@ class Simulator:
         for zombie in [host for host in self.zombies if host.endpoint.zone == zone]:
             self._react(zombie, message, refused, zombie=True)
             if zombie.endpoint.tick > self.directory.table.tick:
-                self.zombies.remove(zombie)  # it has sent all its messages
+                self.zombies.remove(zombie)  # the dead process has sent all its messages
         host = self.hosts.get(zone)
         if host is None:
             return

@@ -60,7 +60,7 @@ def test_decoded_messages_equal_encoded_ones(message: Message) -> None:
     assert decode(encode(message), RUN) == message
 
 
-def test_every_kind_is_tried() -> None:
+def test_the_samples_include_every_kind_of_message() -> None:
     assert {type(message) for message in MESSAGES} == set(KINDS)
 
 
@@ -95,7 +95,7 @@ def resealed(body: bytes) -> bytes:
     return body + struct.pack("<I", zlib.crc32(body))
 
 
-def test_refusals_have_their_types() -> None:
+def test_refused_bytes_raise_errors_with_the_reason() -> None:
     wire = encode(MESSAGES[3])
     with pytest.raises(MessageError):
         decode(wire[:5])
@@ -135,6 +135,8 @@ def test_arbitrary_bytes_are_refused(data: bytes) -> None:
     ),
     st.integers(0, 2**62),
 )
-def test_any_offer_arrives(entries: list[tuple[int, int, bytes, bytes]], tick: int) -> None:
+def test_any_offer_is_decoded_as_it_was_encoded(
+    entries: list[tuple[int, int, bytes, bytes]], tick: int
+) -> None:
     message = Prepare(RUN, 0, tick, 0, 1, 1, 1, tuple(Offer(*entry) for entry in entries))
     assert decode(encode(message)) == message

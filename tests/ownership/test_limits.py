@@ -30,12 +30,12 @@ def test_distances_that_cannot_work_are_refused() -> None:
         Distances(approach_m=10.0, hysteresis_m=0.0, overlap_m=10.0)
 
 
-def test_a_rate_is_a_probability() -> None:
+def test_a_rate_that_is_no_probability_is_refused() -> None:
     with pytest.raises(ConfigError, match="rate of drop is 2"):
         Rates(drop=2.0)
 
 
-def test_a_tally_is_that_of_its_set() -> None:
+def test_a_tally_depends_only_on_its_set_of_vehicles() -> None:
     whole = tally(RUN, {7: 0, 8: 3, 9: 1})
     assert whole == OwnedTally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
     assert whole.minus(RUN, 8, 3) == tally(RUN, {7: 0, 9: 1})

@@ -81,7 +81,7 @@ def test_quiet_ticks_need_no_messages_and_give_the_same_table() -> None:
     assert quiet.known() == told.known()
 
 
-def test_a_zone_can_break_a_quiet_tick() -> None:
+def test_a_zone_can_end_a_quiet_tick_with_an_event() -> None:
     told, quiet = Both(), Both()
     told.deliver(told.directory.begin(()).messages)
     told.deliver((told.zones[0].complete(0, [Removed(2, 1)]), told.zones[1].complete(0)))
@@ -99,7 +99,7 @@ def test_a_zone_can_break_a_quiet_tick() -> None:
     assert quiet.known() == told.known()
 
 
-def test_acknowledgements_in_a_quiet_tick_count() -> None:
+def test_acknowledgements_in_a_quiet_tick_take_effect() -> None:
     both = Both()
     both.leave_alone()
     both.deliver(both.zones[0].offer([Approach(1, 1, STATE)]))
@@ -113,7 +113,7 @@ def test_acknowledgements_in_a_quiet_tick_count() -> None:
     assert not both.zones[0].retained
 
 
-def test_an_episode_that_begins_in_a_quiet_tick_goes_on_from_it() -> None:
+def test_an_episode_that_begins_in_a_quiet_tick_continues() -> None:
     both = Both()
     both.leave_alone()
     both.directory.reset()

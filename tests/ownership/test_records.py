@@ -37,7 +37,7 @@ def test_a_line_has_its_schema_sequence_and_kind(log: str) -> None:
         assert {"kind", "episode", "tick", "checksum"} <= set(content)
 
 
-def test_records_come_back_equal(log: str) -> None:
+def test_records_are_read_as_they_were_written(log: str) -> None:
     records = records_from_lines(log)
     assert "".join(lines_of(records)) == log
     written, read = LogChain(), LogChain()
@@ -51,7 +51,7 @@ def test_every_prefix_can_be_replayed(log: str) -> None:
     assert ticks[-1] == 15
 
 
-def test_a_torn_last_line_is_named_and_what_precedes_it_is_whole(log: str) -> None:
+def test_a_torn_last_line_is_named_and_earlier_lines_are_read(log: str) -> None:
     torn = log[:-7]
     with pytest.raises(JournalError, match=f"line {len(log.splitlines())} "):
         records_from_lines(torn)
@@ -68,7 +68,7 @@ def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
                     records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
 
 
-def test_every_added_byte_is_noticed_where_json_means_the_same(log: str) -> None:
+def test_an_added_byte_is_noticed_even_if_the_json_value_is_the_same(log: str) -> None:
     lines = log.splitlines(keepends=True)
     line, before = lines[8], lines[:8]
     for at in range(len(line)):

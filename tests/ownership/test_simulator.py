@@ -101,7 +101,7 @@ def test_a_seeded_campaign_is_invisible_and_repeats_itself(seed: int) -> None:
     assert first.trace.text() == second.trace.text()
 
 
-def test_once_the_faults_end_every_open_hand_off_does() -> None:
+def test_every_open_hand_off_ends_after_the_last_fault() -> None:
     """Liveness: D + 2 ticks after the last fault, no vehicle waits that had crossed before."""
     limits = Limits()
     for seed in range(6):

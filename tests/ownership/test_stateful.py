@@ -131,5 +131,5 @@ Ownership.TestCase.settings = settings(max_examples=120, stateful_step_count=30,
 test_any_sequence_keeps_the_owners_of_the_model = Ownership.TestCase
 
 
-def test_the_kinds_that_may_be_lost_are_all_kinds() -> None:
+def test_all_kinds_of_messages_may_be_lost() -> None:
     assert {Step, Prepare, Abort, Ack, Nack} <= set(Message.__subclasses__())

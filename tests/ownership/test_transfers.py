@@ -44,7 +44,7 @@ def test_a_forced_transfer_has_its_deferral() -> None:
     assert log.counts == {"forced": 1, "deferred": 2, "removed": 1}
 
 
-def test_ended_approaches_are_counted_and_forgotten_ones_take_no_memory() -> None:
+def test_ended_approaches_are_counted_and_take_no_memory() -> None:
     bench = Bench(3)
     bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1), (8, 2)])
     bench.tick(offers=[(8, 2)])
@@ -83,7 +83,7 @@ def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
     assert log.counts["switched"] + log.counts["forced"] == len(rows)
 
 
-def test_the_stored_rows_are_those_of_the_newest_changes() -> None:
+def test_rows_of_the_newest_changes_are_stored() -> None:
     log = TransferLog(Limits().lifetime)
     made = []
 

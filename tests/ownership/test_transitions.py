@@ -30,7 +30,7 @@ def test_transitions_outside_of_the_table_raise() -> None:
             after(party, state, event)
 
 
-def test_a_host_does_not_receive_vehicles_that_it_owns_or_release_others() -> None:
+def test_a_host_receives_only_foreign_vehicles_and_releases_only_its_own() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0), (8, 1)])
     step = bench.begin()[0]

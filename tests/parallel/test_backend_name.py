@@ -1,4 +1,4 @@
-"""How the argument `backend` and its short forms are read."""
+"""Parsing of the argument `backend` and of its short forms."""
 
 from __future__ import annotations
 

@@ -23,7 +23,7 @@ SPLIT = {"zones": 4}
 
 @pytest.mark.parametrize("kind", [WHOLE, SPLIT])
 @pytest.mark.parametrize("worker", [0, 1])
-def test_a_worker_that_dies_when_the_log_is_full(
+def test_a_worker_that_dies_when_the_log_is_full_changes_no_result(
     make: Make, kind: dict[str, Any], worker: int
 ) -> None:
     wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
@@ -41,7 +41,7 @@ def test_a_worker_that_dies_when_the_log_is_full(
 
 
 @pytest.mark.parametrize("kind", [WHOLE, SPLIT])
-def test_worlds_that_are_reset_when_the_log_is_full(make: Make, kind: dict[str, Any]) -> None:
+def test_resets_when_the_log_is_full_change_no_result(make: Make, kind: dict[str, Any]) -> None:
     wanted = {**kind, "agents": 4, "background": 20, "max_cycles": 60}
 
     def run(workers: int) -> list[Any]:
@@ -99,12 +99,12 @@ def test_a_committed_state_stays_until_the_next_commit(checkpoint_log: Checkpoin
     checkpoint_log.prepare([np.full(3, 2.0)])
     assert checkpoint_log.is_prepared
     assert (state_of(checkpoint_log), len(checkpoint_log)) == ([1.0] * 3, STEPS), (
-        "nothing has begun anew"
+        "the log has not restarted yet"
     )
     checkpoint_log.begin()
     checkpoint_log.note(commands_like(checkpoint_log.entries[0], 99))
     assert (state_of(checkpoint_log), noted(checkpoint_log)) == ([2.0] * 3, [99.0])
-    checkpoint_log.go_to(committed)  # the command with which it restarted was not committed
+    checkpoint_log.go_to(committed)  # the first command of the new log was not committed
     assert (state_of(checkpoint_log), noted(checkpoint_log)) == (
         [1.0] * 3,
         [float(k) for k in range(STEPS)],

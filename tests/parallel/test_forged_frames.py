@@ -74,7 +74,7 @@ def test_a_run_survives_forged_frames(
             found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **SMALL)
         (line,) = found.lines
         assert forged[0]
-        # Elsewhere, no node may be lost without faults.
+        # The check reports lost nodes as errors; here, the sender of the forged frame may be lost.
         others = [text for text in line.wrong if "must be tolerated" not in text]
         if others or line.lost > 1:
             wrong.append((kind, line))
@@ -97,7 +97,9 @@ def simulation() -> Simulation:
         {"goal": 10**6}, {"stop": 10**6}, {"way": -(1 << 40)}, {"way": 1 << 40}, {"id": -1},
     ],
 )  # fmt: skip
-def test_rows_with_an_index_out_of_range(simulation: Simulation, change: dict[str, int]) -> None:
+def test_rows_with_an_index_out_of_range_are_refused(
+    simulation: Simulation, change: dict[str, int]
+) -> None:
     checks, rows = IndexCheck(simulation), simulation.division.vehicles(0).copy()
     assert rows.dtype == VEHICLE
     assert len(rows) > 5
@@ -122,7 +124,7 @@ def test_an_error_while_a_frame_is_read_is_the_fault_of_its_sender(error: Except
 
 
 @pytest.mark.parametrize("found", [[3], [-1], [True], [1.0], ["1"], np.array([0, 3])])
-def test_indices_out_of_range(found: Any) -> None:
+def test_indices_out_of_range_are_refused(found: Any) -> None:
     check_indices("zone", [0, 2], 3)
     check_indices("zone", np.array([0, 2]), 3)
     with pytest.raises(MessageError, match="zone"):

@@ -52,7 +52,7 @@ def _journals(folder: Path) -> dict[str, bytes]:
 
 @pytest.mark.parametrize(("worlds", "workers"), [(1, 1), (2, 2), (2, 1), (1, 2)])
 @pytest.mark.parametrize("more", [{}, {"zones.check_invariants": True}])
-def test_journals_are_those_of_an_undisturbed_run(
+def test_journals_equal_those_of_an_undisturbed_run(
     make: Make, tmp_path: Path, worlds: int, workers: int, more: dict[str, Any]
 ) -> None:
     def run(name: str, number: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:

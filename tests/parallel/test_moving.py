@@ -57,7 +57,7 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 def test_worlds_that_move_are_the_same(
     make: Make, uneven: list[int], number: int, env: str
 ) -> None:
-    """The numbers of zones and workers alternate over the entries."""
+    """Numbers of zones and workers change from entry to entry."""
     wanted = {"num_envs": 6, "max_cycles": 8, "zones": (1, 4)[number % 2]}
     whole = drive(make(env, **wanted))
     vec = make(env, workers=(2, 2, 3, 3)[number % 4], overrides=RESTLESS, **wanted)
@@ -96,7 +96,7 @@ STACKED = {"sensors.stack": 3, "population.mode": "respawn", "action.kind": "dis
 
 
 @pytest.mark.parametrize("more", [{"autoreset_mode": "NextStep"}, {"overrides": STACKED}])
-def test_worlds_that_move_with_other_settings(
+def test_worlds_that_move_are_the_same_with_other_settings(
     make: Make, uneven: list[int], more: dict[str, Any]
 ) -> None:
     wanted = {"num_envs": 5, "agents": 3, "background": 10, "max_cycles": 5, **more}
@@ -128,7 +128,7 @@ def test_rerouted_vehicles_keep_their_routes(make: Make, uneven: list[int], tmp_
 def test_worlds_with_sumo_demand_keep_their_routes(
     make: Make, uneven: list[int], tmp_path: Path
 ) -> None:
-    """Driving and waiting vehicles; routes and stops have other places in each worker."""
+    """Vehicles drive or wait; each worker stores routes and stops at other indices."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     overrides: dict[str, Any] = {
         "traffic.source": "sumo-demand",
@@ -159,7 +159,7 @@ def test_chosen_worlds_are_reset_in_any_worker(make: Make, uneven: list[int]) ->
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("split", [False, True])
-def test_workers_that_die_during_a_move(
+def test_workers_that_die_during_a_move_change_no_result(
     make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch, how: signal.Signals, split: bool
 ) -> None:
     wanted = {"num_envs": 1 if split else 5, "agents": 5, "background": 30, "max_cycles": 9}
@@ -209,7 +209,7 @@ def test_a_failed_move_changes_nothing(
     def interrupt(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task == Task.UNPACK and not failed:
             failed.append(task)
-            self._open = self._all  # as if it came while the workers moved
+            self._open = self._all  # as if the interrupt came during the move
             raise KeyboardInterrupt
         return run(self, task, payload, commits)
 
@@ -270,7 +270,7 @@ def test_bad_settings_are_refused(key: str, value: float, words: str) -> None:
         make_vec("ring", workers=1, overrides={f"workers.{key}": value})
 
 
-def test_workers_that_other_programs_keep_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_on_busy_machines_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     busy = LoadSnapshot(
         (Candidate(0, Utilisation(0.1, 0.1)), Candidate(1, Utilisation(0.9, 0.1))), "none", ""
     )

@@ -100,7 +100,7 @@ def test_a_run_without_a_caller_ends() -> None:
     assert "rank 0 is the caller: name its program" in done.stdout
 
 
-def test_more_nodes_than_ranks(program: str) -> None:
+def test_more_nodes_than_ranks_are_refused(program: str) -> None:
     """Rank 0 ends before it listens, and the other ranks end with it."""
     done = mpirun("-n", "2", *NODE, program)
     assert done.returncode != 0

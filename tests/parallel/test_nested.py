@@ -34,7 +34,7 @@ class WithWorkers(gymnasium.Env[Any, Any]):
 ACTIONS = np.zeros((2, 2), dtype=np.float32)
 
 
-def test_in_gymnasiums_workers() -> None:
+def test_worlds_over_workers_run_in_workers_of_gymnasium() -> None:
     vec = gymnasium.vector.AsyncVectorEnv([WithWorkers] * 2, context="spawn")
     observations, _ = vec.reset(seed=[1, 1])
     assert np.array_equal(observations[0], observations[1])
@@ -43,7 +43,7 @@ def test_in_gymnasiums_workers() -> None:
     assert not np.array_equal(moved, observations)
 
 
-def test_in_the_workers_of_stable_baselines3() -> None:
+def test_worlds_over_workers_run_in_workers_of_stable_baselines3() -> None:
     pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.vec_env import SubprocVecEnv
 

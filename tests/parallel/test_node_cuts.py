@@ -71,10 +71,10 @@ def test_rerouting_vehicles_keep_their_places(make: Make, tmp_path: Path) -> Non
     assert over_nodes(vec).repartitions
 
 
-def test_nodes_that_are_lost_before_and_after_repartitioning(
+def test_nodes_that_are_lost_around_a_repartitioning_change_no_result(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All nodes go back to the zones of the kept state, and repartition again."""
+    """All nodes return to the zones of the kept state, and repartition again."""
     monkeypatch.setattr(
         "cavmarl.parallel.nodes.node_pool.KEEP_S", 1e6
     )  # keep a state only at the start
@@ -131,7 +131,7 @@ def test_repartitioning_starts_an_episode_in_the_journal(make: Make, tmp_path: P
     vec.close()
     episodes = [record.episode for record in JournalReader(path) if isinstance(record, Reset)]
     assert episodes == sorted(set(episodes))
-    assert len(episodes) == cuts + 2  # before the first reset, and at the reset
+    assert len(episodes) == cuts + 2  # one more before the first reset, and one at the reset
     assert cuts > 1
 
 

@@ -143,7 +143,7 @@ def test_frames_between_machines_are_encrypted(
     assert (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
     joining_nodes = over_nodes(vec).pool.joining_nodes
-    for heard in wire.heard:  # a replay is refused
+    for heard in wire.heard:  # a replayed handshake is refused
         with socket.create_connection(place) as stranger, suppress(OSError):
             stranger.sendall(heard)
             for _ in range(3):
@@ -203,7 +203,9 @@ def test_a_node_of_this_machine_is_restarted(make: Make) -> None:
 
 
 @pytest.mark.parametrize("is_lost", [False, True])
-def test_zones_that_move_to_another_node(make: Make, uneven: list[int], is_lost: bool) -> None:
+def test_zones_that_move_to_another_node_change_no_result(
+    make: Make, uneven: list[int], is_lost: bool
+) -> None:
     wanted = {"agents": 8, "background": 30, "max_cycles": 8}
     whole = drive(make("town", **wanted), steps=20)
     vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
@@ -231,10 +233,10 @@ def test_actors_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) ->
     assert worlds.pool.zones == [[0, 1], [2, 3]]
 
 
-def test_a_node_that_the_others_cannot_reach(
+def test_a_node_that_two_others_cannot_reach_is_lost(
     make: Make, monkeypatch: pytest.MonkeyPatch, whole: Any
 ) -> None:
-    """A node that two others cannot reach counts as lost, although it lives."""
+    """The node counts as lost although its process lives."""
     wires: list[Proxy] = []
     take = JoiningNodes.take
 
@@ -292,7 +294,7 @@ def test_a_caller_waits_up_to_a_limit(key_file: Path) -> None:
         make_vec("grid4x4", zones=2, backend=f"nodes:2@127.0.0.1:{port}", **limited)
 
 
-def test_a_key_is_a_secret(tmp_path: Path) -> None:
+def test_a_missing_or_readable_key_file_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "key"
     with pytest.raises(ConfigError, match="openssl rand"):
         read_key(path)
@@ -324,7 +326,9 @@ def test_files_are_stored_by_their_content(tmp_path: Path) -> None:
         _ = file._replace(digest="../../x").kept
 
 
-def test_a_node_started_from_the_command_line(make: Make, key_file: Path, tmp_path: Path) -> None:
+def test_a_node_can_be_started_from_the_command_line(
+    make: Make, key_file: Path, tmp_path: Path
+) -> None:
     net = actuated_grid(tmp_path)
     port = free_port("127.0.0.1")
     words = ["node", "--join", f"127.0.0.1:{port}", "--key-file", str(key_file)]
@@ -339,7 +343,7 @@ def test_a_node_started_from_the_command_line(make: Make, key_file: Path, tmp_pa
     assert process.returncode == 0
 
 
-def test_zones_after_losses_and_joins() -> None:
+def test_zones_are_assigned_to_living_nodes_after_losses_and_joins() -> None:
     first = [[0, 1], [2], [3, 4]]
     found = moves_of(first, first, lost=[1], living=[0, 2], state=1)
     assert found.zones == [[0, 1], [], [2, 3, 4]]
@@ -351,4 +355,4 @@ def test_zones_after_losses_and_joins() -> None:
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
     assert "make the environment again" in str(caught.value)
     assert "SIGKILL" not in str(caught.value)  # no record says that a process was killed
-    assert json.dumps(again)  # it is sent as JSON
+    assert json.dumps(again)  # nodes get the moves as JSON

@@ -1,4 +1,4 @@
-"""Frames between nodes: their bytes, bad frames, and which node may send what."""
+"""Frames between nodes: their bytes, bad frames, and frames that a node may not send."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def head(kind: int, size: int) -> bytes:
     return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
 
 
-def test_the_bytes_of_a_frame() -> None:
+def test_a_frame_has_the_recorded_bytes() -> None:
     assert frame(FrameKind.PING, b"abc").hex() == (
         "6361764e07000d000700000000000000" + "0300000000000000" + "50392f89945faf78"
         "30bc61f204c45035" + b"abc".hex()
@@ -79,8 +79,8 @@ def test_a_bad_frame_ends_the_connection(said: bytes, words: str) -> None:
         _ = [links.receive([0], WAIT_S) for _ in range(3)]
 
 
-def test_a_node_sends_for_its_own_zones_only() -> None:
-    """A node that sends something about a zone of another node is disconnected."""
+def test_a_node_may_send_for_its_own_zones_only() -> None:
+    """A node that sends a message about a zone of another node is disconnected."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
@@ -120,7 +120,7 @@ def test_each_changed_bit_of_a_frame_is_noticed(size: int, bits: int | None) -> 
         far.close()
 
 
-def test_words_are_sent_as_bytes() -> None:
+def test_an_array_of_words_is_sent_as_its_bytes() -> None:
     words = np.arange(3)
     assert frame(FrameKind.SYNC, words.data)[-24:] == words.tobytes()
 
@@ -157,7 +157,7 @@ def test_bytes_that_the_system_does_not_accept_are_sent_later(is_encrypted: bool
 
 
 @pytest.mark.parametrize("said", [b"no JSON", b"{}", b"\xff"])
-def test_a_list_is_a_list(said: bytes) -> None:
+def test_a_frame_without_a_list_is_refused(said: bytes) -> None:
     with pytest.raises(MessageError, match="a frame of kind PONG: it"):
         read_list(NodeFrame(FrameKind.PONG, 1, memoryview(said)))
 
@@ -192,7 +192,7 @@ def test_a_call_of_an_earlier_generation_is_rejected() -> None:
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
         (found,) = accept_nodes(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
-        found.close()  # the attempt has failed
+        found.close()  # the first attempt to start nodes has failed
         assert earlier.result() == 0
         earlier = callers.submit(call, 6)
         present: list[object] = []
@@ -239,7 +239,7 @@ def test_two_nodes_that_cannot_reach_each_other_are_lost_in_turn() -> None:
 
 
 def test_a_node_that_keeps_an_action_of_another_node_is_lost() -> None:
-    """A node waits for the action of an agent, which another node has got and not refused."""
+    """A node waits for an action that another node has received and not refused."""
     links, far = pair()
     seen = watch(links)
 
@@ -264,7 +264,7 @@ def test_a_node_that_keeps_an_action_of_another_node_is_lost() -> None:
 
 
 def test_a_node_is_late_only_once() -> None:
-    """A lease of no ticks records the new vehicles of all nodes."""
+    """After a late report, a lease of no ticks records the new vehicles of all nodes."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0,)))))

@@ -50,14 +50,14 @@ def test_pages_show_the_loads_of_machines(make: Make, monkeypatch: pytest.Monkey
     nodes = over_nodes(vec)
     assert sorted(nodes.worker_pids) == [0, 1]
     assert os.getpid() not in nodes.worker_pids.values()
-    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # as for nodes on other machines
+    monkeypatch.setattr(NodeWorlds, "worker_pids", {})  # nodes on other machines have no known pids
     monkeypatch.setattr("cavmarl.viewer.run_loads.EVERY_S", 0.05)
     audience = Audience()
     told: list[Any] = []
     monkeypatch.setattr(audience, "send_all", told.append)
     loads = RunLoads(nodes, audience)
     loads.look()
-    assert not told  # no page watches
+    assert not told  # no page is open
     audience.wishes = Wishes(watchers=1)
     loads.look()
     time.sleep(0.3)

@@ -40,7 +40,7 @@ def lose_one(vec: CavVectorEnv, at: int) -> Callable[[int], None]:
 
 
 @pytest.mark.parametrize("mode", ["ground_truth", "sensors"])
-def test_rigs(make: Make, mode: str) -> None:
+def test_rigs_give_the_same_samples(make: Make, mode: str) -> None:
     overrides = {"rig": "ten_sensors", "observation.mode": mode}
     wanted = {"agents": 5, "background": 60, "max_cycles": 8, "overrides": overrides}
     one = make("town", **wanted)
@@ -63,7 +63,7 @@ def test_samples_follow_agents_to_another_node(make: Make) -> None:
     assert over_nodes(vec).migrations > 0
 
 
-def test_messages_between_vehicles(make: Make) -> None:
+def test_messages_between_vehicles_are_the_same(make: Make) -> None:
     overrides = {"v2x.enabled": True, "v2x.perception.rate_hz": 2.0}
     wanted = {**WANTED, "overrides": overrides}
     whole = drive(make("grid4x4", **wanted))
@@ -72,7 +72,7 @@ def test_messages_between_vehicles(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 1
 
 
-def test_scripted_scenes(make: Make) -> None:
+def test_scripted_scenes_are_the_same(make: Make) -> None:
     wanted = {
         "agents": 1,
         "background": 10,
@@ -84,7 +84,7 @@ def test_scripted_scenes(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 1
 
 
-def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles_take_the_same_routes(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
@@ -103,7 +103,7 @@ def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_sumo_beside_the_world(make: Make, tmp_path: Path, source: str) -> None:
+def test_worlds_with_sumo_are_the_same(make: Make, tmp_path: Path, source: str) -> None:
     overrides = {
         "traffic.source": source,
         "traffic.demand": [str(path) for path in write_stops(tmp_path)],

@@ -1,4 +1,4 @@
-"""Callers that are no nodes of the run, or are not needed, with real sockets."""
+"""Callers that do not belong to the run, or that it does not need, over real sockets."""
 
 from __future__ import annotations
 

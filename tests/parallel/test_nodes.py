@@ -95,7 +95,7 @@ def test_a_node_receives_the_actions_of_its_agents() -> None:
     assert there.meta_actions.tolist() == [[0, 0, 2, 3]]
 
 
-def test_actions_of_other_nodes_and_bad_actions() -> None:
+def test_bad_actions_and_actions_for_other_nodes_are_refused() -> None:
     arrays = StepArrays.of(
         {name: np.ones((1, 4, 2)) for name in StepArrays._fields[:-2]}
         | {"mask": np.ones((1, 4), bool), "meta_actions": np.ones((1, 4), np.int64)}
@@ -133,7 +133,7 @@ def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 0
 
 
-def test_actuated_signals_and_a_demand(make: Make, tmp_path: Path) -> None:
+def test_actuated_signals_and_demand_give_the_same_results(make: Make, tmp_path: Path) -> None:
     wanted = {"env": str(actuated_grid(tmp_path)), "agents": 4, "background": 40}
     whole = drive(make(**wanted), steps=60)
     vec = make(zones=4, nodes=2, **wanted)
@@ -172,7 +172,7 @@ class Killer:
 
 
 @pytest.mark.parametrize(("env", "seed"), [("grid4x4", 1), ("town", 2)])
-def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> None:
+def test_nodes_that_are_lost_at_any_time_change_no_result(make: Make, env: str, seed: int) -> None:
     wanted = {"agents": 6, "background": 60, "max_cycles": 20}
     whole = drive(make(env, **wanted), steps=40)
     vec = make(env, zones=4, nodes=4, **wanted)
@@ -183,7 +183,7 @@ def test_nodes_that_are_lost_at_any_time(make: Make, env: str, seed: int) -> Non
 
 def test_a_stopped_node_counts_as_lost(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    vec = make("grid4x4", zones=4, nodes=3, **WANTED)  # long before workers.timeout_s
+    vec = make("grid4x4", zones=4, nodes=3, **WANTED)
 
     def strike(step: int) -> None:
         if step == 5:
@@ -214,7 +214,7 @@ def test_repeated_equal_commands_are_all_carried_out(make: Make) -> None:
         vec.reset(seed=2)
     still = np.zeros_like(vecs[0].suggest_actions())
     for step in range(60):
-        if step == 50:  # by then, states were kept several times
+        if step == 50:  # several states were kept before this step
             os.kill(over_nodes(vecs[1]).pool.pids[0], signal.SIGKILL)
         for vec in vecs:
             vec.step(still)
@@ -249,10 +249,10 @@ def test_an_interrupted_step_can_be_repeated(make: Make, monkeypatch: pytest.Mon
     assert over_nodes(vecs[1]).pool.recoveries == 0
 
 
-def test_nodes_that_are_lost_while_states_are_kept(
+def test_nodes_that_are_lost_while_states_are_kept_change_no_result(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After a return to an older state, newer ones do not displace it."""
+    """After the nodes return to an older state, newer states do not displace it."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
@@ -261,7 +261,7 @@ def test_nodes_that_are_lost_while_states_are_kept(
     commit, steps = worlds.pool.commit, [0]
 
     def strike_and_commit() -> list[memoryview]:
-        if steps[0] in doomed:  # all nodes have orders to keep a state, and are in the step
+        if steps[0] in doomed:  # during a step in which all nodes keep a state
             os.kill(doomed.pop(steps[0]), signal.SIGKILL)
         return commit()
 
@@ -273,7 +273,7 @@ def test_nodes_that_are_lost_while_states_are_kept(
     assert (worlds.pool.losses, worlds.pool.recoveries) == (2, 2)
 
 
-def test_a_node_and_the_node_with_its_replica_are_lost(make: Make) -> None:
+def test_a_lost_node_and_the_lost_node_with_its_replica_change_no_result(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     vec.reset(seed=1)
     for number in (1, 2):
@@ -286,7 +286,7 @@ def test_a_node_and_the_node_with_its_replica_are_lost(make: Make) -> None:
     again.step(again.suggest_actions())
 
 
-def test_the_only_node_is_lost(make: Make) -> None:
+def test_a_lost_only_node_changes_no_result(make: Make) -> None:
     """The caller keeps replicas of its states, and another node takes its place."""
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=2, nodes=1, **WANTED)
@@ -317,7 +317,7 @@ def test_a_journal_records_changes_of_owner(make: Make, tmp_path: Path) -> None:
     assert sum(len(getattr(record, "switches", ())) for record in records) == switched > 0
 
 
-def test_one_environment_of_pettingzoo() -> None:
+def test_the_pettingzoo_environment_gives_the_same_results() -> None:
     env = parallel_env("grid4x4", zones=4, nodes=2, agents=3, background=10)
     one = parallel_env("grid4x4", agents=3, background=10)
     for made in (env, one):
@@ -346,7 +346,7 @@ def test_one_environment_of_pettingzoo() -> None:
         ),
     ],
 )
-def test_bad_input(arguments: dict[str, Any], words: str) -> None:
+def test_bad_arguments_are_refused(arguments: dict[str, Any], words: str) -> None:
     with pytest.raises(ConfigError, match=words):
         make_vec("grid4x4", **arguments)
 
@@ -406,14 +406,14 @@ def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    tell, struck = NodePool.send_zones, list[int]()  # processes
+    tell, struck = NodePool.send_zones, list[int]()  # killed processes
 
     def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
         strikes = len(struck) < 2
         if is_told:
             if strikes:
-                process.suspend()  # so that it cannot answer before it is killed
+                process.suspend()  # a suspended process cannot answer before it is killed
             tell(self, *told, **more)
         if strikes:
             struck.append(process.pid)

@@ -58,7 +58,7 @@ def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None
     pids = [int(word) for word in loner.stdout.split()]
     assert loner.returncode == -signal.SIGKILL, loner.stderr
     assert len(pids) == 3
-    assert gone_soon(pids)  # also the stopped one
+    assert gone_soon(pids)  # also the stopped process
 
 
 def maps(pid: int) -> list[str]:
@@ -94,7 +94,7 @@ def test_a_stopped_pool_is_closed() -> None:
     assert gone(pids)
 
 
-def test_a_program_that_does_not_start() -> None:
+def test_a_program_that_does_not_start_is_reported() -> None:
     Pool(program(1), 60.0, 3).close()  # the fork server of the tests stays
     gc.collect()
     files = len(os.listdir("/proc/self/fd"))
@@ -113,7 +113,9 @@ def test_too_little_memory_is_reported() -> None:
         Segment.make(1 << 50)
 
 
-def test_memory_without_memfd(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_without_memfd_memory_is_a_deleted_file(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
     monkeypatch.delattr(os, "memfd_create")
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     segment = Segment.make(5000)
@@ -160,7 +162,7 @@ def test_no_process_outlives_the_pools(how: signal.Signals, then: str, tmp_path:
     assert gone_soon(pids)
 
 
-def test_a_pool_without_compiled_loops() -> None:
+def test_a_pool_works_without_compiled_loops() -> None:
     text = LONER.format(root=str(ROOT), then="print(pool.run(1, commits=False), pool.deaths)")
     done = subprocess.run(
         [sys.executable, "-c", text],
@@ -188,7 +190,7 @@ def test_a_fork_of_the_pools_process_cannot_command_its_workers(make: Make) -> N
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_more_descriptors_than_select_accepts(make: Make) -> None:
+def test_a_pool_works_with_more_descriptors_than_select_accepts(make: Make) -> None:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if hard != resource.RLIM_INFINITY and hard < 1300:
         pytest.skip(f"the system allows {hard} open files")

@@ -29,7 +29,7 @@ def test_busy_nodes_get_no_actor() -> None:
         choose_nodes(known, 2)
 
 
-def test_more_workers_than_cpus() -> None:
+def test_more_workers_than_cpus_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"backend = 'ray:4'.*3 free CPUs on 2 nodes.*ray start"):
         choose_nodes([Node("a", 2, IDLE), Node("b", 1, IDLE)], 4)
 

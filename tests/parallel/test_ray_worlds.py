@@ -116,11 +116,13 @@ def test_a_dead_actor_changes_no_result(
 
     assert same(drive(vec, before=strike), whole)
     assert losses_of(vec) == [1, 1]
-    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # the spare actor
+    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # a spare actor
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
-def test_an_actor_that_dies_during_a_step(make: Make, cluster: Any, whole: Any) -> None:
+def test_an_actor_that_dies_during_a_step_changes_no_result(
+    make: Make, cluster: Any, whole: Any
+) -> None:
     vec = make("grid4x4", backend="ray:2", **WANTED)
     timers: list[Timer] = []
 
@@ -159,7 +161,7 @@ def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict
 def test_worlds_that_move_between_nodes_are_the_same(
     make: Make, cluster: Any, uneven: list[int]
 ) -> None:
-    """By its death, the actor has worlds with which it had not started."""
+    """When the actor dies, it has other worlds than at its start."""
     whole = drive(make("grid4x4", **WANTED), steps=16)
     vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
@@ -182,7 +184,7 @@ def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
     env.close()
 
 
-def test_errors_are_those_of_one_process(make: Make, cluster: Any) -> None:
+def test_errors_equal_those_of_one_process(make: Make, cluster: Any) -> None:
     with pytest.raises(CapacityError, match=r"population\.agents"):
         make("ring", num_envs=2, backend="ray:1", agents=4, background=400)
     with pytest.raises(ConfigError, match=r"backend = 'ray:4'.*3 free CPUs on 2 nodes"):

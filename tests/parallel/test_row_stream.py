@@ -1,4 +1,4 @@
-"""Ghosts between two nodes: they arrive as they were sent, whatever has changed."""
+"""Ghosts between two nodes arrive as they were sent, after any changes of rows."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from tests.support.traffic import network
 
 CAPACITY = 40
 WORLDS = 2
-ROOM = 6  # for vehicles that pass a departure queue
+ROOM = 6  # room for vehicles that pass a departure queue
 ROADS = network("merge")
 MINE, THEIRS = np.array([0]), np.array([1, 2])
 GHOSTS = 1 + 3 * WORLDS  # word of a frame at which the numbers of ghosts start
@@ -78,7 +78,7 @@ def clear(zoned: ZoneState) -> None:
 
 
 def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
-    """Return the ghosts of each zone and world, in no order, near ones apart."""
+    """Return the ghosts of each zone and world as sets; near ghosts are in separate sets."""
     parts = []
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
@@ -127,7 +127,7 @@ def test_ghosts_arrive_as_they_were_sent() -> None:
 
 
 def test_forecast_words_are_not_sent() -> None:
-    """For a moving vehicle, few words beside acceleration and position are sent."""
+    """For a moving vehicle, few words other than acceleration and position are sent."""
     near, far = nodes()
     vec = make_vec("merge", agents=1, background=20, overrides={"clock.ctrl_dt_s": 0.05}, seed=0)
     vec.reset()
@@ -203,7 +203,7 @@ def test_bad_frames_are_refused(harm: str) -> None:
     clear(far.zoned)
     with pytest.raises(MessageError, match=f"^{len(data)} bytes are no"):
         far.read(data)
-    assert (far.zoned.num_rows[THEIRS] == 2).all(), "nothing of it was put anywhere"
+    assert (far.zoned.num_rows[THEIRS] == 2).all(), "no part of the frame was used"
     assert not far.departures.num_passing.any()
     assert not far.departures.counts.any()
 

@@ -84,7 +84,7 @@ def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
 
 @pytest.fixture(scope="module")
 def alone() -> list[list[bytes | str]]:
-    """Return what this process senses without sensor workers."""
+    """Return the samples of this process without sensor workers."""
     return _drive()
 
 
@@ -157,11 +157,13 @@ def test_rows_of_all_zones_equal_own_rows_and_ghosts(
     assert _drive(zones=zones, sensor_workers=2) == alone
 
 
-def test_sensor_workers_of_a_divided_world(alone: list[list[bytes | str]]) -> None:
+def test_sensor_workers_of_a_divided_world_give_the_same_results(
+    alone: list[list[bytes | str]],
+) -> None:
     assert _drive(zones=4, workers=2, sensor_workers=2) == alone
 
 
-def test_sensor_workers_of_whole_worlds() -> None:
+def test_sensor_workers_of_whole_worlds_give_the_same_results() -> None:
     both = _drive(num_envs=2)
     assert _drive(num_envs=2, workers=2, sensor_workers=1) == both
     assert _drive(num_envs=2, sensor_workers=2) == both
@@ -201,7 +203,9 @@ def test_a_dead_worker_is_replaced_and_senses_the_same(
         vec.close()
 
 
-def test_a_worker_that_dies_while_it_senses(alone: list[list[bytes | str]]) -> None:
+def test_a_worker_that_dies_while_it_senses_changes_no_result(
+    alone: list[list[bytes | str]],
+) -> None:
     vec = _make(sensor_workers=2)
     stop = threading.Event()
 
@@ -330,7 +334,7 @@ def test_a_run_continues_after_an_interrupted_step() -> None:
         vec.close()
 
 
-def test_parallel_env_has_sensor_workers_too() -> None:
+def test_parallel_env_can_have_sensor_workers() -> None:
     def drive(count: int) -> list[str]:
         overrides = {"rig": SMALL}
         env = cavmarl.parallel_env("merge", agents=2, sensor_workers=count, overrides=overrides)

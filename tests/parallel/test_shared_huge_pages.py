@@ -40,7 +40,7 @@ def test_a_large_array_is_zeros_at_a_boundary_of_huge_pages() -> None:
 
 
 @pytest.mark.parametrize("size", [0, 5, HUGE_BYTES - 1, HUGE_BYTES, 3 * HUGE_BYTES + 7])
-def test_arrays_of_any_size(size: int) -> None:
+def test_arrays_of_any_size_keep_their_content(size: int) -> None:
     array = huge_shared_zeros(size, np.uint8)
     expected = np.arange(size, dtype=np.uint8)
     array[:] = expected

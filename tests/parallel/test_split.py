@@ -56,13 +56,13 @@ def test_rows_change_their_side_for_all_workers(make: Make) -> None:
     assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
 
 
-def test_worlds_that_are_reset_a_step_later(make: Make) -> None:
+def test_worlds_with_next_step_autoreset_are_equal(make: Make) -> None:
     wanted = {"agents": 4, "background": 10, "max_cycles": 5, "autoreset_mode": "NextStep"}
     whole = drive(make("town", **wanted))
     assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
 
 
-def test_some_worlds_are_divided_and_others_not(make: Make) -> None:
+def test_a_step_with_divided_and_undivided_worlds_is_equal(make: Make) -> None:
     wanted = {"num_envs": 2, "agents": 4, "background": 10, "max_cycles": 6}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=3, **wanted)
@@ -73,7 +73,7 @@ def test_some_worlds_are_divided_and_others_not(make: Make) -> None:
     )
 
 
-def test_all_checks_are_on(make: Make) -> None:
+def test_a_world_with_invariant_checks_is_equal(make: Make) -> None:
     wanted = {"agents": 5, "background": 30}
     whole = drive(make("grid4x4", **wanted))
     checked = make(
@@ -84,7 +84,9 @@ def test_all_checks_are_on(make: Make) -> None:
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("worker", [0, 1])
-def test_a_worker_that_dies_between_steps(make: Make, worker: int, how: signal.Signals) -> None:
+def test_a_worker_that_dies_between_steps_changes_no_result(
+    make: Make, worker: int, how: signal.Signals
+) -> None:
     wanted = {"agents": 5, "background": 20, "max_cycles": 8}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=2, **wanted)
@@ -98,7 +100,7 @@ def test_a_worker_that_dies_between_steps(make: Make, worker: int, how: signal.S
 
 
 @pytest.mark.parametrize("env", ["merge", "town"])
-def test_workers_that_die_at_any_time(make: Make, env: str) -> None:
+def test_workers_that_die_at_any_time_change_no_result(make: Make, env: str) -> None:
     wanted = {"agents": 6, "background": 40, "max_cycles": 18}
     whole = drive(make(env, **wanted), steps=36)
     vec = make(env, zones=4, workers=3, **wanted)
@@ -135,7 +137,9 @@ def test_the_process_that_forks_may_die(make: Make) -> None:
 
 
 @pytest.mark.parametrize("phase", ["move", "resolve"])
-def test_a_member_that_fails(make: Make, phase: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_exception_in_one_worker_of_a_team_changes_no_world(
+    make: Make, phase: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     wanted = {"agents": 5, "background": 20}
     whole = drive(make("grid4x4", **wanted))
     monkeypatch.setenv("FAILING_PHASE", phase)
@@ -167,14 +171,14 @@ def test_a_member_that_fails(make: Make, phase: str, monkeypatch: pytest.MonkeyP
     assert alive(left) == []
 
 
-def test_actuated_signals(make: Make, tmp_path: Path) -> None:
+def test_actuated_signals_are_equal(make: Make, tmp_path: Path) -> None:
     wanted = {"agents": 4, "background": 30, "max_cycles": 25}
     net = actuated_grid(tmp_path)
     whole = drive(make(net, **wanted), steps=40)
     assert same(drive(make(net, zones=4, workers=2, **wanted), steps=40), whole)
 
 
-def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
+def test_rerouting_vehicles_take_equal_routes(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     wanted = {
@@ -201,7 +205,7 @@ def test_rerouting_vehicles(make: Make, tmp_path: Path) -> None:
     assert one.traffic_stats()["rerouted"] > 0, "no vehicle has taken another route"
 
 
-def test_more_workers_than_zones() -> None:
+def test_worlds_with_more_workers_than_zones_are_equal() -> None:
     with pytest.raises(ConfigError, match=r"workers = 3.*at most 2.*more zones"):
         make_vec("grid4x4", zones=2, workers=3)
     with pytest.raises(ConfigError, match=r"workers = 9.*at most 8.*more worlds"):

@@ -64,7 +64,11 @@ ROW = {
     "wait_s": (-1.0,),
     "distance_m": (-1.0,),
 }
-LATER = {"tick": (MANY,), "departed": (MANY,), "last_change": (MANY,)}  # than the world's tick
+LATER = {
+    "tick": (MANY,),
+    "departed": (MANY,),
+    "last_change": (MANY,),
+}  # after the world's tick
 WAITING = {
     "lane": (-1, MANY),
     "vtype": (-1, 1),
@@ -126,7 +130,7 @@ def _index(state: State, dtype: np.dtype[Any], last: bool = False) -> int:
     return found[-1 if last else 0]
 
 
-def test_rows_with_an_index_out_of_range(make: Make) -> None:
+def test_rows_with_an_index_out_of_range_are_refused(make: Make) -> None:
     vec = _busy(make)
     for name, values in (ROW | LATER).items():
         for value in values:
@@ -137,7 +141,7 @@ def test_rows_with_an_index_out_of_range(make: Make) -> None:
             _refused(vec, forge)
 
 
-def test_waiting_vehicles_with_an_index_out_of_range(make: Make) -> None:
+def test_waiting_vehicles_with_an_index_out_of_range_are_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
     while not (worlds.simulation.departures.num_queue > 0).any():
@@ -152,7 +156,7 @@ def test_waiting_vehicles_with_an_index_out_of_range(make: Make) -> None:
             _refused(vec, forge)
 
 
-def test_arrays_of_other_shapes_and_numbers(make: Make) -> None:
+def test_other_shapes_and_numbers_of_arrays_are_refused(make: Make) -> None:
     vec = _busy(make)
     count = len(_worlds(vec).save())
     for n in range(count):
@@ -172,7 +176,7 @@ def test_arrays_of_other_shapes_and_numbers(make: Make) -> None:
     _refused(vec, lambda state: state.__delitem__(-1))
 
 
-def test_two_vehicles_that_are_one(make: Make) -> None:
+def test_two_vehicles_with_one_id_are_refused(make: Make) -> None:
     def twice(name: str) -> Forge:
         def forge(state: State) -> None:
             rows = state[_index(state, VEHICLE, last=True)]
@@ -201,7 +205,7 @@ def test_two_vehicles_that_are_one(make: Make) -> None:
     _refused(vec, drives_twice)
 
 
-def test_overridden_signals(make: Make) -> None:
+def test_invalid_states_of_overridden_signals_are_refused(make: Make) -> None:
     vec = make("town", num_envs=2, zones=2, overrides={"signals.overrides": 3})
     vec.reset(seed=2)
     links = vec.network.links[vec.network.links["signal"] >= 0]
@@ -222,7 +226,7 @@ def test_overridden_signals(make: Make) -> None:
         _refused(vec, forge)
 
 
-def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
+def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Path) -> None:
     vec = make(str(actuated_grid(tmp_path)), num_envs=2, zones=2, agents=3, background=30)
     vec.reset(seed=2)
     for _ in range(20):
@@ -270,7 +274,7 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
     words = len(worlds.save()) - 2 * 2 - 2
     rng = np.random.default_rng(0)
     size = worlds.save()[words].shape[1]
-    for n in range(9):  # the lengths of its parts
+    for n in range(9):  # the lengths of the parts of the saved ownership
 
         def lengthen(state: State, n: int = n) -> None:
             state[words][0, n] = MANY
@@ -294,7 +298,7 @@ def test_counts_signals_and_owners(make: Make, tmp_path: Path) -> None:
 
 
 def _with_demand(make: Make, tmp_path: Path) -> CavVectorEnv:
-    """Two worlds whose vehicles look for faster routes."""
+    """Return two worlds whose vehicles look for faster routes."""
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -313,7 +317,7 @@ def _with_demand(make: Make, tmp_path: Path) -> CavVectorEnv:
     return vec
 
 
-def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
+def test_found_routes_out_of_range_are_refused(make: Make, tmp_path: Path) -> None:
     vec = _with_demand(make, tmp_path)
     worlds = _worlds(vec)
     steps = next(n for n, a in enumerate(worlds.save()) if "turnarounds" in (a.dtype.names or ()))
@@ -331,7 +335,7 @@ def test_found_routes_out_of_range(make: Make, tmp_path: Path) -> None:
         worlds.load(_forged(worlds, circle))
 
 
-def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
+def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make) -> None:
     vec = make("grid4x4", num_envs=2, zones=2, overrides={"population.external": 3})
     vec.reset(seed=1)
     min_x, min_y, _, _ = vec.network.extent_m
@@ -366,7 +370,7 @@ def test_external_vehicles_and_slots_that_do_not_match(make: Make) -> None:
         _worlds(vec).check(part)
 
 
-def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> None:
+def test_wrong_greens_times_and_counts_of_signals_are_refused(make: Make) -> None:
     keys = {"signals.agents": "all", "signals.sensing": "loops"}
     vec = make("grid4x4", num_envs=2, zones=2, overrides=keys)
     vec.reset(seed=1)
@@ -383,7 +387,7 @@ def test_states_of_signals_with_wrong_greens_times_and_counts(make: Make) -> Non
     at, seen, counts, history = map(place, found)
     for column, value in ((0, -1), (0, 2), (1, 2), (1, MANY), (2, -1), (2, 1 << 41), (3, -1)):
         _refused(vec, with_value(at, (1, 3, column), value))
-    _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting
+    _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting times
     for wrong in (-0.5, 1.5, np.nan):
         _refused(vec, with_value(seen, (0, 0, 0), wrong))
     _refused(vec, with_value(counts, (0, 0, 0), -1))
@@ -424,7 +428,7 @@ def with_command(at: int, name: str, value: float) -> Forge:
     return forge
 
 
-def test_messages_with_missing_reports(make: Make) -> None:
+def test_messages_with_missing_reports_are_refused(make: Make) -> None:
     overrides = {"v2x.enabled": True}
     vec = make("grid4x4", agents=4, background=20, overrides=overrides)
     vec.reset(seed=1)
@@ -443,7 +447,7 @@ def test_messages_with_missing_reports(make: Make) -> None:
         _refused(vec, lambda state: state[place]["first"].fill(MANY))
 
 
-def test_files_of_one_world(make: Make) -> None:
+def test_forged_states_of_single_worlds_are_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
     saved, hashes = worlds.save_worlds(), [vec.state_hash(w) for w in range(2)]
@@ -461,7 +465,7 @@ def test_files_of_one_world(make: Make) -> None:
     assert [vec.state_hash(w) for w in range(2)] == hashes
 
 
-def test_a_vehicle_that_changes_its_zone(make: Make) -> None:
+def test_forged_rows_of_vehicles_that_change_their_zone_are_refused(make: Make) -> None:
     simulation = _worlds(_busy(make)).simulation
     codec, rows = simulation.division.codec, simulation.shards[0].worlds.rows
     tick = int(simulation.ticks()[0])
@@ -476,7 +480,7 @@ def test_a_vehicle_that_changes_its_zone(make: Make) -> None:
                 codec.unpack(codec.pack(forged, 0, 0, tick), vehicle, tick, rows.copy(), 0, 0)
 
 
-def test_a_departure_that_comes_back(make: Make, tmp_path: Path) -> None:
+def test_a_departure_that_comes_back_is_refused(make: Make, tmp_path: Path) -> None:
     vec = _with_demand(make, tmp_path)
     worlds = _worlds(vec)
     place = next(
@@ -489,7 +493,7 @@ def test_a_departure_that_comes_back(make: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("at", [b"'shape': (2,", b"'descr': '<i8'", b"'fortran_order': False"])
-def test_headers_that_do_not_fit_their_bytes(at: bytes) -> None:
+def test_headers_that_do_not_match_their_bytes_are_refused(at: bytes) -> None:
     like = [np.arange(8).reshape(2, 4)]
     content = to_bytes(like)
     assert at in content
@@ -506,7 +510,7 @@ def test_headers_that_do_not_fit_their_bytes(at: bytes) -> None:
                 from_bytes(content.replace(at, change), like)
 
 
-def test_flags_that_are_neither_true_nor_false() -> None:
+def test_flags_that_are_neither_true_nor_false_are_refused() -> None:
     like = [np.ones(5, dtype=np.bool_)]
     content = bytearray(to_bytes(like))
     assert from_bytes(content, like)[0].all()
@@ -515,7 +519,7 @@ def test_flags_that_are_neither_true_nor_false() -> None:
         from_bytes(content, like)
 
 
-def test_a_clock_that_is_far_ahead(make: Make) -> None:
+def test_a_clock_that_is_far_ahead_is_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
     assert not worlds.simulation.shards[0].worlds.controllers.size, "their times would be refused"
@@ -527,7 +531,7 @@ def test_a_clock_that_is_far_ahead(make: Make) -> None:
     _refused(vec, lambda state: state[ticks].fill(1 << 62))
 
 
-def test_an_ownership_of_another_number_of_vehicles(make: Make) -> None:
+def test_a_saved_ownership_of_another_number_of_vehicles_is_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
     place = len(worlds.save()) - 2 * 2 - 2

@@ -1,4 +1,4 @@
-"""Arrays are read from an image as they were written, whatever the image contained before."""
+"""Arrays are read from an image as they were written, for any earlier content of the image."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_arrays_are_read_as_they_were_written(rounds: list[list[int]]) -> None:
     segment.close()
 
 
-def test_the_same_arrays_with_other_values() -> None:
+def test_arrays_with_new_values_are_read_as_written() -> None:
     segment = Segment.make(64)
     image, successor = Image(segment), Image(segment)
     written = arrays([3, 4, 5], 0)
@@ -66,7 +66,7 @@ def test_the_same_arrays_with_other_values() -> None:
     segment.close()
 
 
-def test_more_arrays_or_fewer() -> None:
+def test_another_number_of_arrays_is_read_as_written() -> None:
     segment = Segment.make(64)
     image = Image(segment)
     for lengths in ([3, 4, 5], [3, 4], [3, 4, 5, 6]):
@@ -77,7 +77,7 @@ def test_more_arrays_or_fewer() -> None:
     segment.close()
 
 
-def test_an_array_of_more_dimensions() -> None:
+def test_an_array_of_more_dimensions_is_read_as_written() -> None:
     segment = Segment.make(64)
     image = Image(segment)
     first = np.arange(5)

@@ -1,4 +1,4 @@
-"""Kept states of a node: at most two, and one once the newest has arrived everywhere."""
+"""Kept states of a node: at most two, and only one when the newest has arrived everywhere."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
 class Worlds:
-    """Worlds with two zones, of which a state has the numbers and the rows of each zone."""
+    """Worlds with two zones. Their state has numbers, and rows of each zone."""
 
     simulation = SimpleNamespace(num_worlds=1)
     world = SimpleNamespace(partition=SimpleNamespace(count=2))
@@ -64,9 +64,9 @@ def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> No
     assert wires.sent == [(4, 1), (4, 2), (4, 3)]
     assert (list(kept.own), list(kept.others[0])) == ([2, 3], [2, 3])
     kept.settle()
-    kept.receive(0, replica(4, THEIRS))  # ahead of this node
+    kept.receive(0, replica(4, THEIRS))  # the other node is ahead of this node
     kept.settle()
-    assert (list(kept.own), list(kept.others[0])) == ([3], [3]), "all may go back to 3"
+    assert (list(kept.own), list(kept.others[0])) == ([3], [3]), "nodes may return to state 3"
     kept.await_replica(4, ZONES, saved)
     assert list(kept.others[0]) == [3, 4]
 

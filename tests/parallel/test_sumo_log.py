@@ -53,7 +53,7 @@ def test_more_ticks_than_were_logged_are_refused() -> None:
 
 
 @pytest.mark.parametrize("most_bytes", [0, 100, 4000])
-def test_a_log_that_is_too_long_is_given_up_until_its_restart(most_bytes: int) -> None:
+def test_a_log_that_is_too_long_is_discarded_until_its_restart(most_bytes: int) -> None:
     log = log_of(200, most_bytes)
     assert log.words.nbytes < 100
     with pytest.raises(SumoError, match=r"exceeds .* MiB.*sumo\.replay_mib"):
@@ -72,7 +72,7 @@ def test_a_copy_equals_the_log_after_any_number_of_updates() -> None:
             other = ToldLog(1 << 20)
             other.take_up(KeptLog(Segment(segment.fd, 0)).read())
             assert other.words.tobytes() == log.words.tobytes()
-    other.note(told(3, 2))  # of its own tick
+    other.note(told(3, 2))  # the other log adds a command of its own
     assert other.words.size != kept.read().size
     segment.close()
 
@@ -82,11 +82,11 @@ def test_a_copy_of_another_episode_is_rewritten() -> None:
     kept, log = KeptLog(segment), log_of(50)
     kept.write(log)
     log.begin()
-    for number in range(60):  # longer than the first copy, with other content
+    for number in range(60):  # this log is longer than the first copy, and has other content
         log.note(told(1000 + number, number % 5))
     kept.write(log)
     assert kept.read().tobytes() == log.words.tobytes()
-    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # as another process
+    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # like another process
     assert kept.read().tobytes() == log_of(55, first=7).words.tobytes()
     segment.close()
 

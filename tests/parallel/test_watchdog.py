@@ -38,7 +38,7 @@ def test_a_process_that_waits_for_its_own_working_child_is_left_alone() -> None:
     assert verdict("import os\nwhile os.getppid() > 1: sum(range(100_000))") is None
 
 
-def test_a_process_whose_child_sleeps_too_is_noticed() -> None:
+def test_a_process_that_sleeps_with_its_child_is_noticed() -> None:
     found = verdict("import time; time.sleep(8)")
     assert found is not None
     assert "asleep" in found

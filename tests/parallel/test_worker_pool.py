@@ -64,7 +64,7 @@ def test_all_workers_work_and_answer(make: Make) -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP, signal.SIGTERM])
-def test_a_worker_that_dies_between_commands(make: Make, how: signal.Signals) -> None:
+def test_a_worker_that_dies_between_commands_is_replaced(make: Make, how: signal.Signals) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     os.kill(pool.pids[1], how)
@@ -74,14 +74,14 @@ def test_a_worker_that_dies_between_commands(make: Make, how: signal.Signals) ->
     assert how.name in pool.deaths[0].cause
 
 
-def test_a_worker_that_dies_before_the_first_command(make: Make) -> None:
+def test_a_worker_that_dies_before_the_first_command_is_replaced(make: Make) -> None:
     pool = make(workers=1)
     os.kill(pool.pids[0], signal.SIGKILL)
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_all_workers_die_at_work(make: Make, tmp_path: Path) -> None:
+def test_workers_that_all_die_at_work_are_replaced(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     pids = pool.pids
@@ -94,7 +94,9 @@ def test_all_workers_die_at_work(make: Make, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("point", range(len(POINTS)), ids=POINTS)
-def test_a_worker_that_dies_at_a_point_of_a_command(make: Make, point: int, tmp_path: Path) -> None:
+def test_a_worker_that_dies_at_a_point_of_a_command_is_replaced(
+    make: Make, point: int, tmp_path: Path
+) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     (tmp_path / "trap").touch()
@@ -120,7 +122,7 @@ def test_the_answer_of_a_worker_that_dies_after_it_is_kept(make: Make, tmp_path:
     pool.run(ADD)
     first, second = pool.pids
     with toiling(tmp_path, 1, lambda: os.kill(first, signal.SIGKILL)) as place:
-        pool.ask(1, TOIL, place)  # it counts in the second worker alone, and is not committed
+        pool.ask(1, TOIL, place)  # the command runs in the second worker only, and is not committed
     assert pool.pids[1] == second
     assert pool.ask(0, TOTAL) == [3.0, MORE]
 
@@ -148,7 +150,7 @@ def test_a_worker_without_a_command_gets_none_when_its_team_is_replaced(make: Ma
 
 
 @pytest.mark.usefixtures("interruptible")
-def test_a_team_that_loses_a_worker_while_its_command_is_given_up(
+def test_a_team_that_loses_a_worker_during_an_interrupt_is_replaced(
     make: Make, tmp_path: Path
 ) -> None:
     pool = make(workers=2, teams=((0, 1),))
@@ -183,7 +185,7 @@ def test_a_worker_that_works_too_long_is_noticed(make: Make) -> None:
     ("task", "payload", "cause"),
     [(DIE, int(signal.SIGKILL), "SIGKILL"), (RUN_OUT, None, "out of memory")],
 )
-def test_a_task_that_kills_all_workers(
+def test_a_task_that_repeatedly_kills_workers_is_an_error(
     make: Make, task: int, payload: int | None, cause: str
 ) -> None:
     pool = make(workers=2, repeats=2)

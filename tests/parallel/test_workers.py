@@ -27,7 +27,7 @@ SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge",
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
 def test_workers_change_no_result(make: Make, number: int, env: str) -> None:
-    """The number of workers alternates over the entries, with and without zones."""
+    """The number of workers changes from entry to entry, with and without zones."""
     wanted = {"num_envs": 5, "max_cycles": 8}
     whole = drive(make(env, **wanted))
     for zones, workers in ((1, 1 + number % 3), (4, 2)):
@@ -83,7 +83,7 @@ def test_chosen_worlds_are_reset_in_their_workers(make: Make) -> None:
     assert same(*found)
 
 
-def test_observations_without_a_copy(make: Make) -> None:
+def test_observations_without_a_copy_are_the_same(make: Make) -> None:
     vec = make("ring", num_envs=2, workers=2, copy=False)
     observations, _ = vec.reset(seed=1)
     assert not observations.flags.writeable
@@ -163,7 +163,7 @@ def test_an_action_that_is_refused_changes_nothing(make: Make) -> None:
     assert [vec.state_hash(w) for w in range(3)] == before
 
 
-def test_errors_are_those_of_one_process(make: Make) -> None:
+def test_errors_equal_those_of_one_process(make: Make) -> None:
     with pytest.raises(CapacityError, match=r"population\.agents"):
         make("ring", num_envs=2, workers=1, agents=4, background=400)
     with pytest.raises(ConfigError, match="backend='local'"):
@@ -206,7 +206,9 @@ def test_workers_may_have_cores_of_their_own(make: Make) -> None:
     assert [os.sched_getaffinity(pid) for pid in pool_of(vec).pids] == wanted
 
 
-def test_a_step_that_kills_all_workers(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_that_repeatedly_kills_workers_is_an_error(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     vec = make("ring", num_envs=2, workers=2, overrides={"workers.max_retries": 1})
     vec.reset(seed=0)
     actions = vec.suggest_actions()

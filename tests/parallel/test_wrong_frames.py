@@ -28,8 +28,8 @@ AGENT = np.dtype([
     ("terms", "<f4", 10), ("terminated", "?"), ("present", "?"), ("acted", "?"), ("events", "<i4"),
     ("vehicle_id", "<i8"), ("place", "<f8", 2),
 ])  # fmt: skip
-NEW = -1  # stands for a node that has not begun
-SENDER = 1  # the node whose frame is changed, if no other one is named
+NEW = -1  # number of a node that has not begun
+SENDER = 1  # the node whose frame is changed, unless a test names another node
 
 
 class Sent(NamedTuple):
@@ -65,8 +65,8 @@ class Forger:
     ) -> None:
         self.frame: Sent | None = None
         self.lost: dict[int, str] = {}
-        self._numbers: dict[int, int] = {}  # of the nodes that have begun, by their links
-        self._left = after  # frames of the kind that stay as they are
+        self._numbers: dict[int, int] = {}  # link → number of each node that has begun
+        self._left = after  # number of frames of the kind that are sent unchanged
         make, send = NodePeers.__init__, Links.send
 
         def made(
@@ -173,7 +173,7 @@ def drop(frame: Sent) -> Sent:
         (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims an order to recover"),
     ],
 )  # fmt: skip
-def test_a_frame_of_another_number_or_kind(
+def test_the_sender_of_a_wrong_frame_number_or_kind_is_lost(
     monkeypatch: pytest.MonkeyPatch, of: FrameKind, change: Change, words: str
 ) -> None:
     check(monkeypatch, of, change, words)
@@ -188,14 +188,16 @@ def test_a_frame_of_another_number_or_kind(
         (FrameKind.AGENT, 0, "it sends SHARE before an awaited frame"),
     ],
 )
-def test_a_frame_that_is_not_sent(
+def test_a_node_that_does_not_send_a_frame_is_lost(
     monkeypatch: pytest.MonkeyPatch, of: FrameKind, after: int, words: str
 ) -> None:
     check(monkeypatch, of, drop, words, after, sender=0)
 
 
 @pytest.mark.parametrize("change", [drop, renumbered(1), content(b"more")])
-def test_a_wrong_sync(monkeypatch: pytest.MonkeyPatch, change: Change) -> None:
+def test_the_sender_of_a_wrong_sync_is_lost(
+    monkeypatch: pytest.MonkeyPatch, change: Change
+) -> None:
     forger = Forger(monkeypatch, FrameKind.SYNC, change)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **BUSY)
     assert [text for text in found.lines[0].wrong if "must be tolerated" not in text] == []
@@ -217,7 +219,7 @@ def absent(frame: Sent) -> Sent | None:
     return frame._replace(data=bytes(data))
 
 
-def test_an_agent_that_is_absent(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sender_of_a_wrong_presence_flag_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     check(monkeypatch, FrameKind.SHARE, absent, "it sends agents that are absent", after=0)
 
 
@@ -256,7 +258,7 @@ def read_arrays(data: bytes) -> list[NDArray[Any]]:
 def test_a_wrong_replica_is_noticed_when_it_is_kept(
     monkeypatch: pytest.MonkeyPatch, change: Change, words: str
 ) -> None:
-    """Later, when the replica is needed, its sender is lost already."""
+    """When the replica is needed, it is too late to find its sender at fault."""
     check(monkeypatch, FrameKind.KEEP, change, words, after=1)
 
 
@@ -309,7 +311,7 @@ def other_incarnation(messages: list[tuple[int, Message]], worlds: list[Any]) ->
 
 
 def old_birth(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
-    """Report a vehicle that has been there."""
+    """Report the birth of a vehicle that already existed in the episode."""
     if not worlds or not worlds[0][0]:
         return False
     (vehicle, zone, _), *_ = worlds[0][0]
@@ -353,7 +355,7 @@ def another_episode(messages: list[tuple[int, Message]], worlds: list[Any]) -> b
         (another_episode, "an episode has begun: True"),
     ],
 )
-def test_a_wrong_report(
+def test_the_sender_of_a_wrong_report_is_lost(
     monkeypatch: pytest.MonkeyPatch,
     change: Callable[[list[tuple[int, Message]], list[Any]], bool],
     words: str,
@@ -361,8 +363,8 @@ def test_a_wrong_report(
     check(monkeypatch, FrameKind.REPORT, reported(change), words, after=0)
 
 
-def test_a_wrong_count_of_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The first difference from the records is taken for a wrong report."""
+def test_the_sender_of_a_wrong_count_of_vehicles_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The report with the first difference from the records counts as the wrong one."""
 
     def one_more_vehicle(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
         (zone, num, total), *rest = worlds[0][3]
@@ -375,7 +377,7 @@ def test_a_wrong_count_of_vehicles(monkeypatch: pytest.MonkeyPatch) -> None:
     )  # fmt: skip
 
 
-def test_the_only_node_does_not_send_its_state(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_only_node_that_does_not_send_its_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
     check(
         monkeypatch, FrameKind.KEEP, drop, "it has not sent state", after=1, sender=0, nodes=1
     )  # fmt: skip
@@ -426,7 +428,7 @@ def one_more(value: int) -> int:
         (1, dropped(Ack, to_coordinator=True), "its answer to an offer is missing"),
     ],
 )
-def test_a_wrong_message(
+def test_the_sender_of_a_wrong_message_is_lost(
     monkeypatch: pytest.MonkeyPatch, sender: int, change: Change, words: str
 ) -> None:
     check(monkeypatch, FrameKind.MESSAGES, change, words, after=0, sender=sender)
@@ -444,10 +446,10 @@ def test_a_wrong_message(
         lambda frame: frame._replace(data=frame.data.replace(b'"node", 1', b'"node", 2')),
     ],
 )
-def test_a_node_that_joins_with_a_wrong_frame(
+def test_a_node_that_joins_with_a_wrong_frame_is_restarted_or_lost(
     monkeypatch: pytest.MonkeyPatch, change: Change
 ) -> None:
-    """It is started again, or is lost because the other nodes cannot reach it."""
+    """A node with a wrong address is lost because the other nodes cannot reach it."""
     forger = Forger(monkeypatch, FrameKind.READY, change, sender=NEW)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **BUSY)
     assert forger.frame is not None

@@ -58,7 +58,7 @@ def test_the_actions_of_a_model_of_stable_baselines3_equal_its_predictions(
     np.testing.assert_array_equal(actions, model.predict(seen, deterministic=True)[0])
 
 
-def test_a_model_with_choices(tmp_path: Path) -> None:
+def test_a_model_with_discrete_actions_gives_its_predictions(tmp_path: Path) -> None:
     worlds = rows(**{"action.kind": "discrete"})
     model = DQN("MlpPolicy", worlds, seed=1, buffer_size=100)
     model.save(tmp_path / "model")
@@ -70,7 +70,7 @@ def test_a_model_with_choices(tmp_path: Path) -> None:
         load_policy(tmp_path / "model.zip", small_vec())
 
 
-def test_a_model_of_dicts(tmp_path: Path) -> None:
+def test_a_model_with_dict_observations_gives_its_predictions(tmp_path: Path) -> None:
     worlds = rows(**{"observation.kind": "dict"})
     model = PPO("MultiInputPolicy", worlds, seed=1)
     model.save(tmp_path / "model")
@@ -109,7 +109,7 @@ def save_script(path: Path, module: torch.nn.Module) -> None:
         torch.jit.trace(module, torch.zeros(1, SIZE)).save(str(path))  # type: ignore[no-untyped-call]
 
 
-def test_a_torch_script(tmp_path: Path) -> None:
+def test_a_torch_script_gives_its_outputs_as_actions(tmp_path: Path) -> None:
     module = torch.nn.Linear(SIZE, 2)
     save_script(tmp_path / "model.pt", module)
     vec = small_vec()
@@ -119,7 +119,7 @@ def test_a_torch_script(tmp_path: Path) -> None:
     assert mask.any()
 
 
-def test_logits_choose_the_largest(tmp_path: Path) -> None:
+def test_the_largest_logit_is_chosen(tmp_path: Path) -> None:
     module = torch.nn.Linear(SIZE, 5)
     save_script(tmp_path / "model.ts", module)
     vec = small_vec(action__kind="discrete")
@@ -151,7 +151,7 @@ def test_other_files_are_refused(tmp_path: Path, name: str, message: str) -> Non
         load_policy(path, small_vec())
 
 
-def test_state_dicts_are_no_torch_script(tmp_path: Path) -> None:
+def test_a_state_dict_is_refused_as_torch_script(tmp_path: Path) -> None:
     torch.save(torch.nn.Linear(SIZE, 2).state_dict(), tmp_path / "model.pt")
     with pytest.raises(PolicyError, match=r"save the module with torch\.jit\.trace"):
         load_policy(tmp_path / "model.pt", small_vec())
@@ -190,7 +190,7 @@ def test_onnx_is_called_with_its_input(tmp_path: Path, monkeypatch: pytest.Monke
         load_policy(path, vec)
 
 
-def test_a_real_onnx_model(tmp_path: Path) -> None:
+def test_a_real_onnx_model_gives_its_outputs_as_actions(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     module = torch.nn.Linear(SIZE, 2)
@@ -205,7 +205,7 @@ def test_a_real_onnx_model(tmp_path: Path) -> None:
     np.testing.assert_allclose(actions, expected.clip(-1.0, 1.0), atol=1e-5)
 
 
-def test_a_function_is_a_model() -> None:
+def test_a_function_can_be_a_model() -> None:
     vec = small_vec()
     policy = ModelPolicy(vec, lambda seen: np.full((len(seen), 2), 3.0))
     _, actions, _ = act(policy, vec)

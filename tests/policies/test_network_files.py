@@ -116,7 +116,7 @@ def test_weights_that_do_not_fit_are_refused(driver: Path, message: str) -> None
     ],
 )
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_the_tensors_of_an_actor_critic_are_those_that_its_config_names(
+def test_an_actor_critic_has_the_tensors_that_its_config_names(
     tmp_path: Path, kind: str, form: dict[str, Any]
 ) -> None:
     pytest.importorskip("torch")

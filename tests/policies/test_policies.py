@@ -64,7 +64,9 @@ def drive(env: CavEnv, policy: Policy, steps: int) -> None:
 
 
 @pytest.mark.parametrize("form", ["flat", "dict"])
-def test_a_network_does_the_same_in_dicts_as_in_batches(checkpoint: Path, form: str) -> None:
+def test_a_network_gives_the_same_actions_for_dicts_and_batches(
+    checkpoint: Path, form: str
+) -> None:
     vec = make_vec("merge", num_envs=1, agents=3, background=4)
     env = parallel_env("merge", agents=3, background=4, overrides={"observation.kind": form})
     one, many = load_policy(checkpoint, env), load_policy(checkpoint, vec)
@@ -193,7 +195,9 @@ def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
         ("action__steering_rad", 0.3),
     ],
 )
-def test_a_network_refuses_another_seat(checkpoint: Path, key: str, value: Any) -> None:
+def test_a_network_refuses_an_environment_with_other_sensors_or_actions(
+    checkpoint: Path, key: str, value: Any
+) -> None:
     vec = small_vec(**{key: value})
     name = key.replace("__", ".")
     with pytest.raises(PolicyError, match=rf"expects different .*overrides: .*'{name}'") as caught:
@@ -257,7 +261,7 @@ def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vec = make_vec("merge", num_envs=1, agents=5)
-    # The built-in driver accelerates less, coasts, brakes a little, as hard, and harder.
+    # The built-in driver accelerates less, coasts, or brakes: a little, equally hard, or harder.
     built_in = np.array([[(0.2, 0.5), (0.0, 0.5), (-0.3, 0.5), (-0.4, 0.5), (-0.9, 0.5)]])
     own = np.array([[(1.0, -0.1), (0.8, -0.1), (-0.6, -0.1), (-0.4, -0.1), (-0.2, -0.1)]])
     monkeypatch.setattr(shield, "built_in_actions", lambda env, mask: built_in)
@@ -299,7 +303,7 @@ def test_choices_cannot_be_corrected(tmp_path: Path) -> None:
         save_driver(tmp_path, small_vec(action__kind="discrete"), residual=True)
 
 
-def test_a_shield_compares_throttles() -> None:
+def test_a_shield_refuses_discrete_actions() -> None:
     vec = small_vec(action__kind="discrete")
     observations, infos = vec.reset(seed=0)
     with pytest.raises(PolicyError, match=r"action\.kind = discrete: this driver needs throttle"):
@@ -362,4 +366,4 @@ def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
         observations, _, _, _, infos = vec.step(driver.act_batch(observations, infos["mask"]))
         stood_s = max(stood_s, *vec.simulation.vehicles(0)["wait_s"], 0.0)
     vec.close()
-    assert 0.0 < stood_s < 60.0  # at a red light
+    assert 0.0 < stood_s < 60.0  # the vehicle stood at a red light only

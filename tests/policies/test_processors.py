@@ -39,7 +39,7 @@ def test_kernels_for_other_processors_give_the_same_bytes(
     )
     assert ran.stdout.split() == [DIGEST]
     if has_avx and shutil.which("objdump"):
-        assert str(_has_wide_registers(tmp_path)) == has_avx  # the code does differ
+        assert str(_has_wide_registers(tmp_path)) == has_avx  # the compiled code differs
 
 
 def _has_wide_registers(cache: Path) -> bool:

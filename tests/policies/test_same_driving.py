@@ -51,7 +51,7 @@ def test_both_interfaces_give_the_same_actions(driver: str) -> None:
     vec.close()
 
 
-def test_drivers_that_share_the_agents_act_as_each_does_alone() -> None:
+def test_drivers_that_share_the_agents_act_as_they_act_alone() -> None:
     vec = make_vec("merge", num_envs=3, agents=5, background=4)
     observations, infos = vec.reset(seed=5)
     names = ("merge_ippo+idm", "merge_ippo", "idm")

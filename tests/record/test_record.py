@@ -123,7 +123,7 @@ def test_maps_come_in_the_order_of_success() -> None:
     assert by_map(report)["east"]["collision"] == "5.0 %"
 
 
-def test_a_number_that_is_not_0_does_not_look_so() -> None:
+def test_a_small_number_is_not_shown_as_0() -> None:
     shown = [number(value, 1) for value in (0.0, 0.04, 0.06, 1234.56)]
     assert shown == ["0.0", "0.04", "0.1", "1,234.6"]
     assert number(0.04, 0) == "0"
@@ -182,7 +182,7 @@ def test_the_tests_that_write_blocks_are_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("page", ["agents/exit_ippo/README.md", "README.md"])
-def test_a_table_recorded_again_is_what_its_page_says(page: str, tmp_path: Path) -> None:
+def test_a_table_that_is_recorded_again_equals_its_page(page: str, tmp_path: Path) -> None:
     (table,) = tables_named([page])
     tell = partial(print, flush=True)
     text = table.write(Results(finish_all(table.jobs, 2, tell, tmp_path)))

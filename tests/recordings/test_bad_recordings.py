@@ -117,7 +117,7 @@ def test_a_spoilt_recording_is_refused(
         assert word in str(caught.value)
 
 
-def test_parts_before_a_damaged_one_can_be_read_as_its_error_says(good: Path, bad: Path) -> None:
+def test_parts_before_a_damaged_part_can_be_read_after_its_removal(good: Path, bad: Path) -> None:
     cut("world-0/vehicles/000002.parquet")(bad)
     with pytest.raises(RecordingError):
         read(bad)

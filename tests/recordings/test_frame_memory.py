@@ -19,7 +19,7 @@ def test_rows_are_reused_only_after_they_are_returned() -> None:
     memory = FrameMemory()
     first, second = memory.take(10), memory.take(10)
     assert not np.shares_memory(first, second)
-    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # rows of another memory
+    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # rows that do not come from this memory
     assert not np.shares_memory(memory.take(10), second)
     memory.give_back(first)
     assert np.shares_memory(memory.take(12), first)

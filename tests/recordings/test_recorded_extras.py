@@ -29,7 +29,7 @@ RIG = {
 
 
 @pytest.mark.parametrize("zones", [1, 4])
-def test_observations_are_those_of_each_step(tmp_path: Path, zones: int) -> None:
+def test_recorded_observations_equal_those_of_each_step(tmp_path: Path, zones: int) -> None:
     options = RecordOptions(tmp_path / "run", ("observations",))
     seen: list[list[Any]] = [[], []]
     with closing(
@@ -83,7 +83,7 @@ def test_rows_of_the_second_episode_are_found_by_its_own_ticks(
     assert not np.array_equal(seen[0], seen[1])
 
 
-def test_samples_are_those_of_the_rig(tmp_path: Path) -> None:
+def test_recorded_samples_equal_those_of_the_rig(tmp_path: Path) -> None:
     options = RecordOptions(tmp_path / "run", ("samples",))
     taken = []
     with closing(

@@ -101,7 +101,7 @@ def test_worlds_of_a_vector_have_folders_of_their_own_and_episodes_are_counted(
         next(recording.frames(7))
 
 
-def test_an_episode_without_a_step_is_one(tmp_path: Path) -> None:
+def test_an_episode_without_a_step_is_recorded(tmp_path: Path) -> None:
     with closing(make_vec("ring", record=tmp_path / "run", agents=1, background=0)) as vec:
         for seed in (1, 2):
             vec.reset(seed=seed)

@@ -94,7 +94,7 @@ def test_mcap_has_scenes_and_events(path: Path, frames: list[WorldFrame], tmp_pa
     assert sorted(map(str, events)) == sorted(str(e.event._asdict()) for e in recording.events())
 
 
-def test_pictures_are_those_of_the_world(tmp_path: Path) -> None:
+def test_pictures_equal_those_of_the_world(tmp_path: Path) -> None:
     made = parallel_env("grid4x4", zones=4, render_mode="rgb_array", record=tmp_path / "run")
     with closing(made) as env:
         env.reset(seed=2)

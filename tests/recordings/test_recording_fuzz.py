@@ -13,7 +13,7 @@ from tests.support.hostile_recordings import Forger, Use, limited_memory, make_r
 
 MUTATIONS = 150
 MANY_MUTATIONS = int(os.environ.get("CAVMARL_RECORDING_MUTATIONS", "20000"))
-EVERY = 10  # one of this number is also drawn and shown on a page
+EVERY = 10  # one in this number of recordings is also drawn and shown on a page
 
 
 @pytest.fixture(scope="module")

@@ -26,7 +26,7 @@ def test_an_animation_can_be_read_back(tmp_path: Path) -> None:
     assert shades == pytest.approx(range(0, 240, 40), abs=4)
 
 
-def test_no_frames_no_file(tmp_path: Path) -> None:
+def test_without_frames_no_file_is_written(tmp_path: Path) -> None:
     with AnimationWriter(tmp_path / "drive.webp", fps=10.0):
         pass
     assert not list(tmp_path.iterdir())

@@ -58,7 +58,7 @@ def count(frame: NDArray[np.uint8], color: palette.Color) -> int:
 
 @pytest.mark.parametrize("agent", [-1, 3])
 @pytest.mark.parametrize("owner", [0, 1, 2, 3])
-def test_a_vehicle_has_the_colour_of_its_owner_wherever_it_is(
+def test_a_vehicle_has_the_colour_of_its_owner_at_any_position(
     ring: RoadNetwork, car: Car, owner: int, agent: int
 ) -> None:
     rows = car(x=5.0, y=9.0, id=5, agent=agent)
@@ -98,7 +98,7 @@ def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> No
         assert at(frame, 6.0, 5.0) == palette.zone_color(3)
 
 
-def test_the_sight_of_a_zone_ends_where_its_halo_does() -> None:
+def test_the_drawn_sight_of_a_zone_ends_with_its_halo() -> None:
     surface = blank((300, 300))
     surface.fill((255, 255, 255))
     draw_sight(surface, PINWHEEL, 3.0, 4, Viewport.fit(PINWHEEL.bounds, (300, 300)))

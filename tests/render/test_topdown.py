@@ -48,7 +48,7 @@ def test_frame_is_rgb_of_the_asked_size(ring: RoadNetwork, car: Car) -> None:
     assert tuple(frame[120, 130]) == palette.LAND
 
 
-def test_size_suits_the_map(grid: RoadNetwork) -> None:
+def test_the_picture_has_the_proportions_of_the_map(grid: RoadNetwork) -> None:
     width, height = TopDownRenderer(grid).size
     wide = TopDownRenderer(grid, focus=(0.0, 0.0, 5000.0, 10.0)).size
     assert width > height
@@ -56,7 +56,7 @@ def test_size_suits_the_map(grid: RoadNetwork) -> None:
     assert width % 16 == height % 16 == 0
 
 
-def test_same_world_same_bytes(grid: RoadNetwork, car: Car) -> None:
+def test_equal_worlds_give_equal_pictures(grid: RoadNetwork, car: Car) -> None:
     rows = np.concatenate([car(x=100.0 * k, y=300.0, id=k, agent=k - 1) for k in range(5)])
     phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     one = TopDownRenderer(grid, SIZE).frame(rows, phases, clock_s=2.0)
@@ -118,12 +118,12 @@ def test_vehicle_shows_its_state(
 
 def test_left_blinker_is_at_the_left(ring: RoadNetwork, car: Car) -> None:
     renderer = TopDownRenderer(ring, SIZE, focus=(-8.0, -6.0, 8.0, 6.0))
-    left = renderer.frame(car(agent=-1, blinker=1))  # heads east: its left is up
+    left = renderer.frame(car(agent=-1, blinker=1))  # it drives east: left is up
     assert count(left[:120], palette.BLINKER) > 0
     assert count(left[120:200], palette.BLINKER) == 0
 
 
-def test_signal_letters_are_those_of_the_phase(grid: RoadNetwork) -> None:
+def test_signal_letters_equal_those_of_the_phase(grid: RoadNetwork) -> None:
     phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     codes = signal_codes(grid, phases)
     signalled = grid.links["signal"] >= 0
@@ -222,7 +222,7 @@ def test_window_keeps_pace(headless: None, ring: RoadNetwork, car: Car) -> None:
     renderer.close()
 
 
-def test_run_goes_on_when_the_window_is_closed(
+def test_a_run_continues_when_its_window_is_closed(
     headless: None, ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pygame = load_pygame()

@@ -106,7 +106,7 @@ def test_comfort_is_the_mean_jerk() -> None:
         (EVENT_ARRIVED, "arrival"),
     ],
 )
-def test_event_terms_are_one_in_their_step(bit: int, name: str) -> None:
+def test_event_terms_are_1_in_the_step_of_the_event(bit: int, name: str) -> None:
     flags = ("collision", "off_road", "wrong_way", "red_light", "arrival")
     found = terms(one(events=bit))
     assert [flag for flag in flags if found[flag] == 1.0] == [name]
@@ -133,7 +133,7 @@ def test_time_to_collision_of_one_behind_another() -> None:
     assert terms(rows)["ttc_risk"] == 0.0, "the other is on the next lane"
 
 
-def test_cars_side_by_side_do_not_collide_unless_they_drift_together() -> None:
+def test_adjacent_cars_collide_only_if_they_approach_sideways() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (1.0, 3.2, 0.0)], speed=[15.0, 10.0])
     assert terms(rows)["ttc_risk"] == 0.0, "one vehicle passes the other"
     # The flanks are 1.2 m apart; one vehicle approaches the other sideways at 1 m/s.

@@ -1,4 +1,4 @@
-"""Paths over junctions that run backwards are drawn again, and nothing else changes."""
+"""Paths over junctions that run backwards are replaced, and other paths do not change."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -68,7 +68,7 @@ def test_other_paths_from_the_same_lane_keep_their_way() -> None:
     assert shapes[4][-3:].tolist() == _line((50.0, 0.0), (57.0, 3.0), (60.0, 10.0)).tolist()
 
 
-def test_a_path_in_parts_is_drawn_anew_in_as_many() -> None:
+def test_a_path_of_several_lanes_is_replaced_by_the_same_number_of_lanes() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((48.0, 2.0), (48.0, 60.0)),
@@ -81,7 +81,7 @@ def test_a_path_in_parts_is_drawn_anew_in_as_many() -> None:
     assert _corners(*(shapes[k] for k in (0, 2, 3, 1))).max() < np.radians(60.0)
 
 
-def test_paths_that_a_car_can_follow_stay_as_they_are() -> None:
+def test_paths_that_a_car_can_follow_are_unchanged() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((50.0, 3.2), (0.0, 3.2)),
@@ -92,7 +92,7 @@ def test_paths_that_a_car_can_follow_stay_as_they_are() -> None:
     assert [shape.tolist() for shape in shapes] == drawn
 
 
-def test_a_lane_that_a_movement_without_a_path_leaves_keeps_its_end() -> None:
+def test_a_lane_with_a_movement_without_a_path_keeps_its_end() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((49.0, 0.1), (100.0, 0.1)),
@@ -137,7 +137,7 @@ def test_no_path_of_a_city_runs_backwards(shared_maps: Path, name: str) -> None:
     _check_forward(network_of(shared_maps / "net" / f"{name}.net.xml"))
 
 
-def test_a_path_drawn_anew_has_an_even_grade() -> None:
+def test_a_replaced_path_has_an_even_grade() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((49.0, 0.1), (50.0, 40.0)),

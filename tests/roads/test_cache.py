@@ -98,7 +98,7 @@ def test_a_truncated_entry_is_built_again(
     assert load_network(path).content_hash == whole.content_hash
 
 
-def test_the_name_is_the_files_and_not_the_caches(
+def test_the_name_of_a_network_is_that_of_its_present_file(
     crossing: Callable[..., Path], cache_folder: Path
 ) -> None:
     path = crossing()
@@ -117,7 +117,7 @@ ROWS_SHA256 = {
 
 
 @pytest.mark.parametrize("name", ROWS_SHA256)
-def test_other_rows_of_a_map_have_another_format(name: str) -> None:
+def test_changed_rows_of_a_map_need_another_format_number(name: str) -> None:
     network = read_network(find_map(name))
     digest = hashlib.sha256()
     for array in network.arrays:

@@ -18,7 +18,7 @@ def straight(begin: tuple[float, float], end: tuple[float, float]) -> LinkPath:
 
 
 @pytest.mark.parametrize(("apart_m", "near"), [(2.0, True), (2.7, False), (9.0, False)])
-def test_paths_that_keep_apart_are_not_near_whatever_the_map_says(
+def test_separate_paths_are_not_near_even_if_the_map_lists_them_as_foes(
     apart_m: float, near: bool
 ) -> None:
     one, other = straight((0.0, 0.0), (20.0, 0.0)), straight((0.0, apart_m), (20.0, apart_m))

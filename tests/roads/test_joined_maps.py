@@ -54,7 +54,7 @@ def test_each_episode_of_each_world_draws_its_map_by_the_seed() -> None:
     assert [vec.worlds.state_hash(world) for world in range(6)] == first
 
 
-def test_workers_and_worlds_taken_apart_see_the_same() -> None:
+def test_worlds_on_workers_are_the_same() -> None:
     settings: dict[str, Any] = {"agents": 4, "background": 4, "overrides": OVERRIDES}
     here = make_vec("cities", num_envs=4, **settings)
     there = make_vec("cities", num_envs=4, workers=2, **settings)
@@ -74,7 +74,7 @@ def test_a_divided_world_is_the_undivided_one() -> None:
     assert sum(result.crossings for result in found.results) > 10
 
 
-def test_a_list_of_one_is_that_map() -> None:
+def test_a_list_of_one_map_equals_the_map() -> None:
     plain, listed = (
         make_vec("ring", seed=1, overrides={"map.source": source})
         for source in ("map/map.net.xml", ["map/map.net.xml"])
@@ -150,7 +150,7 @@ def test_keys_of_one_map_are_refused_with_several(key: str, value: object) -> No
         load_world("cities", overrides={**OVERRIDES, key: value})
 
 
-def test_a_folder_without_maps_and_no_map_at_all(tmp_path: Path) -> None:
+def test_a_folder_without_maps_or_a_missing_source_is_refused(tmp_path: Path) -> None:
     with pytest.raises(MapError, match="no map file"):
         load_world("cities", overrides={"map.source": str(tmp_path)})
     with pytest.raises(ConfigError, match="source"):

@@ -1,4 +1,4 @@
-"""Rules of lanes in SUMO's networks: solid lines, stop offsets, and what is not simulated."""
+"""Rules of lanes in SUMO's networks: solid lines, stop offsets, and ignored rules."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_lanes_bar_classes_from_changes(grid: Path) -> None:
 
 
 @pytest.mark.parametrize("rules", ["", 'changeLeft="all" changeRight=""'])
-def test_networks_without_rules_stay_as_they_are(grid: Path, rules: str) -> None:
+def test_networks_without_rules_are_unchanged(grid: Path, rules: str) -> None:
     assert read_network(with_rules(grid, rules)).content_hash == read_network(grid).content_hash
 
 
@@ -86,7 +86,7 @@ def test_stop_offsets_move_stop_lines(grid: Path) -> None:
     assert network.notes == ()
 
 
-def test_what_is_not_simulated_is_counted(grid: Path) -> None:
+def test_rules_that_are_not_simulated_are_counted(grid: Path) -> None:
     inside = '<neigh lane="B1B0_1"/><stopOffset value="3" vClasses="truck"/>'
     notes = (
         "1 <neigh> elements (overtaking on the opposite lane) ignored",

@@ -1,4 +1,4 @@
-"""Lane shapes beside neighbours of other lengths."""
+"""Shapes of lanes whose neighbours have other lengths."""
 
 from __future__ import annotations
 

@@ -78,7 +78,7 @@ def test_a_link_leads_over_its_chain_of_internal_lanes(network: RoadNetwork) -> 
     assert chr(turn["state"]) == "o"
 
 
-def test_lanes_into_a_lane_are_internal_ones(network: RoadNetwork) -> None:
+def test_lanes_into_a_lane_are_internal_lanes(network: RoadNetwork) -> None:
 
     row = network.lanes[lane(network, "e_0")]
     into = network.into[row["first_into"] : row["first_into"] + row["num_into"]]

@@ -160,7 +160,7 @@ def check_against_sumolib(network: RoadNetwork, net: Any) -> None:
         for foe in np.flatnonzero(links["junction"] == link["junction"]) if node._foes else ():
             a, b = int(link["index"]), int(links["index"][foe])
             either = foe != mine and (node.areFoes(a, b) or node.areFoes(b, a))
-            # Links that pass too closely are foes besides the map's, so there are never fewer.
+            # All foes of the map are listed, and also links that pass too closely.
             assert foe in listed or not either
             if either:
                 assert listed[foe] == node.forbids(connections[foe], connections[mine])
@@ -179,12 +179,12 @@ def check_everything(path: Path, read: Callable[[Path], RoadNetwork] = network_o
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_a_real_map_is_read_whole(built_map: BuiltMap, name: str) -> None:
+def test_all_of_a_real_map_is_read(built_map: BuiltMap, name: str) -> None:
     check_everything(built_map(name))
 
 
 @pytest.mark.parametrize("name", GAMES)
-def test_a_network_of_sumo_is_read_whole(name: str) -> None:
+def test_all_of_a_network_of_sumo_is_read(name: str) -> None:
     check_everything(game(name))
 
 
@@ -196,7 +196,7 @@ def test_a_network_of_sumo_is_read_whole(name: str) -> None:
         ["--rand", "--rand.iterations=30", "--seed=3", "--no-internal-links"],
     ],
 )
-def test_a_generated_network_is_read_whole(tmp_path: Path, options: list[str]) -> None:
+def test_all_of_a_generated_network_is_read(tmp_path: Path, options: list[str]) -> None:
     sumo = pytest.importorskip("sumo")
     path = tmp_path / "made.net.xml"
     command = [str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate"), *options, "-o", str(path)]

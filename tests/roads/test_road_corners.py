@@ -1,4 +1,4 @@
-"""Corners inside a road are rounded, so that cars keep to their lanes, and nothing else changes."""
+"""Corners inside a road are rounded, so that cars keep to their lanes; other shapes remain."""
 
 from __future__ import annotations
 
@@ -50,11 +50,11 @@ def test_a_corner_becomes_a_tangent_curve_in_which_a_car_keeps_within_its_lane(
     assert find_corners(shape) == []
 
 
-def test_lanes_keep_their_distance() -> None:
+def test_rounded_lanes_keep_their_distance() -> None:
     shapes = [
         line((0, -3.2 * k), (100 + 3.2 * k, -3.2 * k), (100 + 3.2 * k, 100)) for k in range(3)
     ]
-    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # lanes of the other direction
+    shapes.append(line((96.8, 100), (96.8, 3.2), (0, 3.2)))  # a lane of the other direction
     assert round_corners(shapes, [3.2] * 4, [range(3), range(3, 4)]) == [0, 1, 2, 3]
     for one, other in ((0, 1), (1, 2), (3, 0)):
         own, far = (
@@ -72,13 +72,13 @@ def test_lanes_keep_their_distance() -> None:
         line(*[(7 * np.sin(t), 7 * np.cos(t)) for t in np.linspace(0, 5, 80)]),
     ],
 )
-def test_gentle_bends_stay_as_drawn(shape: Shape) -> None:
+def test_gentle_bends_are_unchanged(shape: Shape) -> None:
     shapes = [shape]
     assert round_corners(shapes, [3.2], [range(1)]) == []
     assert shapes[0] is shape
 
 
-def test_a_corner_of_several_points_is_one() -> None:
+def test_a_corner_of_several_points_is_rounded_once() -> None:
     shape = line((0, 0), (100, 0), (102, 2), (102, 100))
     (corner,) = find_corners(shape)
     assert (corner.first, corner.last) == (1, 2)
@@ -107,7 +107,7 @@ def test_cars_take_the_corner_without_a_collision(
     assert found["success"].mean == 1.0
 
 
-def test_rounded_lanes_are_named_and_the_world_says_it(
+def test_rounded_lanes_are_reported_by_the_world(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = bent_street(tmp_path, [90.0])

@@ -166,7 +166,7 @@ def test_the_remaining_length_is_the_sum_of_the_steps_ahead(
             here = roads.lanes[lane]
             if k > 0 and not here["internal"] and roads.lanes[lanes[k - 1]]["internal"]:
                 n += 1
-            # Inside a junction the way is already that of the edge beyond.
+            # Inside a junction, the way already belongs to the edge beyond.
             way_ = ways[min(n + int(here["internal"]), len(ways) - 1)]
             s = share * float(here["length_m"])
             row = on_lane(roads, lane, s, travel, way=way_)
@@ -189,7 +189,7 @@ def changes_lane(roads: RoadNetwork, pair: list[int]) -> bool:
 
 
 def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
-    """Return the time at the limits; of an edge with lane changes, only the last lane counts."""
+    """Return the time at the speed limits; an edge with lane changes counts by its last lane."""
     total = 0.0
     for k, lane in enumerate(lanes):
         if k + 1 == len(lanes) or not changes_lane(roads, lanes[k : k + 2]):
@@ -198,7 +198,7 @@ def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_edges_of_a_way_are_those_of_its_lanes(name: str) -> None:
+def test_the_edges_of_a_way_are_the_edges_of_its_lanes(name: str) -> None:
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"]).tolist()
     room = np.zeros(len(outside) + 1, np.int32)

@@ -1,4 +1,4 @@
-"""Opposite lanes on the same strip are named and moved apart, and nothing else changes."""
+"""Opposite lanes on the same strip are reported and moved apart; other lanes do not change."""
 
 from __future__ import annotations
 
@@ -71,7 +71,7 @@ def test_lanes_on_the_same_strip_move_to_the_side_on_which_they_are_driven() -> 
     assert strips_of(*shapes) == []
 
 
-def test_in_left_hand_traffic_they_move_to_the_left() -> None:
+def test_in_left_hand_traffic_lanes_on_the_same_strip_move_to_the_left() -> None:
     shapes = [line((0, 0), (100, 0)), line((100, 0), (0, 0))]
     strips = strips_of(*shapes, left_hand=True)
     move_apart(shapes, strips, [], left_hand=True)
@@ -94,11 +94,11 @@ def test_parallels_of_a_bent_lane_keep_their_distance() -> None:
         line((100, 0), (50, 40), (0, 0)),  # an edge that touches only its ends
     ],
 )
-def test_other_streets_stay(other: Shape) -> None:
+def test_other_streets_do_not_change(other: Shape) -> None:
     assert strips_of(line((0, 0), (100, 0)), other) == []
 
 
-def test_ordinary_maps_have_none(tmp_path: Path) -> None:
+def test_ordinary_maps_have_no_shared_strips(tmp_path: Path) -> None:
     path = bent_street(tmp_path, [20.0], lanes=2)
     network = read_network(path)
     assert network.notes == ()
@@ -123,7 +123,7 @@ def test_a_street_around_its_centre_line_becomes_two_directions(tmp_path: Path, 
     assert found["success"].mean == 1.0
 
 
-def test_the_check_names_them_and_the_repair_draws_them_apart(tmp_path: Path) -> None:
+def test_the_check_names_shared_strips_and_the_repair_separates_them(tmp_path: Path) -> None:
     path, target = tram_street(tmp_path), tmp_path / "mended.net.xml"
     before = [one for one in find_defects(read_network(path), path) if one.kind == KIND]
     assert sorted(one.name for one in before) == ["0_1_1", "1_2_1", "2_3_1", "3_4_1"]

@@ -1,4 +1,4 @@
-"""Programs of additional files are added to those of the map; as in SUMO, the last one is on."""
+"""Programs of additional files are added to the map's; as in SUMO, the last program is active."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def states(
     return shown
 
 
-def test_the_program_loaded_last_is_on(
+def test_the_program_loaded_last_is_active(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())
@@ -113,7 +113,7 @@ def test_phases_change_at_their_tick_though_sums_of_ticks_are_not_exact(
     assert states(network, range(600), 0.1) == [planned(tick) for tick in range(600)]
 
 
-def test_of_several_programs_in_a_map_the_last_is_on(crossing: Callable[..., Path]) -> None:
+def test_the_last_of_several_programs_in_a_map_is_active(crossing: Callable[..., Path]) -> None:
     second = (
         '<tlLogic id="c" type="static" programID="1"><phase duration="9" state="ggg"/></tlLogic>'
     )
@@ -134,7 +134,7 @@ def test_a_selected_program_overrides_all_others(
     assert states(with_programs(plain, chosen={"c": "off"}), [0, 50]) == ["Ooo", "Ooo"]
 
 
-def test_a_signal_goes_dark_and_stays_so(
+def test_a_signal_goes_dark_and_stays_dark(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())

@@ -56,7 +56,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
         assert seen(rows, row=row).tobytes() == seen(rows[order], row=place).tobytes()
 
 
-def test_ahead_is_up_and_left_is_left() -> None:
+def test_in_the_grid_ahead_is_up_and_left_is_left() -> None:
     rows = vehicles([(0.0, 0.0, 0.5), (8 * math.cos(0.5), 8 * math.sin(0.5), 0.5)])
     rows = np.concatenate([rows, vehicles([(-9 * math.sin(0.5), 9 * math.cos(0.5), 0.5)], id=2)])
     rows["vtype"][2] = 1

@@ -58,7 +58,7 @@ def shoot(
 def test_rows_do_not_depend_on_bands(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
 ) -> None:
-    """Pictures too large for the cache are rendered in bands; a worker may get some bands."""
+    """Pictures that exceed the cache are rendered in bands; a worker may render some of them."""
     camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
     depths, classes, _ = shoot(rows, camera, walls=walls)
     reach_m = camera_reach_m(camera, WIDTH, HEIGHT) + 1.0
@@ -110,7 +110,7 @@ def test_pixels_equal_twin(
         ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
         exact = naive.trace(rows, 0, walls, start, ray, range_m, 0.0)
         if exact.distance < 0.02:
-            continue  # inside of a body, where a camera sees no face, or touching a body
+            continue  # the camera is inside a body, where it sees no face, or touches a body
         is_equal = depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
         if is_equal and classes[j, i] == CLASS_OF[exact.what[0]]:
             continue
@@ -154,7 +154,7 @@ def test_a_long_box_at_ten_metres_is_ten_metres_deep() -> None:
     assert (classes[middle] == CAR).all()
 
 
-def test_the_nearer_one_hides_the_other() -> None:
+def test_the_nearer_body_hides_the_other() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (20.0, 0.0, RIGHT), (10.0, 0.0, RIGHT)], length=60.0)
     rows["vtype"][2] = 1
     _, classes, _ = shoot(rows, forward(z_m=0.8))
@@ -210,7 +210,7 @@ def test_float16_numbers_equal_those_of_numpy() -> None:
         assert (out.view(np.float16) == floats.astype(np.float16)).all()
 
 
-def test_colours_are_those_of_the_classes_and_pale_with_the_distance() -> None:
+def test_colours_depend_on_the_class_and_fade_with_the_distance() -> None:
     rows = vehicles(
         [(0.0, 0.0, 0.0), (6.0, 0.0, RIGHT), (40.0, 0.0, RIGHT)], length=[5, 3, 120], height=6.0
     )

@@ -28,7 +28,7 @@ def _metres_apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float
 
 
 @pytest.mark.parametrize("origin", [(48.0, 11.0, 0.0), (-33.9, 151.2, 58.0), (69.6, -18.9, 3.0)])
-def test_a_tangent_plane_is_that_of_proj(origin: tuple[float, float, float]) -> None:
+def test_a_tangent_plane_equals_projs(origin: tuple[float, float, float]) -> None:
     plane = TangentPlane(*origin)
     points = np.random.default_rng(0).uniform(-5000.0, 5000.0, (50, 3)) * [1.0, 1.0, 0.01]
     lat, lon, height = origin

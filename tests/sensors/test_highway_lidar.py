@@ -27,9 +27,9 @@ def cells(rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
 @pytest.mark.parametrize("name", ["highway-v0", "merge-v0", "intersection-v1"])
 @pytest.mark.parametrize("num_cells", [4, 16, 64])
 @pytest.mark.parametrize("normalize", [True, False])
-def test_the_cells_are_highway_envs(name: str, num_cells: int, normalize: bool) -> None:
+def test_the_cells_equal_highway_envs(name: str, num_cells: int, normalize: bool) -> None:
     env = highway.make(name, 1)
-    env.road.objects.clear()  # the end of the ramp of merge-v0; cavmarl has no obstacles
+    env.road.objects.clear()  # an obstacle at the ramp's end in merge-v0; cavmarl has no obstacles
     config = {"cells": num_cells, "normalize": normalize}
     theirs = highway.observation(env, "LidarObservation", **config)
     ours = cells(highway.vehicles(env), highway.own_row(env), **config)

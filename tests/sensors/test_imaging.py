@@ -90,13 +90,13 @@ def test_a_wall_at_ten_metres_reads_ten_metres(before_a_wall: CavVectorEnv) -> N
     assert set(middle[first + 1 :].tolist()) <= {ROAD, LANE_LINE}
 
 
-def test_bodies_look_the_same_from_any_first_side() -> None:
+def test_rays_of_a_fan_are_spread_evenly() -> None:
     fan = lidar_fan(LidarRigConfig(rate_hz=5, rays=5, fov_deg=90.0))
     angles = np.degrees(np.arctan2(fan.rays[:, 0, 1], fan.rays[:, 0, 0]))
     assert angles == pytest.approx([-45.0, -22.5, 0.0, 22.5, 45.0])
 
 
-def test_lanes_are_covered_by_their_strips() -> None:
+def test_the_strips_of_lanes_have_the_area_of_the_lanes() -> None:
     network = load_world("grid4x4").network
     strips, lined = lane_strips(network)
     x, y = strips[..., 0], strips[..., 1]

@@ -63,7 +63,7 @@ def standing(name: str, seed: int) -> Any:
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", ["highway-v0", "merge-v0", "two-way-v0", "intersection-v1"])
 @pytest.mark.parametrize("case", CONFIGS)
-def test_the_table_is_highway_envs(name: str, seed: int, case: str) -> None:
+def test_the_table_equals_highway_envs(name: str, seed: int, case: str) -> None:
     env = standing(name, seed)
     config = {"vehicles_count": 5, "features": KinematicsConfig.features, **CONFIGS[case]}
     theirs = highway.observation(
@@ -80,7 +80,7 @@ def test_the_table_is_highway_envs(name: str, seed: int, case: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_shuffled_rows_are_highway_envs_in_another_order(seed: int) -> None:
+def test_shuffled_rows_equal_highway_envs_in_another_order(seed: int) -> None:
     env = standing("highway-v0", seed)
     config = {"vehicles_count": 8, "order": "shuffled"}
     theirs = highway.observation(env, "Kinematics", **config)
@@ -105,7 +105,7 @@ def test_the_order_of_rows_does_not_matter() -> None:
         )
 
 
-def test_one_row_is_the_vehicle_itself() -> None:
+def test_a_table_of_one_row_describes_the_own_vehicle() -> None:
     env = standing("highway-v0", 0)
     rows = highway.vehicles(env)
     alone = table(env, rows, 2, {}, vehicles_count=1, normalize=False)

@@ -20,7 +20,7 @@ SETTINGS = {
     "sensors.way.lines": 2,
     "rig": {"lane": {"type": "lane_boundary", "rate_hz": 5}},
 }
-LIKE = ("ego", "route", "signal", "lanes", "way")  # not ordered by distance
+LIKE = ("ego", "route", "signal", "lanes", "way")  # sensors whose rows are not ordered by distance
 TURNED = ("y", "left", "curvature", "lateral_offset", "heading_error", "steering", "yaw_rate")
 STEPS = 40
 

@@ -40,7 +40,7 @@ def test_turns_are_yaw_then_pitch_then_roll(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_the_pose_of_a_sensor_is_that_of_its_vehicle_and_mount(seed: int) -> None:
+def test_the_pose_of_a_sensor_combines_vehicle_and_mount(seed: int) -> None:
     config, row = _some(seed)
     mount = mount_of(config)
     points = np.random.default_rng(seed).normal(size=(20, 3))

@@ -109,7 +109,7 @@ def test_gaps_on_a_straight_road() -> None:
 
 
 def test_a_vehicle_that_has_left_a_shorter_lane_is_ahead_on_the_longer_lane(tmp_path: Path) -> None:
-    """The vehicle is on the junction by its own lane, and still covers the longer lane beside."""
+    """By its own lane, the vehicle is on the junction; it still covers the longer adjacent lane."""
     path = with_shorter_lane(build_crossing(tmp_path, "priority", side_lanes=2), "S_in_1", 8.0)
     roads = read_network(path)
     own, inside = (roads.lane_ids.index(lane) for lane in ("S_in_0", ":c_10_0"))

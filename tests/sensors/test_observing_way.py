@@ -187,7 +187,7 @@ def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
     observations, infos = vec.reset()
-    assert place.stop == observations.shape[2], "the history is last"
+    assert place.stop == observations.shape[2], "the history is the last part"
     rng = np.random.default_rng(0)
     fresh = 0
     before = None

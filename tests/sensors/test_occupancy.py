@@ -45,7 +45,7 @@ def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[n
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", ["highway-v0", "two-way-v0"])
 @pytest.mark.parametrize("case", CONFIGS)
-def test_the_grid_is_highway_envs(name: str, seed: int, case: str) -> None:
+def test_the_grid_equals_highway_envs(name: str, seed: int, case: str) -> None:
     env = highway.make(name, seed)
     rng = np.random.default_rng(seed)
     for vehicle in env.road.vehicles[:9]:

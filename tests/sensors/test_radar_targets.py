@@ -62,7 +62,7 @@ def test_targets_equal_twin(
     assert ranges == sorted(ranges)
 
 
-def test_targets_are_listed_nearest_first_whatever_ray_met_them() -> None:
+def test_targets_are_listed_nearest_first_for_any_order_of_rows() -> None:
     places = [(0.0, 0.0, 0.0), (40.0, -12.0, 0.0), (20.0, 0.0, 0.0), (30.0, 9.0, 0.0)]
     for order in ([0, 1, 2, 3], [0, 3, 1, 2], [0, 2, 3, 1]):
         rows = vehicles([places[k] for k in order])

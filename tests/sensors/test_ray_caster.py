@@ -21,7 +21,7 @@ LEVEL = np.zeros(1)
 def scan(
     rows: NDArray[np.void], fan: Fan, row: int = 0, walls: NDArray[np.void] = NO_WALLS
 ) -> NDArray[np.void]:
-    """Return HIT (A, E); `what` of bodies and walls is their own number, not the panorama's."""
+    """Return HIT (A, E); `what` is the number of the body or wall, not of its panorama entry."""
     panorama, counts = look_around(rows, row, backdrop(walls), fan.range_m + 3.0)
     hits = np.zeros(fan.rays.shape[:2], HIT)
     cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)
@@ -38,7 +38,7 @@ AZIMUTHS = st.sampled_from(
 
 
 @given(crowds(most=6), wall_sets(), mounts(), st.integers(1, 16))
-def test_rays_do_not_depend_on_which_are_cast_together(
+def test_a_ray_gives_the_same_hit_in_any_batch(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, columns: int
 ) -> None:
     fan = make_fan(matrix, (0.3, math.pi / 8, 16), np.array([-0.2, 0.1]), 60.0)
@@ -139,7 +139,7 @@ def test_a_wall_and_a_long_box_at_ten_metres_read_ten_metres() -> None:
 
 
 @pytest.mark.parametrize("yaw", [0.0, 0.5, 2.0, -2.5])
-def test_a_turned_sensor_sees_with_its_first_ray_where_it_looks(yaw: float) -> None:
+def test_the_first_ray_of_a_turned_sensor_points_along_its_yaw(yaw: float) -> None:
     target = (20.0 * math.cos(yaw), 20.0 * math.sin(yaw), yaw)
     hits = scan(vehicles([(0.0, 0.0, 0.0), target]), full_circle(mount(angles=(yaw, 0.0, 0.0))))
     assert hits["distance"][0, 0] == pytest.approx(17.5)
@@ -170,7 +170,7 @@ def test_rays_pass_over_low_bodies_and_walls() -> None:
     assert low["distance"][0, 0] == 7.5
 
 
-def test_nothing_slips_through_the_corner_of_a_building() -> None:
+def test_a_ray_at_the_corner_of_a_building_hits_it() -> None:
     corner = np.array([(10.0, 0.0, 15.0, 5.0, 8.0, 0), (15.0, -5.0, 10.0, 0.0, 8.0, 0)], WALL)
     hits = scan(vehicles([(0.0, 0.0, 0.0)]), full_circle(mount()), walls=corner)
     assert hits["distance"][0, 0] == pytest.approx(10.0)

@@ -150,7 +150,7 @@ def test_one_agent_has_its_own_samples() -> None:
         env.frames("car_99")
 
 
-def test_a_rig_has_a_name_or_a_file(tmp_path: Path) -> None:
+def test_a_rig_is_given_by_a_name_or_a_file(tmp_path: Path) -> None:
     config, _ = load_config("merge", overrides={"rig": "ten_sensors", "rig.gnss.rate_hz": 10})
     assert len(config.rig) == 10
     assert len({type(sensor) for sensor in config.rig.values()}) == 10

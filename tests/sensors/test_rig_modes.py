@@ -42,7 +42,7 @@ def test_an_agent_observes_the_latest_samples() -> None:
     assert space["imu"].shape == (space["imu"].shape[0], 6)
 
 
-def test_flat_ones_hold_the_same_in_the_order_of_the_rig() -> None:
+def test_flat_observations_have_the_samples_in_the_order_of_the_rig() -> None:
     named, flat = _car(NAMED), _car(FLAT)
     in_named, in_flat = named.reset(seed=3)[0], flat.reset(seed=3)[0]
     for _ in range(4):
@@ -57,7 +57,7 @@ def test_flat_ones_hold_the_same_in_the_order_of_the_rig() -> None:
 
 @pytest.mark.parametrize("overrides", [NAMED, FLAT])
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_worlds_that_end_keep_what_was_seen_last(overrides: dict[str, Any], mode: str) -> None:
+def test_ended_worlds_keep_their_last_observations(overrides: dict[str, Any], mode: str) -> None:
     vec = make_vec(
         "grid4x4", num_envs=2, agents=3, background=5, max_cycles=3, overrides=overrides,
         autoreset_mode=mode,
@@ -89,7 +89,7 @@ def _same(space: Any, seen: Any) -> bool:
     return bool(seen.shape == space.shape and seen.dtype == space.dtype)
 
 
-def test_sensors_are_observed_only_where_there_are_some() -> None:
+def test_observation_mode_sensors_without_a_sensor_is_refused() -> None:
     with pytest.raises(
         ConfigError, match=r"observation\.mode = 'sensors': needs a sensor under rig"
     ):

@@ -28,7 +28,7 @@ def _speeds(rig: dict[str, Any], seed: int = 0, steps: int = 40) -> dict[str, ND
     return {name: np.stack(samples) for name, samples in found.items()}
 
 
-def test_normal_numbers_are_normal() -> None:
+def test_random_numbers_have_a_normal_distribution() -> None:
     key = np.uint64(123456789)
     numbers = np.array(
         [gauss(key, v, t, d) for v in range(20) for t in range(50) for d in range(10)]
@@ -40,7 +40,7 @@ def test_normal_numbers_are_normal() -> None:
     assert abs(np.corrcoef(numbers[:-1], numbers[1:])[0, 1]) < 0.03
 
 
-def test_noise_and_bias_are_as_large_as_they_are_set() -> None:
+def test_noise_and_bias_have_their_configured_sizes() -> None:
     noisy = {**CLEAN, "noise": [0.5, 0.0, 2.0]}
     found = _speeds({"clean": CLEAN, "noisy": noisy, "biased": {**CLEAN, "bias": [3.0]}})
     error = found["noisy"] - found["clean"]
@@ -54,7 +54,7 @@ def test_noise_and_bias_are_as_large_as_they_are_set() -> None:
     assert abs(np.corrcoef(bias[0, :, 0], bias[0, :, 1])[0, 1]) < 0.6
 
 
-def test_sensors_have_numbers_of_their_own_whatever_else_is_mounted() -> None:
+def test_the_random_numbers_of_a_sensor_do_not_depend_on_other_sensors() -> None:
     noisy = {**CLEAN, "noise": [1.0]}
     two = _speeds({"a": noisy, "b": noisy})
     assert not np.array_equal(two["a"], two["b"])
@@ -64,7 +64,7 @@ def test_sensors_have_numbers_of_their_own_whatever_else_is_mounted() -> None:
     assert stream_of("a") != stream_of("b")
 
 
-def test_the_share_of_lost_samples_is_the_configured_one() -> None:
+def test_the_share_of_lost_samples_equals_the_configured_share() -> None:
     settings = {
         "rig": {"a": {**CLEAN, "rate_hz": 100, "dropout": 0.25}},
         "clock.ctrl_dt_s": 0.5, "population.mode": "respawn",

@@ -50,9 +50,7 @@ def test_samples_are_due_at_the_listed_ticks(rate: Fraction, phase: int) -> None
         (0.05, 3.0, "accumulate"),
     ],
 )
-def test_a_minute_has_as_many_samples_as_the_rate_says(
-    dt: float, rate: float, schedule: str
-) -> None:
+def test_a_minute_has_sixty_times_the_rate_samples(dt: float, rate: float, schedule: str) -> None:
     rig = {"a": {"type": "odometry", "rate_hz": rate, "schedule": schedule}}
     settings = {
         "rig": rig, "clock.sim_dt_s": dt, "clock.ctrl_dt_s": 1.0, "horizon_s": 60.0,
@@ -103,11 +101,11 @@ def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> 
 
 
 @pytest.mark.parametrize("rate", [2.85714, 3.33333])
-def test_rates_that_are_proposed_are_taken(rate: float) -> None:
+def test_rates_that_errors_propose_are_accepted(rate: float) -> None:
     load_config("merge", overrides={"rig": {"a": {"type": "gnss", "rate_hz": rate}}})
 
 
 @pytest.mark.parametrize("name", ["Roof", "a.b", "", "9a", "a" * 65])
-def test_names_are_plain(name: str) -> None:
+def test_names_with_other_characters_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="a sensor's name"):
         load_config("merge", overrides={"rig": {name: {"type": "collision"}}})

@@ -62,7 +62,7 @@ TOLD = {"messages"}
 
 @cache
 def world(env: str, sensor: str) -> Simulation:
-    """Return a world after one step, whose agents have one sensor beside `ego`."""
+    """Return a world after one step, whose agents have one sensor in addition to `ego`."""
     overrides = {**OFF, **ON[sensor]}
     simulation = make_simulation(env, mode="closed", agents=1, background=MOST, overrides=overrides)
     start(simulation, seed=4)
@@ -146,7 +146,7 @@ def test_a_crowd_beyond_the_reach_changes_nothing(env: str, sensor: str, seed: i
 
 
 @pytest.mark.parametrize("sensor", sorted(set(ON) - BLIND))
-def test_the_reach_is_not_too_long(sensor: str) -> None:
+def test_the_declared_reach_is_at_most_half_a_metre_too_long(sensor: str) -> None:
     env = "grid4x4"
     simulation = world(env, sensor)
     agent = agent_of(simulation)

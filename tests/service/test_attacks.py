@@ -141,7 +141,7 @@ def test_a_state_that_cannot_be_used_ends_its_session_alone(service: LoopbackSer
     assert not [line for line in service.log.lines if "Traceback" in line]
 
 
-def test_a_changed_state_is_damaged_or_usable() -> None:
+def test_a_changed_state_is_refused_as_damaged_or_can_be_used() -> None:
     """Nodes do not sign states, so a state from another node may be any bytes."""
     document = {**WORLD, "max_cycles": None, "num_envs": 2, "seed": 0, "overrides": {}}
     world = SessionWorld(document, None, 0, {})
@@ -169,7 +169,7 @@ def problem_of_state(document: dict[str, Any], state: bytes) -> str:
     return ""
 
 
-def test_the_signature_of_a_state_opens_no_session(service: LoopbackService) -> None:
+def test_the_signature_of_a_state_is_no_session_token(service: LoopbackService) -> None:
     opened = open_session(service)
     session = service.broker.log.state.sessions[opened["session"]]
     opened["token"] = service.access.state_token(session, 0, b"")
@@ -317,7 +317,8 @@ def test_no_flood_from_an_address_locks_an_identity_out(tmp_path: Path) -> None:
             assert last.status_code == 429
         for _ in range(15):
             refused = service.ask("", "GET", "/nodes", headers={"Authorization": "Bearer x"})
-            assert refused.status_code == 401  # so a client with an old token gets another one
+            # 401 makes a client with an old token get another one.
+            assert refused.status_code == 401
         secret = {"secret": service.secrets["client"]}
         tokens = service.ask("", "POST", "/token", json=secret)
         assert tokens.status_code == 200
@@ -359,7 +360,7 @@ def test_a_node_forgets_keys_that_the_service_has_replaced(
     service.run(link.public_key(old, 0.0))
     for _ in range(2):
         service.ask("admin", "POST", "/keys")
-    service.run(link.public_key(old))  # until the next look-up of keys
+    service.run(link.public_key(old))  # the node knows the old key until its next look-up of keys
     monkeypatch.setattr("cavmarl.service.node_link.KEYS_KEPT_S", 0.0)
     with pytest.raises(KeyError):
         service.run(link.public_key(old))
@@ -517,7 +518,7 @@ def test_answers_name_no_path_of_the_installation(
 
 
 def drive(flow: Flow[Any], *answers: dict[str, Any]) -> None:
-    """Answer the requests of a flow as a server that is not the service could."""
+    """Answer the requests of a flow as a malicious server could."""
     said: Any = None
     for answer in answers:
         assert isinstance(flow.send(said), Ask)
@@ -530,7 +531,7 @@ OUTSIDE = ["..", ".", "", "../x", "a/b", "a\\b", "/x", "a\0b", ".x", "x" * 99]
 
 
 @pytest.mark.parametrize("name", OUTSIDE)
-def test_a_result_stays_in_its_folder(name: str) -> None:
+def test_a_result_name_that_leaves_the_folder_is_refused(name: str) -> None:
     flow = ServiceFlows("http://127.0.0.1:1", "").results("s-" + "0" * 24)
     with pytest.raises(ServiceError, match="is not a name"):
         drive(flow, TOKENS, {"results": [name]})

@@ -36,7 +36,7 @@ def reasons(fleet: Fleet, **given: object) -> dict[str, str]:
     return {one.node: one.reason for one in refused.value.exclusions}
 
 
-def test_a_node_that_misses_its_beats_is_down_and_comes_back_with_the_next(fleet: Fleet) -> None:
+def test_a_node_without_heartbeats_is_down_until_its_next_heartbeat(fleet: Fleet) -> None:
     fleet.join("a")
     fleet.now_s += 3.0
     fleet.broker.sweep()
@@ -75,7 +75,7 @@ def test_all_scores_of_a_watched_node_are_sent(fleet: Fleet) -> None:
     assert fleet.beat("a")["scores"] == []
 
 
-def test_the_steps_of_a_job_are_those_of_all_its_runs_and_drivers(
+def test_the_steps_of_a_job_count_all_its_runs_and_drivers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     def drives(*_: Any, progress: Any, **more: Any) -> None:
@@ -93,11 +93,11 @@ def test_the_steps_of_a_job_are_those_of_all_its_runs_and_drivers(
     assert told == [(done, 16) for done in (1, 2, 5, 6, 9, 10, 13, 14)]
 
 
-def test_a_state_that_is_too_old_is_not_relied_upon(fleet: Fleet) -> None:
+def test_a_node_with_an_old_or_missing_load_gets_no_session(fleet: Fleet) -> None:
     fleet.join("a")
     fleet.now_s += 3.5  # no sweep has run yet
     assert reasons(fleet) == {"a": "stale"}
-    fleet.register("b")  # and has reported no load
+    fleet.register("b")  # b has reported no load yet
     assert reasons(fleet) == {"a": "stale", "b": "stale"}
 
 
@@ -146,7 +146,7 @@ def test_one_overloaded_resource_excludes_a_node(
     assert fleet.open().node == "a"
 
 
-def test_a_job_that_waits_says_which_limit_it_waits_for(fleet: Fleet) -> None:
+def test_a_waiting_job_names_the_limit_that_it_waits_for(fleet: Fleet) -> None:
     fleet.join("a", slots=1)
     fleet.beat("a", cpu=0.97)
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
@@ -189,11 +189,11 @@ def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
     assert reasons(fleet) == {"full": "capacity", "plain": "capacity", "others": "access"}
 
 
-def test_the_redirect_of_the_paper(fleet: Fleet) -> None:
+def test_a_session_is_redirected_by_the_rule_of_the_paper(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     fleet.beat("b", cpu=0.12)
     kept = fleet.open(preferred="b")
-    assert (kept.node, kept.reason) == ("b", "preferred")  # 0.012 above the best
+    assert (kept.node, kept.reason) == ("b", "preferred")  # the score is 0.012 above the best
     fleet.beat("b", cpu=0.5)
     moved = fleet.open(preferred="b")
     assert (moved.node, moved.reason) == ("a", "preferred above margin")
@@ -382,7 +382,7 @@ def test_expired_tokens_are_refused(fleet: Fleet) -> None:
         fleet.access.refresh(tokens["refresh_token"])
 
 
-def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fleet) -> None:
+def test_jobs_that_no_node_can_take_cost_little_time_and_delay_no_other_job(fleet: Fleet) -> None:
     asked = 0
 
     def count(_: float) -> None:
@@ -395,7 +395,7 @@ def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fle
         fleet.open(job=job, needs=[f"none-{k % 60}"])
     possible = fleet.open(job=job)
     asked = 0
-    fleet.join("a")  # one pass: each kind once, but no more than may fail at once
+    fleet.join("a")  # one pass tries each kind of job once, up to the limit of failures
     for _ in range(100):
         fleet.beat("a")
     assert asked <= 52
@@ -403,7 +403,7 @@ def test_jobs_that_no_node_can_take_cost_little_and_keep_none_waiting(fleet: Fle
         fleet.now_s += 0.5
         fleet.beat("a")
     assert possible.node == "a"
-    assert asked <= 1100  # a hundred a second
+    assert asked <= 1100  # at most a hundred searches per second
 
 
 def test_the_next_pass_continues_with_the_jobs_that_were_not_tried(fleet: Fleet) -> None:
@@ -413,7 +413,7 @@ def test_the_next_pass_continues_with_the_jobs_that_were_not_tried(fleet: Fleet)
         fleet.open(job=job, needs=[f"none-{k}"])
     fleet.register("a", capabilities=["x"])
     fleet.now_s += 1.0
-    fleet.broker.jobs.place()  # 50 searches fail: it stops at another job than the first
+    fleet.broker.jobs.place()  # after 50 failed searches, this pass stops
     fleet.now_s += 1.0
     fleet.beat("a")
     assert early.node == "a"
@@ -485,7 +485,7 @@ def test_the_caller_that_asked_longest_ago_is_forgotten_first(
     assert not limit.has("cy")
 
 
-def test_a_pause_saves_up_one_burst_at_most(fleet: Fleet) -> None:
+def test_a_pause_allows_at_most_one_burst(fleet: Fleet) -> None:
     limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
     limit.take("ada")
     fleet.now_s += 3600.0

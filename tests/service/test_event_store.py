@@ -64,7 +64,7 @@ def history(where: str | Path) -> tuple[list[str], EventLog]:
     return kinds, again
 
 
-def test_postgresql_keeps_what_sqlite_keeps(empty_postgresql: str, tmp_path: Path) -> None:
+def test_postgresql_keeps_the_same_data_as_sqlite(empty_postgresql: str, tmp_path: Path) -> None:
     kinds, log = history(empty_postgresql)
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(empty_postgresql)
@@ -135,7 +135,7 @@ def test_the_store_s_file_is_its_owner_s_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_what_was_acknowledged_outlives_a_kill(
+def test_acknowledged_requests_survive_a_kill(
     kind: str, tmp_path: Path, request: pytest.FixtureRequest
 ) -> None:
     where: str | Path = tmp_path / "store.sqlite"
@@ -155,10 +155,10 @@ def test_what_was_acknowledged_outlives_a_kill(
             one.start()
         while len(acknowledged) < 20 and any(one.is_alive() for one in askers):
             time.sleep(0.001)
-        service.kill()  # with requests under way
+        service.kill()  # while requests are in progress
         for one in askers:
             one.join()
-        service.start_again()  # prints no secret, because an admin exists
+        service.start_again()  # the service prints no secret, because an admin exists
         with service.client() as client:
             known = {one["id"] for one in client.get("/identities")["identities"]}
     assert len(acknowledged) >= 20
@@ -172,7 +172,7 @@ def test_a_secret_is_shown_once(tmp_path: Path) -> None:
         fleet.close()
 
 
-def test_a_store_from_before_the_indices_gets_them(tmp_path: Path) -> None:
+def test_missing_indices_of_an_older_store_are_added(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     EventStore(path).close()
     damage(path, "DROP INDEX events_of_owner")
@@ -183,7 +183,7 @@ def test_a_store_from_before_the_indices_gets_them(tmp_path: Path) -> None:
     assert names == {"events_of_owner", "events_of_actor", "events_of_subject"}
 
 
-def test_nothing_is_acknowledged_that_could_not_be_written(tmp_path: Path) -> None:
+def test_a_request_that_could_not_be_written_is_not_acknowledged(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "store.sqlite")
     fleet.log.flush()
     before = fleet.log.durable

@@ -122,7 +122,7 @@ def check(served: Served, name: str, mode: GenerationMode, examples: int) -> Non
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_answers_are_as_the_document_says(served: Served, name: str) -> None:
+def test_answers_agree_with_the_document(served: Served, name: str) -> None:
     check(served, name, GenerationMode.POSITIVE, 8)
 
 
@@ -135,7 +135,7 @@ def can_be_wrong(name: str) -> bool:
 
 
 @pytest.mark.parametrize("name", list(filter(can_be_wrong, OPERATIONS)))
-def test_what_the_document_does_not_allow_is_refused(served: Served, name: str) -> None:
+def test_requests_that_the_document_does_not_allow_are_refused(served: Served, name: str) -> None:
     check(served, name, GenerationMode.NEGATIVE, 8)
 
 

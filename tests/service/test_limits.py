@@ -55,7 +55,7 @@ def test_only_content_of_nodes_may_be_larger(
         assert (answer.status_code, problem_of(answer)) == (413, "too-large"), name
     large = ask(service, tokens["node"], "PUT", f"{path}/state?at=1", content=b"x" * 300_000)
     assert problem_of(large) == "lost"
-    secret = {"secret": "x" * 100_000}  # read before its sender is known
+    secret = {"secret": "x" * 100_000}  # the body is read before the sender is known
     assert httpx.post(f"{service.url}/v1/token", json=secret).status_code == 413
 
 
@@ -96,7 +96,7 @@ def test_a_world_that_no_node_could_hold_is_refused(
     assert "at most 200000" in answer.json()["detail"]
 
 
-def test_vehicles_that_pages_may_insert_need_room_in_a_node_too(tmp_path: Path) -> None:
+def test_vehicles_that_pages_may_insert_count_for_the_size_of_a_world(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "store.sqlite")
     keys: dict[str, Any] = {"environment": "merge", "agents": 5, "background": 0, "num_envs": 1000}
     for insertions in (195, 196):
@@ -148,14 +148,14 @@ def test_a_long_head_ends_the_connection(service: RunningService) -> None:
     assert httpx.get(f"{service.url}/v1/health").status_code == 200
 
 
-@pytest.mark.slow  # it waits as long as a body may take
-def test_slow_heads_and_bodies_are_given_up(service: RunningService) -> None:
+@pytest.mark.slow  # the test waits for the time limit of a body
+def test_slow_heads_and_bodies_end_the_connection(service: RunningService) -> None:
     token = token_of(service, service.secret).json()["access_token"]
     place = urlsplit(service.url)
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(b"GET /v1/health HTTP/1.1\r\nX-Slow: ")
         line.settimeout(20.0)
-        assert line.recv(4096) == b""  # also for a head that does not end
+        assert line.recv(4096) == b""  # the connection ends also for a head that does not end
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(
             b"POST /v1/configurations HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"

@@ -25,7 +25,7 @@ def fleet(tmp_path: Path) -> Iterator[Fleet]:
     made.close()
 
 
-def test_a_log_gives_owners_and_members_again(fleet: Fleet) -> None:
+def test_owners_and_members_are_restored_from_the_log(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     session = fleet.open(zone_nodes=2)
     rows = [[0, 1, 5, 7, 0, 1, 1], [0, 1, 6, 8, 1, 0, 1], [0, 1, 9, 7, 1, 2, 2]]
@@ -38,7 +38,7 @@ def test_a_log_gives_owners_and_members_again(fleet: Fleet) -> None:
         replayed.apply(line)
     assert asdict(replayed.sessions[session.id]) == asdict(session)
     fleet.broker.hand_over(session, TransfersBody(at=4, transfers=[[0, 2, 1, 1, 0, 1, 1]]))
-    assert session.owners["0"].zones == {1: [1, 1]}  # of the new episode
+    assert session.owners["0"].zones == {1: [1, 1]}  # owners in the new episode
     assert fleet.broker.prepared[session.id] == []
 
 
@@ -75,7 +75,7 @@ def test_lost_members_are_replaced_and_get_the_address_of_their_leader(fleet: Fl
 def test_a_single_node_may_have_all_parts(fleet: Fleet) -> None:
     fleet.join("a", slots=3)
     session = fleet.open(zone_nodes=4)
-    assert session.members == ["a", "a"]  # one slot is its own
+    assert session.members == ["a", "a"]  # the leader takes the third slot of a
     fleet.join("b")
     fleet.broker.sweep()
     assert session.members == ["a", "a", "b", "b"]
@@ -97,7 +97,7 @@ def test_a_request_that_is_repeated_is_carried_out_once(fleet: Fleet) -> None:
         fleet.open(key="k-1")
 
 
-def test_a_world_reports_each_transfer_once_and_prepared_ones() -> None:
+def test_a_world_reports_each_transfer_once_and_prepared_transfers() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})

@@ -27,8 +27,8 @@ from tests.support.request_fuzz import (
 
 ROOT = Path(__file__).resolve().parents[2]
 PLACES = [str(ROOT), sys.prefix, str(Path.home())]
-RENEWED_EVERY = 100  # requests
-LONGEST_LINE = 500  # characters of the log for one request
+RENEWED_EVERY = 100  # number of requests
+LONGEST_LINE = 500  # characters of a log line for one request
 WORLD = {"environment": "ring", "agents": 1, "background": 1}
 
 
@@ -113,7 +113,7 @@ def test_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     assert min(found[status] for status in (200, 401, 404, 405, 422)) >= 10
 
 
-@pytest.mark.slow  # the same for more requests
+@pytest.mark.slow  # the same test with more requests
 def test_many_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     found = run_fuzz(tmp_path / "store.sqlite", 25_000, seed=2)
     print(f"answers by status, 0 for a closed connection: {dict(sorted(found.items()))}")

@@ -24,7 +24,7 @@ ALL = {*ROLES}
 READERS = ALL - {"node"}
 WATCHERS = {"viewer", "operator", "admin"}
 CLIENTS = {"client", "operator", "admin"}
-OPEN = None  # no token is needed
+OPEN = None  # a route that needs no token
 
 # Each route has a row here; the test fails for a route without a row.
 MATRIX: dict[str, set[str] | None] = {
@@ -122,7 +122,7 @@ def test_a_role_may_do_what_the_matrix_says(
     refused = set()
     for role in ROLES:
         if name in ("DELETE /v1/token", "GET /v1/events/stream") and role in (allowed or ()):
-            continue  # would close sessions of other tests; would not end
+            continue  # the first would end sessions of other tests; the second would not end
         answer = ask(service, tokens[role], method, path)
         assert answer.status_code != 401
         refused |= {role} if answer.status_code == 403 else set()
@@ -222,7 +222,7 @@ def test_the_same_configuration_is_the_same_version(
     assert versions == [1, 2, 1]
 
 
-def test_no_node_is_503_with_a_time_to_try_again(
+def test_without_a_node_the_answer_is_503_with_a_time_to_retry(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     found = ask(service, tokens["client"], "POST", "/configurations", json={"environment": "merge"})
@@ -240,7 +240,7 @@ def test_no_node_is_503_with_a_time_to_try_again(
     assert told[1]["data"] == {"of": "request for a node", "after_s": 0.5}
 
 
-def test_a_percentage_is_refused_with_the_share(
+def test_a_percentage_is_refused_with_the_share_to_give(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     beat = {"incarnation": 1, "sequence": 1, "cpu": 85.0, "ram": 0.1, "sent_s": 0.0}
@@ -272,7 +272,7 @@ def test_forged_expired_and_foreign_tokens_are_refused(
     assert ask(service, good, "GET", "/nodes").status_code == 200
 
 
-def test_a_refresh_token_is_good_once(service: RunningService) -> None:
+def test_a_refresh_token_can_be_used_once(service: RunningService) -> None:
     secret = service.grant("refresher", "viewer")
     first = token_of(service, secret).json()
     body = {"refresh_token": first["refresh_token"]}

@@ -24,7 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org"])
-def test_without_tls_others_cannot_reach_it(host: str) -> None:
+def test_without_tls_other_machines_cannot_reach_the_service(host: str) -> None:
     with pytest.raises(ServiceError, match="--certificate and --key"):
         check_transport(host, None, None)
 
@@ -55,7 +55,7 @@ def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
             client.get("/health")
 
 
-def test_it_starts_within_two_seconds(tmp_path: Path) -> None:
+def test_the_service_starts_within_two_seconds(tmp_path: Path) -> None:
     """The limit is for processor time, since other programs use this machine."""
     with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200

@@ -73,18 +73,18 @@ def make_local() -> cavmarl.CavVectorEnv:
     return cavmarl.make_vec("merge", agents=AGENTS, background=8)
 
 
-def test_a_session_goes_on_bit_for_bit_when_its_node_is_killed(
+def test_a_session_continues_bit_for_bit_when_its_node_is_killed(
     cluster: Cluster, client: Client
 ) -> None:
     remote, local = open_world(client, node="victim"), make_local()
     assert remote.flows.assignment["assigned"] == "victim"
     np.testing.assert_array_equal(remote.reset(seed=5)[0], local.reset(seed=5)[0])
     np.testing.assert_array_equal(remote.suggest_actions(), local.suggest_actions())
-    assert_same(remote, local, range(60))  # past a saved state
+    assert_same(remote, local, range(60))  # until a state has been saved
     cluster.processes["victim"].kill()
     assert_same(remote, local, range(60, 75))
     assert remote.flows.moves == 1
-    events = client.get("/events", limit=1000)["events"]  # only events of this client
+    events = client.get("/events", limit=1000)["events"]  # a client gets only its own events
     kinds = [one["kind"] for one in events]
     assert kinds == [
         "configuration.added", "session.opened", "session.assigned", "session.saved",
@@ -104,7 +104,7 @@ def test_a_session_moves_from_a_drained_node(cluster: Cluster, client: Client) -
         admin.post(f"/nodes/{place}/drain")
         while remote.flows.assignment["assigned"] == place:
             assert_same(remote, local, range(1))
-        assert remote.flows.moves >= 1  # other nodes may be slow
+        assert remote.flows.moves >= 1  # a slow node may cause another move
     remote.close()
 
 
@@ -148,7 +148,7 @@ def test_a_refused_step_changes_nothing(client: Client) -> None:
     remote.close()
 
 
-def test_the_client_that_awaits_does_the_same(cluster: Cluster) -> None:
+def test_the_async_client_gives_the_same_results(cluster: Cluster) -> None:
     secret = cluster.service.grant("awaiting", "client")
 
     async def run() -> tuple[str, int]:
@@ -213,7 +213,7 @@ def test_a_job_that_cannot_run_fails_with_its_cause(client: Client) -> None:
         client.wait(job, timeout_s=120.0)
 
 
-@pytest.mark.slow  # each kind of kill alone is in every run
+@pytest.mark.slow  # every run has tests of each kind of kill alone
 def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None:
     options = ("--lease-s", "2", "--beat-s", "0.3")
     with running_service(tmp_path / "store.sqlite", *options) as service:
@@ -225,7 +225,7 @@ def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None
             local.reset(seed=8)
             assert_same(remote, local, range(40))
             service.kill()
-            assert_same(remote, local, range(40, 60))  # the lease still holds
+            assert_same(remote, local, range(40, 60))  # the lease is still valid
             service.start_again(*options)
             assert_same(remote, local, range(60, 90))
             nodes.processes[remote.flows.assignment["assigned"]].kill()
@@ -265,7 +265,7 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
                 message = page.recv(timeout=10)
                 told_of = json.loads(message) if isinstance(message, str) else {}
                 rows = told_of.get("rows", rows)
-                if len(rows) > 1 and rows[-1]["score"] is not None:  # None: late heartbeat
+                if len(rows) > 1 and rows[-1]["score"] is not None:  # None if the heartbeat is late
                     break
             assert "node of the service" in rows[-1]["name"]
             assert rows[-1]["score"] is not None

@@ -41,13 +41,13 @@ def wait_for(what: Callable[[], bool]) -> None:
         time.sleep(0.1)
 
 
-def test_zones_are_at_nodes_that_are_killed(cluster: Cluster, client: Client) -> None:
+def test_a_session_over_nodes_survives_kills_of_its_nodes(cluster: Cluster, client: Client) -> None:
     remote = client.open("grid4x4", nodes=2, wait_s=30.0, **WORLD)
     session = f"/sessions/{remote.flows.session}"
     local = cavmarl.make_vec("grid4x4", **WORLD)
     remote.reset(seed=3)
     local.reset(seed=3)
-    assert_same(remote, local, range(55))  # past a saved state
+    assert_same(remote, local, range(55))  # until a state has been saved
     assert_told(client, session, remote, local)
     found = client.get(session)
     assert len(set(found["members"])) == 2
@@ -81,7 +81,7 @@ def assert_told(
     assert {row["vehicle"] for row in remote.transfers()} == {*last}
 
 
-def test_a_job_has_no_nodes_of_its_own(client: Client) -> None:
+def test_a_job_on_several_nodes_is_refused(client: Client) -> None:
     with pytest.raises(ServiceError, match="runs on one node"):
         client.submit("grid4x4", nodes=2, zones=2)
 

@@ -74,7 +74,7 @@ def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
     assert together.traffic_stats().departed > 64, "no vehicle has left and been replaced"
 
 
-def test_a_shard_is_stepped_alone() -> None:
+def test_a_shard_can_be_stepped_alone() -> None:
     simulation = divided()
     shard = simulation.shards[2]
     others = [other for other in simulation.shards if other is not shard]

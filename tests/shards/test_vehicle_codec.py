@@ -89,7 +89,7 @@ def rough_world(files: tuple[Path, Path], **overrides: Any) -> Simulation:
     return simulation
 
 
-def carry_everybody(simulation: Simulation) -> None:
+def carry_all(simulation: Simulation) -> None:
     """Pack each vehicle, overwrite all packed arrays, and unpack the vehicles in another order."""
     worlds, codec = simulation.shards[0].worlds, codec_of(simulation)
     packed = []
@@ -114,7 +114,7 @@ class Carrier(PhaseLog):
     def run(self, phase: Phase, arguments: tuple[Any, ...]) -> None:
         super().run(phase, arguments)
         if phase is Phase.DETECT:
-            carry_everybody(self._simulation)
+            carry_all(self._simulation)
             self.seen = np.concatenate([self.seen, self._simulation.vehicles(0)])
 
 
@@ -140,7 +140,7 @@ def test_vehicles_that_are_packed_every_tick_continue_bit_for_bit(
     use_executor(carried, carrier)
     assert trace(carried) == expected
     seen = carrier.seen
-    assert len(np.unique(seen["vtype"])) >= 4  # the generator's cars, and those of the demand
+    assert len(np.unique(seen["vtype"])) >= 4  # cars of the generator and of the demand
     assert len(np.unique(seen["length"])) >= 3
     assert np.ptp(seen["z"]) > 1.0
     assert (seen["pitch"] > 0.03).any()
@@ -253,7 +253,7 @@ def test_every_field_arrives_and_other_rows_do_not_change(agent: int) -> None:
 @given(record=st.binary(min_size=VEHICLE.itemsize, max_size=VEHICLE.itemsize),
        apart=st.binary(min_size=8 * 2 * TICKS + 4 * NUMBERS, max_size=8 * 2 * TICKS + 4 * NUMBERS),
        agent=st.integers(-1, AGENTS - 1))  # fmt: skip
-def test_any_record_arrives(record: bytes, apart: bytes, agent: int) -> None:
+def test_any_record_is_unpacked_as_it_was_packed(record: bytes, apart: bytes, agent: int) -> None:
     codec, rows, commands, frames = arrays()
     rows[1, 2] = np.frombuffer(record, VEHICLE)[0]
     rows["agent"][1, 2], rows["transfer"][1, 2] = agent, 0
@@ -266,12 +266,12 @@ def test_any_record_arrives(record: bytes, apart: bytes, agent: int) -> None:
     assert other.pack(there, 0, 0, TICK) == state
 
 
-# What is refused
+# Refused states
 
 RECORD_AT = 44
 
 
-def test_refusals_have_their_types() -> None:
+def test_invalid_bytes_are_refused_with_the_reason() -> None:
     state, vehicle = a_state()
     header, other = bytearray(state), RECORD_VERSION + 1
     for length in range(len(state)):
@@ -341,7 +341,7 @@ def test_a_refused_state_changes_nothing() -> None:
         assert (array.view(np.uint8) == SCRIBBLE).all()
 
 
-def test_there_are_worlds_without_agents() -> None:
+def test_states_work_in_worlds_without_agents() -> None:
     rows = arrays()[1]
     rows["agent"], rows["transfer"] = -1, 0
     nobody = TransferCodec(VEHICLE, np.zeros((2, 0, 1, 2)), np.zeros((2, 0, 0), dtype=np.float32))
@@ -384,7 +384,7 @@ def test_a_state_of_version_one_is_read() -> None:
     np.testing.assert_array_equal(frames[0, 1], their_frames[1, 1])
 
 
-def test_another_record_is_another_version() -> None:
+def test_a_changed_record_needs_another_version() -> None:
     record = np.dtype([(name, kind) for name, kind in golden()["fields"]])
     same = layout_text(VEHICLE) == layout_text(record)
     assert same == (golden()["version"][0] == RECORD_VERSION), (

@@ -1,4 +1,4 @@
-"""Agents of signals: what they see, choose and get, and that divided worlds are the undivided."""
+"""Agents of signals: observations, actions and rewards, and equality of divided worlds."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def world(env: str = "grid4x4", **more: Any) -> CavEnv:
 
 
 def letters(env: CavEnv, s: int = 0) -> str:
-    """The letters that the s-th signal with an agent shows."""
+    """Return the letters that the s-th signal with an agent shows."""
     row = env.signals.table.arrays.row[s]
     phase = env.network.phases[env.simulation.signal_phases(0)[row]]
     start, count = phase["first_state"], env.network.signals["num_links"][row]
@@ -55,7 +55,7 @@ def letters(env: CavEnv, s: int = 0) -> str:
 
 
 def choose(env: CavEnv, choices: Any) -> dict[str, Any]:
-    """Actions of all agents: what is suggested for vehicles, and one choice for all signals."""
+    """Return actions: the suggested ones for vehicles, and one choice for all signals."""
     actions = env.suggest_actions()
     return actions | dict.fromkeys(env.signals.agents, choices)
 
@@ -88,7 +88,7 @@ def test_a_green_lasts_at_least_its_minimum_and_at_most_its_maximum() -> None:
         lasted, since = [], 0
         for step in range(60):
             states = env.worlds.arrays.signal_states[0, 0].copy()
-            env.step(choose(env, int(states[GREEN])))  # to keep it is not allowed for ever
+            env.step(choose(env, int(states[GREEN])))  # the agent always tries to keep the green
             after = env.worlds.arrays.signal_states[0, 0]
             if after[SINCE] != states[SINCE]:
                 lasted.append(step - since - 2)
@@ -114,7 +114,7 @@ def test_choices_that_are_not_allowed_are_counted_or_refused() -> None:
         env.step(choose(env, 0))
 
 
-def test_keep_or_next_goes_through_the_greens_in_their_order() -> None:
+def test_keep_or_next_selects_the_greens_in_their_order() -> None:
     with closing(world(action="keep_or_next", min_green_s=0.0, decide_s=5.0)) as env:
         env.reset()
         assert env.action_space(env.signals.agents[0]) == spaces.Discrete(2)
@@ -152,7 +152,7 @@ def test_signals_without_an_agent_keep_their_programs() -> None:
 def expected_counts(
     env: CavEnv, stood: dict[int, tuple[int, int]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Counts by lane from all vehicles; `stood` has the lane and the ticks by vehicle."""
+    """Return counts by lane, from all vehicles; `stood`: lane and standing ticks by vehicle."""
     found: dict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(4))
     speed_mps = env.network.lanes["speed_mps"]
     for row in env.simulation.vehicles(0):
@@ -163,7 +163,7 @@ def expected_counts(
     return found
 
 
-def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
+def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
     weights = {"diff_wait": 1.0, "average_speed": 0.5, "queue": 0.25, "pressure": 0.125}
     weights |= {"delay": 0.1, "wait": 0.2}
     ticks = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2}
@@ -350,14 +350,14 @@ def test_wrong_choices_have_clear_errors(actions: Any, message: str) -> None:
         assert vec.state_hash(0) == before
 
 
-def test_a_missing_choice_is_an_error_when_it_counts() -> None:
+def test_a_missing_choice_is_an_error_only_when_a_signal_decides() -> None:
     with closing(world()) as env:
         env.reset()
         cars = {agent: value for agent, value in env.suggest_actions().items() if "car" in agent}
         with pytest.raises(ActionError, match=r"no action for signal_A0, .*'decides'"):
             env.step(cars)
         env.step(choose(env, 0))
-        env.step(cars)  # no signal decides now
+        env.step(cars)  # no choice is due in this step
 
 
 @pytest.mark.parametrize(
@@ -420,7 +420,7 @@ SENSING: dict[str, dict[str, Any]] = {
 def hashes(
     sensing: str = "truth", kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any
 ) -> list[str]:
-    """Hashes of the states and of everything that the agents of signals get."""
+    """Return hashes of the states and of all results of the agents of signals."""
     overrides = ALL | SENSING[sensing]
     overrides |= {"horizon_s": 30.0, "sensors.signal.timing": True, "signals.max_green_s": 10.0}
     vec: CavVectorEnv = make_vec(
@@ -468,23 +468,23 @@ def undivided_world(sensing: str) -> list[str]:
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_a_divided_world_is_the_undivided_one(
+def test_a_divided_world_equals_the_undivided_one(
     zones: int, sensing: str, undivided: list[str]
 ) -> None:
     assert hashes(sensing, zones=zones) == undivided
 
 
 @pytest.mark.integration
-def test_it_is_the_same_on_workers_of_which_one_is_killed(
+def test_results_are_the_same_on_workers_when_one_is_killed(
     sensing: str, undivided: list[str], undivided_world: list[str]
 ) -> None:
-    # workers share out the zones of one world, but whole worlds of several
+    # A single world is divided among the workers by zones; several worlds are divided as wholes.
     assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
     assert hashes(sensing, workers=2, kill_at=(33,)) == undivided
 
 
 @pytest.mark.integration
-def test_over_nodes_it_is_the_same_too(sensing: str, undivided_world: list[str]) -> None:
+def test_results_are_the_same_over_nodes(sensing: str, undivided_world: list[str]) -> None:
     assert hashes(sensing, num_envs=1, zones=3, nodes=2, kill_at=(24,)) == undivided_world
 
 
@@ -533,7 +533,7 @@ def test_a_saved_state_continues_with_other_zones(sensing: str) -> None:
 
 
 def arrived(name: str) -> tuple[int, float]:
-    """Vehicles that arrive in ten minutes, and how many stand at a time."""
+    """Return the number of vehicles that arrive in ten minutes, and of vehicles that stand."""
     overrides = ALL | {
         "clock.ctrl_dt_s": 5.0,
         "horizon_s": 900.0,
@@ -654,13 +654,13 @@ def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float
             for k in range(len(links)):
                 later = [n for n in range(tick, 70) if shown[n][k] != now[k]]
                 if later:
-                    # The letter at `later` has changed at some time in the second before.
+                    # The letter changed at some time in the second before `later`.
                     assert soonest[k] <= later[0] - tick + 1e-9
                     is_exact += soonest[k] >= later[0] - tick - 1.0 - 1e-9
         assert is_exact > 100
 
 
-def test_a_shown_letter_wins_over_a_chosen_green() -> None:
+def test_an_overridden_letter_takes_precedence_over_a_chosen_green() -> None:
     def run(**more: Any) -> list[str]:
         overrides = ALL | {"signals.overrides": 8, "horizon_s": 60.0}
         env = parallel_env("grid4x4", agents=2, background=60, overrides=overrides, **more)

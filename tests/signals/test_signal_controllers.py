@@ -1,4 +1,4 @@
-"""Controllers of signals: their rules, what they remember, and that zones change nothing."""
+"""Controllers of signals: their rules, their counts of lanes, and equality of divided worlds."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 
 
 def view_of(vec: CavVectorEnv) -> SignalView:
-    """The signals after 100 s, of which their first green has lasted for 20 s."""
+    """Return the signals at 100 s, when the first green has lasted for 20 s."""
     vec.reset(seed=0)
     given = vec.signals.view
     states, history = np.zeros_like(given.states), np.zeros_like(given.history)
@@ -64,14 +64,14 @@ def view() -> Iterator[SignalView]:
 
 
 def lanes_of(view: SignalView, green: int) -> list[int]:
-    """The lanes that only one green of the signal A0 opens."""
+    """Return the lanes that this green of the signal A0 opens and the other green does not."""
     moves, opened = view.table.movements[0], view.table.opened[0]
     other = set(moves[opened[1 - green], 0].tolist())
     return sorted(set(moves[opened[green], 0].tolist()) - other)
 
 
 def lasted(view: SignalView, green_s: float) -> SignalView:
-    """The same view after another duration of the present green."""
+    """Return the same view with another duration of the present green."""
     states = view.states.copy()
     states[..., SINCE] = 500 - round((2.0 + green_s) / view.dt)
     return view._replace(states=states)
@@ -112,7 +112,7 @@ def test_webster_counts_a_lane_of_several_greens_in_equal_parts() -> None:
             if len(openers := np.flatnonzero(opened[:, moves[:, 0] == lane].any(axis=1))) == 2
         )
         view.history[0, :, FLOW] = 0
-        view.history[0, lane, FLOW] = 60  # Y = 0.4, 0.2 for each of the two greens
+        view.history[0, lane, FLOW] = 60  # Y = 0.4: each of the two greens counts 0.2
         lost_s = 4.0 * len(table.greens[s])
         cycle_s = max(30.0, (1.5 * lost_s + 5.0) / 0.6)
         green_s = (cycle_s - lost_s) / 2.0 + 2.0
@@ -137,7 +137,7 @@ def test_actuated_ends_a_green_at_a_gap(view: SignalView) -> None:
     view.history[0, lane, DETECTED_MS] = 97_000
     assert choice("actuated", view) == 1
     assert choice("actuated", view, max_gap_s=3.1) == 0
-    view.history[0, lanes_of(view, 1)[0], DETECTED_MS] = 100_000  # of the red light
+    view.history[0, lanes_of(view, 1)[0], DETECTED_MS] = 100_000  # a lane at red
     assert choice("actuated", view) == 1
 
 
@@ -152,12 +152,12 @@ def test_sotl_gives_a_green_on_demand_but_keeps_platoons(view: SignalView) -> No
     view.counts[0, green[1], NEAR_LINE] = 2
     assert choice("sotl", view) == 0
     assert choice("sotl", view, platoon=2) == 1
-    view.counts[0, green[1], NEAR_LINE] = 3  # a long platoon can be separated
+    view.counts[0, green[1], NEAR_LINE] = 3  # a platoon of four may be interrupted
     assert choice("sotl", view) == 1
 
 
 @pytest.mark.parametrize("name", ["longest_queue", "max_pressure"])
-def test_the_longest_red_comes_before_the_queue(name: str, view: SignalView) -> None:
+def test_the_longest_red_takes_precedence_over_the_queue(name: str, view: SignalView) -> None:
     view.counts[0, lanes_of(view, 0), VEHICLES] = 9
     view.history[0, lanes_of(view, 1)[0], RED_TICKS] = 300
     assert choice(name, view) == 0
@@ -169,7 +169,7 @@ def test_the_longest_red_comes_before_the_queue(name: str, view: SignalView) -> 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
 def test_controllers_begin_the_next_green_of_the_order(name: str, view: SignalView) -> None:
-    view.history[0, :, FLOW] = 0  # two equal greens of a cycle of 30 s
+    view.history[0, :, FLOW] = 0  # without flow, two equal greens in a cycle of 30 s
     view.history[0, lanes_of(view, 1), RED_VEHICLE_TICKS] = 1000
     view.counts[0, lanes_of(view, 1), VEHICLES] = 1
     assert choice(name, view, action="keep_or_next") == 1
@@ -177,7 +177,7 @@ def test_controllers_begin_the_next_green_of_the_order(name: str, view: SignalVi
     assert choice(name, view, action="keep_or_next") == 0
 
 
-# What is remembered of lanes
+# Counts of lanes
 
 
 def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
@@ -189,7 +189,7 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
         lanes = np.flatnonzero(table.arrays.detector >= 0)
         places = network.detectors[table.arrays.detector[lanes]]
         assert (places["lane"] == table.arrays.lane_row[lanes]).all()
-        # 2 s at the limit, but no farther than 5 s of green empty
+        # 2 s away at the speed limit, but at most as far as the queue that 5 s of green empty
         speed = table.arrays.speed_mps[lanes]
         away_m = np.minimum(2.0 * speed, (5.0 / 1.9 + 0.5) * 7.5)
         np.testing.assert_allclose(places["s_m"], table.arrays.length_m[lanes] - away_m)
@@ -212,7 +212,7 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
                 assert counted.sum() > 20
                 counted[:] = 0
             assert (history[:, PASSED] == counted).all()
-            since_ms = history[:, DETECTED_MS] - last  # it may leave between two ticks
+            since_ms = history[:, DETECTED_MS] - last  # the vehicle may leave between two ticks
             assert ((since_ms >= 0) & (since_ms <= 200)).all()
 
 
@@ -234,7 +234,7 @@ def test_vehicles_near_the_line_are_counted() -> None:
         assert total > 100
 
 
-def test_red_lanes_are_followed_until_they_open() -> None:
+def test_counts_of_red_lanes_last_until_the_lanes_get_green() -> None:
     keys = ALL | {"signals.min_green_s": 30.0, "signals.max_green_s": 30.0}
     vec = make_vec("grid4x4", num_envs=1, agents=0, background=150, overrides=keys)
     with closing(vec):
@@ -286,7 +286,7 @@ def test_a_side_road_does_not_starve(tmp_path: Path) -> None:
 
 
 def drive(name: str, kill_at: tuple[int, ...] = (), num_envs: int = 1, **more: Any) -> list[str]:
-    """Hashes of the states, and greens of all signals."""
+    """Return hashes of the states, and the greens of all signals."""
     keys = ALL | CONTROLLERS[name] | {"horizon_s": 35.0, "signals.controller": name}
     vec = make_vec("grid4x4", num_envs=num_envs, agents=4, background=80, overrides=keys, **more)
     with closing(vec):
@@ -307,13 +307,15 @@ def undivided(request: pytest.FixtureRequest) -> tuple[str, list[str]]:
 
 
 @pytest.mark.parametrize("zones", [2, 4])
-def test_a_divided_world_is_the_undivided_one(zones: int, undivided: tuple[str, list[str]]) -> None:
+def test_a_divided_world_equals_the_undivided_one(
+    zones: int, undivided: tuple[str, list[str]]
+) -> None:
     name, expected = undivided
     assert drive(name, zones=zones) == expected
 
 
 @pytest.mark.integration
-def test_it_is_the_same_on_workers_of_which_one_is_killed(
+def test_results_are_the_same_on_workers_when_one_is_killed(
     undivided: tuple[str, list[str]],
 ) -> None:
     name, expected = undivided
@@ -321,7 +323,7 @@ def test_it_is_the_same_on_workers_of_which_one_is_killed(
 
 
 @pytest.mark.integration
-def test_over_nodes_it_is_the_same_too(undivided: tuple[str, list[str]]) -> None:
+def test_results_are_the_same_over_nodes(undivided: tuple[str, list[str]]) -> None:
     name, expected = undivided
     assert drive(name, zones=3, nodes=2, kill_at=(24,)) == expected
 

@@ -21,7 +21,7 @@ NODES |= {"n": (0, 300), "z": (0, -300)}
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A signal `s`; the road from the west has the edges `wa`, `am` and `ms`."""
+    """Write a map with a signal `s`; the road from the west has the edges `wa`, `am` and `ms`."""
     folder = tmp_path_factory.mktemp("crossing")
     kinds = dict.fromkeys(NODES, "priority") | {"s": "traffic_light"}
     nodes = (
@@ -80,7 +80,9 @@ def test_a_divided_world_sees_the_same_vehicles_within_the_range(crossing: Path)
         with closing(vec):
             vec.reset(seed=1)
             steps = round(60.0 / vec.config.clock.ctrl_dt_s)
-            for green in np.repeat([0, 1], steps):  # one of them stops this road
+            for green in np.repeat(
+                [0, 1], steps
+            ):  # one of both greens stops the road from the west
                 _, rewards, *_ = vec.step({"signals": np.array([[green]])})
                 found.append((rewards["signals"].tolist(), vec.state_hash()))
         assert min(rewards[0][0] for rewards, _ in found) < -2.0

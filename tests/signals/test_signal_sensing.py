@@ -1,4 +1,4 @@
-"""What agents and controllers of signals know of the vehicles, by `signals.sensing`."""
+"""Knowledge of vehicles of agents and controllers of signals, for each `signals.sensing`."""
 
 from __future__ import annotations
 
@@ -65,14 +65,14 @@ def ticks(vec: CavVectorEnv, seconds: float, seed: int = 3) -> Iterator[int]:
 
 
 def watched(vec: CavVectorEnv) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """The vehicles on watched lanes, and the index of each one's lane."""
+    """Return the vehicles on watched lanes, and the index of the lane of each vehicle."""
     rows = vec.simulation.vehicles(0)
     lanes = vec.signals.table.arrays.lane_index[rows["lane"]].astype(np.int64)
     return rows[lanes >= 0], lanes[lanes >= 0]
 
 
 def ways_m(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """How far each vehicle is from the signal that observes its lane: before it, else behind."""
+    """Return the distance of each vehicle to the signal that observes its lane."""
     table = vec.signals.table
     before = {lane for row in table.arrays.incoming.tolist() for lane in row}
     found = []
@@ -85,14 +85,14 @@ def ways_m(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.float64]:
 
 
 def near_line(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.bool_]:
-    """Whether the front of each vehicle is within `signals.platoon_m` of the end of its lane."""
+    """Return whether each vehicle's front is within `signals.platoon_m` of its lane's end."""
     to_end = vec.network.lanes["length_m"][rows["lane"]] - rows["s"] - 0.5 * rows["length"]
     near: NDArray[np.bool_] = to_end <= vec.config.signals.platoon_m
     return near
 
 
 def sums(rows: NDArray[np.void], lanes: NDArray[np.int64], num: int) -> NDArray[np.int64]:
-    """Numbers of vehicles and of standing vehicles by lane."""
+    """Return the numbers of vehicles and of standing vehicles by lane."""
     standing = lanes[np.abs(rows["speed"]) < 0.1]
     return np.stack([np.bincount(each, minlength=num) for each in (lanes, standing)], axis=1)
 
@@ -123,7 +123,7 @@ def test_a_camera_counts_the_vehicles_within_its_range() -> None:
 def is_in_sight(
     camera: NDArray[np.float64], row: np.void, others: NDArray[np.void]
 ) -> NDArray[np.bool_]:
-    """Whether the line from a camera to the middle of a vehicle passes above the other vehicles."""
+    """Return whether the line from a camera to a vehicle's middle passes above other vehicles."""
     target = np.array([row["x"], row["y"], row["z"] + 0.5 * row["height"]])
     far = np.sqrt(((target - camera)[:2] ** 2).sum())
     along, across = (target - camera)[:2] / far, np.array([-1.0, 1.0]) * (target - camera)[1::-1]
@@ -199,7 +199,7 @@ def test_a_camera_misses_vehicles_by_chance() -> None:
     everything, some = counted(0.0), counted(0.3)
     assert (some <= everything).all()
     assert some.sum() / everything.sum() == pytest.approx(0.7, abs=0.03)
-    # Another draw for each vehicle and each decision: not the same vehicles every time.
+    # Each vehicle is drawn anew for each decision, so missed vehicles change.
     standing = (np.diff(everything, axis=0) == 0) & (everything[1:] > 0)
     assert 0.1 < (np.diff(some, axis=0)[standing] != 0).mean() < 0.9
     np.testing.assert_array_equal(some, counted(0.3))
@@ -257,7 +257,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             np.testing.assert_array_equal(counts[:, LENGTH_MM], 5000 * counts[:, VEHICLES])
             moving = counts[:, VEHICLES] - counts[:, STANDING]
             np.testing.assert_array_equal(counts[:, SPEED_PPM], 1_000_000 * moving)
-            # A vehicle that stands at the line is known, and the estimate is never more than fits.
+            # A vehicle that stands at the line is counted. At most as many are estimated as fit.
             covered = vec.signals.view.loops[0, :, EXIT, FREE_TICKS] == 0
             assert (counts[covered, VEHICLES] > 0).all()
             np.testing.assert_array_equal(counts[:, NEAR_LINE], covered)
@@ -315,7 +315,7 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
                 assert not counts.any()
             elif tick % 5 == 0:
                 assert before is not None
-                # The newest message is of the tick before the decision.
+                # The newest message was sent in the tick before the decision.
                 found = counts[:, [VEHICLES, STANDING, NEAR_LINE]]
                 differing += int(np.abs(found - before).sum())
                 total += int(before.sum())
@@ -323,7 +323,8 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
             near = np.bincount(lanes[near_line(vec, rows)], minlength=len(counts))
             before = np.column_stack([sums(rows, lanes, len(counts)), near])
         assert total > 500
-        assert differing < 0.03 * total  # vehicles that change lanes, or are in two inboxes
+        # Differences: vehicles that change lanes, or are in two inboxes.
+        assert differing < 0.03 * total
 
 
 @pytest.mark.parametrize(
@@ -332,11 +333,11 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
         ({"v2x.equipped": 0.0}, 0.0, 0.0),
         ({"v2x.equipped": 0.5}, 0.3, 0.7),
         ({"v2x.channel.loss": 1.0}, 0.0, 0.0),
-        ({"v2x.channel.loss": 0.5}, 0.8, 1.05),  # another message comes soon
+        ({"v2x.channel.loss": 0.5}, 0.8, 1.05),  # after a loss, another message comes soon
         ({"v2x.channel.range_m": 40.0}, 0.1, 0.7),
     ],
 )
-def test_units_know_only_what_the_channel_brings(
+def test_units_know_only_vehicles_whose_messages_arrive(
     keys: dict[str, Any], low: float, high: float
 ) -> None:
     with closing(make_messages(V2X | keys, background=50)) as vec:
@@ -360,7 +361,7 @@ def test_messages_of_the_last_episode_are_forgotten() -> None:
         assert vec.signals.view.counts.any()
 
 
-def test_full_inboxes_are_told_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_full_inboxes_are_reported_once(caplog: pytest.LogCaptureFixture) -> None:
     with closing(make_messages(V2X | {"v2x.inbox.objects": 2}, background=100)) as vec:
         with caplog.at_level(logging.WARNING):
             for _ in ticks(vec, 6.0):
@@ -392,7 +393,7 @@ def test_wrong_settings_have_clear_errors(keys: dict[str, Any], message: str) ->
 
 
 @pytest.mark.parametrize("keys", [{"signals.sensing": "camera"}, {"signals.sensing": "loops"}, V2X])
-def test_rewards_are_those_of_the_truth(keys: dict[str, Any]) -> None:
+def test_rewards_are_computed_from_all_vehicles(keys: dict[str, Any]) -> None:
     terms = {"diff_wait": 1.0, "average_speed": 1.0, "queue": 1.0, "pressure": 1.0}
     differing = 0
     with (

@@ -31,7 +31,7 @@ class PackageCode:
 
     @property
     def lines(self) -> int:
-        """The number of lines of all files."""
+        """Return the number of lines of all files."""
         return sum(self._lines.values())
 
     def classes(self) -> Iterator[tuple[str, ast.ClassDef]]:
@@ -109,7 +109,7 @@ def counted_parameters(function: Function, is_method: bool) -> int:
 
 
 def has_untyped_arguments(function: Function) -> bool:
-    """Return whether a function takes untyped `*arguments`; those of a `ParamSpec` are typed."""
+    """Return whether a function takes untyped `*arguments`; a `ParamSpec` counts as typed."""
     given = function.args.vararg
     if given is None or function.name == "__exit__":
         return False

@@ -23,7 +23,7 @@ DEAD_END = {
 
 
 def before_dead_end(folder: Path, length_m: float) -> tuple[Simulation, int, int, int]:
-    """Return a world with two agents, the right and the left lane, and the goal.
+    """Return a world with two agents, its right and left lane, and the goal edge.
 
     Args:
         folder: folder for the map.

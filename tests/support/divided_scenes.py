@@ -28,7 +28,7 @@ CLOCK |= {"zones.approach_ticks": 2}
 
 
 class DividedScene:
-    """The same vehicles in one zone, and in four zones that meet at a point, in m from the middle.
+    """The same vehicles in one zone, and in four zones that meet `at` (m from the middle).
 
     `departs`: further lines of the demand file by name, for vehicles that depart in the scene.
     """

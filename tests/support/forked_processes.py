@@ -125,7 +125,7 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     os.environ.clear()
     os.environ.update(variables)
     own, asked = os.getpid(), os.getppid
-    # Between them is the process that has forked this process.
+    # The parent of this process is the process that forks; report the caller as the parent.
     os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.stdin = open(0, closefd=False)
     sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # type: ignore[misc]

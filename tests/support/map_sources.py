@@ -43,7 +43,7 @@ ROUNDABOUT = (
     | {300 + k: ([200 + k, 100 + k], {"highway": "secondary"}) for k in range(0, 8, 2)},
 )
 
-Nodes = dict[int, tuple[float, float]]  # metres to the east and north, by id
+Nodes = dict[int, tuple[float, float]]  # (metres to the east, metres to the north) by id
 Ways = dict[int, tuple[list[int], dict[str, str]]]  # nodes and tags, by id
 
 

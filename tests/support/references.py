@@ -26,7 +26,16 @@ _DOTTED = re.compile(r"`([A-Za-z_]\w*(?:\.[A-Za-z_]\w*)+)(?:\([^`]*\))?`")
 _FILE = re.compile(r"`([\w./-]+\.py)`")
 _DOCSTRING = re.compile(r'"""(.*?)"""', re.DOTALL)
 _COMMENT = re.compile(r"#\s(.*)")
-_DATA = ("html", "json", "jsonl", "parquet", "safetensors", "xml", "yaml", "zst")  # endings
+_DATA = (
+    "html",
+    "json",
+    "jsonl",
+    "parquet",
+    "safetensors",
+    "xml",
+    "yaml",
+    "zst",
+)  # suffixes of file names
 
 
 class _Members:
@@ -77,7 +86,7 @@ class Package:
     def __init__(self) -> None:
         self.sources: dict[str, str] = {}
         self._classes: dict[str, list[_Members]] = defaultdict(list)
-        self._modules: dict[str, list[str]] = defaultdict(list)  # by the last part of names
+        self._modules: dict[str, list[str]] = defaultdict(list)  # names by their last part
         self._keys = dotted_keys(EnvConfig)
         trees: dict[str, ast.Module] = {}
         for path in sorted((ROOT / "cavmarl").rglob("*.py")):

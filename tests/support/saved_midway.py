@@ -10,7 +10,7 @@ from cavmarl import make_vec
 
 
 def check_resumed(
-    act: Callable[[Any, int], None],  # what the caller does in a step
+    act: Callable[[Any, int], None],  # commands of the caller in a step
     overrides: dict[str, Any],
     at: int,  # step before which the state is saved
     steps: int,

@@ -50,7 +50,7 @@ ALONE_FILES: tuple[str, ...] = (
     "tests/test_memory.py",
 )
 
-# Their kernels use unsigned products, of whose overflow Python warns.
+# Kernels in these tests use unsigned products; NumPy warns when such a product overflows.
 _COMPILED_ONLY = (
     "tests/sensors/test_gnss.py",
     "tests/sensors/test_heard_conflicts.py",

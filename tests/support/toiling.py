@@ -20,7 +20,8 @@ def toiling(
     The workers then finish; without `ends`, they finish at the end of the block.
     """
     os.mkfifo(folder / AT_WORK)
-    heard = os.open(folder / AT_WORK, os.O_RDWR)  # so that no process waits for the other end
+    # Opening for both directions waits for no other process.
+    heard = os.open(folder / AT_WORK, os.O_RDWR)
     given_up = False
 
     def watch() -> None:

@@ -21,7 +21,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 LIMIT_S = 50.0  # from the first test on; later, no other test begins
 
-# Folders of Python files beside the package, whose imports are parsed.
+# Folders outside of the package whose Python files are parsed for imports.
 BESIDE = ("tests", "benchmarks", "fuzz", "docs")
 
 # Files that tests read without importing them, and these tests.

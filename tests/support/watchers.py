@@ -1,4 +1,4 @@
-"""The parts of lanes that zones watch, zone by zone."""
+"""Parts of lanes that each zone watches."""
 
 from __future__ import annotations
 

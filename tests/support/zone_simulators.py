@@ -20,7 +20,7 @@ from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup
 
 
 class OwnKinematics:
-    """A simulator that moves vehicles as cavmarl does: agents by the model, others as wanted.
+    """A simulator that moves vehicles like cavmarl: agents by the model, others as requested.
 
     Attributes:
         made: all simulators that have been made, in their order.

@@ -70,7 +70,7 @@ def test_worlds_together_equal_single_worlds_and_differ(make: Make) -> None:
         assert together.traffic_stats(world) == simulation.traffic_stats()
 
 
-def test_a_reset_with_the_seed_repeats_the_episode_and_without_it_goes_on(make: Make) -> None:
+def test_a_reset_with_the_seed_repeats_the_episode_and_without_a_seed_continues(make: Make) -> None:
     simulation = make()
 
     def episode() -> list[str]:

@@ -89,7 +89,7 @@ def test_vehicles_that_start_in_one_zone_cause_imbalance(vehicles: int, seed: in
     assert imbalance(anywhere) < SHARE * ZONES
 
 
-def test_low_density_crosses_now_and_then() -> None:
+def test_in_low_density_vehicles_rarely_cross_borders() -> None:
     simulation = world(LOW)
     at_once: Counter[tuple[int, int]] = Counter()
     for _ in first_minute(simulation):
@@ -115,7 +115,7 @@ def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
     for _ in first_minute(simulation):
         in_flight.append(len({transfer.vehicle for transfer in simulation.zones.view().transfers}))
         ids = simulation.vehicles()["id"]
-        assert len(set(ids.tolist())) == len(ids), "no vehicle twice"
+        assert len(set(ids.tolist())) == len(ids), "no vehicle is duplicated"
         stats = simulation.traffic_stats()
         assert stats.departed - stats.arrived - stats.removed == len(ids), "no vehicle is lost"
     assert max(in_flight) >= 10
@@ -129,12 +129,14 @@ def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
-def test_a_divided_city_is_the_undivided_one(vehicles: int) -> None:
+def test_a_divided_city_equals_the_undivided_city(vehicles: int) -> None:
     equal("rush", vehicles, steps=60)
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
-def test_a_divided_town_of_carla_is_the_undivided_one(vehicles: int, shared_maps: Path) -> None:
+def test_a_divided_town_of_carla_equals_the_undivided_town(
+    vehicles: int, shared_maps: Path
+) -> None:
     # There is no room for all hundred agents: the others wait.
     equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"})
 

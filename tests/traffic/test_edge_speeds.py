@@ -48,7 +48,7 @@ def vehicles(draw: st.DrawFn, lanes: int) -> NDArray[np.void]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_sums_are_those_of_the_last_means(name: str, data: st.DataObject) -> None:
+def test_sums_equal_the_sums_of_the_last_means(name: str, data: st.DataObject) -> None:
     roads = network(name)
     meter, shuffled = Meter(roads), Meter(roads)
     means = [naive.mean_speeds(roads, np.zeros(0, VEHICLE))] * SAMPLES
@@ -64,7 +64,7 @@ def test_sums_are_those_of_the_last_means(name: str, data: st.DataObject) -> Non
     np.testing.assert_array_equal(meter.past, shuffled.past)
 
 
-def test_speeds_of_traffic_take_the_place_of_limits_and_closed_edges_of_ways() -> None:
+def test_travel_times_use_measured_speeds_and_closed_edges_are_no_way() -> None:
     roads = network("grid4x4")
     edge = int(np.flatnonzero(~roads.edges["internal"])[0])
     sums = np.full(len(roads.edges), 10**9, dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Each of SUMO's words for lane, position and speed of departures."""
+"""Departures: SUMO's words for lane, position and speed, and other vehicles."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def lane_of(
     return entry_lane(ROADS.arrays, travel, KEY, waiting, ranks, flags)
 
 
-def test_a_given_lane_is_taken_once_a_tick() -> None:
+def test_one_departure_per_tick_enters_a_given_lane() -> None:
     _, room = traffic()
     for lane in WEAVE:
         assert lane_of(codes.LANE_GIVEN, room, lane) == lane
@@ -91,7 +91,7 @@ def test_first_is_the_rightmost_lane_that_leads_on() -> None:
     assert lane_of(codes.LANE_FIRST, room, WEAVE[2], taken=[WEAVE[0]]) == -1
 
 
-def test_random_takes_each_lane_as_often_and_the_same_again() -> None:
+def test_random_lanes_are_equally_likely_and_repeatable() -> None:
     _, room = traffic()
     picked = [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
     assert picked == [lane_of(codes.LANE_RANDOM, room, vehicle=k) for k in range(600)]
@@ -102,7 +102,7 @@ def test_random_takes_each_lane_as_often_and_the_same_again() -> None:
 
 
 @pytest.mark.parametrize("code", [codes.LANE_FREE, codes.LANE_ALLOWED])
-def test_free_is_the_emptiest_lane_and_the_right_one_of_two(code: int) -> None:
+def test_free_is_the_emptiest_lane_or_the_right_lane_of_two(code: int) -> None:
     _, room = traffic((WEAVE[0], 20.0, 5.0), (WEAVE[0], 60.0, 5.0), (WEAVE[1], 40.0, 5.0))
     assert lane_of(code, room) == WEAVE[2]
     _, room = traffic((WEAVE[0], 20.0, 5.0))
@@ -126,10 +126,12 @@ def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
     _, room = traffic((WEAVE[1], 20.0, 5.0))
     assert lane_of(codes.LANE_BEST, room) == WEAVE[2]
     taken = WEAVE[1:]
-    assert lane_of(codes.LANE_BEST, room, taken=taken) == -1, "it waits for one of the lanes"
+    assert lane_of(codes.LANE_BEST, room, taken=taken) == -1, (
+        "the departure waits for one of the lanes"
+    )
 
 
-def test_no_lane_that_leads_nowhere_is_taken() -> None:
+def test_no_departure_enters_a_lane_without_a_way_to_its_goal() -> None:
     nowhere = travel_by(make_plans(ROADS, [ROADS.edge_ids.index("ramp")]))
     _, room = traffic()
     for code in (codes.LANE_FIRST, codes.LANE_RANDOM, codes.LANE_FREE, codes.LANE_BEST):
@@ -141,7 +143,7 @@ def place(room: Scratch, tick: int = 0, **fields: Any) -> float:
     return entry_place(ROADS.arrays, TRAVEL, KEY, waiting, KIND, MAIN[0], tick, room)
 
 
-def test_given_places_are_of_the_front_bumper_from_either_end() -> None:
+def test_given_positions_are_those_of_the_front_bumper_from_either_end() -> None:
     _, room = traffic()
     assert place(room, pos_code=codes.POS_GIVEN, pos=40.0) == 37.5
     assert place(room, pos_code=codes.POS_GIVEN, pos=-40.0) == pytest.approx(LENGTH - 42.5)
@@ -149,7 +151,7 @@ def test_given_places_are_of_the_front_bumper_from_either_end() -> None:
     assert place(room, pos_code=codes.POS_GIVEN, pos=LENGTH) == pytest.approx(LENGTH - 3.5)
 
 
-def test_no_front_enters_over_the_line_not_even_of_a_bus_that_is_longer_than_the_lane() -> None:
+def test_no_vehicle_enters_with_its_front_over_the_line_even_on_a_shorter_lane() -> None:
     _, room = traffic()
     bus = generated_types().copy()[0]
     bus["length"] = LENGTH + 5.0
@@ -174,10 +176,10 @@ def test_last_keeps_the_gap_to_stop_behind_the_last(wanted_mps: float) -> None:
     assert place(room, **words) == pytest.approx(expected)
     _, room = traffic((MAIN[0], 60.0, 0.0))
     words["speed"] = LIMIT
-    assert place(room, **words) == 2.5, "it waits at that place"
+    assert place(room, **words) == 2.5, "the departure waits for that position"
 
 
-def test_last_on_an_empty_lane_is_its_end() -> None:
+def test_last_on_an_empty_lane_is_the_end_of_the_lane() -> None:
     """The vehicle has the speed at which it may approach the line, or stands at the line."""
     _, room = traffic()
     words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN}
@@ -193,7 +195,7 @@ def test_behind_the_last_a_departure_waits_until_its_speed_is_safe() -> None:
 
 
 @pytest.mark.parametrize("code", [codes.POS_RANDOM, codes.POS_FREE, codes.POS_RANDOM_FREE])
-def test_random_places_are_anywhere_and_others_in_another_tick(code: int) -> None:
+def test_random_positions_are_anywhere_and_differ_between_ticks(code: int) -> None:
     _, room = traffic()
     found = np.array([place(room, tick, pos_code=code) for tick in range(400)])
     assert (found >= 2.5).all()
@@ -216,7 +218,7 @@ def speed(
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
-def test_on_a_free_lane_each_word_means_its_speed(factor: float) -> None:
+def test_on_a_free_lane_each_word_gives_its_speed(factor: float) -> None:
     _, room = traffic()
     wanted = {"speed_factor": factor}
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=5.0, **wanted) == 5.0
@@ -240,20 +242,20 @@ def test_last_is_the_speed_of_the_leader_and_average_the_mean_of_the_lane() -> N
 
 
 @pytest.mark.parametrize("code", [codes.SPEED_DESIRED, codes.SPEED_LIMIT, codes.SPEED_AVERAGE])
-def test_only_max_and_random_enter_slower_than_they_say(code: int) -> None:
+def test_only_max_and_random_may_enter_more_slowly(code: int) -> None:
     _, room = traffic((MAIN[0], 50.0, 3.0), (MAIN[0], 60.0, 2.0 * LIMIT))
     assert 0.0 < speed(room, speed_code=codes.SPEED_MAX) < LIMIT
     assert speed(room, speed_code=code) == -1.0
 
 
-def test_a_leader_makes_slower_but_a_given_speed_waits() -> None:
+def test_a_leader_reduces_the_speed_but_a_departure_with_a_given_speed_waits() -> None:
     _, room = traffic((MAIN[0], 50.0, 3.0))
     safe = speed_behind(KIND, 25.0, 3.0, KIND["decel"])
     assert 3.0 < safe < LIMIT
     assert speed(room, speed_code=codes.SPEED_MAX) == pytest.approx(safe)
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=0.9 * safe) == 0.9 * safe
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=1.1 * safe) == -1.0
-    assert speed(room, s=44.5, speed_code=codes.SPEED_MAX) == -1.0, "no room at all"
+    assert speed(room, s=44.5, speed_code=codes.SPEED_MAX) == -1.0, "there is no room"
 
 
 def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
@@ -269,7 +271,7 @@ def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
     [(-0.47, codes.DRIVER_AGENT, True), (0.0, codes.DRIVER_AGENT, False),
      (-0.47, codes.DRIVER_BACKGROUND, False)],
 )  # fmt: skip
-def test_a_steered_car_that_sticks_out_from_the_lane_beside_is_a_leader(
+def test_a_steered_car_that_reaches_over_from_the_adjacent_lane_is_a_leader(
     askew: float, driver: int, minds: bool
 ) -> None:
     # The car has nearly finished its change to the left; its rear is over the departure's lane.
@@ -291,7 +293,7 @@ def test_before_the_end_of_a_lane_no_vehicle_enters_fast() -> None:
     assert speed_at(ROADS.arrays, KIND, MAIN[0], 10.0, 20.0) == 20.0
 
 
-def test_only_a_line_where_it_may_have_to_stop_makes_a_departure_slow() -> None:
+def test_a_departure_is_slow_only_before_a_line_where_it_may_have_to_stop() -> None:
     """Behind that line, a lower speed limit has the same effect."""
     _, room = traffic()
     place_m = LENGTH - 12.0
@@ -378,7 +380,7 @@ def test_a_vehicle_on_another_link_is_a_leader_while_its_rear_is_before_the_fork
 def test_no_vehicle_enters_before_a_vehicle_that_turns_into_the_lane_beside(
     to_start_m: float, fork_m: float, brakes: bool
 ) -> None:
-    """`to_start_m`: distance of its front, at 10 m/s, to the end of a path of 8 m. `fork_m`: length
+    """`to_start_m`: way of the other front, at 10 m/s, to the end of its path. `fork_m`: length
     over which the path runs beside the own path.
 
     A long vehicle blocks the lane for 6 m more.

@@ -31,7 +31,7 @@ ROUTES = """<routes>
 MIRRORED = {"x": 1.0, "y": -1.0, "s": 1.0, "d": -1.0, "speed": 1.0, "to_go": 1.0}
 
 
-def test_neighbours_lie_on_the_side_that_the_map_says(tmp_path: Path) -> None:
+def test_neighbour_lanes_are_on_the_side_given_by_the_map(tmp_path: Path) -> None:
     network = read_network(netgenerate(tmp_path / "left.net.xml", *NETS["random"]))
     assert network.left_hand
     beside = np.flatnonzero(network.lanes["right"] >= 0)
@@ -41,7 +41,7 @@ def test_neighbours_lie_on_the_side_that_the_map_says(tmp_path: Path) -> None:
         assert network.lanes["left"][row["right"]] == lane
         assert network.lanes["index"][row["right"]] == row["index"] + 1
         x, y, *_ = network.pose_on(lane, 0.5 * row["length_m"])
-        assert network.beside(row["right"], x, y)[1] > 1.0  # distance to its left
+        assert network.beside(row["right"], x, y)[1] > 1.0  # lateral distance, positive to the left
 
 
 def test_u_turns_are_recognized_on_both_sides(tmp_path: Path) -> None:
@@ -70,7 +70,7 @@ def test_an_invalid_side_is_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("junctions", ["priority", "traffic_light", "right_before_left"])
-def test_a_mirrored_world_is_driven_as_in_a_mirror(tmp_path: Path, junctions: str) -> None:
+def test_vehicles_in_a_mirrored_world_move_as_mirror_images(tmp_path: Path, junctions: str) -> None:
     plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-j", junctions)
     mirror = mirror_net(plain, tmp_path / "left.net.xml")
     worlds = [make_traffic(path, background=25) for path in (plain, mirror)]
@@ -112,7 +112,7 @@ def test_drivers_on_the_left_touch_nothing(tmp_path: Path, net: str) -> None:
 
 
 @pytest.mark.parametrize("name", scenario_names())
-def test_scenarios_are_staged_as_in_a_mirror(tmp_path: Path, name: str) -> None:
+def test_scenarios_on_the_left_are_mirror_images(tmp_path: Path, name: str) -> None:
     plain = netgenerate(tmp_path / "right.net.xml", *GRID, "-j", "traffic_light", "-L", "1")
     mirror = mirror_net(plain, tmp_path / "left.net.xml")
     worlds = [

@@ -56,7 +56,7 @@ def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
     return travel, Paths(first, np.array([-1], dtype=np.int32), np.zeros(1, dtype=np.int64), 0)
 
 
-def test_rows_stand_where_the_twin_says(network: RoadNetwork) -> None:
+def test_positions_of_rows_equal_the_twin(network: RoadNetwork) -> None:
     seen = fronts(network, 200)
     zoned = make_zone_state(2, 1, 300)
     travel, paths = nowhere(network)
@@ -101,7 +101,7 @@ def came_by(network: RoadNetwork, seen: np.void) -> int:
     return int(found[0]) if len(found) else -1
 
 
-def test_others_are_all_vehicles_that_sumo_does_not_move(network: RoadNetwork) -> None:
+def test_vehicles_that_sumo_does_not_move_are_listed(network: RoadNetwork) -> None:
     zoned = make_zone_state(3, 2, 10)
     for zone in range(3):
         for n in range(zone + 2):

@@ -77,7 +77,9 @@ def test_numbers_out_of_range_are_refused(
         write_random_demand(grid, tmp_path / "a.rou.xml", **asked)  # type: ignore[arg-type]
 
 
-def test_the_command_writes_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_writes_a_demand_file(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "a.rou.xml"
     with pytest.raises(SystemExit) as ended:
         main(("demand", "random", "grid4x4", "--vehicles", "3", "--out", str(path)))

@@ -50,14 +50,14 @@ def cars(device: str = "") -> str:
 
 
 @pytest.mark.parametrize("device", [DEVICE, ONCE])
-def test_vehicles_with_a_device_share_out_as_in_sumo(
+def test_vehicles_with_a_device_choose_routes_as_in_sumo(
     net: Path, tmp_path: Path, device: str
 ) -> None:
     body = cars(device) + FLOW
     simulation = two_ways(net, tmp_path, body)
     ours = passed(simulation, SECONDS)
     sumo = sumo_passed(net, write_demand(tmp_path, body), tmp_path)
-    assert sumo["long1"] > 60, "the short way was not jammed"
+    assert sumo["long1"] > 60, "the short route was not jammed"
     for edge in ("short", "long1", "long2", "out"):
         assert ours[edge] == pytest.approx(sumo[edge], rel=0.15), edge
     stats = simulation.traffic_stats()
@@ -92,7 +92,7 @@ def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) ->
         (CLOSED, 'off="true"', 0, 0),
         ('<closingReroute id="narrow" disallow="bus"/>', "", 0, 0),
         ('<closingReroute id="narrow" allow="bus"/>', "", 65, 75),
-        ('<closingReroute id="out"/>', "", 0, 0),  # without another route, it continues
+        ('<closingReroute id="out"/>', "", 0, 0),  # a vehicle without another route continues
         ('<closingReroute id="out"/><destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/>', "", 65, 75),
         ('<destProbReroute id="long2"/><destProbReroute id="keepDestination"/>', "", 22, 48),
@@ -150,7 +150,7 @@ def test_shuffled_rows_give_the_same_bytes(net: Path, tmp_path: Path) -> None:
     assert tidy.traffic_stats().rerouted > 10
 
 
-def test_worlds_together_are_the_worlds_alone_and_resets_repeat(net: Path, tmp_path: Path) -> None:
+def test_worlds_together_equal_single_worlds_and_resets_repeat(net: Path, tmp_path: Path) -> None:
     together = jam(net, tmp_path, num_worlds=3)
     start(together, seed=9)
     hashes: list[str] = []
@@ -170,7 +170,7 @@ def test_worlds_together_are_the_worlds_alone_and_resets_repeat(net: Path, tmp_p
     assert len(set(hashes)) == 3
 
 
-def test_a_reset_of_one_world_leaves_the_others(net: Path, tmp_path: Path) -> None:
+def test_a_reset_of_one_world_does_not_change_other_worlds(net: Path, tmp_path: Path) -> None:
     simulation = jam(net, tmp_path, num_worlds=2)
     start(simulation, seed=3)
     for _ in range(200):

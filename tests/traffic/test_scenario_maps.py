@@ -32,7 +32,7 @@ def test_a_driver_that_never_yields_fails_on_any_map(
         vec.close()
 
 
-def test_a_blockage_stands_on_the_way_that_it_blocks(tmp_path: Path) -> None:
+def test_a_blockage_stands_on_the_route_of_the_agent(tmp_path: Path) -> None:
     scenario = load_scenario("intersection_blockage")
     found = 0
     for number in (0, 1, 3):

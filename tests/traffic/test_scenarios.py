@@ -81,7 +81,7 @@ def test_the_reference_driver_passes_and_a_driver_that_never_yields_fails(
     careless = played(name, "never_yield", seed, params=params)
     assert careless.verdict == "collided"
     assert (careless.min_ttc_s, careless.pet_s) == (0.0, 0.0)
-    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # it kept its speed
+    assert careless.delay_s == pytest.approx(0.2, abs=0.2)  # the driver kept its speed
     assert careless.place == found.place
 
 
@@ -176,7 +176,7 @@ def test_signals_that_fail_are_dark_from_then_on() -> None:
     assert shown[-1] == {"o", "O"}
 
 
-def test_the_seed_draws_the_place_and_its_name_repeats_it() -> None:
+def test_the_seed_draws_the_place_and_the_name_of_the_place_repeats_the_run() -> None:
     places = {seed: played("pedestrian_crossing", "never_yield", seed).place for seed in range(4)}
     assert len(set(places.values())) > 1
     again = played("pedestrian_crossing", "never_yield", 0, place=places[3])
@@ -204,7 +204,7 @@ def test_invalid_arguments_are_refused(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_several_agents_come_one_after_the_other(name: str) -> None:
+def test_several_agents_enter_the_scene_one_after_the_other(name: str) -> None:
     place = ROOMY.get(name, "")
     found = played(name, "idm", agents=3, place=place)
     assert (found.verdicts, found.verdict) == (("passed",) * 3, "passed")
@@ -213,7 +213,7 @@ def test_several_agents_come_one_after_the_other(name: str) -> None:
     assert (careless.verdict, careless.verdicts[0]) == ("collided", "collided")
 
 
-def test_the_first_agent_starts_where_it_starts_alone() -> None:
+def test_the_first_of_several_agents_starts_at_the_place_of_a_single_agent() -> None:
     starts = []
     for agents in (1, 3):
         with made("unprotected_left_turn", agents=agents, density="high") as vec:
@@ -292,7 +292,7 @@ def test_a_file_can_add_a_scenario(tmp_path: Path) -> None:
 
 
 def test_worlds_with_a_scenario_are_independent() -> None:
-    """Each world equals the world alone, whatever agents of other worlds do."""
+    """Each world equals a single world, for any actions in other worlds."""
     keys = {"scenario.name": "pedestrian_crossing", "population.mode": "closed",
             "population.budget": None, "action.kind": "continuous"}  # fmt: skip
     one, three = (make_vec("grid4x4", num_envs=n, agents=1, background=20, overrides=keys)

@@ -67,14 +67,16 @@ def test_a_vehicle_stands_at_its_stop_for_its_duration_and_arrives(world: World)
 
 
 @pytest.mark.parametrize(("until", "leaves"), [(50.0, 50.0), (5.0, None)])
-def test_a_vehicle_leaves_no_sooner_than_its_timetable_says(
+def test_a_vehicle_leaves_no_sooner_than_its_timetable(
     world: World, until: float, leaves: float | None
 ) -> None:
     stop = f'<stop lane="main_in_0" endPos="200" duration="4" until="{until}"/>'
     (stand,) = stands(world(car(stop)), 70.0)
     begun, ended, _, _ = stand
     if leaves is None:
-        assert ended - begun == pytest.approx(4.0, abs=2.0 * DT), "late: it goes after the duration"
+        assert ended - begun == pytest.approx(4.0, abs=2.0 * DT), (
+            "a late vehicle leaves after the duration"
+        )
     else:
         assert ended == pytest.approx(leaves, abs=2.0 * DT)
 
@@ -86,7 +88,7 @@ def test_the_driver_changes_to_the_lane_of_its_stop_and_stays_there(world: World
     assert simulation.traffic_stats().arrived == 1
 
 
-def test_one_stop_after_the_other(world: World) -> None:
+def test_a_vehicle_makes_its_stops_in_their_order(world: World) -> None:
     stops = (
         '<stop lane="main_in_1" endPos="120" duration="3"/>'
         '<stop lane="weave_1" endPos="100" duration="4"/>'
@@ -120,7 +122,7 @@ def test_vehicles_pass_a_vehicle_that_stands_on_another_lane(world: World) -> No
         drive(simulation)
         assert (simulation.vehicles()["hit"] < 0).all()
     assert simulation.traffic_stats().arrived >= 3
-    assert 0 in simulation.vehicles()["id"], "the first one has stood all the time"
+    assert 0 in simulation.vehicles()["id"], "the first vehicle has stood all the time"
 
 
 def test_a_vehicle_that_cannot_change_lanes_takes_another_route(world: World) -> None:

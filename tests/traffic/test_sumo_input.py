@@ -1,4 +1,4 @@
-"""SUMO writes no file, whatever files of a user it reads."""
+"""SUMO writes no files, although files of users may ask for outputs."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ def test_additional_files_write_nothing(tmp_path: Path, element: str, trip: str)
     try:
         run(tmp_path, "a.add.xml", "r.rou.xml")
     except (ConfigError, subprocess.CalledProcessError):
-        pass  # refused by us (no XML), or by SUMO
+        pass  # refused by cavmarl, because the file is not XML, or by SUMO
     assert not (tmp_path / "victim").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.add.xml", "own", "r.rou.xml"]
 
@@ -144,7 +144,7 @@ def test_options_that_write_are_not_passed_on(
         f'<c><input><route-files value="r.rou.xml"/></input>'
         f'<{section}><{option} value="victim"/></{section}></c>'
     )
-    with suppress(ConfigError):  # refused, or left out
+    with suppress(ConfigError):  # the option is refused, or left out
         run(tmp_path, "run.sumocfg")
     assert not (tmp_path / "victim").exists()
 
@@ -185,7 +185,7 @@ def test_a_file_that_includes_another_is_refused(tmp_path: Path, trip: str) -> N
         run(tmp_path, "r.rou.xml")
 
 
-def test_demand_deep_in_itself_is_refused_and_not_copied(tmp_path: Path) -> None:
+def test_deeply_nested_demand_is_refused_and_not_copied(tmp_path: Path) -> None:
     deep = tmp_path / "r.rou.xml"
     deep.write_text(f'<routes>{"<param>" * 50_000}<a file="x"/>{"</param>" * 50_000}</routes>')
     with pytest.raises(ConfigError, match=r"over 100 deep.*CAVMARL_MAX_XML_DEPTH"):

@@ -84,7 +84,7 @@ def test_the_memory_of_sumo_is_limited(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("source", MODES)
 def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: str) -> None:
-    """One of them is this process."""
+    """One of the two is this process."""
     demand = tiny_file(tmp_path)
     with run(demand, source, "end") as other:
         both = settings(demand, source)
@@ -106,7 +106,7 @@ def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: s
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGKILL])
-def test_nothing_is_left_after_ctrl_c_or_a_kill(tmp_path: Path, number: signal.Signals) -> None:
+def test_no_process_is_left_after_ctrl_c_or_a_kill(tmp_path: Path, number: signal.Signals) -> None:
     with run(tiny_file(tmp_path), "sumo-traffic", "wait") as process:
         pids = [int(word) for word in answer(process)[2:]]
         assert len(pids) == 2
@@ -177,11 +177,11 @@ def test_a_second_start_in_one_process_is_refused(tmp_path: Path) -> None:
         with alone(simulation, tmp_path):
             with pytest.raises(SumoError, match="one simulation per process"):
                 free_libsumo()
-            drive(simulation)  # a process of its own
+            drive(simulation)  # this SUMO runs in a process of its own
         free_libsumo()
 
 
-def test_traci_does_the_same_as_libsumo(tmp_path: Path) -> None:
+def test_traci_gives_the_same_results_as_libsumo(tmp_path: Path) -> None:
     hashes = []
     for interface in ("libsumo", "traci"):
         own = {"sumo.interface": interface}
@@ -210,7 +210,7 @@ def test_files_of_another_map_are_refused_with_sumos_words(tmp_path: Path) -> No
         pass
 
 
-def test_files_that_name_what_is_not_there_are_refused(tmp_path: Path) -> None:
+def test_files_that_refer_to_missing_objects_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "x.sumocfg"
     path.write_text(
         '<configuration><input><route-files value="none.rou.xml"/></input></configuration>',
@@ -246,7 +246,7 @@ def test_invalid_arguments_are_refused(
         load_world("grid4x4", overrides=both)
 
 
-def test_the_version_is_on_record(tmp_path: Path) -> None:
+def test_the_version_of_sumo_is_recorded(tmp_path: Path) -> None:
     with coupled("grid4x4", [tiny_file(tmp_path)]) as simulation:
         document = describe_world(
             simulation.config, simulation.network, simulation.demand, simulation.partition
@@ -257,7 +257,7 @@ def test_the_version_is_on_record(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("zones", [1, 4])
-def test_workers_have_sumos_of_their_own(tmp_path: Path, source: str, zones: int) -> None:
+def test_each_worker_has_its_own_sumo(tmp_path: Path, source: str, zones: int) -> None:
     both = settings(tiny_file(tmp_path), source)
     hashes = []
     for workers in (0, 2):
@@ -330,7 +330,7 @@ def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
         vec.close()
 
 
-def test_a_worker_dies_whose_sumo_log_exceeds_its_limit(tmp_path: Path) -> None:
+def test_a_killed_worker_with_a_too_long_sumo_log_is_an_error(tmp_path: Path) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
     vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
     try:

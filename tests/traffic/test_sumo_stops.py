@@ -93,7 +93,7 @@ def test_vehicles_stop_at_their_stops_for_the_given_time(tmp_path: Path) -> None
         for (_, _, lasted), seconds in zip(found[name], SECONDS[name], strict=True):
             assert lasted >= seconds - 0.2
     (_, since, lasted), _ = found["bus"]
-    assert since + lasted == pytest.approx(25.0, abs=0.6), "it leaves when `until` says so"
+    assert since + lasted == pytest.approx(25.0, abs=0.6), "the vehicle leaves at the time `until`"
     first, second = (x for x, _, _ in found["bus"])
     assert second > first
 
@@ -118,7 +118,7 @@ def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1]
 
 
-def test_more_stops_than_there_is_room_for_are_refused(tmp_path: Path) -> None:
+def test_too_many_stops_of_a_vehicle_are_refused(tmp_path: Path) -> None:
     with coupled("merge", write_stops(tmp_path), "sumo-demand", seed=None) as simulation:
         table = np.zeros(5, dtype=simulation.travel.stops.dtype)
         book = StopBook(simulation.network, table, 2)

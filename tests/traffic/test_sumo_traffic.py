@@ -40,7 +40,7 @@ def names(simulation: Simulation) -> list[str]:
 
 
 def test_positions_speeds_and_signals_equal_those_of_sumo_alone(tmp_path: Path) -> None:
-    """Without agents, the coupled SUMO runs as it does alone; rows equal SUMO at every tick."""
+    """Without agents, the coupled SUMO runs as if it were alone; rows equal SUMO at every tick."""
     turned = False
     with (
         coupled("grid4x4", [tiny_file(tmp_path)]) as simulation,
@@ -78,7 +78,7 @@ def test_positions_speeds_and_signals_equal_those_of_sumo_alone(tmp_path: Path) 
                 name: libsumo.trafficlight.getRedYellowGreenState(name)
                 for name in network.signal_ids
             }
-    assert turned, "no centre was ever on another lane than its front"
+    assert turned, "no vehicle had its centre on another lane than its front"
 
 
 def blinker(signals: int) -> int:
@@ -176,7 +176,7 @@ def edges_ahead(simulation: Simulation, row: np.void) -> list[str]:
     raise AssertionError("the way does not end")
 
 
-def test_clocks_are_equal(tmp_path: Path) -> None:
+def test_the_clocks_of_sumo_and_the_world_are_equal(tmp_path: Path) -> None:
     files = write_demand(tmp_path, STEADY + FLOW)
     (tmp_path / "late.sumocfg").write_text(
         "<configuration><input>"
@@ -288,7 +288,7 @@ def test_a_teleport_is_counted_and_moves_no_agent(
 
 
 @pytest.mark.parametrize("source", ["sumo-traffic", "sumo-demand"])
-def test_closures_and_reroutings_are_sumos(tmp_path: Path, source: str) -> None:
+def test_closed_edges_and_new_routes_of_sumo_take_effect(tmp_path: Path, source: str) -> None:
     """The narrow edge is closed from second 100 on; later vehicles take the long route."""
     net = make_map(tmp_path)
     cars = CARS.format(device="")
@@ -322,7 +322,7 @@ def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path)
         assert simulation.traffic_stats().removed == 1
 
 
-def test_a_cycle_is_that_of_algorithm_1(tmp_path: Path) -> None:
+def test_a_cycle_follows_algorithm_1(tmp_path: Path) -> None:
     """SUMO steps to t + dt, its vehicles are mirrored, the world ticks once, sensors see t + dt."""
     own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
     with coupled("grid4x4", [tiny_file(tmp_path)], agents=1, overrides=own) as simulation:

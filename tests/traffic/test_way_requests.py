@@ -130,7 +130,7 @@ def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> Non
     assert asking(9) == []
     edge = int(roads.lanes[second]["edge"])
     assert looks[8]["seen"] == edge
-    assert asking(9, edge) == [], "there before the rerouter was asked: noted as seen"
+    assert asking(9, edge) == [], "a vehicle that was there before counts as seen by the rerouter"
     looks[8]["seen"] = -1
     assert asking(9, edge) == [0]
 
@@ -139,12 +139,12 @@ def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> Non
     ("speed", "back", "changes", "link", "fits"),
     [
         (10.0, 60.0, 0, 1, True),
-        (10.0, 15.0, 0, 1, False),  # it can no longer stop for another turn
+        (10.0, 15.0, 0, 1, False),  # the vehicle can no longer stop for another turn
         (10.0, 15.0, 0, 0, True),  # the same turn
         (0.0, 3.0, 0, 1, True),
         (0.0, 3.0, 1, 1, False),  # no room to change lanes
         (0.0, 45.0, 1, 1, True),
-        (0.0, 2.0, 0, 1, False),  # its front is over the line
+        (0.0, 2.0, 0, 1, False),  # the vehicle's front is over the line
     ],
 )
 def test_a_vehicle_needs_room_to_leave_its_route(

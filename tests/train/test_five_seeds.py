@@ -71,7 +71,7 @@ def has_ended(pidfd: int) -> bool:
     return ended
 
 
-def test_a_seed_that_was_cut_short_goes_on(tmp_path: Path) -> None:
+def test_an_interrupted_seed_continues(tmp_path: Path) -> None:
     program = load_program("five_seeds")
     commands: list[list[str]] = []
 

@@ -62,13 +62,15 @@ def ends(driver: Path, agents: int) -> tuple[float, float]:
     return arrivals / trips, collisions / trips
 
 
-def test_the_first_rung(ippo: ModuleType, tmp_path: Path) -> None:
+def test_an_agent_alone_learns_to_reach_its_goal(ippo: ModuleType, tmp_path: Path) -> None:
     """The short variant, which is part of every run of the tests."""
     assert ends(learn(ippo, tmp_path, agents=1, agent_steps=120_000), agents=1)[0] > 0.9
 
 
 @pytest.mark.slow
-def test_the_ladder(ippo: ModuleType, tmp_path: Path) -> None:
+def test_an_agent_alone_learns_and_then_two_agents_learn_to_avoid_collisions(
+    ippo: ModuleType, tmp_path: Path
+) -> None:
     alone = learn(ippo, tmp_path, agents=1, agent_steps=400_000)
     assert ends(alone, agents=1)[0] > 0.98
     reckless = ends(alone, agents=2)[1]

@@ -12,7 +12,9 @@ from tests.support.training import TRAIN, load_program
 pytest.importorskip("torch", reason="needs the extra: train")
 
 
-def test_the_arms_are_compared_by_seed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_training_with_and_without_messages_is_compared_by_seed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.syspath_prepend(TRAIN)
     program = load_program("messages")
     on = {"collision": [1.0, 2.0], "success": [90.0, 90.0], "delay_s": [5.0, 7.0]}
@@ -25,7 +27,7 @@ def test_the_arms_are_compared_by_seed(monkeypatch: pytest.MonkeyPatch) -> None:
     lines = program.table(arms, args).splitlines()
     assert lines[-1].startswith("| on minus off | -2.50 [-8.85, 3.85] | 15.00 [")
     assert "| off | 4.00 [" in lines[-2]
-    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # not a share
+    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # this metric is not a share
     assert "| on | 1.50 [" in lines[-3]
 
 
@@ -40,7 +42,7 @@ def test_intervals_of_shares_end_at_0_and_100(monkeypatch: pytest.MonkeyPatch) -
     assert five.interval_of(np.array([0.0, 0.003, 0.0]), False).low < 0.0
 
 
-def test_both_arms_are_trained_with_the_settings_that_are_given(
+def test_both_trainings_get_the_given_settings(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(TRAIN)

@@ -59,7 +59,7 @@ def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path
     args = parse_run(ippo.Args, ["--config", str(config), "--seed", "77"], "")
     assert args.env in entries()
     bounds = {"total_agent_steps", "minutes"} & yaml.safe_load(config.read_text()).keys()
-    assert bounds, "how long it trains is left to a default"
+    assert bounds, "the config does not state the length of the training"
     assert all(getattr(args, bound) > 0 for bound in bounds)
     assert args.seed == 77
 
@@ -79,7 +79,7 @@ def log(folder: Path) -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def test_two_updates_by_command_line(tmp_path: Path) -> None:
+def test_two_updates_run_from_the_command_line(tmp_path: Path) -> None:
     words = [*TINY, "--total-agent-steps", "60", "--runs", str(tmp_path), "--name", "one"]
     done = subprocess.run(
         [sys.executable, str(TRAIN / "ppo.py"), *words],
@@ -155,7 +155,9 @@ def test_a_central_critic_is_not_part_of_the_driver(ippo: ModuleType, here: Path
 
 
 @pytest.mark.parametrize("kind", ["continuous", "discrete", "grid"])
-def test_a_run_goes_on_where_it_stopped_and_drives(ippo: ModuleType, here: Path, kind: str) -> None:
+def test_a_stopped_run_resumes_and_its_driver_drives(
+    ippo: ModuleType, here: Path, kind: str
+) -> None:
     entry = here / "envs" / "small"
     entry.mkdir(parents=True)
     source = TRAIN.parent / "envs" / "merge" / "map" / "map.net.xml"
@@ -182,7 +184,7 @@ def test_the_clock_ends_a_run(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--minutes", "0.0001", "--name", "short"]
     assert ippo.main([*words, "--total-agent-steps", "1000000000"]) == 0
     rows = log(here / "runs" / "short")
-    assert 1 <= len(rows) < 1000  # 6 ms suffice for few updates on any machine
+    assert 1 <= len(rows) < 1000  # in 6 ms, any machine makes few updates
 
 
 def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None:
@@ -226,7 +228,7 @@ def test_a_folder_that_cannot_be_written_is_refused(
 
 
 @pytest.mark.parametrize("words", [["--num-envs", "x"], ["--nonsense"], ["--minutes"]])
-def test_words_that_are_no_settings_are_wrong_use(ippo: ModuleType, words: list[str]) -> None:
+def test_unknown_options_are_refused(ippo: ModuleType, words: list[str]) -> None:
     with pytest.raises(SystemExit, match="2"):
         ippo.main(words)
 

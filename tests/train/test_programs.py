@@ -40,10 +40,10 @@ def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], program: str, *words: object) -> str:
-    """Return the message of a program that refuses arguments; run it here: torch loads slowly."""
+    """Return a program's message about wrong arguments; run it here, because torch loads slowly."""
     try:
         code = load_program(program.removesuffix(".py")).main([*map(str, words)])
-    except SystemExit as end:  # the errors of argparse
+    except SystemExit as end:  # argparse writes its errors there
         code = end.code
     assert code == 2
     return capsys.readouterr().err
@@ -128,7 +128,7 @@ def test_wrong_use_of_a_librarys_program_is_refused(
     ("program", "module"),
     [("ppo.py", "torch"), ("ippo_torchrl.py", "torchrl"), ("ppo_rllib.py", "ray.rllib")],
 )
-@pytest.mark.filterwarnings("ignore")  # what the libraries warn of themselves
+@pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 def test_programs_for_drivers_refuse_agents_of_signals(
     tmp_path: Path, program: str, module: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -207,7 +207,7 @@ def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
     assert "contains a run" in again.stderr
 
 
-@pytest.mark.filterwarnings("ignore")  # what the library warns of itself
+@pytest.mark.filterwarnings("ignore")  # the library warns about its own code
 def test_a_network_scores_signals_of_any_shape(tmp_path: Path) -> None:
     """Learning changes the weights, and forbidden greens are never chosen."""
     pytest.importorskip("stable_baselines3", reason="needs the extra: train")
@@ -236,7 +236,7 @@ def test_a_network_scores_signals_of_any_shape(tmp_path: Path) -> None:
     assert np.all(allowed)
 
 
-def test_the_table_of_training_seeds_is_that_of_the_figures(
+def test_the_table_of_training_seeds_on_the_page_is_current(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     program = load_program("signal_seeds")

@@ -108,9 +108,7 @@ def cut(program: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch) 
             program.main(words)
 
 
-def test_a_run_that_is_killed_goes_on_bit_for_bit(
-    ippo: ModuleType, here: Path, whole: Learnt
-) -> None:
+def test_a_killed_run_resumes_bit_for_bit(ippo: ModuleType, here: Path, whole: Learnt) -> None:
     words = [*TINY, *LENGTH]
     command = [sys.executable, "-c", KILLED, str(TRAIN / "ppo.py"), *words, "--name", "cut"]
     killed = subprocess.run(command, capture_output=True, check=False)
@@ -120,7 +118,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     assert state.updates == 4
     rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + CUT_AFTER
-    left = here / "runs" / "cut" / ".build-left"  # killed while it was written
+    left = here / "runs" / "cut" / ".build-left"  # its writer was killed
     left.mkdir()
     (left / CHECKPOINT_FILE).touch()
     # The saved driver is for users: a run does not resume from it.
@@ -142,7 +140,7 @@ def test_a_run_that_is_killed_goes_on_bit_for_bit(
     ],
 )
 @pytest.mark.filterwarnings("ignore:workers = 2")
-def test_a_run_goes_on_bit_for_bit_in_every_way_to_collect(
+def test_a_run_resumes_bit_for_bit_with_each_way_to_collect(
     here: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], others: list[str]
 ) -> None:
     program = load_program("ppo")
@@ -226,7 +224,7 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
     assert learnt(here / "runs" / "cut") == whole
 
 
-def test_a_row_that_finds_no_room_is_a_typed_error(here: Path) -> None:
+def test_a_full_disk_while_a_row_is_written_is_a_typed_error(here: Path) -> None:
     (here / "progress.csv").symlink_to("/dev/full")
     log = Log(here)
     with pytest.raises(TrainingError, match=r"progress\.csv: cannot be written \(No space left"):
@@ -310,7 +308,7 @@ def test_tensorboard_is_cut_where_the_checkpoint_is(
     [("ppo_gymnasium", "gymnasium"), ("ppo_sb3", "stable_baselines3"), ("ippo_torchrl", "torchrl")],
 )
 @pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
-def test_a_librarys_run_goes_on(
+def test_a_run_of_a_library_resumes(
     here: Path, monkeypatch: pytest.MonkeyPatch, name: str, module: str
 ) -> None:
     pytest.importorskip(module)
@@ -334,7 +332,7 @@ def test_a_librarys_run_goes_on(
     assert program.main(["--resume", "runs/cut"]) == 0
     assert is_trained(here / "runs" / "cut")
     uncut, resumed = learnt(here / "runs" / "whole"), learnt(here / "runs" / "cut")
-    if name == "ippo_torchrl":  # its collector keeps its worlds, which begin new episodes
+    if name == "ippo_torchrl":  # the collector keeps its worlds; they begin new episodes
         assert (resumed[1][:4], resumed[2]) == (uncut[1][:4], uncut[2])
         rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
         updates = [int(row.partition(",")[0]) for row in rows[1:]]

@@ -84,5 +84,5 @@ class Standing:
         return int(self.worlds.ticks[0])
 
     def key(self) -> int:
-        """The key of the world's random numbers."""
+        """Return the key of the world's random numbers."""
         return int(self.worlds.keys[0])

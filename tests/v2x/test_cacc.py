@@ -82,7 +82,7 @@ def drive(road: Path, policy: str, **settings: Any) -> Platoon:
     return Platoon(speed.std(axis=0), float((gap / speed[:, 1:]).mean()), float(np.min(gaps)))
 
 
-def test_it_follows_closer_than_idm_and_oscillations_do_not_grow(road: Path) -> None:
+def test_cacc_follows_closer_than_idm_and_oscillations_do_not_grow(road: Path) -> None:
     cacc, idm = drive(road, "cacc"), drive(road, "idm")
     assert cacc.headway_s < 0.5 * idm.headway_s
     assert cacc.gap_m > 0.0
@@ -90,7 +90,7 @@ def test_it_follows_closer_than_idm_and_oscillations_do_not_grow(road: Path) -> 
     assert (np.diff(cacc.spread) <= 0.0).all()
 
 
-def test_without_messages_it_drives_as_idm(road: Path) -> None:
+def test_without_messages_cacc_drives_like_idm(road: Path) -> None:
     deaf, idm = drive(road, "cacc", **{"v2x.channel.loss": 1.0}), drive(road, "idm")
     assert deaf.headway_s == idm.headway_s
     assert (deaf.spread == idm.spread).all()
@@ -104,7 +104,7 @@ def test_missing_requirements_are_named() -> None:
         load_policy("cacc", discrete)
 
 
-def test_it_drives_through_a_city_as_safely_as_idm() -> None:
+def test_cacc_drives_through_a_city_as_safely_as_idm() -> None:
     ends = {}
     for policy in ("cacc", "idm"):
         env = make_vec("grid4x4", overrides=HEARS | {"population.mode": "respawn"})

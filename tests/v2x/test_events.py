@@ -43,7 +43,7 @@ def test_declared_events_reach_all_other_agents() -> None:
     assert (seen[:2] == 0.0).all()
     assert seen[2:, [0, 2, 3], PRESENT].all()
     assert seen[2:, [0, 2, 3], OTHER].all()
-    assert not seen[:, 1].any()  # the sender knows it
+    assert not seen[:, 1].any()  # the sender knows its own event
 
 
 def test_workers_and_zones_receive_the_same_events() -> None:
@@ -52,7 +52,7 @@ def test_workers_and_zones_receive_the_same_events() -> None:
     assert (run(workers=1) == whole).all()
 
 
-def test_it_is_sent_once_a_step_and_kept_for_its_validity() -> None:
+def test_an_event_is_sent_once_per_step_and_kept_for_its_validity() -> None:
     overrides = TOLD | {"v2x.denm.validity_s": 0.4}
     env = make_vec("grid4x4", agents=2, overrides=overrides)
     env.reset(seed=3)

@@ -32,7 +32,7 @@ def driven(loss: float, seed: int, worlds: int = 8, **overrides: Any) -> tuple[i
     return trips, collisions, delay_s / trips
 
 
-def test_messages_halve_its_collisions_at_no_more_delay() -> None:
+def test_messages_halve_the_collisions_without_more_delay() -> None:
     trips, collisions, delay_s = driven(0.0, seed=8)
     deaf_trips, deaf_collisions, deaf_delay_s = driven(1.0, seed=8)
     assert min(trips, deaf_trips) > 60

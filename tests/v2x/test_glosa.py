@@ -1,4 +1,4 @@
-"""Messages tell when the next signal changes, and a driver that follows them stops less often."""
+"""Messages contain the time of the next signal change; a driver that uses them stops less."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ KNOWN, GO, LINE, CHANGE, RETURN = 0, 1, 4, 5, 6
 
 
 def told(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
-    """What agents hear of the next signal in each tick, (steps, A, 7), times in s, and seen times.
+    """Return the received data on the next signal, (steps, A, 7), in s, and the true times.
 
     The last column is the time until the letter of the next line changes, without messages.
     """
@@ -43,7 +43,7 @@ def told(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
     return np.array(found)
 
 
-def test_the_times_of_the_next_two_changes_come_true() -> None:
+def test_the_times_of_the_next_two_changes_are_correct() -> None:
     heard = told("grid4x4", 400)
     tick_s = 0.06  # messages may be a tick old
     changes = steps = 0
@@ -67,7 +67,7 @@ def test_the_times_of_the_next_two_changes_come_true() -> None:
     assert steps > 1000
 
 
-def test_of_actuated_signals_the_soonest_times_are_told(tmp_path: Path) -> None:
+def test_actuated_signals_report_the_earliest_times(tmp_path: Path) -> None:
     heard = told(actuated_grid(tmp_path), 300)
     ahead = (heard[:-1, :, KNOWN] > 0.0) & (np.abs(heard[:-1, :, LINE] - heard[1:, :, LINE]) < 5.0)
     ahead &= heard[1:, :, KNOWN] > 0.0
@@ -77,7 +77,7 @@ def test_of_actuated_signals_the_soonest_times_are_told(tmp_path: Path) -> None:
     assert np.isfinite(heard[heard[..., KNOWN] > 0.0][:, [CHANGE, RETURN]]).all()
 
 
-def test_of_chosen_greens_no_times_are_told() -> None:
+def test_signals_with_agents_report_no_times() -> None:
     keys = {"signals.agents": "all", "signals.controller": "max_pressure", "clock.ctrl_dt_s": 1.0}
     heard = told("grid4x4", 30, **keys)
     is_known = heard[..., KNOWN] > 0.0

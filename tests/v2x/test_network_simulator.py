@@ -36,7 +36,7 @@ class Federate:
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         self._asked.put((sent.tick, sent.packets.copy(), sent.receivers.copy()))
-        return self._answers.get()  # waits at the barrier
+        return self._answers.get()  # the simulator waits at the barrier
 
     def _run(self) -> None:
         while (asked := self._asked.get()) is not None:
@@ -59,7 +59,7 @@ class Federate:
         self._thread.join()
 
 
-def test_world_and_simulator_advance_together_and_delays_hold() -> None:
+def test_world_and_simulator_advance_together_and_packets_are_delayed() -> None:
     world = Standing(2, cam__rate_hz=10.0, **EXTERNAL)
     federate = Federate({1: 2, 2: 0, 3: 3})
     world.bus.connect(federate)

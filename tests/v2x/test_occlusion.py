@@ -11,7 +11,7 @@ from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CP
 from tests.support.world import tick_of
 from tests.v2x.station_worlds import Standing
 
-# The agent, a truck ahead, a car hidden behind the truck, and a car beside that sees both.
+# The agent, a truck ahead, a car behind the truck, and a car beside the truck that sees all.
 PLACES = np.array([[100.0, 120.0], [112.0, 120.0], [135.0, 120.0], [118.0, 140.0]])
 HIDDEN = 2
 
@@ -36,7 +36,7 @@ def behind_a_truck(**settings: Any) -> Standing:
 
 def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
     world = behind_a_truck(perception__rate_hz=10.0)
-    # The CPM of the agent lists what it sees itself, without the hidden car.
+    # The CPM of the agent lists the vehicles that the agent sees, without the hidden car.
     world.tick()
     mail = world.bus.mail
     reports = mail.reports[0, 0, : mail.num_reports[0, 0]]
@@ -70,7 +70,7 @@ def test_a_vehicle_hidden_from_lidar_is_known_from_messages() -> None:
         return simulation.outputs.observations[0, 0, place].copy()
 
     with_hidden, without = lidar(placed), lidar(placed[:2])
-    assert (with_hidden == without).all()  # no ray can detect whether the car exists
+    assert (with_hidden == without).all()  # the readings of the rays are the same without the car
     world.write(placed)
     world.tick()
     assert known(world)[2] == (2, KIND_CAM)
@@ -91,7 +91,7 @@ def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
     assert known(world) == {1: (FIRST_ROADSIDE_ID + 5, KIND_CPM)}
 
 
-def test_buildings_weaken_packets_through_them() -> None:
+def test_packets_through_buildings_are_weaker() -> None:
     ratios = []
     for building_db in (0.0, 12.0, 60.0):
         world = Standing(

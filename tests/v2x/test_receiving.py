@@ -83,7 +83,7 @@ def drift(random: np.random.Generator, places: NDArray[np.float64]) -> NDArray[n
 
 @pytest.mark.parametrize("seen", [False, True], ids=["cams", "cpms"])
 @pytest.mark.parametrize("name", CHANNELS)
-def test_inboxes_hold_what_the_definitions_say(name: str, seen: bool) -> None:
+def test_inboxes_agree_with_the_definitions(name: str, seen: bool) -> None:
     settings = CHANNELS[name] | {"inbox__objects": 5, "inbox__memory_s": 0.4, "cam__rate_hz": 5.0}
     world = Standing(AGENTS, perception__rate_hz=2.5 if seen else 0.0, **settings)
     random = np.random.default_rng(1)
@@ -131,7 +131,7 @@ def test_receptions_have_the_configured_probability() -> None:
         assert abs(band - distance) <= 13.0
 
 
-def test_packets_beyond_the_capacity_are_those_of_the_larger_ids() -> None:
+def test_packets_of_the_larger_ids_exceed_the_capacity() -> None:
     world = Standing(1, capacity=10)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (30, 2)))
     world.tick()
@@ -197,7 +197,7 @@ def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert there[there >= 0].tolist() == [10]  # the only other sender of this tick
+    assert there[there >= 0].tolist() == [10]  # the only other station that sends in this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

@@ -123,7 +123,8 @@ def test_seen_vehicles_are_reported(units: bool) -> None:
     world = Standing(1, cam__rate_hz=0.0, denm__rate_hz=0.0, **settings)
     random = np.random.default_rng(8)
     cells = np.stack(np.meshgrid(np.arange(9), np.arange(8)), -1).reshape(-1, 2)
-    places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))  # no station in other ticks
+    # In other ticks, no station sends.
+    places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))
     rows = world.put(places, heading=random.uniform(-3.0, 3.0, 72))
     world.tick()
     told: dict[int, list[int]] = {}

@@ -71,7 +71,7 @@ def test_messages_and_all_effects_of_the_channel_are_off_by_default() -> None:
     assert (channel.path_loss_exponent, channel.building_db, channel.data_rate_mbps) == (0, 0, 0)
 
 
-def test_the_mode_messages_shows_nothing_else_of_others() -> None:
+def test_in_mode_messages_other_vehicles_are_observed_from_messages_only() -> None:
     overrides = {
         "v2x.enabled": True, "sensors.messages.objects": 3, "sensors.messages.events": 1,
         "sensors.messages.signal": True, "observation.mode": "messages", "observation.kind": "dict",

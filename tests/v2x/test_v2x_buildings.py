@@ -27,6 +27,6 @@ def test_buildings_of_the_map_weaken_messages() -> None:
     assert reception_ratio(**BUILT) < 0.8 * reception_ratio()
 
 
-def test_buildings_weaken_messages_in_divided_worlds_too() -> None:
+def test_buildings_weaken_messages_in_divided_worlds() -> None:
     found = verify_zones("grid4x4", (4,), steps=10, overrides=CHANNEL | BUILT)
     assert all(result.difference is None for result in found.results)

@@ -27,7 +27,7 @@ def example(kind: int, count: int = 1) -> bytes:
     return encode(packet, reports)
 
 
-def test_the_bytes_are_those_on_record() -> None:
+def test_the_bytes_equal_the_recorded_bytes() -> None:
     lines = [f"schema version {SCHEMA_VERSION}"]
     for kind, name in ((KIND_CAM, "CAM"), (KIND_DENM, "DENM"), (KIND_CPM, "CPM"),
                        (KIND_SPAT, "SPAT")):  # fmt: skip

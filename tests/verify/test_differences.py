@@ -50,14 +50,14 @@ def test_arrays_of_another_shape_are_a_difference() -> None:
     assert (found.what, found.field, found.values) == ("rewards", "shape", ((1, 2), (1, 3)))
 
 
-def test_results_are_the_same_bytes_or_not() -> None:
+def test_results_differ_if_a_byte_differs() -> None:
     assert same_bytes({"a": np.array([np.nan])}, {"a": np.array([np.nan])})
     assert not same_bytes({"a": np.array([0.0])}, {"a": np.array([-0.0])})
 
 
 @pytest.mark.parametrize("name", ["rewards", "mask", "observations radar", "observations ego"])
 @pytest.mark.parametrize("place", [(0, 0), (1, 2)])
-def test_every_place_of_every_array_counts(name: str, place: tuple[int, int]) -> None:
+def test_a_difference_at_any_place_of_any_array_is_found(name: str, place: tuple[int, int]) -> None:
     def results(value: float) -> dict[str, Any]:
         arrays = {
             other: np.zeros((2, 3))

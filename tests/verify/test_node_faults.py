@@ -93,7 +93,7 @@ def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.s
     assert one.recv(100) == other.recv(100) == b""
 
 
-def test_pieces_are_late_side_by_side() -> None:
+def test_delays_of_pieces_do_not_add_up() -> None:
     num, apart_s, latency_s = 20, 0.005, 0.05
     network = FaultyNetwork(seed=0, latency_s=latency_s)
     try:
@@ -131,7 +131,7 @@ def test_no_threads_or_sockets_remain() -> None:
 
 
 @pytest.mark.parametrize("fault", [NetworkFault.DAMAGE, NetworkFault.SILENCE, STOP])
-def test_worlds_run_through_the_faulty_network(fault: str) -> None:
+def test_worlds_over_the_faulty_network_are_equal(fault: str) -> None:
     found = verify_node_faults("merge", [3], faults=[fault], seeds=1, zones=3, steps=25, **SMALL)
     (line,) = found.lines
     assert found.holds

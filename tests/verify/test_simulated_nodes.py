@@ -154,7 +154,7 @@ def test_a_run_is_a_function_of_its_seed() -> None:
     assert both.injected == lines[0].injected + lines[1].injected
 
 
-def test_faults_that_are_drawn_for_each_frame() -> None:
+def test_faults_drawn_for_each_frame_are_tolerated() -> None:
     tolerated = one_line("many_tolerated", seeds=2)
     assert not tolerated.wrong
     assert set(tolerated.injected) == set(TOLERATED_RATES)
@@ -167,7 +167,7 @@ def test_faults_that_are_drawn_for_each_frame() -> None:
     assert every.deaths > 0
 
 
-def test_the_caller_has_the_state_of_the_only_node() -> None:
+def test_a_lost_only_node_resumes_from_the_state_at_the_caller() -> None:
     line = one_line("kill", nodes=1, seeds=2)
     assert (line.wrong, line.equal, line.ended, line.deaths) == ([], 2, 0, 2)
 
@@ -182,7 +182,7 @@ def test_another_error_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "WorkerError: the zones of lost nodes" in line.wrong[0]
 
 
-def test_a_world_that_is_given_up_too_soon(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_world_that_is_given_up_too_soon_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
     """The next node has the state of the lost one."""
 
     def give_up(*arguments: Any) -> Any:
@@ -193,22 +193,22 @@ def test_a_world_that_is_given_up_too_soon(monkeypatch: pytest.MonkeyPatch) -> N
     assert "ended after 1 losses in a row" in line.wrong[0]
 
 
-def test_a_node_that_is_given_up_without_need(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A late answer is an answer."""
+def test_a_node_that_is_given_up_without_need_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A node that answers late is not lost."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_watch.PONG_S", 0.01)
     line = one_line("stale_heartbeat")
     assert "nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
 def test_nodes_that_ignore_a_rollback_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """They wait for ever for a node that only the caller has lost."""
+    """Such nodes wait for ever for a node that only the caller has lost."""
     monkeypatch.setattr(Links, "check_recovery", lambda self: None)
     assert one_line("partition", seeds=3).wrong
 
 
 @pytest.mark.slow
 def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Damaged or repeated frames are taken for other frames.
+    """Without a checksum, damaged or repeated frames pass for other frames.
 
     The content of frames is checked, too, so most of these frames are refused.
     """
@@ -217,7 +217,7 @@ def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch)
 
 
 def test_frames_without_a_sequence_number_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A frame arrives twice. Missing frames are detected by the content of others."""
+    """A frame arrives twice. Missing frames are detected by the content of other frames."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     assert one_line("duplicate", seeds=8).wrong
@@ -261,10 +261,10 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
         (FrameKind.GIVE, 1, "kill"),
     ],
 )
-def test_a_silent_connection_between_two_nodes(
+def test_a_silent_connection_between_two_nodes_loses_one_of_them(
     monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int, mix: str
 ) -> None:
-    """All nodes answer the caller; one of the two is given up, whatever the other node awaits."""
+    """All nodes answer the caller. One of the two is given up, whichever frame the other awaits."""
     seen = silenced(monkeypatch, kind, nth)
     keys: dict[str, Any] = {"agents": 12, "background": 20, "zones": 8, "steps": 24}
     found = verify_simulated_nodes(

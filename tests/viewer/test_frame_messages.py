@@ -94,7 +94,7 @@ def check(page: Page, frame: WorldFrame, message: bytes) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sets(st.integers(0, 40)), st.booleans(), st.booleans()), max_size=12))
-def test_watchers_that_miss_frames_or_come_late_see_the_same(
+def test_late_watchers_and_watchers_that_miss_frames_get_the_same_data(
     moments: list[tuple[set[int], bool, bool]],
 ) -> None:
     encoder = FrameEncoder(ORIGIN)

@@ -70,7 +70,7 @@ def test_a_page_chooses_among_the_worlds_that_a_program_steps(
         assert tick_of(client) % ticks == 0
         assert shown.publishers[0].published == 0
     monkeypatch.setattr(shown, "turn", None)
-    vec.step(vec.suggest_actions())  # no longer called
+    vec.step(vec.suggest_actions())  # the step no longer calls `turn`
 
 
 def test_showing_a_world_does_not_change_it() -> None:
@@ -122,7 +122,7 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
         vec.reset(seed=0)
         vec.step(vec.suggest_actions())
         assert "<iframe" in shown._repr_html_()
-        with joined(shown.address) as client:  # although no further step is run
+        with joined(shown.address) as client:  # although the program runs no further step
             assert tick_of(client) == vec.config.clock.ticks_per_step
         policy = httpx.get(shown.address).headers["content-security-policy"]
         assert "frame-ancestors 'self' http://127.0.0.1:* http://localhost:* vscode" in policy
@@ -132,7 +132,7 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
             assert again.address == shown.address
 
 
-def test_an_evaluation_is_watched_and_stays_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_watching_an_evaluation_does_not_change_it(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(CavVectorEnv, "watch", None)  # requests of the page
     keys: dict[str, Any] = {"agents": 2, "background": 2, "overrides": {"horizon_s": 5.0}}
     looks: list[int] = []

@@ -89,10 +89,10 @@ def turns(heard: Heard, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int,
         found = heard.turn()
         if found is not None and is_so(found):
             return found
-    raise AssertionError("it never came")
+    raise AssertionError("no such frame came")
 
 
-def test_it_plays_to_its_end_pauses_and_begins_again(
+def test_a_recording_plays_to_its_end_pauses_and_restarts(
     path: Path, loop: asyncio.AbstractEventLoop
 ) -> None:
     heard = Heard(path, loop)

@@ -186,7 +186,8 @@ def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Ser
     page.uncheck("#sensors")
     until(page, "viewer.shapes && viewer.shapes.all.length === 0")
     until(page, f"{drawn} < 20000 && {drawn} > 0")
-    assert not [one for one in problems if "getImageData" not in one]  # of the test itself
+    # The test itself causes this message.
+    assert not [one for one in problems if "getImageData" not in one]
 
 
 def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_path: Path) -> None:

@@ -40,7 +40,7 @@ def recorded(path: Path, *include: str) -> list[tuple[int, int, Any]]:
     return seen
 
 
-def test_shapes_of_a_replay_are_those_of_the_live_page(tmp_path: Path) -> None:
+def test_shapes_of_a_replay_equal_those_of_the_live_page(tmp_path: Path) -> None:
     seen = recorded(tmp_path / "run", "observations", "samples")
     sensors = RecordedSensors(Recording.open(tmp_path / "run"), 0, 0)
     names = set()

@@ -13,7 +13,7 @@ from cavmarl.viewer.run_clock import RunClock
 
 @pytest.fixture
 def now(monkeypatch: pytest.MonkeyPatch) -> SimpleNamespace:
-    """The time, `now.s`; it starts at 100 s."""
+    """Return a clock whose time is `now.s`, at first 100 s."""
     found = SimpleNamespace(s=100.0)
     monkeypatch.setattr(run_clock, "time", SimpleNamespace(monotonic=lambda: found.s))
     return found

@@ -123,7 +123,7 @@ def test_the_way_leads_from_the_vehicle_to_its_goal(told: Any) -> None:
     assert length_m == pytest.approx(row["to_go"], abs=10.0)
 
 
-def test_details_are_those_of_the_chosen_world() -> None:
+def test_details_belong_to_the_chosen_world() -> None:
     vec = make_vec("merge", num_envs=2, agents=2, background=4)
     vec.reset(seed=0)
     for _ in range(5):

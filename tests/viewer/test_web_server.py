@@ -278,7 +278,7 @@ def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
             assert first_of(client, 3)[1] == 0
 
 
-def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_goes_on(serve: Serve) -> None:
+def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_continues(serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, send_s=0.5), drives=False)
     served.run.clock.pace = 0.0
     large = Publication(b"\x03" + bytes(2**20), (Change(1, b""),))

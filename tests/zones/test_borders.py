@@ -48,7 +48,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
             id=100 * zone + np.arange(len(xy)),
         )
         parts.append(rows)
-    reach_m = MAX_SPEED_MPS * ahead_s  # the distance that a vehicle can drive until then
+    reach_m = MAX_SPEED_MPS * ahead_s  # distance that a vehicle can drive in this time
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
     if check_all:
@@ -63,13 +63,14 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
         ]
         expected = naive.near_borders(partition.reaching, zone, hysteresis_m, ahead_s, rows)
         margins = _margins(partition, zone, hysteresis_m, ahead_s, rows)
-        clear = {i for i, margin in enumerate(margins) if margin > 1e-6}  # squares round otherwise
+        # Squares are rounded differently.
+        clear = {i for i, margin in enumerate(margins) if margin > 1e-6}
         assert [e for e in told if e[0] in clear] == [e for e in expected if e[0] in clear]
     for entry in out[:found]:
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # the square of such a small distance is 0
+        if depth_m * depth_m == 0.0:  # the square of this small distance is 0
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)

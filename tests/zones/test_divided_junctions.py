@@ -47,7 +47,7 @@ def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
 def test_a_border_through_a_deadlock_on_equal_roads_changes_nothing(
     tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """Each vehicle yields to the vehicle on its right; chance decides which lets the others go."""
+    """Each vehicle yields to the vehicle on its right; a random draw decides which gives way."""
     here = DividedScene(build_crossing(tmp_path, "right_before_left"), tmp_path, corner_m, ("car",))
     for arm, goal in {"W": "E", "S": "N", "E": "W", "N": "S"}.items():
         here.put(arm, f"{arm}_in_0 {goal}_out_0", -0.2, wait_s=1.0, hold=HOLD_YIELD)
@@ -139,7 +139,7 @@ def test_a_vehicle_that_has_left_a_shorter_lane_is_seen_on_the_longer_lane(
     for vehicles in here.run(9.0):
         covered += int(vehicles["changed"]["side_lane"]) == right
     assert covered > 20
-    assert vehicles["follows"]["speed"] > 3.0, "and goes on where it has room"
+    assert vehicles["follows"]["speed"] > 3.0, "the vehicle continues where it has room"
 
 
 @pytest.fixture

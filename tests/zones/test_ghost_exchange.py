@@ -39,7 +39,7 @@ def ids(rows: NDArray[np.void]) -> list[int]:
 
 
 @given(st.data(), partitions(), st.booleans())
-def test_each_vehicle_is_taken_by_one_zone_in_the_given_order(
+def test_one_zone_takes_each_vehicle_in_the_given_order(
     data: st.DataObject, partition: ZonePartition, in_place: bool
 ) -> None:
     xy = data.draw(places(partition))

@@ -106,7 +106,7 @@ def test_the_longest_move_counts_jumps_over_junctions_without_lanes(tmp_path: Pa
     )
     assert longest_move_m(roads, travel("merge"), 1.0) == pytest.approx(
         10.0 * way_m + 2.0 * 20.0 + LENGTH_M / 2
-    ), "two in a tick"
+    ), "two jumps in a tick"
 
 
 def test_the_longest_move_counts_kinks() -> None:

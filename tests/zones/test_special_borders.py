@@ -17,8 +17,8 @@ from cavmarl.verify.equivalence import verify_zones
 from tests.support.borders import bounds_around, cut_at
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
-BRIDGE_M = 4.0  # distance of one road above another,
-NEAR_M = 5.0  # where points of both are this close in the plane
+BRIDGE_M = 4.0  # height of one road above another,
+NEAR_M = 5.0  # where points of both roads are this close in the plane
 Place = NDArray[np.float64]
 
 

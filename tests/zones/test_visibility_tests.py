@@ -88,7 +88,7 @@ def test_the_kernel_equals_its_twin(
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On these maps, only vans, buses and steered cars sweep over paths beside theirs.
+    # On these maps, only vans, buses and steered cars sweep over adjacent paths.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
 
@@ -98,7 +98,7 @@ def test_the_kernel_equals_its_twin(
 def test_merging_drivers_see_vehicles_beyond_the_previous_junction(
     tmp_path: Path, side_m: float, part: tuple[float, float, float, float]
 ) -> None:
-    """They are seen one lane farther if no vehicle has to stop before the junction."""
+    """Vehicles are seen one lane farther if no vehicle has to stop before the junction."""
     options = ("--grid.number", "7", "--grid.length", str(side_m), "-L", "2")
     net = netgenerate(tmp_path / "net.net.xml", "-g", "-j", "priority_stop", *options)
     roads = read_network(net)
@@ -114,7 +114,7 @@ def test_merging_drivers_see_vehicles_beyond_the_previous_junction(
 
 
 @pytest.mark.parametrize(("junctions", "seen"), [("right_before_left", 4), ("priority", 1)])
-def test_on_equal_roads_vehicles_are_seen_to_which_foes_yield(
+def test_on_equal_roads_vehicles_to_which_foes_yield_are_seen(
     tmp_path: Path, junctions: str, seen: int
 ) -> None:
     """A driver checks for a deadlock along the vehicles to which each vehicle yields."""

@@ -129,11 +129,12 @@ def test_exactly_the_vehicles_that_matter_are_seen(seed: int, zones: int) -> Non
     assert 0.05 * VEHICLES < seen < (zones - 1) * VEHICLES
 
 
-def test_zones_watch_lanes_that_they_ask_about_and_those_beside_them() -> None:
+def test_zones_watch_lanes_that_they_ask_about_and_adjacent_lanes() -> None:
     roads = network("grid4x4")
     partition = cut_map(roads, "grid", 4)
     looks = blank_looks((4, len(roads.lanes)))
-    far = int(np.argmax(roads.lanes["min_x"] + roads.lanes["min_y"]))  # to the zone at the origin
+    # Distance to the zone at the origin.
+    far = int(np.argmax(roads.lanes["min_x"] + roads.lanes["min_y"]))
     looks["line"][0, far] = 3.0
     start, watchers = lane_watchers(partition, roads.lanes, looks, 20.0)
     halo = zone_halo(partition, 100.0)._replace(watcher_start=start, watchers=watchers)

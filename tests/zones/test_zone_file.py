@@ -30,7 +30,7 @@ def test_a_written_zone_file_is_read_back(tmp_path: Path, partition: ZonePartiti
     assert json.loads(path.read_text())["schema"] == "cavmarl.zones"
 
 
-def test_yaml_and_any_order_do(tmp_path: Path) -> None:
+def test_yaml_and_any_order_of_zones_are_accepted(tmp_path: Path) -> None:
     path = tmp_path / "zones.yaml"
     path.write_text(
         "schema: cavmarl.zones\nversion: 1\nbounds_m: [0, 0, 2, 1]\nzones:\n"
@@ -90,7 +90,7 @@ def test_bad_files_are_refused_with_the_place(tmp_path: Path, change: Change, wo
 
 
 @pytest.mark.parametrize("number", [".nan", ".inf", "-.inf"])
-def test_numbers_are_finite(tmp_path: Path, number: str) -> None:
+def test_numbers_that_are_not_finite_are_refused(tmp_path: Path, number: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(json.dumps(document()).replace("[20.0, 0.0", f"[20.0, {number}"))
     with pytest.raises(ConfigError, match=r"bad\.yaml: "):
@@ -112,7 +112,7 @@ def test_an_unwritable_zone_file_is_an_error(tmp_path: Path) -> None:
         write_zones(tmp_path / "no" / "folder.json", four())
 
 
-def test_a_file_must_be_of_this_map_and_number(
+def test_a_file_for_another_map_or_number_of_zones_is_refused(
     tmp_path: Path, crossing: Callable[..., Path]
 ) -> None:
     network, path = read_network(crossing()), tmp_path / "zones.json"

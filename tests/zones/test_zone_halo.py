@@ -11,7 +11,7 @@ from tests.support.partitions import PINWHEEL, four
 
 
 @pytest.mark.parametrize("value", [-1.0, math.inf, math.nan])
-def test_a_halo_is_a_finite_number_from_0(value: float) -> None:
+def test_a_negative_or_infinite_halo_is_refused(value: float) -> None:
     with pytest.raises(ConfigError, match="halo_m = "):
         zone_halo(four(), value)
 
@@ -26,7 +26,7 @@ def test_near_zones_are_those_within_the_halo() -> None:
     assert near(10.0) == [[0, 1, 2, 3, 4]] * 5
 
 
-def test_the_inner_part_is_out_of_others_halos() -> None:
+def test_the_inner_part_of_a_zone_is_outside_of_other_halos() -> None:
     halo = zone_halo(PINWHEEL, 3.0)
     assert halo.inner[4] == pytest.approx([13.0, 13.0, 17.0, 17.0])
     assert halo.inner[0].tolist()[:2] == [-math.inf, -math.inf]

@@ -50,7 +50,7 @@ def test_grids_have_equal_cells(
     assert sides == pytest.approx(np.full((count, 2), (210.0 / shape[1], 210.0 / shape[0])))
 
 
-def test_lanes_are_sampled_whole(cross: RoadNetwork) -> None:
+def test_lanes_are_sampled_from_end_to_end(cross: RoadNetwork) -> None:
     segments, samples = lane_segments(cross), lane_samples(cross)
     assert samples[:, 2].sum() == pytest.approx(5 * 95.0)
     assert np.hypot(*(segments[:, 2:] - segments[:, :2]).T).sum() == pytest.approx(5 * 95.0)
@@ -59,7 +59,7 @@ def test_lanes_are_sampled_whole(cross: RoadNetwork) -> None:
     assert not east[:, 1].any()
 
 
-def test_junctions_have_their_inside_s_box(cross: RoadNetwork) -> None:
+def test_the_box_of_a_junction_contains_its_internal_lanes(cross: RoadNetwork) -> None:
     half = 0.5 * cross.lanes["width_m"][0]
     assert junction_boxes(cross) == pytest.approx(
         np.array([[-5.0 - half, -5.0 - half, 5.0 + half, 5.0 + half]])
@@ -84,7 +84,7 @@ def test_zones_can_have_equal_density_instead_of_lane_length(cross: RoadNetwork)
         cut_map(cross, "bisection", 2, density=crowd * np.nan)
 
 
-def test_no_other_weight_is_known(cross: RoadNetwork) -> None:
+def test_an_unknown_weight_is_refused(cross: RoadNetwork) -> None:
     with pytest.raises(ConfigError, match="weight 'speed' does not exist; use lane_length"):
         cut_map(cross, "bisection", 2, weight="speed")
 
@@ -143,7 +143,7 @@ def test_bisection_divides_lane_length_evenly(city: RoadNetwork) -> None:
     assert kept.junctions_cut <= plain.junctions_cut
 
 
-def test_junctions_are_kept_whole_where_they_can(shared_maps: Path) -> None:
+def test_junctions_are_not_cut_if_possible(shared_maps: Path) -> None:
     town = load_network(map_file(shared_maps / "xodr/Town04.xodr"))
     plain, kept = (
         zone_statistics(cut_map(town, "bisection", 4, avoid_junctions=avoid), town)

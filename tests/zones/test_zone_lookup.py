@@ -92,7 +92,7 @@ def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
     car = cars(np.array([[7.0, 16.0]]))
     assert ghosts(four(), 5.0, car, 0) == [[], [0], [0], [0]]
     assert ghosts(four(), 4.9, car, 0) == [[], [0], [0], []]
-    # In another zone than its own, because a transfer is late.
+    # The vehicle is not in its owner's zone, because a transfer is late.
     assert ghosts(PINWHEEL, 1.0, cars(np.array([[15.0, 15.0]])), 0) == [[], [], [], [], [0]]
 
 
@@ -104,7 +104,7 @@ def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
     drift_m = 2.0 + (deferred + 1) * 5.0
     places_then = data.draw(places(partition))
     owners = partition.zones_of(places_then)
-    # Each vehicle has moved since then, as far as it can without a new owner.
+    # Since the last exchange, each vehicle has moved as far as it can without a new owner.
     headings = data.draw(st.lists(st.floats(0.0, 6.3), min_size=len(owners), max_size=len(owners)))
     now = places_then + drift_m * np.stack([np.cos(headings), np.sin(headings)], axis=1) * (
         1 - 1e-12

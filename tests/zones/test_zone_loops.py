@@ -13,7 +13,7 @@ def entry(name: str) -> RoadNetwork:
     return load_network(resolve_map(*load_config(name)))
 
 
-def test_points_lanes_and_edges_lie_in_order() -> None:
+def test_points_of_lanes_and_lanes_of_edges_are_stored_in_order() -> None:
     network = entry("grid4x4")
     lanes, edges = network.lanes, network.edges
     assert (np.diff(lanes["first_point"]) == lanes["num_points"][:-1]).all()
@@ -32,6 +32,6 @@ def test_blocks_of_a_city_are_loops() -> None:
     assert zones_without_loop(city, cut_map(city, "strips", 4)) != ()
 
 
-def test_a_road_through_has_none() -> None:
+def test_a_through_road_has_no_loop() -> None:
     merge = entry("merge")
     assert zones_without_loop(merge, cut_map(merge, "strips", 3)) == (0, 1, 2)

@@ -46,12 +46,12 @@ def test_neighbors_are_mutual(partition: ZonePartition) -> None:
             assert Neighbor(zone, other.corner) in partition.neighbors[other.zone]
 
 
-def test_the_hash_is_of_the_division() -> None:
+def test_the_hash_depends_on_the_division_only() -> None:
     plain = four()
     assert plain.content_hash == four().content_hash
     assert plain.content_hash != four(np.nextafter(10.0, 11.0)).content_hash
     assert plain.content_hash != ZonePartition(BOUNDS, plain.rects[::-1]).content_hash
-    # Points have the same owners, whatever box was cut.
+    # Points have the same owners for any box that was cut.
     wider = np.where(plain.rects == -40.0, -45.0, plain.rects)
     assert plain.content_hash == ZonePartition((-45.0, *BOUNDS[1:]), wider).content_hash
     assert four(0.0).content_hash == four(-0.0).content_hash
@@ -82,7 +82,7 @@ def test_an_invalid_division_is_refused(change: tuple[int, int, float], words: s
         ZonePartition(BOUNDS, rects)
 
 
-def test_bounds_are_zones_too() -> None:
+def test_invalid_bounds_are_refused() -> None:
     with pytest.raises(ConfigError, match="there are no zones"):
         ZonePartition(BOUNDS, np.empty((0, 4)))
     with pytest.raises(ConfigError, match=r"bounds_m: .* must be finite"):

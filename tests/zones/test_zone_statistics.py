@@ -74,7 +74,7 @@ def test_imbalance_is_maximum_over_mean() -> None:
     assert imbalance([0.0, 0.0]) == 1.0
 
 
-def test_figures_become_json(cross: RoadNetwork) -> None:
+def test_figures_can_be_written_as_json(cross: RoadNetwork) -> None:
     plain = zone_statistics(halves(0.0), cross).to_dict()
     assert plain["lane_imbalance"] == pytest.approx(1.2)
     assert plain["junctions_cut"] == 1

@@ -7,10 +7,12 @@ from functools import partial
 import typer
 
 from cavmarl.cli.bench import signals, step, traffic, train
-from cavmarl.cli.output import add_command
+from cavmarl.cli.output import CliGroup, add_command
 from cavmarl.cli.report_command import report_command
 
-app = typer.Typer(help="Measure speed side by side with other simulators.", no_args_is_help=True)
+app = typer.Typer(
+    cls=CliGroup, help="Measure speed side by side with other simulators.", no_args_is_help=True
+)
 _add = partial(add_command, app)
 
 _add("step", report_command(step.step), "cavmarl bench step --agents 20 --repeats 3")

@@ -6,16 +6,15 @@ from functools import partial
 from typing import Any
 
 import typer
-from typer.core import TyperGroup
 
-from cavmarl.cli.output import add_command
+from cavmarl.cli.output import CliGroup, add_command
 from cavmarl.cli.verify import determinism, nodes, workers, zones
 from cavmarl.core.errors import ConfigError
 
 __all__ = ["app"]
 
 
-class _Checks(TyperGroup):
+class _Checks(CliGroup):
     """A group that names the checks if an environment or an option is given in their place."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:

@@ -28,7 +28,7 @@ STEPS, SEEDS, PROCESS_RUNS = 200, 65, 3
 Env = Annotated[
     str | None,
     typer.Argument(
-        metavar="[ENV]",
+        metavar="ENV",
         help="Environment: its name, its folder, a map file or a .sumocfg.",
         show_default="with --faults: a busy grid4x4",
     ),

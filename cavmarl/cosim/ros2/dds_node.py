@@ -16,7 +16,7 @@ from weakref import WeakValueDictionary
 from cavmarl.core.errors import ConfigError, RosError, require
 from cavmarl.cosim.ros2.ros_types import RosTypes
 
-MAX_DOMAIN = 101  # higher ones need ports that Linux gives to other programs
+MAX_DOMAIN = 101  # higher domains need ports that Linux gives to other programs
 _MAX_PARTICIPANTS = 32
 _KEPT_SAMPLES = 10
 _MAX_BLOCKING_S = 10
@@ -32,7 +32,7 @@ _LOOPBACK = f"""<CycloneDDS><Domain id="any">
 <Peers><Peer address="127.0.0.1"/></Peers></Discovery>
 </Domain></CycloneDDS>"""
 
-_DOMAINS: WeakValueDictionary[int, Any] = WeakValueDictionary()  # those of this process
+_DOMAINS: WeakValueDictionary[int, Any] = WeakValueDictionary()  # domains of this process
 _LOCK = Lock()
 
 
@@ -46,16 +46,16 @@ class Received(NamedTuple):
 class DdsNode:
     """A node with publishers and subscriptions on one domain.
 
-    It reaches the programs of this machine. If the environment has `CYCLONEDDS_URI`, it reaches
-    the network which this configuration describes.
+    The node reaches programs on this machine. If the environment variable `CYCLONEDDS_URI` is set,
+    the node uses the network of that configuration.
 
     Args:
         types: message types.
         name: name of the node.
         domain: ROS_DOMAIN_ID.
-        publishers: kind by topic.
-        subscriptions: kind by topic.
-        latched: topics whose last message a late subscriber gets.
+        publishers: message type of each published topic.
+        subscriptions: message type of each subscribed topic.
+        latched: topics whose last message late subscribers get.
 
     Raises:
         ConfigError: the domain is out of range.
@@ -131,7 +131,7 @@ class DdsNode:
         found = []
         for sample in self._readers[topic].take(_KEPT_SAMPLES):
             data = getattr(sample, "cdr", None)
-            if data is not None:  # otherwise it tells that a publisher has left
+            if data is not None:  # a sample without data says that a publisher has left
                 found.append(Received(data, sample.sample_info.publication_handle))
         return found
 
@@ -177,8 +177,8 @@ class DdsNode:
     def _quality(self, kind: str, latched: bool, depth: int, is_writer: bool = True) -> Any:
         policy = self._dds["qos"].Policy
         duration = self._dds["util"].duration
-        # A publisher offers the most, so that every subscriber matches; a subscriber asks for the
-        # least, so that every publisher does.
+        # Publishers offer the strongest quality of service, so that every subscriber matches.
+        # Subscribers ask for the weakest, so that every publisher matches.
         reliable = policy.Reliability.Reliable(duration(seconds=_MAX_BLOCKING_S))
         policies = [
             reliable if is_writer else policy.Reliability.BestEffort,
@@ -196,7 +196,7 @@ class DdsNode:
         return self._dds["qos"].Qos(*policies)
 
     def _class_of(self, kind: str) -> Any:
-        """Return the DDS class of a type: described field by field, its samples are CDR bytes."""
+        """Return the DDS class of a type, described field by field; its samples hold CDR bytes."""
         if kind in self._classes:
             return self._classes[kind]
         nodes: Any = require("rosbags.interfaces", "ros2").Nodetype
@@ -238,7 +238,7 @@ class DdsNode:
         return cls
 
     def _tell_graph(self) -> None:
-        """Tell the name of the node, which `ros2 node list` shows."""
+        """Publish the name of the node, for `ros2 node list`."""
         size = self._types.fields_of("rmw_dds_common/msg/Gid")[0][1][1][1]
 
         def gid(entity: Any) -> dict[str, Any]:

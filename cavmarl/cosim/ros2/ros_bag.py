@@ -47,7 +47,7 @@ class BagWriter:
         self._connections: dict[str, Any] = {}
 
     def write(self, message: RosMessage, data: bytes | None = None) -> None:
-        """Write a message; `data`: the same in CDR, if it is known."""
+        """Write a message; `data`: its encoding in CDR, if the caller has it."""
         topic = message.topic
         if topic not in self._connections:
             self._connections[topic] = self._writer.add_connection(

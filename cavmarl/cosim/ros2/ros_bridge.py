@@ -1,8 +1,8 @@
 """`RosBridge`: follows the clock of a world, publishes it over ROS 2, and drives by ROS messages.
 
-A cycle: the snapshot of a tick arrives; sensors and states are published with its time, then
-`/clock`; the bridge waits for commands as `wait` says; it answers. It makes no world, ticks none,
-and sets no pace.
+In each cycle, the bridge receives the snapshot of a tick, and publishes sensors and states with the
+time of the tick, then `/clock`. It waits for commands according to `wait`, and answers. The bridge
+starts no world, ticks no world, and sets no pace.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class RosOptions:
         deadline_s: a step waits at most this long, wall time; then the last command is held.
         lag_steps: a command may be this many steps old.
         ready_s: the first step waits this long for a publisher of commands of each vehicle.
-        truth: whether true states are published, which the world has to allow.
+        truth: whether true states are published; the world must allow it.
         names: names of topics and frames by sensor; see `ros_topics.read_names`.
         bag: folder of a bag with all published messages; None: no bag.
     """
@@ -80,12 +80,12 @@ class RosBridge:
 
     Args:
         follower: the connection to the world; its `truth` must be that of `options`.
-        options: options.
+        options: settings of the bridge.
 
     Attributes:
         sent: number of messages by topic.
         steps: number of answered snapshots.
-        wait_wall_s: time of waiting for commands, wall time.
+        wait_wall_s: wall time that was spent waiting for commands.
 
     Raises:
         ConfigError: a vehicle has actions of another kind or no speed, or names of topics clash.
@@ -195,8 +195,8 @@ class RosBridge:
         self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
-                "no node publishes commands of %s on domain %d: the vehicles brake until then; "
-                "topics: %s",
+                "no node publishes commands of %s on domain %d: the vehicles brake until a node "
+                "publishes commands; topics: %s",
                 ", ".join(silent),
                 self._options.domain,
                 ", ".join(self._controls[silent[0]].topics),
@@ -276,7 +276,7 @@ class RosBridge:
     def _until(
         self, seconds: float, is_done: Callable[[], bool], bases: Mapping[str, float]
     ) -> None:
-        """Read commands until something is so, or the time is over; repeat the clock meanwhile."""
+        """Read commands until `is_done` returns True or the time is over; repeat the clock."""
         end_s = time.monotonic() + seconds
         repeat_s = time.monotonic() + _REPEAT_S
         while not is_done() and (left_s := end_s - time.monotonic()) > 0.0:
@@ -290,7 +290,7 @@ class RosBridge:
         return any(map(self._node.publishers_of, self._controls[vehicle].topics))
 
     def _drain(self, bases: Mapping[str, float]) -> None:
-        self._node.take(CLOCK)  # its messages are those of this node
+        self._node.take(CLOCK)  # discard this node's own messages
         for name, wheelbase_m in bases.items():
             controls = self._controls[name]
             for topic in controls.topics:
@@ -312,8 +312,8 @@ def join(
     Args:
         address: path of a Unix socket, or a port of this machine.
         vehicles: agents to drive.
-        options: options.
-        secret: of the world, if it listens at a port.
+        options: settings of the bridge.
+        secret: the world's secret, if the world listens at a port.
         joins_s: maximum time for the world to accept the bridge.
         steps: number of steps; None: until the world ends.
 

@@ -1,7 +1,8 @@
 """Controls of vehicles from ROS messages.
 
-A command has the angle of the front wheels and an acceleration, or a speed that is reached with
-`SPEED_TIME_S`. Angles hold for `base_link`, the middle of the rear axle.
+A command has the steering angle of the front wheels, and an acceleration or a speed. The vehicle
+approaches the speed with the time constant `SPEED_TIME_S`. Steering angles and yaw rates refer to
+`base_link`, the middle of the rear axle.
 """
 
 from __future__ import annotations
@@ -14,19 +15,19 @@ from typing import Any, NamedTuple
 from cavmarl.cosim.followers.follower_messages import Welcome
 from cavmarl.cosim.ros2.ros_types import RosTypes, ns_of
 
-SPEED_TIME_S = 0.5  # time constant of reaching a commanded speed
+SPEED_TIME_S = 0.5  # time constant of the approach to a commanded speed
 NEVER = -(1 << 62)  # ns, before all times
-_STANDS_MPS = 0.05  # below this speed, a turn on the spot is a full turn of the wheels
+_STANDS_MPS = 0.05  # below this speed, a commanded yaw rate means full steering
 
 
 class Command(NamedTuple):
-    """What a message commands."""
+    """The command of a message."""
 
     stamp_ns: int
     steering_rad: float
-    acceleration_mps2: float | None  # None: the speed says
-    speed_mps: float  # wanted speed, if there is no acceleration
-    limit_mps2: float = math.inf  # of the acceleration with which the speed is reached
+    acceleration_mps2: float | None  # None: `speed_mps` is the target
+    speed_mps: float  # target speed, if there is no acceleration
+    limit_mps2: float = math.inf  # largest acceleration towards `speed_mps`
 
 
 def _ackermann(message: Any, wheelbase_m: float) -> Command:
@@ -71,12 +72,12 @@ def control_topics(vehicle: str, is_plain: bool) -> dict[str, str]:
 
 @dataclass
 class ControlCounts:
-    """What has happened to the commands of a vehicle."""
+    """Counts of the commands of a vehicle."""
 
     received: int = 0  # messages
     used: int = 0  # steps with a command of their time
-    held: int = 0  # steps with an older command, or with none: the vehicle brakes
-    late: int = 0  # steps in which none came before the deadline
+    held: int = 0  # steps with an older command, or without any (the vehicle brakes)
+    late: int = 0  # steps in which no command came before the deadline
     old: int = 0  # messages older than a used message
     invalid: int = 0  # messages with NaN, infinity, or bytes that are no message
     limited: int = 0  # steps in which a command was beyond the limits of the vehicle
@@ -85,13 +86,14 @@ class ControlCounts:
 class VehicleControls:
     """The commands of one vehicle.
 
-    `vehicle`: id of its agent. `types`: message types. `welcome`: of the world.
+    `vehicle`: id of its agent. `types`: message types. `welcome`: the world's first message.
+    `is_plain`: whether topics have the names of the profile `plain`.
     """
 
     def __init__(self, vehicle: str, types: RosTypes, welcome: Welcome, is_plain: bool) -> None:
         self.topics = control_topics(vehicle, is_plain)
         self.counts = ControlCounts()
-        self.steering_rad = 0.0  # to which the vehicle was last told to steer
+        self.steering_rad = 0.0  # steering angle of the last control
         self._types = types
         self._most = welcome.acceleration_mps2, welcome.steering_rad
         self._last: Command | None = None
@@ -124,9 +126,9 @@ class VehicleControls:
         self.steering_rad = 0.0
 
     def control(self, due_ns: int, speed_mps: float) -> list[float]:
-        """Return the control, two numbers in [-1, 1], and count how it was found.
+        """Return throttle and steering in [-1, 1], and count the kind of their command.
 
-        `due_ns`: a command from this time on is in time. `speed_mps`: of the vehicle.
+        `due_ns`: earliest time of a command that is in time. `speed_mps`: speed of the vehicle.
         """
         if self._last is None:
             self.counts.held += 1

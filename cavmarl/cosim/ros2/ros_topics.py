@@ -1,4 +1,4 @@
-"""`VehicleTopics` and `WorldTopics`: what is published about a world, as messages by topic."""
+"""`VehicleTopics` and `WorldTopics`: the messages that are published about a world, by topic."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ def kinds_of_world(truth: bool) -> dict[str, str]:
 
 
 class RosClock:
-    """ROS time of a world: it goes on over episodes, as ROS time must not go back.
+    """ROS time of a world. It increases across episodes, because ROS time must not go back.
 
     `dt_s`: length of a tick; `ticks_per_step`: ticks of a step.
     """
@@ -85,7 +85,7 @@ class RosClock:
 class SensorNames:
     """Names of a sensor."""
 
-    topic: str  # topics are this, with a part such as `image_raw` behind it
+    topic: str  # the topic, or the prefix of topics such as `…/image_raw`
     frame: str
 
 
@@ -259,7 +259,7 @@ class VehicleTopics:
     ) -> Iterator[RosMessage]:
         """Yield the messages about the vehicle in the profile `autoware`.
 
-        `steering_rad`: angle to which the vehicle was last told to steer.
+        `steering_rad`: steering angle of the last control.
         """
         if self.is_plain:
             return
@@ -334,8 +334,8 @@ class WorldTopics:
     ) -> Iterator[RosMessage]:
         """Yield the wanted messages of a snapshot, in a fixed order; the clock comes last.
 
-        `/tf_static` is always included when it has changed. `steering_rad`: angle to which each
-        vehicle was last told to steer.
+        `/tf_static` is always included when it has changed. `steering_rad`: steering angle of
+        the last control of each vehicle.
         """
         snapshot, clock = view.snapshot, self.clock
         clock.set(snapshot.episode, snapshot.tick)

@@ -1,4 +1,4 @@
-"""`RosTypes`: the message types of a ROS 2 distribution, and those of Autoware that are used here.
+"""`RosTypes`: message types of a ROS 2 distribution, and the types of Autoware that cavmarl uses.
 
 Types and their encoding come from `rosbags`. The definitions below are the fields of packages that
 `rosbags` does not have: `ackermann_msgs` and Autoware's (autoware_msgs, main, 2026).
@@ -110,7 +110,7 @@ class RosTypes:
         """
         try:
             return self.store.deserialize_cdr(data, kind)
-        except Exception as error:  # of any class, for bytes of strangers
+        except Exception as error:  # invalid bytes raise errors of any class
             raise ValueError(f"{len(data)} bytes are no {kind}: {error}") from error
 
     def _message(self, kind: str, fields: dict[str, Any]) -> Any:

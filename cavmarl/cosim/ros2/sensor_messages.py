@@ -198,7 +198,7 @@ def _imu(settings: Settings, sample: NDArray[Any], stamp_ns: int, frame: str) ->
     fields = {
         "header": header_of(stamp_ns, frame),
         "orientation": {"w": 1.0},
-        "orientation_covariance": [-1.0] + [0.0] * 8,  # it measures no orientation
+        "orientation_covariance": [-1.0] + [0.0] * 8,  # -1: not measured
         "angular_velocity": vector(sample[3:]),
         "angular_velocity_covariance": covariance(settings["noise"], 3),
         "linear_acceleration": vector(sample[:3]),
@@ -227,7 +227,7 @@ def _odometry(_: Settings, sample: NDArray[Any], stamp_ns: int, frame: str) -> l
     return [Made("", "geometry_msgs/msg/TwistStamped", fields)]
 
 
-# By type of sensor: the function that makes its messages, and end and type of each topic.
+# By sensor type: the function that makes messages, and the suffix and type of each topic.
 SENSORS: dict[str, tuple[Make, tuple[tuple[str, str], ...]]] = {
     "lidar": (_lidar, (("points", "sensor_msgs/msg/PointCloud2"),)),
     "radar": (_radar, (("points", "sensor_msgs/msg/PointCloud2"),)),

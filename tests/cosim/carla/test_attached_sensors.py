@@ -206,7 +206,7 @@ def test_a_collision_is_reported_with_the_last_frame_of_its_vehicle(
         sensor = session.spawn("sensor.other.collision", {}, ROOF, agent.number)
         steering_rad = session.world.env.config.action.steering_rad
         for _ in range(1000):
-            # The axles of an agent are a length apart, those of CARLA's vehicles are closer.
+            # An agent's wheelbase is its length; CARLA's vehicles have a shorter wheelbase.
             angle = steering_rad * float(session.world.env.suggest_actions()["car_0"][1])
             steer = -same_turn(angle, WHEELBASE_SHARE) / FULL_STEER_RAD
             session.world.controls[0] = CarlaControl(throttle=0.7, steer=steer)

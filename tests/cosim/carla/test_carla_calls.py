@@ -1,4 +1,4 @@
-"""Each call answers in CARLA's form, whatever its arguments are, and faults change nothing."""
+"""Each call answers in CARLA's form for any arguments, and faults change nothing."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def test_poses_outside_of_the_world_are_refused(
             call(name, *arguments)
 
 
-def test_blueprints_have_recommended_values_for_what_can_be_changed(call: Call) -> None:
+def test_attributes_that_can_be_changed_have_recommended_values(call: Call) -> None:
     for _, type_id, tags, attributes in call("get_actor_definitions"):
         assert set(tags.split(",")) == set(type_id.split("."))
         for name, kind, default, recommended, can_change, _ in attributes:
@@ -211,7 +211,7 @@ def test_ticks_of_a_second_client_are_noticed(
         answer(first, session, "tick_cue", [])
         assert master.own_ticks == 1
         session.release(first)
-        answer(second, session, "tick_cue", [])  # it is the master now
+        answer(second, session, "tick_cue", [])  # the second client is the master now
         assert master.own_ticks == 1
 
 
@@ -237,7 +237,7 @@ def test_a_map_is_loaded_by_its_name(session: CarlaSession, call: Call) -> None:
     call("load_new_episode", "", True, 0)
     assert session.map.path == "Carla/Maps/intersection"
     call("load_new_episode", "grid4x4", True, 0)
-    assert len(session.world.env.agents) == 3  # as the server was started
+    assert len(session.world.env.agents) == 3  # the map with which the server was started
     assert not {"cities", "cities_validation"} & {
         name.rpartition("/")[2] for name in call("get_available_maps")
     }

@@ -77,7 +77,7 @@ def test_long_ids_of_signals_are_replaced() -> None:
     assert [one.get("id") for one in root.iterfind("junction/controller")] == ["c"]
 
 
-def test_junctions_lead_only_to_lanes_for_cars() -> None:
+def test_junctions_connect_only_lanes_for_cars() -> None:
     root = fromstring(
         '<OpenDRIVE><road id="1"><lanes><laneSection><right><lane id="-1" type="restricted"/>'
         '<lane id="-2" type="driving"/></right></laneSection></lanes></road><road id="2"><lanes>'

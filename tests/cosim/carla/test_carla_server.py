@@ -153,7 +153,7 @@ def env() -> Iterator[cavmarl.CavEnv]:
     made.close()
 
 
-def test_a_second_server_does_not_get_the_port() -> None:
+def test_a_second_server_on_the_same_port_is_refused() -> None:
     with make_server() as server, pytest.raises(ServiceError, match=r"give another --port"):
         CarlaServer(server.session.source, port=server.port)
 

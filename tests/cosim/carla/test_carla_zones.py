@@ -21,7 +21,7 @@ from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
 from tests.cosim.carla.conftest import client_python, run_client, running_server
 from tests.support.zone_simulators import step_on
 
-# No client ticks at first, so the first snapshot may come later than the first call.
+# At first no client ticks, so this program waits until a snapshot has vehicles.
 DESTROY = """
 import time
 until = time.monotonic() + 10.0
@@ -111,7 +111,7 @@ def test_vehicles_cross_the_borders_of_carla_zones_and_none_is_lost(
         assert stats["contacts"] <= 2
         assert np.quantile(far, 0.9) < 0.5, "they drive on the middle of their lanes"
     assert not any(map(is_running, pids))
-    # The client shows the signals of this world there.
+    # The client sets CARLA's traffic lights to the states of this world without an error.
     assert "set_traffic_light_state" not in caplog.text
 
 

@@ -31,7 +31,7 @@ def client(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.mark.parametrize("env", ENVS)
 @pytest.mark.usefixtures("client")
-def test_it_reads_the_export_of_each_map(env: str) -> None:
+def test_carlas_library_reads_the_export_of_each_map(env: str) -> None:
     path = find_map(env)
     found = check_with_client(load_network(path), path, path)
     assert found.problems == []
@@ -42,7 +42,7 @@ def test_it_reads_the_export_of_each_map(env: str) -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_it_reads_the_exports_of_a_family_of_maps() -> None:
+def test_carlas_library_reads_the_exports_of_a_family_of_maps() -> None:
     """Movements, junctions and lanes with lights are complete."""
     totals = dict.fromkeys(("movements", "junctions", "lanes with lights"), 0)
     for path in resolve_maps(*load_config("cities")):

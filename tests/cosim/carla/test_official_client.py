@@ -19,7 +19,7 @@ world.apply_settings(settings)
 """
 
 
-def test_it_connects_and_waits_for_ticks(port: int) -> None:
+def test_the_client_connects_and_waits_for_ticks(port: int) -> None:
     found = run_client(
         port,
         """
@@ -55,7 +55,7 @@ found["spectator"] = spectator.get_location().z
     assert found["spectator"] == pytest.approx(30.0)
 
 
-def test_its_map_is_the_map_of_the_world(port: int) -> None:
+def test_the_map_of_the_client_is_the_map_of_the_world(port: int) -> None:
     found = run_client(
         port,
         SYNCHRONOUS
@@ -99,7 +99,7 @@ found["off_lane"] = max(
     assert found["off_lane"] < 2.0
 
 
-def test_the_place_on_the_earth_is_that_of_the_gnss(port: int) -> None:
+def test_geolocations_of_the_client_equal_the_gnss(port: int) -> None:
     found = run_client(
         port,
         SYNCHRONOUS
@@ -256,7 +256,7 @@ found["frames"] = [frames[1] - frames[0], frames[2] - frames[1]]
     assert found["frames"] == [1, 1]
 
 
-def test_it_reads_the_answer_of_each_of_its_methods(port: int) -> None:
+def test_the_client_reads_the_answer_of_each_of_its_methods(port: int) -> None:
     """A wrong answer is `std::bad_cast`; a refused call has a reason, or no answer at all."""
     found = run_client(
         port,

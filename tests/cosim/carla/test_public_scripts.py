@@ -117,10 +117,10 @@ def test_frames_of_sensors_come_with_their_ticks(name: str, tmp_path: Path) -> N
         copy.write_text((where / name).read_text("utf-8").replace("2000", str(port)), "utf-8")
         for _ in range(5):
             process = started([str(copy)], where)
-            with suppress(subprocess.TimeoutExpired):  # it runs until it is interrupted
+            with suppress(subprocess.TimeoutExpired):  # the program runs until it is interrupted
                 process.wait(8.0)
             text = ended(process)
-            if "Spawn failed because of collision" not in text:  # a random place can be taken
+            if "Spawn failed because of collision" not in text:  # the random place is occupied
                 break
     assert "Cancelled by user. Bye!" in text or "Exited by user." in text, text
     assert "Traceback" not in text
@@ -128,7 +128,7 @@ def test_frames_of_sensors_come_with_their_ticks(name: str, tmp_path: Path) -> N
 
 
 def test_agents_navigation_finds_routes_between_spawn_points() -> None:
-    """A junction with lanes for others, or a spawn point on a way out, would have no route."""
+    """Lanes that cars may not use, or spawn points on roads out of the map, would have no route."""
     agents = str(folder("PythonAPI", "carla"))
     with running_server(agents=1, background=0, env="town") as port:
         found = run_client(

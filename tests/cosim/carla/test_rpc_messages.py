@@ -1,4 +1,4 @@
-"""Requests of CARLA's clients: what is read, and what ends the connection."""
+"""Requests of CARLA's clients: accepted requests, and bytes that end the connection."""
 
 from __future__ import annotations
 

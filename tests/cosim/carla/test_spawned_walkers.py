@@ -16,7 +16,7 @@ from tests.cosim.carla.test_official_client import FREE, SYNCHRONOUS
 WALKER = [0, "walker.pedestrian.0001", []]
 
 
-def test_a_walker_walks_where_its_control_says(session: CarlaSession, call: Call) -> None:
+def test_a_walker_walks_in_the_direction_of_its_control(session: CarlaSession, call: Call) -> None:
     number = call("spawn_actor", WALKER, [[30.0, -7.0, 1.0], [0.0, 90.0, 0.0]])[0]
     session.tick()
     actor = session.actors.actors[number]

@@ -67,7 +67,7 @@ def test_frozen_lights_keep_their_states_and_their_times(own_session: CarlaSessi
     assert states["elapsed_s"][same] == pytest.approx(elapsed_s[same] + 0.05, abs=1e-4)
 
 
-def test_a_frozen_and_released_group_goes_on_with_its_program(own_session: CarlaSession) -> None:
+def test_a_released_group_continues_its_program(own_session: CarlaSession) -> None:
     lights = own_session.world.lights
     with make_server() as other:
         wanted = ticks(other.session, 900)
@@ -112,7 +112,7 @@ def test_calls_to_lights_reach_the_world(session: CarlaSession, call: Call) -> N
     assert call("reset_all_traffic_lights") is None
 
 
-def test_a_world_without_overrides_refuses_them() -> None:
+def test_a_world_without_overrides_refuses_calls_to_lights() -> None:
     env = parallel_env("grid4x4", overrides={"action.kind": "continuous", "signals.overrides": 3})
     env.reset(seed=0)
     with make_server() as server:

@@ -47,7 +47,7 @@ def types() -> RosTypes:
 
 @pytest.fixture
 def domain() -> int:
-    """A domain of this process alone, as tests of other processes run at the same time."""
+    """Return a DDS domain for this process; tests in other processes run at the same time."""
     return 10 + os.getpid() % 80
 
 
@@ -61,7 +61,7 @@ Run = Callable[..., tuple[dict[str, Any], str]]
 
 @pytest.fixture
 def run_bridge(tmp_path: Path) -> Iterator[Run]:
-    """Runs a world with a bridge; returns the bridge's report and the hash of the world."""
+    """Return a function that runs a world with a bridge; it returns the report and the hash."""
     threads: list[threading.Thread] = []
 
     def run(
@@ -101,7 +101,7 @@ def run_bridge(tmp_path: Path) -> Iterator[Run]:
 
 
 class Driver:
-    """A node that answers each clock with a command of its time, until it is closed."""
+    """A node that answers each clock message with a command of the same time until it is closed."""
 
     def __init__(
         self,

@@ -54,7 +54,7 @@ def test_one_command_starts_a_world_and_its_bridge(
         (["nowhere"], "nowhere"),
     ],
 )
-def test_wrong_calls_say_what_is_wrong(
+def test_wrong_options_are_refused_with_a_reason(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str], tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:  # fmt: skip

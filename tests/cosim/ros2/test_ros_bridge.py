@@ -47,7 +47,7 @@ def test_a_node_drives_in_lock_step(types: RosTypes, domain: int, run_bridge: Ru
     counts = report["controls"]["car_0"]
     assert (counts["used"], counts["held"], counts["late"]) == (steps + 1, 0, 0)
     truths = driver.heard["/car_0/truth"]
-    # one for each step, with the time of its tick
+    # one message per step, with the time of the step's tick
     stamps = [stamp_ns(one) for one in truths]
     assert np.diff(stamps).tolist() == [50_000_000] * (len(stamps) - 1)
     speeds = [one.twist.twist.linear.x for one in truths]
@@ -56,14 +56,14 @@ def test_a_node_drives_in_lock_step(types: RosTypes, domain: int, run_bridge: Ru
     assert report["time_s"] == pytest.approx(0.05 * steps)
     for topic, count in (("/car_0/imu", 5 * steps), ("/car_0/roof/points", steps // 2)):
         assert len(driver.heard[topic]) >= count - 10, topic
-    # what is measured is what is true, without an error of the wheels
+    # The odometry of this rig has no error, so measured speeds equal the true speeds.
     measured = {stamp_ns(one): one.twist.linear.x for one in driver.heard["/car_0/wheels"]}
     for one in truths[10:]:
         if stamp_ns(one) in measured:
             assert math.isclose(measured[stamp_ns(one)], one.twist.twist.linear.x, abs_tol=0.3)
 
 
-def test_the_world_is_that_of_a_follower_with_the_same_controls(
+def test_the_world_equals_that_of_a_follower_with_the_same_controls(
     types: RosTypes, domain: int, run_bridge: Run, tmp_path: Path
 ) -> None:
     with Driver(types, domain):
@@ -94,18 +94,18 @@ def test_the_world_is_that_of_a_follower_with_the_same_controls(
     thread.join(10.0)
 
 
-def test_without_commands_the_vehicle_stands_and_says_so(
+def test_without_commands_the_vehicle_brakes_and_a_warning_is_logged(
     domain: int, run_bridge: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
     report, _ = run_bridge(RosOptions(domain=domain, ready_s=0.2, deadline_s=0.0), 5)
     counts = report["controls"]["car_0"]
     assert (counts["held"], counts["used"], counts["received"]) == (6, 0, 0)
     assert "no node publishes commands of car_0" in caplog.text
-    # no node listens: only the mounts, which late subscribers get, are sent, with their time
+    # No node listens. Only the sensors' transforms, for late subscribers, and their time are sent.
     assert report["sent"] == {"/tf_static": 1, "/clock": 1}
 
 
-def test_a_command_that_does_not_come_is_waited_for_and_counted(
+def test_a_missing_command_is_awaited_until_the_deadline_and_counted(
     types: RosTypes, domain: int, run_bridge: Run
 ) -> None:
     def old(stamp: int) -> dict[str, Any]:
@@ -117,7 +117,7 @@ def test_a_command_that_does_not_come_is_waited_for_and_counted(
         assert time.monotonic() - began_s > 0.5
     counts = report["controls"]["car_0"]
     assert counts["late"] == counts["held"] == 5
-    assert counts["used"] == 1  # that of time 0
+    assert counts["used"] == 1  # the command of time 0
 
 
 def test_a_lag_allows_older_commands(types: RosTypes, domain: int, run_bridge: Run) -> None:
@@ -130,7 +130,9 @@ def test_a_lag_allows_older_commands(types: RosTypes, domain: int, run_bridge: R
     assert report["controls"]["car_0"]["late"] == 0
 
 
-def test_newest_never_waits(types: RosTypes, domain: int, run_bridge: Run) -> None:
+def test_in_mode_newest_the_bridge_never_waits(
+    types: RosTypes, domain: int, run_bridge: Run
+) -> None:
     def never(stamp: int) -> dict[str, Any]:
         return cruise(0)
 
@@ -199,7 +201,7 @@ def test_two_bridges_cannot_drive_one_vehicle(domain: int, tmp_path: Path) -> No
     assert "car_0 is driven by 'ros2'" in str(errors[1])
 
 
-def test_the_truth_is_given_only_if_the_world_allows_it(domain: int, tmp_path: Path) -> None:
+def test_true_states_are_refused_unless_the_world_allows_them(domain: int, tmp_path: Path) -> None:
     errors: list[str] = []
     with closing(make_env()) as env, FollowedWorld(env, tmp_path / "s") as world:
 
@@ -225,21 +227,21 @@ def test_the_truth_is_given_only_if_the_world_allows_it(domain: int, tmp_path: P
         ({"names": {"rof": {"frame": "x"}}}, {}, "no sensor 'rof'; choose among roof, front"),
     ],
 )
-def test_what_cannot_be_bridged_is_refused(
+def test_unsupported_options_and_worlds_are_refused(
     options: Any, more: Any, message: str, domain: int, run_bridge: Run
 ) -> None:
     with pytest.raises(ConfigError, match=message):
         run_bridge(RosOptions(**{"domain": domain, **options}), 1, **more)
 
 
-def test_a_profile_for_one_vehicle_refuses_two(domain: int, run_bridge: Run) -> None:
+def test_two_vehicles_are_refused_by_a_profile_for_one(domain: int, run_bridge: Run) -> None:
     options = RosOptions(domain=domain, profile="autoware")
     with pytest.raises(ConfigError, match="2 vehicles: the names of Autoware's topics are those"):
         run_bridge(options, 1, ("car_0", "car_1"))
 
 
 @pytest.mark.parametrize("key", ["deadline_s", "ready_s"])
-def test_times_must_be_numbers(key: str) -> None:
+def test_options_that_are_not_numbers_or_negative_are_refused(key: str) -> None:
     with pytest.raises(ConfigError, match=f"{key} = nan: must be a number from 0 on"):
         RosOptions(**{key: math.nan})
     with pytest.raises(ConfigError, match="lag_steps = -1: must be at least 0"):
@@ -271,7 +273,7 @@ def test_topics_of_autoware_drive_a_vehicle(types: RosTypes, domain: int, run_br
     assert report["controls"]["car_0"]["used"] == 41
     velocities = driver.heard["/vehicle/status/velocity_status"]
     gained = velocities[-1].longitudinal_velocity - velocities[-21].longitudinal_velocity
-    assert gained == pytest.approx(1.5, abs=0.05)  # in 1 s
+    assert gained == pytest.approx(1.5, abs=0.05)  # after 1 s
     angle = driver.heard["/vehicle/status/steering_status"][-1].steering_tire_angle
     assert angle == pytest.approx(0.05, abs=1e-3)
     assert driver.heard["/vehicle/status/gear_status"][-1].report == 2
@@ -299,7 +301,7 @@ def test_a_bag_has_the_messages_that_were_sent(
         assert kinds[topic] == kind
         assert hashes[topic] == types.type_hash(kind)
         known = {data for _, data in written[topic]}
-        # DDS fills up to four bytes
+        # DDS pads data to a multiple of four bytes
         assert all(any(got.startswith(one) for one in known) for got in driver.data[topic]), topic
     clocks = [when_ns for when_ns, _ in written["/clock"]]
     assert clocks == [50_000_000 * step for step in range(21)]

@@ -55,13 +55,15 @@ def test_a_speed_is_reached_with_a_time_constant(
     assert math.isclose(steering, 0.5, rel_tol=1e-6)
     assert math.isclose(controls.steering_rad, 0.4, rel_tol=1e-6)
     assert (controls.counts.used, controls.counts.limited) == (1, 0)
-    # the acceleration of an Ackermann command is the most with which the speed is reached
+    # the acceleration of an Ackermann command limits how fast the speed is approached
     take(controls, types, TOPICS["drive"], drive(0.0, 8.0, 0.5))
     assert math.isclose(controls.control(NOW_NS, 7.0)[0], 0.1)
     assert math.isclose(controls.control(NOW_NS, 9.0)[0], -0.1)
 
 
-def test_a_twist_turns_as_the_rear_axle_does(controls: VehicleControls, types: RosTypes) -> None:
+def test_a_twist_sets_the_yaw_rate_at_the_rear_axle(
+    controls: VehicleControls, types: RosTypes
+) -> None:
     take(controls, types, TOPICS["twist"], twist(6.0, 0.5))
     controls.control(NOW_NS, 6.0)
     # a circle of radius v / yaw rate of the rear axle: tan(steering) = wheelbase / radius
@@ -90,7 +92,7 @@ def test_autoware_commands_an_acceleration_or_a_speed(
     "fields",
     [drive(math.nan, 1.0), drive(0.0, math.inf), drive(0.0, 1.0, math.nan), drive(-math.inf, 0.0)],
 )
-def test_numbers_that_are_none_are_counted_and_not_used(
+def test_nan_and_infinite_commands_are_counted_and_not_used(
     controls: VehicleControls, types: RosTypes, fields: Any
 ) -> None:
     take(controls, types, TOPICS["drive"], drive(0.1, 5.0))

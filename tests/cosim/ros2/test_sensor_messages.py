@@ -40,7 +40,7 @@ def turned(quaternion: dict[str, float], point: Any) -> NDArray[np.float64]:
 @pytest.mark.parametrize("heading_deg", [0.0, 37.0, 90.0, 179.0, 180.0, -135.0])
 @pytest.mark.parametrize("pitch_deg", [0.0, 12.0, -80.0])
 @pytest.mark.parametrize("roll_deg", [0.0, 170.0, -25.0])
-def test_a_quaternion_turns_points_as_the_angles_do(
+def test_a_quaternion_rotates_points_by_its_angles(
     heading_deg: float, pitch_deg: float, roll_deg: float
 ) -> None:
     heading, pitch, roll = map(math.radians, (heading_deg, pitch_deg, roll_deg))
@@ -56,7 +56,7 @@ def test_a_quaternion_turns_points_as_the_angles_do(
         np.testing.assert_allclose(turned(found, point), want, atol=1e-12)
 
 
-def test_positive_pitch_is_uphill_here_and_nose_down_in_ros() -> None:
+def test_pitch_is_positive_uphill_in_cavmarl_and_nose_down_in_ros() -> None:
     found = quaternion_of(turn_of(0.0, 0.1))
     assert found["y"] < 0.0
     assert turned(found, (1.0, 0.0, 0.0))[2] > 0.0
@@ -87,7 +87,7 @@ def made(kind: str, sample: Any, **settings: Any) -> list[dict[str, Any]]:
     return [one.fields for one in make(given, np.asarray(sample), 1_250_000_000, "frame")]
 
 
-def test_points_are_in_the_frame_of_the_lidar_and_without_misses() -> None:
+def test_points_are_in_the_frame_of_the_lidar_and_rays_without_echo_are_left_out() -> None:
     scan = np.full((2, 4), 50.0, dtype=np.float32)
     scan[1, 1] = 10.0  # upper layer, to the left
     scan[0, 2] = 5.0  # lower layer, behind
@@ -115,20 +115,20 @@ def test_targets_of_a_radar_have_places_and_radial_speeds() -> None:
     np.testing.assert_allclose(list(target), (0.0, 20.0, 0.0, -3.0), atol=1e-5)
 
 
-def test_a_camera_tells_its_optics_and_rows_from_the_top() -> None:
+def test_a_camera_message_has_intrinsics_and_rows_from_the_top() -> None:
     picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
     image, info = made("rgb_camera", picture, fov_deg=90.0)
     assert (image["encoding"], image["step"]) == ("rgb8", 12)
     assert image["data"].tobytes() == picture.tobytes()
     assert image["header"]["frame_id"] == info["header"]["frame_id"] == "frame_optical_link"
-    # A point at the right edge of a field of view of 90° is as far aside as ahead.
+    # At the right edge of a field of view of 90°, a point is as far to the side as ahead.
     k = np.reshape(info["k"], (3, 3))
     u, v, w = k @ np.array([1.0, 0.0, 1.0])
     assert (u / w, v / w) == (4.0, 1.0)
     np.testing.assert_array_equal(np.reshape(info["p"], (3, 4))[:, :3], k)
 
 
-def test_depths_are_floats_in_m_and_classes_bytes() -> None:
+def test_depths_are_floats_in_m_and_classes_are_bytes() -> None:
     depth, _ = made("depth_camera", np.array([[1.5, 100.0]], dtype=np.float16), fov_deg=60.0)
     assert depth["encoding"] == "32FC1"
     assert np.frombuffer(depth["data"].tobytes(), "<f4").tolist() == [1.5, 100.0]
@@ -150,7 +150,7 @@ def test_inertial_and_satellite_measurements_keep_values_and_noise() -> None:
     assert fix["header"]["stamp"] == {"sec": 1, "nanosec": 250_000_000}
 
 
-def test_the_rear_axle_does_not_slip() -> None:
+def test_the_velocity_at_the_rear_axle_has_no_lateral_part() -> None:
     wheelbase_m, dt = 2.7, 1e-6
     row = dict.fromkeys(("z", "pitch", "accel", "agent", "id"), 0.0)
     row |= {"x": 3.0, "y": -2.0, "heading": 0.6, "speed": 7.0, "steering": 0.35}
@@ -208,7 +208,7 @@ def test_sensors_without_a_message_are_named_once(caplog: pytest.LogCaptureFixtu
     assert "1 sensors have no ROS message and are not published: grid (bev_grid)" in caplog.text
 
 
-def test_ros_time_goes_on_over_episodes_and_is_whole_ns() -> None:
+def test_ros_time_increases_across_episodes_in_whole_ns() -> None:
     clock = RosClock(0.05, 2)
     clock.set(0, 0)
     for tick in (3, 7):
@@ -220,7 +220,7 @@ def test_ros_time_goes_on_over_episodes_and_is_whole_ns() -> None:
 
 
 @pytest.mark.parametrize("distro", ["humble", "jazzy", "kilted"])
-def test_messages_are_those_of_the_distribution(distro: str) -> None:
+def test_message_types_equal_the_distributions(distro: str) -> None:
     types = RosTypes(distro)
     image, info = made("rgb_camera", np.zeros((2, 4, 3), np.uint8), fov_deg=90.0)
     for kind, fields in (

@@ -58,7 +58,7 @@ def test_an_opendrive_export_is_read_back_equal(town: Path, tmp_path: Path) -> N
     [
         "net/Town10HD.net.xml",
         "net/bologna_acosta/acosta_buslanes.net.xml",
-        "net/mcity/mcity.net.xml",  # lanes that merge, beside lanes that lead elsewhere
+        "net/mcity/mcity.net.xml",  # merging lanes next to lanes with other targets
     ],
 )
 def test_exports_of_real_maps_are_read_back_equal(
@@ -75,11 +75,11 @@ def test_exports_of_real_maps_are_read_back_equal(
             [int(one.get("id", "0")) for one in road.iterfind(f"{LANES}/link/{kind}")]
             for kind in ("predecessor", "successor")
         ]
-        for ids in ends:  # neighbours on both roads that a link joins
+        for ids in ends:  # linked lanes are neighbours, on both roads
             assert ids == list(range(ids[0], ids[0] - len(ids), -1))
 
 
-def test_geojson_has_each_lane_where_it_is(town: Path, tmp_path: Path) -> None:
+def test_geojson_has_each_lane_at_its_position(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     target = tmp_path / "town.geojson"
     count = write_geojson(network, target, town)

@@ -54,7 +54,7 @@ def _polyline(geometry: Element) -> np.ndarray:
     return np.stack([x + u * cos - v * sin, y + u * sin + v * cos], axis=1)
 
 
-def test_lengths_are_those_of_the_curves(roads: dict[str, Element]) -> None:
+def test_lengths_equal_those_of_the_curves(roads: dict[str, Element]) -> None:
     curves = 0
     for road in roads.values():
         s = 0.0
@@ -71,7 +71,7 @@ def test_lengths_are_those_of_the_curves(roads: dict[str, Element]) -> None:
     assert curves > 10
 
 
-def test_lanes_over_junctions_begin_and_end_where_roads_do(roads: dict[str, Element]) -> None:
+def test_lanes_over_junctions_join_the_roads_without_a_gap(roads: dict[str, Element]) -> None:
     def border(road: Element, at_start: bool, lane: int) -> np.ndarray:
         geometry = road.findall("planView/geometry")[0 if at_start else -1]
         line = _polyline(geometry)
@@ -95,10 +95,10 @@ def test_lanes_over_junctions_begin_and_end_where_roads_do(roads: dict[str, Elem
                 there = int(lane.find(f"link/{kind}").get("id"))
                 mine = border(road, at_start, int(lane.get("id", "0")))
                 assert mine == pytest.approx(border(other, not at_start, there), abs=0.01)
-    assert around > 0  # at dead ends, vehicles turn round
+    assert around > 0  # U-turns at dead ends occur
 
 
-def test_a_quarter_circle_is_as_long_as_it_is() -> None:
+def test_the_length_of_a_quarter_circle_is_exact() -> None:
     k = 4.0 / 3.0 * math.tan(math.pi / 8.0)
     control = 10.0 * np.array([(1.0, 0.0), (1.0, k), (k, 1.0), (0.0, 1.0)])
     p0, p1, p2, p3 = control

@@ -69,7 +69,7 @@ def text(content: str) -> Callable[[Path], Any]:
         ("k.laz", las),
     ],
 )
-def test_each_kind_gives_the_same_points(
+def test_each_kind_of_file_gives_the_same_points(
     tmp_path: Path, name: str, write: Callable[[Path], Any]
 ) -> None:
     write(tmp_path / name)

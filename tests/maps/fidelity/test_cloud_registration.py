@@ -21,7 +21,7 @@ from tests.maps.fidelity.scenes import motion, street
 
 pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
-KNOWN = motion(0.5, -0.5, 0.25, 2.0)  # 0.75 m and 2°
+KNOWN = motion(0.5, -0.5, 0.25, 2.0)  # a shift of 0.75 m and a rotation of 2°
 
 
 def compared(source: np.ndarray, reference: np.ndarray, **options: float):
@@ -59,7 +59,7 @@ def test_identical_clouds_have_no_distance_and_a_moved_copy_is_brought_back() ->
 
 
 def test_noise_gives_the_rmse_of_theory() -> None:
-    reference = 3.0 * np.random.default_rng(3).uniform(-10.0, 10.0, (2000, 3))  # far apart
+    reference = 3.0 * np.random.default_rng(3).uniform(-10.0, 10.0, (2000, 3))  # points far apart
     noise = np.random.default_rng(4).normal(0.0, 0.02, reference.shape)
     found = compared(reference + noise, reference, registered=False)
     assert found.rmse_m == pytest.approx(0.02 * np.sqrt(3.0), rel=0.05)
@@ -147,7 +147,7 @@ def test_clouds_far_from_zero_keep_their_digits() -> None:
     assert thin_out(Cloud("far", cloud), 0.5).points.mean(axis=0) == pytest.approx(middle, abs=2.0)
 
 
-def test_filters_count_what_they_remove() -> None:
+def test_filters_count_removed_points() -> None:
     cloud = Cloud("c", np.vstack([street(5000), [(0.0, 0.0, 900.0)]]), {"read": 5001})
     thin = thin_out(cloud, 1.0)
     assert 0 < len(thin.points) < 5001

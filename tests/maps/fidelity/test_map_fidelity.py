@@ -73,7 +73,7 @@ def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray
     )
     assert code == 0, said
     (found,) = json.loads(out.read_text())["comparisons"]
-    assert found["converged"] is None  # it was not registered by its points
+    assert found["converged"] is None  # the scan was aligned by road edges, not by its points
     assert np.array(found["transform"])[:2, 3] == pytest.approx([-0.2, 0.1], abs=0.1)
     # Near junctions, a cross-section meets the kerb of the crossing road.
     assert 0.0 < found["roads"]["lateral_median_m"] < GAP_M + 2 * BIN_M  # voxels are 5 cm

@@ -65,10 +65,10 @@ def plane_of(path: Path) -> list[str]:
     return ["/".join(node) for node in nodes]
 
 
-def test_heights_are_the_models_and_nothing_moves(
+def test_heights_equal_the_model_and_nothing_moves_in_the_plane(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Draping adds points, which change the rounding of corners; so none are rounded here."""
+    """Corners are not rounded here, because draping adds points, which change the rounding."""
     monkeypatch.setattr(reader, "round_corners", lambda *_: [])
     rolling = plane(0.02, 0.05)
     model = write_geotiff(

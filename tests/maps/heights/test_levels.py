@@ -13,7 +13,7 @@ from cavmarl.maps.heights import levels
 
 
 @pytest.mark.parametrize("level", [1, -2])
-def test_a_bridge_reaches_from_its_first_place_to_its_last(
+def test_a_bridge_extends_from_its_first_point_to_its_last(
     monkeypatch: pytest.MonkeyPatch, level: int
 ) -> None:
     monkeypatch.setattr(levels, "project", lambda source, places, geo: places)

@@ -29,7 +29,7 @@ def test_heights_are_read_from_geotiffs(tmp_path: Path, kind: type) -> None:
     assert coverage.filled_places == 0
 
 
-def test_hgt_plain_and_packed(tmp_path: Path) -> None:
+def test_plain_and_zipped_hgt_files_have_equal_heights(tmp_path: Path) -> None:
     plain = write_hgt(tmp_path / "N48E011.hgt", GROUND)
     packed = tmp_path / "N48E011.hgt.zip"
     with zipfile.ZipFile(packed, "w") as archive:

@@ -52,7 +52,7 @@ def test_invalid_types_are_refused(demand: Reader, attribute: str) -> None:
         'begin="0" end="10" number="-1"', 'begin="soon" end="10" number="1"',
     ],
 )  # fmt: skip
-def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
+def test_flows_that_sumo_refuses_are_refused(demand: Reader, timing: str) -> None:
     refused(demand, f'{ROUTE}<flow id="f" route="r" {timing}/>', '<flow id="f">')
 
 
@@ -90,7 +90,9 @@ def test_flows_that_sumo_refuses(demand: Reader, timing: str) -> None:
         ('<vehicle id="a" depart="0"><route edges=" "/></vehicle>', ("no edges",)),
     ],
 )  # fmt: skip
-def test_contradictions(demand: Reader, body: str, words: tuple[str, ...]) -> None:
+def test_contradictory_attributes_are_refused(
+    demand: Reader, body: str, words: tuple[str, ...]
+) -> None:
     refused(demand, f"{ROUTE}\n{body}", *words)
 
 
@@ -102,7 +104,7 @@ def test_contradictions(demand: Reader, body: str, words: tuple[str, ...]) -> No
         ("BC AB", ("no connection from edge 'BC' to 'AB'",)),
     ],
 )
-def test_routes_that_a_class_cannot_drive(
+def test_routes_that_a_class_cannot_drive_are_refused(
     demand: Reader, edges: str, words: tuple[str, ...]
 ) -> None:
     body = f'<vehicle id="a" depart="0"><route edges="{edges}"/></vehicle>'
@@ -185,7 +187,9 @@ def test_files_without_demand_are_refused(
         assert word in str(caught.value)
 
 
-def test_missing_files_and_files_that_include_themselves(town: RoadNetwork, tmp_path: Path) -> None:
+def test_missing_files_and_files_that_include_themselves_are_refused(
+    town: RoadNetwork, tmp_path: Path
+) -> None:
     with pytest.raises(DemandError, match="cannot be read"):
         read_demand([tmp_path / "none.rou.xml"], town)
     with pytest.raises(DemandError, match=r"name a \.rou\.xml"):

@@ -73,7 +73,7 @@ def test_flows_have_the_rate_that_they_state(demand: Reader, rate: str) -> None:
 
 
 @pytest.mark.parametrize("rate", ['period="2"', 'period="exp(0.5)"', 'probability="0.5"'])
-def test_a_departure_at_the_border_of_two_spans_is_in_the_later_one(
+def test_a_departure_at_the_end_of_a_time_span_is_in_the_next_span(
     demand: Reader, rate: str
 ) -> None:
     file = demand(f'<flow id="f" end="100" {rate}><route edges="AB BC"/></flow>')
@@ -129,7 +129,7 @@ def test_trips_name_the_edges_to_pass(demand: Reader) -> None:
     assert names == ["AB", "BC", "CB"]
 
 
-def test_attributes_of_departure_and_arrival(demand: Reader) -> None:
+def test_attributes_of_departure_and_arrival_are_read(demand: Reader) -> None:
     file = demand(
         '<vehicle id="a" depart="0" departLane="1" departPos="-20" departSpeed="max" '
         'arrivalPos="30" speedFactor="1.1"><route edges="AB BC"/></vehicle>'
@@ -148,7 +148,7 @@ def test_attributes_of_departure_and_arrival(demand: Reader) -> None:
     assert np.isnan(second["speed_factor"])
 
 
-def test_stops_of_routes_and_vehicles(demand: Reader) -> None:
+def test_stops_of_routes_and_vehicles_are_read(demand: Reader) -> None:
     file = demand(
         '<busStop id="s" lane="BC_0" startPos="10" endPos="30"/>'
         '<route id="r" edges="AB BC"><stop busStop="s" duration="20" until="60"/></route>'
@@ -184,7 +184,7 @@ def test_reroute_chances_are_drawn(demand: Reader) -> None:
      ('<default.departspeed value="3.5"/>', "", LANE_BEST, (SPEED_GIVEN, 3.5)),
      ('<default.departspeed value="max"/>', 'departSpeed="2"', LANE_BEST, (SPEED_GIVEN, 2.0))],
 )  # fmt: skip
-def test_departures_that_name_no_lane_and_speed_have_sumos_or_the_configurations(
+def test_default_lanes_and_speeds_of_departures_come_from_sumo_or_the_configuration(
     town: RoadNetwork, tmp_path: Path, options: str, own: str, lane: int, speed: tuple[int, float]
 ) -> None:
     car = f'<vehicle id="a" depart="0" {own}><route edges="AB"/></vehicle>'

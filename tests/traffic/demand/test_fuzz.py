@@ -45,7 +45,9 @@ def check(town: RoadNetwork, folder: Path, content: bytes) -> None:
 
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_mutated_files(town: RoadNetwork, tmp_path: Path, data: st.DataObject) -> None:
+def test_mutated_files_are_read_or_refused(
+    town: RoadNetwork, tmp_path: Path, data: st.DataObject
+) -> None:
     pieces = list(PIECES)
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(pieces) - 1))
@@ -64,7 +66,9 @@ def test_mutated_files(town: RoadNetwork, tmp_path: Path, data: st.DataObject) -
 
 @settings(max_examples=100, deadline=None, suppress_health_check=list(HealthCheck))
 @given(content=st.binary(max_size=60), at=st.integers(0, len(WHOLE)))
-def test_bytes_in_the_middle(town: RoadNetwork, tmp_path: Path, content: bytes, at: int) -> None:
+def test_files_with_inserted_bytes_are_read_or_refused(
+    town: RoadNetwork, tmp_path: Path, content: bytes, at: int
+) -> None:
     whole = WHOLE.encode()
     check(town, tmp_path, whole[:at] + content + whole[at:])
 
@@ -76,7 +80,7 @@ def test_the_whole_file_is_read(town: RoadNetwork, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("value", VALUES)
-def test_every_attribute_with_every_odd_value(
+def test_odd_values_of_any_attribute_are_read_or_refused(
     town: RoadNetwork, tmp_path: Path, value: str
 ) -> None:
     for at, piece in enumerate(PIECES):

@@ -197,7 +197,7 @@ def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
         ('<begin value="25190"/>', 25_190.0, None),
     ],
 )
-def test_sumo_begins_with_the_first_departure_too(
+def test_sumo_also_begins_with_the_first_departure(
     read: Read, tmp_path: Path, option: str, begin_s: float, words: str | None
 ) -> None:
     read(option, LATE)
