@@ -72,4 +72,5 @@ class SceneArrays(NamedTuple):
         return cls(**arrays)
 
     def due_of(self, sensor: int, carriers: NDArray[np.bool_]) -> Due:
-        return Due(*self.due[sensor], carriers)
+        num, first, slot = self.due[sensor]
+        return Due(num, first, slot, carriers)

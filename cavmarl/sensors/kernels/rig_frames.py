@@ -189,9 +189,8 @@ class Due(NamedTuple):
 @kernel
 def carries(due: Due, row: np.void) -> bool:
     """Return whether a vehicle is an agent's and carries the sensor."""
-    if row["driver"] != DRIVER_AGENT:
-        return False
-    return due.carriers[row["agent"]]
+    carried: bool = row["driver"] == DRIVER_AGENT and due.carriers[row["agent"]]
+    return carried
 
 
 @kernel
