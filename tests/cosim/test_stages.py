@@ -281,6 +281,15 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
     assert stage.perceive({"roof": Scan(nothing)}, pose, 2.0) in ([], found)
 
 
+def test_the_only_ray_of_a_lidar_detects_an_object_ahead(grid: HdMap) -> None:
+    pose = pose_on(grid, lane_of(grid, 60.0), 10.0, 0.0)
+    settings = {"fov_deg": 90.0, "range_m": 60.0}
+    stage = LidarObjects([StackSensor("nose", "lidar", StackMount(0.0, 0.0, 0.0), settings)], grid)
+    (seen,) = stage.perceive({"nose": Scan(np.full((1, 1, 1), 20.0))}, pose, 0.0)
+    assert seen.x_m == pytest.approx(pose.x_m + 20.0 * math.cos(pose.heading_rad))
+    assert seen.y_m == pytest.approx(pose.y_m + 20.0 * math.sin(pose.heading_rad))
+
+
 def test_stages_are_chosen_by_name() -> None:
     with pytest.raises(
         ConfigError, match="perception = 'radar': must be lidar or lidar_camera or blind"
