@@ -161,7 +161,6 @@ class TimeFollower:
 
     master: TimeMaster  # the master of the clock
     name: str
-    since_tick: int  # the master's tick at joining
     own_ticks: int = 0  # number of its own ticks
 
     @property
@@ -273,7 +272,7 @@ class TimeMaster:
 
     def follow(self, name: str) -> TimeFollower:
         """Add a follower; this does not change the world."""
-        follower = TimeFollower(self, name, self.tick)
+        follower = TimeFollower(self, name)
         self._followers.append(follower)
         return follower
 

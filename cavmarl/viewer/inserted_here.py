@@ -8,14 +8,13 @@ import numpy as np
 
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
 from cavmarl.env.insertions import CLOSED, INSERTED, OPENED
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.subscribers import Audience
 from cavmarl.viewer.vehicle_details import Shown
 
 FARTHEST_M = 30.0  # largest distance from a lane's centre
-_CARS = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def handle_insertion(
@@ -76,7 +75,7 @@ def lane_at(
         ActionError: no lane for cars is within `FARTHEST_M`.
     """
     lanes = network.lanes
-    usable = ~lanes["internal"] & ((lanes["permissions"] & _CARS) != 0)
+    usable = ~lanes["internal"] & ((lanes["permissions"] & CARS) != 0)
     if among is not None:
         usable &= np.isin(lanes["edge"], [network.edge_ids.index(edge) for edge in among])
     rows = np.flatnonzero(usable)
