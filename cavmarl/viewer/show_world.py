@@ -19,7 +19,7 @@ from cavmarl.viewer.live_run import ShownRun
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.viewed_world import Stage, first_stage
-from cavmarl.viewer.web_options import WebOptions
+from cavmarl.viewer.web_options import PACKAGES, WebOptions
 
 Tell = Callable[[str], None]
 
@@ -103,7 +103,7 @@ def show_recording(
 
 def check_extra() -> None:
     """Raise MissingExtraError if the server's packages are not installed."""
-    for module in ("starlette", "uvicorn", "httptools", "websockets"):
+    for module in PACKAGES:
         require(module, "viewer")
 
 

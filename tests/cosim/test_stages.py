@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 import cavmarl
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED
 from cavmarl.cosim.followers.follower_client import sight_of
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
@@ -99,7 +100,7 @@ class TurnedMap(HdMap):
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
         found = super().near(x_m, y_m, within_m)
-        return [lane._replace(heading_rad=wrap(lane.heading_rad + math.pi)) for lane in found]
+        return [lane._replace(heading_rad=wrap_angle(lane.heading_rad + math.pi)) for lane in found]
 
 
 def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]:
@@ -125,7 +126,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
         row = rows[rows["agent"] == 0][0]
         off.append(math.hypot(pose.x_m - row["x"], pose.y_m - row["y"]))
         if step > 0.75 * steps:
-            assert abs(wrap(pose.heading_rad - row["heading"])) < 0.1
+            assert abs(wrap_angle(pose.heading_rad - row["heading"])) < 0.1
             assert abs(pose.speed_mps - row["speed"]) < 0.5
         env.step(env.suggest_actions())
     return off

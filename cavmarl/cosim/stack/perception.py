@@ -15,7 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSensor
 from cavmarl.sensors.mounted.lidar import azimuths, elevations, has_echo
 
@@ -146,8 +147,8 @@ def _differ(one: str, other: str) -> bool:
 def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
     """Return the direction of the nearest lane, reversed if the own heading is opposite."""
     nearest = lanes[0].heading_rad
-    apart = abs(wrap(nearest - pose.heading_rad))
-    return nearest if apart < 0.5 * math.pi else wrap(nearest + math.pi)
+    apart = abs(wrap_angle(nearest - pose.heading_rad))
+    return nearest if apart < 0.5 * math.pi else wrap_angle(nearest + math.pi)
 
 
 def _groups(
