@@ -24,7 +24,7 @@ from cavmarl.viewer.web_options import PACKAGES, WebOptions
 Tell = Callable[[str], None]
 
 
-class Shown(Protocol):
+class ShownWorld(Protocol):
     """A run or a recording on a stage."""
 
     def turn(self) -> float:
@@ -122,7 +122,9 @@ def serve_stages(stack: ExitStack, stages: Sequence[Stage], options: WebOptions,
     return server.address
 
 
-def _go_on(shown: Sequence[Shown], first: Stage, tell: Tell, goes_on: Callable[[], bool]) -> None:
+def _go_on(
+    shown: Sequence[ShownWorld], first: Stage, tell: Tell, goes_on: Callable[[], bool]
+) -> None:
     try:
         while goes_on():
             wait_s = min([one.turn() for one in shown])
