@@ -92,10 +92,10 @@ def frame_size(config: SensorsConfig) -> int:
 
 
 def carried_from(config: SensorsConfig) -> int:
-    """Return the index from which an observation is carried over to the next one.
+    """Return the index from which an observation repeats values of earlier observations.
 
-    Everything before this index is the oldest frame or is observed again in each step. If nothing
-    is carried over, the index equals the observation's size.
+    The values before this index are observed anew in each step, or belong to the oldest frame,
+    which the next observation drops. If no value is repeated, the index is the observation's size.
     """
     if config.stack > 1:
         return frame_size(config)
