@@ -1,10 +1,14 @@
 """The built-in driver in agents' seats, alone and in traffic, on any maps.
 
 Every trip counts, including trips that the end of the run cuts off. A vehicle stands without a
-cause if it has stood for `STANDS_S`; its signal is not red; no other vehicle is close ahead or just
-behind the junction; no vehicle, or its rear, is on a path that crosses its own; and no vehicle with
-priority approaches within the distance of an announcement. Contacts on ground that the map gives to
-two roads are counted separately (`shared_ground`).
+cause if it has stood for `STANDS_S` and none of these causes applies:
+
+- its signal is red;
+- another vehicle is close ahead, or just behind the junction;
+- another vehicle, or its rear, is on a path that crosses its own;
+- a vehicle with priority approaches, within its `registration_distance_m`.
+
+Contacts on ground that the map gives to two roads are counted separately (`shared_ground`).
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.endpoint import Endpoint
 from cavmarl.ownership.ledger import OwnedTally, state_digest
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.log_records import lines_of, records_from_lines, replay, sealed
+from cavmarl.ownership.log_records import LogChain, replay, sealed
 from cavmarl.ownership.messages import (
     Abort,
     Ack,
@@ -89,7 +89,8 @@ def _log(content: bytes) -> object:
             if isinstance(found, dict):
                 found = sealed(found, last)
                 lines[-1], last = json.dumps(found, separators=(",", ":")) + "\n", found["checksum"]
-    return replay(records_from_lines("".join(lines)))
+    chain = LogChain()
+    return replay(chain.read(line) for line in lines)
 
 
 def _logs() -> tuple[bytes, ...]:
@@ -111,7 +112,8 @@ def _logs() -> tuple[bytes, ...]:
             gone = [Removed(7, 1)] if tick == 2 and 7 in endpoint.owned else []
             directory.on_message(endpoint.complete(0, gone))
         log += directory.commit({0: 0, 1: 0}).records
-    lines = lines_of(log)
+    chain = LogChain()
+    lines = [chain.write(record) for record in log]
     return ("".join(lines).encode(), "".join(lines[:4]).encode())
 
 

@@ -53,10 +53,10 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
     `open` worlds.
 
     Agents of signals act only when it is time for their decision: other steps have no observation,
-    reward or info of signals. All signals have the same spaces, so that they can share a policy:
-    actions `Discrete(G)` with the largest number of choices G, where a choice that a signal does
-    not have keeps its green, and observations with `action_mask` (G,) and `observations` (D,),
-    padded with 0. If no agent acts next, the world advances until one does.
+    reward or info of signals. All signals have the same spaces, so that they can share a policy.
+    The action space is `Discrete(G)`, where G is the largest number of choices of a signal. A
+    choice that a signal does not have keeps its green. An observation has `action_mask` (G,) and
+    `observations` (D,), padded with 0. If no agent acts next, the world advances until one does.
 
         PPOConfig().multi_agent(policies={"vehicles", "signals"}, policy_mapping_fn=policy_of)
 

@@ -104,8 +104,3 @@ def plan_from_dict(document: object) -> Plan:
         cost_source=found.cost_source,
     )
     return Plan(problem, tuple(one.worker for one in found.shards), found.method)
-
-
-def snapshot_from_dict(document: object) -> LoadSnapshot:
-    """Return the snapshot of a document. Raises ConfigError: a key or a value is invalid."""
-    return validate(LoadSnapshot, document, "not a snapshot", extra="ignore")

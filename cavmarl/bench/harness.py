@@ -172,7 +172,9 @@ def numbers_of(option: str, text: str) -> list[int]:
     try:
         return [int(word) for word in text.split(",")]
     except ValueError:
-        raise ConfigError(f"{option} {text}: must be comma-separated whole numbers") from None
+        raise ConfigError(
+            f"{option} {text}: must be comma-separated whole numbers, for example 1,2,4"
+        ) from None
 
 
 @contextmanager

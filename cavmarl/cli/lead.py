@@ -29,7 +29,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, FollowerError
-from cavmarl.core.private_files import check_private, write_private
+from cavmarl.core.private_files import read_private, write_private
 
 if TYPE_CHECKING:
     from cavmarl.cosim.followers.followed_world import FollowedWorld
@@ -58,18 +58,12 @@ def read_secret(path: Path | None, may_make: bool = False) -> str:
     """
     if path is None:
         return ""
-    try:
-        if may_make and not path.exists():
+    if may_make and not path.exists():
+        try:
             write_private(path, token_hex(32) + "\n")
-        check_private("--secret-file", path)
-        secret = path.read_text("utf-8").strip()
-    except (OSError, UnicodeError) as error:
-        raise ConfigError(f"--secret-file {path}: {error}") from error
-    if not secret:
-        raise ConfigError(
-            f"--secret-file {path}: the file is empty; delete it: `cavmarl lead` creates a new one"
-        )
-    return secret
+        except OSError as error:
+            raise ConfigError(f"--secret-file {path}: cannot be written: {error}") from error
+    return read_private("--secret-file", path)
 
 
 def address_of(text: str) -> str | int:

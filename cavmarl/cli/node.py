@@ -19,7 +19,7 @@ from cavmarl.cli.output import (
     about,
     flag,
 )
-from cavmarl.cli.service import Authority, Certificate, Key, PlainHttp, SecretFile, read_secret
+from cavmarl.cli.service import Authority, Certificate, Key, PlainHttp, UserSecretFile, user_secret
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
 AGAIN_S = 0.5  # between two attempts while no caller listens
@@ -102,7 +102,7 @@ def node(
         Literal["measured", "idle"],
         about("Load that the node reports: as measured on this machine, or idle.", panel=SERVICE),
     ] = "measured",
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     certificate: Certificate = None,
     key: Key = None,
     authority: Authority = None,
@@ -129,7 +129,7 @@ def node(
 
     options = NodeOptions(
         service=str(service),
-        secret=read_secret(secret_file),
+        secret=user_secret(secret_file),
         name=name or socket.gethostname(),
         host=host,
         port=port,

@@ -25,6 +25,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, require_all
 from cavmarl.core.extensions import import_plugins
 from cavmarl.core.seeds import check_seed
+from cavmarl.viewer.web_options import PACKAGES
 
 if TYPE_CHECKING:
     from cavmarl.recordings.extra_tables import RecordOptions
@@ -85,7 +86,7 @@ def _import_all(modules: list[str] | None) -> list[str] | None:
 PAGE_EXTRAS = {"matplotlib": "report", "jinja2": "report"}
 WINDOW_EXTRAS = {"pygame": "render"}
 VIDEO_EXTRAS = WINDOW_EXTRAS | {"imageio_ffmpeg": "render"}
-WEB_EXTRAS = dict.fromkeys(("starlette", "uvicorn", "httptools", "websockets"), "viewer")
+WEB_EXTRAS = dict.fromkeys(PACKAGES, "viewer")
 RECORD_EXTRAS = {"pyarrow": "record"}
 DRIVER_EXTRAS: dict[str, dict[str, str]] = {  # by the suffix of a model file
     SB3_FILE: {"stable_baselines3": "train", "torch": "train"},

@@ -30,7 +30,7 @@ from cavmarl.cli.output import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, ServiceError, require
-from cavmarl.core.private_files import check_private, write_private
+from cavmarl.core.private_files import read_private, write_private
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ Url = Annotated[
     str,
     about("URL of the service.", "--service", metavar="URL", envvar=URL_VARIABLE, panel=SERVICE),
 ]
-SecretFile = Annotated[
+UserSecretFile = Annotated[
     Path | None,
     about(
         f"File with your secret [default: the variable {SECRET_VARIABLE}].",
@@ -148,7 +148,7 @@ def grant(
         str, about("Role: viewer, client, operator, admin or node.", metavar="ROLE")
     ] = "client",
     service: Url = DEFAULT_URL,
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
     out: Annotated[
@@ -208,7 +208,7 @@ def submit(
         about("Folder for the results [default: runs/submit/JOB].", metavar="DIR", panel=OUTPUT),
     ] = None,
     service: Url = DEFAULT_URL,
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
     json_path: JsonPath = None,
@@ -270,7 +270,7 @@ def _collect(client: Client, job: str, folder: Path, bar: Progress) -> None:
 
 def nodes(
     service: Url = DEFAULT_URL,
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
     drain: Annotated[
@@ -308,7 +308,7 @@ def sessions(
         ),
     ] = None,
     service: Url = DEFAULT_URL,
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
     json_path: JsonPath = None,
@@ -342,7 +342,7 @@ def events(
         about("Print only events of this session, job, node or configuration.", metavar="NAME"),
     ] = None,
     service: Url = DEFAULT_URL,
-    secret_file: SecretFile = None,
+    secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
 ) -> None:
@@ -396,23 +396,17 @@ def connect(
     from cavmarl.client import Client
 
     verify = str(authority) if authority else True
-    secret = read_secret(secret_file)
+    secret = user_secret(secret_file)
     return Client(service, secret, verify=verify, allow_plain_http=plain_http)
 
 
-def read_secret(secret_file: Path | None) -> str:
+def user_secret(secret_file: Path | None) -> str:
     """Return the secret from a file or an environment variable.
 
     No option takes the secret itself, as other users can read the command line.
     """
     if secret_file is not None:
-        try:
-            check_private("--secret-file", secret_file)
-            return secret_file.read_text(encoding="utf-8").strip()
-        except OSError as error:
-            raise ServiceError(
-                f"--secret-file {secret_file}: cannot be read: {error.strerror}"
-            ) from error
+        return read_private("--secret-file", secret_file)
     secret = os.environ.get(SECRET_VARIABLE, "")
     if not secret:
         raise ServiceError(

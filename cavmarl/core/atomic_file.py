@@ -7,6 +7,7 @@ locks, these folders stay.
 
 from __future__ import annotations
 
+import hashlib
 import os
 import shutil
 import sys
@@ -19,6 +20,12 @@ if sys.platform != "win32":
     import fcntl
 
 _PREFIX = ".build-"
+
+
+def sha256_of(path: Path) -> str:
+    """Return the SHA-256 of a file, hex; raises OSError if the file cannot be read."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_whole(path: Path, content: bytes) -> None:

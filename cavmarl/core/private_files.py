@@ -15,6 +15,21 @@ def check_private(what: str, path: Path) -> None:
         raise ConfigError(f"{what} {path}: other users can read it; run chmod 600 {path}")
 
 
+def read_private(what: str, path: Path) -> str:
+    """Return the secret in a file, without white space around it.
+
+    Raises ConfigError: the file is missing, empty, or readable by other users; `what` names it.
+    """
+    try:
+        check_private(what, path)
+        secret = path.read_text("utf-8").strip()
+    except (OSError, UnicodeError) as error:
+        raise ConfigError(f"{what} {path}: cannot be read: {error}") from error
+    if not secret:
+        raise ConfigError(f"{what} {path}: the file is empty; write the secret into it")
+    return secret
+
+
 def write_private(path: Path, text: str) -> None:
     """Write a new file that only this user can read; raise OSError if the file exists."""
     with open(path, "x", opener=partial(os.open, mode=0o600), encoding="utf-8") as file:

@@ -16,9 +16,11 @@ from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from cavmarl.core.errors import WorkerError
+
+LAST_WORDS = 2000
 
 _PR_SET_PDEATHSIG = 1
 _LIBC = ctypes.CDLL(None, use_errno=True) if sys.platform == "linux" else None
@@ -41,6 +43,21 @@ def refuse_fork(pid: int, things: str) -> None:
             f"{things} belong to process {pid}, and this process is a fork of it; make the "
             "environment here, after the fork"
         )
+
+
+def end_process(process: subprocess.Popen[Any], within_s: float) -> None:
+    """Wait for a process, and kill it if it has not ended by itself within this time."""
+    try:
+        process.wait(within_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
+def last_words(output: IO[bytes]) -> str:
+    """Return the end of a process's output, at most `LAST_WORDS` characters."""
+    output.seek(0)
+    return output.read().decode(errors="replace").strip()[-LAST_WORDS:]
 
 
 def die_with_parent() -> None:

@@ -15,15 +15,21 @@ SUMO_CONFIG_SUFFIX = ".sumocfg"
 _SUMO_CONFIG_ROOTS = ("configuration", "sumoConfiguration")
 
 
-def root_tag(path: Path) -> str:
-    """Return the name of the root element of a plain or gzipped file; "" if there is none."""
+def head_of_file(path: Path) -> bytes:
+    """Return the first bytes of a plain or gzipped file; b"" if it cannot be read."""
     try:
         with path.open("rb") as raw:
             head = raw.read(_HEAD_BYTES)
         if head.startswith(_GZIP_MAGIC):
             head = zlib.decompressobj(wbits=31).decompress(head, _HEAD_BYTES)
     except (OSError, ValueError, zlib.error):
-        return ""
+        return b""
+    return head
+
+
+def root_tag(path: Path) -> str:
+    """Return the name of the root element of a plain or gzipped file; "" if there is none."""
+    head = head_of_file(path)
     encoding = "utf-16" if head[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8-sig"
     found = _ROOT.match(_BEFORE_ROOT.sub("", head.decode(encoding, errors="replace")))
     return found[1] if found else ""

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.cosim.followers.follower_client import Samples, sight_of
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
 from cavmarl.cosim.height_track import HeightTrack
-from cavmarl.cosim.stack.hd_map import HdMap, wrap
+from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.lidar_points import lidar_points
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.stack import REFERENCE_RIG, Vehicle, sensor_of, vehicle_of
@@ -124,10 +125,9 @@ class Surveyor:
         view = seen.snapshot.vehicles.get(env.possible_agents[0])
         time_s = seen.snapshot.time_s
         drive = self._drives[world]
-        if drive is not None and (view is None or view.vehicle_id != drive.vehicle_id):
-            self._end(world)
-            drive = None
-        if drive is not None and time_s <= drive.last_s:
+        if drive is not None and (
+            view is None or view.vehicle_id != drive.vehicle_id or time_s <= drive.last_s
+        ):
             self._end(world)
             drive = None
         if view is None:
@@ -187,7 +187,9 @@ class Surveyor:
             self._parts.append(points @ turn.T + np.array([x, y, heights[step]]))
             self._read += len(points)
             off_m = math.hypot(x - truth[0], y - truth[1])
-            self._off.append((off_m, float(heights[step]) - truth[2], wrap(heading - truth[3])))
+            self._off.append(
+                (off_m, float(heights[step]) - truth[2], wrap_angle(heading - truth[3]))
+            )
         self._frames += len(drive.frames)
         self._ended += 1
         if len(self._parts) > _FRAMES_HELD:

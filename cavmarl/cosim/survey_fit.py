@@ -59,7 +59,7 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
     kept = cloud.kept(cloud.points[ground | high], "ground beside lanes")
     if not ground.any() or len(kept.points) < FEWEST_POINTS:
         raise MapError(f"{cloud.name}: has no ground on '{network.name}'; survey more steps")
-    wall_m = _across_walls(network, box, spacing_m, cloud.points[high])
+    wall_m = _across_walls(whole.points[len(lanes) :], cloud.points[high])
     seen = nearest_distances(lanes, kept.points) < _SEEN_M
     fit = SurveyFit(
         height_rmse_m=float(np.sqrt(np.mean(above_m[ground] ** 2))),
@@ -71,14 +71,9 @@ def fit_survey(cloud: Cloud, network: RoadNetwork) -> tuple[SurveyFit, Compariso
     return fit, compare(kept, whole, registered=False)
 
 
-def _across_walls(network: RoadNetwork, box: Any, spacing_m: float, points: Points) -> Points:
-    """Return absolute distances of points from walls, perpendicular to the wall."""
-    if not len(network.walls) or not len(points):
-        return np.zeros(0)
-    whole = map_surface(network, box, spacing_m)[0].points
-    lanes = map_surface(replace(network, walls=network.walls[:0]), box, spacing_m)[0].points
-    walls = whole[len(lanes) :]
-    if len(walls) < FEWEST_POINTS:
+def _across_walls(walls: Points, points: Points) -> Points:
+    """Return absolute distances of points from sampled walls, perpendicular to the wall."""
+    if len(walls) < FEWEST_POINTS or not len(points):
         return np.zeros(0)
     target = Target(walls)
     rows, distance_m = target.nearest(points)

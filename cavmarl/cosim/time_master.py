@@ -3,9 +3,10 @@
 Time is an integer number of ticks, and time = tick · Δt: after 5,000 ticks of 50 ms it is exactly
 250.0. A master replaces the environment's worlds by a guard, so that no other caller can step or
 reset them. Without a master there is no overhead. Followers may join and leave while the world
-runs. In the co-simulation paper, a follower's own ticks made the world advance 1.92 times as fast
-as its master. Here, a follower's own tick is refused, ignored, or, to reproduce the fault, obeyed;
-all are counted. Ticks without the master are detected before its next step.
+runs. If a follower tries to advance the world itself, the master refuses the tick, ignores it, or
+obeys it, and counts it. Obeying reproduces a fault of the co-simulation paper, in which the world
+advanced 1.92 times as fast as its master. Ticks without the master are detected before its next
+step.
 
 A `Pacer` paces steps by the wall clock; simulated time does not depend on it.
 """
@@ -161,7 +162,6 @@ class TimeFollower:
 
     master: TimeMaster  # the master of the clock
     name: str
-    since_tick: int  # the master's tick at joining
     own_ticks: int = 0  # number of its own ticks
 
     @property
@@ -273,7 +273,7 @@ class TimeMaster:
 
     def follow(self, name: str) -> TimeFollower:
         """Add a follower; this does not change the world."""
-        follower = TimeFollower(self, name, self.tick)
+        follower = TimeFollower(self, name)
         self._followers.append(follower)
         return follower
 

@@ -24,7 +24,7 @@ from cavmarl.driving.kernels.models.idm import (
     TIME_HEADWAY_S,
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
-from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.roads.network import CARS, VEHICLE_CLASSES
 
 # A vehicle of SUMO's class "ignoring" may use every lane.
 ALL_PERMISSIONS = (1 << 32) - 1
@@ -253,7 +253,7 @@ def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]
     car["vclass"] = VEHICLE_CLASSES.index("passenger")
-    car["permissions"] = 1 << VEHICLE_CLASSES.index("passenger")
+    car["permissions"] = CARS
     set_model(types, model)
     car["length"], car["width"], car["height"] = 5.0, 2.0, 1.6
     car["accel"] = ACCEL_MAX

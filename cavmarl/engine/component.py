@@ -43,10 +43,10 @@ class Component(Protocol):
     are restored to their state before the tick.
 
     Attributes:
-        reads_all: names of the methods, `reset`, `begin` or `end`, that read the vehicles of all
-            zones; the value at the time of the call counts. Other methods read the vehicles and
-            ghosts of the zones in this process. An agent's part of `arrays` is kept in the process
-            that has its vehicle.
+        reads_all: names of the methods (`reset`, `begin` or `end`) that read the vehicles of all
+            zones. This attribute is read again before each call. All other methods read only the
+            vehicles and ghosts of the zones in this process. The process that has an agent's
+            vehicle keeps the agent's part of `arrays`.
     """
 
     @property

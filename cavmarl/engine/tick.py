@@ -1,4 +1,7 @@
-"""`Tick` runs one tick of W worlds, phase by phase. Only this module defines the order."""
+"""`Tick` runs one tick of W worlds, phase by phase, and defines the order of the phases.
+
+`compiled_step.py` makes the same calls in the same order for plain undivided worlds.
+"""
 
 from __future__ import annotations
 

@@ -17,10 +17,9 @@ from cavmarl.core.records.codes import (
     INSERT_OPEN,
     INSERT_VEHICLE,
 )
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.shards.shard import Commands
 
-_CARS = 1 << VEHICLE_CLASSES.index("passenger")
 INSERTED, CLOSED, OPENED = "inserted", "closed", "opened"  # kinds of frame events
 
 Asked = tuple[tuple[str, str], ...]
@@ -97,7 +96,7 @@ class Insertions:
         """Place a standing car on each lane of an edge until it is opened; raises as `vehicle`."""
         lanes = self._network.lanes
         rows = self._lanes_of(world, edge)
-        rows = rows[(lanes["permissions"][rows] & _CARS) != 0]
+        rows = rows[(lanes["permissions"][rows] & CARS) != 0]
         if not len(rows) or lanes["internal"][rows].any():
             raise ActionError(f"edge {edge!r}: no lane of it is open to cars; give a road")
         if np.isin(rows, self._barriers[world]).any():
@@ -158,7 +157,7 @@ class Insertions:
         row, lanes = self._lanes.get(lane, -1), self._network.lanes
         if row < 0:
             raise ActionError(f"lane {lane!r}: the map has no such lane; give the id of one")
-        if lanes["internal"][row] or not lanes["permissions"][row] & _CARS:
+        if lanes["internal"][row] or not lanes["permissions"][row] & CARS:
             raise ActionError(f"lane {lane!r}: cars cannot enter there; give a car lane of a road")
         return row
 

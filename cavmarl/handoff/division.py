@@ -49,9 +49,9 @@ class ZonedShards:
     """All shards of W worlds, with their owned vehicles and ghosts.
 
     Attributes:
-        gathering: arguments of the phase `gather`: the distance in m outside of a zone within which
-            a ghost can touch a vehicle of the zone, and the distance in m within which a vehicle is
-            at a border.
+        gathering: (touching_m, border_m), the arguments of the phase `gather`. A ghost farther than
+            `touching_m` outside of a zone touches no vehicle of the zone. A vehicle is at a border
+            if its distance to the border is at most `border_m`.
         neighbours: (k, k) whether vehicles change their owner between two zones.
         row_count: the call that sets the numbers of rows in an undivided world.
         changes: finds vehicles near borders and changes their owners.

@@ -17,9 +17,8 @@ from cavmarl.maps.components import strong_components
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.held_signals import held_signals, held_signals_note
-from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, SIGNAL_STATES, RoadNetwork
 
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 # A limit below walking speed or above the speed of any car probably has a wrong unit.
 _SPEED_RANGE_MPS = (1.0, 70.0)
 _STEEP = 0.15
@@ -131,7 +130,7 @@ class _Cars:
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
-        allowed = network.lanes["permissions"] & _CAR != 0
+        allowed = network.lanes["permissions"] & CARS != 0
         self.lanes = np.flatnonzero(allowed & ~network.lanes["internal"])
         self.edge_of_lane = network.lanes["edge"][self.lanes]
         self.edges = np.unique(self.edge_of_lane)

@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.polylines import clean_shape
 from cavmarl.roads.sumo_net.road_corners import find_corners
 from cavmarl.roads.sumo_net.shared_strips import Road, Strip, find_strips
 
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 CAR_WIDTH_M = 1.8
 LEVEL_M = 3.0  # lanes with a larger difference in height are a bridge and the road below it
 STEP_M = 0.1  # minimum difference in height of lanes that lead into each other
@@ -87,7 +86,7 @@ def cut_off_edges(network: RoadNetwork) -> list[int]:
     """Return edges for cars (EDGE rows) that neither reach the largest part nor are reached."""
     from cavmarl.maps.components import strong_components
 
-    open_lanes = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    open_lanes = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
     edges = np.unique(network.lanes["edge"][open_lanes])
     links = network.links[
         open_lanes[network.links["from_lane"]] & open_lanes[network.links["to_lane"]]
@@ -203,7 +202,7 @@ def _idle_signals(network: RoadNetwork) -> Iterator[Defect]:
 
 
 def _narrow_lanes(network: RoadNetwork) -> Iterator[Defect]:
-    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    cars = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
     for lane in np.flatnonzero(cars & (network.lanes["width_m"] < CAR_WIDTH_M)).tolist():
         x, y = network.lane_polyline(lane)[0, :2].tolist()
         width = f"{network.lanes['width_m'][lane]:.2f} m, a car {CAR_WIDTH_M:.2f} m"
@@ -268,7 +267,7 @@ def _with_height(points: Points) -> list[tuple[float, float, float]]:
 
 def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
     """Find corners inside roads that the reader has no room to round."""
-    cars = (network.lanes["permissions"] & _CAR != 0) & ~network.lanes["internal"]
+    cars = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
     for lane in np.flatnonzero(cars).tolist():
         shape = network.lane_polyline(lane)
         for corner in find_corners(shape):

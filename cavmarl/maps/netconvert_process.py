@@ -118,6 +118,7 @@ def sumo_home() -> Path:
 
 
 def quoted(lines: Sequence[str]) -> str:
+    """Return an indented list of the first lines, and the number of the others."""
     shown = [f"  {line}" for line in lines[:_SHOWN_LINES]]
     if len(lines) > _SHOWN_LINES:
         shown.append(f"  … and {len(lines) - _SHOWN_LINES} more")

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import gzip
 import re
-import zlib
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from cavmarl.core.xml_root import head_of_file
 from cavmarl.maps.net_document import NetDocument
 from cavmarl.maps.osm_roads import OsmRoads
 
@@ -23,7 +22,6 @@ NOT_STATED = "not stated: see the source"
 NOTE_SEPARATOR = "; "
 
 _TITLE = "map built by cavmarl"
-_HEAD_BYTES = 1 << 16
 _COMMENT = re.compile(rf"<!-- {_TITLE}\n(.*?)-->", re.DOTALL)
 _GUESSED = {"lanes": "numLanes", "maxspeed": "speed", "width": "width"}
 
@@ -51,14 +49,7 @@ def head_of(facts: Mapping[str, str]) -> bytes:
 
 def read_provenance(path: Path) -> dict[str, str]:
     """Return the origin of a map from its file; empty if the file does not give it."""
-    try:
-        with path.open("rb") as raw:
-            head = raw.read(_HEAD_BYTES)
-        if head[:2] == b"\x1f\x8b":
-            head = zlib.decompressobj(wbits=31).decompress(head, _HEAD_BYTES)
-    except (OSError, zlib.error, gzip.BadGzipFile):
-        return {}
-    found = _COMMENT.search(head.decode("utf-8", errors="replace"))
+    found = _COMMENT.search(head_of_file(path).decode("utf-8", errors="replace"))
     lines = found[1].splitlines() if found else []
     return dict(line.split(": ", 1) for line in lines if ": " in line)
 

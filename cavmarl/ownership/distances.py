@@ -4,8 +4,7 @@
     control       the vehicle is beyond the border and the hysteresis    SWITCH
     overlap       the vehicle is outside of the old zone's halo          RELEASE
 
-A depth is the distance of a vehicle beyond its owner's border: positive outside of the owner's
-zone, negative inside. The runtime compares arrays of depths with the same thresholds.
+`zones/kernels/borders.py` finds the vehicles that are offered and that switch.
 """
 
 from __future__ import annotations
@@ -33,18 +32,6 @@ class Distances:
                 f"{self.approach_m:g} m and the hysteresis of {self.hysteresis_m:g} m; increase "
                 "the overlap, or decrease the other distances"
             )
-
-    def offers(self, depth_m: float) -> bool:
-        """Return whether the owner offers the vehicle to the zone beyond the border."""
-        return depth_m > -self.approach_m
-
-    def switches(self, depth_m: float) -> bool:
-        """Return whether the vehicle has crossed, and is a mover for `Directory.begin`."""
-        return depth_m > self.hysteresis_m
-
-    def releases(self, depth_m: float) -> bool:
-        """Return whether the zone that the vehicle left does not see it."""
-        return depth_m > self.overlap_m
 
 
 def needed_overlap_m(

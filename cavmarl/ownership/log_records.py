@@ -99,22 +99,6 @@ def sealed(line: dict[str, Any], last: str = "") -> dict[str, Any]:
     return content | {"checksum": _checksum(last, _json(content))}
 
 
-def lines_of(records: Iterable[Record]) -> list[str]:
-    """Return the lines of a complete log."""
-    chain = LogChain()
-    return [chain.write(record) for record in records]
-
-
-def records_from_lines(text: str) -> tuple[Record, ...]:
-    chain = LogChain()
-    records = []
-    for line in text.splitlines(keepends=True):
-        if not line.endswith("\n"):
-            raise JournalError(f"line {chain.sequence + 1} of the log is incomplete: {line[:40]!r}")
-        records.append(chain.read(line))
-    return tuple(records)
-
-
 def replay(records: Iterable[Record]) -> Table:
     """Return the table that results from a log, for any number of zones."""
     log = tuple(records)

@@ -1,14 +1,12 @@
-"""Traces: the coordinator's records and all delivered messages, in order.
+"""Entries of a trace: the coordinator's records and all delivered messages, in order.
 
 The program that runs the parties adds each record when it is logged, and each message when it is
 delivered, before the receiver may drop it. `trace_check` checks a trace without the code of the
-protocol; `Trace.text` formats it for people.
+protocol; `describe` formats an entry for people.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 from cavmarl.ownership.messages import (
@@ -39,23 +37,6 @@ class TraceEntry(NamedTuple):
 
     destination: int
     item: Item
-
-
-@dataclass(slots=True)
-class Trace:
-    """Entries in the order in which they happened."""
-
-    entries: list[TraceEntry] = field(default_factory=list)
-
-    def logged(self, records: Iterable[Record]) -> None:
-        self.entries.extend(TraceEntry(LOG, record) for record in records)
-
-    def delivered(self, destination: int, message: Message) -> None:
-        """Add a message that arrives at a zone or at the coordinator."""
-        self.entries.append(TraceEntry(destination, message))
-
-    def text(self) -> str:
-        return "".join(f"{describe(entry)}\n" for entry in self.entries)
 
 
 def describe(entry: TraceEntry) -> str:

@@ -11,7 +11,7 @@ The cost of a tick grows with its changes: vehicles that keep their owner are no
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple, Protocol
 
@@ -33,7 +33,7 @@ from cavmarl.ownership.messages import (
     Reset,
     Step,
 )
-from cavmarl.ownership.trace import TraceEntry, describe
+from cavmarl.ownership.trace import TraceEntry
 
 Holding = tuple[int, int, int, int, bytes]
 
@@ -84,15 +84,6 @@ class _Orders:
     entered: set[tuple[int, int]] = field(default_factory=set)
     left: set[tuple[int, int]] = field(default_factory=set)
     born: set[int] = field(default_factory=set)
-
-
-def check_trace(entries: Iterable[TraceEntry], longest_deferral: int, lifetime: int) -> None:
-    checker = TraceChecker(longest_deferral, lifetime)
-    for number, entry in enumerate(entries, start=1):
-        try:
-            checker.take(entry)
-        except ProtocolError as error:
-            raise ProtocolError(f"entry {number}, {describe(entry)}: {error}") from None
 
 
 def _require(holds: bool, problem: str) -> None:

@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 CROSSINGS = 3.0  # times the free-flow time of a trip across the map, because traffic is slower
 LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def horizon_of(network: RoadNetwork) -> float:
@@ -23,7 +22,7 @@ def horizon_of(network: RoadNetwork) -> float:
 def _horizon_on(network: RoadNetwork, number: int) -> float:
     min_x, min_y, max_x, max_y = network.extent_of(number)
     lanes = network.lanes[network.lanes["map"] == number]
-    lanes = lanes[(lanes["permissions"] & _CAR != 0) & ~lanes["internal"]]
+    lanes = lanes[(lanes["permissions"] & CARS != 0) & ~lanes["internal"]]
     if not len(lanes):
         return LEAST_S
     s_per_m = float(np.sum(lanes["length_m"] / lanes["speed_mps"]) / np.sum(lanes["length_m"]))

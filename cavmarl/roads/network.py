@@ -41,6 +41,7 @@ VEHICLE_CLASSES = (
     "tram",
     "bicycle",
 )
+CARS = 1 << VEHICLE_CLASSES.index("passenger")
 
 # SUMO's signal letters in the order of their codes in `phase_states`.
 SIGNAL_STATES = "rugGysoOY"

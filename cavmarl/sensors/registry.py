@@ -1,7 +1,7 @@
 """The registry of sensors: observed by agents, mounted on vehicles, or added by other packages.
 
-A new mounted sensor needs a class in `config/rig.py`, a class in `sensors/mounted/`, a kernel, and
-an entry in `_CARRIED`.
+A new mounted sensor needs a class in `config/rig.py` that the union `RigSensor` contains, a class
+in `sensors/mounted/`, a kernel, and an entry in `_CARRIED`.
 """
 
 from __future__ import annotations

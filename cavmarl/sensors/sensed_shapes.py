@@ -28,7 +28,7 @@ from cavmarl.config.rig import BevGridConfig, CameraConfig, LidarRigConfig, Moun
 from cavmarl.config.sensors import OccupancyGridConfig
 from cavmarl.sensors.kernels.camera_picture import colours
 from cavmarl.sensors.kernels.panorama import LANE_LINE
-from cavmarl.sensors.mounted.lidar import azimuths
+from cavmarl.sensors.mounted.lidar import has_echo, lidar_directions
 from cavmarl.sensors.mounted.mount_transforms import mount_of, sensor_to_vehicle
 from cavmarl.sensors.observed import layout
 
@@ -36,7 +36,6 @@ MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
 GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # `units` is that of the noise
-FARTHEST = 1.0 - 1e-6  # a ray with at least this share of the range has hit nothing
 
 Shape = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -79,7 +78,7 @@ def _rays(
     """Make rays from the vehicle's centre; `shares` are their lengths as shares of the range."""
     reach = np.clip(shares, 0.0, 1.0) * range_m
     ends = np.stack([np.cos(angles) * reach, np.sin(angles) * reach], axis=1)
-    return _ray_shape(name, np.zeros(2), ends, shares < FARTHEST, axes)
+    return _ray_shape(name, np.zeros(2), ends, has_echo(reach, range_m), axes)
 
 
 def _ray_shape(
@@ -168,21 +167,12 @@ def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> li
 
 def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:
     """Draw a lidar of one layer as rays, and one of several layers as the points that they hit."""
-    first, step, count = azimuths(settings.fov_deg, settings.rays)
-    turns = first + step * np.arange(count)
-    rises = np.radians(np.linspace(settings.lower_deg, settings.upper_deg, settings.layers))
-    rises = rises if settings.layers > 1 else np.zeros(1)
-    ways = np.stack(
-        [
-            np.cos(rises)[:, None] * np.cos(turns),
-            np.cos(rises)[:, None] * np.sin(turns),
-            np.broadcast_to(np.sin(rises)[:, None], (len(rises), count)),
-        ],
-        axis=2,
+    directions = lidar_directions(
+        settings.fov_deg, settings.rays, settings.lower_deg, settings.upper_deg, settings.layers
     )
     mount = mount_of(settings)
-    ends = sensor_to_vehicle(mount, (ways * distances[..., None]).reshape(-1, 3))[:, :2]
-    hits = distances.ravel() < settings.range_m * FARTHEST
+    ends = sensor_to_vehicle(mount, (directions * distances[..., None]).reshape(-1, 3))[:, :2]
+    hits = has_echo(distances.ravel(), settings.range_m)
     if settings.layers == 1:
         return _ray_shape(name, mount.place[:2], ends, hits)
     return _places(name, "points", ends[hits])

@@ -17,8 +17,8 @@ from starlette.exceptions import HTTPException
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.auth import Service, rule_of
 from cavmarl.service.problem_json import FAULT, answer, serve_routes
+from cavmarl.service.route_access import Service, rule_of
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 

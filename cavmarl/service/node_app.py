@@ -24,11 +24,11 @@ from cavmarl.client.world_protocol import SAVED_HEADER
 from cavmarl.core.errors import ServiceError, WorkerError
 from cavmarl.service import response_bodies
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
-from cavmarl.service.auth import StrictRoute
 from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problem_json import serve_routes
 from cavmarl.service.request_bodies import Whole
+from cavmarl.service.route_access import StrictRoute
 from cavmarl.service.route_common import OCTETS, PROBLEM
 from cavmarl.service.session_worlds import SAVED_EVERY, SessionWorld, SessionWorlds
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from cavmarl.service import request_bodies, response_bodies
-from cavmarl.service.auth import TheService
 from cavmarl.service.error_names import problem
+from cavmarl.service.route_access import TheService
 from cavmarl.service.route_common import Nodes, Readers, SessionId, make_router
 
 ownership = make_router("/v1/sessions/{number}", "ownership")

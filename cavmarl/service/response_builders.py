@@ -9,9 +9,9 @@ from contextlib import suppress
 from dataclasses import asdict
 
 from cavmarl.service import response_bodies
-from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker
 from cavmarl.service.node_selection import NoNodeError, score_of
+from cavmarl.service.route_access import Service
 from cavmarl.service.service_records import (
     IdentityRecord,
     LogEvent,

@@ -7,8 +7,8 @@ from typing import Annotated, Any
 from fastapi import APIRouter, Depends, Path
 
 from cavmarl.service import request_bodies
-from cavmarl.service.auth import DurableRoute, may, open_to_all
 from cavmarl.service.error_names import PROBLEM_SCHEMA, PROBLEM_TYPE
+from cavmarl.service.route_access import DurableRoute, may, open_to_all
 from cavmarl.service.service_records import IdentityRecord
 
 OCTETS = "application/octet-stream"

@@ -8,7 +8,6 @@ from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
 from cavmarl.service import configurations, request_bodies, response_bodies
-from cavmarl.service.auth import TheService
 from cavmarl.service.error_names import problem, without_folders
 from cavmarl.service.ownership_routes import ownership
 from cavmarl.service.response_builders import (
@@ -18,6 +17,7 @@ from cavmarl.service.response_builders import (
     node_answer,
     session_answer,
 )
+from cavmarl.service.route_access import TheService
 from cavmarl.service.route_common import (
     BYTES,
     CONTENT,

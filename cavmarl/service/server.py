@@ -14,11 +14,11 @@ from cavmarl.core.request_heads import BoundedHeads
 from cavmarl.core.server_address import is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
-from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.rate_limit import RateLimit
+from cavmarl.service.route_access import Service
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700

@@ -1,4 +1,13 @@
-"""The phases of a tick that shards run, and how several processes may run each phase."""
+"""The phases of a tick that shards run, and how several processes may run each phase.
+
+A new phase needs
+
+- a kernel in `shards/kernels/group_phases.py`, a method of `ShardGroup` and a member of `Phase`;
+- a method of `Executor` and of `PhaseExecutor` in `shards/executor.py`;
+- its place in the order: `engine/tick.py`, and again in `engine/compiled_step.py`;
+- its arguments in `parallel/workers/team_job.py`, if workers share it (`is_shared`);
+- a row in the table "One tick" of `docs/explanation/architecture.md`.
+"""
 
 from __future__ import annotations
 

@@ -14,9 +14,8 @@ from numpy.typing import NDArray
 from cavmarl.config.traffic import TrafficConfig
 from cavmarl.core.errors import CavmarlError, ConfigError, RouteError
 from cavmarl.core.records.arrays import TripTable
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 MIN_ORIGIN_M = 15.0  # m; trips do not start on shorter lanes
 MIN_GOAL_M = 10.0  # m; trips do not end on edges whose lanes are all shorter
 DENSITY_M = 25.0  # m; at reset, a lane counts once per such length in the draw
@@ -122,9 +121,7 @@ class MapTrips:
         """(L,) whether a lane belongs to this map, admits cars, and is outside junctions."""
         lanes = self.network.lanes
         usable: NDArray[np.bool_] = (
-            (lanes["map"] == self.number)
-            & ~lanes["internal"]
-            & (lanes["permissions"] & PASSENGER != 0)
+            (lanes["map"] == self.number) & ~lanes["internal"] & (lanes["permissions"] & CARS != 0)
         )
         return usable
 
@@ -150,7 +147,7 @@ class MapTrips:
 
     def _lanes_of(self, edges: list[int]) -> NDArray[np.int64]:
         lanes = self.network.lanes
-        on_edge = np.isin(lanes["edge"], edges) & (lanes["permissions"] & PASSENGER != 0)
+        on_edge = np.isin(lanes["edge"], edges) & (lanes["permissions"] & CARS != 0)
         return np.flatnonzero(on_edge & (lanes["length_m"] >= MIN_ORIGIN_M))
 
     def _is_way_out(self, edge: int) -> bool:

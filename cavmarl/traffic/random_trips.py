@@ -12,10 +12,9 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, RouteError
 from cavmarl.maps.components import strong_components
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 MAX_VEHICLES = 1_000_000
-_PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 _TURNAROUND = ord("t")
 
 
@@ -35,7 +34,7 @@ class RandomTrips:
         self._random = np.random.default_rng(seed)
         self._into, self._edges = _largest_part(network)
         lanes = network.lanes
-        usable = lanes["permissions"] & _PASSENGER != 0
+        usable = lanes["permissions"] & CARS != 0
         lane_m = np.bincount(lanes["edge"][usable], lanes["length_m"][usable], len(network.edges))
         weights = lane_m[self._edges]
         self._weights = weights / weights.sum()
@@ -118,7 +117,7 @@ def _lines(
 def _largest_part(network: RoadNetwork) -> tuple[list[list[int]], NDArray[np.int64]]:
     """Return the predecessors of each edge, and the edges of the part with the longest lanes."""
     lanes, links = network.lanes, network.links
-    usable = lanes["permissions"] & _PASSENGER != 0
+    usable = lanes["permissions"] & CARS != 0
     good = (
         usable[links["from_lane"]] & usable[links["to_lane"]] & (links["direction"] != _TURNAROUND)
     )

@@ -22,10 +22,9 @@ from cavmarl.driving.kernels.motion.trial_drive import (
 )
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.roads.kernels.plans import TURNAROUND
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 
-CAR = 1 << VEHICLE_CLASSES.index("passenger")
 TURN_RAD = 0.9  # rad; paths that turn less within `NEAR_M` suit every car
 NEAR_M = 12.0
 
@@ -52,7 +51,7 @@ def with_tight_turns(
     to and from it are marked.
     """
     trials = [_Trial(network, steering_rad, body) for body in bodies]
-    for_cars = network.lanes["permissions"] & CAR != 0
+    for_cars = network.lanes["permissions"] & CARS != 0
     links = network.arrays.links.copy()
     normal = np.flatnonzero(for_cars & ~network.lanes["internal"])
     tight = [lane for lane in normal.tolist() if any(trial.is_tight_lane(lane) for trial in trials)]

@@ -26,7 +26,6 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
 from cavmarl.v2x.kernels.v2x_exchange import exchange_messages, hand_out
 from cavmarl.v2x.kernels.v2x_records import (
-    BAND_M,
     COUNT_NO_ACCESS,
     COUNT_OVERFLOW,
     COUNT_REACHABLE,
@@ -378,14 +377,6 @@ class V2xStatistics:
     def reception_ratio(self) -> float:
         """Packet reception ratio; 1 if nothing could be received."""
         return self.received / self.reachable if self.reachable else 1.0
-
-    def ratio_by_distance(self) -> dict[float, float]:
-        """Return the packet reception ratio by the centre of each distance band, m."""
-        return {
-            (band + 0.5) * BAND_M: received / reachable
-            for band, (reachable, received) in enumerate(self.bands.tolist())
-            if reachable
-        }
 
     def to_dict(self) -> dict[str, float]:
         """Return the numbers for a report, named as in `traffic_stats`."""

@@ -8,18 +8,17 @@ import numpy as np
 
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
 from cavmarl.env.insertions import CLOSED, INSERTED, OPENED
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.page_requests import PageRequest
 from cavmarl.viewer.subscribers import Audience
-from cavmarl.viewer.vehicle_details import Shown
+from cavmarl.viewer.vehicle_details import ViewedEnv
 
 FARTHEST_M = 30.0  # largest distance from a lane's centre
-_CARS = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def handle_insertion(
-    env: Shown, world: int, audience: Audience, watcher: int, request: PageRequest, tick: int
+    env: ViewedEnv, world: int, audience: Audience, watcher: int, request: PageRequest, tick: int
 ) -> bool:
     """Insert a vehicle, or close or open a road; return whether the request asked for that.
 
@@ -42,7 +41,7 @@ def handle_insertion(
     return True
 
 
-def _apply(env: Shown, world: int, request: PageRequest) -> tuple[str, str]:
+def _apply(env: ViewedEnv, world: int, request: PageRequest) -> tuple[str, str]:
     """Carry out the request; return kind and detail of the resulting event."""
     network = env.network
     among = env.closed_roads(world) if request.kind == "open" else None
@@ -76,7 +75,7 @@ def lane_at(
         ActionError: no lane for cars is within `FARTHEST_M`.
     """
     lanes = network.lanes
-    usable = ~lanes["internal"] & ((lanes["permissions"] & _CARS) != 0)
+    usable = ~lanes["internal"] & ((lanes["permissions"] & CARS) != 0)
     if among is not None:
         usable &= np.isin(lanes["edge"], [network.edge_ids.index(edge) for edge in among])
     rows = np.flatnonzero(usable)

@@ -18,7 +18,7 @@ from cavmarl.viewer.run_clock import RunClock
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.show_world import check_extra, serve_stages
 from cavmarl.viewer.subscribers import Audience
-from cavmarl.viewer.vehicle_details import Shown, hello_of, vehicle_details
+from cavmarl.viewer.vehicle_details import ViewedEnv, hello_of, vehicle_details
 from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
@@ -53,7 +53,7 @@ class ShownEnv:
 
     def __init__(
         self,
-        env: Shown,
+        env: ViewedEnv,
         options: WebOptions,
         *,
         title: str = "",
@@ -166,7 +166,7 @@ class ShownEnv:
 
 
 def show(
-    env: Shown,
+    env: ViewedEnv,
     *,
     port: int = DEFAULT_PORT,
     host: str = "127.0.0.1",

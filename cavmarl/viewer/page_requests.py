@@ -23,9 +23,10 @@ class PageRequest:
     """One request of a page.
 
     Attributes:
-        kind: `watch` a vehicle, mark the `ghosts` of a zone; of `CONTROLS`: `pause`, `play`,
-            `step`, `pace`, `reset`, take a `seat` and `drive` in it, `seek` a tick of a recording,
-            `insert` a vehicle at a position, `close` the road there, or `open` it again.
+        kind: `watch` (a vehicle), `ghosts` (mark those of a zone), or one of `CONTROLS`: `pause`,
+            `play`, `step`, `pace`, `reset`, `seat` (take the seat of an agent), `drive` (in that
+            seat), `seek` (a tick of a recording), `insert` (a vehicle at a position), `close` and
+            `open` (the road at a position).
         number: the vehicle, zone, agent or tick, None for none; for `pace`, simulated seconds per
             second, 0 for as fast as possible.
         x: position, m from the map's origin.

@@ -19,12 +19,12 @@ from cavmarl.viewer.live_run import ShownRun
 from cavmarl.viewer.run_loads import RunLoads
 from cavmarl.viewer.vehicle_details import hello_of
 from cavmarl.viewer.viewed_world import Stage, first_stage
-from cavmarl.viewer.web_options import WebOptions
+from cavmarl.viewer.web_options import PACKAGES, WebOptions
 
 Tell = Callable[[str], None]
 
 
-class Shown(Protocol):
+class ShownWorld(Protocol):
     """A run or a recording on a stage."""
 
     def turn(self) -> float:
@@ -103,7 +103,7 @@ def show_recording(
 
 def check_extra() -> None:
     """Raise MissingExtraError if the server's packages are not installed."""
-    for module in ("starlette", "uvicorn", "httptools", "websockets"):
+    for module in PACKAGES:
         require(module, "viewer")
 
 
@@ -122,7 +122,9 @@ def serve_stages(stack: ExitStack, stages: Sequence[Stage], options: WebOptions,
     return server.address
 
 
-def _go_on(shown: Sequence[Shown], first: Stage, tell: Tell, goes_on: Callable[[], bool]) -> None:
+def _go_on(
+    shown: Sequence[ShownWorld], first: Stage, tell: Tell, goes_on: Callable[[], bool]
+) -> None:
     try:
         while goes_on():
             wait_s = min([one.turn() for one in shown])

@@ -38,11 +38,9 @@ class PageWatcher:
     vehicle: int | None = None  # id of the watched vehicle
     sensors: bool = False  # whether to include its sensors
     ghosts_of: int | None = None
-    skipped: int = 0  # number of frames that it missed
     is_lost: bool = False  # whether it reads too slowly
 
     def offer(self, publication: Publication) -> None:
-        self.skipped += self.newest is not None
         self.newest = publication
         self.news.set()
 

@@ -37,7 +37,7 @@ DRIVERS = {
 MOST_NUMBERS = 400  # largest number of observed values to show
 ZONE_MARGIN_M = 50.0  # margin around the map up to which zones are drawn
 
-Shown = CavEnv | CavVectorEnv
+ViewedEnv = CavEnv | CavVectorEnv
 
 
 def hello_of_map(
@@ -65,7 +65,7 @@ def hello_of_map(
     }
 
 
-def hello_of(env: Shown, policy: str, *, is_driven_here: bool = True) -> dict[str, Any]:
+def hello_of(env: ViewedEnv, policy: str, *, is_driven_here: bool = True) -> dict[str, Any]:
     """Return the first message to a page about an environment's world.
 
     Args:
@@ -114,7 +114,7 @@ def vehicle_state(
 
 
 def vehicle_details(
-    env: Shown, world: int, frame: WorldFrame, vehicle: int, sensors: bool = False
+    env: ViewedEnv, world: int, frame: WorldFrame, vehicle: int, sensors: bool = False
 ) -> dict[str, Any]:
     """Return the state and the path of a vehicle, and an agent's observation and reward.
 
@@ -146,7 +146,7 @@ def sensed_shapes(config: EnvConfig, arrays: StepArrays, world: int, agent: int)
     return shapes
 
 
-def _observed(env: Shown, world: int, agent: int) -> list[list[Any]]:
+def _observed(env: ViewedEnv, world: int, agent: int) -> list[list[Any]]:
     """Return sensor, feature and value of each feature in the newest frame."""
     config, arrays = env.config, env.worlds.arrays
     if config.observation.mode == "sensors":

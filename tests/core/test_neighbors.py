@@ -6,7 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from cavmarl.core.math.neighbors import BODY, Grid, fill_grid, k_nearest, make_grid
+from cavmarl.core.math.neighbors import BODY, Grid, fill_grid, make_grid, nearest_bodies
 from tests.naive import neighbors as naive
 from tests.support.builders import crowds, vehicles
 
@@ -21,13 +21,14 @@ def grid_of(rows: NDArray[np.void], cell_m: float = 10.0) -> Grid:
 def nearest(
     rows: NDArray[np.void], row: int, radius_m: float, k: int, cell_m: float = 10.0
 ) -> list[tuple[float, int]]:
-    out_row, out_squared = np.full(k, -7, np.int32), np.full(k, -7.0)
-    me = rows[row]
-    found = k_nearest(
-        grid_of(rows, cell_m), row, me["x"], me["y"], me["z"], radius_m, k, out_row, out_squared
-    )
-    assert np.all(out_row[found:] == -7)
-    return list(zip(out_squared[:found].tolist(), out_row[:found].tolist(), strict=True))
+    """Return (squared distance, row) of the vehicles found."""
+    out_body, out_squared = np.full(k, -7, np.int32), np.full(k, -7.0)
+    me, grid = rows[row], grid_of(rows, cell_m)
+    place = (me["x"], me["y"], me["z"])
+    found = nearest_bodies(grid, row, *place, radius_m, k, out_body, out_squared)
+    assert np.all(out_body[found:] == -7)
+    found_rows = grid.bodies[out_body[:found]]["row"]
+    return list(zip(out_squared[:found].tolist(), found_rows.tolist(), strict=True))
 
 
 @given(crowds(), st.sampled_from([3.0, 10.0, 100.0]))
@@ -54,7 +55,7 @@ def test_each_row_has_one_body_in_its_cell(rows: NDArray[np.void], cell_m: float
     crowds(), st.integers(0, 11), st.sampled_from([1.0, 10.0, 25.0, 200.0]), st.integers(1, 6),
     st.sampled_from([4.0, 10.0, 100.0]),
 )  # fmt: skip
-def test_k_nearest_equals_twin(
+def test_the_nearest_equal_the_twin(
     rows: NDArray[np.void], row: int, radius_m: float, k: int, cell_m: float
 ) -> None:
     row %= len(rows)
@@ -85,8 +86,8 @@ def test_equal_distances_are_ordered_by_id_and_other_road_levels_are_ignored() -
 
 def test_a_search_works_at_a_place_without_a_vehicle() -> None:
     rows = vehicles([(1.0, 0.0, 0.0)])
-    out_row, out_squared = np.zeros(4, np.int32), np.zeros(4)
-    assert k_nearest(grid_of(rows), -1, 0.0, 0.0, 0.0, 5.0, 4, out_row, out_squared) == 1
+    out_body, out_squared = np.zeros(4, np.int32), np.zeros(4)
+    assert nearest_bodies(grid_of(rows), -1, 0.0, 0.0, 0.0, 5.0, 4, out_body, out_squared) == 1
 
 
 def test_the_grid_works_at_all_coordinates() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,15 @@ import pytest
 from typer.testing import CliRunner
 
 from cavmarl.cli.map import app
+from cavmarl.config.rig import LidarRigConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.height_track import HeightTrack
 from cavmarl.cosim.stack.lidar_points import lidar_points
 from cavmarl.cosim.stack.stack_types import StackMount, StackSensor
 from cavmarl.maps.fidelity.cloud_files import read_cloud
 from cavmarl.sensors.kernels.vehicle_readings import GRAVITY_MPS2
+from cavmarl.sensors.mounted.lidar import lidar_fan
+from cavmarl.sensors.sensed_shapes import sampled_shapes
 
 pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
@@ -53,6 +57,18 @@ def test_echoes_lie_where_rays_end() -> None:
     assert found[0] == pytest.approx([1.0, -5.0 * np.cos(down), 1.6 - 5.0 * np.sin(down)])
     assert len(found) == 2
     assert len(lidar_points(lidar, scan, 7.0)) == 1
+
+
+def test_the_only_ray_of_a_lidar_points_straight_ahead() -> None:
+    """So it does in the world (`lidar_fan`), and in all programs that use its scans."""
+    config = LidarRigConfig(rate_hz=10.0, rays=1, fov_deg=90.0)
+    (ahead,) = lidar_fan(config).rays[:, 0]
+    lidar = StackSensor("roof", "lidar", StackMount(0.0, 0.0, 0.0), asdict(config))
+    scan = np.array([[10.0]])
+    assert lidar_points(lidar, scan) - (0.0, 0.0, config.z_m) == pytest.approx(10.0 * ahead[None])
+    (shape,) = sampled_shapes("roof", config, scan)
+    assert shape["ends"] == pytest.approx(10.0 * ahead[:2])
+    assert ahead == pytest.approx([1.0, 0.0, 0.0])
 
 
 @pytest.mark.slow

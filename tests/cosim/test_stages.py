@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 import cavmarl
 from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_RED
 from cavmarl.cosim.followers.follower_client import sight_of
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot, welcome_to
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
@@ -99,7 +100,7 @@ class TurnedMap(HdMap):
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
         found = super().near(x_m, y_m, within_m)
-        return [lane._replace(heading_rad=wrap(lane.heading_rad + math.pi)) for lane in found]
+        return [lane._replace(heading_rad=wrap_angle(lane.heading_rad + math.pi)) for lane in found]
 
 
 def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]:
@@ -125,7 +126,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
         row = rows[rows["agent"] == 0][0]
         off.append(math.hypot(pose.x_m - row["x"], pose.y_m - row["y"]))
         if step > 0.75 * steps:
-            assert abs(wrap(pose.heading_rad - row["heading"])) < 0.1
+            assert abs(wrap_angle(pose.heading_rad - row["heading"])) < 0.1
             assert abs(pose.speed_mps - row["speed"]) < 0.5
         env.step(env.suggest_actions())
     return off
@@ -279,6 +280,15 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
     assert seen.vx_mps * cos + seen.vy_mps * sin == pytest.approx(5.0, abs=0.7)
     nothing = np.full((1, 1, 360), 60.0)
     assert stage.perceive({"roof": Scan(nothing)}, pose, 2.0) in ([], found)
+
+
+def test_the_only_ray_of_a_lidar_detects_an_object_ahead(grid: HdMap) -> None:
+    pose = pose_on(grid, lane_of(grid, 60.0), 10.0, 0.0)
+    settings = {"fov_deg": 90.0, "range_m": 60.0}
+    stage = LidarObjects([StackSensor("nose", "lidar", StackMount(0.0, 0.0, 0.0), settings)], grid)
+    (seen,) = stage.perceive({"nose": Scan(np.full((1, 1, 1), 20.0))}, pose, 0.0)
+    assert seen.x_m == pytest.approx(pose.x_m + 20.0 * math.cos(pose.heading_rad))
+    assert seen.y_m == pytest.approx(pose.y_m + 20.0 * math.sin(pose.heading_rad))
 
 
 def test_stages_are_chosen_by_name() -> None:

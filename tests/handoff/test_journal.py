@@ -24,9 +24,10 @@ from cavmarl.handoff.coordinator.journal import (
 )
 from cavmarl.handoff.coordinator.journal_summary import owners_at, summarize
 from cavmarl.ownership.directory import Directory
-from cavmarl.ownership.log_records import KINDS, lines_of, replay
+from cavmarl.ownership.log_records import KINDS, replay
 from cavmarl.ownership.messages import Begin, Record
 from tests.ownership.bench import Bench
+from tests.ownership.recorded_trace import lines_of
 from tests.ownership.test_simulator import campaign
 from tests.support.forks import said_in_fork
 from tests.support.generated import check_block, table

@@ -13,9 +13,8 @@ from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import COORDINATOR, Birth, Message, Output, Record, Removed, Step
 from cavmarl.ownership.offers import Approach
-from cavmarl.ownership.trace import Trace
-from cavmarl.ownership.trace_check import check_trace
 from tests.ownership.explorer import version
+from tests.ownership.recorded_trace import Trace, check_trace
 
 RUN = bytes(range(16))
 

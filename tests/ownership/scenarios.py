@@ -5,19 +5,23 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from cavmarl.core.errors import LostTickError, ProtocolError
 from cavmarl.ownership.directory import StoreError
-from cavmarl.ownership.distances import Distances
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Ack, Confirmed, Done, Held, Nack, Need, Prepare, Removed
+from cavmarl.zones.kernels.borders import NEAR, Borders, find_near
+from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.ownership.bench import Bench
 from tests.ownership.explorer import Explorer, Small, version
 from tests.ownership.simulator import Simulator
 from tests.ownership.toy import ToyWorld
+from tests.support.builders import vehicles
 from tests.support.lossy_network import FaultPlan, Rates
 from tests.support.memory_store import MemoryStore
+from tests.support.zoned import SIDE, zoned_of
 
 OTHER_RUN = bytes(reversed(range(16)))
 
@@ -294,25 +298,35 @@ def digest_before_commit() -> None:
 # Distances
 
 
+HALVES = ZonePartition(
+    (-100.0, -50.0, 100.0, 50.0), np.array([[-100.0, -50.0, 0.0, 50.0], [0.0, -50.0, 100.0, 50.0]])
+)
+"""Zone 0 in the west, zone 1 in the east; the border is at x = 0."""
+
+BORDERS = Borders(hysteresis_m=2.0, ahead_s=1.0, max_speed_mps=20.0)
+
+
+def near_border(x_m: float, owner: int = 0, speed_mps: float = 0.0) -> list[bool]:
+    """Return the entries for a vehicle that drives east: whether each is a crossing."""
+    row = vehicles([(x_m, 0.0, 0.0)], speed=speed_mps)
+    zoned = zoned_of([row if zone == owner else row[:0] for zone in (0, 1)])
+    out = np.zeros(2, dtype=NEAR)
+    found = find_near(HALVES.arrays, BORDERS, zoned, SIDE, 0, True, out)
+    crossed: list[bool] = out["crossed"][:found].tolist()
+    return crossed
+
+
 def hysteresis() -> None:
     """H16: a vehicle that weaves on a border does not change owner."""
-    distances = Distances(approach_m=20.0, hysteresis_m=2.0, overlap_m=100.0)
-    side, changes = 0, 0
-    for tick in range(40):
-        x = 1.0 if tick % 2 else -1.0  # the border is at 0
-        depth = x if side == 0 else -x
-        if distances.switches(depth):
-            side, changes = 1 - side, changes + 1
-    assert changes <= 1
+    for owner in (0, 1):
+        assert near_border(-1.0, owner) == near_border(1.0, owner) == []
+    assert near_border(3.0, 0) == near_border(-3.0, 1) == [True]
 
 
 def early_offer() -> None:
     """H20: a vehicle is offered before it crosses."""
-    distances = Distances(approach_m=5.0, hysteresis_m=1.0, overlap_m=100.0)
-    depths = [-9.0 + 2.0 * tick for tick in range(10)]
-    offered = next(tick for tick, depth in enumerate(depths) if distances.offers(depth))
-    crossed = next(tick for tick, depth in enumerate(depths) if depth > 0.0)
-    assert offered < crossed
+    assert near_border(-9.0, speed_mps=10.0) == []
+    assert near_border(-7.0, speed_mps=10.0) == [False]
 
 
 def approached(bench: Bench) -> Bench:

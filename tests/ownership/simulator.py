@@ -27,9 +27,8 @@ from cavmarl.ownership.messages import (
 )
 from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.reactions import Advance
-from cavmarl.ownership.trace import Trace
-from cavmarl.ownership.trace_check import check_trace
 from tests.ownership.protocol_invariants import Monitor
+from tests.ownership.recorded_trace import Trace, check_trace
 from tests.ownership.toy import ToyWorld
 from tests.support.lossy_network import FaultPlan, Network
 from tests.support.memory_store import MemoryStore

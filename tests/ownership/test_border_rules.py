@@ -21,7 +21,9 @@ from cavmarl.ownership.offers import Approach
 from cavmarl.ownership.trace import LOG, TraceEntry
 from cavmarl.ownership.trace_check import TraceChecker
 from tests.ownership.bench import Bench, version
-from tests.ownership.scenarios import prepared
+from tests.ownership.scenarios import HALVES, near_border, prepared
+from tests.support.builders import vehicles
+from tests.support.zoned import exchanged, ghosts_of
 
 
 def test_r06_the_target_is_where_the_vehicle_is() -> None:
@@ -69,12 +71,16 @@ def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> Non
 
 
 def test_r31_offering_switching_and_releasing_have_distances_of_their_own() -> None:
-    distances = Distances(approach_m=10.0, hysteresis_m=2.0, overlap_m=100.0)
-    rows = [
-        (distances.offers(depth), distances.switches(depth), distances.releases(depth))
-        for depth in (-10.0, -9.0, 0.5, 2.0, 2.5, 100.0, 101.0)
-    ]
-    assert [sum(row) for row in rows] == [0, 1, 1, 1, 2, 2, 3]
+    steps = []
+    for x_m in (-9.0, -7.0, 1.0, 3.0, 19.0, 21.0):
+        entries = near_border(x_m, speed_mps=10.0)
+        row = vehicles([(x_m, 0.0, 0.0)])
+        zoned = exchanged(HALVES, 20.0, [row[:0], row])  # zone 1 owns the vehicle
+        steps.append((bool(entries), True in entries, not len(ghosts_of(zoned, 0))))
+    offered, switches, released = zip(*steps, strict=True)
+    assert offered == (False, True, True, True, True, True)
+    assert switches == (False, False, False, True, True, True)
+    assert released == (False, False, False, False, False, True)
 
 
 def test_r35_offers_name_vehicles_of_their_own() -> None:

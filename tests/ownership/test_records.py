@@ -8,16 +8,10 @@ from dataclasses import replace
 import pytest
 
 from cavmarl.core.errors import JournalError, ProtocolError
-from cavmarl.ownership.log_records import (
-    SCHEMA,
-    LogChain,
-    lines_of,
-    records_from_lines,
-    replay,
-    sealed,
-)
+from cavmarl.ownership.log_records import SCHEMA, LogChain, replay, sealed
 from cavmarl.ownership.messages import Begin, Birth, Commit, Host, Removed, Reset
 from tests.ownership.bench import Bench
+from tests.ownership.recorded_trace import lines_of, records_from_lines
 from tests.ownership.test_simulator import campaign
 
 
@@ -49,13 +43,6 @@ def test_every_prefix_can_be_replayed(log: str) -> None:
     ticks = [replay(records[:length]).tick for length in range(1, len(records) + 1)]
     assert ticks == sorted(ticks)
     assert ticks[-1] == 15
-
-
-def test_a_torn_last_line_is_named_and_earlier_lines_are_read(log: str) -> None:
-    torn = log[:-7]
-    with pytest.raises(JournalError, match=f"line {len(log.splitlines())} "):
-        records_from_lines(torn)
-    assert records_from_lines(torn[: torn.rfind("\n") + 1]) == records_from_lines(log)[:-1]
 
 
 def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:

@@ -8,9 +8,10 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 
 from cavmarl.ownership.directory import Directory
 from cavmarl.ownership.limits import Limits
-from cavmarl.ownership.log_records import lines_of, records_from_lines, replay
+from cavmarl.ownership.log_records import replay
 from cavmarl.ownership.messages import COORDINATOR, Abort, Ack, Message, Nack, Prepare, Step
 from tests.ownership.bench import Bench
+from tests.ownership.recorded_trace import lines_of, records_from_lines
 
 ZONES = 3
 FATES = st.sampled_from(["arrives", "arrives", "is lost", "is doubled", "is late"])

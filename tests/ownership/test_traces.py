@@ -29,8 +29,8 @@ from cavmarl.ownership.messages import (
     Switch,
 )
 from cavmarl.ownership.trace import LOG, TraceEntry
-from cavmarl.ownership.trace_check import check_trace
 from tests.ownership.bench import Bench
+from tests.ownership.recorded_trace import check_trace
 from tests.ownership.simulator import Simulator
 from tests.ownership.test_simulator import campaign, world
 

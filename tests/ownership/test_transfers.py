@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from cavmarl.ownership.limits import Limits
 from cavmarl.ownership.messages import Record
-from cavmarl.ownership.trace import LOG, Trace
+from cavmarl.ownership.trace import LOG
 from cavmarl.ownership.transfer_summary import TransferSummary
 from cavmarl.ownership.transfers import KEPT_ROWS, Transfer, TransferLog
 from tests.ownership.bench import Bench
+from tests.ownership.recorded_trace import Trace
 from tests.ownership.test_simulator import campaign
 from tests.support.held_entries import held_entries
 

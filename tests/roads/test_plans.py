@@ -4,12 +4,10 @@ import numpy as np
 import pytest
 
 from cavmarl.core.errors import RouteError
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import make_plans, way
 from tests.naive import plans as naive
 from tests.support.traffic import NAMES, network
-
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 def goals(roads: RoadNetwork, many: int = 6) -> list[int]:
@@ -23,7 +21,7 @@ def test_plans_take_the_least_time_from_every_lane(name: str) -> None:
     roads = network(name)
     edges = goals(roads)
     for goal, plan in zip(edges, make_plans(roads, edges), strict=True):
-        cost = naive.costs(roads, goal, PASSENGER)
+        cost = naive.costs(roads, goal, CARS)
         np.testing.assert_array_equal(np.isfinite(plan["to_go"]), np.isfinite(cost))
         for lane in np.flatnonzero(np.isfinite(cost)).tolist():
             step = plan[lane]

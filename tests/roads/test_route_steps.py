@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from cavmarl.driving.kernels.lanes.route_following import distance_left, next_step, own_step
 from cavmarl.roads.kernels.route_steps import plan_route, trace_edges
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans, way
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.naive import routes as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 FIRST_STEP = 5  # other routes precede them in the table
 
 
@@ -45,7 +44,7 @@ def routes(draw: st.DrawFn, name: str) -> tuple[str, list[int]]:
 
 
 def planned(
-    roads: RoadNetwork, edges: list[int], permission: int = PASSENGER
+    roads: RoadNetwork, edges: list[int], permission: int = CARS
 ) -> tuple[NDArray[np.void], NDArray[np.float64], list[int]]:
     """Return steps, costs, and the route on each edge."""
     number = int(roads.edges["num_lanes"][edges].sum())
@@ -98,14 +97,12 @@ def test_the_steps_of_a_route_take_the_least_time_along_its_edges(
     case: tuple[str, list[int]],
 ) -> None:
     name, edges = case
-    check_route(network(name), edges, PASSENGER)
+    check_route(network(name), edges, CARS)
 
 
 def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(shared_maps: Path) -> None:
     roads = read_network(shared_maps / "net" / "bologna_acosta" / "acosta_buslanes.net.xml")
-    forbidden = np.flatnonzero(
-        ~roads.lanes["internal"] & (roads.lanes["permissions"] & PASSENGER == 0)
-    )
+    forbidden = np.flatnonzero(~roads.lanes["internal"] & (roads.lanes["permissions"] & CARS == 0))
     edges = np.unique(roads.lanes["edge"][forbidden]).tolist()
     assert edges
     for edge in edges:

@@ -15,7 +15,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.simulation import Simulation
-from cavmarl.rewards.kernels.terms import TTC_REACH_M
+from cavmarl.rewards.kernels.terms import TERMS_REACH_M
 from cavmarl.sensors.observed import SENSORS, largest_radius_m, layout, sensing_reach_m
 from tests.support.driving import drive, make_simulation, start
 from tests.support.world import tick_of
@@ -154,7 +154,7 @@ def test_the_declared_reach_is_at_most_half_a_metre_too_long(sensor: str) -> Non
     looks = {one.name: one for one in SENSORS}
     config = simulation.config.sensors
     if sensor == TERMS_ALONE:
-        reach_m, part = TTC_REACH_M, 1
+        reach_m, part = TERMS_REACH_M, 1
     else:
         reach_m, part = looks[sensor].reach_of_centres_m(config, radius_m), 0
     distance = np.hypot(*(places(env)[:, 2:4] - [agent["x"][0], agent["y"][0]]).T)
@@ -174,4 +174,4 @@ def test_rays_see_the_corner_of_a_body_whose_centre_is_beyond_their_range() -> N
     simulation = world("grid4x4", "lidar")
     config = simulation.config.sensors
     assert sensing_reach_m(config, RADIUS_M) == config.lidar.range_m + RADIUS_M
-    assert sensing_reach_m(world("grid4x4", "way").config.sensors, 9.0) == TTC_REACH_M
+    assert sensing_reach_m(world("grid4x4", "way").config.sensors, 9.0) == TERMS_REACH_M

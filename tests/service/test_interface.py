@@ -20,10 +20,10 @@ from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from cavmarl.service.app import make_app
-from cavmarl.service.auth import Service, open_to_all, rule_of
 from cavmarl.service.configurations import add_configuration
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.request_bodies import ConfigurationBody
+from cavmarl.service.route_access import Service, open_to_all, rule_of
 from cavmarl.service.routes import ROUTERS
 from tests.support.fleet import Fleet
 

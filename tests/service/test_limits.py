@@ -13,9 +13,9 @@ import httpx
 import pytest
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.auth import MOST_HELD
 from cavmarl.service.configurations import MOST_CONFIGURATIONS, add_configuration
 from cavmarl.service.request_bodies import ConfigurationBody
+from cavmarl.service.route_access import MOST_HELD
 from cavmarl.service.service_records import ROLES
 from tests.service.test_routes import ask, problem_of, token_of
 from tests.support.fleet import Fleet

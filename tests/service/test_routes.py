@@ -12,8 +12,8 @@ import jwt
 import pytest
 from fastapi.routing import APIRoute
 
-from cavmarl.service.auth import open_to_all, rule_of
 from cavmarl.service.error_names import PROBLEMS
+from cavmarl.service.route_access import open_to_all, rule_of
 from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_records import ROLES
 from tests.support.generated import check_block

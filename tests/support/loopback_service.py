@@ -24,13 +24,13 @@ from cavmarl.core.errors import ServiceError
 from cavmarl.core.server_address import listen
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
-from cavmarl.service.auth import Service
 from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_app import make_node_app
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.rate_limit import RateLimit
+from cavmarl.service.route_access import Service
 from cavmarl.service.server import ServerOptions, uvicorn_config
 from cavmarl.service.service_records import ROLES, Role
 from cavmarl.service.session_worlds import SessionWorlds

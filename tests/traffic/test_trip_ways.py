@@ -15,7 +15,7 @@ import pytest
 from cavmarl.core.errors import RouteError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.evaluate.traffic.native_side import make_world
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.trip_ways import TripWays
@@ -23,7 +23,6 @@ from tests.support.netgenerate import netgenerate
 
 sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
-MASK = 1 << VEHICLE_CLASSES.index("passenger")
 TRIP = '<trip id="{k}" type="car" depart="0" from="{start}" to="{goal}"/>'
 GRID = "--grid --grid.number=4 --grid.length=70 --turn-lanes=1 --turn-lanes.length=25 -L=2"
 
@@ -79,9 +78,9 @@ def test_no_way_is_slower_than_that_of_duarouter(name: str, tmp_path: Path) -> N
     for pair, other in zip(pairs, theirs, strict=True):
         if other is None:
             with pytest.raises(RouteError, match="no way"):
-                ways.edges(np.array(pair, dtype=np.int32), MASK)
+                ways.edges(np.array(pair, dtype=np.int32), CARS)
             continue
-        own = ways.edges(np.array(pair, dtype=np.int32), MASK).tolist()
+        own = ways.edges(np.array(pair, dtype=np.int32), CARS).tolist()
         limit = time_s(roads, [names.index(edge) for edge in other])
         assert time_s(roads, own) < limit + 1e-3, [names[edge] for edge in own]
 

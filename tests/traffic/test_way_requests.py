@@ -12,7 +12,7 @@ from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, EVENT_AR
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.kernels.plans import plan_goal
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.kernels.way_requests import (
     find_asking,
@@ -26,7 +26,6 @@ from cavmarl.traffic.rerouting import LOOK
 from tests.naive import plans as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 ROOM = 400  # steps
 
 
@@ -48,10 +47,10 @@ def way_to(
 ) -> tuple[NDArray[np.void], int]:
     """Return the steps of the fastest route, and their number."""
     plan = np.zeros(len(roads.lanes), PLAN)
-    plan_goal(roads.arrays, goal, PASSENGER, 1.0, plan)
+    plan_goal(roads.arrays, goal, CARS, 1.0, plan)
     steps = np.zeros(room, PLAN)
     edges = np.zeros(room, np.int32)
-    number = find_way(roads.arrays, plan, lane, PASSENGER, edges, steps, np.zeros(room))
+    number = find_way(roads.arrays, plan, lane, CARS, edges, steps, np.zeros(room))
     return steps, number
 
 
@@ -68,7 +67,7 @@ def test_ways_are_as_fast_as_the_fastest_and_lead_to_the_goal(
 ) -> None:
     roads = with_speeds(network(name), data.draw(st.integers(0, 5)))
     goal = data.draw(st.sampled_from(outside(roads)))
-    cost = naive.costs(roads, goal, PASSENGER)
+    cost = naive.costs(roads, goal, CARS)
     lane = data.draw(st.sampled_from(np.flatnonzero(~roads.lanes["internal"]).tolist()))
     steps, number = way_to(roads, goal, lane)
     if not np.isfinite(cost[lane]):

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.v2x.channel import airtime_s
 from cavmarl.v2x.kernels.v2x_records import (
+    BAND_M,
     COUNT_NO_ACCESS,
     COUNT_OVERFLOW,
     COUNT_REACHABLE,
@@ -127,8 +128,8 @@ def test_receptions_have_the_configured_probability() -> None:
         chance = naive.chance(config, distance, False, 0.0)
         spread = 4.0 * math.sqrt(chance * (1.0 - chance) / 300.0) + 1e-3
         assert abs(world.bus.statistics().reception_ratio - chance) < spread
-        (band,) = world.bus.statistics().ratio_by_distance()
-        assert abs(band - distance) <= 13.0
+        (band,) = np.flatnonzero(world.bus.statistics().bands[:, 0])
+        assert band * BAND_M <= distance <= (band + 1) * BAND_M
 
 
 def test_packets_of_the_larger_ids_exceed_the_capacity() -> None:

@@ -128,5 +128,5 @@ def test_a_halo_of_just_the_distance_is_wide_enough(
     # Without margin: the limit is the squared distance of the pair, by the same operations.
     there = (here[0] + 13.0 * math.cos(angle), here[1] + 13.0 * math.sin(angle))
     dx, dy = there[0] - here[0], there[1] - here[1]
-    zone = partition.zone_of(*here)
+    zone = zone_of(partition.arrays, *here)
     assert squared_distance(partition.reaching, zone, *there) <= dx * dx + dy * dy

@@ -12,6 +12,7 @@ import typer
 from rich.console import Console
 from rich.markup import escape
 
+from cavmarl.bench.harness import numbers_of
 from cavmarl.cli.output import JsonPath, PolicyName, about, grid, pairs_grid, with_world, write_json
 from cavmarl.cli.verify import options
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
@@ -108,7 +109,7 @@ def verify_nodes(
 
     If a result or a state differs, print where and exit with 1.
     """  # fmt: skip
-    counts = options.counts_of("--nodes", nodes)
+    counts = numbers_of("--nodes", nodes)
     runs: dict[str, Any] = {"zones": zones, "policy": policy}
     of_faults = {
         "--mix": mix, "--seeds": seeds, "--first-seed": first_seed, "--process-runs": process_runs,

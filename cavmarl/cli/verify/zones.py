@@ -10,6 +10,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
+from cavmarl.bench.harness import numbers_of
 from cavmarl.cli.output import (
     OUTPUT,
     WORLD,
@@ -68,7 +69,7 @@ def verify_zones(
 
     On the first difference of a division, print it and exit with 1.
     """
-    counts = None if zones is None else options.counts_of("--zones", zones)
+    counts = None if zones is None else numbers_of("--zones", zones)
     world = with_sensors_of_drivers(world, [policy])
     if journal is not None:
         make_folder(journal)

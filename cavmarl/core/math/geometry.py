@@ -218,8 +218,8 @@ def time_to_collision_s(
     """Return the time in s until two oriented rectangles touch; inf: never, 0: now.
 
     This is Hayward's time to collision ("Near miss determination through use of a scale of danger",
-    Highway Research Record 384, 1972) for bodies with constant velocities that do not turn: they
-    overlap while their projections do on each of the four separating axes of `boxes_overlap`.
+    Highway Research Record 384, 1972) for bodies with constant velocities that do not turn. Two
+    bodies overlap while their projections overlap on all four axes of `boxes_overlap`.
     """
     cos = abs(cos1 * cos2 + sin1 * sin2)
     sin = abs(cos1 * sin2 - sin1 * cos2)

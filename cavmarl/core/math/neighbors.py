@@ -195,7 +195,7 @@ def fill_grid(
 
 
 @kernel
-def k_nearest(
+def nearest_bodies(
     grid: Grid,  # filled for this tick
     row: int,  # VEHICLE row to leave out, the searching vehicle; -1: none
     x: float,  # m
@@ -203,30 +203,11 @@ def k_nearest(
     z: float,  # m; vehicles more than `LEVEL_HEIGHT_M` above or below are left out
     radius_m: float,  # maximum distance of centres in the plane
     k: int,  # maximum number of vehicles
-    # (k,) int, VEHICLE rows that were found, overwritten up to the returned number
-    out_row: NDArray[np.int32],
+    # (k,) int, positions in `grid.bodies`, overwritten up to the returned number
+    out_body: NDArray[np.int32],
     out_squared: NDArray[np.float64],  # (k,) their squared distances in m²
 ) -> int:  # number of vehicles found
     """Return the nearest vehicles on the same level, sorted by distance, then by id."""
-    found = nearest_bodies(grid, row, x, y, z, radius_m, k, out_row, out_squared)
-    for m in range(found):
-        out_row[m] = grid.bodies[out_row[m]]["row"]
-    return found
-
-
-@kernel
-def nearest_bodies(
-    grid: Grid,
-    row: int,
-    x: float,
-    y: float,
-    z: float,
-    radius_m: float,
-    k: int,
-    out_body: NDArray[np.int32],
-    out_squared: NDArray[np.float64],
-) -> int:
-    """Find the `k_nearest` as positions in `grid.bodies`."""
     bodies = grid.bodies
     limit = radius_m * radius_m
     first_column, last_column = cell_columns(grid, x, radius_m)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ClockError, FollowerError
-from cavmarl.cosim.followers.follower_connection import Address, ReceivedFrame, call
+from cavmarl.cosim.followers.follower_connection import Address, call
 from cavmarl.cosim.followers.follower_messages import (
     Control,
     FollowerRefusal,
@@ -21,6 +21,7 @@ from cavmarl.cosim.followers.follower_messages import (
     Welcome,
     read_payload,
 )
+from cavmarl.cosim.followers.framed_socket import Frame
 
 CALL_S = 10.0
 
@@ -146,7 +147,7 @@ class Follower:
     def close(self) -> None:
         self._line.close()
 
-    def _expect(self, within_s: float | None, *kinds: Say) -> ReceivedFrame:
+    def _expect(self, within_s: float | None, *kinds: Say) -> Frame:
         frame = self._line.hear(within_s)
         if frame.kind in kinds:
             if frame.kind is not Say.SNAPSHOT:

@@ -16,7 +16,7 @@ from contextlib import contextmanager, suppress
 from hmac import compare_digest
 from math import prod
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,7 +33,7 @@ from cavmarl.cosim.followers.follower_messages import (
     payload_of,
     read_payload,
 )
-from cavmarl.cosim.followers.framed_socket import HEAD_BYTES, FramedSocket, bytes_before_data
+from cavmarl.cosim.followers.framed_socket import HEAD_BYTES, Frame, FramedSocket, bytes_before_data
 
 Array = NDArray[Any]
 
@@ -45,14 +45,6 @@ MAX_PATH = 100  # maximum number of bytes of a Unix socket's path on every syste
 # Dtypes of arrays in NumPy's notation: only numbers, no pointers.
 _DTYPES = {np.dtype(code).newbyteorder("<").str for code in "?bBhHiIqQefd"}
 _MAX_AXES = 8
-
-
-class ReceivedFrame(NamedTuple):
-    """One received frame."""
-
-    kind: Say  # kind of the frame
-    payload: Any  # as decoded by msgpack
-    size: int  # number of bytes of its data
 
 
 class _DeadlineSocket(socket.socket):
@@ -137,7 +129,7 @@ class FollowerConnection:
         with self._peer_errors("read", within_s):
             self._wire.send(kind, 0, payload, arrays)
 
-    def hear(self, within_s: float | None = None) -> ReceivedFrame:
+    def hear(self, within_s: float | None = None) -> Frame:
         """Receive the next frame; then read its data with `take` or `skip`.
 
         Raises FollowerLostError: none arrives in time, or the other end has ended; FollowerError:
@@ -145,8 +137,7 @@ class FollowerConnection:
         """
         self._set_deadline(within_s)
         with self._peer_errors("answered", within_s):
-            frame = self._wire.receive()
-        return ReceivedFrame(Say(frame.kind), frame.payload, frame.size)
+            return self._wire.receive()
 
     def has_come(self) -> bool:
         """Return whether the next frame has arrived except for its data; then `hear` does not wait.
@@ -159,7 +150,7 @@ class FollowerConnection:
             head = self._socket.ahead[:HEAD_BYTES]
             return self._socket.read_ahead(bytes_before_data(head, FOLLOWERS))
 
-    def skip(self, frame: ReceivedFrame) -> None:
+    def skip(self, frame: Frame) -> None:
         """Check that a frame has no data, and finish reading it.
 
         Raises FollowerError: as in `hear`; or the frame has data.
@@ -170,7 +161,7 @@ class FollowerConnection:
             )
         self._take([])
 
-    def take(self, frame: ReceivedFrame) -> tuple[FollowerSnapshot, list[Array]]:
+    def take(self, frame: Frame) -> tuple[FollowerSnapshot, list[Array]]:
         """Return the snapshot of a frame, with its arrays.
 
         Raises FollowerError: as in `hear`.

@@ -20,7 +20,7 @@ from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.stack_types import EgoPose, Readings, StackSensor
 from cavmarl.sensors.kernels.panorama import SEMANTIC_NAMES
-from cavmarl.sensors.kernels.rig_frames import rotation
+from cavmarl.sensors.mounted.mount_transforms import mount_rotation
 
 _HEIGHTS_M = (0.3, 0.7, 1.1)  # above the ground
 _NEAREST_M = 0.5  # minimum depth before the camera
@@ -108,9 +108,7 @@ class LidarCamera(LidarObjects):
 
 def _camera(sensor: StackSensor) -> _Camera:
     settings = sensor.settings
-    yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
-    turn = np.zeros((3, 3))
-    rotation(yaw, pitch, roll, turn)
+    turn = mount_rotation(settings["yaw_deg"], settings["pitch_deg"], settings["roll_deg"])
     place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
     focal_px = 0.5 * settings["width"] / math.tan(0.5 * math.radians(settings["fov_deg"]))
     return _Camera(sensor, turn, place_m, focal_px)

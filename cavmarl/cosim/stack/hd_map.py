@@ -14,10 +14,6 @@ from cavmarl.roads.network import RoadNetwork
 _CELL_M = 20.0
 
 
-def wrap(angle: float) -> float:
-    return math.atan2(math.sin(angle), math.cos(angle))
-
-
 class OnLane(NamedTuple):
     """A place relative to a lane."""
 

@@ -10,11 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.cosim.stack.stack_types import StackSensor
-from cavmarl.sensors.kernels.rig_frames import rotation
+from cavmarl.sensors.mounted.lidar import has_echo, lidar_directions
+from cavmarl.sensors.mounted.mount_transforms import mount_rotation, transform
 
 Points = NDArray[np.float64]
-
-RANGE_MARGIN_M = 0.05  # distances at least this much below the range are echoes
 
 
 def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) -> Points:
@@ -25,12 +24,8 @@ def lidar_points(lidar: StackSensor, scan: Points, range_m: float = math.inf) ->
     """
     settings = lidar.settings
     points, _ = sensor_points(settings, scan, range_m)
-    turn = np.zeros((3, 3))
-    yaw, pitch, roll = (math.radians(settings[key]) for key in ("yaw_deg", "pitch_deg", "roll_deg"))
-    rotation(yaw, pitch, roll, turn)
-    place_m = np.array([settings["x_m"], settings["y_m"], settings["z_m"]])
-    found: Points = points @ turn.T + place_m
-    return found
+    turn = mount_rotation(settings["yaw_deg"], settings["pitch_deg"], settings["roll_deg"])
+    return transform(turn, np.array([settings["x_m"], settings["y_m"], settings["z_m"]]), points)
 
 
 def sensor_points(
@@ -41,21 +36,8 @@ def sensor_points(
     `settings`: keys of the lidar. `scan`, `range_m`: see `lidar_points`.
     """
     layers, rays = scan.shape
-    fov = math.radians(settings["fov_deg"])
-    around = settings["fov_deg"] == 360.0
-    step = fov / rays if around else fov / max(rays - 1, 1)
-    azimuth = np.arange(rays) * step - (0.0 if around else 0.5 * fov)
-    elevation = np.zeros(1)
-    if layers > 1:
-        elevation = np.linspace(settings["lower_deg"], settings["upper_deg"], layers)
-    up = np.radians(elevation)[:, None]
-    rays_of = np.stack(
-        [
-            np.cos(up) * np.cos(azimuth),
-            np.cos(up) * np.sin(azimuth),
-            np.broadcast_to(np.sin(up), scan.shape),
-        ],
-        axis=-1,
+    directions = lidar_directions(
+        settings["fov_deg"], rays, settings["lower_deg"], settings["upper_deg"], layers
     )
-    hit = scan < min(float(settings["range_m"]) - RANGE_MARGIN_M, range_m)
-    return rays_of[hit] * scan[hit][:, None], np.nonzero(hit)[0]
+    hit = has_echo(scan, settings["range_m"]) & (scan < range_m)
+    return directions[hit] * scan[hit][:, None], np.nonzero(hit)[0]

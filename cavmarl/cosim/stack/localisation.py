@@ -18,7 +18,8 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.stack_types import (
     EgoPose,
     Mission,
@@ -101,7 +102,7 @@ class GnssInertial:
 
     def _pose(self) -> EgoPose:
         x_m, y_m, heading, speed_mps = self._get()[:4].tolist()
-        return EgoPose(x_m, y_m, wrap(heading), max(0.0, speed_mps), self._yaw_rate)
+        return EgoPose(x_m, y_m, wrap_angle(heading), max(0.0, speed_mps), self._yaw_rate)
 
     def _set(self, place: Sequence[float], deviations: Sequence[float]) -> None:
         """Set x, y, heading and speed with their standard deviations; the bias is unknown."""
@@ -213,9 +214,9 @@ class GnssInertial:
         east, north = fix[0] - self._anchor[0], fix[1] - self._anchor[1]
         state = self._get()
         if self._turned_rad < _STRAIGHT_RAD:
-            apart = wrap(math.atan2(north, east) - float(state[2]))
+            apart = wrap_angle(math.atan2(north, east) - float(state[2]))
             if abs(apart) > 0.5 * math.pi:
-                turned = (*fix, wrap(float(state[2]) + apart), float(state[3]))
+                turned = (*fix, wrap_angle(float(state[2]) + apart), float(state[3]))
                 self._set_by_fix(turned, (1.0, 1.0, _FIRST_HEADING_RAD, 1.0))
         self._anchor = fix
         self._driven_m = self._turned_rad = 0.0
@@ -233,7 +234,7 @@ class GnssInertial:
         candidates = [
             (abs(offset - place.d_m), place)
             for place in near
-            if abs(wrap(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
+            if abs(wrap_angle(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
         ]
         # Lanes overlap within junctions, so the observed lane would be ambiguous.
         if not candidates or any(internal[place.lane] for place in near):
@@ -242,7 +243,7 @@ class GnssInertial:
         row = np.array([-math.sin(place.heading_rad), math.cos(place.heading_rad), 0.0, 0.0])
         deviation = self._deviation("lane_boundary", 0, _LEAST["lane_d"])
         if self._update(row, offset - place.d_m, deviation):
-            turn = wrap(place.heading_rad + float(seen[3]) - float(self._get()[2]))
+            turn = wrap_angle(place.heading_rad + float(seen[3]) - float(self._get()[2]))
             deviation = self._deviation("lane_boundary", 3, _LEAST["lane_heading"])
             self._update(np.array([0.0, 0.0, 1.0, 0.0]), turn, deviation)
 

@@ -15,13 +15,14 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.stack_types import EgoPose, Obstacle, Readings, StackSensor
+from cavmarl.sensors.mounted.lidar import azimuths, elevations, has_echo
 
 _GAP_M = 0.8
 _ROAD_M = 2.5  # maximum distance of an echo from the centre of a lane
 _BESIDE_ROAD_M = 6.0  # the same for pedestrians, who may step onto the road
-_RANGE_MARGIN_M = 0.05
 _MATCH_M = 3.0  # maximum distance between an object and its predicted position
 _SAME_M = 0.5  # the same for an object that keeps the kind of an earlier detection: 0.1 s before
 _ALPHA, _BETA = 0.5, 0.2
@@ -146,8 +147,8 @@ def _differ(one: str, other: str) -> bool:
 def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
     """Return the direction of the nearest lane, reversed if the own heading is opposite."""
     nearest = lanes[0].heading_rad
-    apart = abs(wrap(nearest - pose.heading_rad))
-    return nearest if apart < 0.5 * math.pi else wrap(nearest + math.pi)
+    apart = abs(wrap_angle(nearest - pose.heading_rad))
+    return nearest if apart < 0.5 * math.pi else wrap_angle(nearest + math.pi)
 
 
 def _groups(
@@ -158,21 +159,20 @@ def _groups(
     `scan`: (layers, rays) distances in m.
     """
     settings = lidar.settings
-    layers, rays, fov = scan.shape[0], scan.shape[1], math.radians(settings["fov_deg"])
+    layers = scan.shape[0]
     level = 0
     if layers > 1:
-        elevations = np.linspace(settings["lower_deg"], settings["upper_deg"], layers)
-        level = int(np.argmin(np.abs(elevations)))
+        rising = elevations(settings["lower_deg"], settings["upper_deg"], layers)
+        level = int(np.argmin(np.abs(rising).round(9)))  # of two, the lower one
     all_around = settings["fov_deg"] == 360.0
-    step = fov / rays if all_around else fov / max(rays - 1, 1)
-    azimuths = np.arange(rays) * step - (0.0 if all_around else 0.5 * fov) + lidar.mount.yaw_rad
+    first, step, rays = azimuths(settings["fov_deg"], scan.shape[1])
+    turns = first + step * np.arange(rays) + lidar.mount.yaw_rad
     ranges = scan[level]
-    is_echo = ranges < settings["range_m"] - _RANGE_MARGIN_M
-    x_m = lidar.mount.x_m + ranges * np.cos(azimuths)
-    y_m = lidar.mount.y_m + ranges * np.sin(azimuths)
+    x_m = lidar.mount.x_m + ranges * np.cos(turns)
+    y_m = lidar.mount.y_m + ranges * np.sin(turns)
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     points = np.stack([pose.x_m + x_m * cos - y_m * sin, pose.y_m + x_m * sin + y_m * cos], axis=1)
-    (hits,) = np.nonzero(is_echo)
+    (hits,) = np.nonzero(has_echo(ranges, settings["range_m"]))
     if not hits.size:
         return []
     apart = np.hypot(*(points[hits[1:]] - points[hits[:-1]]).T)

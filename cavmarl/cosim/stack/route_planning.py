@@ -16,6 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MAJOR,
     SIGNAL_NONE,
@@ -24,7 +25,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.cosim.stack.hd_map import HdMap, OnLane, wrap
+from cavmarl.cosim.stack.hd_map import HdMap, OnLane
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle, Trajectory
 from cavmarl.roads.routing import make_plans
 
@@ -89,7 +90,7 @@ class LaneRoute:
         """Return the nearby lane that fits the vehicle best and leads to the goal, or None."""
         best, least = None, math.inf
         for place in self._map.near(pose.x_m, pose.y_m, _MATCH_M):
-            apart = abs(wrap(pose.heading_rad - place.heading_rad))
+            apart = abs(wrap_angle(pose.heading_rad - place.heading_rad))
             if not np.isfinite(plan["to_go"][place.lane]) or apart > 1.2:
                 continue
             cost = abs(place.d_m) + _HEADING_COST_M * apart
@@ -251,7 +252,7 @@ class LaneRoute:
                 continue
             course = math.atan2(obstacle.vy_mps, obstacle.vx_mps)
             for place in self._map.near(obstacle.x_m, obstacle.y_m, 2.5):
-                if abs(wrap(course - place.heading_rad)) > 1.0:
+                if abs(wrap_angle(course - place.heading_rad)) > 1.0:
                     continue
                 left = float(network.lanes["length_m"][place.lane]) - place.s_m
                 if place.lane in inside or (

@@ -20,7 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, require
-from cavmarl.cosim.stack.hd_map import HdMap, wrap
+from cavmarl.core.math.geometry import wrap_angle
+from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.lidar_points import lidar_points
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Readings, StackSensor
@@ -136,7 +137,7 @@ class ScanMatching(GnssInertial):
     def _apart(self, pose: Points) -> float:
         """Return the squared deviations of x, y and heading (3,) from the filter's pose."""
         off = pose - self._get()[:3]
-        off[2] = wrap(float(off[2]))
+        off[2] = wrap_angle(float(off[2]))
         spread = self._spread[:3, :3] + np.diag([_PAIR_M, _PAIR_M, _PAIR_M / _TURN_M]) ** 2
         return float(off @ np.linalg.solve(spread, off))
 
@@ -182,7 +183,7 @@ class ScanMatching(GnssInertial):
             if share < _WEAKEST * strength[-1] or share < 1.0:  # 1.0: a standard deviation of 1 m
                 continue
             off = seen - self._get()[:3]
-            off[2] = wrap(float(off[2]))
+            off[2] = wrap_angle(float(off[2]))
             row = axis * (1.0, 1.0, _TURN_M)
             deviation = max(1.0 / math.sqrt(share), _LEAST_M * math.sqrt(strength[-1] / share))
             self._update(row, float(row @ off), deviation, gate=math.inf)

@@ -21,8 +21,9 @@ from numpy.typing import NDArray
 
 from cavmarl.config.rig import GnssConfig
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.cosim.stack.camera_classes import LidarCamera
-from cavmarl.cosim.stack.hd_map import HdMap, wrap
+from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.localisation import GnssInertial
 from cavmarl.cosim.stack.perception import LidarObjects
 from cavmarl.cosim.stack.route_planning import LaneRoute
@@ -79,7 +80,7 @@ class PurePursuit:
         x_m, y_m = _point_at(trajectory, pose, ahead_m)
         east, north = x_m - pose.x_m, y_m - pose.y_m
         distance = max(math.hypot(east, north), 0.5)
-        alpha = wrap(math.atan2(north, east) - pose.heading_rad - slip)
+        alpha = wrap_angle(math.atan2(north, east) - pose.heading_rad - slip)
         curvature = 2.0 * math.sin(alpha) / distance
         wanted_slip = math.asin(max(-0.6, min(0.6, 0.5 * mission.length_m * curvature)))
         wanted = math.atan(2.0 * math.tan(wanted_slip))

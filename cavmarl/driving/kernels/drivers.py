@@ -1,9 +1,13 @@
 """Drivers: the acceleration and the lane change of each vehicle, from the committed state alone.
 
 Accelerations follow the car-following model of the vehicle's type, lane changes follow MOBIL. This
-file finds the inputs of these models: the leader, also across lane and junction borders, the next
-lower speed limit, the stop line of a signal or of a right of way, the end of a lane, a vehicle that
-wants to merge, and the lane that the route needs.
+file finds the inputs of these models:
+
+- the leader, also on the next lanes and behind a junction;
+- the next lower speed limit, and the end of the lane;
+- the line at which the vehicle must stop for a signal or for vehicles with the right of way;
+- a vehicle that wants to merge;
+- the lane that the route needs.
 """
 
 from __future__ import annotations

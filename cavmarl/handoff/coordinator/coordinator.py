@@ -35,7 +35,7 @@ class Near(NamedTuple):
 
 
 class Watcher(Protocol):
-    """A receiver of records, such as `ownership.trace.Trace`."""
+    """A receiver of records, such as `InvariantMonitor`."""
 
     def logged(self, records: Iterable[Record]) -> None:
         """Receive records, in the order of the journal."""

@@ -9,10 +9,9 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from cavmarl.maps.exports.opendrive_lanes import LANES
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 MOST_OFF = 0.02  # maximum relative error of the total length
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 @dataclass(frozen=True)
@@ -86,7 +85,7 @@ def _off(one: CarRoads, other: CarRoads) -> float:
 def roads_of_map(network: RoadNetwork) -> CarRoads:
     """Return the roads of a SUMO network."""
     lanes, links = network.lanes, network.links
-    cars = (lanes["permissions"] & _CAR != 0) & ~lanes["internal"]
+    cars = (lanes["permissions"] & CARS != 0) & ~lanes["internal"]
     edges = np.unique(lanes["edge"][cars])
     outside = links[~lanes["internal"][links["from_lane"]] & ~lanes["internal"][links["to_lane"]]]
     pairs = np.stack([lanes["edge"][outside["from_lane"]], outside["to_lane"]], axis=1)

@@ -45,14 +45,6 @@ class Alignment:
     def yaw_deg(self) -> float:
         return float(np.degrees(np.arctan2(self.transform[1, 0], self.transform[0, 0])))
 
-    @property
-    def angle_deg(self) -> float:
-        """Angle of the rotation about its axis."""
-        # Use the sine, too, because the cosine alone is imprecise near 0.
-        turn = self.transform[:3, :3]
-        skew = np.array([turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]])
-        return float(np.degrees(np.arctan2(np.linalg.norm(skew), np.trace(turn) - 1.0)))
-
 
 def moved(points: Points, transform: Points) -> Points:
     """Return points (n, 3) transformed by a motion (4, 4)."""

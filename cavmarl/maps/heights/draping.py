@@ -6,7 +6,6 @@ abutment. If they cross another road, ramps keep them `CLEARANCE_M` above or bel
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from cavmarl.maps.heights.height_model import HeightModel
 from cavmarl.maps.heights.levels import Levels, crossings, levels_of
 from cavmarl.maps.heights.stations import Stations, kept_rows, laid, stations_of
 from cavmarl.maps.net_document import HEIGHT_DIGITS, NetDocument, shape_text
+from cavmarl.maps.netconvert_process import quoted
 from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.maps.projection import unproject
 
@@ -27,7 +27,6 @@ CLEARANCE_M = 5.0  # vertical distance of roads that cross on two levels
 RAMP_GRADE = 0.08
 STEEP_GRADE = 0.15  # steeper roads are reported
 MOST_GRADE = 0.25  # steeper roads are errors
-_LIST = 8
 
 Heights = NDArray[np.float64]
 
@@ -108,7 +107,7 @@ def drape(
     if highest > options.max_grade + 1e-3:
         raise MapError(
             f"{source}: roads would climb up to {highest:.0%}, more than {options.max_grade:.0%}:\n"
-            f"{_listed(steep)}\nCure: flatten them (--limit-grade {STEEP_GRADE:g}), allow it "
+            f"{quoted(steep)}\nCure: flatten them (--limit-grade {STEEP_GRADE:g}), allow it "
             "(--max-grade), or give a model of the bare ground, in metres"
         )
     moved = np.abs(heights - ramped)[:used]
@@ -302,10 +301,3 @@ def _raised(stations: Stations, levels: Levels) -> tuple[str, ...]:
     rows = np.unique(stations.lane_of[np.flatnonzero(levels[: len(stations.s_m)])])
     lanes = [stations.lanes[row] for row in rows.tolist()]
     return tuple(sorted({lane.edge.get("id", "") for lane in lanes if not lane.internal}))
-
-
-def _listed(lines: Sequence[str]) -> str:
-    shown = [f"  {line}" for line in lines[:_LIST]]
-    if len(lines) > _LIST:
-        shown.append(f"  … and {len(lines) - _LIST} more")
-    return "\n".join(shown)

@@ -16,7 +16,7 @@ from cavmarl.config.registry import (
     resolve_programs,
     resolve_zones,
 )
-from cavmarl.core.atomic_file import write_whole
+from cavmarl.core.atomic_file import sha256_of, write_whole
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import MessageError, WorkerError
 
@@ -41,7 +41,7 @@ class WorldFile(NamedTuple):
     def found(self) -> Path | None:
         """Return where the file is on this machine; None: it is missing."""
         for path in (Path(self.path), self.kept):
-            if path.is_file() and _digest(path) == self.digest:
+            if path.is_file() and sha256_of(path) == self.digest:
                 return path
         return None
 
@@ -74,7 +74,7 @@ def files_of(config: EnvConfig, base_dir: Path) -> list[WorldFile]:
         *(("traffic.demand", n, path) for n, path in enumerate(resolve_demand(config, base_dir))),
     ]
     return [
-        WorldFile(key, n, str(path.resolve()), _digest(path))
+        WorldFile(key, n, str(path.resolve()), sha256_of(path))
         for key, n, path in paths
         if path is not None
     ]
@@ -98,8 +98,3 @@ def with_local_files(message: Mapping[str, Any], files: Sequence[WorldFile]) -> 
             values[field][file.nth] = path
         config[section] = values
     return {**message, "config": config}
-
-
-def _digest(path: Path) -> str:
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

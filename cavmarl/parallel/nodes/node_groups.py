@@ -29,12 +29,10 @@ from cavmarl.parallel.placement.commanded_worlds import CommandedWorlds
 from cavmarl.parallel.placement.mover import Mover
 from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.placement.work_shares import Part, parts_of
-from cavmarl.parallel.worlds.tasks import Task, commands_of
+from cavmarl.parallel.worlds.tasks import CHANGES, Task, commands_of, shifted_reset
 from cavmarl.v2x.v2x_messages import Exchange, NetworkSimulator, check_external
 
 Found = TypeVar("Found")
-
-CHANGES = (Task.STEP, Task.RESET, Task.LOAD)  # tasks that change worlds
 
 
 class NodeGroups(CommandedWorlds):
@@ -202,10 +200,7 @@ class NodeGroups(CommandedWorlds):
             return
         payloads = [payload] * len(self.groups)
         if task == Task.RESET:
-            payloads = [
-                {**payload, "first_world": payload["first_world"] + first}
-                for first in self._bounds[:-1]
-            ]
+            payloads = [shifted_reset(payload, first) for first in self._bounds[:-1]]
         elif task == Task.LOAD:
             payloads = payload
 

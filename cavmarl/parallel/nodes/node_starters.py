@@ -12,7 +12,7 @@ from cavmarl.config.workers import WorkersConfig
 from cavmarl.core.errors import ConfigError, WorkerDeathError
 from cavmarl.core.huge_pages import huge_heap
 from cavmarl.core.private_files import check_private
-from cavmarl.core.processes import start_python
+from cavmarl.core.processes import end_process, start_python
 from cavmarl.parallel.network.mpi_transport import MPI, MPI_CURE, mpi_transport
 from cavmarl.parallel.network.ray_actors import RayActors
 from cavmarl.parallel.network.tcp_transport import TcpListener
@@ -147,10 +147,7 @@ class LocalNodes(NodeStarter):
 
     def close(self) -> None:
         for process in self._processes:
-            with suppress(subprocess.TimeoutExpired):
-                process.wait(END_S)
-            process.kill()
-            process.wait()
+            end_process(process, END_S)
         self._processes = []
 
 

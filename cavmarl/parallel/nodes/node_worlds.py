@@ -51,7 +51,7 @@ from cavmarl.parallel.placement.mover import Mover
 from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.placement.work_shares import Part, parts_of
 from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
-from cavmarl.parallel.worlds.tasks import Task
+from cavmarl.parallel.worlds.tasks import CHANGES, Task
 from cavmarl.shards.shard import Commands
 from cavmarl.v2x.v2x_messages import NetworkSimulator, check_external
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -262,7 +262,7 @@ class NodeWorlds(CommandedWorlds):
             raise failed.error from None
 
     def _make_command(self, task: Task, payload: Any) -> NodeCommand:
-        changes = task in (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)
+        changes = task in CHANGES
         pieces = pieces_of(task, payload, self.arrays)
         if task != Task.STEP:
             return NodeCommand(pieces, changes, 0, cut=payload if task == Task.CUT else None)

@@ -374,15 +374,11 @@ class ZoneEndpoints(OwnershipRuntime):
             self._answered += [(w, entry.vehicle, message.zone) for entry in message.entries]
         for destination in message.destinations():
             if destination in self._zones:
-                self._apply_own(w, destination, message)
+                for answer in self._endpoints[w][destination].on_message(message).messages:
+                    self._send(w, answer)
             else:
                 to = COORDINATOR if destination == COORDINATOR else self._node_of[destination]
                 self._links.send(to, FrameKind.MESSAGES, self._generation, [packed([(w, message)])])
-
-    def _apply_own(self, w: int, zone: int, message: Message) -> None:
-        reaction = self._endpoints[w][zone].on_message(message)
-        for answer in reaction.messages:
-            self._send(w, answer)
 
     def _change_owners(self, w: int, leases: dict[int, Advance]) -> None:
         division = self._division

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from cavmarl.core.errors import WorkerError, WorkerFailureError
-from cavmarl.core.processes import occupy_standard_descriptors, start_python
+from cavmarl.core.processes import end_process, occupy_standard_descriptors, start_python
 from cavmarl.parallel.processes.process_barrier import WAKE
 from cavmarl.parallel.processes.watchdog import CHECK_S, STOPPED_CHECKS, is_stopped
 from cavmarl.parallel.processes.worker_loop import MAIL, MAX_MESSAGE
@@ -159,11 +159,7 @@ class ForkServer:
 
     def close(self) -> None:
         self._wire.close()
-        try:
-            self._process.wait(END_S)
-        except subprocess.TimeoutExpired:
-            self._process.kill()  # the system kills the workers
-            self._process.wait()
+        end_process(self._process, END_S)  # the system kills the workers
 
     def _await_ready(self) -> None:
         """Wait until the server is ready, without a limit, unless it is stopped."""

@@ -5,10 +5,10 @@ what the side has done; word `ASLEEP` says whether it has to be woken. A side th
 the number of the other side in a compiled loop, which reacts within a fraction of a microsecond.
 Then it sleeps on a socket, which takes no processor time.
 
-All accesses are sequentially consistent. If each of two sides writes one word and reads the word of
-the other, at least one of them sees what the other wrote: the side about to sleep sees the number,
-or the side that has written the number sees that the other side sleeps. A side that sees a number
-also sees all memory written before it.
+No wake-up is lost, because all accesses are sequentially consistent. Before it sleeps, a side
+writes `ASLEEP`, then reads the number of the other side. The other side writes its number, then
+reads `ASLEEP`. At least one of the two reads returns the new value: the first side does not sleep,
+or the other side wakes it. A side that sees a number also sees all memory written before it.
 """
 
 from __future__ import annotations

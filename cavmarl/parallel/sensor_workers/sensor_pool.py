@@ -50,7 +50,6 @@ class SensorWorkerPlan(NamedTuple):
 class SensorWorkerTimes:
     """Sums over all ticks in which sensors were due."""
 
-    publish_s: float = 0.0  # writing the scene and the shares
     own_s: float = 0.0  # sensing in this process
     wait_s: float = 0.0  # from the command until all frames were there
     busy_s: float = 0.0  # part of `wait_s` in which the busiest worker sensed
@@ -145,7 +144,6 @@ class SensorWorkers:
             sense_here(scenes, turns)
             return
         pool = self._started()
-        began = perf_counter()
         sharing = self._share(tuple(turn.place for turn in theirs))
         self._publish(scenes, theirs)
         published = perf_counter()
@@ -155,7 +153,7 @@ class SensorWorkers:
         self.check(theirs)
         ended = perf_counter()
         sharing.note(self.shared.spent_s, int(self.shared.num_agents.sum()))
-        self._note(began, published, sensed, ended, theirs)
+        self._note(published, sensed, ended, theirs)
 
     def close(self) -> None:
         self._unused()
@@ -263,12 +261,9 @@ class SensorWorkers:
             self._line_costs.learn(sensor, [lines for _, lines in parts], spent_s)
         sharing.forget()
 
-    def _note(
-        self, began: float, published: float, sensed: float, ended: float, turns: Sequence[Turn]
-    ) -> None:
+    def _note(self, published: float, sensed: float, ended: float, turns: Sequence[Turn]) -> None:
         """Add the times of a tick; the arguments are values of `time.perf_counter`."""
         times, shared = self.times, self.shared
-        times.publish_s += published - began
         times.own_s += sensed - published
         times.wait_s += ended - sensed
         # the workers begin while this process still senses, so their time may exceed the wait

@@ -34,6 +34,8 @@ class Task(IntEnum):
     COSTS = 17
 
 
+CHANGES = (Task.STEP, Task.RESET, Task.LOAD, Task.CUT)  # tasks that change worlds
+
 TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 
@@ -69,7 +71,8 @@ def _nothing(payload: None, first: int) -> dict[str, Any]:
     return {}
 
 
-def _begin(payload: dict[str, Any], first: int) -> dict[str, Any]:
+def shifted_reset(payload: dict[str, Any], first: int) -> dict[str, Any]:
+    """Return the payload of RESET for a process whose worlds follow `first` others."""
     return {**payload, "first_world": payload["first_world"] + first}
 
 
@@ -88,7 +91,7 @@ def _saved(payload: list[bytes], first: int) -> dict[str, Any]:
 # A process that does not pass saved worlds as bytes replaces these rows.
 WORLD_TASKS: Mapping[Task, WorldTask] = {
     Task.STEP: WorldTask(_step, _nothing),
-    Task.RESET: WorldTask(LocalWorlds.reset, _begin),
+    Task.RESET: WorldTask(LocalWorlds.reset, shifted_reset),
     Task.SUGGEST: WorldTask(LocalWorlds.suggest, _nothing),
     Task.WRITE_STATES: WorldTask(LocalWorlds.write_states, _nothing),
     Task.STATE_HASH: WorldTask(LocalWorlds.state_hash, _world),

@@ -26,9 +26,9 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.lanes.route_following import free_speed
 
-NUM_TERMS = 10
 TTC_HORIZON_S = 4.0  # longer times to collision do not count
 TTC_REACH_M = 60.0
+TERMS_REACH_M = TTC_REACH_M  # largest distance between centres at which a vehicle changes a term
 CIRCLE_MARGIN_M = 0.01  # margin around two circles that do not touch; larger than rounding errors
 
 
@@ -46,13 +46,13 @@ def _progress(row: np.void, step_s: float) -> float:
 
 
 @kernel
-def _speed(roads: RoadArrays, row: np.void) -> float:
+def _speeding(roads: RoadArrays, row: np.void) -> float:
     """Return the speed above the lane's limit as a share of it; `delay` covers lower speeds."""
     return float(max(row["speed"] / roads.lanes[row["lane"]]["speed_mps"] - 1.0, 0.0))
 
 
 @kernel
-def _comfort(row: np.void, step_s: float) -> float:
+def _jerk(row: np.void, step_s: float) -> float:
     """Return the mean |jerk| over the step in 10 m/s³."""
     discomfort: float = row["step_jerk"] / step_s / 10.0
     return discomfort
@@ -133,12 +133,12 @@ def write_terms(
     kind: np.void,  # its VTYPE
     grid: Grid,  # filled from these rows
     step_s: float,  # duration of a step in s
-    out: NDArray[np.float32],  # (NUM_TERMS,) in the order of `config.terms.TERMS`
+    out: NDArray[np.float32],  # (len(TERMS),) in the order of `config.terms.TERMS`
 ) -> None:
     row = rows[i]
     out[0] = _progress(row, step_s)
-    out[1] = _speed(roads, row)
-    out[2] = _comfort(row, step_s)
+    out[1] = _speeding(roads, row)
+    out[2] = _jerk(row, step_s)
     out[3] = _ttc_risk(rows, i, grid)
     out[4] = _event(row, EVENT_COLLIDED)
     out[5] = _event(row, EVENT_OFF_ROAD)

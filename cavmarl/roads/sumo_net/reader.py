@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 import math
 from collections.abc import Sequence
 from itertools import pairwise
@@ -12,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.atomic_file import sha256_of
 from cavmarl.core.errors import MapError
 from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.core.math.geometry import project
@@ -81,8 +81,7 @@ def source_hash(path: Path) -> str:
     Raises MapError: the file cannot be read.
     """
     try:
-        with path.open("rb") as stream:
-            return hashlib.file_digest(stream, "sha256").hexdigest()
+        return sha256_of(path)
     except OSError as error:
         raise MapError(f"{path}: cannot be read ({error.strerror or error})") from error
 

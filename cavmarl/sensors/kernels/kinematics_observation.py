@@ -41,7 +41,6 @@ FEATURE_SIN_D = 9
 FEATURE_LONG_OFF = 10
 FEATURE_LAT_OFF = 11
 FEATURE_ANG_OFF = 12
-NUM_VEHICLE_FEATURES = 13
 FEATURE_ON_ROAD = 13
 
 
@@ -51,7 +50,7 @@ class KinematicsSensor(NamedTuple):
     at: int
     vehicles: int  # rows, including the ego vehicle; 0: off
     features: NDArray[np.int64]  # (F,) FEATURE_* codes, the columns
-    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) mapped to [-1, 1]; nan: not mapped
+    ranges: NDArray[np.float64]  # (len(VEHICLE_FEATURES), 2) mapped to [-1, 1]; nan: not mapped
     absolute: bool
     shuffled: bool
     clip: bool
@@ -60,7 +59,7 @@ class KinematicsSensor(NamedTuple):
     destinations: NDArray[np.float64]  # (M, G, 2) position of each goal of each map, m
     near_body: NDArray[np.int64]  # (vehicles,) scratch
     near_key: NDArray[np.float64]
-    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
+    values: NDArray[np.float64]  # (len(VEHICLE_FEATURES),) scratch
 
 
 @kernel
@@ -76,7 +75,7 @@ def vehicle_features(
 
     `destinations`: (M, G, 2) x and y of each map's goals in m, in this package's frame.
     `intentions`: whether to write the direction to the vehicle's goal; otherwise it is 0. `out`:
-    (NUM_VEHICLE_FEATURES,), overwritten.
+    (len(VEHICLE_FEATURES),), overwritten.
     """
     cos, sin = cos_sin(row["heading"])
     out[FEATURE_PRESENCE] = 1.0

@@ -35,7 +35,7 @@ class OccupancyGrid(NamedTuple):
 
     at: int
     features: NDArray[np.int64]  # (F,) FEATURE_* codes, the layers; none: off
-    ranges: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES, 2) mapped to [-1, 1]; nan: not mapped
+    ranges: NDArray[np.float64]  # (len(VEHICLE_FEATURES), 2) mapped to [-1, 1]; nan: not mapped
     min_x: float
     min_y: float
     step_x: float
@@ -49,7 +49,7 @@ class OccupancyGrid(NamedTuple):
     destinations: NDArray[np.float64]  # (M, G, 2) position of each goal of each map, m
     cell_body: NDArray[np.int64]  # (num_x * num_y,) scratch
     lane_seen: NDArray[np.int64]  # (L + 1,) scratch: last drawing of each lane; count of drawings
-    values: NDArray[np.float64]  # (NUM_VEHICLE_FEATURES,) scratch
+    values: NDArray[np.float64]  # (len(VEHICLE_FEATURES),) scratch
 
 
 @kernel

@@ -54,6 +54,26 @@ class Fan(NamedTuple):
     looks_down: bool  # whether any ray meets the ground within the range
 
 
+def ray_directions(
+    azimuths_rad: tuple[float, float, int], elevations_rad: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Return the unit vectors (A, E, 3) of the rays in the sensor's frame.
+
+    `azimuths_rad`, `elevations_rad`: as in `make_fan`.
+    """
+    first_rad, step_rad, columns = azimuths_rad
+    azimuth = (first_rad + step_rad * np.arange(columns))[:, np.newaxis]
+    elevation = np.asarray(elevations_rad)[np.newaxis, :]
+    return np.stack(
+        [
+            cos_all(azimuth) * cos_all(elevation),
+            sin_all(azimuth) * cos_all(elevation),
+            sin_all(elevation) * np.ones_like(azimuth),
+        ],
+        axis=2,
+    )
+
+
 def make_fan(
     mount: NDArray[np.float64],
     azimuths_rad: tuple[float, float, int],
@@ -68,17 +88,8 @@ def make_fan(
         elevations_rad: (E,) elevation of each channel in the sensor's frame.
         range_m: range along each ray.
     """
-    first_rad, step_rad, columns = azimuths_rad
-    azimuth = (first_rad + step_rad * np.arange(columns))[:, np.newaxis]
-    elevation = np.asarray(elevations_rad)[np.newaxis, :]
-    own = np.stack(
-        [
-            cos_all(azimuth) * cos_all(elevation),
-            sin_all(azimuth) * cos_all(elevation),
-            sin_all(elevation) * np.ones_like(azimuth),
-        ],
-        axis=2,
-    )
+    first_rad, step_rad, _ = azimuths_rad
+    own = ray_directions(azimuths_rad, elevations_rad)
     # `@` is avoided: its result can depend on the number of threads.
     rays = own[..., :1] * mount[:, 0] + own[..., 1:2] * mount[:, 1] + own[..., 2:] * mount[:, 2]
     down = -rays[:, :, 2]

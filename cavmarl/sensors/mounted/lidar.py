@@ -6,10 +6,11 @@ import math
 from typing import Any, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from cavmarl.config.rig import LidarRigConfig, RadarConfig
 from cavmarl.core.math.elementary import hypot
-from cavmarl.sensors.kernels.ray_caster import HIT, Fan, make_fan
+from cavmarl.sensors.kernels.ray_caster import HIT, Fan, make_fan, ray_directions
 from cavmarl.sensors.kernels.rig_frames import Due
 from cavmarl.sensors.kernels.rig_rays import TARGET, measure_lidar, measure_radar
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -17,6 +18,9 @@ from cavmarl.sensors.mounted.mount_transforms import mount_matrix
 from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platform, SensedScene
 
 C = TypeVar("C", LidarRigConfig, RadarConfig)
+Floats = NDArray[np.float64]
+
+ECHO_MARGIN_M = 0.05  # a ray that ends less than this below the range counts as one without echo
 
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
@@ -31,11 +35,33 @@ def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
     return -0.5 * fov, fov / (rays - 1), rays
 
 
+def elevations(lower_deg: float, upper_deg: float, layers: int) -> Floats:
+    """Return the elevation of each layer of a lidar in rad, the lowest first; a single one is 0."""
+    if layers == 1:
+        return np.zeros(1)
+    return np.linspace(math.radians(lower_deg), math.radians(upper_deg), layers)
+
+
+def lidar_directions(
+    fov_deg: float, rays: int, lower_deg: float, upper_deg: float, layers: int
+) -> Floats:
+    """Return the unit vector (layers, rays, 3) of each ray of a lidar, in the sensor's frame."""
+    rising = elevations(lower_deg, upper_deg, layers)
+    return ray_directions(azimuths(fov_deg, rays), rising).swapaxes(0, 1)
+
+
+def has_echo(distances_m: Floats, range_m: float) -> NDArray[np.bool_]:
+    """Return which rays with these distances have hit something; the others hold the range."""
+    return distances_m < range_m - ECHO_MARGIN_M
+
+
 def lidar_fan(config: LidarRigConfig) -> Fan:
-    lowest, highest = math.radians(config.lower_deg), math.radians(config.upper_deg)
-    layers = np.linspace(lowest, highest, config.layers) if config.layers > 1 else np.zeros(1)
+    """Return the rays of a lidar for the ray caster."""
     return make_fan(
-        mount_matrix(config), azimuths(config.fov_deg, config.rays), layers, config.range_m
+        mount_matrix(config),
+        azimuths(config.fov_deg, config.rays),
+        elevations(config.lower_deg, config.upper_deg, config.layers),
+        config.range_m,
     )
 
 

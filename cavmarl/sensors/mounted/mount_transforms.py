@@ -18,11 +18,16 @@ Points = NDArray[np.float64]
 _ROUNDING_M = 1e-9
 
 
+def mount_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Points:
+    """Return the (3, 3) matrix that rotates a vector of a sensor's frame into the vehicle's."""
+    turn = np.zeros((3, 3))
+    rotation(math.radians(yaw_deg), math.radians(pitch_deg), math.radians(roll_deg), turn)
+    return turn
+
+
 def mount_of(config: MountedConfig) -> Mount:
     """Return the position and orientation of a sensor as a bundle for kernels."""
-    turn = np.zeros((3, 3))
-    yaw, pitch, roll = map(math.radians, (config.yaw_deg, config.pitch_deg, config.roll_deg))
-    rotation(yaw, pitch, roll, turn)
+    turn = mount_rotation(config.yaw_deg, config.pitch_deg, config.roll_deg)
     return Mount(np.array([config.x_m, config.y_m, config.z_m]), turn)
 
 

@@ -16,7 +16,7 @@ from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.extensions import REGISTERED_SENSORS
 from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.records.arrays import Sensors
-from cavmarl.rewards.kernels.terms import TTC_REACH_M
+from cavmarl.rewards.kernels.terms import TERMS_REACH_M
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.lidar_2d import ECHO, ray_directions
 from cavmarl.sensors.kernels.observe_optional import OptionalSensors
@@ -92,10 +92,10 @@ def frame_size(config: SensorsConfig) -> int:
 
 
 def carried_from(config: SensorsConfig) -> int:
-    """Return the index from which an observation is carried over to the next one.
+    """Return the index from which an observation repeats values of earlier observations.
 
-    Everything before this index is the oldest frame or is observed again in each step. If nothing
-    is carried over, the index equals the observation's size.
+    The values before this index are observed anew in each step, or belong to the oldest frame,
+    which the next observation drops. If no value is repeated, the index is the observation's size.
     """
     if config.stack > 1:
         return frame_size(config)
@@ -119,12 +119,11 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     A vehicle that is further away changes no number of an observation and no reward term of the
     package. Sensors of vehicle centres reach as far as their range, including `lanes`, which
     ignores vehicles that are further away in the plane. Rays end at bodies, whose centres can be
-    half a diagonal behind the hit. Time to collision is the only reward term that depends on other
-    vehicles; it is always on.
+    half a diagonal behind the hit. Terms, which are always computed, reach `TERMS_REACH_M`.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
-    return max(TTC_REACH_M, *reaches)
+    return max(TERMS_REACH_M, *reaches)
 
 
 def _starts(config: SensorsConfig) -> dict[str, int]:

@@ -64,7 +64,7 @@ def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
 
 
 def range_table(ranges: Mapping[str, tuple[float, ...]]) -> NDArray[np.float64]:
-    """Return the ranges (NUM_VEHICLE_FEATURES, 2) by feature code; nan where there is none."""
+    """Return the ranges (len(VEHICLE_FEATURES), 2) by feature code; nan where there is none."""
     table = np.full((len(VEHICLE_FEATURES), 2), np.nan)
     for name, bounds in ranges.items():
         table[VEHICLE_FEATURES.index(name)] = bounds

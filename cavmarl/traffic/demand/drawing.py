@@ -111,10 +111,10 @@ def copied(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return departures (m,) of a demand that is multiplied by `scale`; see `scaled_flows`.
 
-    As in SUMO, the k-th vehicle of a flow with a probability, or the k-th vehicle outside of flows,
-    departs floor(scale) times, and once more if k · part mod 1000 < part, where `part` is the
-    fraction of the scale in thousandths. A flow numbers all its vehicles; a copy of another vehicle
-    has the number of the copy.
+    As in SUMO, vehicles are counted by k in each flow with a probability, and outside of flows.
+    Vehicle k departs floor(scale) times, and once more if k · part mod 1000 < part, where `part` is
+    the fraction of the scale in thousandths. In a flow, copies are numbered as further vehicles.
+    Outside of flows, a departure has the number of the copy.
 
     `rows`, `numbers`, `times`: departures (n,) as in `departures_ms`.
     """

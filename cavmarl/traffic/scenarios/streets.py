@@ -10,10 +10,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.elementary import atan2, cosine, hypot, sine
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
-CAR = 1 << VEHICLE_CLASSES.index("passenger")
 STRAIGHT_RAD = 0.05  # maximum change of direction of a straight lane
 BESIDE_M = 8.0  # maximum distance between the centres of neighbouring lanes of a road
 LOOK_MARGIN_M = 0.3
@@ -76,7 +75,7 @@ class Streets:
     def straights(self, least_m: float) -> list[int]:
         """Return straight LANE rows for cars outside junctions, at least `least_m` long."""
         lanes = self.network.lanes
-        good = ~lanes["internal"] & (lanes["permissions"] & CAR != 0)
+        good = ~lanes["internal"] & (lanes["permissions"] & CARS != 0)
         good &= lanes["length_m"] >= least_m
         return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
 
@@ -119,7 +118,7 @@ class Streets:
         """
         links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
-        for_cars = ends & CAR != 0
+        for_cars = ends & CARS != 0
         own = np.repeat(np.arange(len(links)), links["num_conflicts"])
         foe = conflicts["foe"]
         good = for_cars[own] & for_cars[foe] & (links["first_internal"][foe] >= 0)
@@ -157,7 +156,7 @@ class Streets:
         """Return LINK rows of car movements over junctions with SUMO's letters, as `s` or `lL`."""
         links, lanes = self.network.links, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
-        good = (ends & CAR != 0) & (links["first_internal"] >= 0)
+        good = (ends & CARS != 0) & (links["first_internal"] >= 0)
         good &= np.isin(links["direction"], [ord(letter) for letter in directions])
         found: list[int] = np.flatnonzero(good).tolist()
         return found
@@ -171,7 +170,7 @@ class Streets:
         first = int(lanes["first_link"][lane])
         ways = [
             link for link in range(first, first + int(lanes["num_links"][lane]))
-            if lanes["permissions"][links["to_lane"][link]] & CAR
+            if lanes["permissions"][links["to_lane"][link]] & CARS
         ]  # fmt: skip
         ways.sort(key=lambda link: (links["direction"][link] != ord("s"), link))
         return int(links["to_lane"][ways[0]]) if ways else None
@@ -211,7 +210,7 @@ class Streets:
         lanes, into = self.network.lanes, self.network.into
         row = lanes[lane]
         ends = into[row["first_into"] : row["first_into"] + row["num_into"]]
-        return next((k for k in ends.tolist() if lanes["permissions"][k] & CAR), None)
+        return next((k for k in ends.tolist() if lanes["permissions"][k] & CARS), None)
 
     def name(self, lane: int) -> str:
         return self.network.lane_ids[lane]

@@ -11,7 +11,6 @@ import tempfile
 import threading
 import weakref
 from collections.abc import Mapping
-from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any, NamedTuple
@@ -21,7 +20,13 @@ from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, SumoError, missing
 from cavmarl.core.huge_pages import huge_heap
-from cavmarl.core.processes import is_fork, occupy_standard_descriptors, refuse_fork
+from cavmarl.core.processes import (
+    end_process,
+    is_fork,
+    last_words,
+    occupy_standard_descriptors,
+    refuse_fork,
+)
 from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
@@ -30,7 +35,6 @@ ANSWER_S = 120.0  # a step that takes longer counts as hung
 MAX_SUMO_BYTES = 1 << 35
 MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that changes this limit
 END_S = 2.0  # time for the process to end by itself
-LAST_WORDS = 2000  # maximum number of quoted characters of its output
 # Messages of SUMO, Python and the system when memory runs out.
 OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Cannot allocate memory")
 
@@ -187,8 +191,7 @@ class SumoProcess:
         )
 
     def _last_words(self) -> str:
-        self._output.seek(0)
-        text = self._output.read().decode(errors="replace").strip()[-LAST_WORDS:]
+        text = last_words(self._output)
         return f": {text}" if text else ""
 
 
@@ -202,9 +205,5 @@ def _end(
     if is_fork(owner):  # a forked process must not end SUMO
         return
     wire.close()
-    with suppress(subprocess.TimeoutExpired):
-        process.wait(END_S)
-    if process.poll() is None:
-        process.kill()
-        process.wait()
+    end_process(process, END_S)
     output.close()

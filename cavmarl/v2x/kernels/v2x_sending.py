@@ -12,6 +12,7 @@ from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.walls import Walls
 from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
 from cavmarl.v2x.kernels.shown_states import note_shown
@@ -39,8 +40,6 @@ CAM_DISTANCE_M = 4.0
 CAM_HEADING_RAD = math.radians(4.0)
 CAM_SPEED_MPS = 0.5
 CAM_AFTER_S = 1.0
-
-STANDS_MPS = 0.1
 
 
 @kernel
@@ -161,7 +160,7 @@ def _cause(row: np.void, sending: Sending) -> int:
         return CAUSE_COLLISION
     if row["accel"] <= -sending.hard_braking_mps2:
         return CAUSE_HARD_BRAKING
-    if row["wait_s"] >= sending.stationary_s and abs(row["speed"]) < STANDS_MPS:
+    if row["wait_s"] >= sending.stationary_s and abs(row["speed"]) < STANDING_MPS:
         return CAUSE_STATIONARY
     return CAUSE_NONE
 

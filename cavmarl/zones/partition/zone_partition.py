@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError
-from cavmarl.zones.kernels.zone_lookup import ZoneArrays, zone_of, zones_of
+from cavmarl.zones.kernels.zone_lookup import ZoneArrays, zones_of
 
 Bounds = tuple[float, float, float, float]  # min_x, min_y, max_x, max_y in metres
 
@@ -70,10 +70,6 @@ class ZonePartition:
         return ZoneArrays(
             self._sides(0)[1:-1].copy(), self._sides(1)[1:-1].copy(), self._cells, self.reaching
         )
-
-    def zone_of(self, x: float, y: float) -> int:
-        """Return the zone of a position in metres."""
-        return zone_of(self.arrays, x, y)
 
     def zones_of(self, xy: NDArray[np.float64]) -> NDArray[np.int32]:
         """Return the zones (n,) of positions (n, 2) in metres."""

@@ -10,7 +10,6 @@ from cavmarl.maps.fidelity import cloud_registration
 from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_filters import drop_outliers, thin_out
 from cavmarl.maps.fidelity.cloud_registration import (
-    Alignment,
     Target,
     align,
     moved,
@@ -109,16 +108,6 @@ def test_an_alignment_that_still_moves_has_not_converged(monkeypatch: pytest.Mon
     assert found.stages == 1
     assert [problem for problem in found.problems if "the last stage (1) still moved" in problem]
     assert align(cloud, Target(cloud)).problems == ()
-
-
-@pytest.mark.parametrize("degrees", [0.0, 30.0, 150.0])
-def test_the_angle_is_that_about_the_axis(degrees: float) -> None:
-    cos, sin = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
-    transform = np.eye(4)
-    transform[1:3, 1:3] = [[cos, -sin], [sin, cos]]
-    found = Alignment(transform, 0.0, 0.1, 1, (), np.zeros(0), np.zeros(0))
-    assert found.angle_deg == pytest.approx(degrees)
-    assert found.yaw_deg == 0.0
 
 
 def test_other_places_do_not_converge() -> None:

@@ -25,8 +25,8 @@ from cavmarl.adapters.sumo_rl.environment.observations import (
 from cavmarl.adapters.sumo_rl.environment.signal_world import SignalWorld, WorldSettings
 from cavmarl.adapters.sumo_rl.environment.traffic_signal import Rewards, signals_of
 from cavmarl.core.errors import ActionError, ConfigError, EpisodeError
+from cavmarl.signals.kernels.lane_counts import STANDING_MPS
 
-STANDING_MPS = 0.1  # below this speed a vehicle stands
 RANDOM = "random"
 
 # Arguments that change nothing here: name → usual values, and the reason.
