@@ -10,7 +10,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
-from itertools import pairwise
+from itertools import compress, pairwise
 from pathlib import Path
 from typing import Any
 from xml.sax.handler import ContentHandler
@@ -30,9 +30,11 @@ Ring = NDArray[np.float64]
 DEFAULT_HEIGHT_M = 8.0  # height of a building if the file does not give it
 LEVEL_M = 3.0  # height of a level, if only the number of levels is given
 
+PASSABLE_M = 3.0  # vehicles and rays pass under a building that begins at this height or higher
+
 # Values of building=* for buildings without walls, or that rays pass under.
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
-_METRES = re.compile(r"\s*([0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
+_METRES = re.compile(r"\s*(-?[0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
 _DIGITS = 6  # corners are rounded to µm, because nearly level sides would have huge slopes
 
@@ -46,10 +48,13 @@ class Footprint:
     # even-odd rule
     rings: tuple[Ring, ...]
     height_m: float  # above the ground
+    layer: float = 0.0  # OSM's order of things that cross; 0: on the ground
 
 
 def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
-    """Return the buildings of a file, in its order.
+    """Return the buildings of a file that stand on the ground, in its order.
+
+    Buildings under the ground and buildings that begin at `PASSABLE_M` or higher are left out.
 
     Args:
         path: OpenStreetMap (<osm>), or a SUMO file with <poly> elements; may be gzipped.
@@ -66,8 +71,9 @@ def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
         return list(_osm_buildings(path, reader, geo))
     if reader.root in ("additional", "polygons", "shapes"):
         found = [
-            Footprint(element.name, _rings([ring]), _height_m(element.tags))
+            Footprint(element.name, _rings([ring]), _height_m(element.tags), element.layer)
             for element, ring in reader.polygons
+            if element.is_on_the_ground
         ]
         return [footprint for footprint in found if footprint.rings]
     raise MapError(
@@ -88,8 +94,21 @@ class _Element:
 
     @property
     def is_building(self) -> bool:
-        kind = self.tags.get("building", "no")
-        return kind not in _NO_WALLS and self.tags.get("location") != "underground"
+        return self.tags.get("building", "no") not in _NO_WALLS and self.is_on_the_ground
+
+    @property
+    def is_on_the_ground(self) -> bool:
+        """Return whether the building is neither underground nor above passing vehicles."""
+        if self.tags.get("location") == "underground" or self.layer < 0.0:
+            return False
+        begins_m = _number(self.tags, "min_height")
+        if begins_m is None:
+            begins_m = (_number(self.tags, "building:min_level") or 0.0) * LEVEL_M
+        return begins_m < PASSABLE_M
+
+    @property
+    def layer(self) -> float:
+        return _number(self.tags, "layer") or 0.0
 
 
 class _Reader(ContentHandler):
@@ -195,7 +214,7 @@ def _osm_buildings(path: Path, osm: _Reader, geo: GeoReference | None) -> Iterat
         ]
         rings = _rings([_project(path, ring, geo) for ring in closed])
         if rings:
-            yield Footprint(element.name, rings, _height_m(element.tags))
+            yield Footprint(element.name, rings, _height_m(element.tags), element.layer)
 
 
 def _closed(ways: list[list[str]]) -> list[list[str]]:
@@ -228,10 +247,16 @@ def _rings(rings: list[Ring]) -> tuple[Ring, ...]:
 def _height_m(tags: Mapping[str, str]) -> float:
     """Return the height from `height`, else from `building:levels`, else the default."""
     for key, unit_m in (("height", 1.0), ("building:levels", LEVEL_M)):
-        match = _METRES.fullmatch(tags.get(key, ""))
-        if match is not None and 0.0 < float(match[1]) * unit_m <= _MOST_HEIGHT_M:
-            return float(match[1]) * unit_m
+        number = _number(tags, key)
+        if number is not None and 0.0 < number * unit_m <= _MOST_HEIGHT_M:
+            return number * unit_m
     return DEFAULT_HEIGHT_M
+
+
+def _number(tags: Mapping[str, str], key: str) -> float | None:
+    """Return the number in a tag, without its unit; None if there is none."""
+    match = _METRES.fullmatch(tags.get(key, ""))
+    return None if match is None else float(match[1])
 
 
 def _project(path: Path, ring: Ring, geo: GeoReference | None) -> Ring:
@@ -253,6 +278,8 @@ MOST_CORNERS = 4000
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     """Return a network with the buildings of a file.
 
+    A building with a layer above 0 over a lane is a bridge of buildings, and is left out.
+
     Returns:
         A network whose `source_hash` covers both files.
 
@@ -269,12 +296,17 @@ def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
             f"'{network.name}': give the file from which this map was built"
         )
     parts = [convex_parts(footprint.rings) for footprint in near]
+    stands = [
+        footprint.layer <= 0.0 or not len(points_inside(network, there))
+        for footprint, there in zip(near, parts, strict=True)
+    ]
+    near, parts = list(compress(near, stands)), list(compress(parts, stands))
     digest = hashlib.sha256(f"{network.source_hash}\0buildings={source_hash(path)}".encode())
     return replace(
         network,
         source_hash=digest.hexdigest(),
         walls=walls_of(near),
-        roofs=np.concatenate(parts),
+        roofs=np.concatenate([np.zeros((0, 4, 2)), *parts]),
         roof_height=np.repeat([footprint.height_m for footprint in near], list(map(len, parts))),
     )
 
@@ -310,6 +342,20 @@ def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
         if (start != end).any()
     ]
     return np.array(rows, dtype=WALL)
+
+
+def points_inside(network: RoadNetwork, roofs: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Return the rows of `network.points` inside convex parts (n, 4, 2), rims included."""
+    places = np.stack([network.points["x"], network.points["y"]], axis=1)
+    is_inside = np.zeros(len(places), dtype=np.bool_)
+    for roof in roofs:
+        low, high = roof.min(axis=0), roof.max(axis=0)
+        near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
+        along = np.roll(roof, -1, axis=0) - roof
+        apart = places[near, np.newaxis] - roof
+        side = along[:, 0] * apart[..., 1] - along[:, 1] * apart[..., 0]
+        is_inside[near] |= (side >= 0.0).all(axis=1) | (side <= 0.0).all(axis=1)
+    return np.flatnonzero(is_inside)
 
 
 def convex_parts(rings: tuple[NDArray[np.float64], ...]) -> NDArray[np.float64]:

@@ -11,8 +11,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.math.elementary_arrays import hypot_all
-from cavmarl.maps.buildings import with_buildings
+from cavmarl.maps.buildings import points_inside, with_buildings
 from cavmarl.maps.net_document import NetDocument, points_of
+from cavmarl.maps.osm_roads import OsmRoads
 from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.polylines import clean_shape
 from cavmarl.roads.sumo_net.road_corners import find_corners
@@ -74,7 +75,7 @@ def find_defects(
         lambda: _tight_corners(network),
     ]
     if buildings is not None:
-        searches.append(lambda: _buildings_on_roads(with_buildings(network, buildings)))
+        searches.append(lambda: _buildings_on_roads(network, document, buildings))
     found: list[Defect] = []
     for name, search in zip(SEARCHES, searches, strict=False):  # the last search may be missing
         told(name)
@@ -291,17 +292,20 @@ def _to_rim(place: Points, rim: Points) -> float:
     return float(hypot_all(*(rim + share[:, None] * along - place).T).min())
 
 
-def _buildings_on_roads(network: RoadNetwork) -> Iterator[Defect]:
-    """Find lanes with points under a roof; the building may have a passage for the road."""
+def _buildings_on_roads(
+    network: RoadNetwork, document: NetDocument, buildings: Path
+) -> Iterator[Defect]:
+    """Find lanes inside buildings; tunnels, passages and covered roads lead through them."""
+    # SUMO's polygons have no ways.
+    covered = {name for name, way in OsmRoads(buildings).ways.items() if way.is_covered}
+    passages = {lane.id for lane in document.lanes if covered.intersection(lane.ways)}
+    is_passage = np.array([id_ in passages for id_ in network.lane_ids], dtype=np.bool_)
+    inner = np.flatnonzero(network.lanes["internal"] & (network.lanes["link"] >= 0))
+    links = network.links[network.lanes["link"][inner]]
+    is_passage[inner] = is_passage[links["from_lane"]] & is_passage[links["to_lane"]]
     lane_of = np.repeat(np.arange(len(network.lanes)), network.lanes["num_points"])
-    places = np.stack([network.points["x"], network.points["y"]], axis=1)
-    seen: set[int] = set()
-    for roof in network.roofs:
-        low, high = roof.min(axis=0), roof.max(axis=0)
-        near = np.flatnonzero(((places >= low) & (places <= high)).all(axis=1))
-        for row in near.tolist():
-            lane = int(lane_of[row])
-            if lane not in seen and _inside(places[row], roof):
-                seen.add(lane)
-                x, y = places[row].tolist()
-                yield Defect("building on a road", network.lane_ids[lane], x, y, "")
+    rows = points_inside(network, with_buildings(network, buildings).roofs)
+    rows = rows[~is_passage[lane_of[rows]]]
+    for row in rows[np.unique(lane_of[rows], return_index=True)[1]].tolist():
+        x, y = network.points[["x", "y"]][row].tolist()
+        yield Defect("building on a road", network.lane_ids[lane_of[row]], x, y, "")

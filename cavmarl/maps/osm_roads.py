@@ -13,7 +13,7 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 
 _MOST_KINDS = 5  # in an error message
 _TAGS = frozenset(
-    "highway bridge tunnel layer name ref lanes maxspeed width oneway busway motorcar "
+    "highway bridge tunnel covered layer name ref lanes maxspeed width oneway busway motorcar "
     "motor_vehicle motor_vehicle:forward motor_vehicle:backward vehicle turn:lanes "
     "turn:lanes:forward turn:lanes:backward lanes:bus lanes:bus:forward lanes:bus:backward "
     "lanes:psv lanes:psv:forward lanes:psv:backward".split()
@@ -44,6 +44,12 @@ class RoadWay:
                     layer = sign
                 return layer if layer * sign > 0 else sign
         return 0
+
+    @property
+    def is_covered(self) -> bool:
+        """Whether the way leads under the ground, or under or through buildings."""
+        tags = (self.tags.get("tunnel", "no"), self.tags.get("covered", "no"))
+        return self.level < 0 or any(tag != "no" for tag in tags)
 
     @property
     def for_cars(self) -> bool:

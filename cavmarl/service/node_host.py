@@ -23,7 +23,7 @@ from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 from cavmarl.service.configurations import world_keywords
 from cavmarl.service.error_names import without_folders
 from cavmarl.service.node_app import in_turn, make_node_app
-from cavmarl.service.node_link import MOST_MESSAGE, NodeLink, is_final
+from cavmarl.service.node_link import MOST_MESSAGE, NodeLink, is_final, must_register
 from cavmarl.service.server import ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
@@ -157,7 +157,7 @@ async def _beat_until_end(host: _Host) -> None:
                     host.tell(f"node {link.name}: drained")
                     return
         except ServiceError as error:
-            if error.problem == "conflict" or error.problem == "not-found":
+            if must_register(error):
                 await link.register()
             elif is_final(error):
                 host.failure = error

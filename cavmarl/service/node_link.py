@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import hashlib
-import itertools
 import os
 import secrets
 import socket
@@ -41,6 +40,9 @@ class NodeLink:
         secret: of an identity with the role `node`.
         body: body of the registration; docs/guides/service.md lists its fields.
         is_supposed_idle: report no load, so that nodes are selected by their sessions alone.
+
+    Attributes:
+        beats: number of heartbeats sent so far; the next one has this number.
     """
 
     def __init__(
@@ -56,7 +58,7 @@ class NodeLink:
         self.name: str = body["name"]
         self.incarnation = 0
         self.is_draining = False
-        self._beats = itertools.count()
+        self.beats = 0
         self._keys: dict[str, Any] = {}
         self._keys_s = -KEYS_S  # time of the last request for keys
         self._asking_for_keys = asyncio.Lock()
@@ -83,7 +85,8 @@ class NodeLink:
 
         With `is_watched`, the answer includes the LoadScores of all nodes.
         """
-        number = next(self._beats)
+        number = self.beats
+        self.beats += 1
         load = {"cpu": 0.0, "ram": 0.0, "gpu": 0.0}
         if not self._is_supposed_idle:
             if number % GPU_EVERY == 0:
@@ -253,6 +256,15 @@ class NodeLink:
         await self._client.close()
         for session in tuple(self._key_files):
             self.close_key_file(session)
+
+
+def must_register(error: ServiceError) -> bool:
+    """Return whether the node must register again, because its heartbeats are refused.
+
+    A refused number means that another process has sent heartbeats as this node. The new
+    registration has another incarnation, so that process is refused from then on.
+    """
+    return error.problem in ("conflict", "not-found", "stale-beat")
 
 
 def is_final(error: ServiceError) -> bool:

@@ -26,11 +26,14 @@ class RateLimit:
         return self._left(caller, self._clock_s()) >= 1.0
 
     def take(self, caller: str) -> None:
-        """Count a request of `caller`; raise the problem `too-many` at the limit."""
+        """Count a request of `caller`; raise the problem `too-many` at the limit.
+
+        A refused request does not count, so the next one is accepted after the time in the problem.
+        """
         now_s = self._clock_s()
         left = self._left(caller, now_s)
         self._buckets.pop(caller, None)
-        self._buckets[caller] = (max(left - 1.0, 0.0), now_s)
+        self._buckets[caller] = (left - 1.0 if left >= 1.0 else left, now_s)
         while len(self._buckets) > MOST_BUCKETS:
             self._buckets.popitem(last=False)
         if left < 1.0:

@@ -247,6 +247,7 @@ class RowCheck:
         edges = self._roads.edges[self._roads.lanes["edge"][lane]]
         first = way + edges["first_lane"]
         wrong = (first < 0) | (first + edges["num_lanes"] > len(self._travel.steps))
+        wrong |= (way < -MOST) | (way > MOST)  # the sums above may have overflowed
         return _of(rows[np.argmax(wrong)], "way", "leads out of all routes") if wrong.any() else ""
 
     def _own_lanes(self, lane: NDArray[np.int32]) -> Numbers:

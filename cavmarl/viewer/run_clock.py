@@ -46,8 +46,7 @@ class RunClock:
         """Return the time until the next step is due, at most `IDLE_S`; 0: it is due now."""
         if self._steps_wanted:
             return 0.0
-        if self.is_paused:
-            self._due_s = now_s
+        if self.is_paused:  # the request to play sets the next time
             return IDLE_S
         return min(max(0.0, self._due_s - now_s), IDLE_S) if self.pace else 0.0
 

@@ -51,7 +51,7 @@ class Worlds:
 
 def test_a_trip_is_the_sum_of_its_steps() -> None:
     worlds = Worlds()
-    worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.25, 0.0))
+    worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.5, 0.0))
     worlds.add(
         progress=(4.0, 1.0),
         jerk=(0.3, 0.0),
@@ -73,7 +73,7 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     assert trips["mean_speeding"] == pytest.approx([0.1, 0.0])
     assert trips["mean_jerk_mps3"] == pytest.approx([4.0 / 3.0, 0.0])
     assert trips["least_ttc_s"] == pytest.approx([1.2, 4.0])
-    # The term 0.7 means 1.2 s and 0.25 means 3 s, so one of three steps is below 1.5 s.
+    # 0.7 is 1.2 s and 0.5 is 2 s: one step of three lies below 1.5 s.
     assert trips["short_ttc_share"] == pytest.approx([1.0 / 3.0, 0.0])
     assert np.isnan(trips["least_pet_s"]).all()
 

@@ -13,6 +13,7 @@ from cavmarl.maps.buildings import (
     LEVEL_M,
     Footprint,
     convex_parts,
+    points_inside,
     read_footprints,
     walls_of,
     with_buildings,
@@ -178,15 +179,64 @@ def test_buildings_of_real_maps_do_not_stand_on_roads(
     source = shared_maps / "osm" / name
     network = load_world(source, overrides={"map.buildings": "osm"}).network
     assert len(set(network.walls["building"].tolist())) >= buildings
-    # Roads meet buildings only where they lead through; in a wrong frame, they meet them anywhere.
-    middles = np.stack([network.points["x"], network.points["y"]], axis=1)
-    built_over = np.zeros(len(middles), dtype=bool)
-    for part in network.roofs:
-        (x0, y0), (x1, y1) = part.min(axis=0), part.max(axis=0)
-        near = ((middles > [x0, y0]) & (middles < [x1, y1])).all(axis=1)
-        edges = np.roll(part, -1, axis=0) - part
-        for point in np.flatnonzero(near):
-            apart = middles[point] - part
-            side = edges[:, 0] * apart[:, 1] - edges[:, 1] * apart[:, 0]
-            built_over[point] |= bool((side >= 0).all() or (side <= 0).all())
-    assert built_over.mean() < 0.02
+    # Roads meet buildings only where they lead through or under them, which counts here as well; in
+    # a wrong frame, they meet them anywhere.
+    assert len(points_inside(network, network.roofs)) < 0.02 * len(network.points)
+
+
+def _tagged(tags: str) -> str:
+    """Return a map with a way over the square of way 10, which has these tags."""
+    words = "".join(
+        f'<tag k="{k}" v="{v}"/>' for k, v in (pair.split("=") for pair in tags.split())
+    )
+    return OSM.replace('<tag k="building" v="yes"/><tag k="height" v="12.5 m"/>', words)
+
+
+@pytest.mark.parametrize(
+    ("tags", "stands"),
+    [
+        ("building=yes", True),
+        ("building=yes layer=-1", False),
+        ("building=yes location=underground", False),
+        ("building=yes layer=1", True),  # no road is known to lead under it
+        ("building=yes layer=x", True),
+        ("building=yes min_height=1.8", True),
+        ("building=yes min_height=3", False),
+        ("building=yes min_height=4.5 building:min_level=0", False),
+        ("building=yes building:min_level=1", False),
+        ("building=yes building:min_level=0", True),
+        ("building=yes building:min_level=-2", True),  # with cellars
+    ],
+)
+def test_buildings_that_do_not_stand_on_the_ground_are_left_out(
+    tmp_path: Path, tags: str, stands: bool
+) -> None:
+    found = {f.name for f in read_footprints(written(tmp_path, _tagged(tags)), GEO)}
+    assert ("way 10" in found) is stands
+    assert {"way 11", "way 12", "relation 20"} <= found
+
+
+@pytest.mark.parametrize(
+    ("key", "value", "walls"), [("layer", "1", 0), ("layer", "0", 4), ("min_height", "5", 0)]
+)
+def test_a_building_above_a_road_has_no_walls(
+    tmp_path: Path, key: str, value: str, walls: int
+) -> None:
+    network = read_network(Path("envs/merge/map/map.net.xml"))
+    x, y = network.lane_polyline(0)[0, :2].tolist()
+    near, far = (
+        " ".join(f"{x + dx:.2f},{y + dy:.2f}" for dx, dy in corners)
+        for corners in (
+            ((-5, -5), (5, -5), (5, 5), (-5, 5)), ((-5, 200), (5, 200), (5, 210), (-5, 210))
+        )
+    )  # fmt: skip
+    text = (
+        f'<additional><poly id="above" type="building" shape="{near}">'
+        f'<param key="{key}" value="{value}"/></poly>'
+        f'<poly id="beside" type="building" shape="{far}"/>'
+        f'<poly id="beside, raised" type="building" shape="{far}"><param key="layer" value="1"/>'
+        "</poly></additional>"
+    )
+    built = with_buildings(network, written(tmp_path, text, "a.poly.xml"))
+    assert len(points_inside(built, built.roofs)) == 0 or walls
+    assert len(built.walls) == 8 + walls

@@ -108,6 +108,36 @@ def test_buildings_on_roads(town: Path, tmp_path: Path) -> None:
         assert all(defect.kind == "building on a road" for defect in on_roads)
 
 
+@pytest.mark.parametrize(
+    ("tags", "is_found"),
+    [
+        ("", True),
+        ("tunnel=no covered=no", True),
+        ("tunnel=building_passage", False),
+        ("tunnel=yes layer=-1", False),
+        ("covered=yes", False),
+    ],
+)
+def test_roads_through_buildings_are_no_defects(tmp_path: Path, tags: str, is_found: bool) -> None:
+    words = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in (one.split("=") for one in tags.split()))
+    building = (
+        '<node id="91" lat="48.0055" lon="10.9995"/><node id="92" lat="48.0055" lon="11.0005"/>'
+        '<node id="93" lat="48.0065" lon="11.0005"/><node id="94" lat="48.0065" lon="10.9995"/>'
+        '<way id="90"><nd ref="91"/><nd ref="92"/><nd ref="93"/><nd ref="94"/><nd ref="91"/>'
+        '<tag k="building" v="yes"/></way></osm>'
+    )
+    source = tmp_path / "covered.osm"
+    way = '<way id="10"><nd ref="1"/><nd ref="2"/><nd ref="3"/>'
+    # A bend inside the building, since straight lanes have points at their ends alone.
+    bent = '<node id="95" lat="48.006" lon="11.0001"/>'
+    text = TOWN.replace('<way id="10">', f'{bent}<way id="10">', 1)
+    text = text.replace(way, way.replace('<nd ref="3"/>', '<nd ref="95"/><nd ref="3"/>') + words)
+    source.write_text(text.replace("</osm>", building))
+    path = build_network(source, tmp_path / "covered.net.xml").path
+    kinds = {defect.kind for defect in found(path, source)}
+    assert ("building on a road" in kinds) is is_found
+
+
 def test_paths_on_two_levels_do_not_cross() -> None:
     one = np.array([[0.0, 0.0, 0.0], [10.0, 10.0, 0.0]])
     other = np.array([[0.0, 10.0, 0.0], [10.0, 0.0, 0.0]])

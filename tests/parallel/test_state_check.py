@@ -20,6 +20,7 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.signals.kernels import lane_history as lanes
 from cavmarl.traffic.departure_queue import DEPARTURE
 from tests.support.actuated import actuated_grid
+from tests.support.forged_states import MANY, MOST, ROW, WAITING
 from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.signal_worlds import common_of_worlds
@@ -29,61 +30,7 @@ Array = NDArray[Any]
 State: TypeAlias = list[Array]
 Forge = Callable[[State], None]
 
-MANY = 1 << 30
-ROW = {
-    "lane": (-1, MANY),
-    "lane_stood": (-2, MANY << 32),
-    "side_lane": (-2, MANY),
-    "target_lane": (-2, MANY),
-    "vtype": (-1, 1),
-    "driver": (-1, 2, 4),
-    "link": (-2, MANY),
-    "stopped_at": (-2, MANY),
-    "hold": (-1, 4),
-    "blinker": (-2, 2),
-    "stop": (-2, MANY),
-    "stops_end": (-2, MANY),
-    "agent": (-2, 6),
-    "goal": (-2, MANY),
-    "leg": (-1,),
-    "order": (-2, 0),
-    "way": (-MANY, MANY),
-    "id": (-1, MANY),
-    "owner": (-1,),
-    "epoch": (-1,),
-    "transfer": (1,),
-    "tick": (-1,),
-    "x": (np.nan, np.inf, 1e30),
-    "s": (np.nan, -np.inf, -1.0),
-    "speed": (np.nan,),
-    "heading": (np.inf,),
-    "to_go": (np.nan,),
-    "length": (0.0, -1.0, 100.0, np.nan),
-    "height": (30.0,),
-    "speed_factor": (0.0, -1.0),
-    "wait_s": (-1.0,),
-    "distance_m": (-1.0,),
-}
-LATER = {
-    "tick": (MANY,),
-    "departed": (MANY,),
-    "last_change": (MANY,),
-}  # after the world's tick
-WAITING = {
-    "lane": (-1, MANY),
-    "vtype": (-1, 1),
-    "agent": (-2, 6),
-    "goal": (-2, MANY),
-    "order": (-2, 0),
-    "way": (-MANY, MANY),
-    "stop": (-2, MANY),
-    "id": (-1, MANY),
-    "lane_code": (-6, 1),
-    "pos_code": (-1, 6),
-    "speed_code": (-1, 7),
-    "pos": (np.nan,),
-    "speed_factor": (np.inf, 0.0),
-}
+LATER = {"tick": (MANY,), "departed": (MANY,), "last_change": (MANY,)}  # than the world's tick
 
 
 def _busy(make: Make, **more: Any) -> CavVectorEnv:
@@ -139,6 +86,19 @@ def test_rows_with_an_index_out_of_range_are_refused(make: Make) -> None:
                 state[_index(state, VEHICLE, last=True)][name][-1] = value
 
             _refused(vec, forge)
+
+
+def test_ways_whose_sums_overflow(make: Make) -> None:
+    vec = _busy(make)
+    rows = vec.network.edges[~vec.network.edges["internal"]]
+    for edge in rows[:3]:
+        lane = int(edge["first_lane"])
+
+        def forge(state: State, lane: int = lane) -> None:
+            row = state[_index(state, VEHICLE, last=True)]
+            row["lane"][-1], row["way"][-1] = lane, MOST - lane
+
+        _refused(vec, forge)
 
 
 def test_waiting_vehicles_with_an_index_out_of_range_are_refused(make: Make) -> None:

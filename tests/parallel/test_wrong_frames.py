@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.ownership.messages import COORDINATOR, Ack, Done, Message, Prepare
 from cavmarl.parallel.nodes import node_pool
 from cavmarl.parallel.nodes.link import FrameKind
@@ -19,6 +20,7 @@ from cavmarl.parallel.nodes.node_peers import NodePeers
 from cavmarl.parallel.nodes.zone_endpoints import packed, packed_report, read_report, unpacked
 from cavmarl.parallel.state.world_bytes import to_bytes
 from cavmarl.verify.simulated_nodes import verify_simulated_nodes
+from tests.support.forged_states import ROW
 
 BUSY: dict[str, Any] = {
     "agents": 12, "background": 20, "zones": 8, "steps": 16, "overrides": {"clock.ctrl_dt_s": 0.4},
@@ -29,6 +31,7 @@ AGENT = np.dtype([
     ("vehicle_id", "<i8"), ("place", "<f8", 2),
 ])  # fmt: skip
 NEW = -1  # number of a node that has not begun
+REFUSED = "the state is damaged or belongs to different worlds"
 SENDER = 1  # the node whose frame is changed, unless a test names another node
 
 
@@ -260,6 +263,76 @@ def test_a_wrong_replica_is_noticed_when_it_is_kept(
 ) -> None:
     """When the replica is needed, it is too late to find its sender at fault."""
     check(monkeypatch, FrameKind.KEEP, change, words, after=1)
+
+
+def forged(dtype: np.dtype[Any], name: str, value: float) -> Change:
+    """Return a change of a field of the last record of a type in a kept state."""
+
+    def changed(frame: Sent) -> Sent | None:
+        found = read_arrays(frame.data)
+        rows = [array for array in found if array.dtype == dtype and array.size]
+        if not rows:
+            return None
+        rows[-1][name][(-1,) * rows[-1].ndim] = value
+        return frame._replace(data=to_bytes(found))
+
+    return changed
+
+
+NAMES = ("lane", "link", "vtype", "goal", "stop", "way", "id", "x", "length")
+# The worlds of these runs have more than 6 agents, and departures.
+FORGED = [
+    (name, value) for name, values in ROW.items() for value in values
+    if (name, value) not in (("agent", 6), ("order", 0))
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_forged_replica_loses_its_sender(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+    """A node knows the key and sends a state with a number that no table allows."""
+    check(monkeypatch, FrameKind.KEEP, forged(VEHICLE, name, ROW[name][-1]), REFUSED, after=1)
+
+
+@pytest.mark.slow  # the same for each field and value
+@pytest.mark.parametrize(("name", "value"), FORGED)
+def test_each_forged_replica_loses_its_sender(
+    monkeypatch: pytest.MonkeyPatch, name: str, value: float
+) -> None:
+    check(monkeypatch, FrameKind.KEEP, forged(VEHICLE, name, value), REFUSED, after=1)
+
+
+def test_forged_arrays_of_a_replica_lose_their_sender(monkeypatch: pytest.MonkeyPatch) -> None:
+    """All integers of an array out of all ranges."""
+
+    def forge(n: int) -> Change:
+        def changed(frame: Sent) -> Sent | None:
+            found = read_arrays(frame.data)
+            if not found[n].size:
+                return None
+            found[n][...] = np.iinfo(found[n].dtype).min
+            return frame._replace(data=to_bytes(found))
+
+        return changed
+
+    for n in (4, -9):  # ticks, contacts
+        with monkeypatch.context() as patch:
+            check(patch, FrameKind.KEEP, forge(n), REFUSED, after=1)
+
+
+@pytest.mark.parametrize("name", ["lane", "way", "goal"])
+def test_a_forged_state_of_moving_zones_loses_its_sender(
+    monkeypatch: pytest.MonkeyPatch, name: str
+) -> None:
+    """Node 1 is lost first. The node that has its zones gives them to the next node 1."""
+    first = Forger(monkeypatch, FrameKind.KEEP, content(b""), after=1)
+    giver = Forger(monkeypatch, FrameKind.GIVE, forged(VEHICLE, name, ROW[name][-1]), sender=2)
+    keys = {**BUSY, "steps": 40}
+    found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **keys)
+    assert first.frame is not None
+    assert giver.frame is not None
+    assert [text for text in found.lines[0].wrong if "must be tolerated" not in text] == []
+    assert list(giver.lost)[:2] == [1, 2]
+    assert REFUSED in giver.lost[2]
 
 
 # Reports

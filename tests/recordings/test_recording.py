@@ -13,8 +13,12 @@ import numpy as np
 import pytest
 
 from cavmarl import CavEnv, RecordingError, make_vec, parallel_env
+from cavmarl.core.records.codes import EVENT_RED_LIGHT
+from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.engine.world_setup import load_world
 from cavmarl.recordings.recording import Recording
+from cavmarl.recordings.recording_writer import RecordingWriter
 from tests.support.forks import said_in_fork
 from tests.support.killed_recordings import killed_recording
 
@@ -121,6 +125,32 @@ def test_an_end_in_the_step_of_an_autoreset_is_an_event(tmp_path: Path) -> None:
             vec.step(actions)
     kinds = {found.event.kind for found in Recording.open(tmp_path / "run").events()}
     assert kinds & {"off_road", "collision", "wrong_way"}
+
+
+def test_events_of_the_last_frame_of_an_episode_are_recorded_once(tmp_path: Path) -> None:
+    """The vehicle stays in the last step, which has no frame; its events are of the step before."""
+    world = load_world("ring", agents=1, background=1)
+    with closing(parallel_env("ring", agents=1, background=1)) as env:
+        first, second, third = drive(env, 2)
+    third.vehicles["events"][-1] = EVENT_RED_LIGHT
+    described = world.config, world.network, world.demand, world.partition
+    writer = RecordingWriter(
+        tmp_path / "run",
+        environment="ring-v1",
+        network=world.network,
+        partition=world.partition,
+        halo_m=0.0,
+        sim_dt_s=0.1,
+        step_s=0.1 * (second.tick - first.tick),
+        manifest={"world": describe_world(*described)},
+    )
+    writer.add([first])
+    writer.add([second])
+    writer.add([third])
+    writer.add([first])
+    writer.close()
+    found = [one.event for one in Recording.open(tmp_path / "run").events()]
+    assert [one.tick for one in found if one.kind == "red_light"] == [third.tick]
 
 
 def test_copies_do_not_record(tmp_path: Path) -> None:

@@ -245,6 +245,25 @@ def test_a_node_cannot_fill_the_memory_of_the_service(fleet: Fleet) -> None:
 # Bodies
 
 
+def test_a_forged_heartbeat_does_not_shut_a_node_out(tmp_path: Path) -> None:
+    """The node's own heartbeats are refused after it, so the node registers again."""
+    with loopback_service(tmp_path / "store.sqlite") as service:
+        link = service.start_node("a", "node")
+        service.ask("operator", "POST", "/nodes/a/drain")
+        while not link.is_draining:
+            time.sleep(0.02)
+        beat = {"incarnation": link.incarnation, "sequence": 2**53, "sent_s": 0.0,
+                "cpu": 0.0, "ram": 0.0}  # fmt: skip
+        assert service.ask("node", "POST", "/nodes/a/beat", json=beat).status_code == 200
+        service.ask("operator", "POST", "/nodes/a/resume")
+        service.wait_until_ready("a")
+        assert link.incarnation == 2
+        beat["sequence"] += 1
+        assert service.ask("node", "POST", "/nodes/a/beat", json=beat).status_code == 409
+        service.wait_until_ready("a")
+        assert link.incarnation == 2
+
+
 @pytest.mark.parametrize("depth", [33, 100, 500, 900, 1000, 30_000])
 @pytest.mark.parametrize("key", ["environment", "overrides", "new"])
 def test_deep_bodies_are_refused_in_one_line(

@@ -20,7 +20,7 @@ from cavmarl.service.node_host import run_evaluation
 from cavmarl.service.node_selection import NoNodeError
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.response_builders import session_answer
-from tests.support.fleet import Fleet
+from tests.support.fleet import CONFIGURATION, Fleet
 
 
 @pytest.fixture
@@ -189,6 +189,21 @@ def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
     assert reasons(fleet) == {"full": "capacity", "plain": "capacity", "others": "access"}
 
 
+def test_a_node_serves_those_it_allows_and_has_all_that_they_need(fleet: Fleet) -> None:
+    fleet.join("own", capabilities=["gpu", "tls"], allowed=["bob", "ada"])
+    assert fleet.open(needs=["gpu", "tls"]).node == "own"
+    assert reasons(fleet, needs=["gpu", "sumo"]) == {"own": "capability"}
+
+
+def test_a_job_that_no_node_serves_does_not_hold_up_another_client(fleet: Fleet) -> None:
+    bob = fleet.identity("bob", "client")
+    job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
+    first = fleet.open(job=job)
+    second = fleet.broker.open(bob, CONFIGURATION, job=job)
+    fleet.join("bobs", allowed=["bob"])
+    assert (first.node, second.node) == (None, "bobs")
+
+
 def test_a_session_is_redirected_by_the_rule_of_the_paper(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     fleet.beat("b", cpu=0.12)
@@ -220,6 +235,18 @@ def test_a_session_moves_when_its_node_is_drained_gone_or_out_of_reach(fleet: Fl
     fleet.join("a")
     assert fleet.broker.resolve(fleet.client, session.id).node == "a"
     assert fleet.broker.live["b"].hosted == set()
+
+
+def test_a_state_is_stored_again_after_a_change_between_two_commands(fleet: Fleet) -> None:
+    fleet.join("a")
+    session = fleet.open()
+    for content in (b"state", b"state with another vehicle"):
+        fleet.broker.save(session, 3, content)
+    fleet.log.flush()
+    assert session.saved_number == 3
+    assert fleet.log.content(str(session.saved_blob)) == b"state with another vehicle"
+    with pytest.raises(ServiceError, match="command 3 is stored"):
+        fleet.broker.save(session, 2, b"older")
 
 
 def test_a_superseded_process_is_notified(fleet: Fleet) -> None:
@@ -469,7 +496,11 @@ def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
         limit.take("ada")
     assert (refused.value.problem, refused.value.retry_s) == ("too-many", 0.5)
     limit.take("bob")
-    fleet.now_s += 0.5
+    fleet.now_s += 0.125
+    with pytest.raises(ServiceError) as refused:
+        limit.take("ada")
+    assert refused.value.retry_s == 0.375
+    fleet.now_s += 0.375
     limit.take("ada")
 
 

@@ -40,10 +40,10 @@ def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
         if not any(one.name == role and not one.revoked for one in state.identities.values()):
             service.grant(role, role)
         fuzz.tokens[role] = service.token(role)
-    if state.nodes["a"].incarnation != link.incarnation or state.nodes["a"].state != "up":
+    if state.nodes["a"].incarnation != link.incarnation:
         service.run(link.register())
-    service.wait_for_beat("a")
     service.ask("operator", "POST", "/nodes/a/resume")
+    service.wait_until_ready("a")
     found = service.ask("client", "POST", "/configurations", json=WORLD).json()["hash"]
     body = {"configuration": found, "node": "a"}
     for one in service.ask("client", "GET", "/sessions").json()["sessions"]:
@@ -54,7 +54,7 @@ def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
     bearer = {"Authorization": f"Bearer {opened[0]['token']}"}
     world = f"{service.nodes['a'][1]}/v1/worlds/{opened[0]['session']}"
     for command in ("", "/reset?number=1&seed=0"):
-        until_s = time.monotonic() + 20.0  # the node gets new keys, and resumes
+        until_s = time.monotonic() + 20.0  # the node gets new keys
         while (answer := service.http.post(world + command, headers=bearer)).status_code != 200:
             assert time.monotonic() < until_s, answer.text
             time.sleep(0.05)

@@ -28,7 +28,7 @@ from cavmarl.service.broker import Broker, BrokerRules
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.node_app import make_node_app
-from cavmarl.service.node_link import NodeLink
+from cavmarl.service.node_link import NodeLink, must_register
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.route_access import Service
 from cavmarl.service.server import ServerOptions, uvicorn_config
@@ -113,6 +113,21 @@ class LoopbackService:
             assert time.monotonic() < until_s
             time.sleep(0.02)
 
+    def wait_until_ready(self, name: str) -> None:
+        """Wait until a node is admitted, accepts sessions, and its heartbeats are accepted.
+
+        Other processes may have drained it, registered it, or sent heartbeats in its name.
+        """
+        link = self.nodes[name][0]
+        until_s = time.monotonic() + 60.0
+        while True:
+            node, live = self.events.state.nodes[name], self.broker.live[name]
+            is_present = node.state == "up" and node.incarnation == link.incarnation
+            if is_present and live.use and live.beat < link.beats and not link.is_draining:
+                return
+            assert time.monotonic() < until_s, (node, live, link.beats)
+            time.sleep(0.02)
+
     async def _start_node(self, name: str, identity: str, slots: int) -> NodeLink:
         listener = listen("127.0.0.1", 0)
         port = listener.getsockname()[1]
@@ -139,8 +154,12 @@ class LoopbackService:
 async def _beat(link: NodeLink, worlds: SessionWorlds) -> None:
     while True:
         with suppress(ServiceError):
-            told = await link.beat(worlds.counters(), {}, False)
-            worlds.keep_only(link.own(told["sessions"]))
+            try:
+                told = await link.beat(worlds.counters(), {}, False)
+                worlds.keep_only(link.own(told["sessions"]))
+            except ServiceError as error:
+                if must_register(error):
+                    await link.register()
         await asyncio.sleep(BEAT_S)
 
 

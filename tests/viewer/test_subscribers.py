@@ -57,6 +57,7 @@ def test_a_watcher_that_reads_no_texts_is_lost_after_256() -> None:
     watcher.queue("256")
     assert watcher.is_lost
     assert watcher.take() == [str(number) for number in range(256)]
+    assert watcher.take() == []
 
 
 def test_a_late_watcher_gets_the_last_frame_and_all_events() -> None:

@@ -148,6 +148,15 @@ def test_filters_count_removed_points() -> None:
     assert drop_outliers(cloud, 0.0) is cloud
 
 
+@pytest.mark.parametrize("sigmas", [0.5, 1.0, 2.5])
+def test_outliers_are_far_from_their_eight_neighbours(sigmas: float) -> None:
+    points = np.random.default_rng(0).normal(size=(400, 3))
+    apart = np.linalg.norm(points[:, None] - points[None], axis=2)
+    distance_m = np.sort(apart, axis=1)[:, 1:9].mean(axis=1)
+    kept = distance_m <= distance_m.mean() + sigmas * distance_m.std()
+    assert drop_outliers(Cloud("c", points), sigmas).points.tolist() == points[kept].tolist()
+
+
 def test_wrong_numbers_are_refused() -> None:
     cloud = Cloud("c", street(500))
     with pytest.raises(ConfigError, match="above 0"):

@@ -14,7 +14,7 @@ from cavmarl.core.errors import CavmarlError, MapError
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.fidelity.cloud_files import Cloud, read_cloud
 from cavmarl.maps.fidelity.cloud_registration import moved, nearest_distances
-from cavmarl.maps.fidelity.map_surface import map_surface
+from cavmarl.maps.fidelity.map_surface import along_lane, lanes_in, map_surface
 from cavmarl.maps.fidelity.road_edges import fit_roads
 from cavmarl.maps.netconvert import map_file
 from cavmarl.roads.cache import load_network
@@ -62,6 +62,25 @@ def test_edges_and_heights_of_roads_are_found(network: RoadNetwork, scan: np.nda
     assert fit.transform is not None
     assert fit.transform[:3, 3] == pytest.approx([-0.2, 0.1, -0.3], abs=BIN_M)
     assert np.median(fit.height_offset_m) == pytest.approx(0.3, abs=0.01)
+
+
+def test_bodies_in_the_inner_half_of_a_lane_are_no_border(
+    network: RoadNetwork, scan: np.ndarray
+) -> None:
+    lanes = network.lanes
+    bodies = []
+    for lane in lanes_in(network, (150.0, 150.0, 250.0, 250.0)).tolist():
+        if lanes["internal"][lane] or lanes["index"][lane]:
+            continue
+        places, direction = along_lane(network, lane, 0.05)
+        left = np.stack([-direction[:, 1], direction[:, 0]], axis=1)
+        places[:, :2] += (2.45 - 0.5 * lanes["width_m"][lane]) * left  # 2.45 m from the border
+        places[:, 2] += 0.5
+        bodies.append(places)
+    plain = fit_roads(network, scan, network.extent_m)
+    fit = fit_roads(network, np.concatenate([scan, *bodies]), network.extent_m)
+    assert len(fit.edge_offset_m) == len(plain.edge_offset_m)
+    assert fit.edge_offset_m == pytest.approx(plain.edge_offset_m, abs=0.05)
 
 
 def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from cavmarl.maps.heights import levels
+from cavmarl.maps.osm_roads import RoadWay
 
 
 @pytest.mark.parametrize("level", [1, -2])
@@ -35,3 +36,22 @@ def test_a_bridge_extends_from_its_first_point_to_its_last(
     geo: Any = None
     found = levels.levels_of(stations, roads, geo, Path("town.osm"))
     assert found.tolist() == [0, 0, 0, *[level] * 5, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("tags", "level"),
+    [
+        ({"bridge": "yes"}, 1),
+        ({"bridge": "viaduct", "layer": "2"}, 2),
+        ({"bridge": "yes", "layer": "-1"}, 1),
+        ({"bridge": "yes", "layer": "high"}, 1),
+        ({"tunnel": "yes"}, -1),
+        ({"tunnel": "yes", "layer": "-3"}, -3),
+        ({"tunnel": "yes", "layer": "0"}, -1),
+        ({"tunnel": "building_passage", "layer": "-1"}, 0),
+        ({"layer": "1"}, 0),
+    ],
+)
+def test_bridges_are_above_the_ground_and_tunnels_below(tags: dict[str, str], level: int) -> None:
+    """A layer that contradicts the way, or is no number, does not count."""
+    assert RoadWay(tags=tags).level == level

@@ -63,6 +63,40 @@ def test_a_void_of_one_tile_has_the_height_of_the_next(tmp_path: Path) -> None:
     assert coverage.filled_places == 1
 
 
+def test_a_void_of_all_tiles_is_filled_from_the_first(tmp_path: Path) -> None:
+    def hole(heights: NDArray[Any]) -> None:
+        heights[40:60, 50:70] = np.nan
+
+    tiles = [
+        write_geotiff(tmp_path / f"{height}.tif", plane(0.0, 0.0, height), holes=hole)
+        for height in (500.0, 700.0)
+    ]
+    places = np.array([[11.007, 48.005], [11.000, 48.000]])
+    heights, coverage = HeightModel(tiles).at(places)
+    assert heights.tolist() == pytest.approx([500.0, 500.0])
+    assert coverage.filled_places == 1
+
+
+def test_at_most_half_of_the_roads_may_be_in_voids(tmp_path: Path) -> None:
+    def hole(heights: NDArray[Any]) -> None:
+        heights[40:60, 50:70] = np.nan
+
+    model = HeightModel([write_geotiff(tmp_path / "g.tif", plane(0.0, 0.0, 500.0), holes=hole)])
+    void, known = [11.007, 48.005], [11.000, 48.000]
+    assert model.at(np.array([void, void, known, known]))[1].filled_places == 2
+    with pytest.raises(MapError, match="67% of the roads are in voids of the model; at most 50%"):
+        model.at(np.array([void, void, known]))
+
+
+def test_a_tile_covers_half_a_cell_around_its_outer_places(tmp_path: Path) -> None:
+    model = HeightModel([write_geotiff(tmp_path / "g.tif", plane(0.0, 0.0, 500.0), step=0.0002)])
+    west = 10.995
+    heights, _ = model.at(np.array([[west - 0.00009, 48.0]]))
+    assert heights.tolist() == [500.0]
+    with pytest.raises(MapError, match="100% of the roads are outside of the model"):
+        model.at(np.array([[west - 0.00011, 48.0]]))
+
+
 def test_tiles_continue_each_other(tmp_path: Path) -> None:
     west = write_geotiff(tmp_path / "w.tif", GROUND, (10.995, 47.995, 11.006, 48.015))
     east = write_geotiff(tmp_path / "e.tif", GROUND, (11.006, 47.995, 11.02, 48.015))
