@@ -101,8 +101,8 @@ def test_without_commands_the_vehicle_stands_and_says_so(
     counts = report["controls"]["car_0"]
     assert (counts["held"], counts["used"], counts["received"]) == (6, 0, 0)
     assert "no node publishes commands of car_0" in caplog.text
-    # no node listens: only the mounts, which late subscribers get, are sent, with their time
-    assert report["sent"] == {"/tf_static": 1, "/clock": 1}
+    # no node listens: only what late subscribers get is sent, with its time
+    assert report["sent"] == {"/tf_static": 1, "/car_0/goal": 1, "/clock": 1}
 
 
 def test_a_command_that_does_not_come_is_waited_for_and_counted(
