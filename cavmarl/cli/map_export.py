@@ -90,7 +90,9 @@ def export(
             document["opendrive"] = trip.to_dict()
         if lanelet2 is not None:
             told(_LANELETS)
-            document["lanelet2"] = found = write_lanelet2(network, lanelet2)
+            document["lanelet2"] = found = write_lanelet2(
+                network, lanelet2, is_local=autoware is not None
+            )
             told_back = f"{found['read back']} lanelets and {found['rules read back']} rules"
             console.print(Text(f"{lanelet2}: {told_back} read back"))
             if autoware is not None:

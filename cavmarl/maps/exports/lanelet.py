@@ -20,26 +20,32 @@ from cavmarl.maps.exports.geojson import unproject_points
 from cavmarl.maps.projection import unproject
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
+_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _BICYCLE = 1 << VEHICLE_CLASSES.index("bicycle")
 _TURNS = {"s": "straight", "l": "left", "L": "left", "t": "left", "r": "right", "R": "right"}
 # The id of a regulatory element is one of these, plus the row of its link.
 FIRST_LIGHT, FIRST_RIGHT = 1_000_000_000, 2_000_000_000
+# Degrees of the origin of a map without a georeference, of which only local_x and local_y count.
+_NOWHERE = 45.0, 3.0
 _LIGHT_HEIGHT_M, _LIGHT_SIZE_M = 5.0, 0.5  # a light is this far above the stop line
 
 
-def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
+def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -> dict[str, int]:
     """Write each lane as a lanelet; return the numbers of lanelets and rules, and those read back.
 
     Lanelets of lanes that lead into each other share end points, so that routes are connected. A
     link with a signal has a traffic light, whose id is `FIRST_LIGHT` plus the row of the link. A
-    link without a signal that gives way to others has a right of way, `FIRST_RIGHT` plus its row.
+    link that gives way to others has a right of way, `FIRST_RIGHT` plus its row; at a signal, it
+    counts while both have green. Lanes without cars have `participant:vehicle` = no.
+
+    `is_local`: the file is read by `local_x` and `local_y`, so the map needs no projection.
 
     Raises:
         MapError: the map has no projection, the target cannot be written, or the number of lanelets
             read back differs.
         MissingExtraError: lanelet2 or pyproj is not installed.
     """
-    if network.geo is None:
+    if network.geo is None and not is_local:
         raise MapError(
             f"{network.name}: the map has no georeference, and Lanelet2 needs degrees: "
             "build it from OpenStreetMap, or with a projParameter"
@@ -48,9 +54,12 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
     from lanelet2.core import AttributeMap, Lanelet, LaneletMap, LineString3d, Point3d
     from lanelet2.projection import UtmProjector
 
-    west, south = unproject_points(network).min(axis=0).tolist()
+    if network.geo is None:
+        south, west = _NOWHERE
+    else:
+        west, south = unproject_points(network).min(axis=0).tolist()
     projector = UtmProjector(lanelet2.io.Origin(south, west))
-    made, ends = LaneletMap(), _Joints(network)
+    made, ends = LaneletMap(), _Joints(network, projector)
     ids = itertools.count(1)
 
     def line(lane: int, side: float) -> Any:
@@ -78,7 +87,7 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
             "subtype": "road" if int(row["permissions"]) != _BICYCLE else "bicycle_lane",
             "location": "urban",
             "one_way": "yes",
-            "participant:vehicle": "yes",
+            "participant:vehicle": "yes" if int(row["permissions"]) & _CAR else "no",
             "speed_limit": f"{row['speed_mps'] * 3.6:.1f} km/h",
             "name": network.lane_ids[lane],
         }
@@ -146,7 +155,6 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
             )
             lanelets[own].addRegulatoryElement(rule)
             count_rules += 1
-            continue
         first, count = int(link["first_conflict"]), int(link["num_conflicts"])
         conflicts = network.conflicts[first : first + count]
         foes = network.links["first_internal"][conflicts["foe"][conflicts["must_yield"]]]
@@ -168,17 +176,21 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
 class _Joints:
     """End points, shared by lanelets that lead into each other."""
 
-    def __init__(self, network: RoadNetwork) -> None:
-        assert network.geo is not None
+    def __init__(self, network: RoadNetwork, projector: Any) -> None:
         self.points: dict[tuple[int, int, int], Any] = {}
-        self._geo = network.geo
+        self._geo, self._projector = network.geo, projector
 
     def key(self, place: NDArray[np.float64]) -> tuple[int, int, int]:
         x, y, z = np.round(place * 4.0).astype(int).tolist()
         return x, y, z
 
     def degrees(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        return unproject(places, self._geo)
+        if self._geo is not None:
+            return unproject(places, self._geo)
+        from lanelet2.core import BasicPoint3d
+
+        found = [self._projector.reverse(BasicPoint3d(x, y, 0.0)) for x, y in places.tolist()]
+        return np.array([(one.lon, one.lat) for one in found])
 
 
 def _beside(network: RoadNetwork, lane: int, side: float) -> NDArray[np.float64]:

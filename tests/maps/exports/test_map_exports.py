@@ -164,9 +164,31 @@ def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
     words = ["export", str(town), "--autoware", str(folder), "--lanelet2", "x.osm"]
     refused = CliRunner().invoke(app, words)
     assert isinstance(refused.exception, ConfigError)
-    without = CliRunner().invoke(app, ["export", "ring", "--autoware", str(tmp_path / "ring")])
-    assert isinstance(without.exception, MapError)
-    assert not list((tmp_path / "ring").iterdir())
+
+
+def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
+    lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
+    network = load_network(find_map("grid4x4"))
+    result = CliRunner().invoke(app, ["export", "grid4x4", "--autoware", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(45.0, 3.0))
+    back = lanelet2.io.load(str(tmp_path / "lanelet2_map.osm"), projector)
+    assert len(back.laneletLayer) == len(network.lanes)
+    for lanelet in back.laneletLayer:
+        lane = network.lane_ids.index(lanelet.attributes["name"])
+        ends = [
+            [(float(p.attributes["local_x"]), float(p.attributes["local_y"])) for p in bound]
+            for bound in (lanelet.leftBound, lanelet.rightBound)
+        ]
+        shape = network.lane_polyline(lane)
+        for place, n in ((shape[0], 0), (shape[-1], -1)):
+            middle = np.mean([ends[0][n], ends[1][n]], axis=0)
+            np.testing.assert_allclose(middle, place[:2], atol=0.3)
+    # at a signal, turns give way to oncoming traffic
+    rights = [one for one in back.regulatoryElementLayer if one.id >= FIRST_RIGHT]
+    yields = network.links[np.array([one.id - FIRST_RIGHT for one in rights])]
+    assert (yields["signal"] >= 0).all()
+    assert ord("l") in yields["direction"]
 
 
 def test_the_command_exports(town: Path, tmp_path: Path) -> None:
