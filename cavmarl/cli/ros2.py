@@ -5,8 +5,6 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
@@ -25,7 +23,7 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import CavmarlError, ConfigError, require_all
+from cavmarl.core.errors import ConfigError, require_all
 
 if TYPE_CHECKING:
     from cavmarl.cosim.ros2.ros_bridge import RosOptions
@@ -172,48 +170,16 @@ def _start(
     steps: int | None,
     pace: float | None,
 ) -> dict[str, Any]:
-    """Run a world and its bridge, which is another thread of this process."""
-    from cavmarl.cosim.followers.followed_world import FollowedWorld
-    from cavmarl.cosim.ros2 import ros_bridge
+    """Run an episode of a world and its bridge."""
+    from cavmarl.cosim.ros2.bridged_world import BridgedWorld
     from cavmarl.cosim.time_master import RealTime
     from cavmarl.env.parallel import parallel_env
 
-    reports: list[dict[str, Any]] = []
-    errors: list[Exception] = []
-
-    def follow(address: str | int) -> None:
-        try:
-            reports.append(ros_bridge.join(address, vehicles, options))
-        except Exception as error:  # raised below, in the thread that runs the world
-            errors.append(error)
-
-    timeout_s = options.ready_s + options.deadline_s + 30.0
     pacer = None if pace is None else RealTime(pace)
-    with (
-        closing(parallel_env(world.env, **world.keywords)) as made,
-        TemporaryDirectory(prefix="cavmarl-ros2-") as folder,
-        FollowedWorld(
-            made, f"{folder}/world.sock", timeout_s=timeout_s, pacer=pacer, truth=options.truth
-        ) as led,
-    ):
-        thread = Thread(target=follow, args=(led.address,), daemon=True)
-        thread.start()
-        try:
-            while not led.seats and thread.is_alive():
-                led.admit(0.2)
-            if errors:
-                raise errors[0]
-            run = run_episode(led, world.seed, steps, "end")
-        except CavmarlError:
-            thread.join(options.deadline_s + 10.0)
-            if errors:  # the reason for which the bridge has ended
-                raise errors[0] from None
-            raise
-        led.close()
-        thread.join(options.deadline_s + 10.0)
-    if errors:
-        raise errors[0]
-    return {**reports[0], "state_hash": run["state_hash"]}
+    with closing(parallel_env(world.env, **world.keywords)) as made:
+        with BridgedWorld(made, vehicles, options, pacer=pacer) as bridged:
+            run = run_episode(bridged.world, world.seed, steps, "end")
+        return {**bridged.report, "state_hash": run["state_hash"]}
 
 
 def _table(found: dict[str, Any]) -> Table:
