@@ -8,6 +8,7 @@ episode succeeds if the vehicle arrives without a contact, a red light or leavin
 
 from __future__ import annotations
 
+import json
 import subprocess
 import time
 from collections import Counter
@@ -44,11 +45,22 @@ def measure(
     episodes: Annotated[int, about("Number of episodes; each has the next seed.")] = 10,
     step_s: Annotated[float, about("Seconds per step of the world.")] = 0.1,
     domain: Annotated[int, about("ROS_DOMAIN_ID.")] = 91,
+    map_folder: Annotated[
+        Path | None,
+        about("Map folder of Autoware [default: exported from the map].", "--map", exists=True),
+    ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
     """Drive by the topics of Autoware and a map folder alone."""
     check_range(episodes=(episodes, 1, 10_000), step_s=(step_s, 0.01, 1.0))
-    found = drive_by_topics(world, episodes=episodes, step_s=step_s, domain=domain, say=say)
+    with TemporaryDirectory() as name:
+        if map_folder is None:
+            say("exporting the map")
+            map_folder = Path(name)
+            write_map_folder(load_network(find_map(world.env)), map_folder)
+        found = drive_by_topics(
+            world, map_folder, episodes=episodes, step_s=step_s, domain=domain, say=say
+        )
     counts = Counter(row["outcome"] for row in found["rows"])
     used = found["controls"]
     return BenchmarkReport(
@@ -74,17 +86,26 @@ def measure(
 
 
 def drive_by_topics(
-    spec: WorldSpec, *, episodes: int, step_s: float, domain: int, say: Say = silent
+    spec: WorldSpec,
+    folder: Path,
+    *,
+    episodes: int,
+    step_s: float,
+    domain: int,
+    say: Say = silent,
 ) -> dict[str, Any]:
     """Run episodes of a world, its bridge, and the stand-in in another process.
 
+    `folder`: map folder of Autoware.
+
     Returns:
-        `rows`: seed, outcome, time and distance of each episode; `controls`: counts of the bridge;
-        `steps_per_s`.
+        `rows`: seed, outcome, time and distance of each episode; `controls` and `requests`: counts
+        of the bridge; `steps_per_s`; `reasons`: steps of the stand-in by the reason of their
+        acceleration.
 
     Raises:
         EvaluationError: the stand-in fails.
-        MissingExtraError: lanelet2, or the extra `ros2`, is not installed.
+        MissingExtraError: the extra `ros2` is not installed.
     """
     overrides = {
         "rig": {"wheels": {"type": "odometry", "rate_hz": 10}},
@@ -98,12 +119,9 @@ def drive_by_topics(
         profile="autoware", domain=domain, deadline_s=10.0, ready_s=ENDS_S, truth=True
     )
     rows, steps = [], 0
-    with TemporaryDirectory() as name, closing(parallel_env(spec.env, **keywords)) as env:
-        folder = Path(name) / "map"
-        say("exporting the map")
-        write_map_folder(load_network(find_map(spec.env)), folder)
-        words = ["-m", topic_driver.__name__, str(folder), "--domain", str(domain)]
-        words += ["--step-s", str(step_s)]
+    words = ["-m", topic_driver.__name__, str(folder), "--domain", str(domain)]
+    words += ["--step-s", str(step_s)]
+    with closing(parallel_env(spec.env, **keywords)) as env:
         with start_python(words, stdout=subprocess.PIPE, text=True) as process:
             try:
                 began_s = time.monotonic()
@@ -124,7 +142,7 @@ def drive_by_topics(
         "controls": bridged.report["controls"][AGENT],
         "requests": bridged.report["requests"][AGENT],
         "steps_per_s": steps / wall_s,
-        "stand_in": output.strip(),
+        "reasons": json.loads(output),
     }
 
 

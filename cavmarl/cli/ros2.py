@@ -29,75 +29,86 @@ if TYPE_CHECKING:
     from cavmarl.cosim.ros2.ros_bridge import RosOptions
 
 
+# The options of the command.
+Join = Annotated[
+    str | None,
+    about("Attach to a world of `cavmarl lead` at this socket or port.", metavar="ADDRESS"),
+]
+Vehicle = Annotated[
+    list[str] | None,
+    about("Agent to publish and drive; repeat it for more [default: car_0].", metavar="NAME"),
+]
+Domain = Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")]
+ProfileName = Annotated[
+    Literal["plain", "autoware"],
+    about("Names: topics begin with the vehicle (plain), or are Autoware's (one vehicle)."),
+]
+Distro = Annotated[
+    Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
+]
+Waits = Annotated[
+    Literal["stamp", "newest"],
+    about(
+        "Each step waits for a command whose time is that of the step (stamp), or takes the "
+        "newest command and never waits (newest)."
+    ),
+]
+Deadline = Annotated[
+    float, about("Seconds that a step waits for a command, real time.", metavar="S")
+]
+Lag = Annotated[int, about("A command may be this many steps old.", metavar="N")]
+Ready = Annotated[
+    float, about("Seconds that the first step waits for a publisher of commands.", metavar="S")
+]
+Truth = Annotated[bool, flag("Publish the true state of the vehicles and of all vehicles around.")]
+Names = Annotated[
+    Path | None,
+    about("Other names of topics and frames, by sensor.", metavar="FILE", exists=True),
+]
+Bag = Annotated[
+    Path | None,
+    about(
+        "Write all messages to a bag of rosbag2, a new folder.",
+        "--record-rosbag2",
+        metavar="FOLDER",
+        panel=OUTPUT,
+    ),
+]
+Rig = Annotated[
+    str | None,
+    about(
+        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
+        "the environment, or reference].",
+        metavar="RIG",
+        panel=WORLD,
+    ),
+]
+Steps = Annotated[int | None, about("Maximum number of steps [default: one episode].", metavar="N")]
+Pace = Annotated[
+    float | None,
+    about("Simulated seconds per second of real time [default: as fast as possible].", metavar="X"),
+]
+
+
 @with_world()
 def ros2(
     world: WorldSpec,
     env: OptionalEnvironment = "",
-    join: Annotated[
-        str | None,
-        about("Attach to a world of `cavmarl lead` at this socket or port.", metavar="ADDRESS"),
-    ] = None,
-    vehicle: Annotated[
-        list[str] | None,
-        about("Agent to publish and drive; repeat it for more [default: car_0].", metavar="NAME"),
-    ] = None,
-    domain: Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")] = 0,
-    profile: Annotated[
-        Literal["plain", "autoware"],
-        about("Names: topics begin with the vehicle (plain), or are Autoware's (one vehicle)."),
-    ] = "plain",
-    distro: Annotated[
-        Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
-    ] = "jazzy",
-    wait: Annotated[
-        Literal["stamp", "newest"],
-        about(
-            "Each step waits for a command whose time is that of the step (stamp), or takes the "
-            "newest command and never waits (newest)."
-        ),
-    ] = "stamp",
-    deadline_s: Annotated[
-        float, about("Seconds that a step waits for a command, real time.", metavar="S")
-    ] = 1.0,
-    lag_steps: Annotated[int, about("A command may be this many steps old.", metavar="N")] = 0,
-    ready_s: Annotated[
-        float,
-        about("Seconds that the first step waits for a publisher of commands.", metavar="S"),
-    ] = 30.0,
-    truth: Annotated[
-        bool, flag("Publish the true state of the vehicles and of all vehicles around.")
-    ] = False,
-    names: Annotated[
-        Path | None,
-        about("Other names of topics and frames, by sensor.", metavar="FILE", exists=True),
-    ] = None,
-    bag: Annotated[
-        Path | None,
-        about(
-            "Write all messages to a bag of rosbag2, a new folder.",
-            "--record-rosbag2",
-            metavar="FOLDER",
-            panel=OUTPUT,
-        ),
-    ] = None,
-    rig: Annotated[
-        str | None,
-        about(
-            "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
-            "the environment, or reference].",
-            metavar="RIG",
-            panel=WORLD,
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None, about("Maximum number of steps [default: one episode].", metavar="N")
-    ] = None,
-    pace: Annotated[
-        float | None,
-        about(
-            "Simulated seconds per second of real time [default: as fast as possible].", metavar="X"
-        ),
-    ] = None,
+    join: Join = None,
+    vehicle: Vehicle = None,
+    domain: Domain = 0,
+    profile: ProfileName = "plain",
+    distro: Distro = "jazzy",
+    wait: Waits = "stamp",
+    deadline_s: Deadline = 1.0,
+    lag_steps: Lag = 0,
+    ready_s: Ready = 30.0,
+    truth: Truth = False,
+    names: Names = None,
+    bag: Bag = None,
+    rig: Rig = None,
+    steps: Steps = None,
+    pace: Pace = None,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -35,6 +35,7 @@ Wait = Literal["stamp", "newest"]
 
 _NODE_NAME = "cavmarl"
 _LOOK_S = 0.1  # how often matched subscribers are counted, wall time
+_SETTLED_S = 0.5  # a node's subscriptions are found one by one; then all are, wall time
 _REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
 
 
@@ -202,10 +203,13 @@ class RosBridge:
             self._bag.close()
 
     def _get_ready(self, view: FollowerView) -> None:
-        """Wait for publishers of commands before the first messages, so that none is missed."""
+        """Wait for publishers of commands, and for subscriptions, so that no message is missed."""
         bases = {name: seen.wheelbase_m for name, seen in view.snapshot.vehicles.items()}
         self._topics.clock.set(view.snapshot.episode, view.snapshot.tick)
-        self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
+        ready_s = self._options.ready_s
+        self._until(ready_s, lambda: all(map(self._has_publisher, bases)), bases)
+        if any(map(self._has_publisher, bases)):
+            self._until(ready_s, _Settled(self._subscribers), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
                 "no node publishes commands of %s on domain %d: the vehicles brake until then; "
@@ -233,6 +237,9 @@ class RosBridge:
         self.sent[message.topic] += 1
         if self._bag is not None:
             self._bag.write(message, data)
+
+    def _subscribers(self) -> tuple[int, ...]:
+        return tuple(map(self._node.subscribers_of, self._topics.kinds))
 
     def _look(self) -> None:
         """Find the topics with subscribers, and refuse another clock."""
@@ -328,6 +335,21 @@ class RosBridge:
                     log.warning("%s: %s (later refusals are only counted)", name, refusal)
         vehicle.motion.turn_indicators = requests.turn_indicators
         vehicle.motion.hazard_lights = requests.hazard_lights
+
+
+class _Settled:
+    """Whether numbers have been the same for `_SETTLED_S`."""
+
+    def __init__(self, count: Callable[[], tuple[int, ...]]) -> None:
+        self._count = count
+        self._last: tuple[int, ...] = ()
+        self._since_s = time.monotonic()
+
+    def __call__(self) -> bool:
+        found = self._count()
+        if found != self._last:
+            self._last, self._since_s = found, time.monotonic()
+        return time.monotonic() - self._since_s > _SETTLED_S
 
 
 def join(
