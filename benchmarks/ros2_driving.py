@@ -78,6 +78,8 @@ def measure(
             + ", ".join(f"{count} {name}" for name, count in counts.items()),
             f"commands: {used['used']} used, {used['late']} late, {used['invalid']} invalid; "
             f"{found['steps_per_s']:.0f} steps/s of the wall clock",
+            "the stand-in's acceleration was limited by, in steps: "
+            + ", ".join(f"{name} {count}" for name, count in found["reasons"].items()),
             "no Autoware was run",
         ],
         facts={"episodes": episodes, "outcomes": dict(counts), **found},

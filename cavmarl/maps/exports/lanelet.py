@@ -12,8 +12,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.core.errors import ConfigError, MapError, require
-from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
+from cavmarl.core.records.codes import (
+    NO_CHANGE_LEFT,
+    NO_CHANGE_RIGHT,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+)
 from cavmarl.maps.exports.geojson import unproject_points
 from cavmarl.maps.exports.lane_borders import LEFT, RIGHT, LaneBorders
 from cavmarl.maps.projection import unproject
@@ -35,8 +43,7 @@ def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -
     Lanelets of lanes that lead into each other share end points, and those of neighbours a border,
     so that routes are connected. A link with a signal has a traffic light, whose id is
     `FIRST_LIGHT` plus the row of the link. A link that gives way to others has a right of way,
-    `FIRST_RIGHT` plus its row; at a signal, it counts while both have green. Lanes without cars
-    have `participant:vehicle` = no.
+    `FIRST_RIGHT` plus its row. Lanes without cars have `participant:vehicle` = no.
 
     `is_local`: the file is read by `local_x` and `local_y`, so the map needs no projection.
 
@@ -162,6 +169,36 @@ def _line_of(network: RoadNetwork, lane: int, side: int) -> str:
     return "solid" if barred else "dashed"
 
 
+def yields_to(network: RoadNetwork, link: int) -> NDArray[np.int32]:
+    """Return the links to which a link gives way.
+
+    At a signal, it gives way where it has the minor green in a phase in which the other has green.
+    """
+    links = network.links
+    first, count = (int(links[name][link]) for name in ("first_conflict", "num_conflicts"))
+    conflicts = network.conflicts[first : first + count]
+    foes: NDArray[np.int32] = conflicts["foe"][conflicts["must_yield"]]
+    signal = links["signal"][link]
+    if signal < 0:
+        return foes
+    programs = network.programs[network.programs["signal"] == signal]
+    phases = [
+        network.phases["first_state"][first : first + count]
+        for first, count in zip(programs["first_phase"], programs["num_phases"], strict=True)
+    ]
+    begins = np.concatenate(phases)
+    is_minor = network.phase_states[begins + links["signal_index"][link]] == SIGNAL_GREEN_MINOR
+    greens = (SIGNAL_GREEN_MINOR, SIGNAL_GREEN_MAJOR)
+    met = [
+        links["signal"][foe] != signal
+        or (
+            is_minor & np.isin(network.phase_states[begins + links["signal_index"][foe]], greens)
+        ).any()
+        for foe in foes
+    ]
+    return foes[np.array(met, dtype=np.bool_)]
+
+
 def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) -> int:
     """Add traffic lights and rights of way inside junctions, and return their number."""
     from lanelet2.core import (
@@ -206,10 +243,10 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
             )
             lanelets[own].addRegulatoryElement(rule)
             count_rules += 1
-        first, count = int(link["first_conflict"]), int(link["num_conflicts"])
-        conflicts = network.conflicts[first : first + count]
-        foes = network.links["first_internal"][conflicts["foe"][conflicts["must_yield"]]]
-        foes = sorted({int(foe) for foe in foes if foe >= 0})
+        foes = sorted(
+            {int(foe) for foe in network.links["first_internal"][yields_to(network, number)]}
+        )
+        foes = [foe for foe in foes if foe >= 0]
         if foes:
             rule = RightOfWay(
                 FIRST_RIGHT + number,
