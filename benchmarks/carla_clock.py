@@ -11,7 +11,7 @@ import json
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import replace
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -21,7 +21,7 @@ import numpy as np
 
 from benchmarks import carla_clock_client
 from benchmarks.carla_clock_client import STEP_S
-from benchmarks.clock_drift import ClockDrift, rows_of, write_rows
+from benchmarks.clock_drift import ClockDrift, drift_report, rows_of, write_rows
 from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, about, about_file, with_world
@@ -57,23 +57,14 @@ def measure(
     )
     if csv_path is not None:
         write_rows(csv_path, found.rows)
-    return BenchmarkReport(
+    return drift_report(
+        found,
         f"{found.environment}, CARLA's client, {1000.0 * found.dt_s:g} ms per step",
-        {
-            "step": "step",
-            "first client, s": "master_s:.1f",
-            "second client, s": "follower_s:.1f",
-            "normalised, s": "normalised_s:.1f",
-            "Δ, s": "delta_s:.1f",
-            "ratio": "ratio:.2f",
-        },
-        [asdict(row) for row in found.rows],
-        notes=[
+        ("first client", "second client"),
+        [
             f"the second client ticked {found.own_ticks} times ({found.answer}); the server has "
             f"noticed {found.counted} of these ticks, and the first client {found.drift_events}"
         ],
-        facts={**asdict(found), "holds": found.holds},
-        holds=found.holds,
     )
 
 

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Literal
 
-from benchmarks.clock_drift import ClockDrift, measure_drift, write_rows
+from benchmarks.clock_drift import ClockDrift, drift_report, measure_drift, write_rows
 from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, silent
 from cavmarl.cli.output import OptionalEnvironment, about, about_file, with_world
@@ -37,22 +36,8 @@ def measure(
     found = measure_drift(world, steps=steps, rogue=rogue, answer=own_ticks, pace=pace)
     if csv_path is not None:
         write_rows(csv_path, found.rows)
-    return BenchmarkReport(
-        f"{found.environment}, {1000.0 * found.dt_s:g} ms per step",
-        {
-            "step": "step",
-            "master, s": "master_s:.1f",
-            "follower, s": "follower_s:.1f",
-            "normalised, s": "normalised_s:.1f",
-            "Δ, s": "delta_s:.1f",
-            "ratio": "ratio:.2f",
-            "own clock, Δ, s": "own_delta_s:+.4f",
-        },
-        [asdict(row) for row in found.rows],
-        notes=[_verdict(found)],
-        facts={**asdict(found), "holds": found.holds},
-        holds=found.holds,
-    )
+    title = f"{found.environment}, {1000.0 * found.dt_s:g} ms per step"
+    return drift_report(found, title, ("master", "follower"), [_verdict(found)])
 
 
 def _verdict(found: ClockDrift) -> str:

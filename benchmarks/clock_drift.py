@@ -10,19 +10,20 @@ import csv
 import json
 import math
 import subprocess
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from fractions import Fraction
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, Unpack
 
-from cavmarl.bench.harness import check_range
+from cavmarl.bench.harness import BenchmarkReport, check_range
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import EvaluationError
 from cavmarl.core.processes import start_python
 from cavmarl.cosim.carla.carla_session import OtherTicks
 from cavmarl.cosim.followers.followed_world import FollowedWorld
-from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, Unpaced
+from cavmarl.cosim.time_master import OwnTicks, Pacer, RealTime, TimeMaster, Unpaced
 from cavmarl.env.parallel import parallel_env
 
 PROGRAM = "benchmarks.clock_reader"
@@ -107,10 +108,6 @@ def measure_drift(
             world.step()
         clock, read = _followed(world, pacer, steps, rogue)
         master = world.master
-    own, drifts = (
-        [event.tick for event in master.events if event.kind == kind]
-        for kind in ("own_tick", "drift")
-    )
     return ClockDrift(
         environment=made.metadata["name"],
         dt_s=dt_s,
@@ -121,7 +118,48 @@ def measure_drift(
         own_ticks=read["own_ticks"],
         counted=master.own_ticks,
         drift_events=master.drifts,
-        noticed_ticks=drifts[0] - own[0] if own and drifts else None,
+        noticed_ticks=noticed_after(master),
+    )
+
+
+def noticed_after(master: TimeMaster) -> int | None:
+    """Return the ticks from the first own tick of a follower until the master noticed a drift."""
+    own, drifts = (
+        [event.tick for event in master.events if event.kind == kind]
+        for kind in ("own_tick", "drift")
+    )
+    return drifts[0] - own[0] if own and drifts else None
+
+
+def drift_report(
+    found: ClockDrift,
+    title: str,
+    clocks: tuple[str, str],
+    notes: Sequence[str],
+    facts: Mapping[str, Any] | None = None,
+) -> BenchmarkReport:
+    """Return Table II as a report.
+
+    `clocks`: names of the two clocks. `facts`: figures besides those of the drift.
+    """
+    master, follower = clocks
+    columns = {
+        "step": "step",
+        f"{master}, s": "master_s:.1f",
+        f"{follower}, s": "follower_s:.1f",
+        "normalised, s": "normalised_s:.1f",
+        "Δ, s": "delta_s:.1f",
+        "ratio": "ratio:.2f",
+    }
+    if found.pace is not None:
+        columns["own clock, Δ, s"] = "own_delta_s:+.4f"
+    return BenchmarkReport(
+        title,
+        columns,
+        [asdict(row) for row in found.rows],
+        notes=list(notes),
+        facts={**asdict(found), **(facts or {}), "holds": found.holds},
+        holds=found.holds,
     )
 
 

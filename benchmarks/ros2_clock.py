@@ -9,28 +9,26 @@ from __future__ import annotations
 import json
 import os
 import subprocess
-import threading
 import time
 from collections.abc import Mapping
-from dataclasses import asdict
+from contextlib import closing
 from fractions import Fraction
 from itertools import groupby
 from pathlib import Path
-from tempfile import TemporaryDirectory
 from typing import Annotated, Any, Literal
 
 from benchmarks import ros2_clock_node
 from benchmarks.carla_clock_client import is_due
-from benchmarks.clock_drift import ClockDrift, rows_of
+from benchmarks.clock_drift import ClockDrift, drift_report, noticed_after, rows_of
 from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, about, with_world
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import CavmarlError, ClockError, ConfigError, EvaluationError
-from cavmarl.cosim.followers.followed_world import FollowedWorld
+from cavmarl.core.errors import ClockError, ConfigError, EvaluationError
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.ros2 import FAST_DDS_PROFILE
-from cavmarl.cosim.ros2.ros_bridge import RosBridge, RosOptions
+from cavmarl.cosim.ros2.bridged_world import BridgedWorld
+from cavmarl.cosim.ros2.ros_bridge import RosOptions
 from cavmarl.cosim.time_master import OwnTicks
 from cavmarl.env.parallel import parallel_env
 
@@ -58,24 +56,16 @@ def measure(
         world, steps=steps, rogue=rogue, own_ticks=own_ticks, domain=domain
     )
     counts = ", ".join(f"{count} {name}" for name, count in report["controls"].items() if count)
-    return BenchmarkReport(
+    return drift_report(
+        found,
         f"{found.environment}, rclpy, {1000.0 * found.dt_s:g} ms per step",
-        {
-            "step": "step",
-            "world, s": "master_s:.1f",
-            "node, s": "follower_s:.1f",
-            "normalised, s": "normalised_s:.1f",
-            "Δ, s": "delta_s:.1f",
-            "ratio": "ratio:.2f",
-        },
-        [asdict(row) for row in found.rows],
-        notes=[
+        ("world", "node"),
+        [
             f"{report['steps_per_s']:.0f} steps/s of the wall clock; commands: {counts}",
             f"the bridge ticked {found.own_ticks} times ({found.answer}); the world noticed "
             f"{found.drift_events} times that it had advanced",
         ],
-        facts={**asdict(found), **report, "holds": found.holds},
-        holds=found.holds,
+        report,
     )
 
 
@@ -103,7 +93,8 @@ def measure_ros_drift(
 
     Raises:
         ConfigError: no Python with `rclpy` is named.
-        EvaluationError: the node or the bridge fails.
+        EvaluationError: the node fails.
+        FollowerError, RosError: the bridge fails.
     """
     check_range(steps=(steps, 1, float("inf")), rogue=(rogue, 0.0, 1.0))
     python = os.environ.get(PYTHON, "").split(":")[0]
@@ -117,60 +108,30 @@ def measure_ros_drift(
         "clock.ctrl_dt_s": STEP_S,
         "horizon_s": STEP_S * (2 * steps + 2),
     }
+    rogues: list[_RogueFollower] = []
+
+    def follow(address: str | int) -> Follower:
+        rogues.append(_RogueFollower(address, ["car_0"], "ros2"))
+        rogues[-1].share = Fraction(str(rogue))
+        return rogues[-1]
+
+    options = RosOptions(domain=domain, deadline_s=10.0, ready_s=JOINS_S)
     keywords = {**spec.keywords, "overrides": overrides}
-    found: dict[str, Any] = {}
-    errors: list[CavmarlError] = []
-
-    def follow(address: str) -> None:
+    with closing(parallel_env(spec.env, **keywords)) as env, _node(python, domain) as node:
         try:
-            options = RosOptions(domain=domain, deadline_s=10.0, ready_s=JOINS_S)
-            with _RogueFollower(address, ["car_0"], "ros2") as follower:
-                follower.share = Fraction(str(rogue))
-                bridge = RosBridge(follower, options)
-                bridge.run()
-                found.update(bridge.report(), own_ticks=follower.own_ticks)
-        except CavmarlError as error:
-            errors.append(error)
-
-    with (
-        TemporaryDirectory() as folder,
-        FollowedWorld(
-            parallel_env(spec.env, **keywords),
-            str(Path(folder) / "world.sock"),
-            timeout_s=JOINS_S + 30.0,
-            own_ticks=own_ticks,
-            on_drift="record",
-        ) as world,
-        _node(python, domain) as node,
-    ):
-        thread = threading.Thread(target=follow, args=(str(world.address),), daemon=True)
-        thread.start()
-        try:
-            world.wait_for(1, JOINS_S)
-            world.reset(spec.seed)
-            clock = [world.master.tick]
-            began_s = time.monotonic()
-            for _ in range(steps):
-                world.step()
-                clock.append(world.master.tick)
-            wall_s = time.monotonic() - began_s
-            world.master.look_for_drift()
-            world.close()
-            thread.join(JOINS_S)
+            with BridgedWorld(
+                env, ["car_0"], options, own_ticks=own_ticks, follow=follow
+            ) as bridged:
+                clock, wall_s = _run(bridged, spec.seed, steps)
             output, _ = node.communicate(timeout=JOINS_S)
         finally:
             node.kill()
-    if errors or node.returncode:
-        raise EvaluationError(f"the bridge or the node has failed: {errors}") from None
+        if node.returncode:
+            raise EvaluationError(f"the node has ended with {node.returncode}; see its output")
+        master = bridged.world.master
     # The bridge repeats a clock while it waits.
     stamps = [ns for ns, _ in groupby(json.loads(output))]
     heard = [round(ns / (1e9 * STEP_S)) for ns in stamps]
-    # With a tick of its own, the world is one tick ahead in the next snapshot.
-    master = world.master
-    own, drifts = (
-        [event.tick for event in master.events if event.kind == kind]
-        for kind in ("own_tick", "drift")
-    )
     drift = ClockDrift(
         environment=Path(spec.env).name,
         dt_s=STEP_S,
@@ -178,16 +139,30 @@ def measure_ros_drift(
         answer=own_ticks,
         pace=None,
         rows=rows_of([tick - clock[0] for tick in clock], heard, STEP_S),
-        own_ticks=found["own_ticks"],
+        own_ticks=rogues[0].own_ticks,
         counted=master.own_ticks,
         drift_events=master.drifts,
-        noticed_ticks=drifts[0] - own[0] if own and drifts else None,
+        noticed_ticks=noticed_after(master),
     )
     return drift, {
         "steps_per_s": steps / wall_s,
-        "controls": found["controls"]["car_0"],
-        "wait_wall_s": found["wait_wall_s"],
+        "controls": bridged.report["controls"]["car_0"],
+        "wait_wall_s": bridged.report["wait_wall_s"],
     }
+
+
+def _run(bridged: BridgedWorld, seed: int, steps: int) -> tuple[list[int], float]:
+    """Return the master's tick at the beginning and after each step, and the wall time."""
+    world = bridged.world
+    world.reset(seed)
+    clock = [world.master.tick]
+    began_s = time.monotonic()
+    for _ in range(steps):
+        world.step()
+        clock.append(world.master.tick)
+    wall_s = time.monotonic() - began_s
+    world.master.look_for_drift()
+    return clock, wall_s
 
 
 def ros_environment(domain: int) -> dict[str, str]:

@@ -24,14 +24,12 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import in_stages
 from cavmarl.engine.world_setup import find_map
 from cavmarl.maps.exports.geojson import write_geojson
-from cavmarl.maps.exports.lanelet import write_lanelet2
+from cavmarl.maps.exports.lanelet import write_lanelet2, write_map_folder
 from cavmarl.maps.exports.opendrive import STAGES, write_opendrive
 from cavmarl.maps.exports.opendrive_trip import MOST_OFF, CarRoads, RoundTrip
 from cavmarl.roads.cache import load_network
 
 _LOAD, _LANELETS, _LINES = "map", "Lanelet2", "GeoJSON"
-# Points have local_x and local_y, so Autoware's frame `map` is that of the map file.
-_PROJECTOR = "projector_type: Local\n"
 
 
 def export(
@@ -63,12 +61,7 @@ def export(
     if autoware is not None:
         if lanelet2 is not None:
             raise ConfigError("--autoware and --lanelet2: use only one of them")
-        try:
-            autoware.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise ConfigError(f"--autoware {autoware}: cannot be written ({error})") from error
-        lanelet2 = autoware / "lanelet2_map.osm"
-    if opendrive is None and lanelet2 is None and geojson is None:
+    if (opendrive, lanelet2, autoware, geojson) == (None,) * 4:
         raise ConfigError(
             "the format is missing: give --opendrive, --lanelet2, --autoware or --geojson"
         )
@@ -78,7 +71,9 @@ def export(
     document: dict[str, Any] = {}
     sound = True
     stages = [_LOAD, *(STAGES if opendrive else ())]
-    stages += [name for name, file in ((_LANELETS, lanelet2), (_LINES, geojson)) if file]
+    stages += [
+        name for name, file in ((_LANELETS, lanelet2 or autoware), (_LINES, geojson)) if file
+    ]
     with in_stages(console, stages) as told:
         told(_LOAD)
         path = find_map(env)
@@ -88,14 +83,12 @@ def export(
             _show(console, opendrive, trip)
             sound = trip.same
             document["opendrive"] = trip.to_dict()
-        if lanelet2 is not None:
+        if target := lanelet2 or autoware:
             told(_LANELETS)
-            document["lanelet2"] = found = write_lanelet2(network, lanelet2)
+            write = write_lanelet2 if lanelet2 else write_map_folder
+            document["lanelet2"] = found = write(network, target)
             told_back = f"{found['read back']} lanelets and {found['rules read back']} rules"
-            console.print(Text(f"{lanelet2}: {told_back} read back"))
-            if autoware is not None:
-                projector = autoware / "map_projector_info.yaml"
-                projector.write_text(_PROJECTOR, encoding="utf-8")
+            console.print(Text(f"{target}: {told_back} read back"))
         if geojson is not None:
             told(_LINES)
             document["geojson"] = {"lanes": write_geojson(network, geojson, path)}

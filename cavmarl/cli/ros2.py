@@ -5,8 +5,6 @@ from __future__ import annotations
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
-from tempfile import TemporaryDirectory
-from threading import Thread
 from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from rich.console import Console
@@ -25,81 +23,92 @@ from cavmarl.cli.output import (
     write_json,
 )
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import CavmarlError, ConfigError, require_all
+from cavmarl.core.errors import ConfigError, require_all
 
 if TYPE_CHECKING:
     from cavmarl.cosim.ros2.ros_bridge import RosOptions
+
+
+# The options of the command.
+Join = Annotated[
+    str | None,
+    about("Attach to a world of `cavmarl lead` at this socket or port.", metavar="ADDRESS"),
+]
+Vehicle = Annotated[
+    list[str] | None,
+    about("Agent to publish and drive; repeat it for more [default: car_0].", metavar="NAME"),
+]
+Domain = Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")]
+ProfileName = Annotated[
+    Literal["plain", "autoware"],
+    about("Topic names: `/car_0/…` (plain), or the names of Autoware, for one vehicle."),
+]
+Distro = Annotated[
+    Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
+]
+Waits = Annotated[
+    Literal["stamp", "newest"],
+    about(
+        "Each step waits for a command whose time is that of the step (stamp), or takes the "
+        "newest command and never waits (newest)."
+    ),
+]
+Deadline = Annotated[
+    float, about("Maximum real time that a step waits for a command, in s.", metavar="S")
+]
+Lag = Annotated[int, about("A command may be this many steps old.", metavar="N")]
+Ready = Annotated[
+    float, about("Maximum time that the first step waits for a publisher of commands.", metavar="S")
+]
+Truth = Annotated[bool, flag("Publish the true states of the driven and of all other vehicles.")]
+Names = Annotated[
+    Path | None,
+    about("File with names of topics and frames by sensor.", metavar="FILE", exists=True),
+]
+Bag = Annotated[
+    Path | None,
+    about(
+        "Write all messages to a rosbag2 bag in a new folder.",
+        "--record-rosbag2",
+        metavar="FOLDER",
+        panel=OUTPUT,
+    ),
+]
+Rig = Annotated[
+    str | None,
+    about(
+        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
+        "the environment, or reference].",
+        metavar="RIG",
+        panel=WORLD,
+    ),
+]
+Steps = Annotated[int | None, about("Maximum number of steps [default: one episode].", metavar="N")]
+Pace = Annotated[
+    float | None,
+    about("Simulated seconds per second of real time [default: as fast as possible].", metavar="X"),
+]
 
 
 @with_world()
 def ros2(
     world: WorldSpec,
     env: OptionalEnvironment = "",
-    join: Annotated[
-        str | None,
-        about("Attach to a world of `cavmarl lead` at this socket or port.", metavar="ADDRESS"),
-    ] = None,
-    vehicle: Annotated[
-        list[str] | None,
-        about("Agent to publish and drive; repeat it for more [default: car_0].", metavar="NAME"),
-    ] = None,
-    domain: Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")] = 0,
-    profile: Annotated[
-        Literal["plain", "autoware"],
-        about("Topic names: `/car_0/…` (plain), or the names of Autoware, for one vehicle."),
-    ] = "plain",
-    distro: Annotated[
-        Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
-    ] = "jazzy",
-    wait: Annotated[
-        Literal["stamp", "newest"],
-        about(
-            "Each step waits for a command whose time is that of the step (stamp), or takes the "
-            "newest command and never waits (newest)."
-        ),
-    ] = "stamp",
-    deadline_s: Annotated[
-        float, about("Maximum real time that a step waits for a command, in s.", metavar="S")
-    ] = 1.0,
-    lag_steps: Annotated[int, about("A command may be this many steps old.", metavar="N")] = 0,
-    ready_s: Annotated[
-        float,
-        about("Maximum time that the first step waits for a publisher of commands.", metavar="S"),
-    ] = 30.0,
-    truth: Annotated[
-        bool, flag("Publish the true states of the driven and of all other vehicles.")
-    ] = False,
-    names: Annotated[
-        Path | None,
-        about("File with names of topics and frames by sensor.", metavar="FILE", exists=True),
-    ] = None,
-    bag: Annotated[
-        Path | None,
-        about(
-            "Write all messages to a rosbag2 bag in a new folder.",
-            "--record-rosbag2",
-            metavar="FOLDER",
-            panel=OUTPUT,
-        ),
-    ] = None,
-    rig: Annotated[
-        str | None,
-        about(
-            "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
-            "the environment, or reference].",
-            metavar="RIG",
-            panel=WORLD,
-        ),
-    ] = None,
-    steps: Annotated[
-        int | None, about("Maximum number of steps [default: one episode].", metavar="N")
-    ] = None,
-    pace: Annotated[
-        float | None,
-        about(
-            "Simulated seconds per second of real time [default: as fast as possible].", metavar="X"
-        ),
-    ] = None,
+    join: Join = None,
+    vehicle: Vehicle = None,
+    domain: Domain = 0,
+    profile: ProfileName = "plain",
+    distro: Distro = "jazzy",
+    wait: Waits = "stamp",
+    deadline_s: Deadline = 1.0,
+    lag_steps: Lag = 0,
+    ready_s: Ready = 30.0,
+    truth: Truth = False,
+    names: Names = None,
+    bag: Bag = None,
+    rig: Rig = None,
+    steps: Steps = None,
+    pace: Pace = None,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -172,48 +181,16 @@ def _start(
     steps: int | None,
     pace: float | None,
 ) -> dict[str, Any]:
-    """Run a world in this thread and its bridge in another one; return the figures."""
-    from cavmarl.cosim.followers.followed_world import FollowedWorld
-    from cavmarl.cosim.ros2 import ros_bridge
+    """Run an episode of a world and its bridge."""
+    from cavmarl.cosim.ros2.bridged_world import BridgedWorld
     from cavmarl.cosim.time_master import RealTime
     from cavmarl.env.parallel import parallel_env
 
-    reports: list[dict[str, Any]] = []
-    errors: list[Exception] = []
-
-    def follow(address: str | int) -> None:
-        try:
-            reports.append(ros_bridge.join(address, vehicles, options))
-        except Exception as error:  # raised below, in the thread that runs the world
-            errors.append(error)
-
-    timeout_s = options.ready_s + options.deadline_s + 30.0
     pacer = None if pace is None else RealTime(pace)
-    with (
-        closing(parallel_env(world.env, **world.keywords)) as made,
-        TemporaryDirectory(prefix="cavmarl-ros2-") as folder,
-        FollowedWorld(
-            made, f"{folder}/world.sock", timeout_s=timeout_s, pacer=pacer, truth=options.truth
-        ) as led,
-    ):
-        thread = Thread(target=follow, args=(led.address,), daemon=True)
-        thread.start()
-        try:
-            while not led.seats and thread.is_alive():
-                led.admit(0.2)
-            if errors:
-                raise errors[0]
-            run = run_episode(led, world.seed, steps, "end")
-        except CavmarlError:
-            thread.join(options.deadline_s + 10.0)
-            if errors:  # the error that ended the bridge
-                raise errors[0] from None
-            raise
-        led.close()
-        thread.join(options.deadline_s + 10.0)
-    if errors:
-        raise errors[0]
-    return {**reports[0], "state_hash": run["state_hash"]}
+    with closing(parallel_env(world.env, **world.keywords)) as made:
+        with BridgedWorld(made, vehicles, options, pacer=pacer) as bridged:
+            run = run_episode(bridged.world, world.seed, steps, "end")
+        return {**bridged.report, "state_hash": run["state_hash"]}
 
 
 def _table(found: dict[str, Any]) -> Table:

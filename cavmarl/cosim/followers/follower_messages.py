@@ -31,7 +31,7 @@ _msgpack: Any = require("msgpack", "followers")
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to construct
 _CLOSED = ConfigDict(extra="forbid")
 
-VERSION = 2
+VERSION = 3
 MAX_LETTER = 1 << 22
 MAX_DATA = 1 << 28
 MAX_VEHICLES = 4096
@@ -132,6 +132,7 @@ class VehicleView:
     wheelbase_m: StrictFloat  # each axle is half of it from the centre of the body
     goal_edge: StrictStr  # destination, an edge of the map
     goal_m: list[StrictFloat]  # end of the destination edge: x and y on the map
+    goal_heading_rad: StrictFloat  # heading of the road there
 
 
 @with_config(_CLOSED)

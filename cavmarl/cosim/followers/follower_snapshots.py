@@ -145,6 +145,7 @@ def _signals(env: CavEnv | CavVectorEnv, world: int) -> NDArray[np.uint8]:
 def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:
     lane = int(network.edges["first_lane"][vehicle.goal_edge])
     end = network.lane_polyline(lane)[-1]
+    last_point = network.lanes["first_point"][lane] + network.lanes["num_points"][lane] - 1
     return VehicleView(
         vehicle_id=vehicle.vehicle_id,
         vclass=VEHICLE_CLASSES[vehicle.vclass],
@@ -153,4 +154,5 @@ def _view(network: RoadNetwork, vehicle: Driven) -> VehicleView:
         wheelbase_m=vehicle.wheelbase_m,
         goal_edge=network.edge_ids[vehicle.goal_edge],
         goal_m=[float(end[0]), float(end[1])],
+        goal_heading_rad=float(network.points["heading"][last_point]),
     )

@@ -93,7 +93,8 @@ class DdsNode:
                 for topic, kind in publishers.items()
             }
             self._readers = {
-                topic: self._reader(f"rt{topic}", kind) for topic, kind in subscriptions.items()
+                topic: self._reader(f"rt{topic}", kind, topic in latched)
+                for topic, kind in subscriptions.items()
             }
             self._kinds = {**publishers, **subscriptions}
             self._graph = self._writer(_GRAPH, _GRAPH_KIND, True, 1)
@@ -167,28 +168,29 @@ class DdsNode:
             qos=self._quality(kind, latched, depth),
         )
 
-    def _reader(self, topic: str, kind: str) -> Any:
+    def _reader(self, topic: str, kind: str, latched: bool) -> Any:
         return self._dds["sub"].DataReader(
             self._participant,
             self._dds["topic"].Topic(self._participant, topic, self._class_of(kind)),
-            qos=self._quality(kind, False, _KEPT_SAMPLES, is_writer=False),
+            qos=self._quality(kind, latched, _KEPT_SAMPLES, is_writer=False),
         )
 
     def _quality(self, kind: str, latched: bool, depth: int, is_writer: bool = True) -> Any:
         policy = self._dds["qos"].Policy
         duration = self._dds["util"].duration
         # Publishers offer the strongest quality of service, so that every subscriber matches.
-        # Subscribers ask for the weakest, so that every publisher matches.
+        # Subscribers ask for the weakest, so that every publisher matches. Only reliable
+        # subscribers get latched messages.
         reliable = policy.Reliability.Reliable(duration(seconds=_MAX_BLOCKING_S))
         policies = [
-            reliable if is_writer else policy.Reliability.BestEffort,
+            reliable if is_writer or latched else policy.Reliability.BestEffort,
             policy.Durability.TransientLocal if latched else policy.Durability.Volatile,
             policy.History.KeepLast(depth),
             policy.DataRepresentation(use_cdrv0_representation=True),  # XCDR1
             policy.WriterDataLifecycle(autodispose=False),
             policy.Userdata(f"typehash={self._types.type_hash(kind)};".encode()),
         ]
-        if latched:
+        if latched and is_writer:
             kept = policy.History.KeepLast(depth)
             policies.append(
                 policy.DurabilityService(duration(seconds=0), kept, -1, -1, -1),

@@ -16,6 +16,7 @@ from typing import Any, Literal
 
 from cavmarl.core.errors import ConfigError, RosError
 from cavmarl.cosim.followers.follower_client import Follower, FollowerView
+from cavmarl.cosim.ros2.autoware_requests import AutowareRequests
 from cavmarl.cosim.ros2.dds_node import DdsNode
 from cavmarl.cosim.ros2.ros_bag import BagWriter
 from cavmarl.cosim.ros2.ros_controls import VehicleControls
@@ -34,6 +35,7 @@ Wait = Literal["stamp", "newest"]
 
 _NODE_NAME = "cavmarl"
 _LOOK_S = 0.1  # how often matched subscribers are counted, wall time
+_SETTLED_S = 0.5  # a node's subscriptions are found one by one; then all are, wall time
 _REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
 
 
@@ -124,6 +126,12 @@ class RosBridge:
             one.vehicle: VehicleControls(one.vehicle, self._types, welcome, one.is_plain)
             for one in vehicles
         }
+        self._requests = {
+            one.vehicle: AutowareRequests(self._types, options.truth)
+            for one in vehicles
+            if not one.is_plain
+        }
+        self._warned: set[str] = set()  # topics of refused requests
         self._driven: dict[str, tuple[int, int]] = {}  # vehicle → episode and vehicle id
         self.sent = dict.fromkeys(self._topics.kinds, 0)
         self.steps, self.wait_wall_s = 0, 0.0
@@ -131,7 +139,9 @@ class RosBridge:
         self._wanted: frozenset[str] = frozenset()
         self._is_first, self._is_commanded = True, False
         commands = {
-            topic: kind for each in self._controls.values() for topic, kind in each.topics.items()
+            topic: kind
+            for each in (*self._controls.values(), *self._requests.values())
+            for topic, kind in each.topics.items()
         }
         self._bag = (
             None
@@ -182,6 +192,10 @@ class RosBridge:
             "time_s": 1e-9 * self._topics.clock.now_ns,
             "sent": {topic: count for topic, count in self.sent.items() if count},
             "controls": {name: asdict(each.counts) for name, each in self._controls.items()},
+            "requests": {
+                name: {topic: asdict(counts) for topic, counts in each.counts.items()}
+                for name, each in self._requests.items()
+            },
         }
 
     def _close_bag(self) -> None:
@@ -189,10 +203,13 @@ class RosBridge:
             self._bag.close()
 
     def _get_ready(self, view: FollowerView) -> None:
-        """Wait for publishers of commands before the first messages, so that none is missed."""
+        """Wait for publishers of commands, and for subscriptions, so that no message is missed."""
         bases = {name: seen.wheelbase_m for name, seen in view.snapshot.vehicles.items()}
         self._topics.clock.set(view.snapshot.episode, view.snapshot.tick)
-        self._until(self._options.ready_s, lambda: all(map(self._has_publisher, bases)), bases)
+        ready_s = self._options.ready_s
+        self._until(ready_s, lambda: all(map(self._has_publisher, bases)), bases)
+        if any(map(self._has_publisher, bases)):
+            self._until(ready_s, _Settled(self._subscribers), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
                 "no node publishes commands of %s on domain %d: the vehicles brake until a node "
@@ -203,6 +220,7 @@ class RosBridge:
             )
 
     def _publish(self, view: FollowerView) -> None:
+        self._topics.notice(view)
         now_s = time.monotonic()
         if now_s - self._looked_s > _LOOK_S:
             self._looked_s = now_s
@@ -210,8 +228,7 @@ class RosBridge:
         wanted = frozenset(self._topics.kinds) if self._bag is not None else self._wanted
         if not wanted and not self._topics.has_news(view):
             return
-        steering = {name: each.steering_rad for name, each in self._controls.items()}
-        for message in self._topics.messages(view, wanted, steering):
+        for message in self._topics.messages(view, wanted):
             self._send(message)
 
     def _send(self, message: RosMessage) -> None:
@@ -220,6 +237,9 @@ class RosBridge:
         self.sent[message.topic] += 1
         if self._bag is not None:
             self._bag.write(message, data)
+
+    def _subscribers(self) -> tuple[int, ...]:
+        return tuple(map(self._node.subscribers_of, self._topics.kinds))
 
     def _look(self) -> None:
         """Find the topics with subscribers, and refuse another clock."""
@@ -230,7 +250,11 @@ class RosBridge:
             if topic not in self._topics.latched
             and self._node.subscribers_of(topic) > int(topic == CLOCK)
         )
-        self._is_commanded = any(map(self._has_publisher, self._controls))
+        self._is_commanded = any(map(self._has_publisher, self._controls)) or any(
+            self._node.publishers_of(topic)
+            for each in self._requests.values()
+            for topic in each.topics
+        )
         others = self._node.publishers_of(CLOCK) - 1
         if others > 0:
             raise RosError(
@@ -253,10 +277,12 @@ class RosBridge:
             self._drain(bases)
         if self._options.wait == "stamp" and bases:
             self._await(bases, due_ns)
-        return {
-            name: self._controls[name].control(due_ns, self._vehicles[name].speed_mps())
-            for name in bases
-        }
+        answers = {}
+        for name in bases:
+            controls, vehicle = self._controls[name], self._vehicles[name]
+            answers[name] = controls.control(due_ns, vehicle.speed_mps())
+            vehicle.motion.steering_rad = controls.steering_rad
+        return answers
 
     def _await(self, bases: Mapping[str, float], due_ns: int) -> None:
         """Wait until each vehicle has a command of this time, or until the deadline."""
@@ -296,6 +322,34 @@ class RosBridge:
             for topic in controls.topics:
                 for received in self._node.take(topic):
                     controls.take(topic, received.data, wheelbase_m)
+            if name in self._requests:
+                self._take_requests(name)
+
+    def _take_requests(self, name: str) -> None:
+        requests, vehicle = self._requests[name], self._vehicles[name]
+        for topic in requests.topics:
+            for received in self._node.take(topic):
+                refusal = requests.take(topic, received.data, vehicle.state)
+                if refusal and topic not in self._warned:
+                    self._warned.add(topic)
+                    log.warning("%s: %s (later refusals are only counted)", name, refusal)
+        vehicle.motion.turn_indicators = requests.turn_indicators
+        vehicle.motion.hazard_lights = requests.hazard_lights
+
+
+class _Settled:
+    """Whether numbers have been the same for `_SETTLED_S`."""
+
+    def __init__(self, count: Callable[[], tuple[int, ...]]) -> None:
+        self._count = count
+        self._last: tuple[int, ...] = ()
+        self._since_s = time.monotonic()
+
+    def __call__(self) -> bool:
+        found = self._count()
+        if found != self._last:
+            self._last, self._since_s = found, time.monotonic()
+        return time.monotonic() - self._since_s > _SETTLED_S
 
 
 def join(

@@ -14,8 +14,15 @@ from numpy.typing import NDArray
 from cavmarl.config.io import read_yaml
 from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.followers.follower_client import FollowerView
-from cavmarl.cosim.followers.follower_messages import SensorView
+from cavmarl.cosim.followers.follower_messages import SensorView, VehicleView
 from cavmarl.cosim.followers.follower_snapshots import TRUTH
+from cavmarl.cosim.ros2.autoware_topics import (
+    DETECTED,
+    OBJECT_RANGE_M,
+    OBJECTS,
+    AutowareTopics,
+    Motion,
+)
 from cavmarl.cosim.ros2.ros_types import RosMessage, header_of, time_of
 from cavmarl.cosim.ros2.sensor_messages import (
     SENSORS,
@@ -24,6 +31,7 @@ from cavmarl.cosim.ros2.sensor_messages import (
     markers,
     mount_transforms,
     odometry,
+    pose_at,
     transform,
     true_state,
 )
@@ -35,7 +43,7 @@ Profile = Literal["plain", "autoware"]
 CLOCK, TF, TF_STATIC = "/clock", "/tf", "/tf_static"
 VEHICLES, SIGNALS = "/vehicles", "/signals"
 _TF_KIND = "tf2_msgs/msg/TFMessage"
-_DRIVE, _AUTONOMOUS = 2, 1  # GearReport, ControlModeReport
+_AUTOWARE_GOAL = "/planning/mission_planning/goal"
 
 # Topic of each type of sensor in the profile `autoware`; {} is the name of the sensor.
 _AUTOWARE_TOPICS = {
@@ -130,6 +138,8 @@ class VehicleTopics:
     Attributes:
         base: name of the frame `base_link`.
         kinds: type of each topic.
+        latched: topics whose last message is for late subscribers, too.
+        motion: what is known of its motion without its true state.
 
     Raises:
         ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have one
@@ -164,6 +174,11 @@ class VehicleTopics:
             if len(parts) == 1:
                 topics = {parts[0][0]: own.topic}
             self._sensors[view.name] = _Sensor(view, own, topics)
+        self._odometers = frozenset(
+            name
+            for name, sensor in self._sensors.items()
+            if sensor.view.settings["type"] == "odometry"
+        )
         if skipped:
             log.warning(
                 "%s: %d sensors have no ROS message and are not published: %s",
@@ -184,18 +199,16 @@ class VehicleTopics:
         self._truth = f"/{vehicle}/truth" if self.is_plain else "/localization/kinematic_state"
         if truth:
             self.kinds[self._truth] = "nav_msgs/msg/Odometry"
-        if not self.is_plain:
-            if truth:
-                kind = "geometry_msgs/msg/AccelWithCovarianceStamped"
-                self.kinds["/localization/acceleration"] = kind
-            for topic, name in (
-                ("velocity_status", "VelocityReport"),
-                ("steering_status", "SteeringReport"),
-                ("gear_status", "GearReport"),
-                ("control_mode", "ControlModeReport"),
-            ):
-                self.kinds[f"/vehicle/status/{topic}"] = f"autoware_vehicle_msgs/msg/{name}"
-        self._speed_mps = self._yaw_rate_radps = 0.0
+        self._goal = f"/{vehicle}/goal" if self.is_plain else _AUTOWARE_GOAL
+        self.kinds[self._goal] = "geometry_msgs/msg/PoseStamped"
+        self._autoware = None if self.is_plain else AutowareTopics(truth)
+        self.latched: tuple[str, ...] = (self._goal,)
+        if self._autoware is not None:
+            self.kinds |= self._autoware.kinds
+            self.latched += self._autoware.latched
+        self.motion = Motion()
+        self._seen: tuple[NDArray[np.float64], float] | None = None  # true row, wheelbase
+        self._state: TrueState | None = None
 
     def _names(self, view: SensorView, given: Mapping[str, str]) -> SensorNames:
         kind = view.settings["type"]
@@ -222,23 +235,48 @@ class VehicleTopics:
         is_base = sensor.view.settings["type"] == "odometry"
         return self.base if is_base else sensor.names.frame
 
+    @property
+    def state(self) -> TrueState | None:
+        """The true state in the last snapshot, if it is known."""
+        if self._state is None and self._seen is not None:
+            row, wheelbase_m = self._seen
+            self._state = true_state(_dicts(row[np.newaxis])[0], wheelbase_m)
+        return self._state
+
     def speed_mps(self) -> float:
         """Return the last known speed at the rear axle."""
-        return self._speed_mps
+        state = self.state
+        return self.motion.speed_mps if state is None else state.speed_mps
+
+    def notice(self, view: FollowerView, rows: NDArray[np.float64]) -> None:
+        """Keep the motion of a snapshot; `rows`: true states of all vehicles, as `TRUTH`."""
+        for name, samples in view.sensors.get(self.vehicle, {}).items():
+            if name in self._odometers and not samples.lost[-1]:
+                newest = map(float, samples.values[-1][:2])
+                self.motion.speed_mps, self.motion.yaw_rate_radps = newest
+        self._seen = self._state = None
+        seen = view.snapshot.vehicles.get(self.vehicle)
+        if seen is not None and len(rows):
+            own = rows[rows[:, 0] == seen.vehicle_id]
+            self._seen = (own[0], seen.wheelbase_m) if len(own) else None
+
+    def begin(self, seen: VehicleView, now_ns: int) -> Iterator[RosMessage]:
+        """Yield the latched messages of a vehicle that has entered the world."""
+        at = pose_at((*seen.goal_m, 0.0), seen.goal_heading_rad)
+        fields = {"header": header_of(now_ns, "map"), "pose": at}
+        yield RosMessage(self._goal, self.kinds[self._goal], now_ns, fields)
+        if self._autoware is not None:
+            yield from self._autoware.begin(now_ns)
 
     def messages(
-        self, view: FollowerView, clock: RosClock, wanted: frozenset[str], state: TrueState | None
+        self, view: FollowerView, clock: RosClock, wanted: frozenset[str]
     ) -> Iterator[RosMessage]:
         """Yield the messages of a snapshot whose topics are wanted."""
         for name, samples in view.sensors.get(self.vehicle, {}).items():
             sensor = self._sensors.get(name)
-            if sensor is None:
+            if sensor is None or wanted.isdisjoint(sensor.topics.values()):
                 continue
             settings = sensor.view.settings
-            if settings["type"] == "odometry" and not samples.lost[-1]:
-                self._speed_mps, self._yaw_rate_radps = map(float, samples.values[-1][:2])
-            if wanted.isdisjoint(sensor.topics.values()):
-                continue
             make, frame = SENSORS[settings["type"]][0], self._frame(sensor)
             for value, stamp_s, lost in zip(
                 samples.values, samples.stamps_s.tolist(), samples.lost.tolist(), strict=True
@@ -249,47 +287,33 @@ class VehicleTopics:
                 for part, kind, fields in make(settings, value, stamp_ns, frame):
                     if sensor.topics[part] in wanted:
                         yield RosMessage(sensor.topics[part], kind, stamp_ns, fields)
-        if state is not None:
-            self._speed_mps, self._yaw_rate_radps = state.speed_mps, state.yaw_rate_radps
+        state = self.state
+        if state is not None and self._truth in wanted:
             fields = odometry(state, clock.now_ns, self.base)
-            yield from self._wanted(self._truth, clock.now_ns, fields, wanted)
+            yield RosMessage(self._truth, self.kinds[self._truth], clock.now_ns, fields)
 
-    def status(
-        self, clock: RosClock, wanted: frozenset[str], steering_rad: float, state: TrueState | None
+    def surroundings(
+        self,
+        now_ns: int,
+        wanted: frozenset[str],
+        rows: NDArray[np.float64],
+        codes: NDArray[np.uint8] | None,
     ) -> Iterator[RosMessage]:
-        """Yield the messages about the vehicle in the profile `autoware`.
+        """Yield the messages of the profile `autoware` about the vehicle and what is around it.
 
-        `steering_rad`: steering angle of the last control.
+        `rows`: true states of all vehicles. `codes`: (links,) the SIGNAL_* codes of the map.
         """
-        if self.is_plain:
+        if self._autoware is None:
             return
-        now_ns, stamp = clock.now_ns, time_of(clock.now_ns)
-        told: dict[str, Fields] = {
-            "/vehicle/status/velocity_status": {
-                "header": header_of(now_ns, self.base),
-                "longitudinal_velocity": self._speed_mps,
-                "heading_rate": self._yaw_rate_radps,
-            },
-            "/vehicle/status/steering_status": {
-                "stamp": stamp,
-                "steering_tire_angle": steering_rad if state is None else state.steering_rad,
-            },
-            "/vehicle/status/gear_status": {"stamp": stamp, "report": _DRIVE},
-            "/vehicle/status/control_mode": {"stamp": stamp, "mode": _AUTONOMOUS},
-        }
-        if state is not None:
-            told["/localization/acceleration"] = {
-                "header": header_of(now_ns, self.base),
-                "accel": {"accel": {"linear": {"x": state.accel_mps2}}},
-            }
-        for topic, fields in told.items():
-            yield from self._wanted(topic, now_ns, fields, wanted)
-
-    def _wanted(
-        self, topic: str, stamp_ns: int, fields: Fields, wanted: frozenset[str]
-    ) -> Iterator[RosMessage]:
-        if topic in wanted:
-            yield RosMessage(topic, self.kinds[topic], stamp_ns, fields)
+        others: list[dict[str, float]] = []
+        if self._seen is not None and not wanted.isdisjoint((OBJECTS, DETECTED)):
+            own = self._seen[0]
+            x, y = TRUTH.index("x"), TRUTH.index("y")
+            distance_m = np.hypot(rows[:, x] - own[x], rows[:, y] - own[y])
+            is_near = (distance_m <= OBJECT_RANGE_M) & (rows[:, 0] != own[0])
+            others = _dicts(rows[is_near])
+        state = self.state
+        yield from self._autoware.messages(now_ns, wanted, self.motion, state, others, codes)
 
 
 class WorldTopics:
@@ -305,11 +329,10 @@ class WorldTopics:
         latched: topics whose last message is for late subscribers, too.
     """
 
-    latched = (TF_STATIC,)
-
     def __init__(self, vehicles: Sequence[VehicleTopics], clock: RosClock, truth: bool) -> None:
         self.vehicles, self.clock = tuple(vehicles), clock
         self.kinds = {TF_STATIC: _TF_KIND, **kinds_of_world(truth)}
+        self.latched = (TF_STATIC, *(topic for each in vehicles for topic in each.latched))
         for vehicle in vehicles:
             if taken := sorted(self.kinds.keys() & vehicle.kinds.keys()):
                 raise ConfigError(
@@ -318,61 +341,72 @@ class WorldTopics:
                 )
             self.kinds |= vehicle.kinds
         self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its present transforms
+        self._begun: dict[str, tuple[int, VehicleView]] = {}  # vehicle → episode, its description
+        self._rows = np.zeros((0, len(TRUTH)))
 
     def clock_message(self) -> RosMessage:
         """Return the message of the present time."""
         now_ns = self.clock.now_ns
         return RosMessage(CLOCK, self.kinds[CLOCK], now_ns, {"clock": time_of(now_ns)})
 
-    def has_news(self, view: FollowerView) -> bool:
-        """Set the clock, and return whether mounts of a snapshot's vehicles have changed."""
+    def notice(self, view: FollowerView) -> None:
+        """Set the clock to a snapshot, and keep the motion of the vehicles."""
         self.clock.set(view.snapshot.episode, view.snapshot.tick)
-        return self._known(view) != self._mounted
+        truth = view.sensors.get("", {}).get("truth")
+        self._rows = np.zeros((0, len(TRUTH))) if truth is None else truth.values[-1]
+        for vehicle in self.vehicles:
+            vehicle.notice(view, self._rows)
 
-    def messages(
-        self, view: FollowerView, wanted: frozenset[str], steering_rad: Mapping[str, float]
-    ) -> Iterator[RosMessage]:
-        """Yield the wanted messages of a snapshot, in a fixed order; the clock comes last.
+    def has_news(self, view: FollowerView) -> bool:
+        """Return whether latched messages about a snapshot's vehicles have changed."""
+        return self._present(view) != self._begun
 
-        `/tf_static` is always included when it has changed. `steering_rad`: steering angle of
-        the last control of each vehicle.
+    def messages(self, view: FollowerView, wanted: frozenset[str]) -> Iterator[RosMessage]:
+        """Yield the wanted messages of a noticed snapshot, in a fixed order; the clock comes last.
+
+        Latched messages are included when they have changed, whether they are wanted or not.
         """
-        snapshot, clock = view.snapshot, self.clock
-        clock.set(snapshot.episode, snapshot.tick)
-        rows = _rows_of(view)
-        if changed := self._mounts(view):
-            yield RosMessage(TF_STATIC, _TF_KIND, clock.now_ns, {"transforms": changed})
+        now_ns, rows = self.clock.now_ns, self._rows
+        yield from self._latched_messages(view)
+        signals = view.sensors.get("", {}).get("signals")
+        codes = None if signals is None else signals.values[-1]
         moved = []
         for vehicle in self.vehicles:
-            seen = snapshot.vehicles.get(vehicle.vehicle)
-            if seen is None:
+            if vehicle.vehicle not in view.snapshot.vehicles:
                 continue
-            own = _dicts(rows[rows[:, 0] == seen.vehicle_id])
-            state = true_state(own[0], seen.wheelbase_m) if own else None
+            yield from vehicle.messages(view, self.clock, wanted)
+            yield from vehicle.surroundings(now_ns, wanted, rows, codes)
+            state = vehicle.state if TF in wanted else None
             if state is not None:
-                moved.append(transform(clock.now_ns, "map", vehicle.base, state.place, state.turn))
-            yield from vehicle.messages(view, clock, wanted, state)
-            steering = steering_rad.get(vehicle.vehicle, 0.0)
-            yield from vehicle.status(clock, wanted, steering, state)
-        if moved and TF in wanted:
-            yield RosMessage(TF, _TF_KIND, clock.now_ns, {"transforms": moved})
+                moved.append(transform(now_ns, "map", vehicle.base, state.place, state.turn))
+        if moved:
+            yield RosMessage(TF, _TF_KIND, now_ns, {"transforms": moved})
         if VEHICLES in wanted and len(rows):
-            fields = markers(_dicts(rows), clock.now_ns, 2 * clock.step_ns)
-            yield RosMessage(VEHICLES, self.kinds[VEHICLES], clock.now_ns, fields)
-        signals = view.sensors.get("", {}).get("signals")
-        if signals is not None and SIGNALS in wanted:
-            fields = {"data": signals.values[-1]}
-            yield RosMessage(SIGNALS, self.kinds[SIGNALS], clock.now_ns, fields)
+            fields = markers(_dicts(rows), now_ns, 2 * self.clock.step_ns)
+            yield RosMessage(VEHICLES, self.kinds[VEHICLES], now_ns, fields)
+        if codes is not None and SIGNALS in wanted:
+            yield RosMessage(SIGNALS, self.kinds[SIGNALS], now_ns, {"data": codes})
         yield self.clock_message()
 
-    def _known(self, view: FollowerView) -> dict[str, float]:
-        """Return the wheelbases of all vehicles so far, by vehicle."""
-        present = view.snapshot.vehicles
-        return self._mounted | {name: seen.wheelbase_m for name, seen in present.items()}
+    def _latched_messages(self, view: FollowerView) -> Iterator[RosMessage]:
+        if changed := self._mounts(view):
+            yield RosMessage(TF_STATIC, _TF_KIND, self.clock.now_ns, {"transforms": changed})
+        present, before = self._present(view), self._begun
+        self._begun = present
+        for vehicle in self.vehicles:
+            if present.get(vehicle.vehicle) != before.get(vehicle.vehicle):
+                yield from vehicle.begin(present[vehicle.vehicle][1], self.clock.now_ns)
+
+    def _present(self, view: FollowerView) -> dict[str, tuple[int, VehicleView]]:
+        """Return episode and description of all vehicles so far."""
+        episode = view.snapshot.episode
+        found = {name: (episode, seen) for name, seen in view.snapshot.vehicles.items()}
+        return self._begun | found
 
     def _mounts(self, view: FollowerView) -> list[Fields]:
         """Return the transforms of all vehicles' sensors, if those of a vehicle have changed."""
-        known = self._known(view)
+        present = view.snapshot.vehicles.items()
+        known = self._mounted | {name: seen.wheelbase_m for name, seen in present}
         if known == self._mounted:
             return []
         self._mounted = known
@@ -382,12 +416,6 @@ class WorldTopics:
             if vehicle.vehicle in known
             for one in vehicle.mounts(self.clock.now_ns, known[vehicle.vehicle])
         ]
-
-
-def _rows_of(view: FollowerView) -> NDArray[np.float64]:
-    """Return the true states (n, columns of TRUTH) of all vehicles; empty without truth."""
-    truth = view.sensors.get("", {}).get("truth")
-    return np.zeros((0, len(TRUTH))) if truth is None else truth.values[-1]
 
 
 def _dicts(rows: NDArray[np.float64]) -> list[dict[str, float]]:

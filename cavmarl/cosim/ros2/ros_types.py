@@ -1,7 +1,8 @@
 """`RosTypes`: message types of a ROS 2 distribution, and the types of Autoware that cavmarl uses.
 
 Types and their encoding come from `rosbags`. The definitions below are the fields of packages that
-`rosbags` does not have: `ackermann_msgs` and Autoware's (autoware_msgs, main, 2026).
+`rosbags` does not have: `ackermann_msgs` and Autoware's (autoware_msgs 1.13 and
+autoware_adapi_msgs, 2026).
 """
 
 from __future__ import annotations
@@ -15,6 +16,7 @@ from cavmarl.core.errors import ConfigError, require
 
 DISTROS = ("humble", "jazzy", "kilted")
 
+_STAMP = "builtin_interfaces/Time stamp\n"
 _TIMES = "builtin_interfaces/Time stamp\nbuiltin_interfaces/Time control_time\n"
 _DEFINITIONS = {
     "ackermann_msgs/msg/AckermannDrive": (
@@ -33,6 +35,70 @@ _DEFINITIONS = {
     ),
     "autoware_vehicle_msgs/msg/GearReport": "builtin_interfaces/Time stamp\nuint8 report",
     "autoware_vehicle_msgs/msg/ControlModeReport": "builtin_interfaces/Time stamp\nuint8 mode",
+    **{
+        f"autoware_vehicle_msgs/msg/{name}": f"{_STAMP}uint8 {field}"
+        for name, field in (
+            ("GearCommand", "command"),
+            ("TurnIndicatorsCommand", "command"),
+            ("TurnIndicatorsReport", "report"),
+            ("HazardLightsCommand", "command"),
+            ("HazardLightsReport", "report"),
+        )
+    },
+    "autoware_adapi_v1_msgs/msg/LocalizationInitializationState": f"{_STAMP}uint16 state",
+    "autoware_perception_msgs/msg/TrafficLightElement": (
+        "uint8 color\nuint8 shape\nuint8 status\nfloat32 confidence"
+    ),
+    "autoware_perception_msgs/msg/PredictedTrafficLightState": (
+        "builtin_interfaces/Time predicted_stamp\n"
+        "autoware_perception_msgs/TrafficLightElement[] simultaneous_elements\n"
+        "float32 reliability\nstring information_source"
+    ),
+    "autoware_perception_msgs/msg/TrafficLightGroup": (
+        "int64 traffic_light_group_id\n"
+        "autoware_perception_msgs/TrafficLightElement[] elements\n"
+        "autoware_perception_msgs/PredictedTrafficLightState[] predictions"
+    ),
+    "autoware_perception_msgs/msg/TrafficLightGroupArray": (
+        f"{_STAMP}autoware_perception_msgs/TrafficLightGroup[] traffic_light_groups"
+    ),
+    "autoware_perception_msgs/msg/ObjectClassification": "uint8 label\nfloat32 probability",
+    "autoware_perception_msgs/msg/Shape": (
+        "uint8 type\ngeometry_msgs/Polygon footprint\ngeometry_msgs/Vector3 dimensions"
+    ),
+    "autoware_perception_msgs/msg/DetectedObjectKinematics": (
+        "geometry_msgs/PoseWithCovariance pose_with_covariance\nbool has_position_covariance\n"
+        "uint8 orientation_availability\n"
+        "geometry_msgs/TwistWithCovariance twist_with_covariance\nbool has_twist\n"
+        "bool has_twist_covariance"
+    ),
+    "autoware_perception_msgs/msg/DetectedObject": (
+        "float32 existence_probability\n"
+        "autoware_perception_msgs/ObjectClassification[] classification\n"
+        "autoware_perception_msgs/DetectedObjectKinematics kinematics\n"
+        "autoware_perception_msgs/Shape shape"
+    ),
+    "autoware_perception_msgs/msg/DetectedObjects": (
+        "std_msgs/Header header\nautoware_perception_msgs/DetectedObject[] objects"
+    ),
+    "autoware_perception_msgs/msg/PredictedPath": (
+        "geometry_msgs/Pose[] path\nbuiltin_interfaces/Duration time_step\nfloat32 confidence"
+    ),
+    "autoware_perception_msgs/msg/PredictedObjectKinematics": (
+        "geometry_msgs/PoseWithCovariance initial_pose_with_covariance\n"
+        "geometry_msgs/TwistWithCovariance initial_twist_with_covariance\n"
+        "geometry_msgs/AccelWithCovariance initial_acceleration_with_covariance\n"
+        "autoware_perception_msgs/PredictedPath[] predicted_paths"
+    ),
+    "autoware_perception_msgs/msg/PredictedObject": (
+        "unique_identifier_msgs/UUID object_id\nfloat32 existence_probability\n"
+        "autoware_perception_msgs/ObjectClassification[] classification\n"
+        "autoware_perception_msgs/PredictedObjectKinematics kinematics\n"
+        "autoware_perception_msgs/Shape shape"
+    ),
+    "autoware_perception_msgs/msg/PredictedObjects": (
+        "std_msgs/Header header\nautoware_perception_msgs/PredictedObject[] objects"
+    ),
     "autoware_control_msgs/msg/Lateral": (
         f"{_TIMES}float32 steering_tire_angle\nfloat32 steering_tire_rotation_rate\n"
         "bool is_defined_steering_tire_rotation_rate"

@@ -88,6 +88,12 @@ def vector(values: Any) -> Fields:
     return {"x": x, "y": y, "z": z}
 
 
+def pose_at(place: Any, heading: float) -> Fields:
+    """Return the `geometry_msgs/msg/Pose` at a place (3,) in m, with a heading in rad."""
+    turn = {"z": math.sin(0.5 * heading), "w": math.cos(0.5 * heading)}
+    return {"position": vector(place), "orientation": turn}
+
+
 def transform(stamp_ns: int, parent: str, child: str, place: Any, turn: Fields) -> Fields:
     """Return a `geometry_msgs/msg/TransformStamped`; `turn` is a quaternion."""
     return {

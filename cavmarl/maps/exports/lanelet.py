@@ -15,62 +15,59 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.errors import MapError, require
+from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.records.codes import (
+    NO_CHANGE_LEFT,
+    NO_CHANGE_RIGHT,
+    SIGNAL_GREEN_MAJOR,
+    SIGNAL_GREEN_MINOR,
+)
 from cavmarl.maps.exports.geojson import unproject_points
+from cavmarl.maps.exports.lane_borders import LEFT, RIGHT, LaneBorders
 from cavmarl.maps.projection import unproject
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
+_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _BICYCLE = 1 << VEHICLE_CLASSES.index("bicycle")
 _TURNS = {"s": "straight", "l": "left", "L": "left", "t": "left", "r": "right", "R": "right"}
 # The id of a regulatory element is one of these, plus the row of its link.
 FIRST_LIGHT, FIRST_RIGHT = 1_000_000_000, 2_000_000_000
+# Degrees of the origin of a map without a georeference, of which only local_x and local_y count.
+_NOWHERE = 45.0, 3.0
 _LIGHT_HEIGHT_M, _LIGHT_SIZE_M = 5.0, 0.5  # a light is this far above the stop line
 
 
-def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
+def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -> dict[str, int]:
     """Write each lane as a lanelet; return the numbers of lanelets and rules, and those read back.
 
-    Lanelets of lanes that lead into each other share end points, so that routes are connected. A
-    link with a signal has a traffic light, whose id is `FIRST_LIGHT` plus the row of the link. A
-    link without a signal that gives way to others has a right of way, `FIRST_RIGHT` plus its row.
+    Lanelets of lanes that lead into each other share end points, and those of neighbours a border,
+    so that routes are connected. A link with a signal has a traffic light, whose id is
+    `FIRST_LIGHT` plus the row of the link. A link that gives way to others has a right of way,
+    `FIRST_RIGHT` plus its row. Lanes without cars have `participant:vehicle` = no.
+
+    `is_local`: the file is read by `local_x` and `local_y`, so the map needs no projection.
 
     Raises:
         MapError: the map has no projection, the target cannot be written, or the number of lanelets
             read back differs.
         MissingExtraError: lanelet2 or pyproj is not installed.
     """
-    if network.geo is None:
+    if network.geo is None and not is_local:
         raise MapError(
             f"{network.name}: the map has no georeference, and Lanelet2 needs degrees: "
             "build it from OpenStreetMap, or with a projParameter"
         )
     lanelet2: Any = require("lanelet2", "lanelet2")
-    from lanelet2.core import AttributeMap, Lanelet, LaneletMap, LineString3d, Point3d
+    from lanelet2.core import AttributeMap, Lanelet, LaneletMap
     from lanelet2.projection import UtmProjector
 
-    west, south = unproject_points(network).min(axis=0).tolist()
+    if network.geo is None:
+        south, west = _NOWHERE
+    else:
+        west, south = unproject_points(network).min(axis=0).tolist()
     projector = UtmProjector(lanelet2.io.Origin(south, west))
-    made, ends = LaneletMap(), _Joints(network)
-    ids = itertools.count(1)
-
-    def line(lane: int, side: float) -> Any:
-        places = _beside(network, lane, side)
-        degrees = ends.degrees(places[:, :2])
-        points = []
-        for n, ((lon, lat), z) in enumerate(zip(degrees.tolist(), places[:, 2], strict=True)):
-            key = ends.key(places[n]) if n in (0, len(places) - 1) else None
-            if key is None or key not in ends.points:
-                at = projector.forward(lanelet2.core.GPSPoint(lat, lon, float(z)))
-                point = Point3d(next(ids), at.x, at.y, float(z))
-                point.attributes["local_x"] = f"{places[n, 0]:.3f}"
-                point.attributes["local_y"] = f"{places[n, 1]:.3f}"
-                if key is not None:
-                    ends.points[key] = point
-            else:
-                point = ends.points[key]
-            points.append(point)
-        return LineString3d(next(ids), points, AttributeMap({"type": "line_thin"}))
-
+    made, ids = LaneletMap(), itertools.count(1)
+    lines = _border_lines(network, projector, ids)
     lanelets = []
     for lane, row in enumerate(network.lanes):
         attributes = {
@@ -78,15 +75,14 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
             "subtype": "road" if int(row["permissions"]) != _BICYCLE else "bicycle_lane",
             "location": "urban",
             "one_way": "yes",
-            "participant:vehicle": "yes",
+            "participant:vehicle": "yes" if int(row["permissions"]) & _CAR else "no",
             "speed_limit": f"{row['speed_mps'] * 3.6:.1f} km/h",
             "name": network.lane_ids[lane],
         }
         if row["internal"] and row["link"] >= 0:
             direction = chr(network.links["direction"][row["link"]])
             attributes["turn_direction"] = _TURNS[direction]
-        left, right = line(lane, 0.5), line(lane, -0.5)
-        lanelets.append(Lanelet(next(ids), left, right, AttributeMap(attributes)))
+        lanelets.append(Lanelet(next(ids), *lines[lane], AttributeMap(attributes)))
     rules = _add_rules(network, lanelets, ids)
     for one in lanelets:
         made.add(one)
@@ -100,6 +96,107 @@ def write_lanelet2(network: RoadNetwork, target: Path) -> dict[str, int]:
     if counts["lanelets"] != counts["read back"] or counts["rules"] != counts["rules read back"]:
         raise MapError(f"{target}: numbers of elements differ ({counts}): export it again")
     return counts
+
+
+def write_map_folder(network: RoadNetwork, folder: Path) -> dict[str, int]:
+    """Write a map folder of Autoware, and return what `write_lanelet2` returns.
+
+    Raises:
+        ConfigError: the folder cannot be made.
+        MapError, MissingExtraError: as `write_lanelet2`.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise ConfigError(f"{folder}: cannot be written ({error})") from error
+    counts = write_lanelet2(network, folder / "lanelet2_map.osm", is_local=True)
+    # Points have local_x and local_y, so Autoware's frame `map` is that of the map file.
+    (folder / "map_projector_info.yaml").write_text("projector_type: Local\n", encoding="utf-8")
+    return counts
+
+
+def _border_lines(
+    network: RoadNetwork, projector: Any, ids: Iterator[int]
+) -> list[tuple[Any, Any]]:
+    """Return the left and the right border of each lane."""
+    from lanelet2.core import AttributeMap, BasicPoint3d, GPSPoint, LineString3d, Point3d
+
+    borders = LaneBorders(network)
+    ends: dict[int, Any] = {}
+
+    def point(place: list[float], at: Any) -> Any:
+        made = Point3d(next(ids), at.x, at.y, place[2])
+        made.attributes["local_x"] = f"{place[0]:.3f}"
+        made.attributes["local_y"] = f"{place[1]:.3f}"
+        return made
+
+    def line(lane: int, side: int) -> Any:
+        places = borders.places[lane][side]
+        if network.geo is None:
+            on_map = [BasicPoint3d(*place) for place in places.tolist()]
+        else:
+            degrees = unproject(places[:, :2], network.geo).tolist()
+            on_map = [projector.forward(GPSPoint(lat, lon, 0.0)) for lon, lat in degrees]
+        points = []
+        for n, (place, at) in enumerate(zip(places.tolist(), on_map, strict=True)):
+            if 0 < n < len(places) - 1:
+                points.append(point(place, at))
+                continue
+            joint = int(borders.joints[lane, side, int(n > 0)])
+            if joint not in ends:
+                ends[joint] = point(place, at)
+            points.append(ends[joint])
+        kind = {"type": "line_thin", "subtype": _line_of(network, lane, side)}
+        return LineString3d(next(ids), points, AttributeMap(kind))
+
+    right = [line(lane, RIGHT) for lane in range(len(network.lanes))]
+    return [
+        (right[borders.shared[lane]] if lane in borders.shared else line(lane, LEFT), right[lane])
+        for lane in range(len(network.lanes))
+    ]
+
+
+def _line_of(network: RoadNetwork, lane: int, side: int) -> str:
+    """Return the marking of a border: dashed where cars may change lanes in both directions."""
+    other = int(network.lanes["left" if side == LEFT else "right"][lane])
+    if other < 0:
+        return "solid"
+    bits = (NO_CHANGE_LEFT, NO_CHANGE_RIGHT) if side == LEFT else (NO_CHANGE_RIGHT, NO_CHANGE_LEFT)
+    barred = any(
+        int(network.lanes["permissions"][each]) >> bit & 1
+        for each, bit in zip((lane, other), bits, strict=True)
+    )
+    return "solid" if barred else "dashed"
+
+
+def yields_to(network: RoadNetwork, link: int) -> NDArray[np.int32]:
+    """Return the links to which a link gives way.
+
+    At a signal, it gives way where it has the minor green in a phase in which the other has green.
+    """
+    links = network.links
+    first, count = (int(links[name][link]) for name in ("first_conflict", "num_conflicts"))
+    conflicts = network.conflicts[first : first + count]
+    foes: NDArray[np.int32] = conflicts["foe"][conflicts["must_yield"]]
+    signal = links["signal"][link]
+    if signal < 0:
+        return foes
+    programs = network.programs[network.programs["signal"] == signal]
+    phases = [
+        network.phases["first_state"][first : first + count]
+        for first, count in zip(programs["first_phase"], programs["num_phases"], strict=True)
+    ]
+    begins = np.concatenate(phases)
+    is_minor = network.phase_states[begins + links["signal_index"][link]] == SIGNAL_GREEN_MINOR
+    greens = (SIGNAL_GREEN_MINOR, SIGNAL_GREEN_MAJOR)
+    met = [
+        links["signal"][foe] != signal
+        or (
+            is_minor & np.isin(network.phase_states[begins + links["signal_index"][foe]], greens)
+        ).any()
+        for foe in foes
+    ]
+    return foes[np.array(met, dtype=np.bool_)]
 
 
 def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) -> int:
@@ -146,11 +243,10 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
             )
             lanelets[own].addRegulatoryElement(rule)
             count_rules += 1
-            continue
-        first, count = int(link["first_conflict"]), int(link["num_conflicts"])
-        conflicts = network.conflicts[first : first + count]
-        foes = network.links["first_internal"][conflicts["foe"][conflicts["must_yield"]]]
-        foes = sorted({int(foe) for foe in foes if foe >= 0})
+        foes = sorted(
+            {int(foe) for foe in network.links["first_internal"][yields_to(network, number)]}
+        )
+        foes = [foe for foe in foes if foe >= 0]
         if foes:
             rule = RightOfWay(
                 FIRST_RIGHT + number,
@@ -163,31 +259,3 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
                 lanelets[one].addRegulatoryElement(rule)
             count_rules += 1
     return count_rules
-
-
-class _Joints:
-    """End points, shared by lanelets that lead into each other."""
-
-    def __init__(self, network: RoadNetwork) -> None:
-        assert network.geo is not None
-        self.points: dict[tuple[int, int, int], Any] = {}
-        self._geo = network.geo
-
-    def key(self, place: NDArray[np.float64]) -> tuple[int, int, int]:
-        x, y, z = np.round(place * 4.0).astype(int).tolist()
-        return x, y, z
-
-    def degrees(self, places: NDArray[np.float64]) -> NDArray[np.float64]:
-        return unproject(places, self._geo)
-
-
-def _beside(network: RoadNetwork, lane: int, side: float) -> NDArray[np.float64]:
-    """Return the border of a lane, `side` widths to the left of its centre line."""
-    shape = network.lane_polyline(lane)
-    along = np.gradient(shape[:, :2], axis=0)
-    length = np.maximum(np.hypot(*along.T), 1e-9)
-    shift = side * float(network.lanes["width_m"][lane]) / length
-    border = shape.copy()
-    border[:, 0] -= along[:, 1] * shift
-    border[:, 1] += along[:, 0] * shift
-    return border

@@ -101,8 +101,8 @@ def test_without_commands_the_vehicle_brakes_and_a_warning_is_logged(
     counts = report["controls"]["car_0"]
     assert (counts["held"], counts["used"], counts["received"]) == (6, 0, 0)
     assert "no node publishes commands of car_0" in caplog.text
-    # No node listens. Only the sensors' transforms, for late subscribers, and their time are sent.
-    assert report["sent"] == {"/tf_static": 1, "/clock": 1}
+    # No node listens. Only messages for late subscribers and their time are sent.
+    assert report["sent"] == {"/tf_static": 1, "/car_0/goal": 1, "/clock": 1}
 
 
 def test_a_missing_command_is_awaited_until_the_deadline_and_counted(

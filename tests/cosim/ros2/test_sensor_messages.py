@@ -204,7 +204,7 @@ def test_two_sensors_cannot_have_one_topic() -> None:
 def test_sensors_without_a_message_are_named_once(caplog: pytest.LogCaptureFixture) -> None:
     grid = SensorView("grid", [], PLACE | {"type": "bev_grid"})
     topics = VehicleTopics("car_0", [grid, *views("imu")], "plain", {}, False)
-    assert list(topics.kinds) == ["/car_0/imu"]
+    assert list(topics.kinds) == ["/car_0/imu", "/car_0/goal"]
     assert "1 sensors have no ROS message and are not published: grid (bev_grid)" in caplog.text
 
 

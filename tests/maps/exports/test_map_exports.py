@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -104,10 +105,44 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
     projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(latitude, longitude))
     back = lanelet2.io.load(str(target), projector)
     by_name = {lanelet.attributes["name"]: lanelet for lanelet in back.laneletLayer}
-    for link in network.links[network.links["direction"] == ord("s")]:
-        lanes = (link["from_lane"], link["next_lane"])
-        one, other = (by_name[network.lane_ids[lane]] for lane in lanes)
-        assert lanelet2.geometry.follows(one, other)
+    ends = lanelet_ends(target)
+    for link in network.links:
+        chain = [int(link["from_lane"]), int(link["next_lane"])]
+        while network.lanes["internal"][chain[-1]]:
+            chain.append(int(network.lanes["successor"][chain[-1]]))
+        names = [network.lane_ids[lane] for lane in chain]
+        for one, other in itertools.pairwise(names):
+            assert ends[one][1] == ends[other][0], (one, other)
+            # the package turns lanelets around whose borders cross, such as U-turns on the spot
+            if link["direction"] == ord("s"):
+                assert lanelet2.geometry.follows(by_name[one], by_name[other])
+    # borders stay beside their lanes
+    for lane, name in enumerate(network.lane_ids):
+        if network.lanes["internal"][lane]:
+            continue
+        shape = network.lane_polyline(lane)
+        for n in (0, -1):
+            bounds = [by_name[name].leftBound[n], by_name[name].rightBound[n]]
+            places = [
+                [float(point.attributes[key]) for key in ("local_x", "local_y")] for point in bounds
+            ]
+            assert np.hypot(*(np.mean(places, axis=0) - shape[n, :2])) < 0.5, name
+
+
+def lanelet_ends(path: Path) -> dict[str, list[list[str | None]]]:
+    """Return the points at the beginning and at the end of each lanelet, by its name."""
+    root = ElementTree.parse(path).getroot()
+    ways = {way.get("id"): [nd.get("ref") for nd in way.iter("nd")] for way in root.iter("way")}
+    found = {}
+    for relation in root.iter("relation"):
+        tags = {tag.get("k"): tag.get("v") for tag in relation.iter("tag")}
+        if tags["type"] == "lanelet":
+            bounds = {one.get("role"): ways.get(one.get("ref")) for one in relation.iter("member")}
+            left, right = bounds["left"], bounds["right"]
+            assert left is not None
+            assert right is not None
+            found[str(tags["name"])] = [[left[n], right[n]] for n in (0, -1)]
+    return found
 
 
 def test_lanelets_have_lights_rights_of_way_and_turns(tmp_path: Path) -> None:
@@ -139,7 +174,7 @@ def test_lanelets_have_lights_rights_of_way_and_turns(tmp_path: Path) -> None:
     rights = [one for id, one in rules.items() if id >= FIRST_RIGHT]
     assert counts["rules"] == len(lights) + len(rights) == len(rules)
     assert rights
-    for rule in rights[:50]:
+    for rule in [one for one in rights if links["signal"][one.id - FIRST_RIGHT] < 0][:50]:
         n = rule.id - FIRST_RIGHT
         conflicts = network.conflicts[links["first_conflict"][n] :][: links["num_conflicts"][n]]
         foes = links["first_internal"][conflicts["foe"][conflicts["must_yield"]]]
@@ -164,9 +199,45 @@ def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
     words = ["export", str(town), "--autoware", str(folder), "--lanelet2", "x.osm"]
     refused = CliRunner().invoke(app, words)
     assert isinstance(refused.exception, ConfigError)
-    without = CliRunner().invoke(app, ["export", "ring", "--autoware", str(tmp_path / "ring")])
-    assert isinstance(without.exception, MapError)
-    assert not list((tmp_path / "ring").iterdir())
+
+
+def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
+    lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
+    network = load_network(find_map("grid4x4"))
+    result = CliRunner().invoke(app, ["export", "grid4x4", "--autoware", str(tmp_path)])
+    assert result.exit_code == 0, result.output
+    projector = lanelet2.projection.UtmProjector(lanelet2.io.Origin(45.0, 3.0))
+    back = lanelet2.io.load(str(tmp_path / "lanelet2_map.osm"), projector)
+    assert len(back.laneletLayer) == len(network.lanes)
+    for lanelet in back.laneletLayer:
+        lane = network.lane_ids.index(lanelet.attributes["name"])
+        ends = [
+            [(float(p.attributes["local_x"]), float(p.attributes["local_y"])) for p in bound]
+            for bound in (lanelet.leftBound, lanelet.rightBound)
+        ]
+        shape = network.lane_polyline(lane)
+        for place, n in ((shape[0], 0), (shape[-1], -1)):
+            middle = np.mean([ends[0][n], ends[1][n]], axis=0)
+            np.testing.assert_allclose(middle, place[:2], atol=0.3)
+    # neighbours share a border
+    by_name = {lanelet.attributes["name"]: lanelet for lanelet in back.laneletLayer}
+    lefts = np.flatnonzero(~network.lanes["internal"] & (network.lanes["left"] >= 0))
+    pairs = [(lane, int(network.lanes["left"][lane])) for lane in lefts.tolist()]
+    sides = [
+        lanelet2.geometry.leftOf(*(by_name[network.lane_ids[each]] for each in (left, lane)))
+        for lane, left in pairs
+    ]
+    assert len(pairs) == 80
+    assert all(sides)
+    # at a signal, turns give way to oncoming traffic
+    rights = [one for one in back.regulatoryElementLayer if one.id >= FIRST_RIGHT]
+    yields = network.links[np.array([one.id - FIRST_RIGHT for one in rights])]
+    assert set(map(chr, yields["direction"])) == {"l"}
+    for rule in rights:
+        own = network.links["first_internal"][rule.id - FIRST_RIGHT]
+        assert rule.yieldLanelets()[0].attributes["name"] == network.lane_ids[own]
+        for foe in rule.rightOfWayLanelets():
+            assert foe.attributes["turn_direction"] == "straight"
 
 
 def test_the_command_exports(town: Path, tmp_path: Path) -> None:
