@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
+from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import EVENTS_THAT_END
 from cavmarl.driving.kernels.motion.reported_motion import find_aims, follow_reports
 from cavmarl.engine.component import Component
@@ -61,7 +62,7 @@ class SimulatorComponent(Component):
     """Runs the simulators of zones, and the gate of the coordinators.
 
     Attributes:
-        zones: the zones that simulators run.
+        zones: the zones that simulators run, in this process or in others.
         coordinators: the coordinators of the worlds; set after they are made.
     """
 
@@ -72,7 +73,8 @@ class SimulatorComponent(Component):
         self.coordinators: Sequence[Coordinator] = ()
         self.zones = frozenset(one.zone for one in hosted)
         self._tick, self._config, self._network = tick, config, network
-        self._hosted = {one.zone: one for one in hosted}
+        self._hosted = {one.zone: one for one in hosted}  # of this process
+        self._all_hosted = tuple(hosted)
         self._runs: dict[_Place, _Run] = {}  # zones that have failed are absent
         self._broken: dict[int, str] = {}  # world → why it cannot continue before a reset
         self._patience = max(1, round(ENTRY_S / config.clock.sim_dt_s))
@@ -92,6 +94,26 @@ class SimulatorComponent(Component):
         """Begin an episode: start simulators that do not run, and remove all vehicles."""
         for w in np.flatnonzero(chosen).tolist():
             self._broken.pop(w, None)
+            for zone in self._hosted:
+                self._begin(_Place(w, zone))
+
+    def host(self, zones: Sequence[int]) -> None:
+        """Run the simulators of these zones only: other processes run the other zones.
+
+        The coordinator of those processes records the hosts of zones.
+        """
+        self.coordinators = ()
+        self._hosted = {one.zone: one for one in self._all_hosted if one.zone in zones}
+        for place in [place for place in self._runs if place.zone not in zones]:
+            self._end(place)
+
+    def refill(self) -> None:
+        """Resume from the loaded rows: give them to the simulators, and start those that ended.
+
+        The vehicles enter in the next tick, as vehicles do that enter the world.
+        """
+        self._broken.clear()
+        for w in range(self._tick.division.num_worlds):
             for zone in self._hosted:
                 self._begin(_Place(w, zone))
 
@@ -260,33 +282,44 @@ class SimulatorComponent(Component):
                 f"world {w} cannot continue: {self._broken[w]}. Reset it", min(self.zones)
             )
 
-    def refusals(self, w: int, zone: int, vehicles: Sequence[int]) -> Mapping[int, str]:
+    def refusals(
+        self, w: int, zone: int, vehicles: NDArray[np.void], is_last: bool = False
+    ) -> Mapping[int, str]:
         place = _Place(w, zone)
         run = self._runs.get(place)
         if run is None:
             return {}
-        found = [self._tick.division.changes.find(w, vehicle) for vehicle in vehicles]
-        rows = np.array([self._tick.division.owned(w, zone_)[row] for zone_, row in found])
-        refused = self._ask(place, "answer", lambda: dict(run.simulator.prepare(rows)))
+        refused = self._ask(place, "answer", lambda: dict(run.simulator.prepare(vehicles)))
         if refused is None:
             return {}
-        run.accepted.update(vehicle for vehicle in vehicles if vehicle not in refused)
+        ids = vehicles["id"].tolist()
+        run.accepted.update(vehicle for vehicle in ids if vehicle not in refused)
         for vehicle, reason in refused.items():
             log.info("zone %d refuses vehicle %d: %s", zone, vehicle, reason)
+        if refused and is_last:
+            vehicle, reason = next(iter(refused.items()))
+            message = (
+                f"zone {zone}: its simulator has refused vehicle {vehicle} for "
+                f"{self._config.zones.max_deferred_ticks} ticks ({reason}); free the place there, "
+                "or increase zones.max_deferred_ticks"
+            )
+            self._fail(place, ZoneSimulatorError(message, zone))
+            return {}
         return refused
 
-    def fail(self, w: int, zone: int, error: ZoneSimulatorError) -> None:
-        self._end(_Place(w, zone))
-        coordinator = self.coordinators[w]
-        if self._config.zones.simulator_failure == "return" and isinstance(
-            coordinator, MessageCoordinator
-        ):
+    def _fail(self, place: _Place, error: ZoneSimulatorError) -> None:
+        """End the simulator of a zone. Raise the error unless cavmarl takes the zone back."""
+        self._end(place)
+        if self._config.zones.simulator_failure == "return":
             log.warning("%s. cavmarl runs the zone until the episode ends", error)
-            coordinator.rehost(zone)
+            if self.coordinators:
+                coordinator = self.coordinators[place.w]
+                assert isinstance(coordinator, MessageCoordinator)
+                coordinator.rehost(place.zone)
             return
         # The other simulators and the other worlds are in the middle of the same tick.
         self.close()
-        self._broken = dict.fromkeys(range(len(self.coordinators)), str(error))
+        self._broken = dict.fromkeys(range(self._tick.division.num_worlds), str(error))
         self._tick.division.align()
         raise error
 
@@ -295,7 +328,7 @@ class SimulatorComponent(Component):
         try:
             return call()
         except ZoneSimulatorError as error:
-            self.fail(*place, error)
+            self._fail(place, error)
         except Exception as error:  # a registered simulator may raise any exception
             text = self._hosted[place.zone].text
             failure = ZoneSimulatorError(
@@ -304,7 +337,7 @@ class SimulatorComponent(Component):
                 place.zone,
             )
             failure.__cause__ = error
-            self.fail(*place, failure)
+            self._fail(place, failure)
         return None
 
     def _end(self, place: _Place) -> None:
@@ -323,10 +356,19 @@ class SimulatorPhases(OutsideTraffic):
     """The phases of a tick in worlds in which other simulators run zones."""
 
     def __init__(self, hosted: SimulatorComponent) -> None:
-        self._hosted = hosted
+        self.gate = self._hosted = hosted
+
+    def host(self, zones: Sequence[int]) -> None:
+        """Run the simulators of these zones only."""
+        self._hosted.host(zones)
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Fill the simulators from the loaded state."""
+        self._hosted.refill()
 
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of hosted zones."""
+        tick.finish_phase()  # other workers may still be moving vehicles
         self._hosted.move()
 
     def close(self) -> None:

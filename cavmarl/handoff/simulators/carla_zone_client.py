@@ -16,6 +16,7 @@ import os
 import re
 import signal
 import sys
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +25,7 @@ LARGE_M = 7.0  # longer vehicles are buses or trucks
 WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
 MOST_SLIP = 0.6  # largest sine of the slip angle
 PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
+PREDECESSOR_S = 3.0  # longest wait for the end of the synchronous mode of another client
 SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
 STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
 
@@ -77,6 +79,7 @@ class Zone:
         self._world = self._client.get_world()
         self._map = self._world.get_map()
         self._check_map(start["places"])
+        self._await_predecessor()
         self._before = self._world.get_settings()
         settings = self._world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
@@ -92,6 +95,15 @@ class Zone:
         self._world.freeze_all_traffic_lights(True)  # their own programs do not run
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
+
+    def _await_predecessor(self) -> None:
+        """Wait while another client drives the server: the client of a process that has died.
+
+        That client removes its actors, and then ends the synchronous mode.
+        """
+        until_s = time.monotonic() + PREDECESSOR_S
+        while self._world.get_settings().synchronous_mode and time.monotonic() < until_s:
+            time.sleep(0.05)
 
     def _check_map(self, places: Sequence[Sequence[float]]) -> None:
         on_road = sum(

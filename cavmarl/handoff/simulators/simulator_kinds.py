@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
@@ -84,6 +84,14 @@ def hosted_zones(simulators: Mapping[int, str], num_zones: int) -> tuple[HostedZ
     if len(set(places)) < len(places):
         raise ConfigError("zones.simulators: each zone needs a CARLA server of its own")
     return tuple(found)
+
+
+def check_servers(hosted: Sequence[HostedZone], num_worlds: int) -> None:
+    """Raise ConfigError if a server that runs a zone of one world would run several."""
+    if num_worlds > 1 and any(one.is_single for one in hosted):
+        raise ConfigError(
+            f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
+        )
 
 
 def _read(zone: int, text: str) -> HostedZone:

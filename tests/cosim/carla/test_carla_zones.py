@@ -39,6 +39,7 @@ def carla_zones(
     options: str = "",
     background: int = 40,
     overrides: Mapping[str, Any] | None = None,
+    backend: str = "local",
     **server: Any,
 ) -> Iterator[cavmarl.CavVectorEnv]:
     """Create worlds some of whose zones CARLA servers run."""
@@ -56,6 +57,7 @@ def carla_zones(
             agents=4,
             background=background,
             seed=3,
+            backend=backend,
             overrides={"zones.check_invariants": True, **(overrides or {})},
         )
         try:
@@ -208,3 +210,44 @@ def test_a_server_with_another_map_is_refused(monkeypatch: pytest.MonkeyPatch) -
         with pytest.raises(ZoneSimulatorError, match="its map Carla/Maps/grid4x4 is another one"):
             vec.reset()
         vec.close()
+
+
+@pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
+def test_carla_zones_belong_to_a_process_and_survive_it(backend: str) -> None:
+    with carla_zones(2, 1, background=20, backend=backend) as vec:
+        vec.reset()
+        step_on(vec, 40)
+        before = vec.traffic_stats()
+        assert before["running"] > 10
+        for pid in vec.worlds.worker_pids.values():
+            os.kill(pid, signal.SIGKILL)
+            step_on(vec, 10)
+        after = vec.traffic_stats()
+        entered = after["departed"] - before["departed"]
+        assert (
+            after["running"] == before["running"] + entered - after["arrived"] + before["arrived"]
+        )
+        saved = vec.save_state()
+        hash_then = vec.state_hash(0)
+        step_on(vec, 5)
+        vec.load_state(saved)
+        assert vec.state_hash(0) == hash_then
+        step_on(vec, 5)
+
+
+@pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
+def test_a_server_that_does_not_answer_is_an_error_on_each_backend(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PYTHON, client_python(DEFAULT_VERSION))
+    vec = cavmarl.make_vec(
+        "grid4x4",
+        zones=2,
+        zone_simulators={1: "carla://127.0.0.1:9?timeout_s=1"},
+        agents=2,
+        background=4,
+        backend=backend,
+    )
+    with pytest.raises(ZoneSimulatorError, match=r"zone 1: carla://127.0.0.1:9: start: RuntimeErr"):
+        vec.reset()
+    vec.close()
