@@ -1,4 +1,4 @@
-"""Zones in other simulators, over worker processes and nodes: no bit changes, no vehicle is lost."""
+"""Zones in other simulators, over worker processes and nodes: no bit changes."""
 
 from __future__ import annotations
 
@@ -128,10 +128,9 @@ def test_a_step_whose_simulator_fails_can_be_repeated(backend: str) -> None:
     vec = hosted(FAILING, 1, backend=backend)
     whole.reset(), vec.reset()
     before = ""
-    with pytest.raises(
-        ZoneSimulatorError, match="zone 1: its simulator.*cannot run a tick: OSError"
-    ) as caught:
-        for _ in range(30):
+    message = r"zone 1: its simulator.*cannot run a tick: OSError"
+    with pytest.raises(ZoneSimulatorError, match=message) as caught:  # noqa: PT012
+        while True:
             before = vec.state_hash(0)
             vec.step(vec.suggest_actions())
             whole.step(whole.suggest_actions())

@@ -46,11 +46,11 @@ class Unwilling(Hesitant):
 
 
 class Failing(OwnKinematics):
-    """A simulator that fails in its 60th tick: after a failed step, a worker repeats up to 32."""
+    """A simulator that fails in its 100th tick: after a failed step, a worker repeats up to 64."""
 
     def read(self) -> NDArray[np.void]:
         self.counts["read"] += 1
-        if self.counts["read"] == 60:
+        if self.counts["read"] == 100:
             raise OSError("connection lost")
         return super().read()
 

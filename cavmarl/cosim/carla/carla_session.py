@@ -232,6 +232,7 @@ class CarlaSession:
         for actor in self.actors.keep_spawned(self.world, before):
             log.warning("actor %d (%s) could not be kept", actor.number, actor.type_id)
             self._forget(actor)
+        self.sensors.await_listeners()
         for number, control in driven.items():
             if number in self.actors.actors:
                 self.world.external.control(self.actors.actors[number].slot, control)

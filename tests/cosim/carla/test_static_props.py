@@ -11,6 +11,7 @@ import pytest
 from cavmarl.cosim.carla.attached_imaging import SEMANTIC_POINT
 from cavmarl.cosim.carla.carla_session import CarlaSession
 from tests.cosim.carla.conftest import Call, run_client, running_server
+from tests.cosim.carla.test_attached_sensors import newest, recorded
 from tests.cosim.carla.test_official_client import SYNCHRONOUS
 
 CONE, BARRIER = "static.prop.trafficcone01", "static.prop.streetbarrier"
@@ -55,7 +56,10 @@ def test_a_prop_stands_and_can_be_moved_and_destroyed(session: CarlaSession, cal
     assert number not in session.actors.actors
 
 
-def test_sensors_show_the_tag_and_the_number_of_a_prop(session: CarlaSession, call: Call) -> None:
+def test_sensors_show_the_tag_and_the_number_of_a_prop(
+    session: CarlaSession, call: Call, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = recorded(monkeypatch)
     number = call("spawn_actor", [0, BARRIER, []], [[66.0, -60.0, 0.0], [0.0, 0.0, 0.0]])[0]
     behind = [[60.0, -60.0, 1.0], [0.0, 0.0, 0.0]]
     lidar = call("spawn_actor", [0, "sensor.lidar.ray_cast_semantic", LIDAR], behind)[0]
@@ -66,7 +70,8 @@ def test_sensors_show_the_tag_and_the_number_of_a_prop(session: CarlaSession, ca
     )
     session.tick()
     session.tick()
-    bodies = {one: session.sensors.last_body(one) for one in (lidar, semantic, instance)}
+    actors = session.actors.actors
+    bodies = {one: newest(recorder, actors[one]) for one in (lidar, semantic, instance)}
     head = 8 + 4 * 8
     points = np.frombuffer(bodies[lidar][head:], SEMANTIC_POINT)
     hit = points[points["actor"] == number]
