@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from cavmarl.cosim.carla.attached_imaging import SEMANTIC_POINT
+from cavmarl.cosim.carla.carla_geometry import CarlaPose
 from cavmarl.cosim.carla.carla_session import CarlaSession
-from tests.cosim.carla.conftest import Call, run_client, running_server
+from tests.cosim.carla.conftest import Call, make_server, run_client, running_server
 from tests.cosim.carla.test_attached_sensors import newest, recorded
 from tests.cosim.carla.test_official_client import SYNCHRONOUS
 
@@ -91,23 +92,22 @@ def test_sensors_show_the_tag_and_the_number_of_a_prop(
     session.tick()
 
 
-def test_traffic_stops_before_a_prop(session: CarlaSession, call: Call) -> None:
-    session.tick()
-    network, rows = session.map.network, session.world.rows
-    free_m = network.lanes["length_m"][rows["lane"]] - rows["s"]
-    moving = np.flatnonzero((rows["agent"] < 0) & (free_m > 60.0) & (rows["driver"] == 0))
-    assert moving.size
-    follower = rows[moving[0]].copy()
-    x, y, z, heading, *_ = network.pose_on(int(follower["lane"]), float(follower["s"]) + 45.0)
-    there = [[float(x), -float(y), float(z)], [0.0, -math.degrees(float(heading)), 0.0]]
-    number = call("spawn_actor", [0, BARRIER, []], there)[0]
-    for _ in range(400):
+def test_traffic_stops_before_a_prop() -> None:
+    with make_server(agents=1, background=6, env="ring") as server:
+        session = server.session
         session.tick()
-    there_m = np.hypot(session.world.rows["x"] - float(x), session.world.rows["y"] - float(y))
-    near = session.world.rows[(there_m < 12.0) & (there_m > 0.5)]
-    assert (near["speed"] < 0.5).any(), "a vehicle waits before the barrier"
-    call("destroy_actor", number)
-    session.tick()
+        network, rows = session.map.network, session.world.rows
+        lane, s = int(rows["lane"][-1]), float(rows["s"][-1])
+        length_m = float(network.lanes["length_m"][lane])
+        x, y, z, heading, *_ = map(float, network.pose_on(lane, (s + 15.0) % length_m))
+        there = CarlaPose(x, -y, z, 0.0, -math.degrees(heading), 0.0)
+        number = session.spawn(BARRIER, {}, there).number
+        for _ in range(400):
+            session.tick()
+        apart_m = np.hypot(session.world.rows["x"] - x, session.world.rows["y"] - y)
+        waits = (apart_m > 0.5) & (apart_m < 12.0) & (session.world.rows["speed"] < 0.5)
+        assert waits.any(), "a vehicle waits before the barrier"
+        assert row_of(session, number)["speed"] == 0.0
 
 
 def test_the_official_client_places_props() -> None:
