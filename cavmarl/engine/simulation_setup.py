@@ -10,6 +10,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
 from cavmarl.engine.outside_traffic import SumoPhases
+from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.simulator_component import SimulatorComponent, SimulatorPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
@@ -46,7 +47,12 @@ def add_simulators(
     if not hosted:
         return None
     check_servers(hosted, tick.division.num_worlds)
+    for one in hosted:
+        one.check_rig(config.rig)
     part = SimulatorComponent(tick, config, network, hosted)
+    for other in tick.attached:
+        if isinstance(other, RigComponent) and not config.workers.sensors:
+            other.rig.sense = part.sense
     tick.attached, tick.outside = (*tick.attached, part), SimulatorPhases(part)
     return part
 

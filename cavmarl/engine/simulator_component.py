@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.rig import MountedConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
 from cavmarl.core.records.arrays import Worlds
@@ -27,8 +28,15 @@ from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.message_coordinator import MessageCoordinator
 from cavmarl.handoff.simulators.simulator_kinds import HostedZone
-from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup, ZoneSimulator
+from cavmarl.handoff.simulators.zone_simulator import (
+    MOTION,
+    FrameSource,
+    ZoneSetup,
+    ZoneSimulator,
+)
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.sensors.mounted.mounted_sensor import SensedScene
+from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 from cavmarl.shards.shard import Commands
 
 log = logging.getLogger(__name__)
@@ -76,6 +84,7 @@ class SimulatorComponent(Component):
         self._hosted = {one.zone: one for one in hosted}  # of this process
         self._all_hosted = tuple(hosted)
         self._runs: dict[_Place, _Run] = {}  # zones that have failed are absent
+        self._has_moved = False  # since the begin of the tick
         self._broken: dict[int, str] = {}  # world → why it cannot continue before a reset
         self._patience = max(1, round(ENTRY_S / config.clock.sim_dt_s))
         self._roads, self._travel = tick.shards[0].roads, tick.shards[0].travel
@@ -147,6 +156,7 @@ class SimulatorComponent(Component):
             wheelbases=self._travel.types["wheelbase"].astype(np.float64),
             place=hosted.place,
             options=hosted.options,
+            rig=self._config.rig,
         )
         return hosted.kind.make(setup)
 
@@ -202,6 +212,7 @@ class SimulatorComponent(Component):
 
     def move(self) -> None:
         """Let all simulators run a tick, and correct the rows that cavmarl has moved."""
+        self._has_moved = True
         wanted: dict[_Place, NDArray[np.int64]] = {}  # rows of the simulator's vehicles, by id
         for place, run in list(self._runs.items()):
             rows = self._next_rows(place)
@@ -212,6 +223,26 @@ class SimulatorComponent(Component):
             self._ask(place, "run a tick", partial(run.simulator.advance, rows[found], aims))
         for place, run in list(self._runs.items()):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
+
+    def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
+        """Write the samples of all turns: cavmarl's own, then those of simulators with frames."""
+        sense_here(scenes, turns)
+        if not self._has_moved:  # at a reset, simulators have no vehicles yet
+            return
+        for place, run in list(self._runs.items()):
+            source = run.simulator
+            if not isinstance(source, FrameSource):
+                continue
+            worlds = self._tick.shards[place.zone].worlds
+            rows = worlds.rows[place.w, : worlds.num_owned[place.w]]
+            rows = rows[(rows["agent"] >= 0) & np.isin(rows["id"], list(run.owned))]
+            for turn in turns:
+                is_due = turn.due.num.item(place.w) and len(rows)
+                if is_due and _type_of(turn.sensor.config) in source.frame_types:
+                    self._ask(place, "give frames", partial(_copy, source, rows, turn, place.w))
+
+    def end(self) -> None:
+        self._has_moved = False
 
     def _next_rows(self, place: _Place) -> NDArray[np.void]:
         """Return the owned rows VEHICLE (n,) of a zone, after cavmarl has moved them."""
@@ -350,6 +381,24 @@ class SimulatorComponent(Component):
         """End all simulators."""
         for place in list(self._runs):
             self._end(place)
+
+
+def _type_of(config: MountedConfig) -> str:
+    return str(getattr(config, "type", ""))  # each class of sensors defines it
+
+
+def _copy(source: FrameSource, rows: NDArray[np.void], turn: Turn, w: int) -> None:
+    """Copy the samples that a simulator takes of the agents' vehicles VEHICLE (n,)."""
+    frames, slot = turn.frames.data, turn.due.slot.item(w)
+    found = source.sense(turn.sensor.name, rows["id"].tolist())
+    agents = dict(zip(rows["id"].tolist(), rows["agent"].tolist(), strict=True))
+    for vehicle, sample in found.items():
+        if sample.shape != frames.shape[3:]:
+            raise ValueError(
+                f"a sample of '{turn.sensor.name}' has the shape {sample.shape}, not "
+                f"{frames.shape[3:]}"
+            )
+        frames[w, agents[vehicle], slot] = sample
 
 
 class SimulatorPhases(OutsideTraffic):

@@ -6,9 +6,10 @@ from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
+from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_ZONE_SIMULATORS
-from cavmarl.handoff.simulators import carla_zone
+from cavmarl.handoff.simulators import carla_frames, carla_zone
 from cavmarl.handoff.simulators.zone_simulator import MakeSimulator, number_option
 
 CARLA = "carla"
@@ -37,6 +38,11 @@ class HostedZone(NamedTuple):
     place: str
     options: dict[str, str]
     tolerance_m: float
+
+    def check_rig(self, rig: Mapping[str, MountedConfig]) -> None:
+        """Raise ConfigError if the simulator cannot take the samples that its options demand."""
+        if self.is_single:
+            carla_frames.check_rig(self.zone, self.options, rig)
 
     @property
     def is_single(self) -> bool:
