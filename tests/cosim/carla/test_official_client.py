@@ -7,6 +7,8 @@ import pytest
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS
 from tests.cosim.carla.conftest import VERSION, run_client, running_server
 
+# Errors of client 0.10.0 have the text `std::exception` instead of the reason.
+HAS_REASONS = VERSION != "0.10.0"
 SYNCHRONOUS = """
 settings = world.get_settings()
 settings.synchronous_mode, settings.fixed_delta_seconds = True, 0.05
@@ -229,7 +231,7 @@ found["back"] = back.get_map().name
     assert found["other"] == ["Carla/Maps/intersection", True]
     assert found["actors"] > 0
     assert found["again"] == ["Carla/Maps/intersection", True]
-    assert "Map 'Town01' not found" in found["unknown"]
+    assert "Map 'Town01' not found" in found["unknown"] or not HAS_REASONS
     assert found["made"] == ["Carla/Maps/OpenDriveMap", True]
     assert found["garbage"]
     assert found["back"] == "Carla/Maps/grid4x4"
@@ -341,10 +343,11 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
 """
         + FREE,
     )
-    refused = [one for one in found["errors"] if "physics of vehicles of CARLA 0.10" not in one]
-    assert len(refused) == 2
-    assert all("CARLA's recorder is not available" in one for one in refused)
-    assert VERSION == "0.10.0" or refused == found["errors"]
+    if HAS_REASONS:
+        assert len(found["errors"]) == 2
+        assert all("CARLA's recorder is not available" in one for one in found["errors"])
+    else:  # physics are refused, too
+        assert len(found["errors"]) >= 2
     assert VERSION != "0.9.16" or not found["absent"]
     assert found["batch"][:3] == ["", "", ""]
     assert "vehicles of the world move by themselves" in found["batch"][3]
