@@ -40,6 +40,7 @@ Each message says what is wrong, where, and what to do.
 from __future__ import annotations
 
 import importlib
+import re
 from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
@@ -265,7 +266,8 @@ class RosError(CavmarlError):
 class ZoneSimulatorError(CavmarlError):
     """Another simulator that runs a zone cannot start or continue, or sends invalid data.
 
-    The step is not finished; the next reset starts the simulators again.
+    The step is not finished. In this process, the next reset starts the simulators again. Worker
+    processes and nodes return to the state before the step, and fill the simulators from it.
 
     Attributes:
         zone: number of the zone.
@@ -274,6 +276,12 @@ class ZoneSimulatorError(CavmarlError):
     def __init__(self, message: str, zone: int) -> None:
         super().__init__(message)
         self.zone = zone
+
+    @classmethod
+    def of_text(cls, text: str) -> ZoneSimulatorError:
+        """Return the error with this text, which another process has raised."""
+        zone = re.match(r"zone (\d+): ", text)
+        return cls(text, -1 if zone is None else int(zone[1]))
 
 
 class ServiceError(CavmarlError):

@@ -5,6 +5,7 @@ SUMO moves them here, the caller of the environment in `ExternalPhases`.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.engine.step_trace import MIRROR, SUMO
+from cavmarl.handoff.coordinator.message_coordinator import ZoneGate
 from cavmarl.traffic.sumo.sumo_traffic import SumoTraffic
 
 if TYPE_CHECKING:
@@ -26,15 +28,20 @@ class OutsideTraffic:
 
     Attributes:
         sumo: SUMO, or None.
+        gate: the simulators of zones, which may refuse vehicles; None: there are none.
     """
 
     sumo: SumoTraffic | None = None
+    gate: ZoneGate | None = None
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Begin an episode in the chosen worlds (W,)."""
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Advance to the ticks of worlds whose state was loaded. Raises as `SumoTraffic` does."""
+        """Resume from the state of worlds that were loaded. Raises as `SumoTraffic` does."""
+
+    def host(self, zones: Sequence[int]) -> None:
+        """Move vehicles in these zones only from now on: other processes run the other zones."""
 
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of the other simulator, after cavmarl's own vehicles."""

@@ -10,11 +10,12 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.external_component import ExternalComponent, ExternalPhases
 from cavmarl.engine.outside_traffic import SumoPhases
+from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.simulator_component import SimulatorComponent, SimulatorPhases
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, make_coordinators
 from cavmarl.handoff.coordinator.handoff_log import HandoffLog
-from cavmarl.handoff.simulators.simulator_kinds import hosted_zones
+from cavmarl.handoff.simulators.simulator_kinds import check_servers, hosted_zones
 from cavmarl.ownership.messages import Switch
 from cavmarl.ownership.transfers import TransferLog
 from cavmarl.roads.network import RoadNetwork
@@ -45,12 +46,13 @@ def add_simulators(
     hosted = hosted_zones(config.zones.simulators, tick.division.count)
     if not hosted:
         return None
-    num_worlds = tick.division.num_worlds
-    if num_worlds > 1 and any(one.is_single for one in hosted):
-        raise ConfigError(
-            f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
-        )
+    check_servers(hosted, tick.division.num_worlds)
+    for one in hosted:
+        one.check_rig(config.rig)
     part = SimulatorComponent(tick, config, network, hosted)
+    for other in tick.attached:
+        if isinstance(other, RigComponent) and not config.workers.sensors:
+            other.rig.sense = part.sense
     tick.attached, tick.outside = (*tick.attached, part), SimulatorPhases(part)
     return part
 

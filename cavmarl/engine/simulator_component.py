@@ -16,8 +16,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.rig import MountedConfig
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
+from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import EVENTS_THAT_END
 from cavmarl.driving.kernels.motion.reported_motion import find_aims, follow_reports
 from cavmarl.engine.component import Component
@@ -26,8 +28,15 @@ from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.message_coordinator import MessageCoordinator
 from cavmarl.handoff.simulators.simulator_kinds import HostedZone
-from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup, ZoneSimulator
+from cavmarl.handoff.simulators.zone_simulator import (
+    MOTION,
+    FrameSource,
+    ZoneSetup,
+    ZoneSimulator,
+)
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
+from cavmarl.sensors.mounted.mounted_sensor import SensedScene
+from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 from cavmarl.shards.shard import Commands
 
 log = logging.getLogger(__name__)
@@ -61,7 +70,7 @@ class SimulatorComponent(Component):
     """Runs the simulators of zones, and the gate of the coordinators.
 
     Attributes:
-        zones: the zones that simulators run.
+        zones: the zones that simulators run, in this process or in others.
         coordinators: the coordinators of the worlds; set after they are made.
     """
 
@@ -72,8 +81,10 @@ class SimulatorComponent(Component):
         self.coordinators: Sequence[Coordinator] = ()
         self.zones = frozenset(one.zone for one in hosted)
         self._tick, self._config, self._network = tick, config, network
-        self._hosted = {one.zone: one for one in hosted}
+        self._hosted = {one.zone: one for one in hosted}  # of this process
+        self._all_hosted = tuple(hosted)
         self._runs: dict[_Place, _Run] = {}  # zones that have failed are absent
+        self._has_moved = False  # since the begin of the tick
         self._broken: dict[int, str] = {}  # world → why it cannot continue before a reset
         self._patience = max(1, round(ENTRY_S / config.clock.sim_dt_s))
         self._roads, self._travel = tick.shards[0].roads, tick.shards[0].travel
@@ -92,6 +103,26 @@ class SimulatorComponent(Component):
         """Begin an episode: start simulators that do not run, and remove all vehicles."""
         for w in np.flatnonzero(chosen).tolist():
             self._broken.pop(w, None)
+            for zone in self._hosted:
+                self._begin(_Place(w, zone))
+
+    def host(self, zones: Sequence[int]) -> None:
+        """Run the simulators of these zones only: other processes run the other zones.
+
+        The coordinator of those processes records the hosts of zones.
+        """
+        self.coordinators = ()
+        self._hosted = {one.zone: one for one in self._all_hosted if one.zone in zones}
+        for place in [place for place in self._runs if place.zone not in zones]:
+            self._end(place)
+
+    def refill(self) -> None:
+        """Resume from the loaded rows: give them to the simulators, and start those that ended.
+
+        The vehicles enter in the next tick, as vehicles do that enter the world.
+        """
+        self._broken.clear()
+        for w in range(self._tick.division.num_worlds):
             for zone in self._hosted:
                 self._begin(_Place(w, zone))
 
@@ -125,6 +156,7 @@ class SimulatorComponent(Component):
             wheelbases=self._travel.types["wheelbase"].astype(np.float64),
             place=hosted.place,
             options=hosted.options,
+            rig=self._config.rig,
         )
         return hosted.kind.make(setup)
 
@@ -180,6 +212,7 @@ class SimulatorComponent(Component):
 
     def move(self) -> None:
         """Let all simulators run a tick, and correct the rows that cavmarl has moved."""
+        self._has_moved = True
         wanted: dict[_Place, NDArray[np.int64]] = {}  # rows of the simulator's vehicles, by id
         for place, run in list(self._runs.items()):
             rows = self._next_rows(place)
@@ -190,6 +223,26 @@ class SimulatorComponent(Component):
             self._ask(place, "run a tick", partial(run.simulator.advance, rows[found], aims))
         for place, run in list(self._runs.items()):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
+
+    def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
+        """Write the samples of all turns: cavmarl's own, then those of simulators with frames."""
+        sense_here(scenes, turns)
+        if not self._has_moved:  # at a reset, simulators have no vehicles yet
+            return
+        for place, run in list(self._runs.items()):
+            source = run.simulator
+            if not isinstance(source, FrameSource):
+                continue
+            worlds = self._tick.shards[place.zone].worlds
+            rows = worlds.rows[place.w, : worlds.num_owned[place.w]]
+            rows = rows[(rows["agent"] >= 0) & np.isin(rows["id"], list(run.owned))]
+            for turn in turns:
+                is_due = turn.due.num.item(place.w) and len(rows)
+                if is_due and _type_of(turn.sensor.config) in source.frame_types:
+                    self._ask(place, "give frames", partial(_copy, source, rows, turn, place.w))
+
+    def end(self) -> None:
+        self._has_moved = False
 
     def _next_rows(self, place: _Place) -> NDArray[np.void]:
         """Return the owned rows VEHICLE (n,) of a zone, after cavmarl has moved them."""
@@ -260,33 +313,44 @@ class SimulatorComponent(Component):
                 f"world {w} cannot continue: {self._broken[w]}. Reset it", min(self.zones)
             )
 
-    def refusals(self, w: int, zone: int, vehicles: Sequence[int]) -> Mapping[int, str]:
+    def refusals(
+        self, w: int, zone: int, vehicles: NDArray[np.void], is_last: bool = False
+    ) -> Mapping[int, str]:
         place = _Place(w, zone)
         run = self._runs.get(place)
         if run is None:
             return {}
-        found = [self._tick.division.changes.find(w, vehicle) for vehicle in vehicles]
-        rows = np.array([self._tick.division.owned(w, zone_)[row] for zone_, row in found])
-        refused = self._ask(place, "answer", lambda: dict(run.simulator.prepare(rows)))
+        refused = self._ask(place, "answer", lambda: dict(run.simulator.prepare(vehicles)))
         if refused is None:
             return {}
-        run.accepted.update(vehicle for vehicle in vehicles if vehicle not in refused)
+        ids = vehicles["id"].tolist()
+        run.accepted.update(vehicle for vehicle in ids if vehicle not in refused)
         for vehicle, reason in refused.items():
             log.info("zone %d refuses vehicle %d: %s", zone, vehicle, reason)
+        if refused and is_last:
+            vehicle, reason = next(iter(refused.items()))
+            message = (
+                f"zone {zone}: its simulator has refused vehicle {vehicle} for "
+                f"{self._config.zones.max_deferred_ticks} ticks ({reason}); free the place there, "
+                "or increase zones.max_deferred_ticks"
+            )
+            self._fail(place, ZoneSimulatorError(message, zone))
+            return {}
         return refused
 
-    def fail(self, w: int, zone: int, error: ZoneSimulatorError) -> None:
-        self._end(_Place(w, zone))
-        coordinator = self.coordinators[w]
-        if self._config.zones.simulator_failure == "return" and isinstance(
-            coordinator, MessageCoordinator
-        ):
+    def _fail(self, place: _Place, error: ZoneSimulatorError) -> None:
+        """End the simulator of a zone. Raise the error unless cavmarl takes the zone back."""
+        self._end(place)
+        if self._config.zones.simulator_failure == "return":
             log.warning("%s. cavmarl runs the zone until the episode ends", error)
-            coordinator.rehost(zone)
+            if self.coordinators:
+                coordinator = self.coordinators[place.w]
+                assert isinstance(coordinator, MessageCoordinator)
+                coordinator.rehost(place.zone)
             return
         # The other simulators and the other worlds are in the middle of the same tick.
         self.close()
-        self._broken = dict.fromkeys(range(len(self.coordinators)), str(error))
+        self._broken = dict.fromkeys(range(self._tick.division.num_worlds), str(error))
         self._tick.division.align()
         raise error
 
@@ -295,7 +359,7 @@ class SimulatorComponent(Component):
         try:
             return call()
         except ZoneSimulatorError as error:
-            self.fail(*place, error)
+            self._fail(place, error)
         except Exception as error:  # a registered simulator may raise any exception
             text = self._hosted[place.zone].text
             failure = ZoneSimulatorError(
@@ -304,7 +368,7 @@ class SimulatorComponent(Component):
                 place.zone,
             )
             failure.__cause__ = error
-            self.fail(*place, failure)
+            self._fail(place, failure)
         return None
 
     def _end(self, place: _Place) -> None:
@@ -319,14 +383,41 @@ class SimulatorComponent(Component):
             self._end(place)
 
 
+def _type_of(config: MountedConfig) -> str:
+    return str(getattr(config, "type", ""))  # each class of sensors defines it
+
+
+def _copy(source: FrameSource, rows: NDArray[np.void], turn: Turn, w: int) -> None:
+    """Copy the samples that a simulator takes of the agents' vehicles VEHICLE (n,)."""
+    frames, slot = turn.frames.data, turn.due.slot.item(w)
+    found = source.sense(turn.sensor.name, rows["id"].tolist())
+    agents = dict(zip(rows["id"].tolist(), rows["agent"].tolist(), strict=True))
+    for vehicle, sample in found.items():
+        if sample.shape != frames.shape[3:]:
+            raise ValueError(
+                f"a sample of '{turn.sensor.name}' has the shape {sample.shape}, not "
+                f"{frames.shape[3:]}"
+            )
+        frames[w, agents[vehicle], slot] = sample
+
+
 class SimulatorPhases(OutsideTraffic):
     """The phases of a tick in worlds in which other simulators run zones."""
 
     def __init__(self, hosted: SimulatorComponent) -> None:
-        self._hosted = hosted
+        self.gate = self._hosted = hosted
+
+    def host(self, zones: Sequence[int]) -> None:
+        """Run the simulators of these zones only."""
+        self._hosted.host(zones)
+
+    def catch_up(self, worlds: Worlds) -> None:
+        """Fill the simulators from the loaded state."""
+        self._hosted.refill()
 
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of hosted zones."""
+        tick.finish_phase()  # other workers may still be moving vehicles
         self._hosted.move()
 
     def close(self) -> None:

@@ -126,7 +126,7 @@ def ownership_of(parts: Parts, saved: Sequence[Array]) -> list[SavedOwnership] |
         ConfigError: the ownership contradicts the vehicles of the state.
     """
     division, num_worlds = parts.division, len(parts.worlds.ticks)
-    if not parts.coordination.coordinators:
+    if not parts.coordination.resumes:
         return None
     first = len(saved) - num_worlds * division.count
     found: list[SavedOwnership] = []

@@ -13,6 +13,7 @@ from cavmarl.engine.peers import Peers
 from cavmarl.engine.shard_clock import ShardClock
 from cavmarl.engine.tick import Tick
 from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime, WorldCoordinators
+from cavmarl.handoff.coordinator.message_coordinator import ZoneGate
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
 from cavmarl.handoff.division import ZoneLoads
 from cavmarl.handoff.repartitioning import Repartition, Repartitioner
@@ -73,10 +74,17 @@ class ZoneHosting:
         self.refuse_changes("the zones of one world over workers")
         self._tick.host(make)
 
-    def host_zones(self, peers: Peers, coordination: OwnershipRuntime, executor: Executor) -> None:
-        """Run only the zones of this executor here; other processes (peers) run the rest."""
+    def host_zones(
+        self,
+        zones: Sequence[int],  # of the executor
+        peers: Peers,
+        coordination: OwnershipRuntime,
+        executor: Executor,
+    ) -> None:
+        """Run only these zones here; other processes (peers) run the rest."""
         tick = self._tick
         tick.peers, tick.coordination, tick.executor = peers, coordination, executor
+        tick.outside.host(zones)
         self._repartitioner = None  # no process has the positions of all vehicles
 
     def set_zones(self, partition: ZonePartition) -> None:
@@ -120,6 +128,11 @@ class ZoneHosting:
         if self._repartitioner is not None:
             self._repartitioner.steps = saved.numbers.repartition_steps_done
         return True
+
+    @property
+    def gate(self) -> ZoneGate | None:
+        """The simulators that run zones, which may refuse vehicles; None: there are none."""
+        return self._tick.outside.gate
 
     @property
     def repartition_steps_done(self) -> int:

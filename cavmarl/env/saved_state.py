@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError
 from cavmarl.env.step_session import StepSession
 from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
-from cavmarl.parallel.worlds.local_worlds import every_array, kept_elsewhere
+from cavmarl.parallel.worlds.local_worlds import every_array, missing_in_states
 
 _DIGEST_BYTES = 32
 
@@ -23,7 +23,7 @@ def save_session(session: StepSession, mask: NDArray[np.bool_]) -> bytes:
         EpisodeError: before the first reset.
         ConfigError: the worlds use processes of their own, such as SUMO's.
     """
-    if key := kept_elsewhere(session.config):
+    if key := missing_in_states(session.config):
         raise ConfigError(
             f"{key}: worlds with processes of their own cannot be saved; reset them instead"
         )

@@ -65,9 +65,10 @@ class _Approach:
     last: int
     offers: int
     state_bytes: int
+    began_s: float | None  # when the first state arrived; None: no clock
 
 
-_NEVER = _Approach(-1, -1, 0, 0)
+_NEVER = _Approach(-1, -1, 0, 0, None)
 
 
 class TransferLog:
@@ -80,7 +81,10 @@ class TransferLog:
     def __init__(
         self,
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
+        clock: Callable[[], float] | None = None,  # returns the time in s; None: no clock
     ) -> None:
+        self._clock = clock
+        self._begun_s: float | None = None  # when the record BEGIN came
         self.episode = -1  # episode of the newest record
         self.ask: Callable[[], None] = lambda: None
         self._rows: deque[Transfer] = deque(maxlen=KEPT_ROWS)
@@ -129,7 +133,8 @@ class TransferLog:
                     key = (vehicle, message.target, epoch)
                     known = self._approaches.get(key)
                     if known is None:
-                        self._approaches[key] = _Approach(message.tick, message.tick, 1, len(state))
+                        tick, now_s = message.tick, self._now_s()
+                        self._approaches[key] = _Approach(tick, tick, 1, len(state), now_s)
                     else:
                         known.last = max(known.last, message.tick)
                         known.offers += 1
@@ -142,6 +147,9 @@ class TransferLog:
                 self._counts["acknowledged"] += len(message.entries)
             case Nack() if destination == COORDINATOR:
                 self._counts["refused"] += len(message.entries)
+
+    def _now_s(self) -> float | None:
+        return None if self._clock is None else self._clock()
 
     def add_later(self, number: int, removed: int, make: Callable[[], Iterable[Transfer]]) -> None:
         """Add changes of owner without messages. Their rows are made when they are read."""
@@ -171,7 +179,7 @@ class TransferLog:
         self._counts.update({name: number for name, number in numbers.items() if number})
 
     def _begin(self, record: Begin) -> None:
-        self._begun = record
+        self._begun, self._begun_s = record, self._now_s()
         self._counts["deferred"] += len(record.deferred)
 
     def _commit(self, record: Commit) -> None:
@@ -190,8 +198,10 @@ class TransferLog:
     def _note(self, episode: int, tick: int, switch: Switch, removed: bool) -> None:
         vehicle, source, target, epoch, forced = switch
         found = self._approaches.pop((vehicle, target, epoch - 1), _NEVER)
+        now_s, began_s = self._now_s(), found.began_s or self._begun_s
+        ms = None if now_s is None or began_s is None else 1e3 * (now_s - began_s)
         row = Transfer(
             episode, tick, vehicle, source, target, epoch, forced, removed, found.first,
-            self._waited.get(vehicle, 0), found.offers, found.state_bytes,
+            self._waited.get(vehicle, 0), found.offers, found.state_bytes, ms=ms,
         )  # fmt: skip
         self._add(row)

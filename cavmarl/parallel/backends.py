@@ -8,6 +8,7 @@ from typing import Protocol
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_BACKENDS
 from cavmarl.engine.world_setup import World
+from cavmarl.handoff.simulators.simulator_kinds import check_servers, hosted_zones
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_starters import system_of
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
@@ -81,10 +82,7 @@ def make_worlds(
     """
     count = backend.count
     if world.config.zones.simulators and backend.kind != LOCAL:
-        raise ConfigError(
-            f"zones.simulators: the backend '{backend.kind}' does not support zones of other "
-            "simulators; use backend='local'"
-        )
+        _check_simulators(world, num_worlds, backend)
     if backend.kind == LOCAL:
         return local_worlds(world, base_dir, num_worlds, in_next_step)
     if backend.kind == PROCESSES:
@@ -97,3 +95,24 @@ def make_worlds(
         return make(world, base_dir, num_worlds, backend, in_next_step, system=system)
     made: MakeWorlds = REGISTERED_BACKENDS[backend.kind]
     return made(world, base_dir, num_worlds, count, in_next_step)
+
+
+def _check_simulators(world: World, num_worlds: int, backend: BackendName) -> None:
+    """Check that the processes of a backend can run zones in other simulators.
+
+    Raises:
+        ConfigError: a setting does not work with such zones there, or their servers are too few.
+    """
+    config = world.config
+    check_servers(hosted_zones(config.zones.simulators, world.partition.count), num_worlds)
+    wrong = {
+        "zones.journal": backend.kind == PROCESSES and config.zones.journal,
+        "workers.balance_steps": config.workers.balance_steps and num_worlds > 1,
+        "workers.sensors": config.workers.sensors,
+    }
+    for key, is_set in wrong.items():
+        if is_set:
+            raise ConfigError(
+                f"{key}: worlds of the backend '{backend.kind}' with zones.simulators do not "
+                "support this; leave it out, or use backend='local'"
+            )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import json
 import re
 from collections.abc import Mapping, Sequence
@@ -349,8 +350,6 @@ def test_rows_follow_a_simulator_that_is_not_exact() -> None:
     [
         ({"zone_simulators": {4: "NAME"}}, "there is no such zone; zones are numbered from 0 to 3"),
         ({"zone_simulators": {1: "unknown"}}, "zone_simulator 'unknown': not registered"),
-        ({"nodes": 2}, "the backend 'nodes' does not support zones of other simulators"),
-        ({"workers": 2}, "the backend 'processes' does not support"),
         ({"overrides": {"population.external": 2}}, "population.external: worlds with"),
         ({"overrides": {"zones.repartition_steps": 5}}, "set zones.repartition_steps to 0"),
         ({"zone_simulators": {1: "carla://nowhere"}}, "is not an address; use carla://HOST:PORT"),
@@ -376,12 +375,12 @@ def test_unsupported_features_are_refused_by_name(keys: dict[str, Any], message:
             cavmarl.make_vec(ENV, zones=4, zone_simulators=named, **SEEN, **keys)
 
 
-def test_the_state_of_hosted_worlds_cannot_be_saved() -> None:
+def test_hosted_worlds_cannot_be_copied() -> None:
     with registered(OwnKinematics) as name:
         vec = hosted(name)
         vec.reset()
         with pytest.raises(ConfigError, match=r"zones\.simulators: worlds with processes"):
-            vec.save_state()
+            copy.deepcopy(vec)
         vec.close()
 
 

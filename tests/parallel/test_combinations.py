@@ -17,6 +17,7 @@ from cavmarl.balance.load_snapshot import LoadSnapshot, idle_snapshot
 from cavmarl.core.errors import ConfigError
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange
 from tests.support.actuated import actuated_grid
+from tests.support.exact_zone import EXACT
 from tests.support.generated import check_block, table
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
@@ -82,6 +83,7 @@ FEATURES: dict[str, Callable[[Path], Keywords]] = {
     "a journal": lambda folder: _with(zones__journal=str(folder / "run.jsonl"))(folder),
     "invariant checks": _with(zones__check_invariants=True),
     "repartitions": _with(zones__repartition_steps=3),
+    "zones of other simulators": _with(zones__simulators={0: EXACT}),
 }
 PLACES: dict[str, Keywords] = {
     "zones": {"zones": 3},
@@ -95,7 +97,7 @@ PLACES: dict[str, Keywords] = {
 # Settings that are left out in the undivided world of a comparison.
 ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
-    "workers.balance_steps", "workers.monitor_cpu",
+    "workers.balance_steps", "workers.monitor_cpu", "zones.simulators",
 )  # fmt: skip
 OF_THE_CALLER = "the network simulator is in the process of the caller"
 BY_COSTS = "whole worlds on nodes are balanced by their costs only"

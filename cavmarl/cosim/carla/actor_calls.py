@@ -68,7 +68,7 @@ def get_actors_by_id(caller: Caller, session: CarlaSession, ids: list[int]) -> l
     "spawn_actor",
     description,
     pose,
-    note="vehicles, walkers and sensors; they enter in the next tick, sensors at once",
+    note="vehicles, walkers, props and sensors; they enter in the next tick, sensors at once",
 )
 def spawn_actor(
     caller: Caller, session: CarlaSession, what: tuple[Any, ...], there: CarlaPose

@@ -229,7 +229,7 @@ class SemanticLidarSensor:
         points = np.zeros(int(kept.sum()), SEMANTIC_POINT)
         points["place"] = scan.ways[kept] * scan.distance[kept][:, None]
         points["cosine"] = scan.cosines[kept]
-        points["tag"] = scan.tags[kept]
+        points["tag"] = context.tagged(scan.tags[kept], scan.ids[kept])
         points["actor"] = context.numbers_of(scan.ids[kept])
         return _lidar_head(scan.angle, kept.sum(axis=1)) + points.tobytes()
 
@@ -346,6 +346,17 @@ class SemanticCameraSensor(_CameraSensor):
     ) -> None:
         pixels[..., :2] = 0
         pixels[..., 2] = TAGS[picture]
+        if context.session.actors.props.size:
+            shown, ids = self.bodies(context)
+            pixels[shown, 2] = context.tagged(pixels[shown, 2], ids)
+
+    def bodies(self, context: SensorContext) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Return which pixels (H, W) show vehicles or walkers, and the ids (n,) of their rows."""
+        surroundings = context.surroundings
+        prisms = surroundings.panorama.prisms
+        body = (self._lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM
+        shown = (body >= 0) & (body < len(prisms))
+        return shown, prisms["id"][body[shown]]
 
 
 class InstanceCameraSensor(SemanticCameraSensor):
@@ -357,10 +368,7 @@ class InstanceCameraSensor(SemanticCameraSensor):
         self, context: SensorContext, picture: NDArray[Any], pixels: NDArray[np.uint8]
     ) -> None:
         super().fill(context, picture, pixels)
-        surroundings = context.surroundings
-        prisms = surroundings.panorama.prisms
-        body = (self._lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM
-        shown = (body >= 0) & (body < len(prisms))
-        numbers = context.numbers_of(prisms["id"][body[shown]])
+        shown, ids = self.bodies(context)
+        numbers = context.numbers_of(ids)
         pixels[shown, 1] = numbers & 255
         pixels[shown, 0] = numbers >> 8 & 255

@@ -234,6 +234,14 @@ class SensorSuite:
         if mounted is not None:
             self._streams.end(mounted.stream)
 
+    def await_listeners(self) -> None:
+        """Wait again for clients that listen soon, after a restart of the world, which takes long.
+
+        See `are_listeners_due`.
+        """
+        for mounted in self._mounted.values():
+            mounted.added_wall_s = time.monotonic()
+
     def are_listeners_due(self) -> bool:
         """Return whether a client may be about to listen to a sensor that it has just spawned."""
         now_s = time.monotonic()

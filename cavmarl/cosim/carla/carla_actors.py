@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
-from cavmarl.cosim.carla.carla_blueprints import BLUEPRINT_OF_CLASS, BLUEPRINTS, Blueprint
+from cavmarl.cosim.carla.carla_blueprints import (
+    BLUEPRINT_OF_CLASS,
+    BLUEPRINTS,
+    PROP,
+    WALKER,
+    Blueprint,
+)
 from cavmarl.cosim.carla.carla_geometry import ZERO, CarlaPose, Vector, axes_of, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import (
@@ -22,7 +28,7 @@ from cavmarl.cosim.carla.carla_snapshots import (
     WALKER_STATE,
     place_state,
 )
-from cavmarl.cosim.carla.external_vehicles import WALKER, ExternalBody
+from cavmarl.cosim.carla.external_vehicles import ExternalBody
 from cavmarl.cosim.carla.hosted_world import HostedWorld
 from cavmarl.cosim.carla.vehicle_controls import (
     BRAKE_MPS2,
@@ -46,6 +52,7 @@ from cavmarl.sensors.kernels.panorama import (
 SPECTATOR_POSE = CarlaPose(0.0, 0.0, 50.0, -90.0, 0.0, 0.0)
 AT_LIGHT_M = 14.0  # a vehicle whose centre is this close to its stop line is at the light
 LIGHT_TAG = 7
+PROP_TAG = 21  # CARLA's "dynamic": objects that may change their place
 TAG_OF_CLASS = {
     CAR: 14,
     TRUCK: 15,
@@ -57,7 +64,7 @@ TAG_OF_CLASS = {
 }
 TAG_OF_BASE = {
     "car": 14, "van": 14, "truck": 15, "bus": 16, "motorcycle": 18, "bicycle": 19,
-    WALKER: 12,
+    WALKER: 12, PROP: PROP_TAG,
 }  # fmt: skip
 _CLASS_NAMES = {**dict(enumerate(VEHICLE_CLASSES)), CLASS_PEDESTRIAN: "pedestrian"}
 
@@ -101,6 +108,10 @@ class CarlaActor:
         return self.type_id.startswith("walker.")
 
     @property
+    def is_prop(self) -> bool:
+        return self.type_id.startswith("static.")
+
+    @property
     def is_attached(self) -> bool:
         """Whether this is a sensor or a controller."""
         return self.type_id.startswith(("sensor.", "controller."))
@@ -126,7 +137,7 @@ class ActorTable:
         self._ids = np.zeros(0, np.int64)
         self._listed: list[CarlaActor] = []
         self._row_of: dict[int, int] = {}
-        self._is_walker = np.zeros(0, np.bool_)
+        self._is_walker = self._is_prop = np.zeros(0, np.bool_)
         self._other_states = np.zeros(0, ACTOR_STATE)
         self.vehicle_states = np.zeros(0, VEHICLE_STATE)
         self.take(world)
@@ -140,6 +151,11 @@ class ActorTable:
     def vehicles(self) -> list[CarlaActor]:
         """Vehicles and walkers, in the order of `vehicle_states`."""
         return self._listed
+
+    @property
+    def props(self) -> NDArray[np.int64]:
+        """The ids (n,) of the rows of props."""
+        return self._ids[self._is_prop]
 
     @property
     def lights(self) -> NDArray[np.void]:
@@ -206,9 +222,9 @@ class ActorTable:
         slot: int,
         size_m: tuple[float, float, float],
     ) -> CarlaActor:
-        """Add a vehicle or walker that enters in the next tick."""
+        """Add a vehicle, walker or prop that enters in the next tick."""
         length, width, height = size_m
-        base_type = blueprint.default("base_type") or WALKER
+        base_type = blueprint.base_type
         return self.add(
             blueprint.type_id,
             pose,
@@ -232,7 +248,7 @@ class ActorTable:
                 pose, speed = before.pose_of(actor), 0.0
                 if state is not None:
                     speed = float(state["velocity"] @ axes_of(pose)[:, 0])
-                base_type = BLUEPRINTS[actor.type_id].default("base_type")
+                base_type = BLUEPRINTS[actor.type_id].base_type
                 length, width, height = (2.0 * half for half in actor.half_m)
                 body = ExternalBody(actor.type_id, base_type, pose, (length, width, height), speed)
                 try:
@@ -334,6 +350,7 @@ class ActorTable:
         self._ids = rows["id"].copy()
         self._row_of = {actor.number: k for k, actor in enumerate(self._listed)}
         self._is_walker = np.array([actor.is_walker for actor in self._listed], np.bool_)
+        self._is_prop = np.array([actor.is_prop for actor in self._listed], np.bool_)
         self.vehicle_states = np.zeros(len(rows), VEHICLE_STATE)
         self.vehicle_states["state"] = ACTIVE
         self.vehicle_states["id"] = list(self._row_of)
@@ -387,6 +404,8 @@ class ActorTable:
             self._write_control(states[k], world.controls.get(int(rows["agent"][k])))
         for k in np.flatnonzero(rows["driver"] == DRIVER_EXTERNAL).tolist():
             self._write_control(states[k], world.external.controls.get(int(rows["order"][k])))
+        raw = states.view(np.uint8).reshape(len(states), -1)
+        raw[self._is_walker | self._is_prop, _FIRST_OWN_BYTE:] = 0
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:
@@ -415,10 +434,9 @@ class ActorTable:
         if not self._is_walker.any():
             return
         walkers = self.vehicle_states.view(WALKER_STATE)
-        raw = self.vehicle_states.view(np.uint8).reshape(len(ahead), -1)
-        raw[self._is_walker, 65:] = 0
         walkers["direction"][self._is_walker] = ahead[self._is_walker]
         walkers["speed"][self._is_walker] = speed[self._is_walker]
 
 
 _LIGHT = bytes([LIGHT_TAG])
+_FIRST_OWN_BYTE = 65  # of a record: what follows depends on the type of the actor

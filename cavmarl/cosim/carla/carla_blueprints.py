@@ -6,10 +6,13 @@ these has at least one.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from cavmarl.sensors.kernels.panorama import BICYCLE, BUS, CAR, MOTORCYCLE, PEDESTRIAN, TRAM, TRUCK
+
+WALKER, PROP = "pedestrian", "prop"  # values of `Blueprint.base_type` beside CARLA's
 
 Kind = Literal["bool", "int", "float", "string", "colour"]
 
@@ -53,6 +56,12 @@ class Blueprint:
             for one in self.attributes
         ]
         return [number, self.type_id, ",".join(reversed(self.type_id.split("."))), attributes]
+
+    @property
+    def base_type(self) -> str:
+        """CARLA's base type of a vehicle (car, van, truck, bus, …), WALKER or PROP."""
+        kinds = {"walker": WALKER, "static": PROP}
+        return kinds.get(self.type_id.partition(".")[0]) or self.default("base_type")
 
     def default(self, name: str) -> str:
         """Return the default value of an attribute, or an empty text."""
@@ -117,6 +126,18 @@ def _walker(number: int, age: str, gender: str) -> Blueprint:
             _fixed("generation", "int", "2"),
         ),
         (0.38, 0.38, 1.86),
+    )
+
+
+def _prop(name: str, *size_m: float) -> Blueprint:
+    length, width, height = size_m
+    largest_m = max(size_m)
+    sizes = ((0.4, "tiny"), (1.0, "small"), (2.5, "medium"), (math.inf, "big"))
+    size = next(text for limit_m, text in sizes if largest_m <= limit_m)
+    return Blueprint(
+        f"static.prop.{name}",
+        (BlueprintAttribute("role_name", "string", "prop"), _fixed("size", "string", size)),
+        (length, width, height),
     )
 
 
@@ -211,6 +232,55 @@ _IMU = _floats(
     }
 )
 
+# Length, width and height in m; typical sizes of such objects.
+_PROPS = {
+    "atm": (0.9, 0.7, 2.0),
+    "barrel": (0.6, 0.6, 0.9),
+    "bench01": (0.6, 1.8, 0.9),
+    "bench02": (0.6, 1.6, 0.9),
+    "bin": (0.6, 0.6, 1.1),
+    "box01": (0.6, 0.6, 0.5),
+    "box02": (0.5, 0.5, 0.4),
+    "box03": (0.4, 0.4, 0.3),
+    "busstop": (1.8, 4.0, 2.6),
+    "chainbarrier": (0.2, 1.5, 1.0),
+    "clothcontainer": (1.2, 1.2, 1.9),
+    "constructioncone": (0.35, 0.35, 0.6),
+    "container": (1.4, 2.2, 1.6),
+    "creasedbox01": (0.5, 0.5, 0.3),
+    "creasedbox02": (0.5, 0.5, 0.3),
+    "creasedbox03": (0.5, 0.5, 0.3),
+    "dirtdebris01": (1.5, 1.5, 0.1),
+    "dirtdebris02": (1.5, 1.5, 0.1),
+    "dirtdebris03": (1.5, 1.5, 0.1),
+    "foodcart": (1.5, 2.5, 2.2),
+    "garbage01": (0.4, 0.4, 0.2),
+    "garbage02": (0.4, 0.4, 0.2),
+    "garbage03": (0.4, 0.4, 0.2),
+    "glasscontainer": (1.2, 1.2, 1.8),
+    "haybale": (1.2, 0.8, 0.8),
+    "kiosk_01": (2.5, 2.5, 2.8),
+    "mailbox": (0.6, 0.6, 1.3),
+    "plantpot01": (0.9, 0.9, 0.9),
+    "plasticbag": (0.5, 0.5, 0.4),
+    "plasticchair": (0.6, 0.6, 0.9),
+    "plastictable": (1.0, 1.0, 0.8),
+    "shoppingcart": (1.0, 0.6, 1.0),
+    "streetbarrier": (0.4, 1.2, 1.1),
+    "streetsign": (0.2, 0.8, 2.2),
+    "table": (1.6, 0.9, 0.8),
+    "trafficcone01": (0.4, 0.4, 0.9),
+    "trafficcone02": (0.4, 0.4, 0.9),
+    "trafficwarning": (1.3, 2.0, 2.6),
+    "trashbag": (0.6, 0.6, 0.5),
+    "trashcan01": (0.7, 0.7, 1.1),
+    "trashcan02": (0.7, 0.7, 1.1),
+    "travelcase": (0.5, 0.3, 0.7),
+    "vendingmachine": (0.9, 1.1, 2.0),
+    "warningaccident": (0.4, 0.8, 0.9),
+    "warningconstruction": (0.4, 0.8, 0.9),
+    "wateringcan": (0.4, 0.2, 0.3),
+}
 _CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
 # Programs look these up, but a server refuses to spawn them.
 _OTHER_CAMERAS = (
@@ -273,6 +343,7 @@ BLUEPRINTS = {
             )
             for number in range(1, 53)
         ),
+        *(_prop(name, *size_m) for name, size_m in _PROPS.items()),
         Blueprint("controller.ai.walker", (BlueprintAttribute("role_name", "string", "default"),)),
         _sensor("camera.rgb", *_RGB),
         _sensor("camera.depth", *_CAMERA),

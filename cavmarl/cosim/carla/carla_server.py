@@ -46,7 +46,7 @@ CALL_MODULES = (
     light_calls,
 )  # they fill the table of calls
 _LATE_S = 0.5  # a free-running world that is later than this does not catch up
-_PATIENCE_S = 0.01  # how long a tick waits for listeners of new sensors
+_PATIENCE_S = 0.05  # how long a tick waits for listeners of new sensors
 _LOOK_S = 0.0005
 _MAX_PORT = 65534  # the streams have the next port
 

@@ -13,13 +13,13 @@ from cavmarl.cosim.carla.attached_sensors import SensorSuite
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.call_table import Caller
 from cavmarl.cosim.carla.carla_actors import ActorTable, CarlaActor
-from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, UNAVAILABLE, Blueprint
+from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS, PROP, UNAVAILABLE, Blueprint
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, compose
 from cavmarl.cosim.carla.carla_map import CarlaMap
 from cavmarl.cosim.carla.carla_snapshots import frame_head, snapshot_body
 from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM, StreamHub
 from cavmarl.cosim.carla.carla_versions import ClientVersion
-from cavmarl.cosim.carla.external_vehicles import WALKER, ExternalBody
+from cavmarl.cosim.carla.external_vehicles import ExternalBody
 from cavmarl.cosim.carla.hosted_world import (
     STEP_S,
     EndedVehicle,
@@ -232,6 +232,7 @@ class CarlaSession:
         for actor in self.actors.keep_spawned(self.world, before):
             log.warning("actor %d (%s) could not be kept", actor.number, actor.type_id)
             self._forget(actor)
+        self.sensors.await_listeners()
         for number, control in driven.items():
             if number in self.actors.actors:
                 self.world.external.control(self.actors.actors[number].slot, control)
@@ -273,10 +274,9 @@ class CarlaSession:
         if type_id.startswith(("sensor.", "controller.")):
             return self._attach(blueprint, attributes, pose, parent)
         there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
-        if not type_id.startswith(("vehicle.", "walker.")):
-            raise CallRefused(f"{type_id}: only vehicles, walkers and sensors can be spawned")
-        base_type = blueprint.default("base_type") or WALKER
-        body = ExternalBody(type_id, base_type, there, blueprint.size_m)
+        if parent and blueprint.base_type == PROP:
+            raise CallRefused(f"{type_id}: props cannot be attached; spawn it at a place")
+        body = ExternalBody(type_id, blueprint.base_type, there, blueprint.size_m)
         slot, size_m = self.world.external.spawn(body)
         return self.actors.add_spawned(blueprint, attributes, there, slot, size_m)
 

@@ -1,4 +1,4 @@
-"""`ExternalVehicles`: the vehicles and walkers that clients spawn into a world.
+"""`ExternalVehicles`: the vehicles, walkers and static props that clients spawn into a world.
 
 They are external vehicles of the environment, so drivers, sensors and contacts see them, and they
 are part of the world's state. They enter in the next step.
@@ -16,6 +16,7 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ActionError, CavmarlError
 from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
+from cavmarl.cosim.carla.carla_blueprints import WALKER
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, Vector
 from cavmarl.cosim.carla.vehicle_controls import (
     WHEELBASE_SHARE,
@@ -31,7 +32,6 @@ from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.env.parallel import CavEnv
 
 MASS_KG = 1845.0  # that clients read in the physics of each vehicle
-WALKER = "pedestrian"
 _OCCUPIED = "Spawn failed because of collision at spawn position"  # CARLA's text
 _VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all others are cars
 _FASTEST_MPS = MAX_SPEED_MPS - 0.5  # a pose that is farther in a step is a jump
@@ -39,10 +39,10 @@ _FASTEST_BACKWARD_MPS = 10.0
 
 
 class ExternalBody(NamedTuple):
-    """A vehicle or walker to spawn."""
+    """A vehicle, walker or static prop to spawn."""
 
     type_id: str  # of its blueprint
-    base_type: str  # CARLA's attribute: car, van, truck, bus, motorcycle, bicycle; or WALKER
+    base_type: str  # see `Blueprint.base_type`; a prop is a vehicle that stands
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height
     speed_mps: float = 0.0

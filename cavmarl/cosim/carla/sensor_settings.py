@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.cosim.carla.call_arguments import CallRefused
-from cavmarl.cosim.carla.carla_actors import CarlaActor
+from cavmarl.cosim.carla.carla_actors import PROP_TAG, CarlaActor
 from cavmarl.cosim.carla.sensed_surroundings import Surroundings
 
 if TYPE_CHECKING:
@@ -82,6 +82,13 @@ class SensorContext:
         numbers = [0 if actor is None else actor.number for actor in actors]
         found: NDArray[np.uint32] = np.array(numbers, np.uint32)[places]
         return found
+
+    def tagged(self, tags: NDArray[np.uint8], vehicles: NDArray[np.int64]) -> NDArray[np.uint8]:
+        """Return tags (n,) of vehicles' ids, of which some are props."""
+        props = self.session.actors.props
+        if not props.size:
+            return tags
+        return np.where(np.isin(vehicles, props), np.uint8(PROP_TAG), tags)
 
     def velocities_of(self, vehicles: NDArray[np.int64]) -> NDArray[np.float64]:
         """Return velocities (n, 3) of vehicles' ids; zero for ids without an actor."""

@@ -92,8 +92,8 @@ class Coordinator(ABC):
         """Begin an episode without vehicles."""
 
     @abstractmethod
-    def save(self) -> SavedOwnership:
-        """Return the state between two ticks, except zones and their rows."""
+    def save(self) -> SavedOwnership | None:
+        """Return the state between two ticks, except zones and their rows; None: it is not kept."""
 
     @abstractmethod
     def go_on(

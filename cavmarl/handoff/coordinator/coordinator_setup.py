@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import time
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
@@ -83,7 +84,9 @@ def make_coordinators(
         JournalError: a journal cannot be created.
     """
     limits = limits_of(settings, division.codec.schema)
-    transfers = tuple(TransferLog(limits.lifetime) for _ in range(division.num_worlds))
+    # Without simulators, the kernels of changes of owner measure the time.
+    clock = None if gate is None else time.perf_counter
+    transfers = tuple(TransferLog(limits.lifetime, clock) for _ in range(division.num_worlds))
     coordinators = [
         _coordinator(
             settings, w, division, limits, transfers[w], None if runs is None else runs[w], gate

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import DepartureQueue
 from cavmarl.handoff.coordinator.coordinator import Coordinator
 from cavmarl.handoff.coordinator.invariant_monitor import Departed, InvariantMonitor
+from cavmarl.handoff.coordinator.message_coordinator import MessageCoordinator
 from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
@@ -27,10 +28,12 @@ class OwnershipRuntime:
     Attributes:
         coordinators: one per world, if they are in this process.
         needs_ghosts: whether each tick must find ghosts and vehicles near borders.
+        resumes: whether `go_on` can resume from what `save` has returned.
     """
 
     coordinators: tuple[Coordinator, ...] = ()
     needs_ghosts = False
+    resumes = False
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,)."""
@@ -72,6 +75,7 @@ class WorldCoordinators(OwnershipRuntime):
         monitor: InvariantMonitor | None = None,  # checks every committed tick; None: no checks
     ) -> None:
         self.coordinators = tuple(coordinators)
+        self.resumes = not any(isinstance(one, MessageCoordinator) for one in coordinators)
         self._division = division
         self._digests = digests
         self._monitor = monitor
@@ -89,10 +93,10 @@ class WorldCoordinators(OwnershipRuntime):
                 if self._monitor is not None:
                     self._monitor.begin(w, coordinator.notes()[0])
 
-    def save(self, w: int) -> SavedOwnership:
+    def save(self, w: int) -> SavedOwnership | None:
         """Return the state that the next changes of owner depend on, except the zones."""
         saved = self.coordinators[w].save()
-        if not self._rows_changed[w]:
+        if saved is None or not self._rows_changed[w]:
             return saved
         # Rows have changed since vehicles near borders were recorded, so they are searched again.
         numbers = saved.numbers._replace(is_stirred=1, crossed=0)

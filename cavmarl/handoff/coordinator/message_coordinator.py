@@ -12,7 +12,10 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol
 
-from cavmarl.core.errors import ConfigError, ProtocolError, ZoneSimulatorError
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.core.errors import ProtocolError
 from cavmarl.handoff.coordinator.coordinator import Coordinator, Near
 from cavmarl.handoff.coordinator.journal import Journal
 from cavmarl.handoff.division import ZonedShards
@@ -53,15 +56,17 @@ class ZoneGate(Protocol):
         """Raise ZoneSimulatorError if a simulator of the world has ended."""
         ...
 
-    def refusals(self, w: int, zone: int, vehicles: Sequence[int]) -> Mapping[int, str]:
+    def refusals(
+        self,
+        w: int,
+        zone: int,
+        vehicles: NDArray[np.void],  # VEHICLE (n,)
+        is_last: bool = False,  # whether a refusal is a failure of the simulator
+    ) -> Mapping[int, str]:
         """Ask the simulator of a zone whether vehicles may enter; return the reasons against it.
 
-        Raises ZoneSimulatorError if the simulator cannot answer.
+        Raises ZoneSimulatorError if the simulator fails, unless cavmarl takes the zone back.
         """
-        ...
-
-    def fail(self, w: int, zone: int, error: ZoneSimulatorError) -> None:
-        """End the simulator of a zone. Raise the error unless cavmarl takes the zone back."""
         ...
 
 
@@ -123,11 +128,12 @@ class MessageCoordinator(Coordinator):
         """Return the worker of a zone in the records: 0 is cavmarl, 1 + zone its simulator."""
         return 1 + zone if zone in self._gate.zones and zone not in self._returned else 0
 
-    def save(self) -> SavedOwnership:
-        raise _not_saved()
+    def save(self) -> None:
+        """Return None: a saved state has no offers, so ownership begins anew with it."""
 
     def go_on(self, saved: SavedOwnership, rows: Mapping[int, tuple[int, int]]) -> list[Departed]:
-        raise _not_saved()
+        """Raise ProtocolError: `OwnershipRuntime.resumes` is false."""
+        raise ProtocolError("ownership with simulators of zones begins anew with a loaded state")
 
     def begin(self, check_all: bool, inputs: bytes = b"") -> None:
         """Offer the vehicles outside of their owner's zone, and decide; see `Coordinator.begin`.
@@ -141,7 +147,7 @@ class MessageCoordinator(Coordinator):
         movers = self._movers(check_all, births)
         self._offer(movers)
         for zone, vehicles in self._overdue(movers).items():
-            self._insist(zone, vehicles)
+            self._gate.refusals(self._world, zone, self._rows(vehicles), is_last=True)
         pairs = [(near.vehicle, near.target) for near in movers]
         output = self._directory.begin(pairs, births, inputs)
         self._is_open = True
@@ -187,18 +193,11 @@ class MessageCoordinator(Coordinator):
                 found.setdefault(near.target, []).append(near.vehicle)
         return found
 
-    def _insist(self, zone: int, vehicles: Sequence[int]) -> None:
-        """Ask a simulator for the last time to accept vehicles."""
-        refused = self._gate.refusals(self._world, zone, vehicles)
-        if not refused:
-            return
-        vehicle, reason = next(iter(refused.items()))
-        message = (
-            f"zone {zone}: its simulator has refused vehicle {vehicle} for "
-            f"{self._limits.deferral} ticks ({reason}); free the place there, or increase "
-            "zones.max_deferred_ticks"
-        )
-        self._gate.fail(self._world, zone, ZoneSimulatorError(message, zone))
+    def _rows(self, vehicles: Sequence[int]) -> NDArray[np.void]:
+        """Return the committed rows VEHICLE (n,) of vehicles."""
+        division, w = self._division, self._world
+        found = [division.changes.find(w, vehicle) for vehicle in vehicles]
+        return np.array([division.owned(w, zone)[row] for zone, row in found])
 
     def _hand_over(self, switches: Sequence[Switch], row_of: Mapping[int, int]) -> None:
         for switch in switches:
@@ -262,18 +261,20 @@ class MessageCoordinator(Coordinator):
     def _prepare(self, zone: int, message: Prepare) -> None:
         """Deliver a PREPARE; the simulator of the zone, if any, may refuse vehicles."""
         vehicles = [offer.vehicle for offer in message.entries]
-        refused = self._gate.refusals(self._world, zone, vehicles)
-        endpoint = self._endpoints[zone]
-        taken = tuple(offer for offer in message.entries if offer.vehicle not in refused)
-        if taken:
-            self._deliver(endpoint.on_message(replace(message, entries=taken)).messages)
-        left = tuple(offer for offer in message.entries if offer.vehicle in refused)
-        if left:
-            answer = endpoint.refuse(replace(message, entries=left), Refusal.SIMULATOR)
-            self._deliver(answer.messages)
+        refused = self._gate.refusals(self._world, zone, self._rows(vehicles))
+        self._deliver(answers_to(message, refused, self._endpoints[zone]))
 
 
-def _not_saved() -> ConfigError:
-    return ConfigError(
-        "zones.simulators: worlds with processes of their own cannot be saved; reset them instead"
-    )
+def answers_to(
+    message: Prepare, refused: Mapping[int, str], endpoint: Endpoint
+) -> tuple[Message, ...]:
+    """Deliver a PREPARE to a zone whose simulator refuses some vehicles; return the answers."""
+    taken = tuple(offer for offer in message.entries if offer.vehicle not in refused)
+    left = tuple(offer for offer in message.entries if offer.vehicle in refused)
+    answers: tuple[Message, ...] = ()
+    if taken:
+        answers = endpoint.on_message(replace(message, entries=taken)).messages
+    if left:
+        refusal = endpoint.refuse(replace(message, entries=left), Refusal.SIMULATOR)
+        answers = (*answers, *refusal.messages)
+    return answers

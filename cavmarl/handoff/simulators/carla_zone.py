@@ -19,8 +19,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.rig import CameraConfig
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
-from cavmarl.handoff.simulators import carla_zone_client
+from cavmarl.handoff.simulators import carla_frames, carla_zone_client
 from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup, number_option
 
 PYTHON = "CAVMARL_CARLA_PYTHON"  # environment variable: the Python that has CARLA's client
@@ -33,9 +34,9 @@ GRACE_S = 5.0  # the client reports its own timeout before the process counts as
 _END_S = 5.0  # time for the process to end by itself
 _LAST_WORDS = 500
 _CHECKED_LANES = 20
-_FIELDS = ("id", "x", "y", "z", "heading", "speed", "length", "width")
+_FIELDS = ("id", "x", "y", "z", "heading", "speed", "length", "width", "agent")
 _PLACE = re.compile(r"(?P<host>[A-Za-z0-9.-]+|\[[0-9A-Fa-f:]+\]):(?P<port>[0-9]{1,5})")
-_OPTIONS = {"ghosts_m", "timeout_s", "tolerance_m"}
+_OPTIONS = {"frames", "ghosts_m", "timeout_s", "tolerance_m"}
 
 
 def check(place: str, options: Mapping[str, str]) -> None:
@@ -52,6 +53,7 @@ def check(place: str, options: Mapping[str, str]) -> None:
         )
     number_option(options, "timeout_s", TIMEOUT_S, MOST_TIMEOUT_S)
     number_option(options, "ghosts_m", GHOSTS_M, MOST_GHOSTS_M)
+    carla_frames.check_option(options)
 
 
 class CarlaZone:
@@ -59,6 +61,7 @@ class CarlaZone:
 
     Attributes:
         pid: id of the client's process.
+        frame_types: types of sensors whose samples CARLA takes.
     """
 
     def __init__(self, setup: ZoneSetup) -> None:
@@ -68,6 +71,8 @@ class CarlaZone:
         self._signals = setup.network.signal_ids
         self._timeout_s = number_option(setup.options, "timeout_s", TIMEOUT_S, MOST_TIMEOUT_S)
         self._ghosts_m = number_option(setup.options, "ghosts_m", GHOSTS_M, MOST_GHOSTS_M)
+        gives_frames = carla_frames.gives_frames(setup.options)
+        self.frame_types = frozenset(carla_frames.BLUEPRINTS if gives_frames else ())
         self._output = tempfile.TemporaryFile()
         python = os.environ.get(PYTHON) or sys.executable
         try:
@@ -91,6 +96,7 @@ class CarlaZone:
                 timeout_s=self._timeout_s,
                 dt=setup.dt_s,
                 places=self._places(),
+                cameras=carla_frames.cameras_of(setup.rig) if gives_frames else {},
             )
         except BaseException:
             self._end()
@@ -140,6 +146,12 @@ class CarlaZone:
         if rows:
             found = np.array([tuple(row) for row in rows], dtype=MOTION)
         return found
+
+    def sense(self, sensor: str, vehicles: Sequence[int]) -> Mapping[int, NDArray[Any]]:
+        config = self._setup.rig[sensor]
+        assert isinstance(config, CameraConfig)
+        found: dict[str, str] = self._call("sense", camera=sensor, vehicles=list(vehicles))
+        return {int(v): carla_frames.sample_of(config, picture) for v, picture in found.items()}
 
     def close(self) -> None:
         """Remove all actors, and end the client's process."""

@@ -9,6 +9,7 @@ CARLA's frame is left-handed: y and yaw have the opposite sign.
 
 from __future__ import annotations
 
+import base64
 import importlib
 import json
 import math
@@ -16,6 +17,8 @@ import os
 import re
 import signal
 import sys
+import threading
+import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -24,6 +27,9 @@ LARGE_M = 7.0  # longer vehicles are buses or trucks
 WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
 MOST_SLIP = 0.6  # largest sine of the slip angle
 PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
+FIRST_PICTURES = 20  # pictures of a new camera that may be missing
+FIRST_PICTURE_S = 0.2  # time to wait for each of them
+PREDECESSOR_S = 3.0  # longest wait for the end of the synchronous mode of another client
 SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
 STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
 
@@ -60,13 +66,57 @@ class Car:
         self.is_owned = False
         self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
         self.left = PLACED_TICKS  # ticks for which it is still placed
+        self.cameras: dict[str, Camera] = {}  # of an agent's vehicle, by their names
+
+    def unmount(self) -> None:
+        """Remove the cameras."""
+        for camera in self.cameras.values():
+            camera.close()
+        self.cameras.clear()
+
+
+class Camera:
+    """A camera on a vehicle, and its newest picture."""
+
+    def __init__(self, actor: Any) -> None:
+        self._actor = actor
+        self._come = threading.Condition()
+        self._picture: tuple[int, bytes] = (-1, b"")  # frame, pixels
+        self._asked = 0
+        actor.listen(self._take)
+
+    def _take(self, image: Any) -> None:
+        with self._come:
+            self._picture = image.frame, bytes(image.raw_data)
+            self._come.notify()
+
+    def picture(self, frame: int, timeout_s: float) -> bytes | None:
+        """Wait for the picture of a frame. Return None if none has come since the mounting."""
+        self._asked += 1
+        with self._come:
+            is_new = self._picture[0] < 0 and self._asked <= FIRST_PICTURES
+            if not self._come.wait_for(
+                lambda: self._picture[0] >= frame, FIRST_PICTURE_S if is_new else timeout_s
+            ):
+                if is_new and self._picture[0] < 0:
+                    return None
+                raise ValueError(
+                    f"CARLA has sent no picture of frame {frame} within {timeout_s:g} s; the "
+                    f"newest one is of frame {self._picture[0]}"
+                )
+            return self._picture[1]
+
+    def close(self) -> None:
+        self._actor.stop()
+        self._actor.destroy()
 
 
 class Zone:
     """The vehicles of a zone in CARLA's world.
 
     Args:
-        start: host, port, timeout in s, length of a tick in s, and places on lanes.
+        start: host, port, timeout in s, length of a tick in s, places on lanes, and cameras that
+            are mounted on agents' vehicles.
     """
 
     def __init__(self, start: dict[str, Any]) -> None:
@@ -77,11 +127,14 @@ class Zone:
         self._world = self._client.get_world()
         self._map = self._world.get_map()
         self._check_map(start["places"])
+        self._await_predecessor()
         self._before = self._world.get_settings()
         settings = self._world.get_settings()
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
         self._world.apply_settings(settings)
         self._cars: dict[int, Car] = {}
+        self._cameras: dict[str, dict[str, Any]] = start["cameras"]
+        self._frame = 0  # number of the last tick
         lights = {
             light.get_opendrive_id(): light
             for light in self._world.get_actors().filter("traffic.traffic_light")
@@ -92,6 +145,15 @@ class Zone:
         self._world.freeze_all_traffic_lights(True)  # their own programs do not run
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
+
+    def _await_predecessor(self) -> None:
+        """Wait while another client drives the server: the client of a process that has died.
+
+        That client removes its actors, and then ends the synchronous mode.
+        """
+        until_s = time.monotonic() + PREDECESSOR_S
+        while self._world.get_settings().synchronous_mode and time.monotonic() < until_s:
+            time.sleep(0.05)
 
     def _check_map(self, places: Sequence[Sequence[float]]) -> None:
         on_road = sum(
@@ -124,6 +186,29 @@ class Zone:
             car.is_owned, car.left = True, 0 if car.is_seen else PLACED_TICKS
             car.actor.set_simulate_physics(True)
             car.actor.set_target_velocity(self._velocity(CarState.of(row)))
+            if row[8] >= 0:
+                self._mount(car)
+
+    def _mount(self, car: Car) -> None:
+        """Mount all cameras on the vehicle of an agent."""
+        library, carla = self._world.get_blueprint_library(), self._carla
+        for name, camera in self._cameras.items():
+            blueprint = library.find(camera["blueprint"])
+            for attribute, value in camera["attributes"].items():
+                blueprint.set_attribute(attribute, value)
+            place = carla.Location(*camera["place"])
+            there = carla.Transform(place, carla.Rotation(*camera["turn"]))
+            actor = self._world.spawn_actor(blueprint, there, attach_to=car.actor)
+            car.cameras[name] = Camera(actor)
+
+    def sense(self, camera: str, vehicles: Sequence[int]) -> dict[int, str]:
+        """Return the pictures of the last tick in base64, of vehicles that have one."""
+        found = {}
+        for vehicle in vehicles:
+            picture = self._cars[vehicle].cameras[camera].picture(self._frame, self._timeout_s)
+            if picture is not None:
+                found[vehicle] = base64.b64encode(picture).decode()
+        return found
 
     def _place(self, vehicle: int, row: Row) -> str:
         """Add an actor without physics. Return the reason if CARLA refuses it, else ""."""
@@ -151,6 +236,7 @@ class Zone:
         for vehicle in vehicles:
             car = self._cars[vehicle]
             car.is_owned = False
+            car.unmount()
             car.actor.set_simulate_physics(False)
 
     def show(self, ghosts: Sequence[Row], signals: dict[str, str]) -> None:
@@ -189,7 +275,7 @@ class Zone:
                 commands.append(self._move(car, pose))
             car.pose = pose
         self._client.apply_batch_sync(commands, False)
-        self._world.tick(self._timeout_s)
+        self._frame = self._world.tick(self._timeout_s)
         after = self._world.get_snapshot()
         found = []
         for row in wanted:
@@ -254,6 +340,7 @@ class Zone:
     def close(self) -> None:
         """Remove all actors, and restore the settings of CARLA's world."""
         for car in self._cars.values():
+            car.unmount()
             car.actor.destroy()
         self._cars.clear()
         self._world.freeze_all_traffic_lights(False)
@@ -277,6 +364,7 @@ def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:
         "drop": zone.drop,
         "show": zone.show,
         "advance": zone.advance,
+        "sense": zone.sense,
         "close": zone.close,
     }
     return calls[kind](**content)

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, NamedTuple
 from urllib.parse import parse_qsl
 
+from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.extensions import REGISTERED_ZONE_SIMULATORS
-from cavmarl.handoff.simulators import carla_zone
+from cavmarl.handoff.simulators import carla_frames, carla_zone
 from cavmarl.handoff.simulators.zone_simulator import MakeSimulator, number_option
 
 CARLA = "carla"
@@ -37,6 +38,11 @@ class HostedZone(NamedTuple):
     place: str
     options: dict[str, str]
     tolerance_m: float
+
+    def check_rig(self, rig: Mapping[str, MountedConfig]) -> None:
+        """Raise ConfigError if the simulator cannot take the samples that its options demand."""
+        if self.is_single:
+            carla_frames.check_rig(self.zone, self.options, rig)
 
     @property
     def is_single(self) -> bool:
@@ -84,6 +90,14 @@ def hosted_zones(simulators: Mapping[int, str], num_zones: int) -> tuple[HostedZ
     if len(set(places)) < len(places):
         raise ConfigError("zones.simulators: each zone needs a CARLA server of its own")
     return tuple(found)
+
+
+def check_servers(hosted: Sequence[HostedZone], num_worlds: int) -> None:
+    """Raise ConfigError if a server that runs a zone of one world would run several."""
+    if num_worlds > 1 and any(one.is_single for one in hosted):
+        raise ConfigError(
+            f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"
+        )
 
 
 def _read(zone: int, text: str) -> HostedZone:

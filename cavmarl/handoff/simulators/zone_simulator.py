@@ -8,11 +8,12 @@ that each vehicle should reach, and reports the state that the vehicle has reach
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import NamedTuple, Protocol
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.rig import MountedConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.roads.network import RoadNetwork
 
@@ -41,6 +42,7 @@ class ZoneSetup(NamedTuple):
     wheelbases: NDArray[np.float64]  # m, by `VEHICLE["vtype"]`
     place: str  # the text after `NAME://` in `zones.simulators`, without options; may be empty
     options: Mapping[str, str]  # the options after `?`
+    rig: Mapping[str, MountedConfig]  # the sensors that are mounted on agents' vehicles, by name
 
 
 class ZoneSimulator(Protocol):
@@ -94,6 +96,30 @@ class ZoneSimulator(Protocol):
 
     def close(self) -> None:
         """End the simulator's part: remove all its vehicles, and end its processes."""
+        ...
+
+
+@runtime_checkable
+class FrameSource(Protocol):
+    """A `ZoneSimulator` that also takes the samples of some mounted sensors.
+
+    Attributes:
+        frame_types: types of sensors, such as `rgb_camera`, whose samples come from the simulator.
+    """
+
+    frame_types: frozenset[str]
+
+    def sense(self, sensor: str, vehicles: Sequence[int]) -> Mapping[int, NDArray[Any]]:
+        """Return the samples of the present tick.
+
+        Args:
+            sensor: name of the sensor in the rig.
+            vehicles: owned vehicles of agents, by id.
+
+        Returns:
+            Vehicle → sample, with the shape and the unit of the sensor's type. Vehicles of which
+            there is no sample yet are left out: cavmarl's own sample stands.
+        """
         ...
 
 

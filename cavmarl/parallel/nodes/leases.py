@@ -22,5 +22,9 @@ def leases_of(ticks: int, lease: int) -> int:
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """Return how many ticks longer than one a vehicle may stay with the zone that it has left."""
-    return lease_ticks(config) - 1
+    """Return how many ticks longer than one a vehicle may stay with the zone that it has left.
+
+    Other simulators may refuse it for some leases.
+    """
+    deferred = config.zones.max_deferred_ticks if config.zones.simulators else 0
+    return lease_ticks(config) * (1 + deferred) - 1

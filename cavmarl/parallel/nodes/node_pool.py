@@ -103,6 +103,7 @@ class NodePool:
         self.generation = 0
         self._next_state = 1
         self._lost: list[int] = []
+        self._failed: set[int] = set()  # nodes that have ended with an error of their own
         self._is_torn = False
         self._successions = 0  # losses of the only node in the present command
         self._max_retries = config.workers.max_retries
@@ -310,6 +311,9 @@ class NodePool:
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
         """Carry out a command, if any; recover and try again until no node is lost during it."""
+        while self._failed:
+            number = self._failed.pop()
+            self._lose(LinkLostError(number, MessageError("it has ended with an error")))
         while True:
             try:
                 if self._is_torn:
@@ -409,6 +413,7 @@ class NodePool:
                 failure = WorkerFailureError(number, part, name, text, trace)
                 found = original_error(failure)
                 found.__cause__ = None if found is failure else failure
+                self._failed.add(number)
                 return found
             case FrameKind.MISSED:
                 peer, fault = int.from_bytes(frame.data[:4], "little"), bytes(frame.data[4:])

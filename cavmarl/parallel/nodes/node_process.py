@@ -8,6 +8,7 @@ import socket
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any, NoReturn
 
 import numpy as np
@@ -180,10 +181,13 @@ class NodeProgram:
         carried += [] if mounted is None else mounted.arrays()
         settings, division = simulation.config.zones, simulation.division
         limits = limits_of(settings, division.codec.schema)
+        gate = simulation.zones.gate
+        if gate is not None:  # the coordinator awaits an answer about each vehicle in each lease
+            limits = replace(limits, backoff=0)
         self._endpoints = ZoneEndpoints(
             division, mine, nodes_of(zones), own_hostings, limits,
             self._links, carried, self._peers.checks, self._answered, generation=generation,
-            is_checked=settings.check_invariants, ticks=self._lease_ticks,
+            is_checked=settings.check_invariants, ticks=self._lease_ticks, gate=gate,
         )  # fmt: skip
         self._run_own()
 
@@ -196,7 +200,7 @@ class NodeProgram:
         self._clock = ShardClock(own, MEASURED_TICKS) if every else None
         plain = NodeExecutor(own, foreign)
         executor = plain if self._clock is None else TimedNodeExecutor(plain, self._clock)
-        simulation.zones.host_zones(self._peers, self._endpoints, executor)
+        simulation.zones.host_zones(self.zones, self._peers, self._endpoints, executor)
 
     def _receive(self, number: int, frame: NodeFrame) -> None:
         """Apply an urgent frame."""
@@ -505,6 +509,11 @@ class NodeProgram:
     def _answer(self, pieces: Sequence[Bytes]) -> None:
         self._links.send(COORDINATOR, FrameKind.RESULT, self._generation, pieces)
 
+    def close(self) -> None:
+        """End the simulators of zones, if any."""
+        if hasattr(self, "_worlds"):
+            self._worlds.close()
+
     @property
     def generation(self) -> int:
         """Number of changes of nodes."""
@@ -564,6 +573,7 @@ def run_node(
                 links.pump(None)
         return False
     finally:
+        node.close()
         links.close()
 
 

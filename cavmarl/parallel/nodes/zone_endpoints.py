@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import json
 import struct
+from collections import Counter
 from collections.abc import Iterable, Sequence
 from typing import Any, NamedTuple
 
@@ -19,7 +20,9 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import MessageError, ProtocolError
 from cavmarl.core.records.arrays import DepartureQueue
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime
+from cavmarl.handoff.coordinator.message_coordinator import ZoneGate, answers_to
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.handoff.kernels.invariant_checks import owned_sum
@@ -94,7 +97,11 @@ class ZoneEndpoints(OwnershipRuntime):
         generation: int = 0,  # number of changes of nodes
         is_checked: bool = False,  # the caller checks the vehicles that zones own
         ticks: int = 1,  # of a lease
+        gate: ZoneGate | None = None,  # the simulators of zones of this node; None: none
     ) -> None:
+        self._gate, self._limits = gate, limits
+        # world, vehicle → number of leases in a row in which a simulator has refused it
+        self._refused: Counter[tuple[int, int]] = Counter()
         self._ticks, self._left = ticks, 0
         self._generation, self._is_checked = generation, is_checked
         self._owned_sum = specialized(owned_sum)
@@ -349,6 +356,7 @@ class ZoneEndpoints(OwnershipRuntime):
         elif isinstance(message, Abort):
             for vehicle, _ in message.entries:
                 self._sources.pop((w, vehicle), None)
+                self._refused.pop((w, vehicle), None)
         dropped = endpoint.dropped.total()
         self._apply(w, message)
         if endpoint.dropped.total() > dropped and not isinstance(message, Abort):
@@ -362,11 +370,18 @@ class ZoneEndpoints(OwnershipRuntime):
             endpoint = self._endpoints[w].get(zone)
             if endpoint is None:
                 continue
+            if isinstance(message, Prepare) and self._is_hosted(zone):
+                self._ask(w, zone, message)
+                continue
             reaction = endpoint.on_message(message)
             if reaction.advance is not None:
                 self._leases[w][zone] = reaction.advance
             for answer in reaction.messages:
                 self._send(w, answer)
+
+    def _is_hosted(self, zone: int) -> bool:
+        """Return whether another simulator runs a zone."""
+        return self._gate is not None and zone in self._gate.zones
 
     def _send(self, w: int, message: Message) -> None:
         """Send a message to its zones, in this process or others, and to the coordinator."""
@@ -374,11 +389,38 @@ class ZoneEndpoints(OwnershipRuntime):
             self._answered += [(w, entry.vehicle, message.zone) for entry in message.entries]
         for destination in message.destinations():
             if destination in self._zones:
-                for answer in self._endpoints[w][destination].on_message(message).messages:
-                    self._send(w, answer)
+                self._apply_own(w, destination, message)
             else:
                 to = COORDINATOR if destination == COORDINATOR else self._node_of[destination]
                 self._links.send(to, FrameKind.MESSAGES, self._generation, [packed([(w, message)])])
+
+    def _ask(self, w: int, zone: int, message: Prepare) -> None:
+        """Deliver a PREPARE to a zone whose simulator may refuse vehicles."""
+        assert self._gate is not None
+        codec = self._division.codec
+        records = [codec.record(offer.state, offer.vehicle) for offer in message.entries]
+        rows = np.frombuffer(b"".join(records), dtype=VEHICLE)
+        most = self._limits.deferral
+        is_last = np.array([self._refused[w, v] >= most for v in rows["id"].tolist()])
+        refused: dict[int, str] = {}
+        for some, is_over in ((rows[~is_last], False), (rows[is_last], True)):
+            if len(some):
+                refused |= self._gate.refusals(w, zone, some, is_over)
+        for vehicle in rows["id"].tolist():
+            if vehicle in refused:
+                self._refused[w, vehicle] += 1
+            else:
+                self._refused.pop((w, vehicle), None)
+        for answer in answers_to(message, refused, self._endpoints[w][zone]):
+            self._send(w, answer)
+
+    def _apply_own(self, w: int, zone: int, message: Message) -> None:
+        if isinstance(message, Prepare) and self._is_hosted(zone):
+            self._ask(w, zone, message)
+            return
+        reaction = self._endpoints[w][zone].on_message(message)
+        for answer in reaction.messages:
+            self._send(w, answer)
 
     def _change_owners(self, w: int, leases: dict[int, Advance]) -> None:
         division = self._division

@@ -21,8 +21,10 @@ class Watchdog:
         self,
         pid: int,
         timeout_s: float,  # limit on the work; times without calls of `verdict` do not count
+        may_sleep: bool = False,  # whether it may wait for programs that are not its descendants
     ) -> None:
         self._pid = pid
+        self._may_sleep = may_sleep
         self._timeout_s = timeout_s
         self._spent = -1
         self._checks = 0
@@ -46,7 +48,7 @@ class Watchdog:
         self._spent = spent
         if self._stopped >= STOPPED_CHECKS:
             return "stopped (SIGSTOP)"
-        if self._still >= STILL_CHECKS:
+        if self._still >= STILL_CHECKS and not self._may_sleep:
             return f"asleep for {self._still * CHECK_S:.1f} s"
         if self._checks * CHECK_S > self._timeout_s:
             return f"not done after workers.timeout_s = {self._timeout_s:g}"

@@ -60,7 +60,9 @@ class Pool:
         program: Program,
         timeout_s: float,  # limit on the duration of a command
         repeats: int,  # how often a start or a command is repeated after deaths
+        may_sleep: bool = False,  # whether workers may wait for other programs
     ) -> None:
+        self._may_sleep = may_sleep
         self.deaths: list[Death] = []  # since the start
         self._program = program
         self._timeout_s = timeout_s
@@ -150,7 +152,8 @@ class Pool:
     def _settle(self) -> None:
         """Wait for the end of a command that was interrupted or failed; it is not committed."""
         for k in self._open:
-            watchdog = Watchdog(self._processes.processes[k].pid, self._timeout_s)
+            pid = self._processes.processes[k].pid
+            watchdog = Watchdog(pid, self._timeout_s, self._may_sleep)
             while not self._processes.settle(k, CHECK_S):
                 if watchdog.verdict() is not None or self._processes.is_left_alone(k):
                     self._processes.processes[k].kill()
@@ -169,7 +172,7 @@ class Pool:
     def _await_asleep(self, pending: list[int], mail: bytes | None, is_asleep: bool) -> None:
         dead = self._processes.sleep(pending, CHECK_S, is_asleep)
         first = len(self.deaths)
-        guard = _Guard(self._processes, self._timeout_s, self._ordered_s)
+        guard = _Guard(self._processes, self._timeout_s, self._ordered_s, self._may_sleep)
         while pending or dead:
             asked = pending
             pending = self._pending()
@@ -238,9 +241,11 @@ class Pool:
 class _Guard:
     """Checks from time to time the workers for which the pool waits."""
 
-    def __init__(self, processes: WorkerProcesses, timeout_s: float, since_s: float) -> None:
+    def __init__(
+        self, processes: WorkerProcesses, timeout_s: float, since_s: float, may_sleep: bool
+    ) -> None:
         self._processes = processes
-        self._timeout_s = timeout_s
+        self._timeout_s, self._may_sleep = timeout_s, may_sleep
         self._watchdogs: dict[int, Watchdog] = {}
         self._next_s = since_s + CHECK_S
 
@@ -254,7 +259,7 @@ class _Guard:
         for k in pending:
             pid = self._processes.processes[k].pid
             if pid not in self._watchdogs:
-                self._watchdogs[pid] = Watchdog(pid, self._timeout_s)
+                self._watchdogs[pid] = Watchdog(pid, self._timeout_s, self._may_sleep)
             verdict = self._watchdogs[pid].verdict()
             if verdict is not None:
                 found[k] = verdict

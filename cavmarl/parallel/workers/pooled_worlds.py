@@ -106,7 +106,8 @@ class PooledWorlds(CommandedWorlds):
             program or PROGRAM, message, _names(parts), segments, TASK_NAMES, pins, teams
         )
         try:
-            self.pool = Pool(what, config.workers.timeout_s, config.workers.max_retries)
+            timeout_s, retries = config.workers.timeout_s, config.workers.max_retries
+            self.pool = Pool(what, timeout_s, retries, bool(config.zones.simulators))
         except WorkerFailureError as failure:
             raise original_error(failure) from failure
         self._saved = [SavedWorlds(one) for one in saved]

@@ -422,11 +422,18 @@ def _made_again(
 
 
 def kept_elsewhere(config: EnvConfig) -> str:
-    """Return a configuration key whose value puts state outside of the arrays; empty: none does."""
+    """Return a configuration key whose value prevents copies of worlds; empty: none does."""
+    return "zones.simulators" if config.zones.simulators else missing_in_states(config)
+
+
+def missing_in_states(config: EnvConfig) -> str:
+    """Return a configuration key whose value puts state outside of the arrays; empty: none does.
+
+    Simulators of zones are filled from a loaded state.
+    """
     kept = {
         "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
         "workers.sensors": config.workers.sensors,
-        "zones.simulators": config.zones.simulators,
     }
     return next((key for key, is_so in kept.items() if is_so), "")
 

@@ -4,7 +4,12 @@ from __future__ import annotations
 
 import cavmarl.core.errors
 from cavmarl.config.v2x import V2xConfig
-from cavmarl.core.errors import CavmarlError, ConfigError, WorkerFailureError
+from cavmarl.core.errors import (
+    CavmarlError,
+    ConfigError,
+    WorkerFailureError,
+    ZoneSimulatorError,
+)
 
 
 def copy_error() -> ConfigError:
@@ -38,5 +43,7 @@ def original_error(failure: WorkerFailureError) -> CavmarlError:
     kind = getattr(cavmarl.core.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
         return failure
+    if kind is ZoneSimulatorError:
+        return ZoneSimulatorError.of_text(failure.text)
     takes_text = "__init__" not in vars(kind)
     return kind(failure.text) if takes_text else failure

@@ -2,7 +2,8 @@
 
 The client can abort its process, so programs with it run in a process of their own. The Python of
 client 0.9.16 is `CAVMARL_CARLA_PYTHON`, or this one if it has the package `carla`. Those of other
-versions are `CAVMARL_CARLA_PYTHON_0_9_15` (package `carla-0-9-15`) and `..._0_10_0`.
+versions are `CAVMARL_CARLA_PYTHON_0_9_15` (package `carla-0-9-15`) and `..._0_10_0`. With
+`CAVMARL_CARLA_VERSION`, all tests use the client of another version.
 """
 
 from __future__ import annotations
@@ -27,13 +28,14 @@ from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
 from cavmarl.cosim.carla.hosted_world import LoadedWorlds
 
 Call = Callable[..., Any]
+VERSION = os.environ.get("CAVMARL_CARLA_VERSION", DEFAULT_VERSION)
 
 
 def make_server(
     agents: int = 3, background: int = 8, env: str = "grid4x4", **options: Any
 ) -> CarlaServer:
     spec = WorldSpec.of(env, agents=agents, background=background)
-    return CarlaServer(LoadedWorlds(spec), port=0, **options)
+    return CarlaServer(LoadedWorlds(spec), port=0, **{"client": VERSION, **options})
 
 
 @pytest.fixture(scope="module")
@@ -81,7 +83,7 @@ def running_server(**options: Any) -> Iterator[int]:
 
 @pytest.fixture(scope="module")
 def port() -> Iterator[int]:
-    """The port of a server for client 0.9.16."""
+    """The port of a server for the client."""
     with running_server() as found:
         yield found
 
@@ -101,7 +103,7 @@ def client_python(version: str) -> str:
 
 
 _START = """
-import json, queue, sys, carla
+import json, queue, sys, time, carla
 client = carla.Client("127.0.0.1", int(sys.argv[1]))
 client.set_timeout(20.0)
 world = client.get_world()
@@ -110,7 +112,7 @@ found = {}
 _END = "\nprint('FOUND' + json.dumps(found), flush=True)\n"
 
 
-def run_client(port: int, program: str, version: str = DEFAULT_VERSION) -> dict[str, Any]:
+def run_client(port: int, program: str, version: str = VERSION) -> dict[str, Any]:
     """Run a program with `client` and `world`; return the dict `found` that it has filled."""
     done = subprocess.run(
         [client_python(version), "-c", _START + program + _END, str(port)],

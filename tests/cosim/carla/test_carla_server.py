@@ -20,7 +20,7 @@ from cavmarl.cosim.carla.carla_snapshots import VEHICLE_STATE
 from cavmarl.cosim.carla.carla_streams import EPISODE_STREAM
 from cavmarl.cosim.carla.hosted_world import SERVED_WORLD, GivenWorld
 from cavmarl.engine.world_setup import find_map
-from tests.cosim.carla.conftest import make_server
+from tests.cosim.carla.conftest import VERSION, make_server
 
 HEAD, SNAPSHOT_HEAD = 48, 36
 CONTINUOUS = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
@@ -89,7 +89,7 @@ def test_garbage_ends_its_connection_only(port: int, data: bytes) -> None:
     with Wire(port) as good, Wire(port) as bad:
         bad.socket.sendall(data)
         assert bad.is_closed()
-        assert good.call("version") == [[1, "0.9.16"]]
+        assert good.call("version") == [[1, VERSION]]
 
 
 def test_clients_that_vanish_leave_the_world_running(port: int) -> None:
@@ -141,7 +141,7 @@ def test_a_client_that_stops_reading_is_left_out_and_then_dropped() -> None:
                 while server.session.streams.connections and not is_over():
                     wire.call("tick_cue")
             assert not server.session.streams.connections
-            assert wire.call("version") == [[1, "0.9.16"]]
+            assert wire.call("version") == [[1, VERSION]]
         over.append(True)
         thread.join(10.0)
 

@@ -15,10 +15,9 @@ import pytest
 
 import cavmarl
 from cavmarl.core.errors import ZoneSimulatorError
-from cavmarl.cosim.carla.carla_versions import DEFAULT_VERSION
 from cavmarl.engine.simulator_component import SimulatorComponent
 from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
-from tests.cosim.carla.conftest import client_python, run_client, running_server
+from tests.cosim.carla.conftest import VERSION, client_python, run_client, running_server
 from tests.support.zone_simulators import step_on
 
 # At first no client ticks, so this program waits until a snapshot has vehicles.
@@ -39,10 +38,11 @@ def carla_zones(
     options: str = "",
     background: int = 40,
     overrides: Mapping[str, Any] | None = None,
+    backend: str = "local",
     **server: Any,
 ) -> Iterator[cavmarl.CavVectorEnv]:
     """Create worlds some of whose zones CARLA servers run."""
-    python = client_python(DEFAULT_VERSION)
+    python = client_python(VERSION)
     with ExitStack() as stack, pytest.MonkeyPatch.context() as patch:
         patch.setenv(PYTHON, python)
         server = {"agents": 1, "background": 0, **server}
@@ -56,6 +56,7 @@ def carla_zones(
             agents=4,
             background=background,
             seed=3,
+            backend=backend,
             overrides={"zones.check_invariants": True, **(overrides or {})},
         )
         try:
@@ -182,7 +183,7 @@ def test_a_server_that_has_no_room_for_a_vehicle_refuses_it() -> None:
 
 
 def test_a_server_that_does_not_answer_is_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(PYTHON, client_python(DEFAULT_VERSION))
+    monkeypatch.setenv(PYTHON, client_python(VERSION))
     vec = cavmarl.make_vec(
         "grid4x4",
         zones=2,
@@ -196,7 +197,7 @@ def test_a_server_that_does_not_answer_is_an_error(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_server_with_another_map_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(PYTHON, client_python(DEFAULT_VERSION))
+    monkeypatch.setenv(PYTHON, client_python(VERSION))
     with running_server(agents=1, background=0) as port:
         vec = cavmarl.make_vec(
             "ring",
@@ -208,3 +209,44 @@ def test_a_server_with_another_map_is_refused(monkeypatch: pytest.MonkeyPatch) -
         with pytest.raises(ZoneSimulatorError, match="its map Carla/Maps/grid4x4 is another one"):
             vec.reset()
         vec.close()
+
+
+@pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
+def test_carla_zones_belong_to_a_process_and_survive_it(backend: str) -> None:
+    with carla_zones(2, 1, background=20, backend=backend) as vec:
+        vec.reset()
+        step_on(vec, 40)
+        before = vec.traffic_stats()
+        assert before["running"] > 10
+        for number in (0, 1):
+            pids = list(vec.worlds.worker_pids.values())
+            os.kill(pids[min(number, len(pids) - 1)], signal.SIGKILL)
+            step_on(vec, 10)
+        after = vec.traffic_stats()
+        entered = after["departed"] - before["departed"]
+        gone = after["arrived"] - before["arrived"]
+        assert after["running"] == before["running"] + entered - gone
+        saved = vec.save_state()
+        hash_then = vec.state_hash(0)
+        step_on(vec, 5)
+        vec.load_state(saved)
+        assert vec.state_hash(0) == hash_then
+        step_on(vec, 5)
+
+
+@pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
+def test_a_server_that_does_not_answer_is_an_error_on_each_backend(
+    backend: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv(PYTHON, client_python(VERSION))
+    vec = cavmarl.make_vec(
+        "grid4x4",
+        zones=2,
+        zone_simulators={1: "carla://127.0.0.1:9?timeout_s=1"},
+        agents=2,
+        background=4,
+        backend=backend,
+    )
+    with pytest.raises(ZoneSimulatorError, match=r"zone 1: carla://127.0.0.1:9: start: RuntimeErr"):
+        vec.reset()
+    vec.close()

@@ -17,7 +17,7 @@ from cavmarl.engine.world_setup import find_map
 from cavmarl.handoff.simulators.carla_zone import PYTHON
 from cavmarl.maps.exports.opendrive import write_opendrive
 from cavmarl.roads.cache import load_network
-from tests.cosim.carla.conftest import client_python
+from tests.cosim.carla.conftest import VERSION, client_python
 
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
@@ -26,7 +26,7 @@ ENVS = sorted(set(entries()) - {"cities", "cities_validation", "rush"})  # rush 
 
 @pytest.fixture
 def client(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv(PYTHON, client_python("0.9.16"))
+    monkeypatch.setenv(PYTHON, client_python(VERSION))
 
 
 @pytest.mark.parametrize("env", ENVS)

@@ -5,8 +5,10 @@ from __future__ import annotations
 import pytest
 
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS
-from tests.cosim.carla.conftest import run_client, running_server
+from tests.cosim.carla.conftest import VERSION, run_client, running_server
 
+# Errors of client 0.10.0 have the text `std::exception` instead of the reason.
+HAS_REASONS = VERSION != "0.10.0"
 SYNCHRONOUS = """
 settings = world.get_settings()
 settings.synchronous_mode, settings.fixed_delta_seconds = True, 0.05
@@ -39,8 +41,9 @@ found["sun"] = world.get_weather().sun_altitude_angle
 world.debug.draw_point(carla.Location(1, 2, 3))
 spectator = world.get_spectator()
 spectator.set_transform(carla.Transform(carla.Location(10, 20, 30), carla.Rotation(-90)))
-world.wait_for_tick()
-world.wait_for_tick()
+until = time.monotonic() + 10.0  # snapshots from before the call may still be unread
+while spectator.get_location().z == 50.0 and time.monotonic() < until:
+    world.wait_for_tick()
 found["spectator"] = spectator.get_location().z
 """,
     )
@@ -49,7 +52,7 @@ found["spectator"] = spectator.get_location().z
     assert found["delta"] == pytest.approx(0.05)
     assert found["elapsed"] == pytest.approx(0.05 * (second - first))
     assert found["seen"]
-    assert found["versions"] == ["0.9.16", "0.9.16"]
+    assert found["versions"] == [VERSION, VERSION]
     assert "/Game/Carla/Maps/grid4x4" in found["maps"]
     assert found["sun"] == 45.0
     assert found["spectator"] == pytest.approx(30.0)
@@ -228,7 +231,7 @@ found["back"] = back.get_map().name
     assert found["other"] == ["Carla/Maps/intersection", True]
     assert found["actors"] > 0
     assert found["again"] == ["Carla/Maps/intersection", True]
-    assert "Map 'Town01' not found" in found["unknown"]
+    assert "Map 'Town01' not found" in found["unknown"] or not HAS_REASONS
     assert found["made"] == ["Carla/Maps/OpenDriveMap", True]
     assert found["garbage"]
     assert found["back"] == "Carla/Maps/grid4x4"
@@ -320,12 +323,14 @@ methods = [
     lambda: client.start_recorder("file.log"),
     lambda: client.replay_file("file.log", 0.0, 0.0, 0),
 ]
-found["errors"] = []
+found["errors"], found["absent"] = [], []
 for method in methods:
     try:
         method()
     except RuntimeError as error:
         found["errors"].append(str(error))
+    except AttributeError as error:  # older clients lack some methods
+        found["absent"].append(str(error))
 commands = [
     do.ApplyVehicleControl(agent.id, carla.VehicleControl()),
     do.SetVehicleLightState(agent.id, carla.VehicleLightState.All),
@@ -338,8 +343,12 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
 """
         + FREE,
     )
-    assert len(found["errors"]) == 2
-    assert all("CARLA's recorder is not available" in one for one in found["errors"])
+    if HAS_REASONS:
+        assert len(found["errors"]) == 2
+        assert all("CARLA's recorder is not available" in one for one in found["errors"])
+    else:  # physics are refused, too
+        assert len(found["errors"]) >= 2
+    assert VERSION != "0.9.16" or not found["absent"]
     assert found["batch"][:3] == ["", "", ""]
     assert "vehicles of the world move by themselves" in found["batch"][3]
     assert found["batch"][4] == ""

@@ -18,7 +18,7 @@ from pathlib import Path
 import pytest
 
 from cavmarl.engine.world_setup import find_map
-from tests.cosim.carla.conftest import client_python, run_client, running_server
+from tests.cosim.carla.conftest import VERSION, client_python, run_client, running_server
 from tests.support.demand_worlds import TINY
 
 SCRIPTS = "CAVMARL_CARLA_SCRIPTS"
@@ -53,7 +53,7 @@ def started(words: list[str], where: Path, **more: str) -> subprocess.Popen[str]
     quiet = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "MPLBACKEND": "Agg"}
     agents = str(folder("PythonAPI", "carla"))
     return subprocess.Popen(
-        [client_python("0.9.16"), "-u", *words],
+        [client_python(VERSION), "-u", *words],
         cwd=where,
         env={**os.environ, **quiet, "PYTHONPATH": agents, **more},
         stdout=subprocess.PIPE,
