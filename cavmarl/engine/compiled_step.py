@@ -77,13 +77,14 @@ class CompiledStep:
             some_pass = bind(any_positive, self.departures.num_passing)
             sequence.call(some_pass)
             with sequence.only_if(some_pass):
-                sequence.call(traffic.calls(self.departures, worlds.ticks, worlds.keys).settle)
+                calls_of = traffic.calls(self.departures, worlds.ticks, worlds.keys, worlds.lanes)
+                sequence.call(calls_of.settle)
 
     def _add_enter(self, sequence: CallSequence) -> None:
         """Append the calls of `Tick.let_in`."""
         tick, calls = self._tick, self.group.departure_calls(self.departures)
         departures, worlds = self.departures, tick.worlds
-        traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys)
+        traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)
         if departures.orders.shape[1]:
             sequence.call(traffic.call_orders)
         some_wait = bind(any_positive, departures.num_queue)

@@ -56,6 +56,7 @@ def make_tick(
             zeros=zeros,
             scene=plan_scene(config.scenario, network),
             sumo=demand if isinstance(demand, SumoDemand) else None,
+            lane_changes=config.map.changed_lanes > 0,
         )
     shards, division = divide(
         config, network, partition, traffic, shared.outputs, num_worlds, zeros, late_ticks
@@ -71,6 +72,8 @@ def make_tick(
             outputs=shared.outputs,
             zeros=zeros,
             frames=frames,
+            lane_plans=traffic.lane_plans,
+            changed_at=traffic.changed_at,
         )
     )
     departures = make_departure_queue(num_worlds, traffic.capacity, network.arrays, blank.dtype)

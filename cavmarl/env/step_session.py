@@ -38,8 +38,8 @@ class StepSession:
 
     A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
     external vehicles, overridden signals and changed lanes. After each reset and step, the session
-    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
-    continue bit for bit; it has no recording and no watchers.
+    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds,
+    which continue bit for bit; it has no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
@@ -51,7 +51,7 @@ class StepSession:
         agents: ids of the agents of a world.
         decoder: decodes actions into commands.
         events: the events that agents have declared for the next step.
-        insertions: vehicles and barriers for the next step.
+        insertions: vehicles for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
         overrides: signals that show states of the caller.
         lane_changes: lanes that the caller closes or slows down.

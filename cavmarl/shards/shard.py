@@ -95,7 +95,7 @@ class Shard:
         config: EnvConfig,
         network: RoadNetwork,
         *,
-        plans: NDArray[np.void],  # PLAN (G, L), the routes of agents
+        plans: NDArray[np.void],  # PLAN (V, G, L), the routes of agents, see `Worlds.lanes` for V
         travel: TripTables,
         zoned: ZoneState,  # the rows of all zones
         outputs: Outputs,  # of the agents of all shards, by agent index

@@ -73,6 +73,7 @@ class TripTables(NamedTuple):
     see_m: float  # distance before a stop line from which drivers check it
     num_fixed: int  # the world writes steps from this index on while it runs
     scripts: Scripts
+    shifts: NDArray[np.int64]  # (W,) steps from each plan to the world's own plan, see `LanePlans`
     trip_horizon: float = 0.0  # limit of agents' trips, in multiples of free time; 0: no limit
     tick_s: float = 0.1
 

@@ -20,6 +20,25 @@ def table_of(lanes: NDArray[np.void], w: int) -> int:
 
 
 @inlined_kernel
+def plans_of(plans: NDArray[np.void], row: np.void, w: int) -> int:
+    """Return the table in PLAN (V, G, L) that an agent's vehicle of world w follows.
+
+    Table 0 has the plans on the lanes of the map. If worlds may change lanes, table 1 + w has those
+    of world w, which its vehicles take once a second (`traffic.kernels.own_plans`).
+    """
+    if plans.shape[0] == 1 or row["way"] == row["goal"] * plans.shape[2]:
+        return 0
+    return 1 + w
+
+
+@inlined_kernel
+def is_closed(roads: RoadArrays, lane: int, kind: np.void) -> bool:
+    """Return whether a lane is closed to vehicles of a VTYPE; `roads`: of the world."""
+    closed: bool = roads.lanes[lane]["permissions"] & kind["permissions"] == 0
+    return closed
+
+
+@inlined_kernel
 def roads_in(roads: RoadArrays, lanes: NDArray[np.void], w: int) -> RoadArrays:
     """Return the roads of world w, with its lanes from `Worlds.lanes`."""
     own_lanes = lanes[table_of(lanes, w)]

@@ -41,7 +41,7 @@ from cavmarl.driving.kernels.motion.highway_control import speed_control
 from cavmarl.driving.kernels.motion.motion import move_agent, move_background
 from cavmarl.driving.kernels.motion.scripted_rows import follow_script
 from cavmarl.driving.kernels.motion.steering import nearest_speed, steer_to_lane, take_meta_action
-from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.roads.kernels.lanes_now import plans_of, roads_in
 from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 
 
@@ -195,7 +195,7 @@ def _drive_in_background(
 @kernel
 def advance(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (V, G, L)
     travel: TripTables,
     lane_grid: LaneGrid,  # index of lanes by position
     worlds: Worlds,  # next_rows is written
@@ -238,7 +238,7 @@ def advance(
             elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
                     here,
-                    plans,
+                    plans[plans_of(plans, row, w)],
                     travel,
                     lane_grid,
                     worlds,
@@ -287,7 +287,7 @@ def resolve(
 @kernel
 def suggest(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (V, G, L)
     travel: TripTables,
     worlds: Worlds,  # not written
     scratch: Scratch,
@@ -322,8 +322,9 @@ def suggest(
             elif change < 0:
                 target = lane["right"]
             out[w, agent, 0] = scratch.accel[i]
+            own_plans = plans[plans_of(plans, row, w)]
             out[w, agent, 1] = steer_to_lane(
-                here, plans, row, target, travel.types[row["vtype"]]["wheelbase"]
+                here, own_plans, row, target, travel.types[row["vtype"]]["wheelbase"]
             )
             if discrete:
                 wanted = nearest_speed(

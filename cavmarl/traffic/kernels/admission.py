@@ -111,22 +111,27 @@ def rank_lanes(
 
 @kernel
 def assign_lanes(
-    roads: RoadArrays, travel: TripTables, departures: DepartureQueue, keys: NDArray[np.uint64]
+    roads: RoadArrays,
+    travel: TripTables,
+    departures: DepartureQueue,
+    keys: NDArray[np.uint64],
+    lanes: NDArray[np.void],
 ) -> None:
     """Assign each queued departure the lane on which it tries to enter, or -1.
 
     A lane is assigned to the longest-waiting departure, even if it finds no gap there.
 
-    `departures`: `tries` and `lane_taken` are written.
+    `departures`: `tries` and `lane_taken` are written. `lanes`: LANE (V, L), see `Worlds`.
     """
     for w in range(keys.size):
         if departures.num_queue[w] == 0:
             continue
         departures.lane_taken[:] = False
+        here = roads_in(roads, lanes, w)
         for q in range(departures.num_queue[w]):
             departure = departures.queue[w, q]
             lane = entry_lane(
-                roads, travel, keys[w], departure, departures.ranks[w, q], departures.lane_taken
+                here, travel, keys[w], departure, departures.ranks[w, q], departures.lane_taken
             )
             departures.tries[w, q] = lane
             if lane >= 0:
