@@ -56,7 +56,8 @@ class LaneComponent(Component):
             return
         if wrong := wrong_changes(told, self._map):
             raise ActionError(wrong)
-        self._changed_at[(told != self._told).any(axis=(1, 2))] = self._ticks.item(0)
+        changed = (told != self._told).any(axis=(1, 2))
+        self._changed_at[changed] = self._ticks[changed]
         self._told[:] = told
         apply_changes(told, self._map, self._speed_mps, self._permissions)
         for w in self.renew_plans():

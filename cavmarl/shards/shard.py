@@ -117,7 +117,7 @@ class Shard:
         self.sensors = sensor_arrays(config.sensors, network)
         most_told = config.v2x.inbox.objects
         num_worlds, capacity = zoned.rows.shape[2:]
-        self.optional = optional_arrays(config.sensors, network, plans, most_told, capacity)
+        self.optional = optional_arrays(config.sensors, network, plans[0], most_told, capacity)
         self.registered = RegisteredOutputs(config, network)
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m

@@ -226,7 +226,7 @@ def test_a_detour_costs_an_agent_no_progress_and_no_time() -> None:
     overrides = {**ROOM, "terms.weights": {"progress": 1.0}, "traffic.trip_horizon": 3.0}
     with closing(parallel_env("grid4x4", agents=6, background=0, overrides=overrides)) as env:
         env.reset(seed=3)
-        before = env.simulation.vehicles(0)
+        before = env.simulation.vehicles(0).copy()
         for agent in range(6):
             env.close_road(ahead(env, agent), shuts_in=True)
         least = 0.0
