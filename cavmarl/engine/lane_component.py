@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ActionError
-from cavmarl.core.records.lane_changes import apply_changes, wrong_changes
+from cavmarl.core.records.changed_lanes import apply_changes, wrong_changes
 from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.own_plans import renew_distances

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
-from cavmarl.core.records.lane_changes import CHANGED, CLOSED_TO, LIMIT_MPS, wrong_changes
+from cavmarl.core.records.changed_lanes import CHANGED, CLOSED_TO, LIMIT_MPS, wrong_changes
 from cavmarl.driving.vehicle_types import ALL_PERMISSIONS
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.ways_out import shut_in_roads

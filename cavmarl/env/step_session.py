@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
+from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
 from cavmarl.engine.world_frame import WorldFrame, frame_of
@@ -164,11 +165,24 @@ class StepSession:
 
     def frames(self, chosen: Sequence[int], ghosts: bool) -> list[WorldFrame]:
         """Return frames of some worlds as they are now; see `WorldsEnvironment.world_frames`."""
-        count = len(self.worlds.arrays.mask)
-        if wrong := [world for world in chosen if not 0 <= world < count]:
-            raise ConfigError(f"world {wrong[0]}: must be from 0 to {count - 1}")
+        for world in chosen:
+            self._check_world(world)
         self.refuse_unready("world_frames()")
         return self._frames(chosen, ghosts)
+
+    def deadlocks(self, world: int) -> tuple[tuple[int, ...], ...]:
+        """Return the deadlocks of a world; see `WorldsEnvironment.deadlocks`."""
+        self.refuse_unready("deadlocks()")
+        self._check_world(world)
+        simulation = self.present()
+        return find_deadlocks(
+            simulation.network, simulation.travel.steps, simulation.vehicles(world)
+        )
+
+    def _check_world(self, world: int) -> None:
+        count = len(self.worlds.arrays.mask)
+        if not 0 <= world < count:
+            raise ConfigError(f"world {world}: must be from 0 to {count - 1}")
 
     def way_ahead(self, vehicle: int, world: int) -> NDArray[np.float64]:
         """Return the path ahead of a vehicle; see `WorldsEnvironment.way_ahead`."""

@@ -209,6 +209,17 @@ class WorldsEnvironment(OwnWorlds):
         """
         return self._session.lane_changes.closed(world)
 
+    def deadlocks(self, world: int = 0) -> tuple[tuple[int, ...], ...]:
+        """Return the cycles of vehicle ids in which each vehicle waits for the next.
+
+        All vehicles of a cycle have stood for at least 10 s; see `engine.waiting_cycles`.
+
+        Raises:
+            ConfigError: there is no such world, or its state is not available in this process.
+            EpisodeError: before the first reset.
+        """
+        return self._session.deadlocks(world)
+
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
         """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from contextlib import closing
+
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from cavmarl import ConfigError, EpisodeError, parallel_env
 from cavmarl.core.records.codes import HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.evaluate.traffic.deadlocks import find_deadlocks
+from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 from tests.support.traffic import network
@@ -89,3 +93,13 @@ def test_vehicles_that_yield_to_each_other_are_a_deadlock() -> None:
         row["id"], row["lane"], row["wait_s"], row["hold"] = link, lane, 30.0, HOLD_YIELD
         row["s"] = roads.lanes["length_m"][lane] - 3.0
     assert find_deadlocks(roads, steps, rows) == ((one, other),)
+
+
+def test_an_environment_names_its_deadlocks() -> None:
+    with closing(parallel_env("grid4x4", agents=1, background=5)) as env:
+        with pytest.raises(EpisodeError, match="before reset"):
+            env.deadlocks()
+        env.reset(seed=1)
+        assert env.deadlocks() == ()
+        with pytest.raises(ConfigError, match="world 1: must be from 0 to 0"):
+            env.deadlocks(1)
