@@ -41,14 +41,19 @@ class MapConfig(Section, key="map"):
         program: the program of each signal named here, whatever was loaded; may be `off`.
         buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
             (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
+        changed_lanes: number of lanes that may differ from the map in a world at the same time:
+            closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
+            each world has its own table of lanes and its own plans.
     """
 
     source: str | tuple[str, ...]
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
     buildings: str = ""
+    changed_lanes: Annotated[int, Whole(0, 1_000_000)] = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.need("source", bool(self.source) and all(self.sources), "must name a map file")
         self.need("programs", all(self.programs), "must name files")
 
@@ -265,6 +270,11 @@ class EnvConfig(Section, key=""):
             "population.external",
             self.population.external == 0,
             f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
+        )
+        self.need(
+            "map.changed_lanes",
+            self.map.changed_lanes == 0,
+            f"traffic.source = {source}: SUMO would not see these changes; leave the key out",
         )
         self.need(
             "signals.overrides",

@@ -34,9 +34,13 @@ class PopulationConfig(Section, key="population"):
         fleet: parts of the agents, each with its vehicle type, its sensors and its driver; see
             `config.fleet.FleetPart`. It replaces `types`.
         insertions: number of vehicles that may be inserted into a world during an episode
-            (`insert_vehicle`, `close_road`); memory is reserved for them.
+            (`insert_vehicle`); memory is reserved for them.
         external: number of vehicles that the caller may pose or drive in a world at the same time
             (`ExternalCommands`); memory is reserved for them.
+        reroute: which vehicles take another way if lanes change (`map.changed_lanes`). `never`:
+            none; they wait before a closed road. `blocked`: those whose way leads over a closed
+            lane. `always`: all vehicles for which another way is faster, also if a speed limit
+            changes.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"
@@ -48,6 +52,7 @@ class PopulationConfig(Section, key="population"):
     fleet: tuple[FleetPart, ...] = ()
     insertions: Annotated[int, Whole(0, 10_000)] = 0
     external: Annotated[int, Whole(0, 10_000)] = 0
+    reroute: Literal["never", "blocked", "always"] = "blocked"
 
     def __post_init__(self) -> None:
         super().__post_init__()

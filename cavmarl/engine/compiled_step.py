@@ -10,6 +10,7 @@ import numpy as np
 
 from cavmarl.core.compiled.bound_call import CallSequence, bind
 from cavmarl.core.math.counters import any_positive, clear, totals
+from cavmarl.engine.lane_component import LaneComponent
 from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
@@ -36,7 +37,7 @@ class CompiledStep:
     def run(self, commands: Commands) -> None:
         """Run the step."""
         calls = self.group.calls
-        for part in self._signals:
+        for part in self._tick.attached:
             part.begin(commands)
         self._tick.begin_step(commands)
         if calls.has_agents:
@@ -76,13 +77,14 @@ class CompiledStep:
             some_pass = bind(any_positive, self.departures.num_passing)
             sequence.call(some_pass)
             with sequence.only_if(some_pass):
-                sequence.call(traffic.calls(self.departures, worlds.ticks, worlds.keys).settle)
+                calls_of = traffic.calls(self.departures, worlds.ticks, worlds.keys, worlds.lanes)
+                sequence.call(calls_of.settle)
 
     def _add_enter(self, sequence: CallSequence) -> None:
         """Append the calls of `Tick.let_in`."""
         tick, calls = self._tick, self.group.departure_calls(self.departures)
         departures, worlds = self.departures, tick.worlds
-        traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys)
+        traffic = tick.traffic.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)
         if departures.orders.shape[1]:
             sequence.call(traffic.call_orders)
         some_wait = bind(any_positive, departures.num_queue)
@@ -126,7 +128,7 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         type(group) is not ShardGroup
         or len(group.shards) != 1
         or tick.coordination.needs_ghosts
-        or not all(isinstance(part, SignalComponent) for part in tick.attached)
+        or not all(isinstance(part, SignalComponent | LaneComponent) for part in tick.attached)
         or tick.outside.sumo is not None
         or tick.traffic.rerouting is not None
         or group.calls.has_registered

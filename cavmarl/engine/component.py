@@ -20,6 +20,7 @@ from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
 from cavmarl.shards.shard import Commands, Shard
+from cavmarl.traffic.lane_plans import LanePlans
 
 
 class ComponentContext(NamedTuple):
@@ -34,6 +35,9 @@ class ComponentContext(NamedTuple):
     outputs: Outputs  # outputs of the agents
     zeros: Zeros  # allocates the arrays that outlive a tick
     frames: Frames  # samples of the agents' rigs
+    lane_plans: LanePlans | None = None  # of worlds whose lanes may differ from the map
+    # (W,) the tick in which lanes last changed, -1: never; see `NativeTraffic`
+    changed_at: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
 
 
 class Component(Protocol):

@@ -280,6 +280,7 @@ class SimulatorComponent(Component):
         self._follow_reports(
             self._roads,
             shard.plans,
+            w,
             shard.lane_grid,
             at,
             before,

@@ -7,6 +7,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.engine.external_component import ExternalComponent
+from cavmarl.engine.lane_component import LaneComponent
 from cavmarl.engine.override_component import OverrideComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.scenario_cues import Cues
@@ -55,6 +56,7 @@ def make_tick(
             zeros=zeros,
             scene=plan_scene(config.scenario, network),
             sumo=demand if isinstance(demand, SumoDemand) else None,
+            lane_changes=config.map.changed_lanes > 0,
         )
     shards, division = divide(
         config, network, partition, traffic, shared.outputs, num_worlds, zeros, late_ticks
@@ -70,6 +72,8 @@ def make_tick(
             outputs=shared.outputs,
             zeros=zeros,
             frames=frames,
+            lane_plans=traffic.lane_plans,
+            changed_at=traffic.changed_at,
         )
     )
     departures = make_departure_queue(num_worlds, traffic.capacity, network.arrays, blank.dtype)
@@ -80,6 +84,8 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
     """Make the components that the environment configures, in the order in which they act."""
     parts: list[Component] = []
     messages = V2xComponent(host) if host.config.v2x.enabled else None
+    if host.config.map.changed_lanes:
+        parts.append(LaneComponent(host))
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.population.external:

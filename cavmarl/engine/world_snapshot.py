@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState, Worlds
 from cavmarl.driving.vehicles import STATE_FIELDS
 from cavmarl.engine.component import Component
+from cavmarl.engine.lane_component import LaneComponent
 from cavmarl.engine.state_check import StateForm
 from cavmarl.handoff.coordinator.coordinators import OwnershipRuntime
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership, zone_table
@@ -80,6 +81,9 @@ def load(
     parts.division.align()
     for array in _fixed(parts):
         array[...] = next(rest)
+    for part in parts.attached:
+        if isinstance(part, LaneComponent):
+            part.renew_plans()
     # The keys determine all orders. Orders that are due already are in the departure queue.
     departures = parts.traffic.draw_orders(parts.departures, parts.worlds, everywhere)
     queue = next(rest)
@@ -165,16 +169,17 @@ def _ownership(parts: Parts, w: int) -> Array:
 def share_of(parts: Parts, w: int) -> list[Array]:
     """Return the arrays of `save` for one world alone. Some of them are views: copy them."""
     departures, rerouting = parts.departures, parts.traffic.rerouting
+    owns_ways = parts.traffic.owns_ways
     waiting = departures.queue[w : w + 1, : departures.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
     if parts.sumo is not None:
         waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
         for rows in (waiting, *owned):
             parts.sumo.shift(rows, -w)
-    if rerouting is not None:
+    if owns_ways:
         owned = [rows.copy() for rows in owned]
         for rows in owned:
-            rows["way"] = rerouting.ways_of_first_world(rows["way"], w)
+            rows["way"] = parts.traffic.moved_ways(rows["way"], -w)
     return [
         *(array[w : w + 1] for array in _fixed(parts)),
         waiting,
@@ -187,7 +192,7 @@ def share_of(parts: Parts, w: int) -> list[Array]:
 
 def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
     """Join states of single worlds to the arrays that `save` would return for all of them."""
-    zones, rerouting = parts.division.count, parts.traffic.rerouting
+    zones = parts.division.count
     if parts.sumo is not None:
         shares = [_shifted(parts, parts.sumo, share, w) for w, share in enumerate(shares)]
     fields = zip(*(share[:-zones] for share in shares), strict=True)
@@ -195,8 +200,8 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
     for w, share in enumerate(shares):
         for owned in share[-zones:]:
             rows = owned.copy()
-            if rerouting is not None:
-                rows["way"] = rerouting.ways_of_world(rows["way"], w)
+            if parts.traffic.owns_ways:
+                rows["way"] = parts.traffic.moved_ways(rows["way"], w)
             joined.append(rows)
     return joined
 
@@ -252,8 +257,8 @@ def digest_world(parts: Parts, world: int) -> str:
     sumo = parts.sumo
     rows = parts.division.vehicles(world)
     rows = rows[np.argsort(rows["id"])]
-    if rerouting is not None:
-        rows["way"] = rerouting.ways_of_first_world(rows["way"], world)
+    if parts.traffic.owns_ways:
+        rows["way"] = parts.traffic.moved_ways(rows["way"], -world)
     if sumo is not None:
         sumo.shift(rows, -world)
     digest = hashlib.blake2b(digest_size=16)

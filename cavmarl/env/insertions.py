@@ -1,4 +1,4 @@
-"""Vehicles and barriers that a user adds to running worlds, held until the next step."""
+"""Vehicles that a user adds to running worlds, held until the next step."""
 
 from __future__ import annotations
 
@@ -11,23 +11,18 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
-from cavmarl.core.records.codes import (
-    INSERT_BARRIER,
-    INSERT_NONE,
-    INSERT_OPEN,
-    INSERT_VEHICLE,
-)
+from cavmarl.core.records.codes import INSERT_NONE, INSERT_VEHICLE
 from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.shards.shard import Commands
 
-INSERTED, CLOSED, OPENED = "inserted", "closed", "opened"  # kinds of frame events
+INSERTED = "inserted"  # kind of a frame event
 
 Asked = tuple[tuple[str, str], ...]
 """Kind and detail of the insertions into a world in one step, in the form of `WorldFrame.asked`."""
 
 
 class Insertions:
-    """Vehicles and barriers for W worlds, at most `population.insertions` in an episode of each.
+    """Vehicles for W worlds, at most `population.insertions` in an episode of each.
 
     Args:
         config: configuration of the worlds.
@@ -42,32 +37,28 @@ class Insertions:
         self._rows = np.zeros((num_worlds, self._most, 3))
         self._waiting = np.zeros(num_worlds, dtype=np.int64)
         self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, waiting ones included
-        # LANE of each standing barrier; -1: none
-        self._barriers = np.full((num_worlds, self._most), -1)
         self._last: list[Asked] = [()] * num_worlds  # insertions of the last step
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """Waiting insertions, their number, the number in the episode, and the closed lanes."""
-        return self._rows, self._waiting, self._used, self._barriers
+        """Waiting insertions, their number, and the number in the episode."""
+        return self._rows, self._waiting, self._used
 
     @memory.setter
     def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
-        self._rows[:], self._waiting[:], self._used[:], self._barriers[:] = memory
+        self._rows[:], self._waiting[:], self._used[:] = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
-        rows, waiting, used, barriers = memory
+        rows, waiting, used = memory
         lanes = self._network.lanes
         if ((waiting < 0) | (waiting > used) | (used > self._most)).any():
             return "the number of insertions is out of range"
-        if ((barriers < -1) | (barriers >= len(lanes))).any():
-            return "a barrier stands on a lane that does not exist"
         is_waiting = np.arange(self._most) < waiting[:, np.newaxis]
         if (rows[~is_waiting] != (INSERT_NONE, INSERT_NONE, INSERT_NONE)).any():
             return "an insertion is not counted"
         kind, lane, position_m = rows[is_waiting].T
-        if not np.isin(kind, (INSERT_VEHICLE, INSERT_BARRIER, INSERT_OPEN)).all():
+        if not (kind == INSERT_VEHICLE).all():
             return "an insertion has an unknown kind"
         if not np.isin(lane, np.arange(len(lanes))).all():
             return "an insertion is on a lane that does not exist"
@@ -91,57 +82,6 @@ class Insertions:
                 "position on it"
             )
         self._add(world, [(INSERT_VEHICLE, row, position_m)])
-
-    def barrier(self, world: int, edge: str) -> None:
-        """Place a standing car on each lane of an edge until it is opened; raises as `vehicle`."""
-        lanes = self._network.lanes
-        rows = self._lanes_of(world, edge)
-        rows = rows[(lanes["permissions"][rows] & CARS) != 0]
-        if not len(rows) or lanes["internal"][rows].any():
-            raise ActionError(f"edge {edge!r}: no lane of it is open to cars; give a road")
-        if np.isin(rows, self._barriers[world]).any():
-            raise ActionError(f"edge {edge!r} is closed already; open it, or close another one")
-        self._add(world, [(INSERT_BARRIER, int(row), 0.0) for row in rows])
-        free = np.flatnonzero(self._barriers[world] < 0)
-        self._barriers[world, free[: len(rows)]] = rows
-
-    def no_barrier(self, world: int, edge: str) -> None:
-        """Let the cars that close an edge drive on.
-
-        Cars that no step has placed yet are cancelled, and no longer count.
-
-        Raises:
-            ActionError: there is no such world or edge, or the edge is not closed.
-            ConfigError: these worlds allow no insertions.
-        """
-        stands = np.isin(self._barriers[world], self._lanes_of(world, edge))
-        lanes = self._barriers[world, stands]
-        if not len(lanes):
-            raise ActionError(f"edge {edge!r} is not closed; give the id of a closed edge")
-        self._barriers[world, stands] = -1
-        waiting = self._rows[world, : self._waiting[world]].copy()
-        new = (waiting[:, 0] == INSERT_BARRIER) & np.isin(waiting[:, 1], lanes)
-        if new.any():
-            self._used[world] -= np.count_nonzero(new)
-            opened = waiting[~new]
-        else:
-            opened = np.concatenate([waiting, [(INSERT_OPEN, lane, 0.0) for lane in lanes]])
-        self._rows[world] = INSERT_NONE
-        self._rows[world, : len(opened)] = opened
-        self._waiting[world] = len(opened)
-
-    def closed(self, world: int) -> tuple[str, ...]:
-        """Return the ids of the closed edges."""
-        lanes = self._barriers[world]
-        edges = np.unique(self._network.lanes["edge"][lanes[lanes >= 0]])
-        return tuple(self._network.edge_ids[edge] for edge in edges.tolist())
-
-    def _lanes_of(self, world: int, edge: str) -> NDArray[np.intp]:
-        self._check(world)
-        edges = self._network.edge_ids
-        if edge not in edges:
-            raise ActionError(f"edge {edge!r}: the map has no such edge; give the id of one")
-        return np.flatnonzero(self._network.lanes["edge"] == edges.index(edge))
 
     def _check(self, world: int) -> None:
         if not self._most:
@@ -184,18 +124,10 @@ class Insertions:
             self._waiting[:] = 0
 
     def _texts(self, world: int, count: int) -> Asked:
-        """Return the waiting insertions in words, each road once."""
-        network = self._network
-        found: list[tuple[str, str]] = []
-        for kind, lane, place in self._rows[world, :count].tolist():
-            if kind == INSERT_VEHICLE:
-                found.append((INSERTED, f"{network.lane_ids[int(lane)]} {place!r}"))
-                continue
-            edge = network.edge_ids[int(network.lanes["edge"][int(lane)])]
-            event = (CLOSED if kind == INSERT_BARRIER else OPENED, edge)
-            if event not in found:
-                found.append(event)
-        return tuple(found)
+        """Return the waiting insertions in words."""
+        ids = self._network.lane_ids
+        rows = self._rows[world, :count].tolist()
+        return tuple((INSERTED, f"{ids[int(lane)]} {place!r}") for _, lane, place in rows)
 
     def last(self, world: int) -> Asked:
         """Return the insertions into a world in the last step."""
@@ -204,7 +136,6 @@ class Insertions:
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,)."""
         self._used[chosen] = 0
-        self._barriers[chosen] = -1
         self._rows[chosen] = INSERT_NONE
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():

@@ -15,12 +15,14 @@ from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
+from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.world_frame import WorldFrame, frame_of
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
+from cavmarl.env.lane_changes import LaneChanges
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.env.signal_agents import SignalAgents
@@ -36,9 +38,9 @@ class StepSession:
     """The running worlds of one environment.
 
     A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
-    external vehicles and overridden signals. After each reset and step, the session records the
-    worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
-    continue bit for bit; it has no recording and no watchers.
+    external vehicles, overridden signals and changed lanes. After each reset and step, the session
+    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds,
+    which continue bit for bit; it has no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
@@ -50,9 +52,10 @@ class StepSession:
         agents: ids of the agents of a world.
         decoder: decodes actions into commands.
         events: the events that agents have declared for the next step.
-        insertions: vehicles and barriers for the next step.
+        insertions: vehicles for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
         overrides: signals that show states of the caller.
+        lane_changes: lanes that the caller closes or slows down.
         signals: the signals whose greens are chosen; None: there are none.
         signal_agents: the same if agents choose the greens, else None.
         is_ready: whether `reset` has been called.
@@ -72,6 +75,7 @@ class StepSession:
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
         self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
+        self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds)
         self.signals = (
             SignalAgents(config, worlds.world.network, arrays)
             if config.signals.are_controlled
@@ -126,7 +130,9 @@ class StepSession:
             signal_choices = self._controller.choose(self.signals.view)
         if signal_choices is not None:
             commands = replace(commands, signal_choices=signal_choices)
-        waiting = (self.events, self.insertions, self.external, self.overrides)
+        waiting = (
+            self.events, self.insertions, self.external, self.overrides, self.lane_changes
+        )  # fmt: skip
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -141,6 +147,7 @@ class StepSession:
         self.insertions.forget(chosen)
         self.external.forget(chosen)
         self.overrides.forget(chosen)
+        self.lane_changes.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -158,11 +165,24 @@ class StepSession:
 
     def frames(self, chosen: Sequence[int], ghosts: bool) -> list[WorldFrame]:
         """Return frames of some worlds as they are now; see `WorldsEnvironment.world_frames`."""
-        count = len(self.worlds.arrays.mask)
-        if wrong := [world for world in chosen if not 0 <= world < count]:
-            raise ConfigError(f"world {wrong[0]}: must be from 0 to {count - 1}")
+        for world in chosen:
+            self._check_world(world)
         self.refuse_unready("world_frames()")
         return self._frames(chosen, ghosts)
+
+    def deadlocks(self, world: int) -> tuple[tuple[int, ...], ...]:
+        """Return the deadlocks of a world; see `WorldsEnvironment.deadlocks`."""
+        self.refuse_unready("deadlocks()")
+        self._check_world(world)
+        simulation = self.present()
+        return find_deadlocks(
+            simulation.network, simulation.travel.steps, simulation.vehicles(world)
+        )
+
+    def _check_world(self, world: int) -> None:
+        count = len(self.worlds.arrays.mask)
+        if not 0 <= world < count:
+            raise ConfigError(f"world {world}: must be from 0 to {count - 1}")
 
     def way_ahead(self, vehicle: int, world: int) -> NDArray[np.float64]:
         """Return the path ahead of a vehicle; see `WorldsEnvironment.way_ahead`."""
@@ -239,10 +259,16 @@ class StepSession:
                 f"{key}: frames of such worlds are only available in the caller's process; use "
                 "backend='local'"
             )
-        simulation, last, arrays = self.present(), self.insertions.last, self.worlds.arrays
+        simulation, arrays = self.present(), self.worlds.arrays
+        inserted, changed = self.insertions.last, self.lane_changes.last
         return [
             frame_of(
-                simulation, world, ghosts, vehicles_that_ended(arrays, world), last(world), room
+                simulation,
+                world,
+                ghosts,
+                vehicles_that_ended(arrays, world),
+                (*inserted(world), *changed(world)),
+                room,
             )
             for world in chosen
         ]
@@ -259,7 +285,7 @@ class StepSession:
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
         parts = self.decoder, self.events, self.insertions, self.external, self.overrides
-        memory = tuple(part.memory for part in parts)
+        memory = (*(part.memory for part in parts), self.lane_changes.memory)
         kept = self.is_ready, self.simulated_s, self._first_seed
         return (
             _restored_session,
@@ -270,7 +296,8 @@ class StepSession:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, *memory = memory
-        self.insertions.memory, self.external.memory, self.overrides.memory = memory
+        self.insertions.memory, self.external.memory, self.overrides.memory = memory[:3]
+        self.lane_changes.memory = memory[3]
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

@@ -135,43 +135,90 @@ class WorldsEnvironment(OwnWorlds):
         """
         self._session.insertions.vehicle(world, lane, position_m)
 
-    def close_road(self, edge: str, world: int = 0) -> None:
-        """Close the car lanes of a road, until it is opened or the episode is over.
+    def close_road(
+        self,
+        edge: str,
+        lanes: Sequence[int] | None = None,
+        world: int = 0,
+        shuts_in: bool = False,
+    ) -> None:
+        """Close lanes of a road, until they are opened or the episode is over.
 
-        From the next step on, a standing car closes each lane that is open to cars at its start,
-        as soon as there is a safe gap. Other lanes, such as bus lanes without cars, stay open. Each
-        of these cars counts in `population.insertions`. Vehicles on the road drive on. Vehicles
-        before it wait; demand vehicles with a rerouting device may take another route.
-
-        Args:
-            edge: id of a road.
-            world: number of the world.
-
-        Raises:
-            ActionError: see `insert_vehicle`; or the road is closed already.
-            CapacityError, ConfigError: see `insert_vehicle`.
-        """
-        self._session.insertions.barrier(world, edge)
-
-    def open_road(self, edge: str, world: int = 0) -> None:
-        """Open a closed road: from the next step on, the cars that close it drive on.
-
-        They drive to goals of the generator, like other inserted cars, and still count in
-        `population.insertions`.
+        From the next step on, no vehicle enters the lanes, except those that cannot stop before
+        them any more. Vehicles on the lanes leave them. The vehicles of `population.reroute` take
+        another way within a second. Vehicles without another way wait before the closed lanes, and
+        departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
 
         Args:
             edge: id of a road.
+            lanes: indices of its lanes, from the kerb; None: all of them.
+            world: number of the world.
+            shuts_in: whether the road may be the last way out of other roads.
+
+        Raises:
+            ActionError: there is no such world, road or lane; or the road is the last way out.
+            CapacityError: more than `map.changed_lanes` lanes would differ from the map.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        self._session.lane_changes.close(world, edge, lanes, shuts_in=shuts_in)
+
+    def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
+        """Give lanes of a closed or damaged road the state that they have on the map.
+
+        Vehicles that wait before them drive on from the next step on.
+
+        Args:
+            edge: id of a road.
+            lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
 
         Raises:
-            ActionError: there is no such road, or it is not closed.
-            ConfigError: `population.insertions` is 0.
+            ActionError: there is no such world, road or lane, or no lane of it has changed.
+            ConfigError: `map.changed_lanes` is 0.
         """
-        self._session.insertions.no_barrier(world, edge)
+        self._session.lane_changes.open(world, edge, lanes)
+
+    def damage_road(
+        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> None:
+        """Lower the speed limit of lanes of a road, until it is opened or the episode is over.
+
+        From the next step on, drivers, sensors and rewards have the new limit. Each lane counts in
+        `map.changed_lanes`.
+
+        Args:
+            edge: id of a road.
+            speed_mps: the limit in m/s, above 0 and at most that of the map; equal to that of the
+                map, it ends an earlier one.
+            lanes: indices of its lanes, from the kerb; None: all of them.
+            world: number of the world.
+
+        Raises:
+            ActionError: there is no such world, road or lane, or the limit is out of range.
+            CapacityError: more than `map.changed_lanes` lanes would differ from the map.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        self._session.lane_changes.limit(world, edge, speed_mps, lanes)
 
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
-        """Return the ids of closed roads, including roads that close in the next step."""
-        return self._session.insertions.closed(world)
+        """Return the ids of roads with a closed lane, including those that close in the next step.
+
+        Raises:
+            ActionError: there is no such world.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        return self._session.lane_changes.closed(world)
+
+    def deadlocks(self, world: int = 0) -> tuple[tuple[int, ...], ...]:
+        """Return the cycles of vehicle ids in which each vehicle waits for the next.
+
+        All vehicles of a cycle have stood for at least 10 s; see `engine.waiting_cycles`.
+
+        Raises:
+            ConfigError: there is no such world, or its state is not available in this process.
+            EpisodeError: before the first reset.
+        """
+        return self._session.deadlocks(world)
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
         """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.

@@ -77,7 +77,7 @@ def divide(
         shard = Shard(
             config,
             network,
-            plans=traffic.plans,
+            plans=traffic.plans_now,
             travel=traffic.travel,
             zoned=zoned,
             outputs=outputs,

@@ -105,12 +105,16 @@ def _check(document: dict[str, Any]) -> None:
         raise problem("refused", refusal)
     population = config.population
     vehicles = document["num_envs"] * (
-        population.num_ids + population.background + population.insertions + population.external
+        population.num_ids
+        + population.background
+        + population.insertions
+        + population.external
+        + config.map.changed_lanes
     )
     if vehicles > MOST_VEHICLES:
         raise problem(
-            "refused", f"{vehicles} vehicles in {document['num_envs']} worlds: at most "
-            f"{MOST_VEHICLES}; reduce agents, background or num_envs"
+            "refused", f"{vehicles} vehicles and changed lanes in {document['num_envs']} worlds: "
+            f"at most {MOST_VEHICLES}; reduce agents, background or num_envs"
         )  # fmt: skip
     wanted = asdict(config)
     for key in _OF_FILES:

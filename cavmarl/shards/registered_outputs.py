@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -10,7 +12,7 @@ from cavmarl.config.terms import TERMS
 from cavmarl.core.extensions import REGISTERED_SENSORS, REGISTERED_TERMS
 from cavmarl.core.records.arrays import Outputs, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.driving.agent_view import BatchView, RegisteredFunction, batch_view
+from cavmarl.driving.agent_view import RegisteredFunction, batch_view
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.frame_stacks import newest_frame
 from cavmarl.sensors.observed import layout
@@ -21,6 +23,8 @@ class RegisteredOutputs:
 
     def __init__(self, config: EnvConfig, network: RoadNetwork) -> None:
         self._network = network
+        self._may_change = config.map.changed_lanes > 0
+        self._networks: dict[int, RoadNetwork] = {}  # by world, if its lanes may change
         self._stack = config.sensors.stack
         self._step_s = config.clock.sim_dt_s * config.clock.ticks_per_step
         places = layout(config.sensors)
@@ -49,25 +53,36 @@ class RegisteredOutputs:
             rows = worlds.rows[w, : worlds.num_rows[w]]
             owned = rows["driver"][: worlds.num_owned[w]] == DRIVER_AGENT
             if owned.any():
-                self._write_agents(rows, np.flatnonzero(owned), w, outputs)
+                network = self._network_of(worlds, w)
+                self._write_agents(network, rows, np.flatnonzero(owned), w, outputs)
+
+    def _network_of(self, worlds: Worlds, w: int) -> RoadNetwork:
+        """Return the roads of a world, with its present lanes."""
+        if not self._may_change:
+            return self._network
+        if w not in self._networks:
+            self._networks[w] = replace(self._network, lanes=worlds.lanes[w])
+        return self._networks[w]
 
     def _write_agents(
-        self, rows: NDArray[np.void], agent_arrays: NDArray[np.int64], w: int, outputs: Outputs
+        self,
+        network: RoadNetwork,
+        rows: NDArray[np.void],
+        agent_arrays: NDArray[np.int64],
+        w: int,
+        outputs: Outputs,
     ) -> None:
         """Write the outputs of the agents whose vehicles are the rows `agent_arrays`."""
         agents = rows["agent"][agent_arrays]
         for call, reach_m, place in self._sensors:
-            numbers = call(self._view(rows, agent_arrays, reach_m))
+            view = batch_view(rows, agent_arrays, reach_m, network, self._step_s)
+            numbers = call(view)
             for agent, own in zip(agents.tolist(), numbers, strict=True):
                 seen = outputs.observations[w, agent]
                 seen[newest_frame(seen, self._stack) :][place] = own
         acted = outputs.acted[w, agents]
         if acted.any():
             for call, reach_m, column in self._terms:
-                numbers = call(self._view(rows, agent_arrays[acted], reach_m))
+                chosen = agent_arrays[acted]
+                numbers = call(batch_view(rows, chosen, reach_m, network, self._step_s))
                 outputs.terms[w, agents[acted], column] = numbers[:, 0]
-
-    def _view(
-        self, rows: NDArray[np.void], agent_arrays: NDArray[np.int64], reach_m: float
-    ) -> BatchView:
-        return batch_view(rows, agent_arrays, reach_m, self._network, self._step_s)

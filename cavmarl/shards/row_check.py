@@ -102,6 +102,7 @@ class RowCheck:
         self._num_lanes = num_lanes
         self._num_goals, self._plan_steps = len(traffic.plans), traffic.plans.size
         self.steps = len(travel.steps)
+        self._own_plans = traffic.own_plan_steps
         goals = max(self._num_goals, len(travel.scripts.frames), self.steps // max(num_lanes, 1))
         self.indices = {
             "id": range(MOST_IDS),
@@ -210,6 +211,10 @@ class RowCheck:
             )
             behind = at - travel.first_detour
             planned |= (behind >= 0) & (at < travel.num_fixed) & (behind % lanes == lane)
+        of_world = at - self._own_plans.start
+        planned |= (
+            (at >= self._own_plans.start) & (at < self._own_plans.stop) & (of_world % lanes == lane)
+        )
         drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
         follow = drives & ~planned
         if self._is_moved:  # after the load, SUMO sends the routes again

@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled.bound_call import BoundCall, bind_by_name, bound, keep_last
 from cavmarl.core.records.arrays import Demand, DepartureQueue
-from cavmarl.core.records.codes import INSERT_OPEN
 from cavmarl.shards.kernels import group_phases
 from cavmarl.shards.kernels.zone_loop import FRAME, Members
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
@@ -39,11 +38,7 @@ class ShardGroup:
         return self.first.side, self.first.next_side
 
     def begin_step(self, commands: Commands) -> None:
-        """Clear the sums of a step, take its actions, and let opened barriers drive on."""
-        inserted = commands.inserted
-        if inserted.size and (inserted[..., 0] == INSERT_OPEN).any():
-            np.copyto(self.calls.inserted, inserted)
-            self.calls.drive_on()
+        """Clear the sums of a step, and take its actions."""
         if self.calls.has_agents:
             np.copyto(self.calls.meta_actions, commands.meta_actions)
             self.calls.begin_step()
@@ -174,7 +169,6 @@ class GroupCalls:
         self.controls = np.zeros_like(first.worlds.pending[:, :, 0])
         self.meta_actions = np.zeros(self.controls.shape[:2], dtype=np.int64)
         self.chosen = np.ones(len(self.controls), dtype=np.bool_)
-        self.inserted = np.zeros((len(self.controls), config.population.insertions, 3))
         self.has_agents = config.population.agents > 0
         self.has_detectors = first.worlds.controllers.shape[1] > 0
         self.has_optional = first.optional is not None
@@ -213,12 +207,10 @@ class GroupCalls:
             "commands": self.controls,
             "meta_actions": self.meta_actions,
             "chosen": self.chosen,
-            "inserted": self.inserted,
             "discrete": first.discrete,
             "target_speeds": first.target_speeds,
             "accel_limit": action.acceleration_mps2,
             "steering_limit": action.steering_rad,
-            "first_stop": len(first.travel.stops) - len(first.roads.lanes),
             "dt": clock.sim_dt_s,
             "tick_s": clock.sim_dt_s,
             "ticks_per_step": clock.ticks_per_step,
@@ -227,7 +219,6 @@ class GroupCalls:
         }
 
     begin_step = bound(group_phases.begin_step_each)
-    drive_on = bound(group_phases.drive_on_each)
     turn = bound(group_phases.turn)
     advance = bound(group_phases.advance_each)
     resolve = bound(group_phases.resolve_each)

@@ -18,7 +18,7 @@ from cavmarl.config.traffic import TrafficConfig
 from cavmarl.core.compiled.bound_call import bound, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Demand, DepartureQueue, TripTables, Worlds
+from cavmarl.core.records.arrays import Demand, DepartureQueue, RoadArrays, TripTables, Worlds
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
@@ -29,6 +29,7 @@ from cavmarl.traffic.demand import STOP, DemandFile
 from cavmarl.traffic.departure_queue import with_room
 from cavmarl.traffic.kernels import admission, demand_generator
 from cavmarl.traffic.kernels.demand_generator import END_ROOM_M, PLACE_GAP_M, populate
+from cavmarl.traffic.lane_plans import LanePlans
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
@@ -59,11 +60,13 @@ class TrafficCalls:
         departures: DepartureQueue,
         ticks: NDArray[np.int64],  # (W,) tick of each world
         keys: NDArray[np.uint64],  # (W,) random key of each world
+        lanes: NDArray[np.void],  # LANE (V, L), see `Worlds`
     ) -> None:
         self._traffic = traffic
         self._departures = departures
         self._ticks = ticks
         self._keys = keys
+        self._lanes = lanes
         self.running = np.zeros(len(ticks), dtype=np.int64)
         self.inserted = np.zeros((len(ticks), traffic.population.insertions, 3))
 
@@ -78,6 +81,7 @@ class TrafficCalls:
             "departures": self._departures,
             "ticks": self._ticks,
             "keys": self._keys,
+            "lanes": self._lanes,
             "dt": traffic.dt,
             "num_goals": len(traffic.plans),
             "inserted": self.inserted,
@@ -108,6 +112,7 @@ class NativeTraffic:
     zeros: Zeros = np.zeros
     scene: Scene | None = None  # the scenario that is played in each world
     sumo: SumoDemand | None = None  # vehicles that SUMO runs beside these worlds; excludes `file`
+    lane_changes: bool = False  # whether lanes of a world may differ from the map
 
     def __post_init__(self) -> None:
         # Refuse impossible trips when the world is made, not at its first reset.
@@ -124,6 +129,8 @@ class NativeTraffic:
             "slots",
             "rerouting",
             "calls",
+            "lane_plans",
+            "changed_at",
         ):  # kept per world
             vars(other).pop(name, None)
         other._check_room()
@@ -140,12 +147,7 @@ class NativeTraffic:
     @cached_property
     def plans(self) -> NDArray[np.void]:
         """PLAN (G, L): for each goal, the way from each lane of the same map."""
-        names = dict.fromkeys(self.population.agent_types)
-        bodies = tuple(
-            TurningBody(*(float(kind[name]) for name in TurningBody._fields))
-            for kind in agent_types(names, own=self.population.own_types)
-        )
-        roads = with_tight_turns(self.network, ActionConfig().steering_rad, bodies)
+        roads = self._plan_roads
         maps = self.network.maps
         if len(maps) == 1:
             return make_plans(self.network, self.goal_edges[0].tolist(), roads=roads)
@@ -155,6 +157,16 @@ class NativeTraffic:
             plans[:, own] = make_plans(self.network, goals, roads=roads)[:, own]
         plans.setflags(write=False)
         return plans
+
+    @cached_property
+    def _plan_roads(self) -> RoadArrays:
+        """The roads without the turns that are too tight for a type of the agents."""
+        names = dict.fromkeys(self.population.agent_types)
+        bodies = tuple(
+            TurningBody(*(float(kind[name]) for name in TurningBody._fields))
+            for kind in agent_types(names, own=self.population.own_types)
+        )
+        return with_tight_turns(self.network, ActionConfig().steering_rad, bodies)
 
     def trips_of(self, number: int) -> MapTrips:
         """Return the trips of one map."""
@@ -221,25 +233,28 @@ class NativeTraffic:
         if self.file is None or self.schedule is None:
             types = np.concatenate([types, actors])
             steps = np.concatenate([steps, nowhere]) if len(nowhere) else steps
-            stops, num_fixed = self._barrier_stops, len(steps)
-            steps = self._with_slots(steps)
-            return TripTables(types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts)
+            stops, num_fixed = np.zeros(0, dtype=STOP), len(steps)
+            steps, shifts = self._with_room(steps), self._shifts
+            return TripTables(
+                types, steps, stops, 0, 0.0, VIEW_M, VIEW_M, num_fixed, scripts, shifts
+            )
         types = np.concatenate([types, self.file.types, actors])
         steps = np.concatenate([steps, self.schedule.steps, nowhere])
         num_fixed = len(steps)
-        steps = self._with_slots(steps)
+        steps = self._with_room(steps)
         first_detour = self.plans.size + self.schedule.first_detour
         begin_s = self.file.begin_ms / 1000.0
         return TripTables(
             types,
             steps,
-            np.concatenate([self.file.stops, self._barrier_stops]),
+            self.file.stops,
             first_detour,
             begin_s,
             view_m=self._farthest_m(look_ahead_m),
             see_m=self._farthest_m(_centre_sees_line_m),
             num_fixed=num_fixed,
             scripts=scripts,
+            shifts=self._shifts,
         )
 
     @property
@@ -255,25 +270,72 @@ class NativeTraffic:
         steps["to_go"] = np.inf
         return steps
 
-    def _with_slots(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
-        """Return the table of ways, with room for ways found at run time if vehicles reroute."""
-        if self.slots is None:
+    @property
+    def _shifts(self) -> NDArray[np.int64]:
+        return self.zeros(self.num_worlds, dtype=np.int64)
+
+    @property
+    def _first_own(self) -> int:
+        """The first of the steps that the world writes while it runs."""
+        return self.nowhere + len(self._nowhere_steps)
+
+    @property
+    def _own_steps(self) -> int:
+        """Steps of the plans of all worlds; 0 if no world has plans of its own."""
+        changes = self.lane_changes and self.population.reroute != "never"
+        return (1 + self.num_worlds) * self.plans.size if changes else 0
+
+    @property
+    def own_plan_steps(self) -> range:
+        """The steps of the plans of single worlds."""
+        return range(self._first_own, self._first_own + self._own_steps)
+
+    def _with_room(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
+        """Return the table of ways, with room for the ways that are found at run time."""
+        more = self._own_steps + (0 if self.slots is None else self.slots.room)
+        if not more:
             return fixed
-        steps = self.zeros(len(fixed) + self.slots.room, dtype=fixed.dtype)
+        steps = self.zeros(len(fixed) + more, dtype=fixed.dtype)
         steps[: len(fixed)] = fixed
         return steps
 
+    @cached_property
+    def lane_plans(self) -> LanePlans | None:
+        """The plans of worlds whose lanes may differ from the map; None: there are none."""
+        if not self._own_steps:
+            return None
+        first, shape = self._first_own, (1 + self.num_worlds, *self.plans.shape)
+        own = self.travel.steps[first : first + self._own_steps].reshape(shape)
+        own[:] = self.plans
+        follows = self.population.reroute == "always"
+        roads, goals = self._plan_roads, self.goal_edges[0]
+        return LanePlans(roads, goals, self.plans, own, self.travel.shifts, first, follows)
+
+    @cached_property
+    def changed_at(self) -> NDArray[np.int64]:
+        """(W,) the tick in which the lanes of each world last changed; -1: never."""
+        ticks: NDArray[np.int64] = self.zeros(self.num_worlds, dtype=np.int64)
+        ticks[:] = -1
+        return ticks
+
     @property
-    def _barrier_stops(self) -> NDArray[np.void]:
-        """STOP (L,): where a barrier stands on each lane; empty if insertions are off."""
-        lanes = self.network.lanes
-        stops = np.zeros(len(lanes) if self.population.insertions else 0, dtype=STOP)
-        stops["lane"], stops["at_edge"] = np.arange(len(stops)), -1
-        stops["end"] = np.minimum(
-            float(self.blank["length"][0]) + 1.0, lanes["length_m"][: len(stops)]
-        )
-        stops["duration"], stops["until"] = np.inf, -1.0
-        return stops
+    def owns_ways(self) -> bool:
+        """Whether each world writes ways of its own while it runs."""
+        return self.rerouting is not None or self._own_steps > 0
+
+    def moved_ways(self, ways: NDArray[np.int64], worlds: int) -> NDArray[np.int64]:
+        """Return VEHICLE["way"] (n,) as they are in the world with a number higher by `worlds`."""
+        first = self._first_own
+        is_plan = (ways >= first) & (ways < first + self._own_steps)
+        moved: NDArray[np.int64] = ways + is_plan * (worlds * self.plans.size)
+        if self.slots is None:
+            return moved
+        return np.where(is_plan, moved, self.slots.ways_of_first_world(ways, -worlds))
+
+    @property
+    def plans_now(self) -> NDArray[np.void]:
+        """PLAN (V, G, L): the plans on the map and, if lanes may change, those of each world."""
+        return self.plans[np.newaxis] if self.lane_plans is None else self.lane_plans.tables
 
     def _travel_of_sumo(
         self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
@@ -294,6 +356,7 @@ class NativeTraffic:
             VIEW_M,
             num_fixed=len(fixed),
             scripts=NO_SCRIPTS,
+            shifts=self._shifts,
         )
 
     def _farthest_m(self, look_m: Callable[[np.void, float], float]) -> float:
@@ -320,17 +383,21 @@ class NativeTraffic:
         schedule = self.schedule
         if schedule is None or not self._reroutes:
             return None
-        number = seekers(schedule, self.capacity, self.horizon_s)
+        if self._own_steps:
+            number = self.capacity
+        else:
+            number = seekers(schedule, self.capacity, self.horizon_s)
         if number == 0:
             return None
-        first_step = self.nowhere + len(self._nowhere_steps)
+        first_step = self._first_own + self._own_steps
         return way_slots(self.network.lanes, schedule.longest, first_step, self.num_worlds, number)
 
     @property
     def _reroutes(self) -> bool:
         """Return whether the demand has vehicles that search for ways, or rerouters."""
         file = self.file
-        return file is not None and (file.may_look or len(file.rerouters.rules) > 0)
+        searches = file is not None and (file.may_look or len(file.rerouters.rules) > 0)
+        return searches or self._own_steps > 0
 
     @property
     def ticks_per_s(self) -> int:
@@ -343,7 +410,16 @@ class NativeTraffic:
         if self.schedule is None or self.slots is None:
             return None
         first_type = len(generated_types())
-        return Rerouting(self.schedule, self.travel, self.slots, first_type, self.dt)
+        avoids = self.population.reroute if self.lane_changes else "never"
+        return Rerouting(
+            self.schedule,
+            self.travel,
+            self.slots,
+            first_type,
+            self.dt,
+            changed_at=self.changed_at,
+            avoids=avoids,
+        )
 
     @cached_property
     def capacity(self) -> int:
@@ -408,6 +484,9 @@ class NativeTraffic:
         self, departures: DepartureQueue, worlds: Worlds, chosen: NDArray[np.bool_]
     ) -> None:
         """Fill the `chosen` worlds (W,) for a new episode."""
+        if self.lane_plans is not None:
+            for w in np.flatnonzero(chosen).tolist():
+                self.lane_plans.renew(w, self.network.arrays.lanes)
         populate(self.demand, self.network.arrays, self.travel, departures, worlds, chosen)
         worlds.cues[chosen] = -1
         if self.cast is not None:
@@ -416,22 +495,22 @@ class NativeTraffic:
 
     def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Count vehicles that have left, and order their successors."""
-        self.calls(departures, worlds.ticks, worlds.keys).settle()
+        self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes).settle()
 
     def assign_lanes(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Assign to each queued vehicle the lane on which it tries to enter."""
-        self.calls(departures, worlds.ticks, worlds.keys).assign_lanes()
+        self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes).assign_lanes()
 
     def call_orders(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Move orders that are due by the coming tick into the queue."""
         if departures.next_order.tolist() != departures.num_orders.tolist():
-            self.calls(departures, worlds.ticks, worlds.keys).call_orders()
+            self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes).call_orders()
 
     def insert(
         self, departures: DepartureQueue, worlds: Worlds, inserted: NDArray[np.float64]
     ) -> None:
         """Queue the vehicles that are to be inserted in this step; `inserted` as in `Commands`."""
-        calls = self.calls(departures, worlds.ticks, worlds.keys)
+        calls = self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)
         np.copyto(calls.inserted, inserted)
         calls.insert()
 
@@ -439,15 +518,17 @@ class NativeTraffic:
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> None:
         """Choose which vehicles enter; `running` (W,): vehicles already in each world."""
-        calls = self.calls(departures, worlds.ticks, worlds.keys)
+        calls = self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)
         np.copyto(calls.running, running)
         calls.accept()
 
     @cached_property
     def calls(
         self,
-    ) -> Callable[[DepartureQueue, NDArray[np.int64], NDArray[np.uint64]], TrafficCalls]:
-        """Return the kernel calls for a departure queue and its worlds' ticks and keys."""
+    ) -> Callable[
+        [DepartureQueue, NDArray[np.int64], NDArray[np.uint64], NDArray[np.void]], TrafficCalls
+    ]:
+        """Return the kernel calls for a departure queue and its worlds' ticks, keys and lanes."""
         return keep_last(partial(TrafficCalls, self))
 
     @property

@@ -1,8 +1,9 @@
 """`Rerouting`: vehicles of the demand that search for another way while the world runs.
 
-Two mechanisms reroute vehicles. SUMO's rerouting device searches for the fastest way by the speeds
-of the last minutes; <rerouter>s act on vehicles that drive on their edges. Both run once a second
-on the departure queue, in one place for any division. Decision 011 gives the reasons.
+Three mechanisms reroute vehicles. Vehicles react once to each change of lanes by the caller. SUMO's
+rerouting device searches for the fastest way by the speeds of the last minutes. <rerouter>s act on
+vehicles that drive on their edges. All run once a second on the departure queue, in one place for
+any division. Decision 011 gives the reasons.
 """
 
 from __future__ import annotations
@@ -37,6 +38,7 @@ LOOK = record(
     ("goal", np.int32),  # EDGE row of the destination
     ("seen", np.int32),  # EDGE row on which the vehicle last asked the rerouters
     ("may_leave", np.bool_),  # whether the route prescribes no edge between its first and last
+    ("reacted", np.int64),  # tick of the last change of lanes to which it has reacted; -1: none
     ("equipped", np.bool_),  # whether it has a rerouting device, and so knows the speeds
 )
 
@@ -45,12 +47,23 @@ class Rerouting:
     """Rerouting of the vehicles of W worlds: measured speeds, searches and the ways found.
 
     `travel`: types and ways, with room for more ways at the end. `slots`: that room. `first_type`:
-    VTYPE row of the file's first type.
+    VTYPE row of the file's first type. `changed_at`: (W,) the tick in which lanes last changed.
+    `avoids`: the vehicles that react to that, see `population.reroute`.
     """
 
     def __init__(
-        self, schedule: Schedule, travel: TripTables, slots: WaySlots, first_type: int, dt: float
+        self,
+        schedule: Schedule,
+        travel: TripTables,
+        slots: WaySlots,
+        first_type: int,
+        dt: float,
+        *,
+        changed_at: NDArray[np.int64],
+        avoids: str,
     ) -> None:
+        self._changed_at = changed_at
+        self._avoids = avoids
         self._roads: RoadArrays = schedule.demand.network.arrays
         self._travel = travel
         self._slots = slots
@@ -90,6 +103,7 @@ class Rerouting:
         looks["next"] = np.where(orders["reroute"], 0, NEVER)
         looks["goal"] = self._schedule.last_edges(orders["route"])
         looks["seen"] = -1
+        looks["reacted"] = -1
         routes = self._schedule.demand.routes[orders["route"]]
         looks["may_leave"] = routes["exact"] | (routes["num_edges"] <= 2)
         first = self._slots.first_of(world)
@@ -103,14 +117,6 @@ class Rerouting:
             if tick % self._ticks_per_s == 0:
                 self._sample(worlds, w, int(tick))
                 departures.counts[w, COUNT_REROUTED] += self._let_ask(worlds, w, int(tick))
-
-    def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """Convert VEHICLE["way"] (n,) of `world` to the values they would have in world 0."""
-        return self._slots.ways_of_first_world(ways, world)
-
-    def ways_of_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """Convert VEHICLE["way"] (n,) from the values of world 0 to those of `world`."""
-        return self._slots.ways_of_first_world(ways, -world)
 
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """Yield the part of a world's state that is kept here, as arrays without padding.
@@ -160,15 +166,22 @@ class Rerouting:
         clock_s = self._travel.begin_s + tick * self._dt
         self._forget_seen(looks, clock_s)
         asking = np.empty(num, dtype=np.int64)
-        found = find_asking(self._roads, rows, num, tick, self._has_rules, looks, asking)
+        changed_at = -1 if self._avoids == "never" else int(self._changed_at[w])
+        found = find_asking(
+            self._roads, rows, num, tick, self._has_rules, looks, changed_at, asking
+        )
         if found == 0:
             return 0
-        traffic = Traffic(self._speed_sums[w], self._past.shape[1], self._closed(clock_s))
+        lanes = worlds.lanes[w if len(worlds.lanes) > 1 else 0]
+        closed = self._closed(clock_s)
+        traffic = Traffic(self._speed_sums[w], self._past.shape[1], closed, lanes)
         search = WaySearch(self._roads, self._travel, self._slots, w, rows, num, traffic)
         legs = rows["leg"][:num].sum()
         for i in asking[:found]:
             row = rows[i]
             look = looks[row["order"]]
+            if look["reacted"] < changed_at:
+                self._react(search, int(i), look, changed_at)
             self._ask_rerouters(search, int(i), row, look, clock_s)
             if tick >= look["next"]:
                 answer = search.send(int(i), int(look["goal"]), True, False)
@@ -191,6 +204,18 @@ class Rerouting:
         now = closings[(closings["begin_s"] <= clock_s) & (clock_s < closings["end_s"])]
         np.bitwise_or.at(closed, now["edge"], now["classes"])
         return closed
+
+    def _react(self, search: WaySearch, i: int, look: np.void, changed_at: int) -> None:
+        """Let a vehicle search for another way after a change of lanes.
+
+        Without another way, it keeps its present one, and waits before the closed lane.
+        """
+        is_blocked = search.meets_closing(i)
+        if is_blocked or self._avoids == "always":
+            answer = search.send(i, int(look["goal"]), bool(look["equipped"]), is_blocked)
+            if answer is WaySearchResult.LATER:
+                return
+        look["reacted"] = changed_at
 
     def _ask_rerouters(
         self, search: WaySearch, i: int, row: np.void, look: np.void, clock_s: float

@@ -118,6 +118,7 @@ class Traffic(NamedTuple):
     speed_sums: NDArray[np.int64]  # (num_edges,) mm/s, see `sample_speeds`
     samples: int  # number of samples in each sum
     closed: NDArray[np.int64]  # (num_edges,) bits of the classes that may not use an edge
+    lanes: NDArray[np.void]  # LANE (L,) with the present limits and permissions
 
 
 class WaySearch:
@@ -152,7 +153,7 @@ class WaySearch:
         self._cost = np.zeros(slots.steps)
 
     def meets_closing(self, i: int) -> bool:
-        """Return whether the way of row i leads over an edge that is closed to the vehicle."""
+        """Return whether the way of row i leads over a lane that is closed to the vehicle."""
         row = self._rows[i]
         roads = self._roads_now(self._permission(i), False)
         time: float = time_left(roads, self._travel.steps, row["way"], row["lane"])
@@ -208,8 +209,8 @@ class WaySearch:
             lanes = self._roads.lanes.copy()
             samples = self._traffic.samples if knows else 0
             slow_lanes(
-                self._roads, self._traffic.speed_sums, samples, self._traffic.closed, permission,
-                lanes,
+                self._roads, self._traffic.speed_sums, samples, self._traffic.closed,
+                self._traffic.lanes, permission, lanes,
             )  # fmt: skip
             # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
             lanes.setflags(write=False)

@@ -1,4 +1,4 @@
-"""Insertions by pages: a vehicle, or a barrier, which pages can also remove."""
+"""Changes by pages: a vehicle that is inserted, a road that is closed or opened."""
 
 from __future__ import annotations
 
@@ -7,7 +7,8 @@ from collections.abc import Collection
 import numpy as np
 
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
-from cavmarl.env.insertions import CLOSED, INSERTED, OPENED
+from cavmarl.env.insertions import INSERTED
+from cavmarl.env.lane_changes import CLOSED, OPENED
 from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.page_requests import PageRequest
@@ -51,9 +52,9 @@ def _apply(env: ViewedEnv, world: int, request: PageRequest) -> tuple[str, str]:
         env.insert_vehicle(network.lane_ids[lane], place_m, world)
         return INSERTED, network.lane_ids[lane]
     if request.kind == "close":
-        env.close_road(edge, world)
+        env.close_road(edge, world=world)
         return CLOSED, edge
-    env.open_road(edge, world)
+    env.open_road(edge, world=world)
     return OPENED, edge
 
 

@@ -80,7 +80,9 @@ def hello_of(env: ViewedEnv, policy: str, *, is_driven_here: bool = True) -> dic
     if is_driven_here:
         hello["may"] = [*hello["may"], "reset", "seat"]
     if config.population.insertions:
-        hello["may"] = [*hello["may"], "insert", "close", "open"]
+        hello["may"] = [*hello["may"], "insert"]
+    if config.map.changed_lanes:
+        hello["may"] = [*hello["may"], "close", "open"]
     return hello
 
 

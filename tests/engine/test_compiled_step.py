@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 
-from cavmarl.core.records.codes import INSERT_BARRIER, INSERT_OPEN
 from cavmarl.engine.simulation import Simulation
 from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands
@@ -77,22 +76,23 @@ def test_actuated_signals_and_ordered_departures_are_the_same(tmp_path: Path) ->
     compare(*made)
 
 
-def test_barriers_are_the_same() -> None:
+def test_changed_lanes_are_the_same() -> None:
     compiled, plain = (
-        make_simulation("grid4x4", mode="respawn", agents=4, overrides={"population.insertions": 3})
+        make_simulation("grid4x4", mode="respawn", agents=4, overrides={"map.changed_lanes": 3})
         for _ in range(2)
     )
     log_phases(plain)
     start(compiled, seed=2)
     start(plain, seed=2)
+    changes = np.zeros((1, 3, 3))
     for step in range(40):
-        inserted = np.zeros((1, 3, 3))
         if step in (3, 20):
-            inserted[0, 0] = INSERT_BARRIER if step == 3 else INSERT_OPEN, 4, 10.0
+            changes[0, 0] = (5, 13.89, 511) if step == 3 else (0, 0.0, 0)
+            changes[0, 1] = 9, 2.0, 0
         for simulation in (compiled, plain):
             controls = suggested(simulation)
             commands = idle(simulation)
-            simulation.step(Commands(controls, commands.meta_actions, inserted=inserted))
+            simulation.step(Commands(controls, commands.meta_actions, lane_changes=changes))
         same(compiled, plain, step)
     assert is_compiled(compiled)
 

@@ -56,7 +56,7 @@ class Halves:
             shard = Shard(
                 whole.config,
                 whole.network,
-                plans=traffic.plans,
+                plans=traffic.plans_now,
                 travel=traffic.travel,
                 zoned=zoned,
                 outputs=self.shared.outputs,

@@ -1,4 +1,4 @@
-"""Vehicles and barriers put into running worlds: equal in all divisions, and recorded."""
+"""Vehicles put into running worlds: equal in all divisions, and recorded."""
 
 from __future__ import annotations
 
@@ -29,11 +29,6 @@ def act(env: Any, step: int) -> None:
     roads = np.flatnonzero(~network.lanes["internal"] & (network.lanes["length_m"] > 60.0))
     if step in (4, 5, 30):
         env.insert_vehicle(network.lane_ids[int(roads[step])], 20.0 + step)
-    road = network.edge_ids[int(network.lanes["edge"][roads[7]])]
-    if step == 10:
-        env.close_road(road)
-    if step == 35:
-        env.open_road(road)
 
 
 def hashes(**more: Any) -> list[str]:
@@ -82,28 +77,21 @@ def test_a_run_follows_from_its_recording(tmp_path: Path) -> None:
     recording = Recording.open(tmp_path / "run")
     told = {}
     for found in recording.events():
-        if found.event.kind in ("inserted", "closed", "opened"):
+        if found.event.kind == "inserted":
             told.setdefault(found.event.tick, []).append(found.event)
-    assert sorted(event.kind for events in told.values() for event in events) == [
-        "closed", "inserted", "inserted", "inserted", "opened",
-    ]  # fmt: skip
+    assert sum(map(len, told.values())) == 3
     ticks = recording.ticks()
     with closing(parallel_env("grid4x4", agents=3, background=40, overrides=ROOM)) as env:
         env.reset(seed=2)
         for tick in ticks[1:]:
             for event in told.get(tick, ()):
-                if event.kind == "closed":
-                    env.close_road(event.detail)
-                elif event.kind == "opened":
-                    env.open_road(event.detail)
-                else:
-                    lane, place = event.detail.rsplit(" ", 1)
-                    env.insert_vehicle(lane, float(place))
+                lane, place = event.detail.rsplit(" ", 1)
+                env.insert_vehicle(lane, float(place))
             env.step(env.suggest_actions())
         assert env.state_hash() == wanted
 
 
-def test_an_inserted_vehicle_drives_and_a_closed_road_stays_closed() -> None:
+def test_an_inserted_vehicle_drives() -> None:
     with closing(parallel_env("grid4x4", agents=1, background=0, overrides=ROOM)) as env:
         env.reset(seed=0)
         lanes = env.network.lanes
@@ -117,51 +105,16 @@ def test_an_inserted_vehicle_drives_and_a_closed_road_stays_closed() -> None:
         rows = env.simulation.vehicles(0)
         new = rows[rows["agent"] < 0][0]
         assert env.network.lane_ids[int(new["lane"])] == lane
-        edge = env.network.edge_ids[int(lanes["edge"][others[-1]])]
-        env.close_road(edge)
         for _ in range(100):
             env.step(env.suggest_actions())
         rows = env.simulation.vehicles(0)
-        moved = rows[rows["id"] == new["id"]]
-        assert moved["distance_m"][0] > 20.0
-        barriers = rows[(rows["agent"] < 0) & (rows["id"] != new["id"])]
-        names = {env.network.edge_ids[int(k)] for k in lanes["edge"][barriers["lane"]]}
-        assert names == {edge}
-        assert len(barriers) == int((lanes["edge"] == lanes["edge"][others[-1]]).sum())
-        assert (barriers["speed"] == 0.0).all()
-        assert (barriers["distance_m"] < 0.5).all()
-        env.open_road(edge)
-        for _ in range(30):
-            env.step(env.suggest_actions())
-        rows = env.simulation.vehicles(0)
-        assert (rows[np.isin(rows["id"], barriers["id"])]["distance_m"] > 5.0).all()
-
-
-def test_barriers_that_wait_for_a_gap_never_enter_a_road_that_is_opened() -> None:
-    with closing(parallel_env("grid4x4", agents=1, background=0, overrides=ROOM)) as env:
-        env.reset(seed=0)
-        roads = env.network.lanes["edge"][~env.network.lanes["internal"]]
-        number = next(int(road) for road in roads if env.network.edge_ids[road] != edge_of(env))
-        edge = env.network.edge_ids[number]
-        lanes = np.flatnonzero(env.network.lanes["edge"] == number)
-        for lane in lanes.tolist():
-            env.insert_vehicle(env.network.lane_ids[lane], 6.0)
-        env.close_road(edge)
-        env.step(env.suggest_actions())  # at each place stands a vehicle, so the barriers wait
-        assert env.traffic_stats()["waiting"] == len(lanes)
-        env.open_road(edge)
-        env.step(env.suggest_actions())
-        assert env.traffic_stats()["waiting"] == 0
-        assert len(env.simulation.vehicles(0)) == 1 + len(lanes)
-        env.close_road(edge)
-        env.open_road(edge)
-        assert env.closed_roads() == ()
+        assert rows[rows["id"] == new["id"]]["distance_m"][0] > 20.0
 
 
 def test_a_repeated_step_has_the_insertions_of_the_failed_step(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    overrides = {**ROOM, "v2x.enabled": True}
+    overrides = {**ROOM, "v2x.enabled": True, "map.changed_lanes": 4}
     found = []
     for fails in (False, True):
         with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
@@ -190,7 +143,7 @@ def test_invalid_insertions_are_refused_with_a_fix() -> None:
     with closing(parallel_env("grid4x4")) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=r"set population\.insertions"):
-            env.close_road(edge_of(env))
+            env.insert_vehicle(env.network.lane_ids[0], 1.0)
     with closing(make_vec("grid4x4", num_envs=2, overrides={"population.insertions": 2})) as vec:
         vec.reset(seed=0)
         roads = np.flatnonzero(~vec.network.lanes["internal"])
@@ -204,10 +157,6 @@ def test_invalid_insertions_are_refused_with_a_fix() -> None:
             vec.insert_vehicle(lane, float("nan"))
         with pytest.raises(ActionError, match="must be from 0 to 1"):
             vec.insert_vehicle(lane, 1.0, world=2)
-        with pytest.raises(ActionError, match="no such edge"):
-            vec.close_road("nowhere")
-        with pytest.raises(ActionError, match="not closed; give the id of a closed edge"):
-            vec.open_road(vec.network.edge_ids[0])
         for _ in range(2):
             vec.insert_vehicle(lane, 10.0, world=1)
         with pytest.raises(CapacityError, match="set it higher, or reset"):

@@ -99,7 +99,7 @@ def saved_arrays(vec: CavVectorEnv, saved: bytes) -> list[NDArray[Any]]:
     return found
 
 
-MASK, CAUSES, INSERTED, WAITING, USED, BARRIERS, LAST, CLIPPED = range(8)
+MASK, CAUSES, INSERTED, WAITING, USED, LAST, CLIPPED = range(7)
 SIZES = -2
 
 
@@ -112,7 +112,6 @@ SIZES = -2
         (WAITING, 0, 3, "the number of insertions is out of range"),
         (WAITING, 0, 0, "an insertion is not counted"),
         (USED, 0, 99, "the number of insertions is out of range"),
-        (BARRIERS, 0, 1 << 30, "a barrier stands on a lane that does not exist"),
         (LAST, 0, 1.5, "a last action is out of range"),
         (LAST, 0, np.nan, "a last action is out of range"),
         (CLIPPED, 0, -1, "a count of tolerated actions is negative"),
@@ -137,7 +136,7 @@ def test_invalid_values_outside_of_the_worlds_are_refused(
     assert vec.save_state() == saved
 
 
-EXTERNAL_COMMANDS, EXTERNAL_USED = 10, 11
+EXTERNAL_COMMANDS, EXTERNAL_USED = 9, 10
 
 
 def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:

@@ -56,6 +56,7 @@ def travel_by(
         see_m=VIEW_M,
         num_fixed=steps.size,
         scripts=NO_SCRIPTS,
+        shifts=np.zeros(64, dtype=np.int64),
     )
 
 

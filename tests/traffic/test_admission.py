@@ -88,7 +88,7 @@ def test_one_vehicle_per_tick_tries_to_enter_each_lane() -> None:
     departures = gate_of(4)
     departures.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
     worlds = make_worlds(1, 12, ROADS)
-    assign_lanes(ROADS.arrays, travel("merge"), departures, worlds.keys)
+    assign_lanes(ROADS.arrays, travel("merge"), departures, worlds.keys, worlds.lanes)
     assert departures.tries[0, :4].tolist() == [MAIN[0], -1, MAIN[1], -1]
 
 

@@ -71,9 +71,10 @@ def test_travel_times_use_measured_speeds_and_closed_edges_are_no_way() -> None:
     sums[edge] = 5 * 2500
     closed = np.zeros(len(roads.edges), dtype=np.int64)
     lanes = roads.lanes.copy()
+    now = roads.lanes.copy()
 
     def speeds(samples: int, permission: int = PASSENGER) -> NDArray[np.float64]:
-        slow_lanes(roads.arrays, sums, samples, closed, permission, lanes)
+        slow_lanes(roads.arrays, sums, samples, closed, now, permission, lanes)
         found: NDArray[np.float64] = lanes["speed_mps"].copy()
         return found
 

@@ -50,7 +50,16 @@ def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
     steps["next"] = -1
     stops = np.zeros(0, dtype=STOP)
     travel = TripTables(
-        generated_types(), steps, stops, 0, 0.0, 100.0, 100.0, len(steps), NO_SCRIPTS
+        generated_types(),
+        steps,
+        stops,
+        0,
+        0.0,
+        100.0,
+        100.0,
+        len(steps),
+        NO_SCRIPTS,
+        np.zeros(1, dtype=np.int64),
     )
     first = np.array([0, 1], dtype=np.int64)
     return travel, Paths(first, np.array([-1], dtype=np.int32), np.zeros(1, dtype=np.int64), 0)

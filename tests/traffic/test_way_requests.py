@@ -117,16 +117,19 @@ def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> Non
     rows[7]["order"] = -1
     rows[8]["lane"] = second
 
-    def asking(tick: int, *rerouters: int) -> list[int]:
+    def asking(tick: int, *rerouters: int, changed_at: int = -1) -> list[int]:
         rules = np.zeros(len(roads.edges), np.bool_)
         rules[list(rerouters)] = True
         room = np.zeros(len(rows), np.int64)
-        found = find_asking(roads.arrays, rows, len(rows), tick, rules, looks, room)
+        found = find_asking(roads.arrays, rows, len(rows), tick, rules, looks, changed_at, room)
         ids: list[int] = rows["id"][room[:found]].tolist()
         return ids
 
     assert asking(10) == [0, 3, 8]
     assert asking(9) == []
+    looks["reacted"] = 4
+    looks["reacted"][8] = 7
+    assert asking(9, changed_at=7) == [0, 3]
     edge = int(roads.lanes[second]["edge"])
     assert looks[8]["seen"] == edge
     assert asking(9, edge) == [], "a vehicle that was there before counts as seen by the rerouter"

@@ -95,7 +95,11 @@ def serve() -> Iterator[Callable[..., Served]]:
             rig: dict[str, Any] | None = None,
             insertions: int = 0,
         ) -> Served:
-            more = {"rig": rig or {}, "population.insertions": insertions}
+            more = {
+                "rig": rig or {},
+                "population.insertions": insertions,
+                "map.changed_lanes": 2 * insertions,
+            }
             made = parallel_env(env, zones=zones, agents=3, background=background, overrides=more)
             return stack.enter_context(served(made, options or WebOptions(port=0), drives))
 

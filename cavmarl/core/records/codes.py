@@ -20,8 +20,6 @@ MODEL_ACC = 2
 # Kinds of insertions into a running world, `Commands.inserted`.
 INSERT_NONE = 0
 INSERT_VEHICLE = 1
-INSERT_BARRIER = 2  # stands until its lane is opened, or until the end of the episode
-INSERT_OPEN = 3  # opens a lane; its barrier drives on, or is cancelled
 
 # DEPARTURE["lane_code"]: the lane of its edge on which a vehicle enters
 LANE_GIVEN = 0

@@ -15,6 +15,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MAJOR,
     SIGNAL_GREEN_MINOR,
 )
+from cavmarl.roads.kernels.lanes_now import plans_of
 from cavmarl.roads.kernels.signal_phases import program_at
 from cavmarl.sensors.kernels.frame_stacks import newest_frame
 from cavmarl.v2x.kernels.shown_states import phase_of, shown_at
@@ -243,7 +244,8 @@ def observe_messages(
                 part = out[k * EVENT_FEATURES :]
                 _observe_event(report, row, cos, sin, scale_m, tick_s, part)
             if signal:
-                link, distance_m = _next_signal(roads, plans, row)
+                own_plans = plans[plans_of(plans, row, w)]
+                link, distance_m = _next_signal(roads, own_plans, row)
                 if link >= 0:
                     part = out[events * EVENT_FEATURES :]
                     inbox = mail.signals[w, agent]

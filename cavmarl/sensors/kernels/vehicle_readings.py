@@ -12,6 +12,7 @@ from cavmarl.core.math.elementary import atan2, cos_sin, tangent
 from cavmarl.core.math.geometry import lane_pose, project_near, wrap_angle
 from cavmarl.core.records.arrays import RoadArrays, Worlds
 from cavmarl.core.records.codes import EVENT_COLLIDED
+from cavmarl.roads.kernels.lanes_now import plans_of
 from cavmarl.sensors.kernels.rig_frames import (
     Due,
     Mount,
@@ -241,9 +242,10 @@ def measure_lane_boundary(
                 roads.points, lane["first_point"], lane["num_points"], x, y, row["s"], _WINDOW_M
             )
             looks = atan2(axes[1, 1, 0], axes[1, 0, 0])
-            x0, y0 = _way_ahead(roads, plans, row, 0.0)
-            x1, y1 = _way_ahead(roads, plans, row, 0.5 * lookahead_m)
-            x2, y2 = _way_ahead(roads, plans, row, lookahead_m)
+            own_plans = plans[plans_of(plans, row, w)]
+            x0, y0 = _way_ahead(roads, own_plans, row, 0.0)
+            x1, y1 = _way_ahead(roads, own_plans, row, 0.5 * lookahead_m)
+            x2, y2 = _way_ahead(roads, own_plans, row, lookahead_m)
             scratch[0] = 0.5 * lane["width_m"] - offset
             scratch[1] = 0.5 * lane["width_m"] + offset
             scratch[2] = lane["width_m"]

@@ -19,7 +19,6 @@ from cavmarl.sensors.kernels.sense import sense
 from cavmarl.shards.kernels.world_phases import advance, begin_step, resolve
 from cavmarl.shards.kernels.zone_loop import COMMITTED, NEXT, Members, for_each_zone
 from cavmarl.traffic.kernels.admission import admit, propose, rank_lanes
-from cavmarl.traffic.kernels.barriers import drive_on
 from cavmarl.traffic.kernels.demand_generator import choose_goals
 from cavmarl.traffic.kernels.leaving import drop_ghosts, leave
 from cavmarl.zones.kernels.ghost_exchange import gather
@@ -67,7 +66,6 @@ def gather_ghosts(
 
 
 begin_step_each = for_each_zone(begin_step)
-drive_on_each = for_each_zone(drive_on)
 advance_each = for_each_zone(advance)
 choose_goals_each = for_each_zone(choose_goals)
 leave_background_each = for_each_zone(leave_background)

@@ -36,12 +36,9 @@ from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     EVENT_ARRIVED,
-    INSERT_BARRIER,
     INSERT_NONE,
-    INSERT_OPEN,
     LANE_GIVEN,
     POS_GIVEN,
-    SPEED_GIVEN,
     SPEED_MAX,
     SUM_DELAY_S,
     SUM_DISTANCE_M,
@@ -49,9 +46,10 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import place_on_lane
+from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.roads.kernels.map_choice import map_of
-from cavmarl.traffic.kernels.barriers import withdraw
 from cavmarl.traffic.kernels.entering import speed_at
+from cavmarl.traffic.kernels.own_plans import follows_plan, take_plan
 
 PLACE_TRIES = 24  # places tried for a vehicle at reset; then the vehicle is queued
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
@@ -130,15 +128,12 @@ def insert(
     """Append the vehicles that are inserted from outside to the queue.
 
     The vehicle drives to the first goal farther than `WANDER_M`, starting from a random goal. If
-    its lane leads to none, it stops at the lane's end. Barriers use the last STOP rows, one a lane.
+    its lane leads to none, it stops at the lane's end.
     """
     lanes = roads.lanes.shape[0]
     for w in range(ticks.size):
         for n in range(inserted.shape[1]):
             lane = int(inserted[w, n, 1])
-            if inserted[w, n, 0] == INSERT_OPEN:
-                withdraw(departures, w, travel.stops.shape[0] - lanes + lane)
-                continue
             if (
                 inserted[w, n, 0] == INSERT_NONE
                 or departures.num_queue[w] >= departures.queue.shape[1]
@@ -154,12 +149,6 @@ def insert(
                     _send(roads, departure, lane, goal)
                     break
             departure["pos"] = inserted[w, n, 2]
-            if inserted[w, n, 0] == INSERT_BARRIER:
-                departure["stop"] = travel.stops.shape[0] - lanes + lane
-                departure["stops_end"] = departure["stop"] + 1
-                departure["pos"] = travel.stops[departure["stop"]]["end"]
-                departure["speed_code"] = SPEED_GIVEN
-                departure["speed"] = 0.0
 
 
 @kernel
@@ -206,6 +195,8 @@ def enter(
     row["height"] = kind["height"]
     row["goal"] = departure["goal"]
     row["way"] = departure["way"]
+    if departure["order"] < 0:
+        row["way"] += travel.shifts[w]
     row["stop"] = departure["stop"]
     row["stops_end"] = departure["stops_end"]
     row["lane"] = lane
@@ -351,8 +342,11 @@ def choose_goals(
     for w in range(worlds.ticks.shape[0]):
         if worlds.ticks[w] % turns != 0:
             continue
+        here = roads_in(roads, worlds.lanes, w)
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
+            if follows_plan(row):
+                departures.counts[w, COUNT_REROUTED] += take_plan(here, travel, row, w)
             if not _needs_goal(demand, roads, travel, row):
                 continue
             lane = row["lane"]
@@ -365,7 +359,7 @@ def choose_goals(
                 goal = below(
                     row["rng_key"], row["id"], row["tick"], STREAM_ROUTE + attempt, num_goals
                 )
-                way = goal * roads.lanes.shape[0]
+                way = goal * roads.lanes.shape[0] + travel.shifts[w]
                 step = travel.steps[way + lane]
                 to_go = step["to_go"] - row["s"]
                 if to_go < math.inf and to_go > WANDER_M and step["change"] == 0:

@@ -36,6 +36,7 @@ from cavmarl.driving.kernels.lanes.lane_index import ahead_on, behind_by, first_
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import accel_behind, speed_behind
+from cavmarl.roads.kernels.lanes_now import is_closed
 
 ENTER_GAP_M = 1.0  # m between bumpers, minimum gap of an entering vehicle
 LEADER_M = 150.0  # m; search distance for a leader
@@ -47,9 +48,9 @@ DRAW_SPEED = 1
 
 
 @kernel
-def _may_use(travel: TripTables, departure: np.void, lane: int) -> bool:
+def _may_use(roads: RoadArrays, travel: TripTables, departure: np.void, lane: int) -> bool:
     usable: bool = travel.steps[departure["way"] + lane]["to_go"] < math.inf
-    return usable
+    return usable and not is_closed(roads, lane, travel.types[departure["vtype"]])
 
 
 @kernel
@@ -75,19 +76,22 @@ def entry_lane(
     A departure that chooses by traffic takes the usable lane with the fewest vehicles (`best`: of
     the lanes that its way follows furthest without a lane change); on a tie, the right one.
 
-    `departure`: the departure. `ranks`: how crowded each lane of its edge is; read if traffic
-    decides. `taken`: (L,) lanes on which another departure tries to enter in this tick.
+    `roads`: of the world. `departure`: the departure. `ranks`: how crowded each lane of its edge
+    is; read if traffic decides. `taken`: (L,) lanes on which another departure tries to enter in
+    this tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:
-        return -1 if taken[departure["lane"]] else departure["lane"]
+        kind = travel.types[departure["vtype"]]
+        waits = taken[departure["lane"]] or is_closed(roads, departure["lane"], kind)
+        return -1 if waits else departure["lane"]
     edge = roads.edges[roads.lanes[departure["lane"]]["edge"]]
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
     usable = 0
     furthest = 0.0  # m that the way follows a lane without a lane change
     for lane in range(first, end):
-        if _may_use(travel, departure, lane):
+        if _may_use(roads, travel, departure, lane):
             usable += 1
             furthest = max(furthest, travel.steps[departure["way"] + lane]["room"])
     furthest = SAME_LENGTH * min(furthest, BEST_LANE_M)
@@ -97,7 +101,7 @@ def entry_lane(
     best = -1
     best_rank = 1 << 40
     for lane in range(first, end):
-        if not _may_use(travel, departure, lane):
+        if not _may_use(roads, travel, departure, lane):
             continue
         if code == LANE_RANDOM:
             if pick == 0:

@@ -35,15 +35,18 @@ def find_asking(
     tick: int,
     has_rules: NDArray[np.bool_],
     looks: NDArray[np.void],
+    changed_at: int,
     asking: NDArray[np.int64],
 ) -> int:
     """List the vehicles that search for a way in this second, by ascending id.
 
     These are background vehicles of the demand that are outside junctions, have no stop ahead, and
-    either are due for a search or have come to an edge with rerouters.
+    are due for a search, have come to an edge with rerouters, or have not reacted to the last
+    change of lanes.
 
     `has_rules`: (num_edges,) whether an edge has rerouters. `looks`: LOOK, by VEHICLE["order"];
-    edges without rerouters are noted as seen. `asking`: receives the rows of the vehicles.
+    edges without rerouters are noted as seen.
+    `changed_at`: tick of the last change, or -1. `asking`: receives the rows of the vehicles.
 
     Returns the number of vehicles.
     """
@@ -61,7 +64,7 @@ def find_asking(
         edge = lane["edge"]
         if not has_rules[edge]:
             look["seen"] = edge
-        if tick >= look["next"] or look["seen"] != edge:
+        if tick >= look["next"] or look["seen"] != edge or look["reacted"] < changed_at:
             k = found
             while k > 0 and rows[asking[k - 1]]["id"] > row["id"]:
                 asking[k] = asking[k - 1]
@@ -303,6 +306,7 @@ def slow_lanes(
     speed_sums: NDArray[np.int64],
     samples: int,
     closed: NDArray[np.int64],
+    now: NDArray[np.void],
     permission: int,
     lanes: NDArray[np.void],
 ) -> None:
@@ -313,15 +317,19 @@ def slow_lanes(
         speed_sums: (num_edges,) mm/s, see `sample_speeds`.
         samples: number of samples in each sum; 0: use the limits.
         closed: (num_edges,) bits of the classes that may not use an edge.
+        now: LANE (L,) of the world.
         permission: bits of the vehicle class.
         lanes: LANE (L,); "speed_mps" is written.
     """
     for lane in range(lanes.shape[0]):
         row = roads.lanes[lane]
         edge = row["edge"]
-        speed = row["speed_mps"]
+        speed = now[lane]["speed_mps"]
         if samples > 0:
             speed = min(speed, max(speed_sums[edge] / (1000.0 * samples), LEAST_MPS))
-        if closed[edge] & permission == permission:
+        is_shut = (
+            row["permissions"] & permission != 0 and now[lane]["permissions"] & permission == 0
+        )
+        if is_shut or closed[edge] & permission == permission:
             speed = row["length_m"] / CLOSED_S
         lanes[lane]["speed_mps"] = speed

@@ -48,6 +48,7 @@ from cavmarl.driving.kernels.junctions.zippers import is_zipper, passes_first
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
+from cavmarl.roads.kernels.lanes_now import is_closed
 
 # m/s²: a driver stops at yellow if this deceleration suffices. Drivers as in SUMO stop if their
 # full deceleration suffices.
@@ -234,6 +235,8 @@ def hold_at_line(
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return HOLD_SIGNAL
     kind = travel.types[row["vtype"]]
+    if is_closed(roads, roads.links[link]["to_lane"], kind) and needed <= HARD_STOP:
+        return HOLD_EXIT_BLOCKED
     stops = kind["decel"] if kind["as_sumo"] else COMFORT_STOP
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
         # A vehicle that yielded at the line during green goes now, because the others stop.

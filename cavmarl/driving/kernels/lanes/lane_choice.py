@@ -32,6 +32,7 @@ from cavmarl.driving.kernels.lanes.side_clearance import has_side_clearance
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import accel_behind, no_constraint, wish
 from cavmarl.driving.kernels.motion.ordered_stops import STAY, change_for_stop
+from cavmarl.roads.kernels.lanes_now import is_closed
 from cavmarl.roads.kernels.plans import is_barred
 
 LOOK_BACK_M = 60.0  # distance within which followers count for a lane change
@@ -272,6 +273,8 @@ def _may_change(
     if lane["internal"] or target < 0 or (needed != 0 and needed != side):
         return False
     if is_barred(roads, row["lane"], side, travel.types[row["vtype"]]["permissions"]):
+        return False
+    if is_closed(roads, target, travel.types[row["vtype"]]):
         return False
     if rear_is_inside(lane, row):
         return False

@@ -28,6 +28,7 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.lanes.route_following import next_step
 from cavmarl.driving.kernels.motion.motion import ARRIVE_M, MAX_SPEED_MPS, STANDING_MPS
 from cavmarl.driving.kernels.motion.tracking import WINDOW_M, locate, side_lane
+from cavmarl.roads.kernels.lanes_now import plans_of
 
 AIM_S = 0.6  # distance of a vehicle's aim, as driving time
 AIM_MIN_M = 4.0
@@ -144,7 +145,8 @@ def _correct_agent(
 @kernel
 def follow_reports(
     roads: RoadArrays,
-    plans: NDArray[np.void],  # PLAN (G, L)
+    plans: NDArray[np.void],  # PLAN (V, G, L), see `plans_of`
+    w: int,  # the world
     grid: LaneGrid,  # the lanes near each place
     places: NDArray[np.int64],  # (n,) rows to correct
     was: NDArray[np.void],  # VEHICLE (n,), these rows before the tick
@@ -161,6 +163,7 @@ def follow_reports(
         if row["driver"] == DRIVER_AGENT:
             if was[k]["events"] & EVENTS_THAT_END:
                 continue  # its trip is over: it does not move
-            _correct_agent(roads, plans, grid, row, was[k], told[k], phase, dt)
+            own_plans = plans[plans_of(plans, row, w)]
+            _correct_agent(roads, own_plans, grid, row, was[k], told[k], phase, dt)
         else:
             _correct_background(roads, row, was[k], told[k], dt)

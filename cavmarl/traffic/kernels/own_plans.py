@@ -1,0 +1,79 @@
+"""Vehicles that take the plans of their world, because its lanes differ from the map."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from cavmarl.core.compiled import kernel
+from cavmarl.core.records.arrays import RoadArrays, TripTables, Worlds
+from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
+from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.traffic.kernels.way_requests import has_room
+
+
+@kernel
+def follows_plan(row: np.void) -> bool:
+    """Return whether a vehicle drives to a goal of the generator."""
+    drives = row["driver"] == DRIVER_AGENT or row["driver"] == DRIVER_BACKGROUND
+    follows: bool = drives and row["order"] < 0
+    return follows
+
+
+@kernel
+def prolong_trip(roads: RoadArrays, travel: TripTables, row: np.void) -> None:
+    """Give an agent's trip at least the time that its present way takes from here."""
+    if row["due"] < 0 or travel.trip_horizon <= 0.0 or roads.lanes[row["lane"]]["internal"]:
+        return
+    most_s = route_time_s(roads, travel, row, row["tick"] * travel.tick_s)
+    row["due"] = max(row["due"], row["tick"] + math.ceil(most_s / travel.tick_s))
+
+
+@kernel
+def take_plan(roads: RoadArrays, travel: TripTables, row: np.void, w: int) -> int:
+    """Put a vehicle on the present plan to its goal; return 1 if this changes its route, else 0.
+
+    A background vehicle that cannot change to another link or lane any more keeps its plan until
+    the next call. A longer way does not count as lost progress of an agent.
+
+    `roads`: of world w. `row`: VEHICLE that follows a plan, written.
+    """
+    lane = row["lane"]
+    way = row["goal"] * roads.lanes.shape[0] + travel.shifts[w]
+    if way == row["way"]:
+        return 0
+    if row["driver"] == DRIVER_BACKGROUND and not roads.lanes[lane]["internal"]:
+        if not has_room(roads, travel, row, travel.steps, way):
+            return 0
+    before = travel.steps[own_step(roads, row)]["to_go"]
+    row["way"] = way
+    step = travel.steps[own_step(roads, row)]
+    if step["to_go"] == before:
+        return 0
+    row["leg"] += 1
+    to_go = distance_left(roads, row, step)
+    if row["driver"] == DRIVER_AGENT:
+        row["step_to_go"] += to_go - row["to_go"]
+        row["to_go"] = to_go
+        prolong_trip(roads, travel, row)
+    row["to_go"] = to_go
+    return 1
+
+
+@kernel
+def renew_distances(roads: RoadArrays, travel: TripTables, worlds: Worlds, w: int) -> None:
+    """Set the remaining distances of a world's agents to those of its plans, which have changed.
+
+    `worlds`: the owned committed rows are written, before a step begins.
+    """
+    here = roads_in(roads, worlds.lanes, w)
+    for i in range(worlds.num_owned[w]):
+        row = worlds.rows[w, i]
+        if row["driver"] != DRIVER_AGENT or row["way"] == row["goal"] * roads.lanes.shape[0]:
+            continue
+        to_go = distance_left(here, row, travel.steps[own_step(here, row)])
+        if to_go != row["to_go"]:
+            row["to_go"] = to_go
+            prolong_trip(here, travel, row)
