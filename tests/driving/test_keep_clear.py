@@ -107,9 +107,9 @@ def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_pat
 def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_path: Path) -> None:
     """There is room for one vehicle in each direction; the U-turns change from one to the other."""
     net, routes = turning_pair(tmp_path)
-    world = make_world(net, [routes], 450, 1, 0.1)
+    world = make_world(net, [routes], 1000, 1, 0.1)
     commands = idle_commands(world)
-    for _ in range(4500):
+    for _ in range(10_000):
         world.step(commands)
         rows = world.vehicles()
         assert (rows["hit"] < 0).all()

@@ -57,15 +57,15 @@ TURNS_EDGES = """<edges><edge id="wa" from="w" to="a" priority="2"/>
 <edge id="ba" from="b" to="a" priority="2"/><edge id="be" from="b" to="e" priority="2"/>
 <edge id="eb" from="e" to="b" priority="2"/></edges>"""
 TURNS_CONNECTIONS = """<connections>
-<connection from="wa" to="ab" fromLane="0" toLane="0"/>
+<connection from="wa" to="ab" fromLane="0" toLane="0" keepClear="true"/>
 <connection from="ab" to="be" fromLane="0" toLane="0"/>
 <connection from="ab" to="ba" fromLane="0" toLane="0"/>
-<connection from="eb" to="ba" fromLane="0" toLane="0"/>
+<connection from="eb" to="ba" fromLane="0" toLane="0" keepClear="true"/>
 <connection from="ba" to="aw" fromLane="0" toLane="0"/>
 <connection from="ba" to="ab" fromLane="0" toLane="0"/></connections>"""
 TURNS_DEMAND = """<routes>
-<flow id="west" begin="0" end="300" period="10"><route edges="wa ab ba aw"/></flow>
-<flow id="east" begin="0" end="300" period="10"><route edges="eb ba ab be"/></flow></routes>"""
+<flow id="west" begin="0" end="900" period="30"><route edges="wa ab ba aw"/></flow>
+<flow id="east" begin="1" end="900" period="30.5"><route edges="eb ba ab be"/></flow></routes>"""
 
 
 def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[Path, Path]:

@@ -59,6 +59,7 @@ LAST_CHANCE_M = 3.0  # distance of the front to the line at which a driver still
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
 EXIT_LOOK_M = 75.0  # limit of that search: room for ten cars
+SWAP_TICKS = 64  # turn of one of two vehicles that wait for room on each other's lane
 # A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
 CREPT_M = 2.4
 CREPT_MPS = 2.0
@@ -151,12 +152,14 @@ def _goes_first_in_swap(
 ) -> bool:
     """Return whether a row enters a junction without room beyond, to swap places with `other`.
 
-    Two vehicles that wait for room on each other's lane would wait for ever. The vehicle with the
-    smaller id goes, and stops inside the junction, if its own lane is clear of it there.
+    Two vehicles that wait for room on each other's lane would wait for ever. One of them goes, and
+    stops inside the junction, if its own lane is clear of it there. They try by turns.
     """
     if other["hold"] != HOLD_EXIT_BLOCKED or other["wait_s"] <= IMPATIENT_S:
         return False
-    if row["id"] > other["id"] or room + roads.links[link]["length_m"] < row["length"] + ROOM_M:
+    if (row["id"] < other["id"]) != (row["tick"] // SWAP_TICKS % 2 == 0):
+        return False
+    if room + roads.links[link]["length_m"] < row["length"] + ROOM_M:
         return False
     if roads.lanes[other["lane"]]["internal"]:
         return False
