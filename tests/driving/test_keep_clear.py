@@ -24,7 +24,7 @@ from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.roads.sumo_net.reader import read_network
-from tests.support.narrow_places import signal_pair
+from tests.support.narrow_places import signal_pair, turning_pair
 from tests.support.traffic import on_lane, scratch, travel_by
 
 
@@ -100,8 +100,21 @@ def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_pat
     assert not is_blocked(scene, WAITING)
     assert is_blocked(scene, MOVING, WAITING)
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
-    # The vehicles move on, but the own one has to expect to yield at that line.
-    assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+    # As in SUMO, a driver does not expect to wait where vehicles yield, if none of them waits.
+    assert not is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+
+
+def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_path: Path) -> None:
+    """There is room for one vehicle in each direction; the U-turns change from one to the other."""
+    net, routes = turning_pair(tmp_path)
+    world = make_world(net, [routes], 1000, 1, 0.1)
+    commands = idle_commands(world)
+    for _ in range(10_000):
+        world.step(commands)
+        rows = world.vehicles()
+        assert (rows["hit"] < 0).all()
+        assert rows["wait_s"].max(initial=0.0) < 60.0
+    assert world.traffic_stats().arrived == 60
 
 
 @pytest.mark.parametrize(("light", "blocked"), [(SIGNAL_RED, True), (SIGNAL_GREEN_MINOR, False)])

@@ -10,6 +10,7 @@ import pytest
 from cavmarl.core.records.arrays import Scratch
 from cavmarl.core.records.codes import (
     DRIVER_BACKGROUND,
+    HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_SIGNAL,
     HOLD_YIELD,
@@ -19,6 +20,7 @@ from cavmarl.core.records.rows import STEERED
 from cavmarl.driving.kernels.drivers import decide, decide_at_line
 from cavmarl.driving.kernels.junctions.approach import APPROACH
 from cavmarl.driving.kernels.junctions.swept_areas import (
+    GIVE_UP_S,
     behind_fork,
     foe_would_sweep_over,
     room_m,
@@ -170,6 +172,25 @@ def test_a_vehicle_that_stands_right_before_the_area_is_outside(
     enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
     stop_m = meeting.stop(0, (enter_m + over_m, car_m + 0.5))
     assert (stop_m == np.inf) == goes
+
+
+@pytest.mark.parametrize(
+    ("hold", "wait_s", "goes"),
+    [
+        (HOLD_EXIT_BLOCKED, GIVE_UP_S + 0.1, True),
+        (HOLD_EXIT_BLOCKED, GIVE_UP_S, False),
+        (HOLD_SIGNAL, GIVE_UP_S + 0.1, False),
+    ],
+)
+def test_a_bus_passes_a_car_that_has_waited_long_for_it(
+    network: RoadNetwork, hold: int, wait_s: float, goes: bool
+) -> None:
+    """The wait of the bus ends when it begins to move, that of the car does not."""
+    meeting = Meeting(network)
+    enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
+    meeting.rows["speed"], meeting.rows["wait_s"] = (0.1, 0.0), (0.0, wait_s)
+    meeting.rows["hold"] = (HOLD_NONE, hold)
+    assert (meeting.stop(0, (enter_m, car_m + 0.5)) == np.inf) == goes
 
 
 def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> None:

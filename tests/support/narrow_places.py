@@ -1,4 +1,4 @@
-"""Maps with little room for vehicles: a lane drop, and two signals close together."""
+"""Maps with little room for vehicles: a lane drop, close signals, and close U-turns."""
 
 from __future__ import annotations
 
@@ -50,6 +50,23 @@ PAIR_DEMAND = """<routes>
 <flow id="we" from="wj1" to="je1" begin="0" end="900" vehsPerHour="150"/>
 <flow id="ew" from="ej2" to="jw2" begin="0" end="900" vehsPerHour="150"/></routes>"""
 
+TURNS_NODES = """<nodes><node id="w" x="-200" y="0"/><node id="a" x="0" y="0" type="priority"/>
+<node id="b" x="11" y="0" type="priority"/><node id="e" x="211" y="0"/></nodes>"""
+TURNS_EDGES = """<edges><edge id="wa" from="w" to="a" priority="2"/>
+<edge id="aw" from="a" to="w" priority="2"/><edge id="ab" from="a" to="b" priority="2"/>
+<edge id="ba" from="b" to="a" priority="2"/><edge id="be" from="b" to="e" priority="2"/>
+<edge id="eb" from="e" to="b" priority="2"/></edges>"""
+TURNS_CONNECTIONS = """<connections>
+<connection from="wa" to="ab" fromLane="0" toLane="0" keepClear="true"/>
+<connection from="ab" to="be" fromLane="0" toLane="0"/>
+<connection from="ab" to="ba" fromLane="0" toLane="0"/>
+<connection from="eb" to="ba" fromLane="0" toLane="0" keepClear="true"/>
+<connection from="ba" to="aw" fromLane="0" toLane="0"/>
+<connection from="ba" to="ab" fromLane="0" toLane="0"/></connections>"""
+TURNS_DEMAND = """<routes>
+<flow id="west" begin="0" end="900" period="30"><route edges="wa ab ba aw"/></flow>
+<flow id="east" begin="1" end="900" period="30.5"><route edges="eb ba ab be"/></flow></routes>"""
+
 
 def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[Path, Path]:
     """Make a road on which two lanes become one, with `per_h` vehicles/h on each lane."""
@@ -61,6 +78,11 @@ def signal_pair(folder: Path, apart_m: float = 24.0) -> tuple[Path, Path]:
     """Make two crossings with signals; opposing left turns share the short road between them."""
     nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0)
     return _made(folder, nodes, PAIR_EDGES, PAIR_CONNECTIONS, PAIR_DEMAND)
+
+
+def turning_pair(folder: Path) -> tuple[Path, Path]:
+    """Make a road of 11 m with room for one car, at both ends of which vehicles turn round."""
+    return _made(folder, TURNS_NODES, TURNS_EDGES, TURNS_CONNECTIONS, TURNS_DEMAND)
 
 
 def _made(folder: Path, nodes: str, edges: str, connections: str, demand: str) -> tuple[Path, Path]:

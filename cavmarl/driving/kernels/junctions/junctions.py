@@ -38,11 +38,12 @@ from cavmarl.driving.kernels.junctions.gaps import (
     STOP_SIGN_S,
     hold_for_foe,
     is_minor,
+    is_red,
     link_signal,
     must_stop,
     stays_inside,
 )
-from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
+from cavmarl.driving.kernels.junctions.stop_line_registration import IMPATIENT_S, STANDING_MPS
 from cavmarl.driving.kernels.junctions.swept_areas import MOST_BACK_M, wait_place
 from cavmarl.driving.kernels.junctions.zippers import is_zipper, passes_first
 from cavmarl.driving.kernels.lanes.route_following import next_step
@@ -59,6 +60,7 @@ LAST_CHANCE_M = 3.0  # distance of the front to the line at which a driver still
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
 EXIT_LOOK_M = 75.0  # limit of that search: room for ten cars
+SWAP_TICKS = 64  # turn of one of two vehicles that wait for room on each other's lane
 # A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
 CREPT_M = 2.4
 CREPT_MPS = 2.0
@@ -140,20 +142,31 @@ def _hold_for_foes(
     return hold
 
 
-@kernel
-def _waits_at(
-    roads: RoadArrays, link: int, road_m: float, needed: float, phase: NDArray[np.int32]
+@inlined_kernel
+def _goes_first_in_swap(
+    roads: RoadArrays,
+    travel: TripTables,
+    row: np.void,  # VEHICLE
+    link: int,  # that it takes next
+    other: np.void,  # VEHICLE that stands on the road beyond, without room for the row behind it
+    room: float,  # behind that vehicle, m
 ) -> bool:
-    """Return whether a vehicle has to expect to wait before `link`, beyond the next junction.
+    """Return whether a row enters a junction without room beyond, to swap places with `other`.
 
-    It does so at red, and where it yields. But if the road before `link`, `road_m` m long, has no
-    room for the vehicle, it cannot wait there until others let it go.
+    Two vehicles that wait for room on each other's lane would wait for ever. One of them goes, and
+    stops inside the junction, if its own lane is clear of it there. They try by turns.
     """
-    signal = link_signal(roads, link, phase)
-    stops = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
-    yields = must_stop(roads, link, signal) or is_minor(roads, link, phase)
-    waits: bool = stops or (yields and road_m >= needed)
-    return waits
+    if other["hold"] != HOLD_EXIT_BLOCKED or other["wait_s"] <= IMPATIENT_S:
+        return False
+    if (row["id"] < other["id"]) != (row["tick"] // SWAP_TICKS % 2 == 0):
+        return False
+    if room + roads.links[link]["length_m"] < row["length"] + ROOM_M:
+        return False
+    if roads.lanes[other["lane"]]["internal"]:
+        return False
+    _, _, back = next_step(roads, travel, other["lane"], other["way"])
+    swaps: bool = back >= 0 and roads.links[back]["to_lane"] == roads.links[link]["from_lane"]
+    return swaps
 
 
 @kernel
@@ -170,8 +183,9 @@ def exit_blocked(
     """Return whether a row could not clear the junction behind the next vehicle that waits ahead.
 
     The vehicles that move in between need room as well. The next line at which a vehicle of that
-    road, or the row itself, has to wait ends the room; the inside of a junction is no room.
-    Vehicles more than `EXIT_LOOK_M` beyond the junction do not count.
+    road has to wait, or that is red, ends the room; the inside of a junction is no room. As in
+    SUMO, the row does not expect to wait at a line where it yields. Vehicles more than
+    `EXIT_LOOK_M` beyond the junction do not count.
     """
     target = roads.links[link]
     if target["may_block"]:
@@ -185,7 +199,7 @@ def exit_blocked(
                 room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
     needed = row["length"] + ROOM_M
-    beyond, road_m = 0.0, 0.0
+    beyond = 0.0
     for _ in range(EXIT_LANES):
         waits = False
         for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
@@ -194,13 +208,15 @@ def exit_blocked(
                 return False
             if other["speed"] < STANDING_MPS:
                 room += other["s"] - other["half"]
-                blocked: bool = room < needed
+                if room >= needed:
+                    return False
+                stands = rows[other["row"]]
+                blocked: bool = not _goes_first_in_swap(roads, travel, row, link, stands, room)
                 return blocked
             waits |= rows[other["row"]]["hold"] != HOLD_NONE
             room -= 2.0 * other["half"] + ROOM_M
         beyond += roads.lanes[lane]["length_m"]
         if not roads.lanes[lane]["internal"]:
-            road_m += roads.lanes[lane]["length_m"]
             room += roads.lanes[lane]["length_m"]
         if room >= needed or beyond > EXIT_LOOK_M:
             return False
@@ -209,7 +225,7 @@ def exit_blocked(
         lane, way, ahead = next_step(roads, travel, lane, way)
         if lane < 0:
             return False
-        if ahead >= 0 and _waits_at(roads, ahead, road_m, needed, phase):
+        if ahead >= 0 and is_red(roads, ahead, phase):
             return True
     return False
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
+from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_EXIT_BLOCKED, HOLD_NONE
 from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.driving.kernels.junctions.stop_line_registration import (
     APPROACH_STANDING_M,
@@ -232,6 +232,9 @@ def _is_in_the_way(
     foe_rear = foe_place - _body_m(foe["half"], sweep["other"])
     if foe_rear > sweep["foe_leave_m"] or row["wait_s"] > GIVE_UP_S:
         return False
+    other = rows[foe["row"]]
+    if other["wait_s"] > GIVE_UP_S and other["hold"] == HOLD_EXIT_BLOCKED:
+        return False  # the foe waits for the row, whose own wait ends with its first movement
     inside = place > sweep["enter_m"] + AT_AREA_M
     foe_inside = foe_place > sweep["foe_enter_m"] + AT_AREA_M
     if foe_inside and not inside:
@@ -242,7 +245,7 @@ def _is_in_the_way(
     comes = room_m > 0.0 and _needs(foe["speed"], to_area, EASY_STOP)
     if not inside and (comes or foe_place > -room_m):
         return True  # the row has to stop anyway, so leaving room costs nothing
-    if rows[foe["row"]]["hold"] != HOLD_NONE:
+    if other["hold"] != HOLD_NONE:
         return False
     if inside:
         return _is_ahead(foe, foe_place, row, place)
@@ -258,7 +261,7 @@ def _is_in_the_way(
     if unaware:
         return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
     # A foe that can be ignored is held by its leader, which may itself wait for this row.
-    return soon and not can_be_ignored(rows[foe["row"]]) and _is_ahead(foe, foe_place, row, place)
+    return soon and not can_be_ignored(other) and _is_ahead(foe, foe_place, row, place)
 
 
 @inlined_kernel
