@@ -118,6 +118,15 @@ class SharedPolicy(Policy):
         return actions
 
 
+def suggested(env: Environment) -> Any:
+    """Return the built-in driver's actions: (W, A, …) of a `CavVectorEnv`, or by id of agent."""
+    found = env.suggest_actions()
+    if isinstance(env, CavVectorEnv):
+        return found[VEHICLES] if isinstance(found, dict) else found
+    vehicles = env.possible_agents[: env.config.population.num_ids]
+    return {agent: found[agent] for agent in vehicles if agent in found}
+
+
 def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Return the built-in driver's actions: a new array (W, A, …) as in `Policy.act_batch`.
 
@@ -128,9 +137,9 @@ def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
             f"action.kind = {env.config.action.kind}: this driver needs throttle and steering; "
             "make the environment with overrides={'action.kind': 'continuous'}"
         )
-    found = env.suggest_actions()
+    found = suggested(env)
     if isinstance(env, CavVectorEnv):
-        return np.array(found[VEHICLES] if isinstance(found, dict) else found)
+        return np.array(found)
     actions = np.zeros((*mask.shape, 2), dtype=np.float32)
     for k, agent in enumerate(env.possible_agents[: mask.shape[1]]):
         if agent in found:
