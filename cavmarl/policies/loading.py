@@ -57,7 +57,7 @@ def load_policy(policy: str | Path, env: Environment, *, beside_signals: bool = 
         raise PolicyError(
             f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
         )
-    refusal = env.config.signals.refusal_of_agents("a policy")
+    refusal = env.config.refusal_of_agents("a policy")
     if refusal and not beside_signals:
         raise PolicyError(f"{refusal}, or load_policy(…, beside_signals=True)")
     return _load(policy, env)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
-from cavmarl.env.signal_agents import VEHICLES
+from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:

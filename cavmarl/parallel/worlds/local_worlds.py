@@ -60,8 +60,8 @@ class LocalWorlds:
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
-        self._shows_signals = world.config.signals.are_controlled
-        self._has_signals = world.config.signals.have_agents
+        self._shows_signals = world.config.controlled is not None
+        self._has_signals = world.config.roadside is not None
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -193,7 +193,7 @@ class LocalWorlds:
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
         if self._shows_signals:
-            found = self.simulation.signals.outputs
+            found = self.simulation.roadside.outputs
             for name, values in found._asdict().items():
                 if begins and name in ("rewards", "terms"):
                     continue
