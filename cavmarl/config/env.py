@@ -42,14 +42,19 @@ class MapConfig(Section, key="map"):
         program: the program of each signal named here, whatever was loaded; may be `off`.
         buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
             (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
+        changed_lanes: number of lanes that may differ from the map in a world at the same time:
+            closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
+            each world has its own table of lanes and its own plans.
     """
 
     source: str | tuple[str, ...]
     programs: tuple[str, ...] = ()
     program: dict[str, str] = field(default_factory=dict)
     buildings: str = ""
+    changed_lanes: Annotated[int, Whole(0, 1_000_000)] = 0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         self.need("source", bool(self.source) and all(self.sources), "must name a map file")
         self.need("programs", all(self.programs), "must name files")
 
@@ -268,6 +273,11 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
         )
         self.need(
+            "map.changed_lanes",
+            self.map.changed_lanes == 0,
+            f"traffic.source = {source}: SUMO would not see these changes; leave the key out",
+        )
+        self.need(
             "signals.overrides",
             self.signals.overrides == 0,
             f"traffic.source = {source}: SUMO runs the signals; leave the key out",
@@ -293,6 +303,11 @@ class EnvConfig(Section, key=""):
         """The registered extensions that the environment may use."""
         simulators = (text.partition("://")[0] for text in self.zones.simulators.values())
         return (*self.terms.registered, *self.sensors.registered, self.traffic.model, *simulators)
+
+    @property
+    def may_change_lanes(self) -> bool:
+        """Whether lanes of a world may differ from the map: closed, or with a lower limit."""
+        return self.map.changed_lanes > 0 or self.limits.are_controlled
 
     @property
     def controlled(self) -> SignalsConfig | LimitsConfig | None:

@@ -79,6 +79,7 @@ class SignalComponent:
             keys=first.worlds.keys,
             signal_phase=first.worlds.signal_phase,
             detected_s=first.worlds.detected_s,
+            lanes=first.worlds.lanes,
             rows=zoned.rows,
             sides=first.row_sides,
             num_owned=zoned.num_owned,

@@ -255,6 +255,7 @@ def _refuse_single_map_keys(config: EnvConfig) -> None:
         "population.insertions": config.population.insertions,
         "population.external": config.population.external,
         "signals.overrides": config.signals.overrides,
+        "map.changed_lanes": config.map.changed_lanes,
         "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
     }
     for key, value in named.items():

@@ -62,6 +62,7 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
         or session.decoder.wrong(rest[4:8])
         or session.external.wrong(rest[8:10])
         or session.overrides.wrong(rest[10:11])
+        or session.lane_changes.wrong(rest[11:12])
         or ("a world has a negative size" if (sizes < 0).any() else "")
     ):
         raise ConfigError(f"the saved state is damaged: {wrong}; save again")
@@ -77,4 +78,5 @@ def _memory(session: StepSession, mask: NDArray[np.bool_]) -> list[NDArray[Any]]
     """Return the arrays to save beside the worlds."""
     waiting = session.events.memory, *session.insertions.memory, *session.decoder.memory
     waiting = *waiting, *session.external.memory, *session.overrides.memory
+    waiting = *waiting, *session.lane_changes.memory
     return [mask, *waiting, *every_array(session.worlds.arrays)]

@@ -21,6 +21,7 @@ from cavmarl.env.declared_events import DeclaredEvents
 from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
+from cavmarl.env.lane_changes import LaneChanges
 from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
@@ -38,8 +39,8 @@ class StepSession:
     """The running worlds of one environment.
 
     A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
-    external vehicles and overridden signals. After each reset and step, the session records the
-    worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
+    external vehicles, overridden signals and changed lanes. After each reset and step, the session
+    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
     continue bit for bit; it has no recording and no watchers.
 
     Args:
@@ -55,6 +56,7 @@ class StepSession:
         insertions: vehicles and barriers for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
         overrides: signals that show states of the caller.
+        lane_changes: lanes that the caller closes or slows down.
         controlled: the signals or limits that are controlled; None: there are none.
         roadside: the same if agents control them, else None.
         is_ready: whether `reset` has been called.
@@ -74,6 +76,7 @@ class StepSession:
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
         self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
+        self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds)
         self.controlled = _controlled(config, worlds)
         self.roadside = None if config.roadside is None else self.controlled
         self._choose = _choices_of_controller(self.controlled, config)
@@ -120,7 +123,9 @@ class StepSession:
             signal_choices = self._choose()
         if signal_choices is not None:
             commands = replace(commands, signal_choices=signal_choices)
-        waiting = (self.events, self.insertions, self.external, self.overrides)
+        waiting = (
+            self.events, self.insertions, self.external, self.overrides, self.lane_changes
+        )  # fmt: skip
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -135,6 +140,7 @@ class StepSession:
         self.insertions.forget(chosen)
         self.external.forget(chosen)
         self.overrides.forget(chosen)
+        self.lane_changes.forget(chosen)
 
     def refuse_unready(self, call: str) -> None:
         """Raise an EpisodeError that names a call if there has been no reset yet."""
@@ -233,10 +239,16 @@ class StepSession:
                 f"{key}: frames of such worlds are only available in the caller's process; use "
                 "backend='local'"
             )
-        simulation, last, arrays = self.present(), self.insertions.last, self.worlds.arrays
+        simulation, arrays = self.present(), self.worlds.arrays
+        inserted, changed = self.insertions.last, self.lane_changes.last
         return [
             frame_of(
-                simulation, world, ghosts, vehicles_that_ended(arrays, world), last(world), room
+                simulation,
+                world,
+                ghosts,
+                vehicles_that_ended(arrays, world),
+                (*inserted(world), *changed(world)),
+                room,
             )
             for world in chosen
         ]
@@ -253,7 +265,7 @@ class StepSession:
     def __reduce__(self) -> tuple[Any, ...]:
         # Objects that refer to arrays of the worlds are created again.
         parts = self.decoder, self.events, self.insertions, self.external, self.overrides
-        memory = tuple(part.memory for part in parts)
+        memory = (*(part.memory for part in parts), self.lane_changes.memory)
         kept = self.is_ready, self.simulated_s, self._first_seed
         return (
             _restored_session,
@@ -264,7 +276,8 @@ class StepSession:
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         (self.is_ready, self.simulated_s, self._first_seed), memory = state
         self.decoder.memory, self.events.memory, *memory = memory
-        self.insertions.memory, self.external.memory, self.overrides.memory = memory
+        self.insertions.memory, self.external.memory, self.overrides.memory = memory[:3]
+        self.lane_changes.memory = memory[3]
 
 
 def _controlled(config: EnvConfig, worlds: SteppedWorlds) -> SignalAgents | LimitAgents | None:

@@ -187,6 +187,28 @@ class WorldsEnvironment(OwnWorlds):
         """
         self._session.insertions.no_barrier(world, edge)
 
+    def damage_road(
+        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> None:
+        """Lower the speed limit of lanes of a road, until it is opened or the episode is over.
+
+        From the next step on, drivers, sensors and rewards have the new limit. Each lane counts in
+        `map.changed_lanes`.
+
+        Args:
+            edge: id of a road.
+            speed_mps: the limit in m/s, above 0 and at most that of the map; equal to that of the
+                map, it ends an earlier one.
+            lanes: indices of its lanes, from the kerb; None: all of them.
+            world: number of the world.
+
+        Raises:
+            ActionError: there is no such world, road or lane, or the limit is out of range.
+            CapacityError: more than `map.changed_lanes` lanes would differ from the map.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        self._session.lane_changes.limit(world, edge, speed_mps, lanes)
+
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
         """Return the ids of closed roads, including roads that close in the next step."""
         return self._session.insertions.closed(world)

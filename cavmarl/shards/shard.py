@@ -72,6 +72,8 @@ class Commands:
     # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
     # unused place; (0, 0, 2): overrides are not configured
     overridden: NDArray[np.int32] = field(default_factory=lambda: np.zeros((0, 0, 2), np.int32))
+    # (W, N, 3) LANE_CHANGE of each lane that differs from the map; (0, 0, 3): lanes never change
+    lane_changes: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
     # (W, S) choices of the agents of signals, -1: none; (0, 0): signals have no agents
     signal_choices: NDArray[np.int64] = field(default_factory=lambda: np.zeros((0, 0), np.int64))
 
@@ -141,6 +143,14 @@ class Shard:
         if first is None and (more := override_columns(config, network)):
             columns = zeros((num_worlds, len(network.signals) + more), dtype=np.int32)
             self.worlds = self.worlds._replace(signal_phase=columns)
+        # `Worlds.lanes` of worlds that may change lanes, for writing; (0, L): they may not
+        self.own_lanes: NDArray[np.void] = (
+            make_lane_table(config, network, num_worlds, zeros)
+            if first is None
+            else first.own_lanes
+        )
+        if first is None and len(self.own_lanes):
+            self.worlds = self.worlds._replace(lanes=_read_only(self.own_lanes))
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         # `side` and `next_side` for kernels: (2,), one array for all shards of this process.
@@ -229,10 +239,28 @@ def make_worlds(
         outer=zoned.outer[zone],
         num_outer=zoned.num_outer[zone],
         cues=zeros((num_worlds, num_cues), dtype=np.int64),
+        lanes=network.arrays.lanes[np.newaxis],
     )
     if common is None:
         return worlds
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
+
+
+def make_lane_table(
+    config: EnvConfig, network: RoadNetwork, num_worlds: int, zeros: Zeros
+) -> NDArray[np.void]:
+    """Return LANE (W, L), the lanes of the map for each world, or (0, L) if lanes never change."""
+    lanes = network.arrays.lanes
+    own = zeros((num_worlds if config.may_change_lanes else 0, len(lanes)), dtype=lanes.dtype)
+    own[:] = lanes
+    return own
+
+
+def _read_only(array: NDArray[np.void]) -> NDArray[np.void]:
+    """Return a view that cannot be written; kernels are compiled for immutable lanes."""
+    view = array[:]
+    view.setflags(write=False)
+    return view
 
 
 def override_columns(config: EnvConfig, network: RoadNetwork) -> int:

@@ -76,6 +76,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
         np.full_like(entry.inserted, value),
         np.full_like(entry.external, value),
         np.full_like(entry.overridden, value),
+        np.full_like(entry.lane_changes, value),
         np.full_like(entry.signal_choices, value),
     )
 

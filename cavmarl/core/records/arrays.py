@@ -87,6 +87,7 @@ class SharedState(NamedTuple):
     detected_s: NDArray[np.float64]
     pending: NDArray[np.float64]
     cues: NDArray[np.int64]
+    lanes: NDArray[np.void]
 
 
 class Worlds(NamedTuple):
@@ -120,6 +121,9 @@ class Worlds(NamedTuple):
     outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, ascending
     num_outer: NDArray[np.int64]  # (W,) -1: not up to date with the rows
     cues: NDArray[np.int64]  # (W, T) tick of each cue of the script, -1: not yet
+    # LANE (V, L) the lanes as they are now, see `lanes_now`; V is 1 if no world may change lanes,
+    # else W
+    lanes: NDArray[np.void]
 
 
 class ZoneState(NamedTuple):

@@ -193,6 +193,8 @@ def _digest(commands: Commands, w: int) -> bytes:
         digest.update(commands.external[w].tobytes())
     if commands.overridden.any():
         digest.update(commands.overridden[w].tobytes())
+    if commands.lane_changes.any():
+        digest.update(commands.lane_changes[w].tobytes())
     if commands.signal_choices.size:
         digest.update(commands.signal_choices[w].tobytes())
     return digest.digest()

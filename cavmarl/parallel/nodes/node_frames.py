@@ -16,7 +16,14 @@ from cavmarl.parallel.worlds.tasks import Task
 
 _HEAD = struct.Struct("<II")
 _INPUTS: Mapping[Task, tuple[str, ...]] = {
-    Task.STEP: ("declared", "inserted", "external", "overridden", "signal_choices"),
+    Task.STEP: (
+        "declared",
+        "inserted",
+        "external",
+        "overridden",
+        "lane_changes",
+        "signal_choices",
+    ),
     Task.RESET: ("chosen",),
 }
 

@@ -123,6 +123,7 @@ class CommandedWorlds(ABC):
         arrays.inserted[:] = commands.inserted if commands.inserted.size else 0
         arrays.external[:] = commands.external if commands.external.size else 0
         arrays.overridden[:] = commands.overridden if commands.overridden.size else 0
+        arrays.lane_changes[:] = commands.lane_changes if commands.lane_changes.size else 0
         arrays.signal_choices[:] = commands.signal_choices if commands.signal_choices.size else KEEP
         self._command(Task.STEP)
         self._steps += 1

@@ -130,6 +130,7 @@ def _layout(config: EnvConfig, num_worlds: int, num_signals: int) -> Layout:
         ("<f8", inserted),
         ("<f8", external),
         ("<i4", overridden),
+        ("<f8", (*worlds, config.map.changed_lanes, 3)),
         ("<i8", (*worlds, num_signals)),
     )
     return dict(zip(COMMANDS, kinds, strict=True))

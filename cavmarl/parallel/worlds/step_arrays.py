@@ -49,12 +49,13 @@ class StepArrays(NamedTuple):
     ticks: NDArray[np.int64]  # (W,) since each world's reset
     episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) worlds to reset
-    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next five
+    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next seven
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
+    lane_changes: NDArray[np.float64]  # (W, N, 3)
     # of agents of signals, or of other agents beside the road (`RoadsideAgents`):
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next eight
@@ -111,6 +112,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: Signal
         "inserted": ("<f8", (num_worlds, config.population.insertions, 3)),
         "external": ("<f8", (num_worlds, config.population.external, EXTERNAL_FIELDS)),
         "overridden": ("<i4", (num_worlds, config.signals.overrides, 2)),
+        "lane_changes": ("<f8", (num_worlds, config.map.changed_lanes, 3)),
         "signal_choices": ("<i8", of_signals),
         "signal_observations": observed,
         "final_signal_observations": observed,

@@ -11,6 +11,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, observe_lidar_cells
 from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
@@ -69,6 +70,7 @@ def observe_optional(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
+        here = roads_in(roads, worlds.lanes, w)
         is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
@@ -81,20 +83,20 @@ def observe_optional(
             seen = observations[w, row["agent"]]
             out = seen[newest_frame(seen, stack) :]
             if kinematics.vehicles > 0:
-                observe_kinematics(roads, rows, i, grid, kinematics, out)
+                observe_kinematics(here, rows, i, grid, kinematics, out)
             if occupancy_grid.features.size > 0:
-                observe_occupancy(roads, lane_grid, rows, i, grid, occupancy_grid, out)
+                observe_occupancy(here, lane_grid, rows, i, grid, occupancy_grid, out)
             if lidar_observation.cells > 0:
                 observe_lidar_cells(rows, i, grid, lidar_observation, out)
             phase = worlds.signal_phase[w]
             if way.distances_m.size > 0 or way.lines > 0:
                 time = worlds.ticks[w] * tick_s
                 controllers = worlds.controllers[w]
-                observe_way(roads, travel, controllers, row, phase, time, tick_s, way, out)
+                observe_way(here, travel, controllers, row, phase, time, tick_s, way, out)
             if conflicts.most > 0:
                 reports, tick = objects[w, row["agent"]], worlds.ticks[w]
                 observe_conflicts(
-                    roads, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
+                    here, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
                 )
             if history.size > 0:
                 entered = has_entered(row, ticks_per_step)

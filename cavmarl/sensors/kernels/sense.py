@@ -34,6 +34,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
+from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame, shift_frames
 from cavmarl.sensors.kernels.lidar_2d import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
@@ -286,6 +287,7 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
+        here = roads_in(roads, worlds.lanes, w)
         is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]
@@ -299,17 +301,17 @@ def sense(
             shift_frames(seen, sensors.stack, sensors.history_at, sensors.history)
             out = seen[newest_frame(seen, sensors.stack) :]
             if sensors.ego:
-                observe_ego(roads, plans, row, out)
+                observe_ego(here, plans, row, out)
                 if sensors.ego_size:
                     observe_size(travel.types[row["vtype"]], row, out)
-            observe_route(roads, plans, row, sensors, out)
+            observe_route(here, plans, row, sensors, out)
             observe_neighbors(rows, i, grid, sensors, out)
             phase = worlds.signal_phase[w]
             if sensors.signal:
                 time = worlds.ticks[w] * tick_s
                 controllers = worlds.controllers[w]
-                observe_signal(roads, plans, controllers, row, phase, time, tick_s, sensors, out)
-            observe_lanes(roads, travel, rows, i, grid, phase, sensors, out)
+                observe_signal(here, plans, controllers, row, phase, time, tick_s, sensors, out)
+            observe_lanes(here, travel, rows, i, grid, phase, sensors, out)
             observe_lidar(rows, i, grid, sensors, out)
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
@@ -318,7 +320,7 @@ def sense(
             if has_entered(row, ticks_per_step):
                 continue
             write_terms(
-                roads,
+                here,
                 rows,
                 i,
                 travel.types[row["vtype"]],

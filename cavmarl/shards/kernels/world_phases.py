@@ -41,6 +41,7 @@ from cavmarl.driving.kernels.motion.highway_control import speed_control
 from cavmarl.driving.kernels.motion.motion import move_agent, move_background
 from cavmarl.driving.kernels.motion.scripted_rows import follow_script
 from cavmarl.driving.kernels.motion.steering import nearest_speed, steer_to_lane, take_meta_action
+from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 
 
@@ -212,30 +213,31 @@ def advance(
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
+        here = roads_in(roads, worlds.lanes, w)
         step = worlds.step[w]
         owned = worlds.num_owned[w]
-        drivers = _decide_in_background(roads, travel, worlds, w, dt, scratch)
+        drivers = _decide_in_background(here, travel, worlds, w, dt, scratch)
         if drivers and not in_place:
-            _order_by_lane(roads, rows, owned, scratch)
+            _order_by_lane(here, rows, owned, scratch)
         else:
             _keep_order(owned, scratch)
         through = outer = touching = 0
         for k in range(owned):
             if k + SOON < owned:
-                _fetch_lanes(roads, rows, k, scratch)
+                _fetch_lanes(here, rows, k, scratch)
             i = scratch.order[k]
             if not in_place:
                 worlds.next_rows[w, k] = rows[i]
             row = worlds.next_rows[w, k]
             touching += row["hit"] >= 0
             if row["driver"] == DRIVER_BACKGROUND:
-                through += _drive_in_background(roads, travel, row, step[i], i, dt, scratch)
+                through += _drive_in_background(here, travel, row, step[i], i, dt, scratch)
             elif row["driver"] == DRIVER_SCRIPTED:
                 row["events"] = 0
-                follow_script(roads, travel, worlds.cues[w], row, dt)
+                follow_script(here, travel, worlds.cues[w], row, dt)
             elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
-                    roads,
+                    here,
                     plans,
                     travel,
                     lane_grid,
@@ -300,18 +302,19 @@ def suggest(
     """Write the actions that the built-in driver would take for the agents."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
+        here = roads_in(roads, worlds.lanes, w)
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
-        index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+        index_lanes(here, travel, rows, worlds.num_rows[w], scratch)
         step = worlds.step[w]
-        register_links(roads, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch)
-        decide(roads, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, step, scratch)
+        register_links(here, travel, rows, worlds.num_rows[w], step, worlds.step_at[w], scratch)
+        decide(here, travel, rows, owned, DRIVER_AGENT, worlds.ticks[w], dt, phase, step, scratch)
         for i in range(owned):
             row = rows[i]
             if row["driver"] != DRIVER_AGENT:
                 continue
             agent = row["agent"]
-            lane = roads.lanes[row["lane"]]
+            lane = here.lanes[row["lane"]]
             target = row["lane"]
             change = scratch.lane_change[i]
             if change > 0:
@@ -320,7 +323,7 @@ def suggest(
                 target = lane["right"]
             out[w, agent, 0] = scratch.accel[i]
             out[w, agent, 1] = steer_to_lane(
-                roads, plans, row, target, travel.types[row["vtype"]]["wheelbase"]
+                here, plans, row, target, travel.types[row["vtype"]]["wheelbase"]
             )
             if discrete:
                 wanted = nearest_speed(

@@ -70,6 +70,7 @@ def worlds_of(members: Members, zone: int) -> Worlds:
         outer=zoned.outer[zone],
         num_outer=zoned.num_outer[zone],
         cues=common.cues,
+        lanes=common.lanes,
     )
 
 

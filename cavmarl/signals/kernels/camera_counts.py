@@ -14,6 +14,7 @@ from cavmarl.core.math.rng import STREAM_CAMERA, uniform
 from cavmarl.core.math.walls import behind_body
 from cavmarl.core.records import record
 from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.roads.kernels.lanes_now import table_of
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals, LanePosts
 from cavmarl.signals.kernels.lane_counts import count_vehicle
 from cavmarl.signals.kernels.signal_steps import SignalRules, SignalWorlds
@@ -64,6 +65,7 @@ def count_by_cameras(
         if not chosen[w]:
             continue
         counts[w] = 0
+        lanes = worlds.lanes[table_of(worlds.lanes, w)]
         num = _list_in_range(rules.controlled, cameras, rows, worlds.num_owned, w)
         for i in range(num):
             found = cameras.in_range[i]
@@ -72,7 +74,7 @@ def count_by_cameras(
                 uniform(worlds.keys[w], row["id"], worlds.ticks[w], STREAM_CAMERA) < cameras.misses
             )
             if not is_missed and not _is_hidden(cameras, i):
-                count_vehicle(rules.controlled, rules.near_m, row, found["lane"], counts[w])
+                count_vehicle(rules.controlled, lanes, rules.near_m, row, found["lane"], counts[w])
 
 
 @kernel

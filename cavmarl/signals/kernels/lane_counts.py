@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.rows import is_off_lanes
+from cavmarl.roads.kernels.lanes_now import table_of
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals
 
 # Columns of the counts (W, N, COUNTS) of lanes.
@@ -32,6 +33,7 @@ _LANE_SHIFT = 32
 @kernel
 def count_vehicle(
     controlled: ControlledSignals,
+    lanes: NDArray[np.void],  # LANE (L,) of the world
     near_m: float,  # see `count_lanes`
     row: np.void,  # VEHICLE
     lane: int,  # index of a watched lane
@@ -40,7 +42,7 @@ def count_vehicle(
     """Add a vehicle to the counts of its lane."""
     found = counts[lane]
     speed = abs(row["speed"])
-    desired = controlled.speed_mps[lane] * max(row["speed_factor"], 1e-3)
+    desired = lanes[row["lane"]]["speed_mps"] * max(row["speed_factor"], 1e-3)
     found[VEHICLES] += 1
     found[STANDING] += speed < STANDING_MPS
     if row["lane_stood"] >= 0:
@@ -93,6 +95,7 @@ def count_standing(
 @kernel
 def count_lanes(
     controlled: ControlledSignals,
+    lanes: NDArray[np.void],  # see `Worlds`
     near_m: float,  # distance from the end of a lane, for NEAR_LINE
     rows: NDArray[np.void],  # VEHICLE (k, W, C)
     num_owned: NDArray[np.int64],  # (k, W)
@@ -104,6 +107,7 @@ def count_lanes(
         if not chosen[w]:
             continue
         counts[w] = 0
+        own_lanes = lanes[table_of(lanes, w)]
         for zone in range(rows.shape[0]):
             for i in range(num_owned[zone, w]):
                 row = rows[zone, w, i]
@@ -111,4 +115,4 @@ def count_lanes(
                     continue
                 n = controlled.lane_index[row["lane"]]
                 if n >= 0:
-                    count_vehicle(controlled, near_m, row, n, counts[w])
+                    count_vehicle(controlled, own_lanes, near_m, row, n, counts[w])

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.geometry import project
+from cavmarl.roads.kernels.lanes_now import table_of
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals
 from cavmarl.signals.kernels.lane_counts import (
     LENGTH_MM,
@@ -58,6 +59,7 @@ def count_by_messages(
     for w in range(chosen.size):
         if not chosen[w]:
             continue
+        lanes = worlds.lanes[table_of(worlds.lanes, w)]
         for n in range(counts.shape[1]):
             stood = counts[w, n, STOOD_TICKS]
             counts[w, n] = 0
@@ -71,7 +73,7 @@ def count_by_messages(
                     found, speed = counts[w, n], abs(box[num]["speed"])
                     found[VEHICLES] += 1
                     found[STANDING] += speed < STANDING_MPS
-                    share = speed / controlled.speed_mps[n]
+                    share = speed / lanes[controlled.lane_row[n]]["speed_mps"]
                     found[SPEED_PPM] += math.floor(share * 1e6 + 0.5)
                     found[LENGTH_MM] += math.floor(box[num]["length"] * 1e3 + 0.5)
                     front_m = along_m + 0.5 * box[num]["length"]

@@ -39,6 +39,7 @@ class SignalWorlds(NamedTuple):
     keys: NDArray[np.uint64]  # (W,)
     signal_phase: NDArray[np.int32]  # (W, num_signals)
     detected_s: NDArray[np.float64]  # (W, D)
+    lanes: NDArray[np.void]  # LANE (V, L), see `Worlds`
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
     sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
     num_owned: NDArray[np.int64]  # (k, W)
@@ -122,7 +123,9 @@ def count_truth(
     for w in range(chosen.size):
         observed[w] = chosen[w] and outputs.decides[w]
     rows = worlds.rows[worlds.sides[0]]
-    count_lanes(rules.controlled, rules.near_m, rows, worlds.num_owned, observed, truth)
+    count_lanes(
+        rules.controlled, worlds.lanes, rules.near_m, rows, worlds.num_owned, observed, truth
+    )
 
 
 @kernel

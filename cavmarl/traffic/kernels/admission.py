@@ -30,6 +30,7 @@ from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.junctions.swept_areas import foe_would_sweep_over
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.lanes.route_following import fed_lane, next_step
+from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.traffic.kernels.demand_generator import enter
 from cavmarl.traffic.kernels.entering import (
     crowd,
@@ -70,6 +71,7 @@ def rank_lanes(
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
+        here = roads_in(roads, worlds.lanes, w)
         for q in range(departures.num_queue[w]):
             departure = departures.queue[w, q]
             code = departure["lane_code"]
@@ -77,17 +79,17 @@ def rank_lanes(
             last = departure["pos_code"] == POS_LAST
             if not (chooses or last):
                 continue
-            edge = roads.edges[roads.lanes[departure["lane"]]["edge"]]
+            edge = here.edges[here.lanes[departure["lane"]]["edge"]]
             first = edge["first_lane"]
             s = max(departure["pos"], 0.0)
             for lane in range(first, first + edge["num_lanes"]):
-                length = roads.lanes[lane]["length_m"]
+                length = here.lanes[lane]["length_m"]
                 on_lane = length if last else min(s, length)
-                ranked = chooses and _zone_on(roads, zones, lane, on_lane) == zone
-                placed = last and _zone_on(roads, zones, lane, length) == zone
+                ranked = chooses and _zone_on(here, zones, lane, on_lane) == zone
+                placed = last and _zone_on(here, zones, lane, length) == zone
                 if (ranked or placed) and not indexed:
                     rows = worlds.next_rows[w]
-                    index_lanes(roads, travel, rows, worlds.num_rows[w], scratch)
+                    index_lanes(here, travel, rows, worlds.num_rows[w], scratch)
                     indexed = True
                 if ranked:
                     departures.ranks[w, q, lane - first] = crowd(
@@ -96,7 +98,7 @@ def rank_lanes(
                 if placed:
                     kind = travel.types[departure["vtype"]]
                     departures.last_s[w, q, lane - first] = entry_place(
-                        roads,
+                        here,
                         travel,
                         worlds.keys[w],
                         departure,
@@ -255,6 +257,7 @@ def propose(
         if departures.num_queue[w] == 0:
             continue
         rows = worlds.next_rows[w]
+        here = roads_in(roads, worlds.lanes, w)
         num = worlds.num_rows[w]
         key = worlds.keys[w]
         indexed = announced = False
@@ -265,32 +268,32 @@ def propose(
             departure = departures.queue[w, q]
             kind = travel.types[departure["vtype"]]
             if departure["pos_code"] == POS_LAST:
-                edge = roads.edges[roads.lanes[lane]["edge"]]
+                edge = here.edges[here.lanes[lane]["edge"]]
                 s = departures.last_s[w, q, lane - edge["first_lane"]]
             else:
-                s = entry_place(roads, travel, key, departure, kind, lane, worlds.ticks[w], scratch)
-            if _zone_on(roads, zones, lane, s) != zone:
+                s = entry_place(here, travel, key, departure, kind, lane, worlds.ticks[w], scratch)
+            if _zone_on(here, zones, lane, s) != zone:
                 continue
             if not indexed:
-                index_lanes(roads, travel, rows, num, scratch)
+                index_lanes(here, travel, rows, num, scratch)
                 indexed = True
-            speed = entry_speed(roads, travel, rows, key, departure, kind, lane, s, scratch)
+            speed = entry_speed(here, travel, rows, key, departure, kind, lane, s, scratch)
             if speed < 0.0:
                 continue
-            if follower_brakes(roads, travel, rows, departure, kind, lane, s, speed, scratch):
+            if follower_brakes(here, travel, rows, departure, kind, lane, s, speed, scratch):
                 continue
             n = departures.num_passing[w]
             row = departures.passing[w, n]
             departures.passing[w, n] = demand.blank[0]
-            enter(roads, travel, worlds, w, departure, lane, s, speed, row)
+            enter(here, travel, worlds, w, departure, lane, s, speed, row)
             if _touches_any(rows, num, row):
                 continue
-            if may_entry_be_swept(roads, travel, row, scratch):
+            if may_entry_be_swept(here, travel, row, scratch):
                 if not announced:
                     step, step_at = worlds.step[w], worlds.step_at[w]
-                    register_links(roads, travel, rows, num, step, step_at, scratch)
+                    register_links(here, travel, rows, num, step, step_at, scratch)
                     announced = True
-                if is_entry_swept(roads, travel, row, scratch):
+                if is_entry_swept(here, travel, row, scratch):
                     continue
             departures.places[w, n] = q
             departures.num_passing[w] = n + 1

@@ -1,0 +1,226 @@
+"""`LaneChanges`: roads that the caller closes or slows down, from the next step on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import ActionError, CapacityError, ConfigError
+from cavmarl.core.records.lane_changes import CHANGED, CLOSED_TO, LIMIT_MPS, wrong_changes
+from cavmarl.driving.vehicle_types import ALL_PERMISSIONS
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.ways_out import shut_in_roads
+from cavmarl.shards.shard import Commands
+
+CLOSED, OPENED, DAMAGED = "closed", "opened", "damaged"  # kinds of frame events
+
+Asked = tuple[tuple[str, str], ...]
+
+
+class LaneChanges:
+    """The lanes of W worlds that differ from the map, at most N = `map.changed_lanes` of each.
+
+    The changes stay until they are undone, or until the world is reset.
+
+    Args:
+        config: configuration of the worlds.
+        network: map of the worlds.
+        num_worlds: number of worlds, W.
+    """
+
+    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
+        self._most = config.map.changed_lanes
+        self._network = network
+        self._edges = {name: row for row, name in enumerate(network.edge_ids)} if self._most else {}
+        self._told = np.zeros((num_worlds, self._most, 3))  # `Commands.lane_changes`
+        self._waiting: list[Asked] = [()] * num_worlds  # changes for the next step
+        self._last: list[Asked] = [()] * num_worlds  # changes of the last step
+
+    @property
+    def memory(self) -> tuple[NDArray[Any], ...]:
+        """The changes that hold from the next step on."""
+        return (self._told,)
+
+    @memory.setter
+    def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
+        (self._told[:],) = memory
+
+    def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
+        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        return wrong_changes(memory[0], self._network.lanes)
+
+    def close(
+        self,
+        world: int,
+        edge: str,
+        lanes: Sequence[int] | None = None,
+        classes: int = ALL_PERMISSIONS,
+        shuts_in: bool = False,
+    ) -> None:
+        """Close lanes of a road.
+
+        Args:
+            world: number of the world.
+            edge: id of the road.
+            lanes: indices of the lanes, from the kerb; None: all lanes.
+            classes: bits of the vehicle classes that may not use them.
+            shuts_in: whether the road may be the last way out of others.
+
+        Raises:
+            ActionError: there is no such world, road or lane; or the road is the last way out.
+            CapacityError: the world already has as many changed lanes as are allowed.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        rows = self._rows(world, edge, lanes)
+        limit_mps, closed = self._now(world)
+        closed[rows] |= np.uint32(classes)
+        if not shuts_in:
+            self._refuse_last_way(world, edge, closed)
+        self._tell(world, limit_mps, closed, (CLOSED, _detail(edge, lanes)))
+
+    def open(self, world: int, edge: str, lanes: Sequence[int] | None = None) -> None:
+        """Give lanes of a road the limits and permissions of the map; raises as `close`."""
+        rows = self._rows(world, edge, lanes)
+        limit_mps, closed = self._now(world)
+        own = self._network.lanes["speed_mps"]
+        if not ((closed[rows] != 0) | (limit_mps[rows] != own[rows])).any():
+            raise ActionError(
+                f"edge {_detail(edge, lanes)!r} is neither closed nor damaged; give the id of a "
+                "changed road"
+            )
+        limit_mps[rows], closed[rows] = own[rows], 0
+        self._tell(world, limit_mps, closed, (OPENED, _detail(edge, lanes)))
+
+    def limit(
+        self, world: int, edge: str, speed_mps: float, lanes: Sequence[int] | None = None
+    ) -> None:
+        """Set the speed limit of lanes of a road.
+
+        Args:
+            world: number of the world.
+            edge: id of the road.
+            speed_mps: limit in m/s, above 0 and at most that of the map. A limit equal to that of
+                the map ends an earlier one.
+            lanes: see `close`.
+
+        Raises:
+            ActionError: there is no such world, road or lane, or the limit is out of range.
+            CapacityError, ConfigError: see `close`.
+        """
+        rows = self._rows(world, edge, lanes)
+        most_mps = float(self._network.lanes["speed_mps"][rows].min())
+        if not 0.0 < speed_mps <= most_mps:
+            raise ActionError(
+                f"speed_mps = {speed_mps:g}: edge {edge!r} has a limit of {most_mps:g} m/s on the "
+                "map; give a speed above 0 and at most that"
+            )
+        limit_mps, closed = self._now(world)
+        limit_mps[rows] = speed_mps
+        event = DAMAGED, f"{_detail(edge, lanes)} {speed_mps!r}"
+        self._tell(world, limit_mps, closed, event)
+
+    def closed(self, world: int) -> tuple[str, ...]:
+        """Return the ids of the roads with a closed lane, from the next step on."""
+        told = self._told[self._checked(world)]
+        lanes = told[told[:, CLOSED_TO] > 0.0, CHANGED].astype(np.int64) - 1
+        edges = np.unique(self._network.lanes["edge"][lanes])
+        return tuple(self._network.edge_ids[edge] for edge in edges.tolist())
+
+    def add_to(self, commands: Commands) -> Commands:
+        """Return the commands with the changes of the caller."""
+        return replace(commands, lane_changes=self._told.copy()) if self._most else commands
+
+    def clear(self) -> None:
+        """Note the changes of the step; they stay."""
+        if self._most:
+            self._last, self._waiting = self._waiting, [()] * len(self._waiting)
+
+    def last(self, world: int) -> Asked:
+        """Return the changes in the last step."""
+        return self._last[world]
+
+    def forget(self, chosen: NDArray[np.bool_]) -> None:
+        """Begin an episode in the chosen worlds (W,)."""
+        self._told[chosen] = 0.0
+        for world in np.flatnonzero(chosen).tolist():
+            self._waiting[world] = self._last[world] = ()
+
+    def _checked(self, world: int) -> int:
+        if not self._most:
+            raise ConfigError(
+                "these worlds allow no changes of lanes: set map.changed_lanes to the number of "
+                "lanes that may be closed or damaged at the same time"
+            )
+        if not 0 <= world < len(self._told):
+            raise ActionError(f"world {world}: must be from 0 to {len(self._told) - 1}")
+        return world
+
+    def _rows(self, world: int, edge: str, lanes: Sequence[int] | None) -> NDArray[np.intp]:
+        """Return the LANE rows of some lanes of a road."""
+        self._checked(world)
+        number = self._edges.get(edge, -1)
+        if number < 0 or self._network.edges["internal"][number]:
+            raise ActionError(f"edge {edge!r}: the map has no such road; give the id of one")
+        first = int(self._network.edges["first_lane"][number])
+        count = int(self._network.edges["num_lanes"][number])
+        if lanes is None:
+            return np.arange(first, first + count)
+        wrong = [lane for lane in lanes if isinstance(lane, bool) or not 0 <= lane < count]
+        if wrong or not len(lanes):
+            raise ActionError(
+                f"lanes = {list(lanes)!r}: edge {edge!r} has the lanes 0 to {count - 1}, from the "
+                "kerb; name at least one of them, or leave lanes out for all"
+            )
+        return first + np.unique(np.asarray(lanes, dtype=np.intp))
+
+    def _now(self, world: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
+        """Return the limit in m/s (L,) and the classes (L,) each lane is closed to."""
+        told = self._told[world]
+        used = told[told[:, CHANGED] > 0.0]
+        lanes = used[:, CHANGED].astype(np.int64) - 1
+        limit_mps = self._network.lanes["speed_mps"].copy()
+        closed = np.zeros(len(limit_mps), dtype=np.uint32)
+        limit_mps[lanes] = used[:, LIMIT_MPS]
+        closed[lanes] = used[:, CLOSED_TO].astype(np.uint32)
+        return limit_mps, closed
+
+    def _tell(
+        self,
+        world: int,
+        limit_mps: NDArray[np.float64],
+        closed: NDArray[np.uint32],
+        event: tuple[str, str],
+    ) -> None:
+        """Let the changes hold from the next step on."""
+        differs = np.flatnonzero((limit_mps != self._network.lanes["speed_mps"]) | (closed != 0))
+        if len(differs) > self._most:
+            raise CapacityError(
+                f"world {world}: {len(differs)} lanes would differ from the map, but "
+                f"map.changed_lanes = {self._most}; set it higher, or open a road"
+            )
+        told = self._told[world]
+        told[:] = 0.0
+        told[: len(differs), CHANGED] = differs + 1
+        told[: len(differs), LIMIT_MPS] = limit_mps[differs]
+        told[: len(differs), CLOSED_TO] = closed[differs]
+        self._waiting[world] = (*self._waiting[world], event)
+
+    def _refuse_last_way(self, world: int, edge: str, closed: NDArray[np.uint32]) -> None:
+        before = shut_in_roads(self._network, self._now(world)[1])
+        after = shut_in_roads(self._network, closed)
+        new = np.flatnonzero(after & ~before)
+        if len(new):
+            names = ", ".join(self._network.edge_ids[row] for row in new[:5].tolist())
+            raise ActionError(
+                f"edge {edge!r}: it is the last way out of {len(new)} roads, such as {names}; "
+                "open another road first, or pass shuts_in=True to let vehicles wait there"
+            )
+
+
+def _detail(edge: str, lanes: Sequence[int] | None) -> str:
+    return edge if lanes is None else f"{edge} {','.join(map(str, sorted(set(lanes))))}"
