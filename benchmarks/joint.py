@@ -23,7 +23,7 @@ from benchmarks.program import run
 from cavmarl.adapters.sb3_green_policy import SharedNetwork
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, Seed, about
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, ConfigError
 from cavmarl.evaluate.statistics import mean_interval
 
 TRAINING = Path(__file__).parent.parent / "train" / "signals_sb3.py"
@@ -63,6 +63,9 @@ def measure(
     loss: Annotated[
         list[float] | None, typer.Option("--loss", help="Share of lost messages; repeatable.")
     ] = None,
+    side: Annotated[
+        list[str] | None, typer.Option("--side", help="Side to measure; repeatable.")
+    ] = None,
     updates: Annotated[int, about("Updates of a training.")] = 60,
     networks: Annotated[Path, about("Folder of the trained networks.")] = Path("runs/joint"),
     seed: Seed = 0,
@@ -73,15 +76,15 @@ def measure(
     losses = loss or [0.0, 0.1, 0.2, 0.3, 0.4, 0.5]
     named: dict[str, Any] = {"agents": agents, "decide_s": decide_s, "updates": updates}
     rows: list[Mapping[str, Any]] = []
-    for side in SIDES:
+    for chosen in _chosen(side):
         network = None
-        if side.trained_with:
-            say(f"training with {side.trained_with}")
-            network = _network(env, side.trained_with, networks, seed, **named)
-        for share in losses if side.drivers == "glosa" else losses[:1]:
-            say(f"{side.name}, {share:.0%} lost")
+        if chosen.trained_with:
+            say(f"training with {chosen.trained_with}")
+            network = _network(env, chosen.trained_with, networks, seed, **named)
+        for share in losses if chosen.drivers == "glosa" else losses[:1]:
+            say(f"{chosen.name}, {share:.0%} lost")
             found = drive_worlds(
-                side.drivers,
+                chosen.drivers,
                 env,
                 agents=agents,
                 worlds=worlds,
@@ -90,8 +93,8 @@ def measure(
                 controller=network,
                 overrides=_keys(share, decide_s if network else None),
             )
-            lost = share if side.drivers == "glosa" else None
-            rows.append({"side": side.name, "loss": lost, **_figures(found)})
+            lost = share if chosen.drivers == "glosa" else None
+            rows.append({"side": chosen.name, "loss": lost, **_figures(found)})
     return BenchmarkReport(
         f"{env}, {agents} vehicles, {worlds} worlds, {seconds} s, decisions every {decide_s:g} s",
         {
@@ -106,6 +109,15 @@ def measure(
         },
         rows,
     )
+
+
+def _chosen(names: Sequence[str] | None) -> list[Side]:
+    """Return the sides of some names, or all."""
+    known = {side.name: side for side in SIDES}
+    for name in names or ():
+        if name not in known:
+            raise ConfigError(f"--side {name}: must be one of {', '.join(known)}")
+    return [known[name] for name in names or known]
 
 
 def _keys(loss: float, decide_s: float | None) -> dict[str, Any]:

@@ -147,6 +147,7 @@ class CavTask(Task):  # type: ignore[misc] # only installed in a separate enviro
     GRID4X4 = None
     HIGHWAY = None
     INTERSECTION = None
+    LANE_DROP = None
     MERGE = None
     RING = None
     RING22 = None

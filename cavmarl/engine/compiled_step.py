@@ -17,6 +17,9 @@ from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.shard_group import ShardGroup
 
+# Components with `tick_calls` and `step_calls`, or that act in `begin` alone.
+COMPILED = SignalComponent | LimitComponent | LaneComponent
+
 
 class CompiledStep:
     """The ticks of a step and the sensing at its end, as one sequence of compiled calls."""
@@ -130,10 +133,7 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         type(group) is not ShardGroup
         or len(group.shards) != 1
         or tick.coordination.needs_ghosts
-        or not all(
-            isinstance(part, SignalComponent | LaneComponent | LimitComponent)
-            for part in tick.attached
-        )
+        or not all(isinstance(part, COMPILED) for part in tick.attached)
         or tick.outside.sumo is not None
         or tick.traffic.rerouting is not None
         or group.calls.has_registered

@@ -74,11 +74,7 @@ class World(NamedTuple):
     @property
     def signal_sizes(self) -> SignalSizes:
         """Sizes of the arrays about signals with agents, or other agents beside the road."""
-        if self.config.signals.are_controlled:
-            return sizes_of(self.network, self.config.signals.range_m)
-        if self.config.limits.are_controlled:
-            return limit_sizes(self.config.limits)
-        return SignalSizes()
+        return roadside_sizes(self.config, self.network)
 
     @property
     def capacity(self) -> int:
@@ -87,6 +83,15 @@ class World(NamedTuple):
         room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
         scene = plan_scene(config.scenario, self.network)
         return room + (0 if scene is None else len(scene.actors))
+
+
+def roadside_sizes(config: EnvConfig, network: RoadNetwork) -> SignalSizes:
+    """Return the sizes of the arrays about controlled signals or limits."""
+    if config.signals.are_controlled:
+        return sizes_of(network, config.signals.range_m)
+    if config.limits.are_controlled:
+        return limit_sizes(config.limits)
+    return SignalSizes()
 
 
 def load_world(

@@ -40,8 +40,8 @@ class StepSession:
 
     A step takes decoded actions and the waiting inputs: declared events, insertions, commands to
     external vehicles, overridden signals and changed lanes. After each reset and step, the session
-    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds, which
-    continue bit for bit; it has no recording and no watchers.
+    records the worlds and calls its watchers. A copy or a pickle of a session has its own worlds,
+    which continue bit for bit; it has no recording and no watchers.
 
     Args:
         worlds: the worlds to step.
