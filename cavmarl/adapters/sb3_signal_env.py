@@ -17,6 +17,8 @@ from numpy.typing import NDArray
 from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.sb3_vec_env import DECIDED, CavSb3VecEnv
 from cavmarl.core.errors import ConfigError, missing
+from cavmarl.env.limit_agents import LIMITS, LimitAgents
+from cavmarl.env.signal_agents import SIGNALS, SignalAgents
 from cavmarl.env.vector import make_vec
 from cavmarl.policies.loading import load_policy
 from cavmarl.signals.green_features import MOST, GreenFeatures
@@ -40,6 +42,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     Args:
         env: see `make_vec`.
         num_worlds: W.
+        kind: the agents of the rows: `signals`, or roadside units with speed `limits`.
         features: `lanes`: observations as the agents get them. `greens`: the rows of
             `GreenFeatures`, for `sb3_green_policy.GreenPolicy`.
         spread: whether the first episodes of the worlds have different lengths, so that the worlds
@@ -59,6 +62,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         env: str | Path = "grid4x4",
         *,
         num_worlds: int = 1,
+        kind: Literal["signals", "limits"] = "signals",
         features: Literal["lanes", "greens"] = "lanes",
         spread: bool = False,
         drivers: str = "",
@@ -68,28 +72,35 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         refuse_decided(DECIDED, arguments)
         if features not in ("lanes", "greens"):
             raise ConfigError(f"features = {features!r}: must be 'lanes' or 'greens'")
-        keys = {"signals.agents": "all", **(overrides or {})}
+        if kind not in (SIGNALS, LIMITS):
+            raise ConfigError(f"kind = {kind!r}: must be {SIGNALS!r} or {LIMITS!r}")
+        if kind == LIMITS and features == "greens":
+            raise ConfigError("features = 'greens': limits have none; leave it out")
+        keys = {f"{kind}.agents": "all", **(overrides or {})}
         self._vec = make_vec(
             env,
             num_envs=num_worlds,
             overrides=keys,
             **{"agents": 0, **arguments, "autoreset_mode": AutoresetMode.DISABLED},
         )
-        signals = self._vec.signals
-        self._features = GreenFeatures(signals.table) if features == "greens" else None
+        self._agents: SignalAgents | LimitAgents = (
+            self._vec.limits if kind == LIMITS else self._vec.signals
+        )
+        greens = features == "greens"
+        self._features = GreenFeatures(self._vec.signals.table) if greens else None
         self._spreads = spread
         self._drivers = load_policy(drivers, self._vec, beside_signals=True) if drivers else None
         self._seen: tuple[Any, Any] = (None, None)  # observations and mask of the vehicles
-        self._size = self._features.size if self._features else signals.table.sizes.features
-        self._shape = (num_worlds, len(signals.agents))
+        self._size = self._features.size if self._features else self._agents.table.sizes.features
+        self._shape = (num_worlds, len(self._agents.agents))
         self._actions = np.zeros(self._shape, dtype=np.int64)
         VecEnv.__init__(
             self,
-            num_worlds * len(signals.agents),
+            num_worlds * len(self._agents.agents),
             spaces.Box(-MOST, MOST, (self._size,), np.float32)
             if self._features
-            else signals.padded_observation_space,
-            spaces.Discrete(signals.most_choices),
+            else self._agents.padded_observation_space,
+            spaces.Discrete(self._agents.most_choices),
         )
         self.metadata = self._vec.metadata
         self.spec = None
@@ -108,7 +119,8 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     def _spread(self) -> None:
         """Begin new episodes one after the other, over the length of an episode."""
         worlds = self._shape[0]
-        per_decision = round(self._vec.config.signals.decide_s / self._vec.config.clock.ctrl_dt_s)
+        decide_s = getattr(self._vec.config, self._agents.kind).decide_s
+        per_decision = round(decide_s / self._vec.config.clock.ctrl_dt_s)
         between = self._vec.max_cycles // per_decision // worlds * per_decision
         for world in range(worlds - 1):
             for _ in range(between):
@@ -136,17 +148,17 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Run all steps of the worlds until the next decision, with the stored actions."""
         arrays = self._vec.worlds.arrays
-        choices = self._vec.signals.keep_beyond(self._actions)
+        kind, choices = self._agents.kind, self._agents.keep_beyond(self._actions)
         rewards = np.zeros(self._shape, dtype=np.float32)
         done = np.zeros(self._shape, dtype=np.bool_)
         last = np.zeros((self.num_envs, self._size), dtype=np.float32)
         while True:
-            seen, gained, _, over, infos = self._vec.step(self._vehicles() | {"signals": choices})
+            seen, gained, _, over, infos = self._vec.step(self._vehicles() | {kind: choices})
             self._see(seen, infos)
-            rewards += gained["signals"]
+            rewards += gained[kind]
             if infos["episode_over"].any():
-                done |= over["signals"]
-                ends = over["signals"].reshape(-1)
+                done |= over[kind]
+                ends = over[kind].reshape(-1)
                 last[ends] = self._signal_rows()[ends]
                 self._see(*self._vec.reset(options={"reset_mask": infos["episode_over"]}))
             if arrays.signal_decides.all():
@@ -173,6 +185,8 @@ class CavSb3SignalEnv(CavSb3VecEnv):
 
     def _signal_rows(self) -> NDArray[np.float32]:
         """Return the present observations (W · S, D)."""
-        view = self._vec.signals.view
-        found = view.observations.copy() if self._features is None else self._features.of(view)
+        if self._features is None:
+            found = self._agents.view.observations.copy()
+        else:
+            found = self._features.of(self._vec.signals.view)
         return found.reshape(self.num_envs, -1)
