@@ -48,6 +48,7 @@ class Args:
     program: ClassVar[str] = "limits_sb3.py"
 
     env: Annotated[str, "environment: a name or a folder"] = "lane_drop"
+    decide_s: Annotated[float, "seconds between two decisions of a unit"] = 20.0
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
     num_worlds: Annotated[int, "number of parallel worlds"] = 8
     seed: Annotated[int, "root of all random numbers"] = 0
@@ -75,7 +76,12 @@ class Args:
     @property
     def overrides(self) -> dict[str, Any]:
         """Keys of the worlds of training and evaluation."""
-        return parse_settings([word for word in self.settings.split(",") if word])
+        return {
+            "limits.agents": "all",
+            "limits.decide_s": self.decide_s,
+            "clock.ctrl_dt_s": self.decide_s,
+            **parse_settings([word for word in self.settings.split(",") if word]),
+        }
 
 
 def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
@@ -112,17 +118,12 @@ def choices_of(model: PPO) -> Choose:
 
 def run_worlds(args: Args, choose: Choose) -> dict[str, list[float]]:
     """Run the worlds of the evaluation for an episode; return their figures."""
-    vec = make_vec(
-        args.env, num_envs=args.evaluations, overrides={"limits.agents": "all", **args.overrides}
-    )
+    vec = make_vec(args.env, num_envs=args.evaluations, agents=0, overrides=args.overrides)
     with closing(vec):
         vec.reset(seed=FIRST_SEED)
         present_s = np.zeros(vec.num_envs)
         for _ in range(vec.max_cycles - 1):
-            actions: dict[str, Any] = {"limits": np.maximum(choose(vec.limits), 0)}
-            if vec.config.population.agents:
-                actions["vehicles"] = vec.suggest_actions()["vehicles"]
-            vec.step(actions)
+            vec.step({"limits": np.maximum(choose(vec.limits), 0)})
             present_s += [vec.step_s * sum(_present(vec.traffic_stats(w))) for w in _worlds(vec)]
         stats = [vec.traffic_stats(world) for world in _worlds(vec)]
         arrived = [each["arrived"] for each in stats]

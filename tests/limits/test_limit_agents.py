@@ -25,15 +25,15 @@ with warnings.catch_warnings():
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import parallel_api_test
 
-STEP = {"clock.ctrl_dt_s": 5.0, "horizon_s": 200.0}
+STEP = {"clock.ctrl_dt_s": 5.0, "limits.decide_s": 5.0, "horizon_s": 200.0}
 UNITS = {"limits.units": {"far": ["far"], "near": ["near"]}}
 SPEEDS = {"limits.speeds_mps": [6.0, 12.0, 20.0, 40.0]}
-KEYS: dict[str, Any] = {**STEP, **UNITS, **SPEEDS}
+KEYS: dict[str, Any] = {"limits.agents": "all", **STEP, **UNITS, **SPEEDS}
 
 
 def vec_of(num_envs: int = 2, **more: Any) -> CavVectorEnv:
     overrides = KEYS | more.pop("overrides", {})
-    return make_vec("lane_drop", num_envs=num_envs, overrides=overrides, **more)
+    return make_vec("lane_drop", num_envs=num_envs, overrides=overrides, **{"agents": 0, **more})
 
 
 def test_vehicles_keep_the_limit_that_is_chosen() -> None:
@@ -119,7 +119,7 @@ def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
 
 
 def test_the_parallel_environment_keeps_its_contract() -> None:
-    env = parallel_env("lane_drop", agents=2, background=10, overrides=KEYS)
+    env = parallel_env("lane_drop", agents=2, overrides=KEYS)
     with closing(env):
         assert env.possible_agents[-2:] == ["limit_far", "limit_near"]
         assert env.action_space("limit_far") == spaces.Discrete(4)
@@ -137,7 +137,7 @@ def hashes(
 ) -> list[str]:
     """Hashes of the states and of everything that the agents of limits get."""
     keys = {"limits.decide_s": 10.0, "limits.most_change": 2, **(overrides or {})}
-    vec = vec_of(num_envs, agents=3, background=0, overrides=keys, **more)
+    vec = vec_of(num_envs, agents=3, overrides=keys, **more)
     with closing(vec):
         vec.reset(seed=1)
         rng, given = np.random.default_rng(0), hashlib.sha256()
@@ -225,7 +225,7 @@ def test_a_saved_state_continues_with_other_zones() -> None:
 
 def test_a_controller_chooses_for_units_in_worlds_of_vehicles() -> None:
     keys = {"limits.controller": "feedback", "limits.wanted_per_km": 5.0}
-    vec = vec_of(1, agents=2, background=0, overrides=keys)
+    vec = vec_of(1, agents=2, overrides=keys)
     with closing(vec):
         vec.reset(seed=1)
         for _ in range(30):
