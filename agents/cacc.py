@@ -20,7 +20,7 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.engine.spaces import observation_parts
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.policies.policy import Policy
+from cavmarl.policies.policy import Policy, suggested
 
 SPEED_GAIN = 1.0  # 1/s, towards the limit
 ACCEL_GAIN = 1.0
@@ -90,11 +90,11 @@ class CaccPolicy(Policy):
 
     def _suggested(self, shape: tuple[int, ...]) -> NDArray[Any]:
         """Return the built-in driver's actions, (W, A, 2)."""
-        suggested = self.env.suggest_actions()
-        if not isinstance(suggested, dict):
-            return np.asarray(suggested)
+        found = suggested(self.env)
+        if not isinstance(found, dict):
+            return np.asarray(found)
         actions = np.zeros((*shape, 2), dtype=np.float32)
-        for agent, action in suggested.items():
+        for agent, action in found.items():
             actions[0, self.env.possible_agents.index(agent)] = action
         return actions
 

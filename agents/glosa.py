@@ -3,8 +3,8 @@
 The driver steers, follows and stops like the built-in driver. If it has received the timing of the
 next signal in a message (SPAT), it drives no faster than the speed at which it reaches the line in
 the earliest green that it can reach. If no speed of at least `SLOWEST_MPS` reaches a green, it
-drives at `SLOWEST_MPS`. The advice is for signals that follow programs. It does not know the queue
-before the signal.
+drives at `SLOWEST_MPS`. Of a signal whose greens are chosen, only the earliest time of the next
+green is known. The driver then arrives no earlier. It does not know the queue before the signal.
 
 Source: Eckhoff, Halmos, German: "Potentials and limitations of green light optimal speed advisory
     systems", IEEE VNC 2013.
@@ -64,7 +64,7 @@ def advised_mps(
         limit: (…) highest speed in m/s.
         is_go: (…) whether the signal is green now.
         change_s: (…) time until the signal changes between green and red.
-        return_s: (…) time until the signal changes back.
+        return_s: (…) time until the signal changes back; infinite: not known.
 
     Returns:
         (…) m/s; `limit` if the line cannot be reached before the last known change.
@@ -74,7 +74,8 @@ def advised_mps(
     begin_s = np.where(is_go, return_s, change_s) + MARGIN_S
     is_beyond = ~is_go & (soonest_s > return_s)
     wanted = np.clip(line_m / begin_s, np.minimum(SLOWEST_MPS, limit), limit)
-    found: Floats = np.where(is_in_first | is_beyond, limit, wanted)
+    is_free = is_in_first | is_beyond | np.isinf(begin_s)
+    found: Floats = np.where(is_free, limit, wanted)
     return found
 
 
@@ -110,8 +111,9 @@ class Glosa(Policy):
         ego, signal = newest[..., self._ego], newest[..., self._signal]
         speed, limit = ego[..., 0] * SPEED_SCALE, np.maximum(ego[..., 6] * SPEED_SCALE, 1.0)
         soon = signal[..., [CHANGE, RETURN]]
-        is_known = (soon > 0.0).all(-1)
-        change_s, return_s = np.moveaxis(SOON_S / np.where(soon > 0.0, soon, 1.0) - SOON_S, -1, 0)
+        is_known = soon[..., 0] > 0.0
+        times_s = np.where(soon > 0.0, SOON_S / np.where(soon > 0.0, soon, 1.0) - SOON_S, np.inf)
+        change_s, return_s = np.moveaxis(times_s, -1, 0)
         line_m = np.maximum(signal[..., LINE] * LINE_SCALE_M - HALF_M, 0.0)
         advice = advised_mps(line_m, speed, limit, signal[..., GO] > 0.0, change_s, return_s)
         accel = np.maximum((advice - speed) / REACT_S, -BRAKE_MPS2)

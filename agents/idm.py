@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import PolicyError
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
-from cavmarl.policies.policy import Policy
+from cavmarl.policies.policy import Policy, suggested
 
 
 class IdmPolicy(Policy):
@@ -25,13 +25,13 @@ class IdmPolicy(Policy):
         """Return the built-in driver's actions (W, A, …) in the present worlds."""
         if isinstance(self.env, CavEnv):
             raise PolicyError("act_batch() drives a make_vec; a parallel_env is driven by act()")
-        return cast(NDArray[Any], self.env.suggest_actions())
+        return cast(NDArray[Any], suggested(self.env))
 
     def act(self, observations: Mapping[str, Any]) -> dict[str, Any]:
         """Return the built-in driver's actions in the present world."""
         if isinstance(self.env, CavVectorEnv):
             raise PolicyError("act() drives a parallel_env; a make_vec is driven by act_batch()")
-        return self.env.suggest_actions()
+        return cast(dict[str, Any], suggested(self.env))
 
 
 def make_policy(env: CavEnv | CavVectorEnv) -> Policy:

@@ -11,15 +11,18 @@ from typing import Annotated, Any, NamedTuple
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 
 from benchmarks.program import run
 from cavmarl import load_policy, make_vec
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, Seed, about
+from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.evaluate.signals.emissions import co2_mg_per_s
+from cavmarl.signals.controllers import SignalController
 
 STANDING_MPS = 0.1
-ADVISED: Mapping[str, Any] = {
+ADVISED: dict[str, Any] = {
     "v2x.enabled": True,
     "v2x.roadside.signals": ["all"],
     "v2x.channel.range_m": 300.0,
@@ -30,16 +33,23 @@ ADVISED: Mapping[str, Any] = {
 
 
 class Driving(NamedTuple):
-    """What all agents of W worlds did."""
+    """What all agents of one or several worlds did."""
 
-    stops: int
+    stops: float
     stood_s: float
     driven_s: float
+    delay_s: float  # driven time beyond that at the desired speed
     distance_m: float
     co2_g: float
 
 
-def drive(
+def drive(policy: str, env: str = "grid4x4", **arguments: Any) -> Driving:
+    """Return the sums over worlds of `drive_worlds`."""
+    found = np.sum(drive_worlds(policy, env, **arguments), axis=0)
+    return Driving(*found.tolist())
+
+
+def drive_worlds(
     policy: str,
     env: str = "grid4x4",
     *,
@@ -47,29 +57,61 @@ def drive(
     worlds: int = 2,
     seconds: int = 300,
     seed: int = 1,
+    controller: SignalController | None = None,
     overrides: Mapping[str, Any] | None = None,
-) -> Driving:
-    """Let agents drive without background vehicles; a new trip follows each trip."""
+) -> list[Driving]:
+    """Let agents drive without background vehicles; a new trip follows each trip.
+
+    `controller`: chooses greens, if `signals.agents` is set. Returns the sums of each world.
+    """
     keys = {**ADVISED, "horizon_s": seconds + 10.0, **(overrides or {})}
     vec = make_vec(env, num_envs=worlds, agents=agents, background=0, overrides=keys)
     with closing(vec):
-        driver = load_policy(policy, vec)
+        driver = load_policy(policy, vec, beside_signals=controller is not None)
         observations, infos = vec.reset(seed=seed)
-        stood_before: list[set[int]] = [set() for _ in range(worlds)]
-        stops, sums = 0, np.zeros(4)
+        meters = [_Meter(vec.step_s) for _ in range(worlds)]
         for _ in range(round(seconds / vec.step_s)):
-            observations, *_, infos = vec.step(driver.act_batch(observations, infos["mask"]))
-            for world in range(worlds):
+            if controller is None:
+                actions: Any = driver.act_batch(observations, infos["mask"])
+            else:
+                actions = {
+                    "vehicles": driver.act_batch(observations["vehicles"], infos["mask"]),
+                    "signals": np.maximum(controller.choose(vec.signals.view), 0),
+                }
+            observations, *_, infos = vec.step(actions)
+            for world, meter in enumerate(meters):
                 rows = vec.simulation.vehicles(world)
-                rows = rows[rows["agent"] >= 0]
-                speed = np.abs(rows["speed"])
-                stands = speed < STANDING_MPS
-                now = set(rows["id"][stands].tolist())
-                stops += len(now - stood_before[world])
-                stood_before[world] = now
-                co2_mg = co2_mg_per_s(speed, rows["accel"]).sum()
-                sums += [stands.sum(), len(rows), speed.sum(), 1e-3 * co2_mg]
-        return Driving(stops, *(sums * vec.step_s).tolist())
+                meter.sample(rows[rows["agent"] >= 0])
+        return [Driving(*meter.sums.tolist()) for meter in meters]
+
+
+class _Meter:
+    """Adds up what the agents of a world do; `sums` are those of `Driving`."""
+
+    def __init__(self, step_s: float) -> None:
+        self._step_s = step_s
+        self._last = np.zeros(0, VEHICLE)
+        self.sums = np.zeros(len(Driving._fields))
+
+    def sample(self, rows: NDArray[np.void]) -> None:
+        """Add a step, with the vehicles (n,) at its end."""
+        rows = rows[np.argsort(rows["id"])]
+        speed, step_s = np.abs(rows["speed"]), self._step_s
+        stands = speed < STANDING_MPS
+        _, now, before = np.intersect1d(rows["id"], self._last["id"], return_indices=True)
+        stood = np.zeros(len(rows), dtype=np.bool_)
+        stood[now] = np.abs(self._last["speed"][before]) < STANDING_MPS
+        free_s = rows["free_s"].sum() - self._last["free_s"][before].sum()
+        co2_g = 1e-3 * co2_mg_per_s(speed, rows["accel"]).sum()
+        self.sums += [
+            (stands & ~stood).sum(),
+            stands.sum() * step_s,
+            len(rows) * step_s,
+            len(rows) * step_s - free_s,
+            speed.sum() * step_s,
+            co2_g * step_s,
+        ]
+        self._last = rows.copy()
 
 
 def measure(

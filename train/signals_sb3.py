@@ -18,14 +18,13 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
-import numpy as np
 import torch
-from numpy.typing import NDArray
 from rich.console import Console
 from stable_baselines3 import PPO
 
-from cavmarl.adapters.sb3_green_policy import GreenPolicy
+from cavmarl.adapters.sb3_green_policy import GreenPolicy, SharedNetwork
 from cavmarl.adapters.sb3_signal_env import CavSb3SignalEnv
+from cavmarl.cli.output import parse_settings
 from cavmarl.cli.suite import signal_table
 from cavmarl.core.progress import counting
 from cavmarl.evaluate.signals.signal_meter import SignalFigures
@@ -33,9 +32,7 @@ from cavmarl.evaluate.signals.signal_runs import OWN_PROGRAM, run_controller
 from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.signals.controllers import CONTROLLERS, SignalController, SignalView
-from cavmarl.signals.green_features import GreenFeatures
-from cavmarl.signals.kernels.green_choices import KEEP
+from cavmarl.signals.controllers import CONTROLLERS, SignalController
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
 FIRST_SEED = 1000  # first seed of the evaluation
@@ -50,7 +47,10 @@ class Args:
 
     env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
     num_worlds: Annotated[int, "number of parallel worlds"] = 4
-    background: Annotated[int, "vehicles of the generator; 0: only vehicles of the demand"] = 0
+    background: Annotated[int, "vehicles of the generator; -1: the environment's"] = -1
+    agents: Annotated[int, "vehicles that are agents in the training"] = 0
+    drivers: Annotated[str, "policy of these vehicles; empty: the built-in driver"] = ""
+    settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
     horizon_s: Annotated[int, "seconds of an episode"] = 3600
     seed: Annotated[int, "root of all random numbers"] = 0
     updates: Annotated[int, "updates of the network"] = 60
@@ -62,7 +62,6 @@ class Args:
     entropy: Annotated[float, "weight of the entropy in the loss"] = 0.01
     delay_weight: Annotated[float, "weight of the reward's term delay"] = 0.1
     wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
-    entry_weight: Annotated[float, "reward for each vehicle that need not wait to enter"] = 1.0
     decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
     range_m: Annotated[float, "signals observe lanes at least this far before them"] = 50.0
     hidden: Annotated[int, "width of the hidden layers"] = 64
@@ -83,49 +82,30 @@ class Args:
     @property
     def overrides(self) -> dict[str, Any]:
         """Keys of the worlds of training and evaluation."""
+        background = {"population.background": self.background} if self.background >= 0 else {}
         return {
             "clock.sim_dt_s": TICK_S,
             "population.mode": "open",
-            "population.background": self.background,
+            **background,
             "signals.decide_s": self.decide_s,
             "signals.max_green_s": 0.0,
             "signals.range_m": self.range_m,
             "signals.terms": {"delay": self.delay_weight, "wait": self.wait_weight},
+            **parse_settings([word for word in self.settings.split(",") if word]),
         }
-
-
-class SharedNetwork:
-    """A controller that selects the most likely green of each signal by one shared network.
-
-    Args:
-        model: a model trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
-    """
-
-    def __init__(self, model: PPO) -> None:
-        self._model = model
-        self._features: GreenFeatures | None = None
-
-    def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
-        shape = view.states.shape[:2]
-        if not view.decides.any():
-            return np.full(shape, KEEP)
-        if self._features is None:
-            self._features = GreenFeatures(view.table)
-        rows = self._features.of(view).reshape(shape[0] * shape[1], -1)
-        actions = self._model.predict(rows, deterministic=True)[0].reshape(shape)
-        return np.where(view.decides[:, None], actions, KEEP)
 
 
 def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
     """Create the library's PPO on the signals of all worlds."""
-    clock = {"clock.ctrl_dt_s": args.decide_s, "horizon_s": float(args.horizon_s)}
+    step_s = TICK_S if args.agents else args.decide_s
+    clock = {"clock.ctrl_dt_s": step_s, "horizon_s": float(args.horizon_s)}
     rows = CavSb3SignalEnv(
         args.env,
         num_worlds=args.num_worlds,
         features="greens",
         spread=True,
-        entry_weight=args.entry_weight,
+        agents=args.agents,
+        drivers=args.drivers,
         overrides=args.overrides | clock,
     )
     model = PPO(

@@ -83,8 +83,8 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return load_config(self.config["env"], overrides=self._overrides, **named)[0]
 
     def supports_continuous_actions(self) -> bool:
-        """Return whether all actions can be continuous: no signal has an agent."""
-        return not self._world.signals.have_agents
+        """Return whether all actions can be continuous: there are no agents beside the road."""
+        return self._world.roadside is None
 
     def supports_discrete_actions(self) -> bool:
         """Return True: meta-actions, or the grid of an environment with a grid of actions."""
@@ -118,8 +118,8 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
         return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: CavTorchRLEnv) -> Composite | None:
-        """Return the spec of the action masks of one world; None if no signal has an agent."""
-        return self._of_agents(env, "action_mask") if self._world.signals.have_agents else None
+        """Return the spec of the action masks of one world; None without agents beside the road."""
+        return None if self._world.roadside is None else self._of_agents(env, "action_mask")
 
     @staticmethod
     def env_name() -> str:
@@ -147,6 +147,7 @@ class CavTask(Task):  # type: ignore[misc] # only installed in a separate enviro
     GRID4X4 = None
     HIGHWAY = None
     INTERSECTION = None
+    LANE_DROP = None
     MERGE = None
     RING = None
     RING22 = None

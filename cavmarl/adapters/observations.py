@@ -47,7 +47,7 @@ class WithSpec:
 
 def refuse_signal_agents(config: EnvConfig, what: str = "this adapter") -> None:
     """Raise a ConfigError if signals have agents, which `what` would ignore."""
-    if refusal := config.signals.refusal_of_agents(what):
+    if refusal := config.refusal_of_agents(what):
         raise ConfigError(refusal)
 
 

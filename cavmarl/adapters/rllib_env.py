@@ -12,8 +12,10 @@ import numpy as np
 from gymnasium import spaces
 
 from cavmarl.core.errors import missing
+from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.parallel import parallel_env
-from cavmarl.env.signal_agents import PREFIX, SIGNALS, VEHICLES, SignalAgents
+from cavmarl.env.roadside_agents import VEHICLES, RoadsideAgents
+from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.env.world_copies import OwnWorlds
 
 try:
@@ -30,11 +32,14 @@ ACTION_MASK, OBSERVATIONS = "action_mask", "observations"
 
 
 def policy_of(agent: str, episode: object = None, worker: object = None) -> str:
-    """Return the policy of an agent by its kind: `vehicles` or `signals`.
+    """Return the policy of an agent by its kind: `vehicles`, `signals` or `limits`.
 
     A `policy_mapping_fn` for one policy per kind of agents; RLlib's other arguments are not read.
     """
-    return SIGNALS if agent.startswith(PREFIX) else VEHICLES
+    for kind in (SignalAgents, LimitAgents):
+        if agent.startswith(kind.prefix):
+            return kind.kind
+    return VEHICLES
 
 
 class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only installed separately
@@ -75,28 +80,28 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
         self.observation_spaces = dict(self._env.observation_spaces)
         self.action_spaces = dict(self._env.action_spaces)
         world = self._env.config
-        self._signals = self._env.signals if world.signals.have_agents else None
+        self._roadside = self._env.roadside
         self.possible_agents = [
             agent
             for agent in self._env.possible_agents
-            if world.population.agents or self._is_signal(agent)
+            if world.population.agents or self._is_roadside(agent)
         ]
-        if self._signals is not None:
-            self._pad_spaces(self._signals)
+        if self._roadside is not None:
+            self._pad_spaces(self._roadside)
         self.render_mode = self._env.render_mode
         self._entered: tuple[dict[str, Any], dict[str, Any]] | None = None
         super().__init__()
 
-    def _is_signal(self, agent: str) -> bool:
-        return self._signals is not None and agent in self._signals
+    def _is_roadside(self, agent: str) -> bool:
+        return self._roadside is not None and agent in self._roadside
 
-    def _pad_spaces(self, signals: SignalAgents) -> None:
+    def _pad_spaces(self, roadside: RoadsideAgents) -> None:
         """Give all signals the spaces of the largest one."""
-        most = signals.most_choices
+        most = roadside.most_choices
         mask = spaces.Box(0.0, 1.0, (most,), np.float32)
-        seen = spaces.Dict({ACTION_MASK: mask, OBSERVATIONS: signals.padded_observation_space})
-        self.observation_spaces |= dict.fromkeys(signals.agents, seen)
-        self.action_spaces |= dict.fromkeys(signals.agents, spaces.Discrete(most))
+        seen = spaces.Dict({ACTION_MASK: mask, OBSERVATIONS: roadside.padded_observation_space})
+        self.observation_spaces |= dict.fromkeys(roadside.agents, seen)
+        self.action_spaces |= dict.fromkeys(roadside.agents, spaces.Discrete(most))
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
@@ -137,42 +142,42 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
 
     def _nobody_acts(self) -> bool:
         """Whether the world has no vehicles of agents, and it is not time for a decision."""
-        signals = self._signals
+        roadside = self._roadside
         return (
-            signals is not None
-            and len(self._env.agents) == len(signals.agents)
-            and not signals.view.decides[0]
+            roadside is not None
+            and len(self._env.agents) == len(roadside.agents)
+            and not roadside.view.decides[0]
         )
 
     def _own_choices(self, actions: Mapping[str, Any]) -> Mapping[str, Any]:
         """Return the actions; choices that a signal does not have keep its green."""
-        signals = self._signals
-        if signals is None:
+        roadside = self._roadside
+        if roadside is None:
             return actions
-        choices = np.array([[actions.get(agent, 0) for agent in signals.agents]])
-        own = dict(zip(signals.agents, signals.keep_beyond(choices)[0], strict=True))
+        choices = np.array([[actions.get(agent, 0) for agent in roadside.agents]])
+        own = dict(zip(roadside.agents, roadside.keep_beyond(choices)[0], strict=True))
         return {agent: own.get(agent, action) for agent, action in actions.items()}
 
     def _shown(self, step: Step) -> Step:
         """Return the results without signals that neither decide next nor end."""
-        signals = self._signals
-        if signals is None:
+        roadside = self._roadside
+        if roadside is None:
             return step
         observations, rewards, ended, cut, infos = step
-        if not (signals.view.decides[0] or cut[signals.agents[0]]):
-            vehicles = [agent for agent in observations if agent not in signals]
+        if not (roadside.view.decides[0] or cut[roadside.agents[0]]):
+            vehicles = [agent for agent in observations if agent not in roadside]
             observations, rewards, ended, cut, infos = (_only(vehicles, part) for part in step)
         return self._padded(observations), rewards, ended, cut, infos
 
     def _padded(self, observations: dict[str, Any]) -> dict[str, Any]:
         """Return the observations; those of signals with their action masks, padded."""
-        signals = self._signals
-        if signals is None:
+        roadside = self._roadside
+        if roadside is None:
             return observations
-        masks, seen = signals.view.masks[0], signals.view.observations[0]
+        masks, seen = roadside.view.masks[0], roadside.view.observations[0]
         return observations | {
             agent: {ACTION_MASK: masks[s].astype(np.float32), OBSERVATIONS: seen[s].copy()}
-            for s, agent in enumerate(signals.agents)
+            for s, agent in enumerate(roadside.agents)
             if agent in observations
         }
 

@@ -1,5 +1,7 @@
 """`GreenPolicy`: a policy of stable-baselines3 that scores the greens of signals of any shape.
 
+`SharedNetwork` is a controller that asks it.
+
 Importing this module loads stable-baselines3 and torch; `import cavmarl` does not import it.
 """
 
@@ -7,11 +9,17 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from cavmarl.core.errors import missing
-from cavmarl.signals.green_features import GREEN_FEATURES
+from cavmarl.signals.controllers import SignalView
+from cavmarl.signals.green_features import GREEN_FEATURES, GreenFeatures
+from cavmarl.signals.kernels.green_choices import KEEP
 
 try:
     import torch
+    from stable_baselines3 import PPO
     from stable_baselines3.common.policies import ActorCriticPolicy
     from torch import Tensor, nn
 except ModuleNotFoundError as error:
@@ -85,6 +93,29 @@ class GreenPolicy(ActorCriticPolicy):
         network = self.get_submodule("mlp_extractor.last")
         self.init_weights(network, FIRST_GAIN)
         self.action_net = nn.Identity()  # the network's outputs are the logits
+
+
+class SharedNetwork:
+    """A controller of signals: the most likely green of one network for all of them.
+
+    Args:
+        model: as trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
+    """
+
+    def __init__(self, model: PPO) -> None:
+        self._model = model
+        self._features: GreenFeatures | None = None
+
+    def choose(self, view: SignalView) -> NDArray[np.int64]:
+        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
+        shape = view.states.shape[:2]
+        if not view.decides.any():
+            return np.full(shape, KEEP)
+        if self._features is None:
+            self._features = GreenFeatures(view.table)
+        rows = self._features.of(view).reshape(shape[0] * shape[1], -1)
+        actions = self._model.predict(rows, deterministic=True)[0].reshape(shape)
+        return np.where(view.decides[:, None], actions, KEEP)
 
 
 def _pooled(embedded: Tensor, exists: Tensor) -> Tensor:

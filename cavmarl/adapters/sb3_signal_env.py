@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from cavmarl.adapters.observations import refuse_decided
 from cavmarl.adapters.sb3_vec_env import DECIDED, CavSb3VecEnv
 from cavmarl.core.errors import ConfigError, missing
+from cavmarl.env.limit_agents import LIMITS, LimitAgents
+from cavmarl.env.signal_agents import SIGNALS, SignalAgents
 from cavmarl.env.vector import make_vec
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds
-from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
+from cavmarl.policies.loading import load_policy
 from cavmarl.signals.green_features import MOST, GreenFeatures
-from cavmarl.signals.signal_table import SignalTable
 
 try:
     from stable_baselines3.common.vec_env.base_vec_env import VecEnv
@@ -37,23 +37,24 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     action beyond a signal's greens, or that its mask excludes, keeps the green. The mask of
     each row is `action_mask` in its info, and `action_masks()` returns all of them.
 
-    Agents of vehicles, if there are any, follow the built-in driver.
+    Agents of vehicles, if there are any, follow `drivers`.
 
     Args:
         env: see `make_vec`.
         num_worlds: W.
+        kind: the agents of the rows: `signals`, or roadside units with speed `limits`.
         features: `lanes`: observations as the agents get them. `greens`: the rows of
             `GreenFeatures`, for `sb3_green_policy.GreenPolicy`.
         spread: whether the first episodes of the worlds have different lengths, so that the worlds
             are at different times of their episodes. Before the first decision, signals then follow
             the durations of their programs for an episode.
-        entry_weight: reward of a signal for each vehicle less that waits to enter the world on the
-            lanes before it, compared with the last decision. Needs worlds in this process.
+        drivers: policy of the agents of vehicles, see `load_policy`; empty: the built-in driver.
         overrides: values of any other keys; `signals.agents` is `all` by default.
         arguments: other keyword arguments of `make_vec`; `agents` is 0 by default.
 
     Raises:
         ConfigError: a key, a value or a combination is not possible.
+        PolicyError: see `load_policy`.
     """
 
     def __init__(
@@ -61,64 +62,70 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         env: str | Path = "grid4x4",
         *,
         num_worlds: int = 1,
+        kind: Literal["signals", "limits"] = "signals",
         features: Literal["lanes", "greens"] = "lanes",
         spread: bool = False,
-        entry_weight: float = 0.0,
+        drivers: str = "",
         overrides: Mapping[str, Any] | None = None,
         **arguments: Any,
     ) -> None:
         refuse_decided(DECIDED, arguments)
         if features not in ("lanes", "greens"):
             raise ConfigError(f"features = {features!r}: must be 'lanes' or 'greens'")
-        keys = {"signals.agents": "all", **(overrides or {})}
+        if kind not in (SIGNALS, LIMITS):
+            raise ConfigError(f"kind = {kind!r}: must be {SIGNALS!r} or {LIMITS!r}")
+        if kind == LIMITS and features == "greens":
+            raise ConfigError("features = 'greens': limits have none; leave it out")
+        keys = {f"{kind}.agents": "all", **(overrides or {})}
         self._vec = make_vec(
             env,
             num_envs=num_worlds,
             overrides=keys,
             **{"agents": 0, **arguments, "autoreset_mode": AutoresetMode.DISABLED},
         )
-        signals = self._vec.signals
-        self._features = GreenFeatures(signals.table) if features == "greens" else None
-        self._spreads = spread
-        self._entries = (
-            _Entries(self._vec.worlds, signals.table, entry_weight) if entry_weight else None
+        self._agents: SignalAgents | LimitAgents = (
+            self._vec.limits if kind == LIMITS else self._vec.signals
         )
-        self._size = self._features.size if self._features else signals.table.sizes.features
-        self._shape = (num_worlds, len(signals.agents))
+        greens = features == "greens"
+        self._features = GreenFeatures(self._vec.signals.table) if greens else None
+        self._spreads = spread
+        self._drivers = load_policy(drivers, self._vec, beside_signals=True) if drivers else None
+        self._seen: tuple[Any, Any] = (None, None)  # observations and mask of the vehicles
+        self._size = self._features.size if self._features else self._agents.table.sizes.features
+        self._shape = (num_worlds, len(self._agents.agents))
         self._actions = np.zeros(self._shape, dtype=np.int64)
         VecEnv.__init__(
             self,
-            num_worlds * len(signals.agents),
+            num_worlds * len(self._agents.agents),
             spaces.Box(-MOST, MOST, (self._size,), np.float32)
             if self._features
-            else signals.padded_observation_space,
-            spaces.Discrete(signals.most_choices),
+            else self._agents.padded_observation_space,
+            spaces.Discrete(self._agents.most_choices),
         )
         self.metadata = self._vec.metadata
         self.spec = None
 
     def reset(self) -> NDArray[np.float32]:
         """Begin an episode in every world; all seeds are derived from the seed of the first row."""
-        self._vec.reset(seed=self._seeds[0])
+        self._see(*self._vec.reset(seed=self._seeds[0]))
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = [{} for _ in range(self.num_envs)]
         if self._spreads:
             self._spreads = False
             self._spread()
-        if self._entries is not None:
-            self._entries.gained()
         return self._signal_rows()
 
     def _spread(self) -> None:
         """Begin new episodes one after the other, over the length of an episode."""
         worlds = self._shape[0]
-        per_decision = round(self._vec.config.signals.decide_s / self._vec.config.clock.ctrl_dt_s)
+        decide_s = getattr(self._vec.config, self._agents.kind).decide_s
+        per_decision = round(decide_s / self._vec.config.clock.ctrl_dt_s)
         between = self._vec.max_cycles // per_decision // worlds * per_decision
         for world in range(worlds - 1):
             for _ in range(between):
                 self._vec.step(self._vec.suggest_actions())
-            self._vec.reset(options={"reset_mask": np.arange(worlds) == world})
+            self._see(*self._vec.reset(options={"reset_mask": np.arange(worlds) == world}))
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -141,25 +148,19 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     ) -> tuple[NDArray[np.float32], NDArray[np.float32], NDArray[np.bool_], list[dict[str, Any]]]:
         """Run all steps of the worlds until the next decision, with the stored actions."""
         arrays = self._vec.worlds.arrays
-        choices = self._vec.signals.keep_beyond(self._actions)
+        kind, choices = self._agents.kind, self._agents.keep_beyond(self._actions)
         rewards = np.zeros(self._shape, dtype=np.float32)
         done = np.zeros(self._shape, dtype=np.bool_)
         last = np.zeros((self.num_envs, self._size), dtype=np.float32)
         while True:
-            actions = {"signals": choices}
-            if self._vec.config.population.agents:
-                actions["vehicles"] = self._vec.suggest_actions()["vehicles"]
-            _, gained, _, over, infos = self._vec.step(actions)
-            rewards += gained["signals"]
-            if self._entries is not None:
-                rewards += self._entries.gained()
+            seen, gained, _, over, infos = self._vec.step(self._vehicles() | {kind: choices})
+            self._see(seen, infos)
+            rewards += gained[kind]
             if infos["episode_over"].any():
-                done |= over["signals"]
-                ends = over["signals"].reshape(-1)
+                done |= over[kind]
+                ends = over[kind].reshape(-1)
                 last[ends] = self._signal_rows()[ends]
-                self._vec.reset(options={"reset_mask": infos["episode_over"]})
-                if self._entries is not None:
-                    self._entries.gained()
+                self._see(*self._vec.reset(options={"reset_mask": infos["episode_over"]}))
             if arrays.signal_decides.all():
                 break
         masks = self.action_masks()
@@ -171,39 +172,21 @@ class CavSb3SignalEnv(CavSb3VecEnv):
             }
         return self._signal_rows(), rewards.reshape(-1), done.reshape(-1), shown
 
+    def _see(self, observations: Any, infos: Mapping[str, Any]) -> None:
+        self._seen = observations["vehicles"], infos["mask"]
+
+    def _vehicles(self) -> dict[str, NDArray[Any]]:
+        """Return the next actions of the agents of vehicles, if there are any."""
+        if not self._vec.config.population.agents:
+            return {}
+        if self._drivers is None:
+            return {"vehicles": self._vec.suggest_actions()["vehicles"]}
+        return {"vehicles": self._drivers.act_batch(*self._seen)}
+
     def _signal_rows(self) -> NDArray[np.float32]:
         """Return the present observations (W · S, D)."""
-        view = self._vec.signals.view
-        found = view.observations.copy() if self._features is None else self._features.of(view)
+        if self._features is None:
+            found = self._agents.view.observations.copy()
+        else:
+            found = self._features.of(self._vec.signals.view)
         return found.reshape(self.num_envs, -1)
-
-
-class _Entries:
-    """Rewards for vehicles that enter the worlds on lanes before signals."""
-
-    def __init__(self, worlds: SteppedWorlds, table: SignalTable, weight: float) -> None:
-        if not isinstance(worlds, LocalWorlds):
-            raise ConfigError(
-                f"entry_weight = {weight}: only worlds in this process count the vehicles that "
-                "wait to enter; leave workers and nodes out, or give 0"
-            )
-        self._simulation = worlds.simulation
-        arrays = table.arrays
-        self._lane_index = arrays.lane_index
-        self._before = np.zeros((len(table.ids), len(table.lanes) + 1), dtype=np.float32)
-        for s, lanes in enumerate(arrays.approach):
-            self._before[s, lanes[lanes >= 0]] = weight
-        self._last: NDArray[np.float32] = np.zeros(0, dtype=np.float32)
-
-    def gained(self) -> NDArray[np.float32]:
-        """Return the rewards (W, S) since the last call."""
-        departures = self._simulation.departures
-        waiting = departures.num_queue
-        rows = departures.queue[:, : waiting.max()]
-        lanes = self._lane_index[rows["lane"]]
-        lanes = np.where(np.arange(rows.shape[1]) < waiting[:, None], lanes, -1)
-        counts = np.zeros((len(waiting), self._before.shape[1]), dtype=np.float32)
-        np.add.at(counts, (np.arange(len(waiting))[:, None], lanes), 1.0)
-        counts[:, -1] = 0.0  # lanes that do not lead to a signal
-        before, self._last = self._last, counts @ self._before.T
-        return before - self._last if len(before) else np.zeros_like(self._last)

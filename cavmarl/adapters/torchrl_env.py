@@ -16,10 +16,9 @@ from gymnasium.vector import AutoresetMode
 from numpy.typing import NDArray
 
 from cavmarl.adapters.observations import ObservationForm, refuse_decided
-from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.errors import missing
 from cavmarl.core.seeds import check_seed
-from cavmarl.env.signal_agents import SIGNALS, VEHICLES
+from cavmarl.env.roadside_agents import VEHICLES, RoadsideAgents
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.env.world_copies import OwnWorlds
 
@@ -39,7 +38,8 @@ DECIDED = ("autoreset_mode", "copy")  # TorchRL resets worlds itself and keeps i
 class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not typed
     """W worlds of the batch size (W,), with A agents of vehicles and S agents of signals each.
 
-    The groups are `vehicles` and `signals`; a kind without agents has no group. Entries of a
+    The groups are `vehicles` and `signals`; a kind without agents has no group. Agents of speed
+    limits have the group `limits`, which is like that of signals. Entries of a
     tensordict; the entries of a group have one axis more than the batch:
 
     - `("vehicles", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
@@ -98,13 +98,13 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         self._vec = vec
         self._next_seed: int | None = None
         self.max_cycles = vec.max_cycles
-        self._has_signals = vec.config.signals.have_agents
+        self._roadside = vec.roadside
         self._groups: dict[str, _Group] = {}
         if vec.config.population.agents:
             self._form = ObservationForm(vec.config)
             self._groups[VEHICLES] = _vehicles(vec, self._form.space)
-        if self._has_signals:
-            self._groups[SIGNALS] = _signals(vec)
+        if self._roadside is not None:
+            self._groups[self._roadside.kind] = _of_roadside(vec, self._roadside)
         self.group_map = {group: list(each.ids) for group, each in self._groups.items()}
         of_group: dict[str, dict[str, Composite]] = {}
         for group, each in self._groups.items():
@@ -152,13 +152,16 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
         actions: Any = {
             group: tensordict.get((group, "action")).cpu().numpy() for group in self.group_map
         }
-        if self._has_signals:
-            actions[SIGNALS] = self._vec.signals.keep_beyond(actions[SIGNALS])
+        if self._roadside is not None:
+            kind = self._roadside.kind
+            actions[kind] = self._roadside.keep_beyond(actions[kind])
         else:
             actions = actions[VEHICLES]
         *results, infos = self._vec.step(actions)
         observations, rewards, ended, cut = map(self._by_group, results)
-        terms = {VEHICLES: infos["terms"], SIGNALS: infos.get("signal_terms")}
+        terms = {VEHICLES: infos["terms"]}
+        if self._roadside is not None:
+            terms[self._roadside.kind] = infos[f"{self._roadside.prefix}terms"]
         entries = self._entries(observations, ended, cut, terms, infos)
         for group, found in entries.items():
             found["reward"] = torch.from_numpy(rewards[group]).unsqueeze(-1)
@@ -168,7 +171,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
 
     def _by_group(self, result: Any) -> Mapping[str, NDArray[Any]]:
         """Return a result of the worlds by the kind of agents."""
-        return result if self._has_signals else {VEHICLES: result}
+        return {VEHICLES: result} if self._roadside is None else result
 
     def _entries(
         self,
@@ -196,12 +199,13 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
             mask = self._groups[VEHICLES].observation.get("action_mask")
             if mask is not None:
                 found[VEHICLES]["action_mask"] = torch.ones(mask.shape, dtype=torch.bool)
-        if SIGNALS in found:
-            decides = torch.from_numpy(infos["signal_decides"])
-            found[SIGNALS] |= {
-                "observation": torch.from_numpy(observations[SIGNALS]),
-                "mask": decides.unsqueeze(-1).repeat(1, len(self.group_map[SIGNALS])),
-                "action_mask": torch.from_numpy(infos["signal_mask"]),
+        if self._roadside is not None:
+            kind, prefix = self._roadside.kind, self._roadside.prefix
+            decides = torch.from_numpy(infos[f"{prefix}decides"])
+            found[kind] |= {
+                "observation": torch.from_numpy(observations[kind]),
+                "mask": decides.unsqueeze(-1).repeat(1, len(self.group_map[kind])),
+                "action_mask": torch.from_numpy(infos[f"{prefix}mask"]),
             }
         return found
 
@@ -232,21 +236,20 @@ class _Group(NamedTuple):
 def _vehicles(vec: CavVectorEnv, space: spaces.Space[Any]) -> _Group:
     agents = (vec.num_envs, vec.num_agents)
     observation = {"observation": _observation_spec(space, agents)}
-    if vec.config.signals.have_agents and isinstance(vec.single_action_space, spaces.Discrete):
+    if vec.roadside is not None and isinstance(vec.single_action_space, spaces.Discrete):
         observation["action_mask"] = _flags((*agents, int(vec.single_action_space.n)))
     action = _action_spec(vec.single_action_space, agents)
     return _Group(tuple(vec.possible_agents), vec.config.terms.names, observation, action)
 
 
-def _signals(vec: CavVectorEnv) -> _Group:
-    signals = vec.signals
-    agents = (vec.num_envs, len(signals.agents))
+def _of_roadside(vec: CavVectorEnv, roadside: RoadsideAgents) -> _Group:
+    agents = (vec.num_envs, len(roadside.agents))
     observation = {
-        "observation": _observation_spec(signals.padded_observation_space, agents),
-        "action_mask": _flags((*agents, signals.most_choices)),
+        "observation": _observation_spec(roadside.padded_observation_space, agents),
+        "action_mask": _flags((*agents, roadside.most_choices)),
     }
-    action = _action_spec(spaces.Discrete(signals.most_choices), agents)
-    return _Group(signals.agents, SIGNAL_TERMS, observation, action)
+    action = _action_spec(spaces.Discrete(roadside.most_choices), agents)
+    return _Group(roadside.agents, roadside.terms, observation, action)
 
 
 def _ends(terminated: NDArray[np.bool_], truncated: NDArray[np.bool_]) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from typing import Annotated, Literal
 
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.checks import Section, Whole, Within, check, check_finite
+from cavmarl.config.limits import LimitsConfig
 from cavmarl.config.population import PopulationConfig
 from cavmarl.config.rig import Rig, check_rig
 from cavmarl.config.scenario import ScenarioConfig
@@ -137,6 +138,7 @@ class EnvConfig(Section, key=""):
     v2x: V2xConfig = field(default_factory=V2xConfig)
     terms: TermsConfig = field(default_factory=TermsConfig)
     signals: SignalsConfig = field(default_factory=SignalsConfig)
+    limits: LimitsConfig = field(default_factory=LimitsConfig)
     rig: Rig = field(default_factory=dict)
     scenario: ScenarioConfig = field(default_factory=ScenarioConfig)
     plugins: tuple[str, ...] = ()
@@ -175,6 +177,13 @@ class EnvConfig(Section, key=""):
         if self.signals.are_controlled:
             self.signals.check_clock(self.clock.sim_dt_s, self.clock.ctrl_dt_s)
             self.signals.check_messages(self.v2x)
+        if self.limits.are_controlled:
+            self.limits.check_clock(self.clock.ctrl_dt_s)
+            self.need(
+                "limits.agents",
+                not self.signals.are_controlled,
+                "needs signals.agents = none: a world has controlled signals or controlled limits",
+            )
         self._check_messages()
         if self.observation.mode == "messages":
             self._drop_sight()
@@ -287,6 +296,11 @@ class EnvConfig(Section, key=""):
             f"traffic.source = {source}: SUMO runs the signals; leave the key out",
         )
         self.need(
+            "limits.agents",
+            not self.limits.are_controlled,
+            f"traffic.source = {source}: SUMO would not see the limits; leave the key out",
+        )
+        self.need(
             "scenario.name",
             not self.scenario.name,
             f"traffic.source = {source}: scenarios need native traffic; leave the key out",
@@ -297,6 +311,28 @@ class EnvConfig(Section, key=""):
         """The registered extensions that the environment may use."""
         simulators = (text.partition("://")[0] for text in self.zones.simulators.values())
         return (*self.terms.registered, *self.sensors.registered, self.traffic.model, *simulators)
+
+    @property
+    def may_change_lanes(self) -> bool:
+        """Whether lanes of a world may differ from the map: closed, or with a lower limit."""
+        return self.map.changed_lanes > 0 or self.limits.are_controlled
+
+    @property
+    def controlled(self) -> SignalsConfig | LimitsConfig | None:
+        """The signals or the limits that are controlled, by agents or otherwise."""
+        if self.signals.are_controlled:
+            return self.signals
+        return self.limits if self.limits.are_controlled else None
+
+    @property
+    def roadside(self) -> SignalsConfig | LimitsConfig | None:
+        """The signals or the limits that agents control."""
+        found = self.controlled
+        return found if found is not None and found.have_agents else None
+
+    def refusal_of_agents(self, what: str) -> str:
+        """Return why `what` cannot have agents beside the road; empty if there are none."""
+        return "" if self.roadside is None else self.roadside.refusal_of_agents(what)
 
     @property
     def max_steps(self) -> int:

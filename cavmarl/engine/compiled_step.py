@@ -11,10 +11,14 @@ import numpy as np
 from cavmarl.core.compiled.bound_call import CallSequence, bind
 from cavmarl.core.math.counters import any_positive, clear, totals
 from cavmarl.engine.lane_component import LaneComponent
+from cavmarl.engine.limit_component import LimitComponent
 from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.shard_group import ShardGroup
+
+# Components with `tick_calls` and `step_calls`, or that act in `begin` alone.
+COMPILED = SignalComponent | LimitComponent | LaneComponent
 
 
 class CompiledStep:
@@ -25,7 +29,9 @@ class CompiledStep:
         self.group = group
         self._tick = tick
         self._ticks = CallSequence()
-        self._signals = [part for part in tick.attached if isinstance(part, SignalComponent)]
+        self._signals = [
+            part for part in tick.attached if isinstance(part, SignalComponent | LimitComponent)
+        ]
         for _ in range(group.first.config.clock.ticks_per_step):
             self._add_tick(self._ticks)
         for part in self._signals:
@@ -128,7 +134,7 @@ def compiled_step(tick: Tick, last: CompiledStep | None) -> CompiledStep | None:
         type(group) is not ShardGroup
         or len(group.shards) != 1
         or tick.coordination.needs_ghosts
-        or not all(isinstance(part, SignalComponent | LaneComponent) for part in tick.attached)
+        or not all(isinstance(part, COMPILED) for part in tick.attached)
         or tick.outside.sumo is not None
         or tick.traffic.rerouting is not None
         or group.calls.has_registered

@@ -8,6 +8,7 @@ from cavmarl.driving.vehicles import blank_vehicle
 from cavmarl.engine.component import Component, ComponentContext
 from cavmarl.engine.external_component import ExternalComponent
 from cavmarl.engine.lane_component import LaneComponent
+from cavmarl.engine.limit_component import LimitComponent
 from cavmarl.engine.override_component import OverrideComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.scenario_cues import Cues
@@ -84,8 +85,9 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
     """Make the components that the environment configures, in the order in which they act."""
     parts: list[Component] = []
     messages = V2xComponent(host) if host.config.v2x.enabled else None
-    if host.config.map.changed_lanes:
-        parts.append(LaneComponent(host))
+    lanes = LaneComponent(host) if host.config.may_change_lanes else None
+    if lanes is not None:
+        parts.append(lanes)
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
     if host.config.population.external:
@@ -94,6 +96,8 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(OverrideComponent(host))
     if host.config.signals.are_controlled:
         parts.append(SignalComponent(host, messages))
+    if host.config.limits.are_controlled and lanes is not None:
+        parts.append(LimitComponent(host, lanes))
     if host.config.rig:
         parts.append(RigComponent(host))
     if messages is not None:

@@ -26,6 +26,7 @@ from cavmarl.core.errors import ConfigError, MapError
 from cavmarl.core.huge_pages import trim
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.steered_sweeps import load_steered
+from cavmarl.limits.limit_table import limit_sizes
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import conversion_notes, map_file
 from cavmarl.roads.cache import load_network
@@ -72,12 +73,8 @@ class World(NamedTuple):
 
     @property
     def signal_sizes(self) -> SignalSizes:
-        """Sizes of the arrays about signals with agents."""
-        return (
-            sizes_of(self.network, self.config.signals.range_m)
-            if self.config.signals.are_controlled
-            else SignalSizes()
-        )
+        """Sizes of the arrays about signals with agents, or other agents beside the road."""
+        return roadside_sizes(self.config, self.network)
 
     @property
     def capacity(self) -> int:
@@ -86,6 +83,15 @@ class World(NamedTuple):
         room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
         scene = plan_scene(config.scenario, self.network)
         return room + (0 if scene is None else len(scene.actors))
+
+
+def roadside_sizes(config: EnvConfig, network: RoadNetwork) -> SignalSizes:
+    """Return the sizes of the arrays about controlled signals or limits."""
+    if config.signals.are_controlled:
+        return sizes_of(network, config.signals.range_m)
+    if config.limits.are_controlled:
+        return limit_sizes(config.limits)
+    return SignalSizes()
 
 
 def load_world(
@@ -299,8 +305,8 @@ def find_map(env: str | Path) -> Path:
 
 def check_agents(config: EnvConfig) -> None:
     """Refuse a world without agents where a caller wants to drive one."""
-    if config.population.agents == 0 and not config.signals.have_agents:
+    if config.population.agents == 0 and config.roadside is None:
         raise ConfigError(
             "population.agents = 0: an environment needs at least one agent; set it higher, or let "
-            "agents control signals (signals.agents)"
+            "agents control signals (signals.agents) or speed limits (limits.agents)"
         )

@@ -13,6 +13,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, TripTables, Worlds
 from cavmarl.engine.component import Component
 from cavmarl.engine.external_component import ExternalComponent
+from cavmarl.engine.limit_component import LimitComponent
 from cavmarl.engine.rig_component import RigComponent
 from cavmarl.engine.signal_component import SignalComponent
 from cavmarl.engine.tick import Tick
@@ -114,6 +115,19 @@ class WorldViews:
         """The signals that agents control."""
         missing = "signals.agents = none: set it to all, or to a list of ids of signals"
         return self._part(SignalComponent, missing)
+
+    def lane_limits(self, world: int = 0) -> NDArray[np.float64]:
+        """Return the speed limit (L,) in m/s of each lane of a world, as it is now."""
+        lanes = self._shard.worlds.lanes
+        found: NDArray[np.float64] = lanes[world if len(lanes) > 1 else 0]["speed_mps"].copy()
+        return found
+
+    @property
+    def roadside(self) -> SignalComponent | LimitComponent:
+        """The component of the signals or of the limits that are controlled."""
+        if self.config.limits.are_controlled:
+            return self._part(LimitComponent, "limits.agents = none: set it to all, or to names")
+        return self.signals
 
     def _part(self, kind: type[Part], missing: str) -> Part:
         """Return the component of a kind. Raises ConfigError with the text if there is none."""

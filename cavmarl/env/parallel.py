@@ -110,11 +110,11 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         one_action, cars = action_space(config.action), self.possible_agents
         self.observation_spaces: dict[str, spaces.Space[Any]] = {**observation_spaces(config, cars)}
         self.action_spaces: dict[str, spaces.Space[Any]] = dict.fromkeys(cars, one_action)
-        self._signals = self._session.signal_agents
-        if self._signals is not None:
-            self.possible_agents = [*cars, *self._signals.agents]
-            self.observation_spaces |= self._signals.observation_spaces()
-            self.action_spaces |= self._signals.action_spaces()
+        self._roadside = self._session.roadside
+        if self._roadside is not None:
+            self.possible_agents = [*cars, *self._roadside.agents]
+            self.observation_spaces |= self._roadside.observation_spaces()
+            self.action_spaces |= self._roadside.action_spaces()
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._dicts = AgentDicts(config)
         self._seats = config.population.mode == "respawn"
@@ -168,8 +168,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         except (KeyError, TypeError):
             raise self._no_agent(agent) from None
 
-    def _is_signal(self, agent: str) -> bool:
-        return self._signals is not None and agent in self._signals
+    def _is_roadside(self, agent: str) -> bool:
+        return self._roadside is not None and agent in self._roadside
 
     def _no_agent(self, agent: object) -> ActionError:
         first, last = self.possible_agents[0], self.possible_agents[-1]
@@ -213,9 +213,11 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         active = self.worlds.arrays.mask[0, self._listed]
         needed = self._cars if active.all() else list(compress(self._cars, active.tolist()))
         choices = None
-        if self._signals is not None and isinstance(actions, Mapping):
-            choices = self._signals.from_dict(actions)
-            actions = {agent: each for agent, each in actions.items() if agent not in self._signals}
+        if self._roadside is not None and isinstance(actions, Mapping):
+            choices = self._roadside.from_dict(actions)
+            actions = {
+                agent: each for agent, each in actions.items() if agent not in self._roadside
+            }
         commands = self._session.decoder.from_dict(actions, self._cars, needed)
         self._session.step(commands, choices)
         self._steps += 1
@@ -236,10 +238,10 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         late = ended & arrays.truncations[0, self._listed]
         terminations = _flags(shown, ended & ~late)
         truncations = _flags(shown, late | (~ended & truncated))
-        if self._signals is not None:
-            rewards |= zip(self._signals.agents, arrays.signal_rewards[0].tolist(), strict=True)
-            terminations |= dict.fromkeys(self._signals.agents, False)
-            truncations |= dict.fromkeys(self._signals.agents, truncated)
+        if self._roadside is not None:
+            rewards |= zip(self._roadside.agents, arrays.signal_rewards[0].tolist(), strict=True)
+            terminations |= dict.fromkeys(self._roadside.agents, False)
+            truncations |= dict.fromkeys(self._roadside.agents, truncated)
         if truncated:
             self._list(self._rows[:0])
             self.agents.clear()
@@ -260,7 +262,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """Set the agents in the episode, given by their index."""
         self._rows = rows
         self._cars = [self.possible_agents[k] for k in rows.tolist()]
-        self.agents = self._cars if self._signals is None else [*self._cars, *self._signals.agents]
+        self.agents = (
+            self._cars if self._roadside is None else [*self._cars, *self._roadside.agents]
+        )
         # A slice takes agents in their usual order without a copy.
         in_order = bool((rows == np.arange(rows.size)).all())
         self._listed = slice(rows.size) if in_order else rows
@@ -277,11 +281,11 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
 
     def _observations(self) -> dict[str, Observation]:
         found = self._dicts.observations(self.worlds.arrays, self._cars, self._listed)
-        return found if self._signals is None else {**found, **self._signals.observations()}
+        return found if self._roadside is None else {**found, **self._roadside.observations()}
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         found = self._dicts.infos(self.worlds.arrays, self._cars, self._listed)
-        return found if self._signals is None else {**found, **self._signals.infos()}
+        return found if self._roadside is None else {**found, **self._roadside.infos()}
 
     def declare_event(self, agent: str, cause: str) -> None:
         """Let an agent's vehicle announce an event in the next step (docs/reference/v2x.md).
@@ -294,7 +298,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             ActionError: there is no such agent, or it has left.
             ConfigError: there is no such cause, or this environment sends no messages.
         """
-        if agent not in self.agents or self._is_signal(agent):
+        if agent not in self.agents or self._is_roadside(agent):
             raise ActionError(
                 f"declare_event({agent!r}, …): not in the episode; give an id of a vehicle from "
                 "env.agents"
@@ -311,7 +315,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """
         if agent not in self.possible_agents:
             raise self._no_agent(agent)
-        if self._is_signal(agent):
+        if self._is_roadside(agent):
             raise ActionError(f"frames({agent!r}): signals have no sensors; give a vehicle's id")
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
@@ -322,8 +326,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         Raises:
             ActionError: the shape, the dtype or a value is wrong.
         """
-        if self._signals is not None and agent in self._signals:
-            self._signals.check(agent, action)
+        if self._roadside is not None and agent in self._roadside:
+            self._roadside.check(agent, action)
         else:
             self._session.decoder.check(agent, action)
 
@@ -360,9 +364,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self.worlds.suggest()
         batch = self._session.decoder.encode(self.worlds.arrays.suggested)[0]
         found: dict[str, Any] = dict(zip(self._cars, batch[self._rows], strict=True))
-        if self._signals is not None:
-            choices = np.maximum(self._signals.suggest()[0], 0).tolist()
-            found |= zip(self._signals.agents, choices, strict=True)
+        if self._roadside is not None:
+            choices = np.maximum(self._roadside.suggest()[0], 0).tolist()
+            found |= zip(self._roadside.agents, choices, strict=True)
         return found
 
     def render(self) -> NDArray[np.uint8] | None:

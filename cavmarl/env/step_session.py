@@ -23,9 +23,11 @@ from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.lane_changes import LaneChanges
+from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.env.signal_agents import SignalAgents
+from cavmarl.limits.controllers import make_limit_controller
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.recordings.extra_tables import RecordOptions
@@ -56,8 +58,8 @@ class StepSession:
         external: commands for the next step to vehicles that the caller poses or drives.
         overrides: signals that show states of the caller.
         lane_changes: lanes that the caller closes or slows down.
-        signals: the signals whose greens are chosen; None: there are none.
-        signal_agents: the same if agents choose the greens, else None.
+        controlled: the signals or limits that are controlled; None: there are none.
+        roadside: the same if agents control them, else None.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """
@@ -76,17 +78,9 @@ class StepSession:
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
         self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
         self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds)
-        self.signals = (
-            SignalAgents(config, worlds.world.network, arrays)
-            if config.signals.are_controlled
-            else None
-        )
-        self.signal_agents = self.signals if config.signals.have_agents else None
-        self._controller = (
-            None
-            if self.signals is None or self.signal_agents is not None
-            else make_controller(config.signals.controller)
-        )
+        self.controlled = _controlled(config, worlds)
+        self.roadside = None if config.roadside is None else self.controlled
+        self._choose = _choices_of_controller(self.controlled, config)
         self.is_ready = False
         self._is_closed = False
         self.simulated_s = 0.0
@@ -126,8 +120,8 @@ class StepSession:
     def step(self, commands: Commands, signal_choices: NDArray[np.int64] | None = None) -> None:
         """Step the worlds with all waiting inputs. If the step fails, the inputs keep waiting."""
         began = time.perf_counter()
-        if self._controller is not None and self.signals is not None:
-            signal_choices = self._controller.choose(self.signals.view)
+        if self._choose is not None:
+            signal_choices = self._choose()
         if signal_choices is not None:
             commands = replace(commands, signal_choices=signal_choices)
         waiting = (
@@ -298,6 +292,30 @@ class StepSession:
         self.decoder.memory, self.events.memory, *memory = memory
         self.insertions.memory, self.external.memory, self.overrides.memory = memory[:3]
         self.lane_changes.memory = memory[3]
+
+
+def _controlled(config: EnvConfig, worlds: SteppedWorlds) -> SignalAgents | LimitAgents | None:
+    """Return the signals or limits that are controlled."""
+    if config.signals.are_controlled:
+        return SignalAgents(config, worlds.world.network, worlds.arrays)
+    if config.limits.are_controlled:
+        return LimitAgents(config, worlds.world.network, worlds.arrays)
+    return None
+
+
+def _choices_of_controller(
+    controlled: SignalAgents | LimitAgents | None, config: EnvConfig
+) -> Callable[[], NDArray[np.int64]] | None:
+    """Return a function that returns the choices of the controller; None: agents choose."""
+    if config.roadside is not None:
+        return None
+    if isinstance(controlled, SignalAgents):
+        signals, greens = controlled, make_controller(config.signals.controller)
+        return lambda: greens.choose(signals.view)
+    if isinstance(controlled, LimitAgents):
+        units, limits = controlled, make_limit_controller(config.limits.controller)
+        return lambda: limits.choose(units.view)
+    return None
 
 
 def _restored_session(worlds: SteppedWorlds, in_place: bool) -> StepSession:

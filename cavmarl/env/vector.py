@@ -22,14 +22,13 @@ from cavmarl.engine.spaces import (
     sensed_observation,
 )
 from cavmarl.env.autoreset import known_mode, present_mode, refuse_over, with_rows
+from cavmarl.env.roadside_agents import VEHICLES, RoadsideAgents
 from cavmarl.env.saved_state import load_session, save_session
-from cavmarl.env.signal_agents import SIGNALS, VEHICLES, SignalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
-from cavmarl.signals.kernels.green_choices import REFUSED
 
 MAX_WORLDS = 65_536
 
@@ -143,8 +142,8 @@ class CavVectorEnv(WorldsEnvironment):
         self.action_space = batch_space(
             batch_space(self.single_action_space, self.num_agents), num_envs
         )
-        if self._session.signal_agents is not None:
-            self._add_signals(self._session.signal_agents)
+        if self._session.roadside is not None:
+            self._add_roadside(self._session.roadside)
         self.metadata |= {
             "autoreset_mode": present_mode(worlds.in_next_step, disabled),
             "render_modes": ["rgb_array"],
@@ -154,18 +153,16 @@ class CavVectorEnv(WorldsEnvironment):
         self._mask = np.zeros((num_envs, self.num_agents), dtype=np.bool_)
         self._copy = copy
 
-    def _add_signals(self, signals: SignalAgents) -> None:
-        """Add the spaces of signals, padded to the largest one."""
-        counts = signals.num_choices.astype(np.int64)
+    def _add_roadside(self, agents: RoadsideAgents) -> None:
+        """Add the spaces of agents beside the road, padded to the largest one."""
+        counts = agents.num_choices.astype(np.int64)
         choices = np.broadcast_to(counts, (self.num_envs, len(counts)))
+        seen = batch_space(agents.padded_observation_space, len(counts))
         self.observation_space = spaces.Dict(
-            vehicles=self.observation_space,
-            signals=batch_space(
-                batch_space(signals.padded_observation_space, len(counts)), self.num_envs
-            ),
+            {VEHICLES: self.observation_space, agents.kind: batch_space(seen, self.num_envs)}
         )
         self.action_space = spaces.Dict(
-            vehicles=self.action_space, signals=spaces.MultiDiscrete(choices.copy())
+            {VEHICLES: self.action_space, agents.kind: spaces.MultiDiscrete(choices.copy())}
         )
 
     @property
@@ -226,8 +223,8 @@ class CavVectorEnv(WorldsEnvironment):
         self._mask = self.worlds.arrays.mask.copy()
         self._over = self._over & ~chosen
         infos = {"mask": self._mask.copy()}
-        if self._session.signal_agents is not None:
-            infos |= self._signal_infos()
+        if self._session.roadside is not None:
+            infos |= self._session.roadside.infos_of_worlds()
         return self._observations(), infos
 
     def _chosen(self, reset_mask: Any, seed: int | None) -> NDArray[np.bool_]:
@@ -280,8 +277,8 @@ class CavVectorEnv(WorldsEnvironment):
             refuse_over(self._over)
         session = self._session
         choices = None
-        if session.signal_agents is not None:
-            actions, choices = self._split(actions, session.signal_agents)
+        if session.roadside is not None:
+            actions, choices = self._split(actions, session.roadside)
         session.step(session.decoder.from_array(actions, self._mask), choices)
         arrays = self.worlds.arrays
         over = self._over = arrays.episode_over.copy()
@@ -302,44 +299,38 @@ class CavVectorEnv(WorldsEnvironment):
         }
         terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
         rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
-        if session.signal_agents is None:
+        roadside = session.roadside
+        if roadside is None:
             return observations, rewards, terminations, truncations, infos
-        over_all = over[:, None].repeat(len(session.signal_agents.agents), axis=1)
+        over_all = over[:, None].repeat(len(roadside.agents), axis=1)
         return (
             observations,
-            {VEHICLES: rewards, SIGNALS: arrays.signal_rewards.copy()},
-            {VEHICLES: terminations, SIGNALS: np.zeros_like(over_all)},
-            {VEHICLES: truncations, SIGNALS: over_all},
-            infos | self._signal_infos(),
+            {VEHICLES: rewards, roadside.kind: arrays.signal_rewards.copy()},
+            {VEHICLES: terminations, roadside.kind: np.zeros_like(over_all)},
+            {VEHICLES: truncations, roadside.kind: over_all},
+            infos | roadside.infos_of_worlds(),
         )
 
-    def _split(self, actions: Any, signals: SignalAgents) -> tuple[Any, NDArray[np.int64]]:
-        """Return the actions of vehicles and the choices of signals."""
-        if not isinstance(actions, Mapping) or actions.keys() - {VEHICLES, SIGNALS}:
+    def _split(self, actions: Any, roadside: RoadsideAgents) -> tuple[Any, NDArray[np.int64]]:
+        """Return the actions of vehicles and the choices of agents beside the road."""
+        kind = roadside.kind
+        if not isinstance(actions, Mapping) or actions.keys() - {VEHICLES, kind}:
             raise ActionError(
-                "with agents of signals, actions must be a dict with the keys 'vehicles' and "
-                "'signals'"
+                f"with agents of {kind}, actions must be a dict with the keys 'vehicles' and "
+                f"{kind!r}"
             )
-        if SIGNALS not in actions or (VEHICLES not in actions and self.config.population.agents):
-            raise ActionError(f"actions lack {SIGNALS if VEHICLES in actions else VEHICLES}")
-        choices = signals.from_array(actions[SIGNALS])
+        if kind not in actions or (VEHICLES not in actions and self.config.population.agents):
+            raise ActionError(f"actions lack {kind if VEHICLES in actions else VEHICLES}")
+        choices = roadside.from_array(actions[kind])
         idle = np.zeros_like(self.worlds.arrays.suggested)  # no agents drive vehicles
         return actions.get(VEHICLES, self._session.decoder.encode(idle)), choices
 
-    def _signal_infos(self) -> dict[str, NDArray[Any]]:
-        arrays = self.worlds.arrays
-        return {
-            "signal_mask": arrays.signal_masks.copy(),
-            "signal_decides": arrays.signal_decides.copy(),
-            "signal_terms": arrays.signal_terms.copy(),
-            "signal_refused": arrays.signal_states[..., REFUSED].copy(),
-        }
-
     def _observations(self) -> Observations:
         found = self._vehicle_observations()
-        if self._session.signal_agents is None:
+        roadside = self._session.roadside
+        if roadside is None:
             return found
-        return {VEHICLES: found, SIGNALS: self.worlds.arrays.signal_observations.copy()}
+        return {VEHICLES: found, roadside.kind: self.worlds.arrays.signal_observations.copy()}
 
     def _vehicle_observations(self) -> Observations:
         arrays = self.worlds.arrays
@@ -379,12 +370,13 @@ class CavVectorEnv(WorldsEnvironment):
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
         """Return the observations; in the worlds `ended` (W,), those before the reset."""
         found, arrays = self._final_vehicle_observations(ended), self.worlds.arrays
-        if self._session.signal_agents is None:
+        roadside = self._session.roadside
+        if roadside is None:
             return found
         last, over = arrays.final_signal_observations, arrays.episode_over
         return {
             VEHICLES: found,
-            SIGNALS: with_rows(arrays.signal_observations, last, over),
+            roadside.kind: with_rows(arrays.signal_observations, last, over),
         }
 
     def _final_vehicle_observations(self, ended: NDArray[np.bool_]) -> Observations:
@@ -419,7 +411,8 @@ class CavVectorEnv(WorldsEnvironment):
     def suggest_actions(self) -> Any:
         """Return what the built-in driver (IDM, MOBIL, lane controller) would do for each agent.
 
-        With agents of signals, return a dict; signals follow the durations of the map's programs.
+        With agents beside the road, return a dict; signals follow the durations of the map's
+        programs, and limits rise to the highest one.
 
         Raises:
             EpisodeError: before the first reset, or after `close`.
@@ -427,10 +420,10 @@ class CavVectorEnv(WorldsEnvironment):
         self._session.refuse_idle("suggest_actions()")
         self.worlds.suggest()
         found = self._session.decoder.encode(self.worlds.arrays.suggested)
-        signals = self._session.signal_agents
-        if signals is None:
+        roadside = self._session.roadside
+        if roadside is None:
             return found
-        return {VEHICLES: found, SIGNALS: np.maximum(signals.suggest(), 0)}
+        return {VEHICLES: found, roadside.kind: np.maximum(roadside.suggest(), 0)}
 
     def state(self) -> NDArray[np.float32]:
         """Return the global states (W, S), each as from `CavEnv.state`; input of a central critic.

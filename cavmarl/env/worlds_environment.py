@@ -14,8 +14,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.external_commands import ExternalCommands
+from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.overridden_signals import SignalOverrides
 from cavmarl.env.recorded_worlds import Record
+from cavmarl.env.roadside_agents import RoadsideAgents
 from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_copies import OwnWorlds
@@ -111,11 +113,27 @@ class WorldsEnvironment(OwnWorlds):
         Raises:
             ConfigError: `signals.agents` is none.
         """
-        if self._session.signals is None:
+        if not isinstance(self._session.controlled, SignalAgents):
             raise ConfigError(
                 "signals.agents = none: set it to all, or to a list of ids of signals"
             )
-        return self._session.signals
+        return self._session.controlled
+
+    @property
+    def limits(self) -> LimitAgents:
+        """The agents of speed limits; see docs/reference/limit_agents.md.
+
+        Raises:
+            ConfigError: `limits.agents` is none.
+        """
+        if not isinstance(self._session.controlled, LimitAgents):
+            raise ConfigError("limits.agents = none: set it to all, or to names of limits.units")
+        return self._session.controlled
+
+    @property
+    def roadside(self) -> RoadsideAgents | None:
+        """The agents beside the road: those of signals or of limits; None: there are none."""
+        return self._session.roadside
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.

@@ -32,7 +32,7 @@ from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPo
 from cavmarl.policies.shield import ShieldedPolicy
 
 
-def load_policy(policy: str | Path, env: Environment) -> Policy:
+def load_policy(policy: str | Path, env: Environment, *, beside_signals: bool = False) -> Policy:
     """Load a policy for an environment.
 
     Args:
@@ -43,10 +43,12 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
             3, …). After `shielded:`, the built-in driver acts instead of the policy whenever it
             would brake harder.
         env: a `CavEnv`, possibly wrapped, or a `CavVectorEnv`.
+        beside_signals: whether the caller itself acts for the agents of signals, if there are any.
 
     Raises:
         PolicyError: the policy does not exist, a file is broken, or a network was made for other
-            observations or actions than this environment's.
+            observations or actions than this environment's; or signals have agents for which
+            nothing acts.
         MissingExtraError: the library of a model file is not installed.
     """
     if isinstance(env, ParallelEnv):
@@ -55,10 +57,17 @@ def load_policy(policy: str | Path, env: Environment) -> Policy:
         raise PolicyError(
             f"env is a {type(env).__name__}: pass what parallel_env() or make_vec() returned"
         )
+    refusal = env.config.refusal_of_agents("a policy")
+    if refusal and not beside_signals:
+        raise PolicyError(f"{refusal}, or load_policy(…, beside_signals=True)")
+    return _load(policy, env)
+
+
+def _load(policy: str | Path, env: Environment) -> Policy:
     if parts := shared_drivers(policy):
-        return SharedPolicy(env, [load_policy(part, env) for part in parts])
+        return SharedPolicy(env, [_load(part, env) for part in parts])
     if isinstance(policy, str) and policy.startswith(SHIELDED):
-        return ShieldedPolicy(env, load_policy(policy.removeprefix(SHIELDED), env))
+        return ShieldedPolicy(env, _load(policy.removeprefix(SHIELDED), env))
     path = find_driver(policy)
     if path.is_dir():
         return _load_network_policy(path, env)

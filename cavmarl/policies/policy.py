@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
 from cavmarl.env.parallel import CavEnv
+from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
@@ -21,15 +22,13 @@ Environment = CavEnv | CavVectorEnv
 
 
 class Policy(ABC):
-    """Drives the agents of one environment.
+    """Drives the agents of one environment that are vehicles.
 
     Args:
         env: environment of the policy; `act` is for a `CavEnv`, `act_batch` for a `CavVectorEnv`.
     """
 
     def __init__(self, env: Environment) -> None:
-        if refusal := env.config.signals.refusal_of_agents("a policy"):
-            raise PolicyError(refusal)
         self.env = env
 
     def reset(self, seed: int | None = None) -> None:  # noqa: B027 - most have nothing to reset
@@ -55,8 +54,9 @@ class Policy(ABC):
         env = self.env
         if not isinstance(env, CavEnv):
             raise PolicyError("act() needs a parallel_env; use act_batch() with a make_vec")
-        index = {agent: k for k, agent in enumerate(env.possible_agents)}
-        live = [agent for agent in env.agents if agent in observations]
+        vehicles = env.possible_agents[: env.config.population.num_ids]
+        index = {agent: k for k, agent in enumerate(vehicles)}
+        live = [agent for agent in env.agents if agent in index and agent in observations]
         size = flat_observation_space(env.config).shape[0]
         names: Iterable[str] = observation_parts(env.config.sensors)
         stack = env.config.sensors.stack
@@ -128,6 +128,15 @@ class SharedPolicy(Policy):
         return actions
 
 
+def suggested(env: Environment) -> Any:
+    """Return the built-in driver's actions: (W, A, …) of a `CavVectorEnv`, or by id of agent."""
+    found = env.suggest_actions()
+    if isinstance(env, CavVectorEnv):
+        return found[VEHICLES] if isinstance(found, dict) else found
+    vehicles = env.possible_agents[: env.config.population.num_ids]
+    return {agent: found[agent] for agent in vehicles if agent in found}
+
+
 def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
     """Return the built-in driver's actions: a new array (W, A, …) as in `Policy.act_batch`.
 
@@ -138,11 +147,11 @@ def built_in_actions(env: Environment, mask: NDArray[np.bool_]) -> NDArray[Any]:
             f"action.kind = {env.config.action.kind}: this driver needs throttle and steering; "
             "make the environment with overrides={'action.kind': 'continuous'}"
         )
-    found = env.suggest_actions()
+    found = suggested(env)
     if isinstance(env, CavVectorEnv):
         return np.array(found)
     actions = np.zeros((*mask.shape, 2), dtype=np.float32)
-    for k, agent in enumerate(env.possible_agents):
+    for k, agent in enumerate(env.possible_agents[: mask.shape[1]]):
         if agent in found:
             actions[0, k] = found[agent]
     return actions

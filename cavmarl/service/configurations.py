@@ -101,7 +101,7 @@ def _check(document: dict[str, Any]) -> None:
         config = load_config(environment, **world_keywords(document))[0]
     except (CavmarlError, RecursionError) as error:
         raise problem("refused", str(error)) from error
-    if refusal := config.signals.refusal_of_agents("a session of the service"):
+    if refusal := config.refusal_of_agents("a session of the service"):
         raise problem("refused", refusal)
     population = config.population
     vehicles = document["num_envs"] * (

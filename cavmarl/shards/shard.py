@@ -251,7 +251,7 @@ def make_lane_table(
 ) -> NDArray[np.void]:
     """Return LANE (W, L), the lanes of the map for each world, or (0, L) if lanes never change."""
     lanes = network.arrays.lanes
-    own = zeros((num_worlds if config.map.changed_lanes else 0, len(lanes)), dtype=lanes.dtype)
+    own = zeros((num_worlds if config.may_change_lanes else 0, len(lanes)), dtype=lanes.dtype)
     own[:] = lanes
     return own
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.signals import SignalsConfig
+from cavmarl.config.signals import SIGNAL_TERMS, SignalsConfig
 from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.signals.kernels.controlled_signals import (
@@ -20,12 +20,13 @@ from cavmarl.signals.kernels.controlled_signals import (
 
 
 class SignalSizes(NamedTuple):
-    """Sizes of the arrays about the signals that agents control."""
+    """Sizes of the arrays about the agents of signals, or of other agents beside the road."""
 
     signals: int = 0  # S
     greens: int = 0  # G, of the signal with most greens
     lanes: int = 0  # N, lanes that lead to or from these signals
     features: int = 0  # D, of the longest observation
+    terms: int = len(SIGNAL_TERMS)  # T, of the reward
 
 
 class SignalTable:

@@ -94,7 +94,7 @@ class Bus:
         self._types = types
         self._roads: RoadArrays = network.arrays
         self.units = make_units(v2x.roadside, network)
-        self._sending = _make_sending(v2x, dt)
+        self._sending = _make_sending(v2x, config.signals.decide_s, dt)
         walls = np.stack([network.walls[name] for name in ("ax", "ay", "bx", "by")], axis=1)
         self._channel = make_channel(v2x.channel, dt, make_walls(walls))
         num_worlds, capacity = zoned.rows.shape[2:]
@@ -258,7 +258,7 @@ class _Silence:
         return np.zeros(0, RECEPTION)
 
 
-def _make_sending(v2x: V2xConfig, dt: float) -> Sending:
+def _make_sending(v2x: V2xConfig, decide_s: float, dt: float) -> Sending:
     def ticks(seconds: float) -> int:
         return max(1, round(seconds / dt))
 
@@ -280,6 +280,7 @@ def _make_sending(v2x: V2xConfig, dt: float) -> Sending:
         unit_range_m=v2x.roadside.range_m,
         memory_ticks=ticks(v2x.inbox.memory_s),
         latency=v2x.channel.latency_ticks,
+        decide=ticks(decide_s),
     )
 
 

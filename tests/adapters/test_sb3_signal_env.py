@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import closing
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -78,31 +77,6 @@ def test_ppo_learns_from_the_rows() -> None:
         model = sb3.PPO("MlpPolicy", rows, n_steps=8, batch_size=64, n_epochs=1, device="cpu")
         model.learn(8 * 32)
         assert model.num_timesteps == 8 * 32
-
-
-def test_a_signal_is_rewarded_for_vehicles_that_enter_its_lanes(tmp_path: Path) -> None:
-    demand = tmp_path / "many.rou.xml"
-    demand.write_text(
-        '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
-        '<flow id="f" route="r" begin="0" end="60" period="0.4"/></routes>'
-    )
-    keys = {"traffic.demand": [str(demand)], "horizon_s": 200.0, "signals.terms": {"queue": 0.0}}
-    rows = make(background=0, entry_weight=0.5, overrides=KEYS | keys)
-    with closing(rows):
-        rows.seed(1)
-        rows.reset()
-        before, first = 0, rows.get_attr("signals")[0].table.ids.index("A0")
-        most = 0
-        for _ in range(36):
-            _, rewards, _, _ = rows.step(np.zeros(32, int))
-            waiting = rows.get_attr("traffic_stats")[0](1)["waiting"]
-            assert rewards[16 + first] == 0.5 * (before - waiting)
-            assert np.count_nonzero(rewards[16:]) <= 1
-            before, most = waiting, max(most, waiting)
-        assert most > 50
-        assert waiting < most
-    with pytest.raises(ConfigError, match="entry_weight"):
-        make(entry_weight=1.0, workers=1)
 
 
 def test_with_features_of_greens_rows_differ_in_size_and_worlds_in_their_start() -> None:

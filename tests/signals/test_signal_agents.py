@@ -590,6 +590,30 @@ def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
         load_policy("idm", vec)
 
 
+def test_drivers_of_vehicles_act_beside_agents_of_signals() -> None:
+    """They drive as under a controller that chooses the same greens."""
+    program = {"signals.controller": "program"}
+    vec = make_vec("grid4x4", agents=3, background=5, overrides=ALL)
+    ready = make_vec("grid4x4", agents=3, background=5, overrides=ALL | program)
+    with closing(vec), closing(ready):
+        driver, alone = load_policy("idm", vec, beside_signals=True), load_policy("idm", ready)
+        (seen, infos), (seen_alone, infos_alone) = vec.reset(seed=1), ready.reset(seed=1)
+        for _ in range(60):
+            vehicles = driver.act_batch(seen["vehicles"], infos["mask"])
+            signals = vec.suggest_actions()["signals"]
+            seen, *_, infos = vec.step({"vehicles": vehicles, "signals": signals})
+            actions = alone.act_batch(seen_alone, infos_alone["mask"])
+            seen_alone, *_, infos_alone = ready.step(actions)
+        assert vec.state_hash() == ready.state_hash()
+    env = parallel_env("grid4x4", agents=3, background=5, overrides=ALL)
+    with closing(env):
+        driver = load_policy("idm", env, beside_signals=True)
+        observations, _ = env.reset(seed=1)
+        actions = driver.act(observations)
+        assert actions.keys() == {agent for agent in env.agents if agent.startswith("car_")}
+        env.step(env.suggest_actions() | actions)
+
+
 @pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
 def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
     with pytest.raises(ConfigError, match="this adapter has agents of vehicles alone; set sig"):

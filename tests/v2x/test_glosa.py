@@ -77,13 +77,29 @@ def test_actuated_signals_report_the_earliest_times(tmp_path: Path) -> None:
     assert np.isfinite(heard[heard[..., KNOWN] > 0.0][:, [CHANGE, RETURN]]).all()
 
 
-def test_signals_with_agents_report_no_times() -> None:
-    keys = {"signals.agents": "all", "signals.controller": "max_pressure", "clock.ctrl_dt_s": 1.0}
-    heard = told("grid4x4", 30, **keys)
+@pytest.mark.parametrize("min_green_s", [4.0, 10.0])
+def test_signals_with_agents_report_the_earliest_change(min_green_s: float) -> None:
+    keys = {
+        "signals.agents": "all",
+        "signals.controller": "max_pressure",
+        "signals.min_green_s": min_green_s,
+    }
+    heard = told("grid4x4", 400, **keys)
     is_known = heard[..., KNOWN] > 0.0
-    assert is_known.sum() > 50
-    assert np.isinf(heard[is_known][:, [CHANGE, RETURN]]).all()
+    assert np.isinf(heard[is_known][:, RETURN]).all()
+    assert np.isfinite(heard[is_known][:, CHANGE]).all()
     assert (heard[is_known, LINE] > 0.0).all()
+    assert heard[is_known][:, CHANGE].max() > min_green_s
+    tick_s = 0.06  # messages may be a tick old
+    before, after = heard[:-1], heard[1:]
+    same = (before[..., KNOWN] > 0.0) & (after[..., KNOWN] > 0.0)
+    same &= np.abs(before[..., LINE] - after[..., LINE]) < 5.0
+    flips = same & (before[..., GO] != after[..., GO])
+    assert flips.sum() > 20
+    assert (before[flips][:, CHANGE] < 0.2 + tick_s).all()
+    steady = same & ~flips  # an earliest time never comes nearer than the clock
+    passed_s = before[steady][:, CHANGE] - after[steady][:, CHANGE]
+    assert (passed_s < 0.2 + tick_s).all()
 
 
 def test_glosa_halves_the_stops_at_almost_the_same_speed() -> None:

@@ -314,7 +314,7 @@ class LoadedWorlds:
 
 
 def _refuse_signal_agents(config: EnvConfig) -> None:
-    if refusal := config.signals.refusal_of_agents("a world for CARLA's clients"):
+    if refusal := config.refusal_of_agents("a world for CARLA's clients"):
         raise ConfigError(refusal)
 
 

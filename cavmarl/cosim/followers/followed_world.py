@@ -77,7 +77,7 @@ class FollowedWorld:
     ) -> None:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
-        if refusal := env.config.signals.refusal_of_agents("a followed world"):
+        if refusal := env.config.refusal_of_agents("a followed world"):
             raise ConfigError(refusal)
         self.env = env
         self._reception = Reception(address, secret)

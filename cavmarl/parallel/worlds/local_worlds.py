@@ -19,7 +19,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.engine.kernels.step_results import Results, keep_last, report, report_continuation
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import global_state, state_space, write_sensed
-from cavmarl.engine.world_setup import World
+from cavmarl.engine.world_setup import World, roadside_sizes
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun
 from cavmarl.handoff.coordinator.saved_ownership import without_journal
 from cavmarl.handoff.zone_view import TransferInFlight
@@ -30,7 +30,6 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.step_arrays import Driven, StepArrays, layout_of
 from cavmarl.sensors.registry import frame_layout
 from cavmarl.shards.shard import Commands
-from cavmarl.signals.signal_table import sizes_of
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 from cavmarl.v2x.v2x_messages import NetworkSimulator
 
@@ -60,8 +59,8 @@ class LocalWorlds:
         form = world.config.observation
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
-        self._shows_signals = world.config.signals.are_controlled
-        self._has_signals = world.config.signals.have_agents
+        self._shows_signals = world.config.controlled is not None
+        self._has_signals = world.config.roadside is not None
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -193,7 +192,7 @@ class LocalWorlds:
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
         if self._shows_signals:
-            found = self.simulation.signals.outputs
+            found = self.simulation.roadside.outputs
             for name, values in found._asdict().items():
                 if begins and name in ("rewards", "terms"):
                     continue
@@ -447,7 +446,7 @@ def every_array(arrays: StepArrays) -> Iterator[NDArray[Any]]:
 
 
 def _own_arrays(simulation: Simulation, num_worlds: int) -> StepArrays:
-    sizes = sizes_of(simulation.network, simulation.config.signals.range_m)
+    sizes = roadside_sizes(simulation.config, simulation.network)
     layout = layout_of(simulation.config, simulation.capacity, num_worlds, sizes)
     sensed = frame_layout(simulation.config, num_worlds)
     made = {

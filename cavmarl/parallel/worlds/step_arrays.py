@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 
 from cavmarl.balance.balance_plan import Plan
 from cavmarl.config.env import EnvConfig
-from cavmarl.config.signals import SIGNAL_TERMS
 from cavmarl.core.records.external_records import EXTERNAL_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.spaces import flat_observation_space, state_space
@@ -57,6 +56,7 @@ class StepArrays(NamedTuple):
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     lane_changes: NDArray[np.float64]  # (W, N, 3)
+    # of agents of signals, or of other agents beside the road (`RoadsideAgents`):
     signal_choices: NDArray[np.int64]  # (W, S)
     signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next eight
     signal_rewards: NDArray[np.float32]  # (W, S)
@@ -117,7 +117,7 @@ def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: Signal
         "signal_observations": observed,
         "final_signal_observations": observed,
         "signal_rewards": ("<f4", of_signals),
-        "signal_terms": ("<f4", (*of_signals, len(SIGNAL_TERMS))),
+        "signal_terms": ("<f4", (*of_signals, signals.terms)),
         "signal_masks": ("|b1", (*of_signals, signals.greens)),
         "signal_decides": ("|b1", (num_worlds,)),
         "signal_counts": ("<i8", (num_worlds, signals.lanes, COUNTS)),

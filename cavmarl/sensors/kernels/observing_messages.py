@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -15,6 +17,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MAJOR,
     SIGNAL_GREEN_MINOR,
 )
+from cavmarl.driving.kernels.junctions.signal_timing import soonest_choice
 from cavmarl.roads.kernels.lanes_now import plans_of
 from cavmarl.roads.kernels.signal_phases import program_at
 from cavmarl.sensors.kernels.frame_stacks import newest_frame
@@ -161,11 +164,17 @@ def _observe_timing(
     """Write the times of the next two changes between green and another state of a link.
 
     `row`: PHASE row that ends in `left_s`. The receiver knows the program; of actuated phases, it
-    knows the minimum duration. The greens that agents or controllers choose are not known.
+    knows the minimum duration. Of greens that agents or controllers choose, it knows the earliest
+    time of the next change alone.
     """
     plan = roads.programs[program]
     first, count = plan["first_phase"], plan["num_phases"]
-    if plan["detector_gap_s"] == CHOSEN_BY_AGENT or row < first or row >= first + count:
+    if row < first or row >= first + count:
+        return
+    if plan["detector_gap_s"] == CHOSEN_BY_AGENT:
+        change_s = soonest_choice(roads, plan, row, index, left_s, True)
+        if change_s < math.inf:
+            out[1] = _soonness(change_s)
         return
     found, now = 0, _is_green(roads, row, index)
     for _ in range(2 * count):

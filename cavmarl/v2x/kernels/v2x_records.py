@@ -127,6 +127,7 @@ class Sending(NamedTuple):
     unit_range_m: float
     memory_ticks: int  # lifetime of all other reports
     latency: int  # ticks between sending and receiving
+    decide: int  # ticks between decisions about chosen greens
 
 
 class Mail(NamedTuple):

@@ -11,7 +11,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.geometry import wrap_angle
 from cavmarl.core.math.walls import Walls
 from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
-from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.core.records.codes import CHOSEN_BY_AGENT, DRIVER_AGENT
 from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
@@ -91,15 +91,24 @@ def phase_left_s(
     controllers: NDArray[np.void],
     signal: int,
     phase: NDArray[np.int32],
-    time: float,
-    dt: float,
+    tick: int,
+    sending: Sending,
 ) -> float:
-    """Return the remaining time of the present phase in s; the shortest one if it is actuated."""
-    program = roads.programs[program_at(roads, signal, time, dt)]
+    """Return the remaining time of the present phase in s; the shortest one if it is actuated.
+
+    A green that is chosen ends at the next decision after its minimum, or later.
+    """
+    time = tick * sending.dt_s
+    program = roads.programs[program_at(roads, signal, time, sending.dt_s)]
     row = phase[signal]
     if program["controller"] >= 0:
         since = 1e-3 * controllers[program["controller"]]["since_ms"]
-        return float(max(since + 1e-3 * roads.phases[row]["min_ms"] - time, 0.0))
+        left = float(max(since + 1e-3 * roads.phases[row]["min_ms"] - time, 0.0))
+        if program["detector_gap_s"] == CHOSEN_BY_AGENT and roads.phases[row]["green"]:
+            last = tick + math.ceil(left / sending.dt_s - 1e-6)
+            decision = -(-last // sending.decide) * sending.decide
+            return float((decision - tick) * sending.dt_s)
+        return left
     left = -((time - program["offset_s"]) % program["cycle_s"])
     for earlier in range(program["first_phase"], row + 1):
         left += roads.phases[earlier]["duration_s"]
@@ -348,7 +357,7 @@ def send_from_units(
                 report["subject"] = signal
                 report["expires"] = expires
                 report["left_s"] = phase_left_s(
-                    roads, common.controllers[w], signal, phase, tick * sending.dt_s, sending.dt_s
+                    roads, common.controllers[w], signal, phase, tick, sending
                 )
                 if phase.size > roads.signals.shape[0]:
                     _write_overrides(report, roads, signal, phase)

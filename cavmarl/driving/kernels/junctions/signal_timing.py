@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
-from cavmarl.core.records.codes import CHOSEN_BY_AGENT
+from cavmarl.core.records.codes import CHOSEN_BY_AGENT, SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
 from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 from cavmarl.roads.kernels.signal_phases import program_at
 
@@ -46,7 +46,8 @@ def time_to_change(
         for earlier in range(program["first_phase"], row):
             left += roads.phases[earlier]["duration_s"]
     if program["detector_gap_s"] == CHOSEN_BY_AGENT:
-        soonest = _soonest_choice(roads, program, row, index, left)
+        ends = left + 1e-3 * roads.phases[row]["min_ms"]
+        soonest = soonest_choice(roads, program, row, index, ends, False)
         return float(max(soonest, 0.0)) if soonest < math.inf else float(program["cycle_s"])
     # Add the phases from the start of the active phase to the first phase with another state.
     for _ in range(program["num_phases"]):
@@ -64,23 +65,23 @@ def time_to_change(
 
 
 @kernel
-def _soonest_choice(
-    roads: RoadArrays, program: np.void, row: int, index: int, begin_s: float
+def soonest_choice(
+    roads: RoadArrays, program: np.void, row: int, index: int, end_s: float, by_green: bool
 ) -> float:
     """Return the earliest time in s at which a letter changes if greens are chosen; inf: never.
 
-    `row`: active PHASE row, which began at `begin_s`. The phases of such a program are its greens,
-    and for each pair of greens the phases between them; see `signals.agent_programs`.
+    `row`: active PHASE row, which ends in `end_s`, or may end then if it is a green. `by_green`:
+    whether only changes between green and other letters count. The phases of such a program are its
+    greens, and for each pair of greens the phases between them; see `signals.agent_programs`.
     """
-    letter = roads.phase_states[roads.phases[row]["first_state"] + index]
-    left = begin_s
+    now = _shown(roads, row, index, by_green)
+    left = end_s
     while not roads.phases[row]["green"]:
-        left += 1e-3 * roads.phases[row]["min_ms"]
         row = roads.phases[row]["following"]
-        if roads.phase_states[roads.phases[row]["first_state"] + index] != letter:
+        if _shown(roads, row, index, by_green) != now:
             return float(left)
+        left += 1e-3 * roads.phases[row]["min_ms"]
     # The green may end after its minimum, and any other green may follow.
-    left += 1e-3 * roads.phases[row]["min_ms"]
     first = program["first_phase"]
     num_greens = 0
     while num_greens < program["num_phases"] and roads.phases[first + num_greens]["green"]:
@@ -95,7 +96,7 @@ def _soonest_choice(
             pair = green * (num_greens - 1) + (other if other < green else other - 1)
             next_row = first + num_greens + pair
         for _ in range(3):  # yellow, red for all, green
-            if roads.phase_states[roads.phases[next_row]["first_state"] + index] != letter:
+            if _shown(roads, next_row, index, by_green) != now:
                 soonest = min(soonest, after)
                 break
             if roads.phases[next_row]["green"]:
@@ -103,3 +104,12 @@ def _soonest_choice(
             after += 1e-3 * roads.phases[next_row]["min_ms"]
             next_row = roads.phases[next_row]["following"]
     return soonest
+
+
+@kernel
+def _shown(roads: RoadArrays, row: int, index: int, by_green: bool) -> int:
+    """Return the letter of a link in a PHASE row; `by_green`: 1 if it is green, else 0."""
+    letter = roads.phase_states[roads.phases[row]["first_state"] + index]
+    if by_green:
+        return int(letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR)
+    return int(letter)

@@ -1,0 +1,1 @@
+"""Roadside units that set variable speed limits: their table, observations and controllers."""

@@ -1,0 +1,1 @@
+"""Kernels of variable speed limits: sums over sections, choices, observations and rewards."""
