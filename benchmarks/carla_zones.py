@@ -149,6 +149,7 @@ def _server(env: str, places: int) -> Iterator[int]:
     finally:
         process.terminate()
         process.wait()
+        process.stdout.close()
 
 
 if __name__ == "__main__":
