@@ -42,7 +42,6 @@ def measure(
     zones: Annotated[str, about("Numbers of zones, comma-separated.")] = "2,4",
     vehicles: Annotated[str, about("Numbers of vehicles, comma-separated.")] = "25,50,100",
     steps: Annotated[int, about("Steps of each row.")] = 300,
-    backend: Annotated[str, about("Backend of the world.")] = "local",
     say: Say = silent,
 ) -> BenchmarkReport:
     """Measure hand-overs between zones with CARLA's client; fail if a vehicle is lost."""
@@ -50,7 +49,7 @@ def measure(
     for count in map(int, zones.split(",")):
         for number in map(int, vehicles.split(",")):
             say(f"{count} zones, {number} vehicles")
-            rows.append(measure_zones(world, count, number, steps, backend))
+            rows.append(measure_zones(world, count, number, steps))
     lost = sum(row["lost"] for row in rows)
     return BenchmarkReport(
         f"{world.env}, {steps} steps, all zones run by servers for CARLA's client",
@@ -70,9 +69,7 @@ def measure(
     )
 
 
-def measure_zones(
-    spec: WorldSpec, zones: int, vehicles: int, steps: int, backend: str = "local"
-) -> dict[str, Any]:
+def measure_zones(spec: WorldSpec, zones: int, vehicles: int, steps: int) -> dict[str, Any]:
     """Return the rate of a world, the latencies of its hand-overs, and how many it has lost.
 
     Raises:
@@ -93,7 +90,6 @@ def measure_zones(
             agents=agents,
             background=vehicles - agents,
             seed=spec.seed,
-            backend=backend,
             overrides={
                 "zones.check_invariants": True,
                 "zones.max_deferred_ticks": 10,
@@ -106,7 +102,7 @@ def measure_zones(
         vec.reset()
         for _ in range(_WARM_UP):
             vec.step(vec.suggest_actions())
-        log = vec.worlds.transfers[0]
+        log = vec.simulation.transfers[0]
         log.take()
         before = vec.traffic_stats()
         begin_s = time.perf_counter()
@@ -153,6 +149,7 @@ def _server(env: str, places: int) -> Iterator[int]:
     finally:
         process.terminate()
         process.wait()
+        process.stdout.close()
 
 
 if __name__ == "__main__":

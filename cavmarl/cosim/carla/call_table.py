@@ -135,11 +135,16 @@ def answer_from(name: str, read: Callable[[CarlaSession], Any], note: str = "") 
 
 
 def refuse(
-    *names: str, checks: tuple[Check, ...], because: str, returns: Returns = Returns.NOTHING
+    *names: str,
+    checks: tuple[Check, ...],
+    because: str,
+    returns: Returns = Returns.NOTHING,
+    required: int | None = None,
 ) -> None:
     """Add calls that are refused with a reason."""
+    fewest = len(checks) if required is None else required
     for name in names:
-        CALLS[name] = ClientCall(name, checks, len(checks), returns, Effect.REFUSED, note=because)
+        CALLS[name] = ClientCall(name, checks, fewest, returns, Effect.REFUSED, note=because)
 
 
 def answer(

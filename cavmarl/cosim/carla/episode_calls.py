@@ -246,7 +246,13 @@ answer_constant([], "get_names_of_all_objects")
 answer_constant([], "get_environment_objects", "get_all_level_BBs", checks=(whole,))
 answer_constant(True, "is_weather_enabled")
 refuse("start_recorder", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
-refuse("replay_file", checks=(anything,) * 6, because=_NO_RECORDER, returns=Returns.VALUE)
+refuse(
+    "replay_file",
+    checks=(anything,) * 6,
+    because=_NO_RECORDER,
+    returns=Returns.VALUE,
+    required=5,  # client 0.9.15 has no offset
+)
 refuse("show_recorder_file_info", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
 refuse(
     "show_recorder_collisions",

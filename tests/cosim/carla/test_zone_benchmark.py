@@ -14,7 +14,7 @@ pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
 def test_no_vehicle_is_lost_between_two_servers(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PYTHON, client_python(VERSION))
-    found = measure_zones(WorldSpec.of("grid4x4", seed=3), zones=2, vehicles=25, steps=30)
+    found = measure_zones(WorldSpec.of("grid4x4", seed=3), zones=2, vehicles=60, steps=60)
     assert found["lost"] == 0
     assert found["hand_overs"] > 0
     assert 0.0 < found["median_ms"] <= found["p99_ms"] < 60_000.0
