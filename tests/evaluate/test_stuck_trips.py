@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.config.terms import TERMS
-from cavmarl.core.records.codes import ACTION_FASTER, ACTION_IDLE
+from cavmarl.core.records.codes import ACTION_FASTER, ACTION_IDLE, ACTION_SLOWER
 from cavmarl.evaluate.recorder import Recorder
 from cavmarl.evaluate.stuck_trips import StandingWatch
 
@@ -89,7 +89,11 @@ def test_an_agent_that_was_away_has_not_stood() -> None:
 
 @pytest.mark.parametrize(
     ("kind", "goes", "waits"),
-    [("continuous", 0.6, 0.4), ("discrete", ACTION_FASTER, ACTION_IDLE)],
+    [
+        ("continuous", 0.6, 0.4),
+        ("discrete", ACTION_FASTER, ACTION_IDLE),
+        ("discrete", ACTION_FASTER, ACTION_SLOWER),
+    ],
 )
 def test_a_stop_of_ten_seconds_counts_as_blocked_or_stood(
     kind: str, goes: float, waits: float
