@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.seeds import check_seed, first_seed
-from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.vehicle_way import way_ahead
+from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.world_frame import WorldFrame, frame_of
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
