@@ -8,7 +8,7 @@ any division. Decision 011 gives the reasons.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +17,7 @@ from cavmarl.core.math.rng import STREAM_REROUTER, uniform
 from cavmarl.core.records import record
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import COUNT_REROUTED
+from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.routing import PLAN
 from cavmarl.traffic.demand import Choices
 from cavmarl.traffic.demand.rerouters import KEEP_DESTINATION
@@ -125,7 +126,8 @@ class Rerouting:
         """
         yield self._speed_sums[world]
         yield self._past[world]
-        yield from _plain(self._looks[world, : self._num_looks[world]])
+        unused = {"reacted"} if self._avoids == "never" else set()
+        yield from _plain(self._looks[world, : self._num_looks[world]], unused)
         slots = self._slots
         used = np.zeros(slots.number, dtype=np.bool_)
         first = slots.first_of(world)
@@ -181,7 +183,7 @@ class Rerouting:
             row = rows[i]
             look = looks[row["order"]]
             if look["reacted"] < changed_at:
-                self._react(search, int(i), look, changed_at)
+                self._react(search, int(i), row, look, changed_at)
             self._ask_rerouters(search, int(i), row, look, clock_s)
             if tick >= look["next"]:
                 answer = search.send(int(i), int(look["goal"]), True, False)
@@ -205,14 +207,18 @@ class Rerouting:
         np.bitwise_or.at(closed, now["edge"], now["classes"])
         return closed
 
-    def _react(self, search: WaySearch, i: int, look: np.void, changed_at: int) -> None:
+    def _react(
+        self, search: WaySearch, i: int, row: np.void, look: np.void, changed_at: int
+    ) -> None:
         """Let a vehicle search for another way after a change of lanes.
 
         Without another way, it keeps its present one, and waits before the closed lane.
         """
         is_blocked = search.meets_closing(i)
         if is_blocked or self._avoids == "always":
-            answer = search.send(i, int(look["goal"]), bool(look["equipped"]), is_blocked)
+            stands = is_blocked and bool(row["speed"] < STANDING_MPS)
+            knows = bool(look["equipped"])
+            answer = search.send(i, int(look["goal"]), knows, is_blocked, stands)
             if answer is WaySearchResult.LATER:
                 return
         look["reacted"] = changed_at
@@ -286,7 +292,10 @@ class Rerouting:
         return int(choices.pick(np.array([number], dtype=np.int32), drawn)[0])
 
 
-def _plain(records: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
-    """Yield the fields of records one by one, without padding."""
+def _plain(
+    records: NDArray[np.void], unused: Collection[str] = ()
+) -> Iterator[NDArray[np.generic]]:
+    """Yield the fields of records one by one, without padding and without the unused ones."""
     for name in records.dtype.names or ():
-        yield np.ascontiguousarray(records[name])
+        if name not in unused:
+            yield np.ascontiguousarray(records[name])

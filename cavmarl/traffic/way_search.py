@@ -159,12 +159,15 @@ class WaySearch:
         time: float = time_left(roads, self._travel.steps, row["way"], row["lane"])
         return CLOSED_S <= time < np.inf
 
-    def send(self, i: int, goal: int, knows: bool, anyhow: bool) -> WaySearchResult:
+    def send(
+        self, i: int, goal: int, knows: bool, anyhow: bool, stands: bool = False
+    ) -> WaySearchResult:
         """Put row i on the fastest way to a goal if it is faster than the present way.
 
         `i`: row of a vehicle outside junctions. `knows`: whether it knows the measured speeds;
         otherwise the limits are used. Closings are known to all. `anyhow`: whether to leave the
-        present way even for a slower one.
+        present way even for a slower one. `stands`: whether it stands, and so needs no room to brake
+        before a lane change.
         """
         row = self._rows[i]
         permission = self._permission(i)
@@ -180,7 +183,7 @@ class WaySearch:
             return WaySearchResult.NO_WAY
         if not anyhow and time >= time_left(roads, self._travel.steps, row["way"], lane):
             return WaySearchResult.KEPT
-        if not has_room(self._roads, self._travel, row, self._steps, way):
+        if not (stands or has_room(self._roads, self._travel, row, self._steps, way)):
             return WaySearchResult.LATER
         found = self._steps[:number]
         taken = take_slot(

@@ -10,6 +10,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
+from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.kernels.lanes_now import roads_in
 from cavmarl.traffic.kernels.way_requests import has_room
 
@@ -45,7 +46,7 @@ def take_plan(roads: RoadArrays, travel: TripTables, row: np.void, w: int) -> in
     if way == row["way"]:
         return 0
     if row["driver"] == DRIVER_BACKGROUND and not roads.lanes[lane]["internal"]:
-        if not has_room(roads, travel, row, travel.steps, way):
+        if row["speed"] >= STANDING_MPS and not has_room(roads, travel, row, travel.steps, way):
             return 0
     before = travel.steps[own_step(roads, row)]["to_go"]
     row["way"] = way
