@@ -11,6 +11,7 @@ The run's folder has stable-baselines3's `model.zip`, the figures as `evaluation
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -37,6 +38,7 @@ from cavmarl.limits.controllers import Feedback
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
 FIRST_SEED = 1000  # of the evaluation
+LONGEST_STEP_S = 10.0  # see `clock.ctrl_dt_s`
 
 Choose = Callable[[LimitAgents], NDArray[np.int64]]
 
@@ -79,7 +81,7 @@ class Args:
         return {
             "limits.agents": "all",
             "limits.decide_s": self.decide_s,
-            "clock.ctrl_dt_s": self.decide_s,
+            "clock.ctrl_dt_s": self.decide_s / math.ceil(self.decide_s / LONGEST_STEP_S),
             **parse_settings([word for word in self.settings.split(",") if word]),
         }
 
