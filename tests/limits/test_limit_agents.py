@@ -234,7 +234,7 @@ def test_a_controller_chooses_for_units_in_worlds_of_vehicles() -> None:
     with closing(vec_of(1, agents=2)) as vec, pytest.raises(PolicyError, match=r"limits\.agents"):
         load_policy("idm", vec)
     with pytest.raises(ConfigError, match=r"this adapter has agents of vehicles alone; set limits"):
-        CavEgoEnv("lane_drop", agents=1, overrides=KEYS)
+        CavEgoEnv("lane_drop", overrides=KEYS)
 
 
 @pytest.mark.parametrize(
