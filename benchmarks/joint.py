@@ -108,6 +108,7 @@ def measure(
             "CO₂, g/km": "co2_g_per_km:.0f",
         },
         rows,
+        notes=_savings(rows),
     )
 
 
@@ -170,8 +171,26 @@ def _vehicles(drivers: str, agents: int) -> Sequence[object]:
     return ["--background", 0, "--agents", agents, "--drivers", drivers, "--settings", settings]
 
 
-def _figures(found: Sequence[Driving]) -> dict[str, float | None]:
-    """Return the means over worlds, and the half widths of their 95 % intervals."""
+def _savings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return lines about what advice saves beside signals, from world to world."""
+    alone = next((row for row in rows if row["side"] == "signals"), None)
+    found = []
+    for row in rows:
+        if alone is None or row["side"] not in ("advice beside signals", "together"):
+            continue
+        parts = []
+        for name, unit in (("delay_of_worlds", "s of delay"), ("stops_of_worlds", "stops")):
+            saved = np.array(alone[name]) - np.array(row[name])
+            interval = mean_interval(saved)
+            bounds = "" if interval is None else f" [{interval.low:.2f}, {interval.high:.2f}]"
+            parts.append(f"{saved.mean():.2f}{bounds} {unit}")
+        lost = f"{row['side']}, {row['loss']:.0%} lost"
+        found.append(f"{lost}: saves {' and '.join(parts)} per km against signals alone")
+    return found
+
+
+def _figures(found: Sequence[Driving]) -> dict[str, Any]:
+    """Return the means over worlds, the half widths of their 95 % intervals, and each world."""
     values = np.array(found)
     kilometres = 1e-3 * values[:, Driving._fields.index("distance_m")]
     per_km = values / kilometres[:, None]
@@ -187,6 +206,8 @@ def _figures(found: Sequence[Driving]) -> dict[str, float | None]:
         "stops_within": within["stops"],
         "speed_mps": 1e3 / means["driven_s"],
         "co2_g_per_km": means["co2_g"],
+        "delay_of_worlds": per_km[:, Driving._fields.index("delay_s")].tolist(),
+        "stops_of_worlds": per_km[:, Driving._fields.index("stops")].tolist(),
     }
 
 

@@ -2,6 +2,8 @@
 
     python train/limits_sb3.py --env lane_drop
 
+The network first imitates the feedback controller, then learns from the rewards.
+
 Afterwards, the network, the feedback controller and no control run in worlds of other seeds. The
 table has the mean time of a vehicle in the world or before it, and the vehicles that have arrived.
 The run's folder has stable-baselines3's `model.zip`, the figures as `evaluation.json`, and
@@ -11,6 +13,7 @@ The run's folder has stable-baselines3's `model.zip`, the figures as `evaluation
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -37,6 +40,8 @@ from cavmarl.limits.controllers import Feedback
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
 FIRST_SEED = 1000  # of the evaluation
+IMITATION_RATE, IMITATION_PASSES, IMITATION_BATCH = 2e-3, 30, 256
+LONGEST_STEP_S = 10.0  # see `clock.ctrl_dt_s`
 
 Choose = Callable[[LimitAgents], NDArray[np.int64]]
 
@@ -48,17 +53,20 @@ class Args:
     program: ClassVar[str] = "limits_sb3.py"
 
     env: Annotated[str, "environment: a name or a folder"] = "lane_drop"
-    decide_s: Annotated[float, "seconds between two decisions of a unit"] = 20.0
+    decide_s: Annotated[float, "seconds between two decisions of a unit"] = 10.0
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
     num_worlds: Annotated[int, "number of parallel worlds"] = 8
     seed: Annotated[int, "root of all random numbers"] = 0
-    updates: Annotated[int, "updates of the network"] = 24
-    num_steps: Annotated[int, "decisions of a unit per update"] = 90
+    updates: Annotated[int, "updates of the network"] = 10
+    num_steps: Annotated[int, "decisions of a unit per update"] = 180
     epochs: Annotated[int, "passes over the decisions of an update"] = 10
-    minibatches: Annotated[int, "minibatches per pass"] = 6
-    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 2e-3
-    gamma: Annotated[float, "discount per decision"] = 0.95
+    minibatches: Annotated[int, "minibatches per pass"] = 8
+    learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 5e-4
+    gamma: Annotated[float, "discount per decision"] = 0.98
     entropy: Annotated[float, "weight of the entropy in the loss"] = 0.005
+    imitate: Annotated[int, "decisions of a unit to imitate first, of the feedback controller"] = (
+        360
+    )
     hidden: Annotated[int, "width of the two hidden layers"] = 32
     evaluations: Annotated[int, "worlds of the evaluation"] = 16
     runs: Annotated[str, "folder of all runs"] = "runs"
@@ -79,7 +87,7 @@ class Args:
         return {
             "limits.agents": "all",
             "limits.decide_s": self.decide_s,
-            "clock.ctrl_dt_s": self.decide_s,
+            "clock.ctrl_dt_s": self.decide_s / math.ceil(self.decide_s / LONGEST_STEP_S),
             **parse_settings([word for word in self.settings.split(",") if word]),
         }
 
@@ -103,6 +111,26 @@ def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
         device="cpu",
     )
     return model, rows
+
+
+def imitate(args: Args, model: PPO, rows: CavSb3SignalEnv) -> None:
+    """Let the network imitate the feedback controller."""
+    feedback, units = Feedback(), rows.get_attr("limits")[0]
+    seen, chosen = [], []
+    observations = rows.reset()
+    for _ in range(args.imitate):
+        choices = np.maximum(feedback.choose(units.view), 0).reshape(-1)
+        seen.append(observations)
+        chosen.append(choices)
+        observations, *_ = rows.step(choices)
+    inputs, targets = torch.tensor(np.concatenate(seen)), torch.tensor(np.concatenate(chosen))
+    optimizer = torch.optim.Adam(model.policy.parameters(), lr=IMITATION_RATE)
+    for _ in range(IMITATION_PASSES):
+        for batch in torch.randperm(len(inputs)).split(IMITATION_BATCH):
+            _, logarithms, _ = model.policy.evaluate_actions(inputs[batch], targets[batch])
+            optimizer.zero_grad()
+            (-logarithms.mean()).backward()  # type: ignore[no-untyped-call]
+            optimizer.step()
 
 
 def choices_of(model: PPO) -> Choose:
@@ -172,6 +200,8 @@ def train(args: Args) -> Path:
     torch.set_num_threads(1)  # more threads slow small networks down
     model, rows = make_model(args)
     with closing(rows), RunFolder(args, rows.get_attr("worlds")[0].world) as folder:
+        if args.imitate:
+            imitate(args, model, rows)
         model.learn(args.updates * args.num_steps * rows.num_envs)
         with writing(args.folder / MODEL_FILE):
             model.save(args.folder / MODEL_FILE)

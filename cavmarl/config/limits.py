@@ -40,7 +40,8 @@ class LimitsConfig(Section, key="limits"):
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `LIMIT_TERMS`.
-        wanted_per_km: `feedback` keeps this density, in vehicles per km and lane.
+        wanted_per_km: above this density, in vehicles per km and lane, `feedback` sets the lowest
+            limit that is allowed; otherwise, the limit rises by one place.
         watched: `feedback` reads the density of this section; empty: of the last one.
     """
 

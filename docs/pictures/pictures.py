@@ -71,6 +71,7 @@ PICTURES = {
     "u-turn": Picture("u-turn", 12.0, (1280, 400)),
     "ring22": Picture("ring22", 60.0),
     "blind_junction": Picture("blind_junction", 20.0),
+    "lane_drop": Picture("lane_drop", 300.0, (1280, 300), (1700.0, -45.0, 2100.0, 45.0)),
     "ghosts": Picture(
         "rush",
         60.0,

@@ -42,7 +42,7 @@ def test_vehicles_keep_the_limit_that_is_chosen() -> None:
         fastest = []
         for step in range(36):
             vec.step({"limits": np.array([[1 if step < 18 else 3, 3]])})
-            rows = vec.simulation.vehicles(0)
+            rows = vec.simulation.vehicles(0).copy()
             lanes = vec.network.lanes["edge"][rows["lane"]]
             far = rows[lanes == vec.network.edge_ids.index("far")]
             fastest.append(far["speed"].max())
@@ -82,7 +82,7 @@ def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
         for step in range(450):
             choices = np.array([[2, 3 if step < 400 else 1]])
             observations, rewards, _, _, infos = vec.step({"limits": choices})
-            rows = vec.simulation.vehicles(0)
+            rows = vec.simulation.vehicles(0).copy()
             decision.append((network.lanes["edge"][rows["lane"]], rows))
             if (step + 1) % 50:
                 assert not rewards["limits"].any()
@@ -234,7 +234,7 @@ def test_a_controller_chooses_for_units_in_worlds_of_vehicles() -> None:
     with closing(vec_of(1, agents=2)) as vec, pytest.raises(PolicyError, match=r"limits\.agents"):
         load_policy("idm", vec)
     with pytest.raises(ConfigError, match=r"this adapter has agents of vehicles alone; set limits"):
-        CavEgoEnv("lane_drop", agents=1, overrides=KEYS)
+        CavEgoEnv("lane_drop", overrides=KEYS)
 
 
 @pytest.mark.parametrize(
