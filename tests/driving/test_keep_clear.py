@@ -16,6 +16,7 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     HOLD_YIELD,
     SIGNAL_GREEN_MINOR,
+    SIGNAL_NONE,
     SIGNAL_RED,
 )
 from cavmarl.driving.kernels.junctions.junctions import exit_blocked
@@ -52,8 +53,15 @@ class Ahead(NamedTuple):
     phase: NDArray[np.int32]
 
 
-def ahead(folder: Path, light: int, *, may_block: bool = False, apart_m: float = 24.0) -> Ahead:
-    net, _ = signal_pair(folder, apart_m)
+def ahead(
+    folder: Path,
+    light: int,
+    *,
+    may_block: bool = False,
+    apart_m: float = 24.0,
+    second: str = "traffic_light",
+) -> Ahead:
+    net, _ = signal_pair(folder, apart_m, second)
     if may_block:
         text = net.read_text()
         net.write_text(text.replace('from="sj"', 'keepClear="0" from="sj"'))
@@ -62,6 +70,8 @@ def ahead(folder: Path, light: int, *, may_block: bool = False, apart_m: float =
     (link,) = np.flatnonzero(network.links["to_lane"] == lane)
     turn = network.links[network.lanes[lane]["first_link"]]
     phase = network.programs["first_phase"][network.signals["program"]].astype(np.int32)
+    if light == SIGNAL_NONE:
+        return Ahead(network, lane, int(link), phase)
     program = network.programs[network.signals["program"][turn["signal"]]]
     for at in range(program["num_phases"]):
         row = program["first_phase"] + at
@@ -100,8 +110,17 @@ def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_pat
     assert not is_blocked(scene, WAITING)
     assert is_blocked(scene, MOVING, WAITING)
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
-    # As in SUMO, a driver does not expect to wait where vehicles yield, if none of them waits.
+    # The vehicles move on, but the own one has to expect to yield at that line.
+    assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+
+
+def test_a_driver_does_not_expect_to_wait_where_no_signal_can_stop_it(tmp_path: Path) -> None:
+    """As in SUMO, it follows vehicles to a line at which all of them yield, if none waits there."""
+    scene = ahead(tmp_path, SIGNAL_NONE, second="priority")
+    turn = scene.network.links[scene.network.lanes[scene.left_turns_from]["first_link"]]
+    assert chr(turn["state"]) == "m"
     assert not is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+    assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), WAITING)
 
 
 def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_path: Path) -> None:

@@ -24,7 +24,7 @@ PAIR_NODES = """<nodes>
 <node id="n" x="0" y="{north}"/><node id="s" x="0" y="-300"/><node id="w1" x="-300" y="0"/>
 <node id="e1" x="300" y="0"/><node id="w2" x="-300" y="{apart}"/><node id="e2" x="300" y="{apart}"/>
 <node id="j1" x="0" y="0" type="traffic_light"/>
-<node id="j2" x="0" y="{apart}" type="traffic_light"/></nodes>"""
+<node id="j2" x="0" y="{apart}" type="{second}"/></nodes>"""
 PAIR_EDGES = """<edges><edge id="sj" from="s" to="j1" numLanes="2"/>
 <edge id="js" from="j1" to="s" numLanes="2"/><edge id="up" from="j1" to="j2" numLanes="2"/>
 <edge id="down" from="j2" to="j1" numLanes="2"/><edge id="nj" from="n" to="j2" numLanes="2"/>
@@ -74,9 +74,14 @@ def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[P
     return _made(folder, ZIPPER_NODES, ZIPPER_EDGES, ZIPPER_CONNECTIONS, demand)
 
 
-def signal_pair(folder: Path, apart_m: float = 24.0) -> tuple[Path, Path]:
-    """Make two crossings with signals; opposing left turns share the short road between them."""
-    nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0)
+def signal_pair(
+    folder: Path, apart_m: float = 24.0, second: str = "traffic_light"
+) -> tuple[Path, Path]:
+    """Make two crossings with signals; opposing left turns share the short road between them.
+
+    `second`: SUMO's type of the second crossing.
+    """
+    nodes = PAIR_NODES.format(apart=apart_m, north=apart_m + 300.0, second=second)
     return _made(folder, nodes, PAIR_EDGES, PAIR_CONNECTIONS, PAIR_DEMAND)
 
 

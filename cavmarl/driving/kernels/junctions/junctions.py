@@ -23,6 +23,7 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     HOLD_YIELD,
     SIGNAL_GREEN_MAJOR,
+    SIGNAL_NONE,
     SIGNAL_OFF,
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
@@ -38,7 +39,6 @@ from cavmarl.driving.kernels.junctions.gaps import (
     STOP_SIGN_S,
     hold_for_foe,
     is_minor,
-    is_red,
     link_signal,
     must_stop,
     stays_inside,
@@ -142,6 +142,25 @@ def _hold_for_foes(
     return hold
 
 
+@kernel
+def _waits_at(
+    roads: RoadArrays, link: int, road_m: float, needed: float, phase: NDArray[np.int32]
+) -> bool:
+    """Return whether a vehicle has to expect to wait before `link`, beyond the next junction.
+
+    It does so at red, and where it yields during green: it may not go before red. But if the road
+    before `link`, `road_m` m long, has no room for the vehicle, it cannot wait there until others
+    let it go. At links without a signal it expects to go, as in SUMO.
+    """
+    signal = link_signal(roads, link, phase)
+    stops = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+    yields = signal != SIGNAL_NONE and (
+        must_stop(roads, link, signal) or is_minor(roads, link, phase)
+    )
+    waits: bool = stops or (yields and road_m >= needed)
+    return waits
+
+
 @inlined_kernel
 def _goes_first_in_swap(
     roads: RoadArrays,
@@ -183,9 +202,8 @@ def exit_blocked(
     """Return whether a row could not clear the junction behind the next vehicle that waits ahead.
 
     The vehicles that move in between need room as well. The next line at which a vehicle of that
-    road has to wait, or that is red, ends the room; the inside of a junction is no room. As in
-    SUMO, the row does not expect to wait at a line where it yields. Vehicles more than
-    `EXIT_LOOK_M` beyond the junction do not count.
+    road, or the row itself, has to wait ends the room; the inside of a junction is no room.
+    Vehicles more than `EXIT_LOOK_M` beyond the junction do not count.
     """
     target = roads.links[link]
     if target["may_block"]:
@@ -199,7 +217,7 @@ def exit_blocked(
                 room -= 2.0 * other["half"] + ROOM_M
         lane = roads.lanes[lane]["successor"]
     needed = row["length"] + ROOM_M
-    beyond = 0.0
+    beyond, road_m = 0.0, 0.0
     for _ in range(EXIT_LANES):
         waits = False
         for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
@@ -217,6 +235,7 @@ def exit_blocked(
             room -= 2.0 * other["half"] + ROOM_M
         beyond += roads.lanes[lane]["length_m"]
         if not roads.lanes[lane]["internal"]:
+            road_m += roads.lanes[lane]["length_m"]
             room += roads.lanes[lane]["length_m"]
         if room >= needed or beyond > EXIT_LOOK_M:
             return False
@@ -225,7 +244,7 @@ def exit_blocked(
         lane, way, ahead = next_step(roads, travel, lane, way)
         if lane < 0:
             return False
-        if ahead >= 0 and is_red(roads, ahead, phase):
+        if ahead >= 0 and _waits_at(roads, ahead, road_m, needed, phase):
             return True
     return False
 
