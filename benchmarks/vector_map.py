@@ -211,4 +211,7 @@ def _middle(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np
         sides.append(np.stack([np.interp(at, along, axis) for axis in side.T], axis=1))
     middle: NDArray[np.float64] = 0.5 * (sides[0] + sides[1])
     keep = np.concatenate([[True], np.hypot(*np.diff(middle, axis=0).T) > 1e-6])
-    return middle[keep] if keep.sum() >= 2 else middle + np.array([[0.0, 0.0], [1e-3, 0.0]])[:count]
+    if keep.sum() < 2:  # a lanelet without a length
+        middle[-1, 0] += 1e-3
+        keep[-1] = True
+    return np.asarray(middle[keep], dtype=np.float64)
