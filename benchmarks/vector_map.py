@@ -65,7 +65,8 @@ class VectorMap:
         if projector != {"projector_type": "Local"}:
             raise MapError(f"{folder}: projector {projector}: must be of type Local")
         try:
-            root = ElementTree.parse(folder / "lanelet2_map.osm").getroot()
+            text = (folder / "lanelet2_map.osm").read_text(encoding="utf-8")
+            root: Element = ElementTree.fromstring(text)
         except (OSError, ElementTree.ParseError) as error:
             raise MapError(f"{folder}: no vector map ({error})") from error
         self.lanelets = _read(root)
@@ -143,7 +144,7 @@ def _read(root: Element) -> list[MapLanelet]:
         if tags.get("subtype") == "traffic_light":
             lights.add(number)
         elif tags.get("subtype") == "right_of_way":
-            roles = defaultdict(list)
+            roles: dict[str, list[int]] = defaultdict(list)
             for role, ref in _members(relation):
                 roles[role].append(ref)
             rights.append(roles)
@@ -208,6 +209,9 @@ def _middle(left: NDArray[np.float64], right: NDArray[np.float64]) -> NDArray[np
             continue
         at = np.linspace(0.0, 1.0, count)
         sides.append(np.stack([np.interp(at, along, axis) for axis in side.T], axis=1))
-    middle = 0.5 * (sides[0] + sides[1])
+    middle: NDArray[np.float64] = 0.5 * (sides[0] + sides[1])
     keep = np.concatenate([[True], np.hypot(*np.diff(middle, axis=0).T) > 1e-6])
-    return middle[keep] if keep.sum() >= 2 else middle + np.array([[0.0, 0.0], [1e-3, 0.0]])[:count]
+    if keep.sum() < 2:  # a lanelet without a length
+        middle[-1, 0] += 1e-3
+        keep[-1] = True
+    return np.asarray(middle[keep], dtype=np.float64)

@@ -118,7 +118,7 @@ def test_another_projector_is_refused(folder: Path, tmp_path: Path) -> None:
 
 @pytest.mark.integration
 def test_the_stand_in_arrives_without_an_incident(folder: Path) -> None:
-    spec = WorldSpec.of("grid4x4", background=16, seed=3, overrides={"traffic.max_trip_m": 300})
+    spec = WorldSpec.of("grid4x4", background=16, seed=4, overrides={"traffic.max_trip_m": 300})
     found = drive_by_topics(spec, folder, episodes=1, step_s=0.1, domain=DOMAIN)
     (row,) = found["rows"]
     assert (row["outcome"], row["events"]) == ("arrived", "1 arrived")

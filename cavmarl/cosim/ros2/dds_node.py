@@ -89,7 +89,9 @@ class DdsNode:
                 domain, qos=quality.Qos(quality.Policy.Userdata(b"enclave=/;"))
             )
             self._writers = {
-                topic: self._writer(f"rt{topic}", kind, topic in latched)
+                topic: self._writer(
+                    f"rt{topic}", kind, topic in latched, 1 if topic in latched else _KEPT_SAMPLES
+                )
                 for topic, kind in publishers.items()
             }
             self._readers = {
@@ -161,7 +163,7 @@ class DdsNode:
             self._dds["core"].Entity.__del__(participant)
         self._domain = None
 
-    def _writer(self, topic: str, kind: str, latched: bool, depth: int = _KEPT_SAMPLES) -> Any:
+    def _writer(self, topic: str, kind: str, latched: bool, depth: int) -> Any:
         return self._dds["pub"].DataWriter(
             self._participant,
             self._dds["topic"].Topic(self._participant, topic, self._class_of(kind)),

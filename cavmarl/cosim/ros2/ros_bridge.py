@@ -275,7 +275,7 @@ class RosBridge:
         due_ns = clock.now_ns - self._options.lag_steps * clock.step_ns
         if self._is_commanded:
             self._drain(bases)
-        if self._options.wait == "stamp" and bases:
+        if self._options.wait == "stamp":
             self._await(bases, due_ns)
         answers = {}
         for name in bases:
@@ -286,18 +286,19 @@ class RosBridge:
 
     def _await(self, bases: Mapping[str, float], due_ns: int) -> None:
         """Wait until each vehicle has a command of this time, or until the deadline."""
-        began_s = time.monotonic()
 
         def late() -> list[str]:
             return [name for name in bases if self._controls[name].stamp_ns < due_ns]
 
         # If no node publishes commands of a vehicle, the step does not wait for them.
-        self._until(
-            self._options.deadline_s, lambda: not any(map(self._has_publisher, late())), bases
-        )
+        if self._is_commanded:
+            began_s = time.monotonic()
+            self._until(
+                self._options.deadline_s, lambda: not any(map(self._has_publisher, late())), bases
+            )
+            self.wait_wall_s += time.monotonic() - began_s
         for name in late():
             self._controls[name].counts.late += 1
-        self.wait_wall_s += time.monotonic() - began_s
 
     def _until(
         self, seconds: float, is_done: Callable[[], bool], bases: Mapping[str, float]

@@ -8,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import yaml
 
 import cavmarl
 from cavmarl.cli import main
-from cavmarl.cosim.ros2.ros_types import RosTypes
+from cavmarl.cosim.ros2.ros_bag import BagWriter
+from cavmarl.cosim.ros2.ros_types import RosMessage, RosTypes
 from tests.cosim.ros2.conftest import Driver
 
 pytestmark = pytest.mark.integration
@@ -96,3 +98,24 @@ def test_a_recording_becomes_a_bag(tmp_path: Path, capsys: pytest.CaptureFixture
     with pytest.raises(SystemExit):
         main(["replay", str(run), "--rosbag2", str(bag)])
     assert "a bag cannot be made there" in " ".join(capsys.readouterr().err.split())
+
+
+@pytest.mark.parametrize(("distro", "version"), [("humble", 8), ("jazzy", 9), ("kilted", 9)])
+def test_a_bag_has_the_metadata_that_its_distribution_reads(
+    distro: str, version: int, tmp_path: Path
+) -> None:
+    from rosbags.rosbag2 import Reader
+
+    bag, kind = tmp_path / "bag", "std_msgs/msg/UInt8MultiArray"
+    types = RosTypes(distro)
+    with closing(BagWriter(bag, types, {"/a": kind})) as writer:
+        writer.write(RosMessage("/a", kind, 7, {"data": b"abc"}))
+    read = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    assert read["version"] == version
+    (topic,) = read["topics_with_message_count"]
+    # up to version 8, profiles are text; Humble reads no others
+    assert isinstance(topic["topic_metadata"]["offered_qos_profiles"], str) == (version == 8)
+    with Reader(bag) as reader:
+        ((_, when_ns, data),) = reader.messages()
+    assert when_ns == 7
+    assert bytes(types.decode(kind, bytes(data)).data) == b"abc"

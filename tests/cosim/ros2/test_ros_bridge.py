@@ -94,6 +94,44 @@ def test_the_world_equals_that_of_a_follower_with_the_same_controls(
     thread.join(10.0)
 
 
+def test_a_follower_of_autowares_topics_drives_bit_for_bit_as_one_of_the_socket(
+    types: RosTypes, domain: int, run_bridge: Run, tmp_path: Path
+) -> None:
+    def wave(tick: int) -> tuple[float, float]:
+        """Return acceleration and angle as a message has them, in single precision."""
+        return float(np.float32(math.sin(0.7 * tick))), float(np.float32(0.1 * math.cos(tick)))
+
+    def control(stamp: int) -> dict[str, Any]:
+        time_ = {"sec": stamp // 10**9, "nanosec": stamp % 10**9}
+        push, angle = wave(stamp // 50_000_000)
+        given = {"acceleration": push, "is_defined_acceleration": True}
+        return {"stamp": time_, "longitudinal": given, "lateral": {"steering_tire_angle": angle}}
+
+    commands = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
+    with Driver(types, domain, None, control, commands):
+        options = RosOptions(domain=domain, profile="autoware", truth=True)
+        report, bridged = run_bridge(options, 40)
+    assert report["controls"]["car_0"]["used"] == 41
+    place = tmp_path / "socket"
+    with closing(make_env()) as env, FollowedWorld(env, place) as world:
+
+        def follow() -> None:
+            with Follower(str(place), ["car_0"]) as follower:
+                most = follower.welcome.acceleration_mps2, follower.welcome.steering_rad
+                for view in follower:
+                    push, angle = wave(view.snapshot.tick)
+                    follower.answer({"car_0": [push / most[0], angle / most[1]]})
+
+        thread = threading.Thread(target=follow, daemon=True)
+        thread.start()
+        world.wait_for(1, 20.0)
+        world.reset(seed=3)
+        for _ in range(40):
+            world.step()
+        assert env.state_hash() == bridged
+    thread.join(10.0)
+
+
 def test_without_commands_the_vehicle_brakes_and_a_warning_is_logged(
     domain: int, run_bridge: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
