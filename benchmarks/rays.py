@@ -135,9 +135,9 @@ class _Sensors:
         self._num = int(simulation.outputs.present.sum())
         sensors = mount(simulation.config.rig, mounted.platform)
         self._sensors = {sensor.name: sensor for sensor in sensors}
-        counts = (np.full(1, value, dtype=np.int64) for value in (1, 0, 0))
         everyone = np.ones(simulation.config.population.num_ids, dtype=np.bool_)
-        self._due = Due(*counts, everyone)
+        one = np.ones(1, dtype=np.int64)
+        self._due = Due(one, 0 * one, 0 * one, everyone)
 
     def time_us(self, name: str) -> float:
         """Return the time of one sample of one vehicle, µs."""

@@ -78,7 +78,7 @@ class ResourceWatch:
 
     def _observed(self, pid: int, migrations: float = np.nan) -> tuple[float, ...]:
         """Return processor time and memory of a process, and NaN for what is not observed."""
-        unknown = (*(np.nan,) * (len(RESOURCE) - 8), migrations)
+        unknown = (*(np.nan,) * (len(RESOURCE.names or ()) - 8), migrations)
         try:
             process = psutil.Process(pid)
             times, memory_bytes = process.cpu_times(), process.memory_info().rss

@@ -57,7 +57,7 @@ class Surroundings:
         self._grid = make_grid(network.extent_m, _CELL_M, capacity)
         self._rows = np.zeros((1, capacity), VEHICLE)
         one = np.ones(1, np.int64)
-        self._due = Due(*(one * value for value in (1, 0, 0)), np.ones(1, dtype=np.bool_))
+        self._due = Due(one, 0 * one, 0 * one, np.ones(1, dtype=np.bool_))
         self._measure: Any = specialized(measure_lidar)
         self._blank = blank_vehicle()
 

@@ -141,8 +141,8 @@ class _Mounted:
         self, place: int, sensor: MountedSensor[Any], frames: SensorFrames, platform: Platform
     ) -> None:
         self.frames = frames
-        counts = (np.zeros(platform.num_worlds, dtype=np.int64) for _ in range(NUM_COUNTS))
-        due = Due(*counts, sensor.carriers)
+        num, first, slot = np.zeros((NUM_COUNTS, platform.num_worlds), dtype=np.int64)
+        due = Due(num, first, slot, sensor.carriers)
         self.turn = Turn(place, sensor, due, frames)
         self._schedule = _schedule_of(sensor.config, platform, frames.lost.shape[2])
         self._sim_dt_s = platform.sim_dt_s
