@@ -166,8 +166,8 @@ class WaySearch:
 
         `i`: row of a vehicle outside junctions. `knows`: whether it knows the measured speeds;
         otherwise the limits are used. Closings are known to all. `anyhow`: whether to leave the
-        present way even for a slower one. `stands`: whether it stands, and so needs no room to brake
-        before a lane change.
+        present way even for a slower one. `stands`: whether it stands, and so needs no room to
+        brake before a lane change.
         """
         row = self._rows[i]
         permission = self._permission(i)
