@@ -97,7 +97,7 @@ def _foes(
     """Return the vehicles on, or first before, the links to which a link must yield."""
     first = int(network.links["first_conflict"][link])
     conflicts = network.conflicts[first : first + int(network.links["num_conflicts"][link])]
-    found = []
+    found: list[int] = []
     for foe in conflicts["foe"][conflicts["must_yield"]].tolist():
         lane = int(network.links["next_lane"][foe])
         while network.lanes["internal"][lane]:

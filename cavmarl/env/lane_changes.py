@@ -121,7 +121,7 @@ class LaneChanges:
             )
         limit_mps, closed = self._now(world)
         limit_mps[rows] = speed_mps
-        event = DAMAGED, f"{_detail(edge, lanes)} {speed_mps!r}"
+        event = DAMAGED, f"{_detail(edge, lanes)} {float(speed_mps)!r}"
         self._tell(world, limit_mps, closed, event)
 
     def closed(self, world: int) -> tuple[str, ...]:

@@ -19,7 +19,7 @@ def wrong_changes(told: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
 
     `told`: (W, N, 3) LANE_CHANGE. `lanes`: LANE (L,) of the map.
     """
-    if not np.isfinite(told).all() or (told < 0.0).any() or (told != told)[..., CHANGED].any():
+    if not np.isfinite(told).all() or (told < 0.0).any():
         return "a changed lane has a number that is negative or not finite"
     used = told[told[..., CHANGED] > 0.0]
     if (told[told[..., CHANGED] == 0.0] != 0.0).any():
