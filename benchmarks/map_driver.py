@@ -332,7 +332,10 @@ def _outline(each: Seen) -> NDArray[np.float64]:
     x = np.repeat(along, 2)
     y = np.tile([-0.5 * each.width_m, 0.5 * each.width_m], count)
     ahead = _direction(each.heading)
-    return each.place + x[:, None] * ahead + y[:, None] * np.array([-ahead[1], ahead[0]])
+    found: NDArray[np.float64] = (
+        each.place + x[:, None] * ahead + y[:, None] * np.array([-ahead[1], ahead[0]])
+    )
+    return found
 
 
 def _approach(speed: float, limit: float, distance_m: float) -> float:

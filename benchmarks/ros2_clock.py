@@ -26,6 +26,7 @@ from cavmarl.cli.output import OptionalEnvironment, about, with_world
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ClockError, ConfigError, EvaluationError
 from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.followers.follower_connection import Address
 from cavmarl.cosim.ros2 import FAST_DDS_PROFILE
 from cavmarl.cosim.ros2.bridged_world import BridgedWorld
 from cavmarl.cosim.ros2.ros_bridge import RosOptions
@@ -110,7 +111,7 @@ def measure_ros_drift(
     }
     rogues: list[_RogueFollower] = []
 
-    def follow(address: str | int) -> Follower:
+    def follow(address: Address) -> Follower:
         rogues.append(_RogueFollower(address, ["car_0"], "ros2"))
         rogues[-1].share = Fraction(str(rogue))
         return rogues[-1]

@@ -10,6 +10,7 @@ from typing import Any, Literal, Self
 from cavmarl.core.errors import CavmarlError
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower
+from cavmarl.cosim.followers.follower_connection import Address
 from cavmarl.cosim.ros2.ros_bridge import RosBridge, RosOptions
 from cavmarl.cosim.time_master import OwnTicks, Pacer
 from cavmarl.env.parallel import CavEnv
@@ -45,7 +46,7 @@ class BridgedWorld:
         *,
         pacer: Pacer | None = None,
         own_ticks: OwnTicks = "refuse",
-        follow: Callable[[str | int], Follower] | None = None,
+        follow: Callable[[Address], Follower] | None = None,
     ) -> None:
         self.report: dict[str, Any] = {}
         self._options = options

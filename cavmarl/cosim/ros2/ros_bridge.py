@@ -140,8 +140,11 @@ class RosBridge:
         self._is_first, self._is_commanded = True, False
         commands = {
             topic: kind
-            for each in (*self._controls.values(), *self._requests.values())
-            for topic, kind in each.topics.items()
+            for topics in (
+                *(each.topics for each in self._controls.values()),
+                *(each.topics for each in self._requests.values()),
+            )
+            for topic, kind in topics.items()
         }
         self._bag = (
             None
