@@ -36,7 +36,7 @@ from cavmarl.evaluate.statistics import mean_interval
 from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.limits.controllers import Feedback
+from cavmarl.limits.limit_controllers import Feedback
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
 FIRST_SEED = 1000  # of the evaluation

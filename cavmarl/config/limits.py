@@ -18,7 +18,7 @@ NO_LIMITS = "none"
 ALL_LIMITS = "all"
 
 BY_AGENTS: Literal["agents"] = "agents"
-LIMIT_CONTROLLERS = ("feedback",)  # see `limits.controllers`
+LIMIT_CONTROLLERS = ("feedback",)  # see `limits.limit_controllers`
 
 
 @dataclass(frozen=True)

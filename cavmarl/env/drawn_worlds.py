@@ -59,7 +59,7 @@ def check_rendering(
 
 
 def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
-    """Return the settings because of which this process cannot copy the worlds; else ""."""
+    """Return the settings that keep this process from copying the worlds; else ""."""
     if backend.is_local:
         return ""
     with_sumo = config.traffic.source != "native"

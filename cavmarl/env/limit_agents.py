@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.limits import LIMIT_TERMS
 from cavmarl.env.roadside_agents import RoadsideAgents
-from cavmarl.limits.controllers import LimitView
+from cavmarl.limits.limit_controllers import LimitView
 from cavmarl.limits.limit_table import LimitTable
 from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.roads.network import RoadNetwork
@@ -49,7 +49,7 @@ class LimitAgents(RoadsideAgents):
 
     @property
     def view(self) -> LimitView:
-        """The state for controllers; see `limits.controllers`."""
+        """The state for controllers; see `limits.limit_controllers`."""
         arrays = self._arrays
         return LimitView(
             config=self._config,
