@@ -116,12 +116,6 @@ class WorldViews:
         missing = "signals.agents = none: set it to all, or to a list of ids of signals"
         return self._part(SignalComponent, missing)
 
-    def lane_limits(self, world: int = 0) -> NDArray[np.float64]:
-        """Return the speed limit (L,) in m/s of each lane of a world, as it is now."""
-        lanes = self._shard.worlds.lanes
-        found: NDArray[np.float64] = lanes[world if len(lanes) > 1 else 0]["speed_mps"].copy()
-        return found
-
     @property
     def roadside(self) -> SignalComponent | LimitComponent:
         """The component of the signals or of the limits that are controlled."""
