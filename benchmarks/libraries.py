@@ -26,7 +26,7 @@ from cavmarl.bench.harness import (
 from cavmarl.cli.output import about
 from cavmarl.core.errors import MissingExtraError, require
 from cavmarl.env.parallel import parallel_env
-from cavmarl.env.signal_agents import VEHICLES
+from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.env.vector import make_vec
 
 WARM_STEPS = 3

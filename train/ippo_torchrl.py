@@ -31,7 +31,7 @@ from torchrl.objectives.value import GAE
 from cavmarl.adapters.observations import refuse_signal_agents
 from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 from cavmarl.config.registry import load_config
-from cavmarl.env.signal_agents import VEHICLES
+from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.log import WINDOW, curve_row

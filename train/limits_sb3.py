@@ -117,7 +117,7 @@ def imitate(args: Args, model: PPO, rows: CavSb3SignalEnv) -> None:
     """Let the network imitate the feedback controller."""
     feedback, units = Feedback(), rows.get_attr("limits")[0]
     seen, chosen = [], []
-    observations = rows.reset()
+    observations: Any = rows.reset()
     for _ in range(args.imitate):
         choices = np.maximum(feedback.choose(units.view), 0).reshape(-1)
         seen.append(observations)
@@ -126,7 +126,7 @@ def imitate(args: Args, model: PPO, rows: CavSb3SignalEnv) -> None:
     inputs, targets = torch.tensor(np.concatenate(seen)), torch.tensor(np.concatenate(chosen))
     optimizer = torch.optim.Adam(model.policy.parameters(), lr=IMITATION_RATE)
     for _ in range(IMITATION_PASSES):
-        for batch in torch.randperm(len(inputs)).split(IMITATION_BATCH):
+        for batch in torch.randperm(len(inputs)).split(IMITATION_BATCH):  # type: ignore[no-untyped-call]
             _, logarithms, _ = model.policy.evaluate_actions(inputs[batch], targets[batch])
             optimizer.zero_grad()
             (-logarithms.mean()).backward()  # type: ignore[no-untyped-call]
