@@ -4,13 +4,19 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import PolicyError
-from cavmarl.engine.spaces import flat_observation, flat_observation_space, observation_parts
+from cavmarl.engine.spaces import (
+    flat_observation,
+    flat_observation_space,
+    frames_space,
+    observation_parts,
+)
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.env.vector import CavVectorEnv
@@ -30,6 +36,15 @@ class Policy(ABC):
 
     def __init__(self, env: Environment) -> None:
         self.env = env
+
+    @cached_property
+    def _nothing(self) -> dict[str, NDArray[np.float64]]:
+        """Zeros for the sensors of a Dict that a vehicle of a fleet may not carry."""
+        config = self.env.config
+        if not (config.population.fleet and config.observation.mode == "sensors"):
+            return {}
+        spaces = frames_space(config).spaces
+        return {name: np.zeros(box.shape or ()) for name, box in spaces.items()}
 
     def reset(self, seed: int | None = None) -> None:  # noqa: B027 - most have nothing to reset
         """Start a new episode; `seed` seeds the random numbers of policies that use them."""
@@ -66,9 +81,9 @@ class Policy(ABC):
         mask = np.zeros((1, len(index)), dtype=np.bool_)
         for agent in live:
             seen = observations[agent]
-            batch[0, index[agent]] = (
-                flat_observation(names, seen, stack) if isinstance(seen, Mapping) else seen
-            )
+            if isinstance(seen, Mapping):
+                seen = flat_observation(names, {**self._nothing, **seen}, stack)
+            batch[0, index[agent]] = seen
             mask[0, index[agent]] = True
         actions = self.act_batch(batch, mask)[0]
         return {agent: actions[index[agent]] for agent in live}

@@ -15,6 +15,7 @@ from typing import Unpack
 from cavmarl.config.checks import check_count
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import ConfigError, WorkerDeathError
+from cavmarl.engine.compilation import compiled_before
 from cavmarl.verify.determinism import MAX_STEPS
 from cavmarl.verify.fault_campaign import (
     FaultCampaign,
@@ -82,10 +83,28 @@ def verify_node_faults(
         raise ConfigError(f"steps = {steps}: must be at least {FIRST_STEPS + 1}")
     count = 2 * max(nodes) if zones is None else zones
     spec = replace(given, overrides={"workers.timeout_s": TIMEOUT_S, **given.overrides})
+    if not compiled_before():
+        _let_nodes_compile(given, max(nodes), count, policy)
     lines = [FaultLine(number, fault) for number in nodes for fault in faults]
     run = partial(_run, spec, per_run, count, steps, policy)
     run_lines(lines, range(first_seed, first_seed + seeds), run, progress)
     return FaultCampaign(given.env, count, steps, tuple(lines))
+
+
+def _let_nodes_compile(spec: WorldSpec, nodes: int, zones: int, policy: str | Path) -> None:
+    """Let nodes, and the successor of a killed one, compile their kernels, without a campaign.
+
+    Compiling takes longer than `TIMEOUT_S`. In the campaign, all nodes would count as lost.
+    """
+    pair = ComparedWorlds(spec, nodes, zones, 1, policy)
+    drawn = random.Random(0)
+
+    def due(step: int) -> Callable[[], object] | None:
+        if nodes == 1 or step != FIRST_STEPS:
+            return None
+        return partial(pair.signal_node, drawn, signal.SIGKILL)
+
+    pair.compare(2 * FIRST_STEPS, due, lambda step: None)
 
 
 def _run(

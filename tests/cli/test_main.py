@@ -231,7 +231,10 @@ def test_verify_determinism_fails_and_names_the_first_difference(
         (("verify", "determinism", "merge", "--steps", "0"), "steps = 0: must be"),
         (("verify", "determinism", "merg"), "did you mean merge"),
         (("verify", "zones", "merge", "--steps", "0"), "steps = 0: must be"),
-        (("verify", "zones", "merge", "--zones", "1,x"), "--zones 1,x: must be numbers"),
+        (
+            ("verify", "zones", "merge", "--zones", "1,x"),
+            "--zones 1,x: must be comma-separated",
+        ),
         (("verify", "zones", "merge", "--zones", "0"), "zones = 0: must be whole numbers from 1"),
         (("verify", "zones", "merge", "--layout", "hexagons"), "zones.layout"),
         (("verify", "zones", "merge", "--layout", "none.json"), "none.json"),

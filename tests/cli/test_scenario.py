@@ -23,6 +23,7 @@ def test_the_list_has_all_scenarios_with_their_parameters(
     assert code("scenario", "list", "--json", str(tmp_path / "list.json")) == 0
     said = capsys.readouterr().out
     listed = json.loads((tmp_path / "list.json").read_text(encoding="utf-8"))
+    assert listed.pop("kind") == "scenario list"
     assert list(listed) == scenario_names()
     for name, about in listed.items():
         assert name in said

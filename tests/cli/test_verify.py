@@ -64,7 +64,7 @@ def test_each_check_has_the_options_that_apply(
     ("words", "message"),
     [
         ((), "name an environment; only --faults has a default"),
-        (("merge", "--nodes", "2,x"), "--nodes 2,x: must be numbers"),
+        (("merge", "--nodes", "2,x"), "--nodes 2,x: must be comma-separated whole numbers"),
         (("merge", "--nodes", "0"), "from 1 on"),
         (("merge", "--mix", "kill"), "--mix kill: goes with --faults"),
         (("merge", "--seeds", "2"), "--seeds 2: goes with --faults"),

@@ -70,7 +70,7 @@ def oversized() -> bytes:
     ("raw", "match"),
     [
         (b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n" + bytes(40), "does not begin a frame"),
-        (hello_in(1), "a frame has version 1, this end has 2: install the same version"),
+        (hello_in(1), f"a frame has version 1, this end has {VERSION}: install the same version"),
         (oversized(), "bytes is too large"),
         (hello_in(VERSION)[:-3] + b"\xff\xff\xff", "does not match its checksum"),
     ],

@@ -172,6 +172,26 @@ def test_the_policy_fleet_gives_each_part_its_driver() -> None:
 DRIVEN = [{"share": 2.0}, {"driver": "never_yield"}]
 
 
+def test_a_policy_acts_on_dicts_with_different_sensors() -> None:
+    class Seen(cavmarl.Policy):
+        """Keeps the flat observations that it gets."""
+
+        def act_batch(self, observations: Any, mask: Any) -> Any:
+            self.observations = observations.copy()
+            return np.zeros((*mask.shape, 2), dtype=np.float32)
+
+    flat = overrides(**{"observation.kind": "flat"})
+    env = cavmarl.parallel_env("grid4x4", overrides=overrides(), **SMALL)
+    batch = cavmarl.make_vec("grid4x4", overrides=flat, **SMALL)
+    policy = Seen(env)
+    observations, padded = env.reset(seed=3)[0], batch.reset(seed=3)[0]
+    for _ in range(3):
+        actions = policy.act(observations)
+        np.testing.assert_array_equal(policy.observations, padded)
+        assert sorted(actions) == sorted(observations)
+        observations, padded = env.step(actions)[0], batch.step(np.zeros((1, 6, 2)))[0]
+
+
 def test_bad_fleets_are_refused() -> None:
     def refused(match: str, **keys: Any) -> None:
         with pytest.raises(ConfigError, match=match):

@@ -258,9 +258,8 @@ def test_a_frame_of_another_tick_is_refused() -> None:
         mounted = vec.simulation.mounted
         assert mounted is not None
         sensor = mounted.rig.sensors[0]
-        turn = Turn(
-            0, sensor, sensor_workers.shared.due_of(0), vec.worlds.arrays.frames[sensor.name]
-        )
+        due = sensor_workers.shared.due_of(0, sensor.carriers)
+        turn = Turn(0, sensor, due, vec.worlds.arrays.frames[sensor.name])
         turn.due.num[:] = 1
         sensor_workers.shared.delivered[0, 0, 0] += 1
         with pytest.raises(WorkerError, match=r"rig\.wheels: the frame of tick 0 .* one of tick 1"):

@@ -109,6 +109,7 @@ def test_random_actions_repeat_with_the_seed() -> None:
 
 # Settings that scripted drivers require.
 NEEDED = {
+    "fleet": {"population.fleet": [{"driver": "idm"}]},
     "cacc": {
         "v2x.enabled": True,
         "sensors.messages.objects": 4,

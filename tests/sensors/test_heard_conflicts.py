@@ -83,7 +83,7 @@ def test_seen_and_heard_vehicles_count_at_their_reported_position() -> None:
             me = rows[i]
             numbers = observations[0, me["agent"]][part(vec)]
             told, hidden = reported(vec, me), hidden_from(rows, me)
-            plans = simulation.shards[0].plans
+            plans = simulation.plans
             twin = naive.conflicts(
                 simulation.network, plans, rows, i, {}, COUNT, RANGE_M, hidden, told
             )

@@ -129,7 +129,7 @@ def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> Non
     assert asking(9) == []
     looks["reacted"] = 4
     looks["reacted"][8] = 7
-    assert asking(9, changed_at=7) == [0, 3]
+    assert asking(9, changed_at=7) == [3, 8]
     edge = int(roads.lanes[second]["edge"])
     assert looks[8]["seen"] == edge
     assert asking(9, edge) == [], "a vehicle that was there before counts as seen by the rerouter"
