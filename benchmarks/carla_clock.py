@@ -26,13 +26,13 @@ from benchmarks.program import run
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, about, about_file, with_world
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.cosim.carla.carla_map import CAR
 from cavmarl.cosim.carla.carla_server import CarlaServer
 from cavmarl.cosim.carla.carla_session import OtherTicks
 from cavmarl.cosim.carla.client_process import client_python, run_client_program
 from cavmarl.cosim.carla.hosted_world import LoadedWorlds
 from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
+from cavmarl.roads.network import CARS
 
 _HEADWAY_S = 2  # between departures of SUMO's vehicles
 
@@ -120,7 +120,7 @@ def measure_client_drift(
 def trips(spec: WorldSpec, number: int) -> str:
     """Return SUMO's demand: cars between random roads of a map, in its random order."""
     network = load_network(find_map(spec.env))
-    for_cars = (network.lanes["permissions"] & CAR) != 0
+    for_cars = (network.lanes["permissions"] & CARS) != 0
     moves = network.links[for_cars[network.links["from_lane"]]]
     edges = network.lanes["edge"]
     sources, targets = (np.unique(edges[moves[name]]) for name in ("from_lane", "to_lane"))

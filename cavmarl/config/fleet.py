@@ -11,8 +11,10 @@ fleet:
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from typing import Annotated, Literal
 
 import numpy as np
@@ -104,11 +106,14 @@ def parts_in_turn(fleet: Sequence[FleetPart], count: int) -> NDArray[np.int64]:
     Agent k belongs to the part that is farthest behind its share of k + 1 agents; of equal ones,
     to the first.
     """
-    shares = np.array([part.share for part in fleet])
-    shares /= shares.sum()
-    counts = np.zeros(len(fleet))
+    exact = [Fraction(part.share) for part in fleet]
+    unit = math.lcm(*(share.denominator for share in exact))
+    shares = [int(share * unit) for share in exact]  # whole numbers: ties do not depend on rounding
+    whole, behind = sum(shares), [0] * len(fleet)
     chosen = np.zeros(count, dtype=np.int64)
     for k in range(count):
-        chosen[k] = np.argmax(shares * (k + 1) - counts)
-        counts[chosen[k]] += 1.0
+        behind = [gap + share for gap, share in zip(behind, shares, strict=True)]
+        part = behind.index(max(behind))
+        behind[part] -= whole
+        chosen[k] = part
     return chosen

@@ -13,13 +13,12 @@ from numpy.typing import NDArray
 from cavmarl.config.terms import TERMS
 from cavmarl.core.math.elementary import hypot
 from cavmarl.core.math.elementary_arrays import hypot_all
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 Rows = NDArray[np.void]
 
 METRICS_VERSION: Final = 2  # raise it whenever the meaning of a column or a metric changes
 
-PASSENGER = 1 << VEHICLE_CLASSES.index("passenger")
 TOLERANCE_M = 0.5  # largest deviation of an outline from the lane's centre
 
 
@@ -173,7 +172,7 @@ def _records(lines: Sequence[Sequence[str]], dtype: np.dtype[np.void]) -> Rows:
 def map_outline(network: RoadNetwork) -> dict[str, Any]:
     """Return centre lines of car lanes in m, rounded to 0.1 m, and their mean width."""
     lanes = network.lanes
-    open_lanes = np.flatnonzero(lanes["permissions"] & PASSENGER != 0)
+    open_lanes = np.flatnonzero(lanes["permissions"] & CARS != 0)
     lines = [_simplified(network.lane_polyline(int(lane))[:, :2]) for lane in open_lanes]
     return {
         "name": network.name,

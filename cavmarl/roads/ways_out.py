@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
-
-_CARS = 1 << VEHICLE_CLASSES.index("passenger")
+from cavmarl.roads.network import CARS, RoadNetwork
 
 
 def shut_in_roads(network: RoadNetwork, closed: NDArray[np.uint32]) -> NDArray[np.bool_]:
@@ -21,8 +19,8 @@ def shut_in_roads(network: RoadNetwork, closed: NDArray[np.uint32]) -> NDArray[n
         closed: (L,) bits of the classes that each lane is closed to.
     """
     lanes, links, num = network.lanes, network.links, len(network.edges)
-    on_map = (lanes["permissions"] & _CARS) != 0
-    is_open = on_map & ((closed & _CARS) == 0)
+    on_map = (lanes["permissions"] & CARS) != 0
+    is_open = on_map & ((closed & CARS) == 0)
     source, target = links["from_lane"], links["to_lane"]
     for_cars = on_map[source] & on_map[target]
     edges = lanes["edge"]

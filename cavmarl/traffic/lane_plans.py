@@ -11,10 +11,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.roads.kernels.plans import plan_goal
-from cavmarl.roads.network import VEHICLE_CLASSES
+from cavmarl.roads.network import CARS
 from cavmarl.traffic.kernels.way_requests import CLOSED_S
-
-_CARS = 1 << VEHICLE_CLASSES.index("passenger")
 
 
 class LanePlans:
@@ -64,7 +62,7 @@ class LanePlans:
         `lanes`: LANE (L,) of the world.
         """
         on_map = self._roads.lanes
-        closed = ((on_map["permissions"] & _CARS) != 0) & ((lanes["permissions"] & _CARS) == 0)
+        closed = ((on_map["permissions"] & CARS) != 0) & ((lanes["permissions"] & CARS) == 0)
         differs = closed.copy()
         if self._follows_limits:
             differs |= lanes["speed_mps"] != on_map["speed_mps"]
@@ -85,6 +83,6 @@ class LanePlans:
         now.setflags(write=False)
         roads = self._roads._replace(lanes=now)
         for goal, edge in enumerate(self._goal_edges.tolist()):
-            plan_goal(roads, edge, _CARS, 1.0, own[goal])
+            plan_goal(roads, edge, CARS, 1.0, own[goal])
         self._shifts[world] = self._first + (1 + world) * self._base.size
         return True

@@ -32,7 +32,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.cosim.carla.carla_geometry import CarlaPose, carla_pose
 from cavmarl.cosim.carla.navigation_mesh import NavigationMesh, make_navigation_mesh
 from cavmarl.maps.components import strong_components
-from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.shown_signals import signal_codes
 
 RED, YELLOW, GREEN, OFF = 0, 1, 2, 3  # CARLA's numbers of states of traffic lights, strict first
@@ -47,7 +47,6 @@ SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
 _SPAWN_EVERY_M = 40.0
 _FIRST_SPAWN_M = 15.0  # from the start of a longer lane
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
-CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _SIGNAL = re.compile(r"<signal\s([^>]*)>")
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
 _BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
@@ -179,7 +178,7 @@ def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
     lanes: list[int] = []
     for lane, row in enumerate(network.lanes):
         length = float(row["length_m"])
-        if row["internal"] or not row["permissions"] & CAR or length < _SHORTEST_M:
+        if row["internal"] or not row["permissions"] & CARS or length < _SHORTEST_M:
             continue
         places = np.arange(_FIRST_SPAWN_M, length - _FIRST_SPAWN_M, _SPAWN_EVERY_M).tolist()
         for s in places or [0.5 * length]:
@@ -194,7 +193,7 @@ def spawn_points(network: RoadNetwork) -> list[CarlaPose]:
 def _in_largest_part(network: RoadNetwork) -> NDArray[np.bool_]:
     """Return (lanes,) whether a lane is in the largest part in which cars can reach each lane."""
     lanes, links = network.lanes, network.links
-    for_cars = (lanes["permissions"] & CAR) != 0
+    for_cars = (lanes["permissions"] & CARS) != 0
     arcs = [np.stack([links["from_lane"], links["to_lane"]], axis=1)]
     for side in ("left", "right"):
         there = np.flatnonzero(lanes[side] >= 0)

@@ -20,13 +20,13 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import MapError
 from cavmarl.cosim.carla import client_map_reader
 from cavmarl.cosim.carla.carla_geometry import carla_pose
-from cavmarl.cosim.carla.carla_map import CAR, SPAWN_HEIGHT_M, spawn_points
+from cavmarl.cosim.carla.carla_map import SPAWN_HEIGHT_M, spawn_points
 from cavmarl.cosim.carla.client_process import run_client_program
 from cavmarl.maps.exports.opendrive import carla_document
 from cavmarl.maps.exports.opendrive_carla import LIGHT_TYPE
 from cavmarl.maps.map_kinds import map_kind
 from cavmarl.maps.net_document import NetDocument
-from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 Poses = NDArray[np.float64]  # (n, 4): x, y, z in m and yaw in degrees, in CARLA's frame
 
@@ -145,7 +145,7 @@ class _Questions:
 
     def __init__(self, network: RoadNetwork) -> None:
         lanes, links = network.lanes, network.links
-        for_cars = (lanes["permissions"] & CAR) != 0
+        for_cars = (lanes["permissions"] & CARS) != 0
         rows = np.flatnonzero(for_cars & ~lanes["internal"]).tolist()
         every_m = max(_EVERY_M, float(lanes["length_m"][rows].sum()) / _MOST_POINTS)
         self.lanes = _poses(

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, RoadNetwork
 
 GAP_M = 0.3  # between a road and its strip
 WIDTH_M = 2.0  # of a strip
@@ -25,7 +25,6 @@ _STEP_M = 5.0  # length of a piece of a strip
 _FARTHEST_M = 60.0  # a longer corner is left out
 _LEAST_AREA_M2 = 0.05
 _MOST_VERTICES = 60_000  # of a tile, whose indices have 16 bits
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 
 # Detour's numbers of areas and flags in the client.
 _SIDEWALK, _CROSSWALK = (1, 0x02), (2, 0x04)
@@ -102,7 +101,7 @@ def mesh_shapes(
     for edge, row in enumerate(network.edges):
         first = int(row["first_lane"])
         lanes = network.lanes[first : first + int(row["num_lanes"])]
-        if row["internal"] or not (lanes["permissions"] & _CAR).any():
+        if row["internal"] or not (lanes["permissions"] & CARS).any():
             continue
         line, inner, outer = _beside(network, first, side, step_m)
         number = len(line)

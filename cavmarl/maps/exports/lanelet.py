@@ -25,9 +25,8 @@ from cavmarl.core.records.codes import (
 from cavmarl.maps.exports.geojson import unproject_points
 from cavmarl.maps.exports.lane_borders import LEFT, RIGHT, LaneBorders
 from cavmarl.maps.projection import unproject
-from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import CARS, VEHICLE_CLASSES, RoadNetwork
 
-_CAR = 1 << VEHICLE_CLASSES.index("passenger")
 _BICYCLE = 1 << VEHICLE_CLASSES.index("bicycle")
 _TURNS = {"s": "straight", "l": "left", "L": "left", "t": "left", "r": "right", "R": "right"}
 # The id of a regulatory element is one of these, plus the row of its link.
@@ -75,7 +74,7 @@ def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -
             "subtype": "road" if int(row["permissions"]) != _BICYCLE else "bicycle_lane",
             "location": "urban",
             "one_way": "yes",
-            "participant:vehicle": "yes" if int(row["permissions"]) & _CAR else "no",
+            "participant:vehicle": "yes" if int(row["permissions"]) & CARS else "no",
             "speed_limit": f"{row['speed_mps'] * 3.6:.1f} km/h",
             "name": network.lane_ids[lane],
         }

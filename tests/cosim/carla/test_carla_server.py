@@ -135,7 +135,10 @@ def test_a_client_that_stops_reading_is_left_out_and_then_dropped() -> None:
         thread = threading.Thread(target=server.run, args=(is_over,), daemon=True)
         thread.start()
         with Wire(server.port) as wire:
-            with listen_to(server.port, EPISODE_STREAM):
+            with listen_to(server.port, EPISODE_STREAM) as deaf:
+                deaf.setsockopt(
+                    socket.SOL_SOCKET, socket.SO_RCVBUF, 1
+                )  # it is full after few ticks
                 rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
                 wire.call("set_episode_settings", [True, False, [False], *rest])
                 while server.session.streams.connections and not is_over():
