@@ -61,7 +61,7 @@ class RegisteredOutputs:
         if not self._may_change:
             return self._network
         if w not in self._networks:
-            self._networks[w] = replace(self._network, lanes=worlds.lanes[w])
+            self._networks[w] = replace(self._network, lanes=worlds.lanes[1 + w])
         return self._networks[w]
 
     def _write_agents(

@@ -143,14 +143,14 @@ class Shard:
         if first is None and (more := override_columns(config, network)):
             columns = zeros((num_worlds, len(network.signals) + more), dtype=np.int32)
             self.worlds = self.worlds._replace(signal_phase=columns)
-        # `Worlds.lanes` of worlds that may change lanes, for writing; (0, L): they may not
+        # LANE (W, L), for writing: the tables in `Worlds.lanes` of worlds that may change lanes
         self.own_lanes: NDArray[np.void] = (
-            make_lane_table(config, network, num_worlds, zeros)
-            if first is None
-            else first.own_lanes
+            network.arrays.lanes[np.newaxis][:0] if first is None else first.own_lanes
         )
-        if first is None and len(self.own_lanes):
-            self.worlds = self.worlds._replace(lanes=_read_only(self.own_lanes))
+        if first is None and config.may_change_lanes:
+            tables = make_lane_tables(network, num_worlds, zeros)
+            self.worlds = self.worlds._replace(lanes=_read_only(tables))
+            self.own_lanes = tables[1:]
         self.sides = (self.worlds.rows, zoned.rows[1, zone])
         self.side = self.next_side = 0
         # `side` and `next_side` for kernels: (2,), one array for all shards of this process.
@@ -246,14 +246,12 @@ def make_worlds(
     return worlds._replace(**{name: getattr(common, name) for name in COMMON})
 
 
-def make_lane_table(
-    config: EnvConfig, network: RoadNetwork, num_worlds: int, zeros: Zeros
-) -> NDArray[np.void]:
-    """Return LANE (W, L), the lanes of the map for each world, or (0, L) if lanes never change."""
+def make_lane_tables(network: RoadNetwork, num_worlds: int, zeros: Zeros) -> NDArray[np.void]:
+    """Return LANE (1 + W, L): the lanes of the map, and again for each world."""
     lanes = network.arrays.lanes
-    own = zeros((num_worlds if config.may_change_lanes else 0, len(lanes)), dtype=lanes.dtype)
-    own[:] = lanes
-    return own
+    tables = zeros((1 + num_worlds, len(lanes)), dtype=lanes.dtype)
+    tables[:] = lanes
+    return tables
 
 
 def _read_only(array: NDArray[np.void]) -> NDArray[np.void]:

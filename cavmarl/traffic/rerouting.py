@@ -174,7 +174,7 @@ class Rerouting:
         )
         if found == 0:
             return 0
-        lanes = worlds.lanes[w if len(worlds.lanes) > 1 else 0]
+        lanes = worlds.lanes[1 + w if len(worlds.lanes) > 1 else 0]
         closed = self._closed(clock_s)
         traffic = Traffic(self._speed_sums[w], self._past.shape[1], closed, lanes)
         search = WaySearch(self._roads, self._travel, self._slots, w, rows, num, traffic)

@@ -187,7 +187,7 @@ def test_limits_hold_beside_changes_of_the_caller() -> None:
         far = edges == vec.network.edge_ids.index("far")
 
         def limits_mps() -> NDArray[Any]:
-            found: NDArray[Any] = vec.simulation.worlds.lanes["speed_mps"][0, far]
+            found: NDArray[Any] = vec.simulation.worlds.lanes["speed_mps"][1, far]
             return found
 
         assert limits_mps().tolist() == [27.78] * 3

@@ -13,7 +13,8 @@ Three changes shorten the first compilation (decision 002):
   from Python, not cached, and optimised once, together with its caller. Numba makes each kernel
   callable, caches it and optimises it.
 - A bundle of arrays is passed as one address and read in place. Numba passes each array as seven
-  numbers, and rebuilds the bundle in the called function.
+  numbers, and rebuilds the bundle in the called function. A bundle that a kernel creates is stored
+  where it is assigned, once for all calls; the next execution of that line overwrites it.
 - Without reference counts, no code is generated for the end of a variable's life.
 """
 
@@ -29,7 +30,7 @@ from typing import Any
 import numba
 from llvmlite import ir
 from llvmlite.binding import ModuleRef, Target, get_process_triple
-from numba.core.cgutils import alloca_once_value, gep_inbounds
+from numba.core.cgutils import alloca_once, alloca_once_value, gep_inbounds
 from numba.core.codegen import CodeLibrary, JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 from numba.core.compiler_lock import global_compiler_lock
@@ -78,10 +79,14 @@ def _is_bundle(kind: Any) -> bool:
     return isinstance(kind, NamedTuple) and kind.instance_class.__module__.startswith("cavmarl.")
 
 
-def _borrow(builder: Any, address: Any) -> Any:
-    """Load the value at an address as borrowed; LLVM reads only the parts that are used."""
+def _borrow(builder: Any, address: Any, is_fixed: bool) -> Any:
+    """Load the value at an address as borrowed; LLVM reads only the parts that are used.
+
+    `is_fixed`: whether the address and what it holds are the same in the whole function.
+    """
     value = builder.load(address)
     value.borrowed = True
+    value.is_fixed = is_fixed
     return value
 
 
@@ -122,7 +127,7 @@ class _BundleModel(_Model):  # type: ignore[misc]
         """Return the bundle at that address."""
         if not _is_bundle(self._fe_type):
             return super().from_argument(builder, value)
-        return _borrow(builder, value)
+        return _borrow(builder, value, is_fixed=True)
 
 
 _manager: Any = default_manager
@@ -141,6 +146,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         """Count the assignments of each variable."""
         super().init()
         self._bundles: dict[str, Any] = {}
+        self._addresses: dict[str, Any] = {}  # variables with the address of one of several bundles
         self._fields: dict[tuple[Any, int], Any] = {}
         blocks = self.blocks.values()
         self._assigned = Counter(
@@ -162,7 +168,9 @@ class _KernelLower(_Lower):  # type: ignore[misc]
             kind = self.typeof(expr.value.name)
             bundle: Any = self.loadvar(expr.value.name) if _is_bundle(kind) else None
             if _is_borrowed(bundle):
-                return self._read(bundle.operands[0], kind.fields.index(expr.attr), resty)
+                place = kind.fields.index(expr.attr)
+                read = self._read if bundle.is_fixed else self._read_here
+                return read(bundle.operands[0], place, resty)
         return super().lower_expr(resty, expr)
 
     def create_cpython_wrapper(self, release_gil: bool = False) -> None:
@@ -174,25 +182,41 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         if (address, place) not in self._fields:
             with self.builder.goto_entry_block():
                 field = _field(self.builder, address, 0, place)
-                is_bundle = _is_bundle(kind)
-                read = _borrow if is_bundle else _read_apart
-                self._fields[address, place] = read(self.builder, field)
+                self._fields[address, place] = self._read_field(field, kind, is_fixed=True)
         return self._fields[address, place]
 
+    def _read_here(self, address: Any, place: int, kind: Any) -> Any:
+        """Read a field of a bundle that is not the same in the whole function."""
+        return self._read_field(_field(self.builder, address, 0, place), kind, is_fixed=False)
+
+    def _read_field(self, address: Any, kind: Any, is_fixed: bool) -> Any:
+        if _is_bundle(kind):
+            return _borrow(self.builder, address, is_fixed)
+        return _read_apart(self.builder, address)
+
     def _alloca_var(self, name: str, fetype: Any) -> None:
-        if name not in self._bundles:
+        if name not in self._bundles and name not in self._addresses:
             super()._alloca_var(name, fetype)
 
     def loadvar(self, name: str) -> Any:
         """Return a borrowed bundle without copying it into a variable."""
+        if name in self._addresses:
+            address = self.builder.load(self._addresses[name])
+            return _borrow(self.builder, address, is_fixed=False)
         return self._bundles[name] if name in self._bundles else super().loadvar(name)
 
     def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
-        """Store a value without reading the variable's previous one."""
+        """Store a value without reading the variable's previous one; of a bundle, its address."""
         if self.context.enable_nrt or name in self._singly_assigned_vars:
             super().storevar(value, name, argidx)
-        elif _is_bundle(self.typeof(name)) and _is_borrowed(value) and self._assigned[name] == 1:
-            self._bundles[name] = value
+        elif _is_bundle(self.typeof(name)):
+            if _is_borrowed(value) and value.is_fixed and self._assigned[name] == 1:
+                self._bundles[name] = value
+                return
+            address = value.operands[0] if _is_borrowed(value) else _copy(self.builder, value)
+            if name not in self._addresses:
+                self._addresses[name] = alloca_once(self.builder, address.type)
+            self.builder.store(address, self._addresses[name])
         else:
             self._alloca_var(name, self.typeof(name))
             self.builder.store(value, self.getvar(name))

@@ -123,7 +123,7 @@ class Worlds(NamedTuple):
     num_outer: NDArray[np.int64]  # (W,) -1: not up to date with the rows
     cues: NDArray[np.int64]  # (W, T) tick of each cue of the script, -1: not yet
     # LANE (V, L) the lanes as they are now, see `lanes_now`; V is 1 if no world may change lanes,
-    # else W
+    # else 1 + W
     lanes: NDArray[np.void]
 
 

@@ -1,7 +1,7 @@
 """The lanes of a world as they are now: with the limits and closures that differ from the map.
 
-Worlds that may change lanes have a table LANE (W, L). Otherwise all worlds share the lanes of the
-map, LANE (1, L).
+Table 0 of LANE (V, L) has the lanes of the map. If worlds may change lanes, table 1 + w has those
+of world w, and V is 1 + W. Otherwise V is 1, and all worlds share table 0.
 """
 
 from __future__ import annotations
@@ -14,9 +14,18 @@ from cavmarl.core.records.arrays import RoadArrays
 
 
 @inlined_kernel
+def shares_lanes(lanes: NDArray[np.void]) -> bool:
+    """Return whether all worlds have the lanes of the map.
+
+    Most worlds do. Kernels then use the roads of the map, because to read `roads_in` costs more.
+    """
+    return lanes.shape[0] == 1
+
+
+@inlined_kernel
 def table_of(lanes: NDArray[np.void], w: int) -> int:
     """Return the row of `Worlds.lanes` with the lanes of world w."""
-    return w if lanes.shape[0] > 1 else 0
+    return 0 if shares_lanes(lanes) else 1 + w
 
 
 @inlined_kernel
@@ -40,8 +49,8 @@ def is_closed(roads: RoadArrays, lane: int, kind: np.void) -> bool:
 
 @inlined_kernel
 def roads_in(roads: RoadArrays, lanes: NDArray[np.void], w: int) -> RoadArrays:
-    """Return the roads of world w, with its lanes from `Worlds.lanes`."""
-    own_lanes = lanes[table_of(lanes, w)]
+    """Return the roads of world w, which does not share lanes, with its lanes in `Worlds.lanes`."""
+    own_lanes = lanes[1 + w]
     return RoadArrays(
         points=roads.points,
         lanes=own_lanes,

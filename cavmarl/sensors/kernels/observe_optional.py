@@ -11,7 +11,7 @@ from cavmarl.core.compiled import kernel
 from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
-from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, observe_lidar_cells
 from cavmarl.sensors.kernels.kinematics_observation import KinematicsSensor, observe_kinematics
@@ -70,7 +70,7 @@ def observe_optional(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]

@@ -34,7 +34,7 @@ from cavmarl.core.records.codes import (
 from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
-from cavmarl.roads.kernels.lanes_now import plans_of, roads_in
+from cavmarl.roads.kernels.lanes_now import plans_of, roads_in, shares_lanes
 from cavmarl.sensors.kernels.frame_stacks import has_entered, newest_frame, shift_frames
 from cavmarl.sensors.kernels.lidar_2d import lidar
 from cavmarl.sensors.kernels.observing_lanes import observe_lanes
@@ -287,7 +287,7 @@ def sense(
         if not chosen[w]:
             continue
         rows = worlds.rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         is_filled = False  # fill the grid on first use: many zones have no agents
         for i in range(worlds.num_owned[w]):
             row = rows[i]

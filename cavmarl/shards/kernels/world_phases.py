@@ -41,7 +41,7 @@ from cavmarl.driving.kernels.motion.highway_control import speed_control
 from cavmarl.driving.kernels.motion.motion import move_agent, move_background
 from cavmarl.driving.kernels.motion.scripted_rows import follow_script
 from cavmarl.driving.kernels.motion.steering import nearest_speed, steer_to_lane, take_meta_action
-from cavmarl.roads.kernels.lanes_now import plans_of, roads_in
+from cavmarl.roads.kernels.lanes_now import plans_of, roads_in, shares_lanes
 from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 
 
@@ -213,7 +213,7 @@ def advance(
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         step = worlds.step[w]
         owned = worlds.num_owned[w]
         drivers = _decide_in_background(here, travel, worlds, w, dt, scratch)
@@ -302,7 +302,7 @@ def suggest(
     """Write the actions that the built-in driver would take for the agents."""
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         owned = worlds.num_owned[w]
         phase = worlds.signal_phase[w]
         index_lanes(here, travel, rows, worlds.num_rows[w], scratch)

@@ -30,7 +30,7 @@ from cavmarl.driving.kernels.junctions.approach import register_links
 from cavmarl.driving.kernels.junctions.swept_areas import foe_would_sweep_over
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
 from cavmarl.driving.kernels.lanes.route_following import fed_lane, next_step
-from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
 from cavmarl.traffic.kernels.demand_generator import enter
 from cavmarl.traffic.kernels.entering import (
     crowd,
@@ -71,7 +71,7 @@ def rank_lanes(
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         for q in range(departures.num_queue[w]):
             departure = departures.queue[w, q]
             code = departure["lane_code"]
@@ -127,7 +127,7 @@ def assign_lanes(
         if departures.num_queue[w] == 0:
             continue
         departures.lane_taken[:] = False
-        here = roads_in(roads, lanes, w)
+        here = roads if shares_lanes(lanes) else roads_in(roads, lanes, w)
         for q in range(departures.num_queue[w]):
             departure = departures.queue[w, q]
             lane = entry_lane(
@@ -262,7 +262,7 @@ def propose(
         if departures.num_queue[w] == 0:
             continue
         rows = worlds.next_rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         num = worlds.num_rows[w]
         key = worlds.keys[w]
         indexed = announced = False

@@ -46,7 +46,7 @@ from cavmarl.core.records.codes import (
 )
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import place_on_lane
-from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
 from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.traffic.kernels.entering import speed_at
 from cavmarl.traffic.kernels.own_plans import follows_plan, take_plan
@@ -342,7 +342,7 @@ def choose_goals(
     for w in range(worlds.ticks.shape[0]):
         if worlds.ticks[w] % turns != 0:
             continue
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         for i in range(worlds.num_owned[w]):
             row = worlds.next_rows[w, i]
             if follows_plan(row):

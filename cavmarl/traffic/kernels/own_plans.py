@@ -11,7 +11,7 @@ from cavmarl.core.records.arrays import RoadArrays, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import STANDING_MPS
-from cavmarl.roads.kernels.lanes_now import roads_in
+from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
 from cavmarl.traffic.kernels.way_requests import has_room
 
 
@@ -69,7 +69,7 @@ def renew_distances(roads: RoadArrays, travel: TripTables, worlds: Worlds, w: in
 
     `worlds`: the owned committed rows are written, before a step begins.
     """
-    here = roads_in(roads, worlds.lanes, w)
+    here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
     for i in range(worlds.num_owned[w]):
         row = worlds.rows[w, i]
         if row["driver"] != DRIVER_AGENT or row["way"] == row["goal"] * roads.lanes.shape[0]:
