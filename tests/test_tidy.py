@@ -67,7 +67,7 @@ PASSED_ON = {
     "cavmarl.evaluate.subprocess_calls._tell",
     "cavmarl.evaluate.subprocess_calls.call_in_fresh_process",
     "cavmarl.parallel.network.encryption.EncryptedSocket.sendmsg",
-    "cavmarl.policies.driver_network.LayerTable.add",
+    "cavmarl.networks.driver_network.LayerTable.add",
     "cavmarl.render.topdown.TopDownRenderer.frame",
 }
 

@@ -40,7 +40,7 @@ from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.parallel.worlds.local_worlds import kept_elsewhere
 from cavmarl.policies.loading import driver_keys, policy_files
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 PHASES = ("simulation", "transfer", "inference", "learning")
 RED_LIGHT = TERMS.index("red_light")

@@ -11,6 +11,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import sources_digest
 from cavmarl.core.extensions import plugin_hashes
 from cavmarl.handoff.simulators.simulator_kinds import describe_simulators
+from cavmarl.networks.background_driver import background_drivers
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -40,6 +41,9 @@ def describe_world(
         "demand_content_sha256": None if demand is None else demand.content_hash,
         "demand_tolerated": [] if demand is None else list(demand.tolerated),
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
+        "background_drivers": {  # SHA-256 by name
+            one.name: one.content_hash for one in background_drivers(config.traffic)
+        },
         "kernels": sources_digest(),
         "plugins": plugin_hashes(config.registered, config.plugins),  # SHA-256 by module
         "zones": partition.count,
