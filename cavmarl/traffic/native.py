@@ -207,6 +207,7 @@ class NativeTraffic:
             [generated_types(code) for code in codes] + [generated_types(codes[0])] * networks
         )
         types["network"][len(codes) :] = np.arange(networks) + 1
+        types.setflags(write=False)
         return types
 
     @cached_property
