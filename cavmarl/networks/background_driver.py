@@ -54,6 +54,8 @@ def background_drivers(traffic: TrafficConfig) -> tuple[BackgroundDriver, ...]:
 
 
 def _background_driver(name: str) -> BackgroundDriver:
+    if not name:
+        raise PolicyError(f"traffic.model = '{ZOO}': names no driver; name one of {_allowed()}")
     try:
         folder = find_driver(name)
     except PolicyError as error:
