@@ -20,6 +20,7 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.networks.driver_network import load_driver_network
 from cavmarl.policies.loading import policy_files
+from cavmarl.recordings.recording import Recording
 from cavmarl.shards.shard import Commands
 from tests.support.vec_runs import Make, drive, same
 from tests.support.world import tick_of
@@ -175,6 +176,51 @@ def test_the_hash_of_a_state_includes_the_memory() -> None:
         assert world.state_hash() != before, name
         owned(world)[0][name] = kept
     assert world.state_hash() == before
+
+
+def test_a_recording_shows_the_drivers_of_the_whole_and_the_divided_world(
+    make: Make, tmp_path: Path
+) -> None:
+    wanted: dict[str, Any] = {
+        "agents": 1,
+        "background": 20,
+        "max_cycles": 15,
+        "overrides": {"traffic.model": MIXED},
+    }
+    seen = []
+    for name, zones in (("whole", 1), ("divided", 4)):
+        path = tmp_path / name
+        vec = make("town", zones=zones, record=path, **wanted)
+        vec.reset(seed=4)
+        for _ in range(10):
+            vec.step(vec.suggest_actions())
+        vec.close()
+        frames = list(Recording.open(path).frames())
+        drivers = Recording.open(path).manifest["world"]["background_drivers"]
+        assert list(drivers) == ["cities_ippo", "intersection_ippo"]
+        assert DRIVER_LEARNED in frames[-1].vehicles["driver"]
+        seen.append([frame.vehicles[["id", "driver", "x", "y"]].tolist() for frame in frames])
+    assert len(seen[0]) == 11
+    assert seen[0] == seen[1]
+
+
+def test_a_vehicle_without_a_way_to_its_goal_gets_another_goal() -> None:
+    world = simulation("town", "zoo:cities_ippo", background=20)
+    row = owned(world)[0]
+    row["to_go"] = np.inf
+    number, goal = int(row["id"]), int(row["goal"])
+    steps = tick_of(world).traffic.travel.steps
+    num_lanes = len(world.network.lanes)
+    steps = steps[goal * num_lanes : (goal + 1) * num_lanes]
+    before = steps["to_go"].copy()
+    steps.setflags(write=True)
+    steps["to_go"] = np.inf
+    for _ in range(10):
+        world.step(idle_commands(world))
+    steps["to_go"] = before
+    row = owned(world)[owned(world)["id"] == number][0]
+    assert row["goal"] != goal
+    assert np.isfinite(row["to_go"])
 
 
 def load(model: Any, **more: Any) -> None:

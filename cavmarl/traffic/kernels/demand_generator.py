@@ -305,12 +305,15 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.v
     """Return whether a vehicle needs another goal: near its goal if trips are endless, or stuck.
 
     A background vehicle is stuck if it has waited for `GIVE_UP_S` at the end of a lane that its
-    way does not follow. Agents are never stuck.
+    way does not follow, or if a network has driven it to a lane without a way. Agents are never
+    stuck.
     """
     if row["driver"] == DRIVER_AGENT:
         return demand.endless and row["to_go"] <= WANDER_M
     if row["driver"] != DRIVER_BACKGROUND and row["driver"] != DRIVER_LEARNED:
         return False
+    if row["driver"] == DRIVER_LEARNED and row["to_go"] == math.inf:
+        return True  # it has taken a turn from which no way leads to its goal
     if row["order"] >= 0:
         return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:
