@@ -29,7 +29,8 @@ def test_each_driver_and_sumo_have_a_row(
     models = ("--model", "IDM", "--model", "zoo:cities_ippo", "--model", "zoo:cities_ippo=1,ACC=1")
     assert run(*words, *models, "--json", str(file)) == 0
     shown = capsys.readouterr().out
-    assert "contacts per" in shown
+    assert "grid4x4, 24 vehicles, 40 s" in shown
+    assert "per 1,000 km of all vehicles" in " ".join(shown.split())
     found = json.loads(file.read_text(encoding="utf-8"))
     names = ["IDM", "zoo:cities_ippo", "zoo:cities_ippo 1, ACC 1", "SUMO"]
     assert [side["name"] for side in found["sides"]] == names

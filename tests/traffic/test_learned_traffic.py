@@ -205,19 +205,15 @@ def test_a_recording_shows_the_drivers_of_the_whole_and_the_divided_world(
 
 
 def test_a_vehicle_without_a_way_to_its_goal_gets_another_goal() -> None:
-    world = simulation("town", "zoo:cities_ippo", background=20)
-    row = owned(world)[0]
-    row["to_go"] = np.inf
-    number, goal = int(row["id"]), int(row["goal"])
-    steps = tick_of(world).traffic.travel.steps
-    num_lanes = len(world.network.lanes)
-    steps = steps[goal * num_lanes : (goal + 1) * num_lanes]
-    before = steps["to_go"].copy()
-    steps.setflags(write=True)
-    steps["to_go"] = np.inf
+    world = simulation("town", "zoo:cities_ippo", background=60)
+    plans = tick_of(world).traffic.plans
+    lost = np.isinf(plans["to_go"][:, owned(world)["lane"]])  # (goals, vehicles)
+    goal, vehicle = np.argwhere(lost)[0].tolist()
+    row = owned(world)[vehicle]
+    row["goal"], row["way"] = goal, goal * len(world.network.lanes)
+    number = int(row["id"])
     for _ in range(10):
         world.step(idle_commands(world))
-    steps["to_go"] = before
     row = owned(world)[owned(world)["id"] == number][0]
     assert row["goal"] != goal
     assert np.isfinite(row["to_go"])

@@ -36,14 +36,12 @@ _ROWS = {
     "teleports": "teleports",
 }
 _OF_MODELS = {
-    "speed, m/s": "mean_speed_mps",
-    "flow per lane, 1/h": "flow_per_h",
-    "median headway, s": "median_headway_s",
+    "m/s": "mean_speed_mps",
+    "flow": "flow_per_h",
+    "headway": "median_headway_s",
     "contacts": "contacts",
-    "contacts per 1,000 km": "contacts_per_1000_km",
+    "per 1,000 km": "contacts_per_1000_km",
     "km": "distance_km",
-    "arrived": "arrived",
-    "longest lock, s": "longest_lock_s",
 }
 
 
@@ -217,6 +215,8 @@ def _models(
         {label: label for label in ("driver", *_OF_MODELS, "removed")},
         rows,
         facts=found.to_dict(),
+        caption="mean speed; flow: vehicles per hour and lane; headway: median time headway in s; "
+        "contacts, also per 1,000 km of all vehicles",
     )
 
 

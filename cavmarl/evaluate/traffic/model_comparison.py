@@ -16,6 +16,7 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.config.registry import entries
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import find_map, load_world
@@ -111,11 +112,9 @@ def compare_models(
     path = find_map(map_name)
     sides: list[ModelRun] = []
     trips = Trips()
-    name = ""
     for model in models:
-        progress(f"{name_of(model)}")
+        progress(name_of(model))
         world = _world(path, model, vehicles, seconds, dt_s, seed)
-        name = world.network.name
         run = _run(world, seconds, None if sides else trips)
         sides.append(ModelRun(name_of(model), run.figures, world.traffic_stats().removed))
     progress("SUMO")
@@ -125,6 +124,9 @@ def compare_models(
         job = SumoJob(path, read_input([file]), seconds, dt_s, seed, teleports)
         sumo, _ = run_seeds(job, ())
     sides.append(ModelRun("SUMO", sumo.figures, None))
+    name = path.name.removesuffix(".gz").removesuffix(".net.xml")
+    if str(map_name) in entries():
+        name = str(map_name)
     return ModelComparison(name, vehicles, seconds, dt_s, seed, tuple(sides))
 
 
