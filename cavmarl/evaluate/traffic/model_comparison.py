@@ -27,6 +27,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.sumo.sumo_input import read_input
 
 CTRL_DT_S = 0.2  # time between two actions of a network, as in the training of the bundled drivers
+TRIP_HORIZON = 3.0  # `traffic.trip_horizon`, as in the training of the bundled drivers
 _TYPE = '<vType id="car" length="5" width="2" height="1.6"/>'  # the generator's car, SUMO's driver
 
 Model = str | Mapping[str, float]
@@ -139,6 +140,7 @@ def _world(
         "clock.ctrl_dt_s": CTRL_DT_S,
         "horizon_s": float(seconds),
         "population.mode": "respawn",
+        "traffic.trip_horizon": TRIP_HORIZON,
         "traffic.model": model if isinstance(model, str) else dict(model),
     }
     config, network, demand, partition = load_world(
