@@ -112,7 +112,7 @@ def compare_models(
         raise ConfigError(f"seconds = {seconds}: must be from 1 to 100000")
     path = find_map(map_name)
     sides: list[ModelRun] = []
-    trips = Trips()
+    trips = SumoTrips()
     for model in models:
         progress(name_of(model))
         world = _world(path, model, vehicles, seconds, dt_s, seed)
@@ -152,7 +152,7 @@ def _world(
     return world
 
 
-def _run(world: Simulation, seconds: int, trips: Trips | None) -> TrafficRun:
+def _run(world: Simulation, seconds: int, trips: SumoTrips | None) -> TrafficRun:
     """Run and measure a world; note its trips, if wanted."""
     if trips is None:
         return run_native(world, seconds)
@@ -160,7 +160,7 @@ def _run(world: Simulation, seconds: int, trips: Trips | None) -> TrafficRun:
     return run_native(world, seconds, trips.note)
 
 
-class Trips:
+class SumoTrips:
     """The trips of the vehicles of a world, for SUMO."""
 
     def __init__(self) -> None:
