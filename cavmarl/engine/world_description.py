@@ -26,8 +26,10 @@ def describe_world(
 ) -> dict[str, Any]:
     """Return the configuration, and the hashes of the roads, demand, zones and kernels.
 
-    `demand_tolerated` lists what was left out or replaced in the demand, with counts.
+    `demand_tolerated` lists what was left out or replaced in the demand, with counts. If networks
+    drive background vehicles, `background_drivers` has the SHA-256 of their files by name.
     """
+    drivers = {one.name: one.content_hash for one in background_drivers(config.traffic)}
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -41,9 +43,6 @@ def describe_world(
         "demand_content_sha256": None if demand is None else demand.content_hash,
         "demand_tolerated": [] if demand is None else list(demand.tolerated),
         "sumo": demand.version if isinstance(demand, SumoDemand) else None,
-        "background_drivers": {  # SHA-256 by name
-            one.name: one.content_hash for one in background_drivers(config.traffic)
-        },
         "kernels": sources_digest(),
         "plugins": plugin_hashes(config.registered, config.plugins),  # SHA-256 by module
         "zones": partition.count,
@@ -55,4 +54,5 @@ def describe_world(
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled
         else "none: there are no messages between vehicles",
+        **({"background_drivers": drivers} if drivers else {}),
     }
