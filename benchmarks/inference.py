@@ -29,8 +29,8 @@ from cavmarl.cli.output import about
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import require
-from cavmarl.policies.driver_network import DriverNetwork
-from cavmarl.policies.network_files import MAX_OBSERVATION_SIZE, MAX_WIDTH, NetworkConfig
+from cavmarl.networks.driver_network import DriverNetwork
+from cavmarl.networks.network_files import MAX_OBSERVATION_SIZE, MAX_WIDTH, NetworkConfig
 
 FORMS = {"tanh": False, "LayerNorm, ReLU": True}  # kind of layers → `shared`
 

@@ -31,7 +31,7 @@ from cavmarl.evaluate.provenance.manifest import (
 from cavmarl.evaluate.provenance.training_record import CHECKPOINT_FILE
 from cavmarl.learning.actor_critic import ActorCritic, load_network, save_network
 from cavmarl.learning.checkpoint import RunState, read_checkpoint, sealed, write_checkpoint
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 from fuzz.files import ROOT, Target, scratch, seed
 
 __all__ = ["CHECKPOINTS", "DRIVERS", "ENTRIES", "MANIFESTS", "OVERRIDES", "PLANS"]

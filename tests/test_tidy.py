@@ -67,12 +67,12 @@ PASSED_ON = {
     "cavmarl.evaluate.subprocess_calls._tell",
     "cavmarl.evaluate.subprocess_calls.call_in_fresh_process",
     "cavmarl.parallel.network.encryption.EncryptedSocket.sendmsg",
-    "cavmarl.policies.driver_network.LayerTable.add",
+    "cavmarl.networks.driver_network.LayerTable.add",
     "cavmarl.render.topdown.TopDownRenderer.frame",
 }
 
 # A new capability raises these two bounds by the lines that it needs; the commit says why.
-PACKAGE_LINES = 139_200
+PACKAGE_LINES = 140_200
 REACHABLE_LINES = 86_800  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.

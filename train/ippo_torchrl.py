@@ -37,7 +37,7 @@ from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # lower bound on an observation's scale, so that constants are not amplified
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (

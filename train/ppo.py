@@ -38,9 +38,9 @@ from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
 from cavmarl.learning.run_folder import RunFolder, parse_run
+from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.parallel.worlds.local_worlds import kept_elsewhere
 from cavmarl.policies.loading import driver_keys, policy_files
-from cavmarl.policies.network_files import NetworkConfig
 
 PHASES = ("simulation", "transfer", "inference", "learning")
 RED_LIGHT = TERMS.index("red_light")

@@ -32,7 +32,7 @@ from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 
 @dataclass(frozen=True)

@@ -39,7 +39,7 @@ from cavmarl.learning.options import (
     run_program,
 )
 from cavmarl.learning.run_folder import RunFolder
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 DRIVER = "driver"  # the policy that all agents share
 

@@ -32,7 +32,7 @@ from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of, writing
 from cavmarl.learning.log import WINDOW, curve_row
 from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import DRIVER_FILES, RunFolder, parse_run
-from cavmarl.policies.network_files import MAX_DEVIATIONS, NetworkConfig
+from cavmarl.networks.network_files import MAX_DEVIATIONS, NetworkConfig
 
 MODEL_FILE = "model.zip"
 

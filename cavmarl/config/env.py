@@ -184,6 +184,12 @@ class EnvConfig(Section, key=""):
                 not self.signals.are_controlled,
                 "needs signals.agents = none: a world has controlled signals or controlled limits",
             )
+        self.need(
+            "traffic.model",
+            not (self.zones.simulators and self.traffic.networks),
+            "other simulators do not evaluate networks: leave out zones.simulators, or name a "
+            "car-following model",
+        )
         self._check_messages()
         if self.observation.mode == "messages":
             self._drop_sight()
@@ -310,7 +316,7 @@ class EnvConfig(Section, key=""):
     def registered(self) -> tuple[str, ...]:
         """The registered extensions that the environment may use."""
         simulators = (text.partition("://")[0] for text in self.zones.simulators.values())
-        return (*self.terms.registered, *self.sensors.registered, self.traffic.model, *simulators)
+        return (*self.terms.registered, *self.sensors.registered, *self.traffic.models, *simulators)
 
     @property
     def may_change_lanes(self) -> bool:

@@ -214,7 +214,7 @@ def _walk(kind: type[Any], location: list[str]) -> tuple[list[str], Any]:
     keys: list[str] = []
     inner: Any = kind
     for part in location:
-        if part == "str" or part.startswith("tuple["):
+        if part == "str" or part.startswith(("tuple[", "dict[")):
             inner = next(one for one in get_args(inner) if part.startswith(one.__name__))
             continue
         members = [one for one in get_args(inner) if getattr(one, "type", None) == part]

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within
+
+ZOO = "zoo:"  # before the name of a trained driver that drives background vehicles
 
 
 @dataclass(frozen=True)
@@ -28,8 +31,10 @@ class TrafficConfig(Section, key="traffic"):
         endless: 150 m before their goal, agents get another goal that is farther than that, like
             the background vehicles of a `closed` world.
         speed_factor_spread: half width of the uniform distribution of desired speed over limit.
-        model: car-following model of the generator's vehicles: `IDM`, `Krauss`, `ACC`, or a
-            registered model (docs/guides/extending.md). Vehicles of `demand` follow their type.
+        model: driver of the generator's vehicles: a car-following model (`IDM`, `Krauss`, `ACC`, or
+            a registered model, docs/guides/extending.md), or `zoo:` and the name of a trained
+            driver (docs/guides/learned_traffic.md). Several drivers: a mapping from each driver to
+            its share, relative to the others. Vehicles of `demand` follow their type.
         trip_horizon: limit of an agent's trip: this multiple of the time that its route takes at
             the speed limits, plus one cycle of each signal on it. Then the vehicle leaves, and the
             trip is truncated. 0: only the episode's horizon limits it.
@@ -45,7 +50,7 @@ class TrafficConfig(Section, key="traffic"):
     max_trip_m: Annotated[float, Within(0.0, 1e6)] = 0.0
     endless: bool = False
     speed_factor_spread: Annotated[float, Within(0.0, 0.5)] = 0.1
-    model: str = "IDM"
+    model: str | dict[str, float] = "IDM"
     trip_horizon: Annotated[float, Within(0.0, 1000.0)] = 0.0
 
     def __post_init__(self) -> None:
@@ -65,3 +70,31 @@ class TrafficConfig(Section, key="traffic"):
             self.max_trip_m == 0.0 or self.max_trip_m > self.min_trip_m,
             f"must be 0 (no limit), or above traffic.min_trip_m = {self.min_trip_m:g}",
         )
+        self._check_models()
+
+    def _check_models(self) -> None:
+        """Check the drivers and their shares."""
+        shares = list(self.models.values())
+        self.need("model", bool(shares), "must name a driver, or map drivers to their shares")
+        self.need(
+            "model",
+            all(math.isfinite(share) and share >= 0.0 for share in shares)
+            and 0.0 < sum(shares) < math.inf,
+            "shares must be finite numbers from 0 on, and at least one must be above 0",
+        )
+        self.need(
+            "model",
+            self.source == "native" or (isinstance(self.model, str) and not self.networks),
+            f"traffic.source = {self.source} needs one car-following model, such as IDM; trained "
+            "drivers and shares need traffic.source = native",
+        )
+
+    @property
+    def models(self) -> dict[str, float]:
+        """The drivers of the generator's vehicles, with their shares."""
+        return {self.model: 1.0} if isinstance(self.model, str) else self.model
+
+    @property
+    def networks(self) -> tuple[str, ...]:
+        """The trained drivers of background vehicles, by name or path."""
+        return tuple(name.removeprefix(ZOO) for name in self.models if name.startswith(ZOO))

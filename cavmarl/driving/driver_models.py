@@ -14,6 +14,7 @@ from cavmarl.driving.kernels.models.registered_models import (
     put_model,
 )
 
+_BY_CASE = {model.name.casefold(): model.code for model in MODELS}
 _CODES = {model.name: model.code for model in MODELS}
 
 # SUMO's other models, with the model of the package whose equations are most similar.
@@ -46,7 +47,7 @@ def has_model(name: str) -> bool:
 
 
 def model_code(name: str, key: str = "traffic.model") -> int:
-    """Return MODEL_* of a model by name.
+    """Return MODEL_* of a model by name; models of the package in upper or lower case.
 
     Raises:
         ConfigError: there is no such model; the message names `key` as the place.
@@ -55,10 +56,13 @@ def model_code(name: str, key: str = "traffic.model") -> int:
         return _CODES[name]
     if name in REGISTERED_MODELS:
         return REGISTERED_MODELS[name]
+    if name.casefold() in _BY_CASE:
+        return _BY_CASE[name.casefold()]
     known = ", ".join(model_names())
     raise ConfigError(
-        f"{key} = {name!r} is not a driver model; choose one of {known}. If a module registers it "
-        f"with cavmarl.register_driver_model, {HOW}"
+        f"{key} = {name!r} is not a driver model; choose one of {known}, or zoo: and the name of "
+        "a trained driver. If a module registers the model with cavmarl.register_driver_model, "
+        f"{HOW}"
     )
 
 

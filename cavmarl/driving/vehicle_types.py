@@ -34,6 +34,9 @@ VTYPE = np.dtype(
         ("vclass", np.int32),  # index in VEHICLE_CLASSES
         ("permissions", np.uint32),  # LANE["permissions"] of a usable lane has one of these bits
         ("model", np.int32),  # MODEL_*; written by `set_model`
+        # 1 + position of the network in `TrafficConfig.networks` that drives background vehicles of
+        # this type; 0: the driver model drives them
+        ("network", np.int32),
         ("as_sumo", np.bool_),  # looks ahead, yields, queues and resolves deadlocks as in SUMO
         ("length", np.float64),  # m
         ("width", np.float64),  # m
@@ -63,7 +66,7 @@ VTYPE = np.dtype(
 )
 
 # The fields that define a type; the other fields are derived from them.
-STATED_FIELDS = [name for name in VTYPE.names or () if name != "as_sumo"]
+STATED_FIELDS = [name for name in VTYPE.names or () if name not in ("as_sumo", "network")]
 
 
 class ClassDefaults(NamedTuple):

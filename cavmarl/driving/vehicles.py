@@ -17,7 +17,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-RECORD_VERSION = 3
+RECORD_VERSION = 4
 
 # The fields are ordered by use: fields that drivers read of others come first and share two
 # cache lines; fields that are rarely read come last.
@@ -95,6 +95,14 @@ VEHICLE = np.dtype(
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle
         # how long it has stood on its lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)
         ("lane_stood", np.int64),
+        # memory of a network that drives a background vehicle: throttle, steering and speed at the
+        # ends of the last step but one and the last step but two, scaled as `history` scales them
+        ("throttle_1", np.float32),
+        ("steering_1", np.float32),
+        ("speed_1", np.float32),
+        ("throttle_2", np.float32),
+        ("steering_2", np.float32),
+        ("speed_2", np.float32),
     ],
     align=True,
 )
@@ -106,10 +114,15 @@ PLACEMENT_FIELDS = ("owner", "source_zone", "target_zone", "epoch", "transfer")
 STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEMENT_FIELDS)
 
 
+# Fields that only vehicles with a network use, see `networks.background_driver`; 0 in all others.
+MEMORY_FIELDS = tuple(name for name in STATE_FIELDS if name.endswith(("_1", "_2")))
+
 # Fields that are equal in a ghost and in its owner's row of the same tick. Contacts and rewards are
 # written after ghosts are sent, and are never read from a ghost.
 GHOST_FIELDS = tuple(
-    name for name in STATE_FIELDS if name not in ("hit", "events", "episode_return", "lane_stood")
+    name
+    for name in STATE_FIELDS
+    if name not in ("hit", "events", "episode_return", "lane_stood", *MEMORY_FIELDS)
 )
 
 # Fields that are -1 in a new vehicle.

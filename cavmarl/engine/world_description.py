@@ -11,6 +11,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import sources_digest
 from cavmarl.core.extensions import plugin_hashes
 from cavmarl.handoff.simulators.simulator_kinds import describe_simulators
+from cavmarl.networks.background_driver import background_drivers
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
@@ -25,8 +26,10 @@ def describe_world(
 ) -> dict[str, Any]:
     """Return the configuration, and the hashes of the roads, demand, zones and kernels.
 
-    `demand_tolerated` lists what was left out or replaced in the demand, with counts.
+    `demand_tolerated` lists what was left out or replaced in the demand, with counts. If networks
+    drive background vehicles, `background_drivers` has the SHA-256 of their files by name.
     """
+    drivers = {one.name: one.content_hash for one in background_drivers(config.traffic)}
     resolved = asdict(config)
     text = json.dumps(resolved, sort_keys=True)
     return {
@@ -51,4 +54,5 @@ def describe_world(
         "channel": asdict(config.v2x.channel)
         if config.v2x.enabled
         else "none: there are no messages between vehicles",
+        **({"background_drivers": drivers} if drivers else {}),
     }

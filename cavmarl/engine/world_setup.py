@@ -29,6 +29,7 @@ from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.limits.limit_table import limit_sizes
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import conversion_notes, map_file
+from cavmarl.networks.background_driver import background_drivers
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.held_signals import held_signals_note
@@ -51,7 +52,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 
 log = logging.getLogger(__name__)
 
-# Networks that are in use in this process. The key is whether there are agents, followed by the
+# Networks that are in use in this process. The key is whether vehicles are steered, followed by the
 # names and hashes of the map files.
 _LOADED: WeakValueDictionary[tuple[object, ...], RoadNetwork] = WeakValueDictionary()
 
@@ -113,6 +114,7 @@ def load_world(
         MapError: the map cannot be read, or has no roads to drive on.
         DemandError: a demand file is missing, damaged or of another map.
         RouteError: a route of the demand is not connected.
+        PolicyError: background vehicles cannot have a driver that `traffic.model` names.
     """
     config, base_dir = load_config(
         env,
@@ -130,6 +132,7 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 
     Raises the errors of `load_world`.
     """
+    background_drivers(config.traffic)  # refuse drivers that do not fit before reading the map
     network = load_roads(config, base_dir)
     if config.horizon_s == BY_MAP:
         step_s = config.clock.ctrl_dt_s
@@ -162,7 +165,7 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
             the map.
     """
     paths = resolve_maps(config, base_dir)
-    network = _joined(paths, config.population.agents > 0)
+    network = _joined(paths, config.population.agents > 0 or bool(config.traffic.networks))
     if len(network.maps) > 1:
         _refuse_single_map_keys(config)
     buildings = resolve_buildings(config, base_dir)
@@ -210,10 +213,10 @@ def _program_files(config: EnvConfig, base_dir: Path) -> list[Path]:
     return [*(file for file in named if file.resolve() not in known), *programs]
 
 
-def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
+def _joined(paths: Sequence[Path], is_steered: bool) -> RoadNetwork:
     """Return the network of map files. Worlds of one process share a network of the same files.
 
-    With agents, the network includes the swept areas of steered vehicles.
+    If policies or networks steer vehicles, the roads include the swept areas of steered vehicles.
 
     Raises MapError with the errors of all files.
     """
@@ -227,13 +230,13 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
             files.append(file)
         except MapError as error:
             refused.append(str(error))
-    found = None if refused else _LOADED.get((has_agents, *contents))
+    found = None if refused else _LOADED.get((is_steered, *contents))
     if found is not None:
         return found
     networks: list[RoadNetwork] = []
     for file in files:
         try:
-            networks.append(load_steered(file) if has_agents else load_network(file))
+            networks.append(load_steered(file) if is_steered else load_network(file))
         except MapError as error:
             refused.append(str(error))
     if refused:
@@ -244,7 +247,7 @@ def _joined(paths: Sequence[Path], has_agents: bool) -> RoadNetwork:
             log.warning("%s: %s", map_name(file), note)
     for note in network.notes:
         log.warning("%s: %s", network.name, note)
-    return _LOADED.setdefault((has_agents, *contents), network)
+    return _LOADED.setdefault((is_steered, *contents), network)
 
 
 def _refuse_single_map_keys(config: EnvConfig) -> None:

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState, Worlds
-from cavmarl.driving.vehicles import STATE_FIELDS
+from cavmarl.core.records.codes import DRIVER_LEARNED
+from cavmarl.driving.vehicles import MEMORY_FIELDS, STATE_FIELDS
 from cavmarl.engine.component import Component
 from cavmarl.engine.lane_component import LaneComponent
 from cavmarl.engine.state_check import StateForm
@@ -262,7 +263,10 @@ def digest_world(parts: Parts, world: int) -> str:
     if sumo is not None:
         sumo.shift(rows, -world)
     digest = hashlib.blake2b(digest_size=16)
+    remembers = (rows["driver"] == DRIVER_LEARNED).any()
     for name in STATE_FIELDS:
+        if name in MEMORY_FIELDS and not remembers:
+            continue
         digest.update(np.ascontiguousarray(rows[name]).tobytes())
     agents = rows["agent"][rows["agent"] >= 0]
     digest.update(worlds.pending[world, agents].tobytes())

@@ -13,6 +13,7 @@ from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.handoff.division import ZonedShards
+from cavmarl.networks.background_driver import background_drivers
 from cavmarl.ownership.decisions import Neighbours
 from cavmarl.ownership.distances import Distances, check_coverage, needed_overlap_m
 from cavmarl.ownership.limits import Limits
@@ -55,13 +56,15 @@ def divide(
         sensing_reach_m(config.sensors, radius_m),
         rig_reach_m(config.rig, radius_m),
     )
-    reach_m = max(driving_reach_m(network, traffic.travel), sensing_m)
+    drivers = background_drivers(config.traffic)
+    learned_m = max((sensing_reach_m(one.sensors, radius_m) for one in drivers), default=0.0)
+    reach_m = max(driving_reach_m(network, traffic.travel), sensing_m, learned_m)
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
-    # Background vehicles have no sensors.
-    has_agents = config.population.agents > 0
-    sensed_m = _needed_m(config, sensing_m, fastest_mps, late_ticks) if has_agents else 0.0
+    # Background vehicles without a network have no sensors.
+    own_m = max(sensing_m if config.population.agents > 0 else 0.0, learned_m)
+    sensed_m = _needed_m(config, own_m, fastest_mps, late_ticks) if own_m > 0.0 else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
     sight = Visibility(
         network,

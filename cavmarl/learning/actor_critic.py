@@ -1,6 +1,6 @@
 """`ActorCritic`: the torch network that training programs train, and how it is saved.
 
-A trained driver is evaluated without torch, see `cavmarl.policies.driver_network`.
+A trained driver is evaluated without torch, see `cavmarl.networks.driver_network`.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.core.atomic_file import write_whole
-from cavmarl.policies.network_files import (
+from cavmarl.networks.network_files import (
     CONTINUOUS_ACTIONS,
     MAX_DEVIATIONS,
     RESIDUAL_PARTS,

@@ -10,7 +10,7 @@ from torch import Tensor
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
 from cavmarl.learning.warm_start import begin_with
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 LEAST_DEVIATION = 0.02  # minimum, so that nearly constant observations are not amplified
 

@@ -112,8 +112,8 @@ def with_form_of(args: S, start: str) -> S:
     """
     if not start:
         return args
+    from cavmarl.networks.network_files import read_network  # an extra, as above
     from cavmarl.policies.loading import policy_files
-    from cavmarl.policies.network_files import read_network  # an extra, as above
 
     form = read_network(policy_files(start)[0].parent)[1]
     own = {"hidden": form.hidden[0], "shared": form.shared, "residual": form.residual}

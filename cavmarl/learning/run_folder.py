@@ -40,7 +40,7 @@ from cavmarl.learning.checkpoint import (
 )
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.options import given_options, settings_of
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 if sys.platform != "win32":
     import fcntl

@@ -10,7 +10,7 @@ from torch import Tensor
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import PolicyError
 from cavmarl.learning.actor_critic import ActorCritic, load_network
-from cavmarl.policies.network_files import CONTINUOUS_ACTIONS, NetworkConfig
+from cavmarl.networks.network_files import CONTINUOUS_ACTIONS, NetworkConfig
 from cavmarl.sensors.observed import feature_names
 
 OF_OBSERVATIONS = (

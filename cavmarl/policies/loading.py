@@ -112,7 +112,7 @@ def _load_script(path: Path, env: Environment) -> Policy:
 
 
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
-    from cavmarl.policies.driver_network import load_driver_network  # imports pydantic
+    from cavmarl.networks.driver_network import load_driver_network  # imports pydantic
 
     network = load_driver_network(folder)
     config, name, here = network.config, name_of_driver(folder), env.config

@@ -22,7 +22,7 @@ from cavmarl.env.roadside_agents import VEHICLES
 from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
-    from cavmarl.policies.driver_network import DriverNetwork
+    from cavmarl.networks.driver_network import DriverNetwork
 
 Environment = CavEnv | CavVectorEnv
 

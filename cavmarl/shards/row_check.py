@@ -17,7 +17,7 @@ from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
-    DRIVER_SUMO,
+    DRIVER_LEARNED,
     HOLD_EXIT_BLOCKED,
 )
 from cavmarl.driving.vehicles import VEHICLE
@@ -112,9 +112,7 @@ class RowCheck:
             "link": range(-1, num_links),
             "stopped_at": range(-1, num_links),
             "vtype": range(len(travel.types)),
-            "driver": range(
-                DRIVER_BACKGROUND, 1 + (DRIVER_EXTERNAL if self._num_external else DRIVER_SUMO)
-            ),
+            "driver": range(DRIVER_BACKGROUND, DRIVER_LEARNED + 1),
             "agent": range(-1, num_agents),
             "goal": range(-1, goals),
             "stop": range(-1, 1 + len(travel.stops)),
@@ -169,11 +167,15 @@ class RowCheck:
         detours = self._num_goals
         if travel.first_detour:
             detours = (travel.num_fixed - travel.first_detour) // self._num_lanes
-        low = np.array([-1, 0, 0, -1, -1])
-        high = np.array([detours, self._num_goals, len(travel.scripts.frames), 0, 0])
+        low = np.array([-1, 0, 0, -1, -1, 0])
+        plans = self._num_goals
+        high = np.array([detours, plans, len(travel.scripts.frames), 0, 0, plans])
         wrong = (rows["goal"] < low[driver]) | (rows["goal"] >= high[driver])
         wrong |= (driver == DRIVER_AGENT) & (rows["agent"] < 0)
         wrong |= (driver == DRIVER_EXTERNAL) & (rows["way"] != self._nowhere)
+        wrong |= (driver == DRIVER_EXTERNAL) & (self._num_external == 0)
+        networks = travel.types["network"][rows["vtype"]]
+        wrong |= (driver == DRIVER_LEARNED) & ((networks == 0) | (rows["agent"] >= 0))
         wrong |= rows["stop"] > rows["stops_end"]
         if not wrong.any():
             return ""
@@ -215,7 +217,7 @@ class RowCheck:
         planned |= (
             (at >= self._own_plans.start) & (at < self._own_plans.stop) & (of_world % lanes == lane)
         )
-        drives = (rows["driver"] == DRIVER_BACKGROUND) | (rows["driver"] == DRIVER_AGENT)
+        drives = np.isin(rows["driver"], (DRIVER_BACKGROUND, DRIVER_AGENT, DRIVER_LEARNED))
         follow = drives & ~planned
         if self._is_moved:  # after the load, SUMO sends the routes again
             follow &= at < travel.num_fixed

@@ -33,7 +33,9 @@ from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, lane_grid
 from cavmarl.sensors.observed import layout, optional_arrays, sensor_arrays
+from cavmarl.shards.kernels.learned_driving import LearnedDriver
 from cavmarl.shards.kernels.world_phases import suggest
+from cavmarl.shards.learned_drivers import learned_drivers
 from cavmarl.shards.registered_outputs import RegisteredOutputs
 from cavmarl.v2x.kernels.v2x_records import REPORT, Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
@@ -119,6 +121,10 @@ class Shard:
         num_worlds, capacity = zoned.rows.shape[2:]
         self.optional = optional_arrays(config.sensors, network, plans[0], most_told, capacity)
         self.registered = RegisteredOutputs(config, network)
+        # The networks of background vehicles; their scratch memory is shared, too.
+        self.learned: tuple[LearnedDriver, ...] = (
+            learned_drivers(config, network, plans[0], capacity) if first is None else first.learned
+        )
         self._floating = len(network.maps) > 1
         self._extent_m = network.room_m
         self.cut(zones, halo)

@@ -38,10 +38,12 @@ class ShardGroup:
         return self.first.side, self.first.next_side
 
     def begin_step(self, commands: Commands) -> None:
-        """Clear the sums of a step, and take its actions."""
+        """Clear the sums of a step, take its actions, and let networks choose their commands."""
         if self.calls.has_agents:
             np.copyto(self.calls.meta_actions, commands.meta_actions)
             self.calls.begin_step()
+        for drive in self.calls.drive_by_networks:
+            drive()
 
     def advance(self, commands: Commands) -> None:
         """Decide all controls from the committed rows, and move owned rows into the next rows."""
@@ -232,6 +234,14 @@ class GroupCalls:
     def _bind_gather(self, touching_m: float, border_m: float) -> BoundCall[None]:
         own = {"members": self.members, "touching_m": touching_m, "border_m": border_m}
         return bind_by_name(group_phases.gather_ghosts_each, own)
+
+    @cached_property
+    def drive_by_networks(self) -> tuple[BoundCall[None], ...]:
+        """One call for each network that drives background vehicles."""
+        return tuple(
+            bind_by_name(group_phases.drive_by_network_each, self.values | {"learned": learned})
+            for learned in self._first.learned
+        )
 
     @cached_property
     def observe_messages(self) -> BoundCall[None]:

@@ -46,7 +46,8 @@ GROUPS: dict[str, tuple[str, ...]] = {
         "actor configuration": "driver vtype length width height sensor_phase",
         "synchronization": "tick departed due transfer",
         "agent logic": "rng_key speed_factor hold wait_s stopped_at stopped_s last_change hit "
-        "events step_to_go step_jerk distance_m free_s episode_return lane_stood",
+        "events step_to_go step_jerk distance_m free_s episode_return lane_stood "
+        "throttle_1 steering_1 speed_1 throttle_2 steering_2 speed_2",
     }.items()
 }
 

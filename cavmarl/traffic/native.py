@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.population import PopulationConfig
-from cavmarl.config.traffic import TrafficConfig
+from cavmarl.config.traffic import ZOO, TrafficConfig
 from cavmarl.core.compiled.bound_call import bound, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Demand, DepartureQueue, RoadArrays, TripTables, Worlds
+from cavmarl.core.records.codes import MODEL_IDM
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
@@ -177,16 +178,50 @@ class NativeTraffic:
         """The demand file's departures and routes."""
         if self.file is None:
             return None
-        return Schedule(self.file, len(generated_types()), self.plans.size)
+        return Schedule(self.file, len(self.own_types), self.plans.size)
 
     @cached_property
     def cast(self) -> Cast | None:
         if self.scene is None:
             return None
-        first_type = len(generated_types()) + (0 if self.file is None else len(self.file.types))
+        first_type = len(self.own_types) + (0 if self.file is None else len(self.file.types))
         goals = {edge: goal for goal, edge in enumerate(self.goal_edges[0].tolist())}
         agents = self.population.agents
         return Cast.of(self.scene, self.network, goals, first_type, self.dt, agents)
+
+    @cached_property
+    def _model_codes(self) -> tuple[int, ...]:
+        """MODEL_* of the generator's car-following models; IDM if networks drive all vehicles."""
+        names = [name for name in self.traffic.models if not name.startswith(ZOO)]
+        return tuple(dict.fromkeys(model_code(name) for name in names)) or (MODEL_IDM,)
+
+    @cached_property
+    def own_types(self) -> NDArray[np.void]:
+        """VTYPE rows of the generator's cars: one for each driver model, then for each network.
+
+        The first is also the type of agents' cars.
+        """
+        codes = self._model_codes
+        networks = len(self.traffic.networks)
+        types = np.concatenate(
+            [generated_types(code) for code in codes] + [generated_types(codes[0])] * networks
+        )
+        types["network"][len(codes) :] = np.arange(networks) + 1
+        types.setflags(write=False)
+        return types
+
+    @cached_property
+    def _drawn_types(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
+        """The rows of `own_types` that vehicles are drawn from, and the ends of their shares."""
+        codes, networks = self._model_codes, self.traffic.networks
+        rows = [
+            len(codes) + networks.index(name.removeprefix(ZOO))
+            if name.startswith(ZOO)
+            else codes.index(model_code(name))
+            for name in self.traffic.models
+        ]
+        ends = np.cumsum(list(self.traffic.models.values()))
+        return np.array(rows, dtype=np.int32), ends / ends[-1]
 
     @cached_property
     def travel(self) -> TripTables:
@@ -194,8 +229,7 @@ class NativeTraffic:
 
         Most agents drive a car, which is a generated type.
         """
-        model = model_code(self.traffic.model)
-        more = agent_types(self._other_types, model, self.population.own_types)
+        more = agent_types(self._other_types, self._model_codes[0], self.population.own_types)
         found = self._travel_of_others
         found = found._replace(trip_horizon=self.traffic.trip_horizon, tick_s=self.dt)
         return found._replace(types=np.concatenate([found.types, more])) if len(more) else found
@@ -223,7 +257,7 @@ class NativeTraffic:
 
     @cached_property
     def _travel_of_others(self) -> TripTables:
-        types = generated_types(model_code(self.traffic.model))
+        types = self.own_types
         steps = self.plans.reshape(-1)
         nowhere = self._nowhere_steps
         if self.sumo is not None:
@@ -409,7 +443,7 @@ class NativeTraffic:
         """The rerouting of vehicles; None if vehicles do not reroute."""
         if self.schedule is None or self.slots is None:
             return None
-        first_type = len(generated_types())
+        first_type = len(self.own_types)
         avoids = self.population.reroute if self.lane_changes else "never"
         return Rerouting(
             self.schedule,
@@ -454,6 +488,8 @@ class NativeTraffic:
             speed_factor_spread=self.traffic.speed_factor_spread,
             blank=self.blank,
             agent_types=self._agent_type_rows,
+            drawn_types=self._drawn_types[0],
+            drawn_ends=self._drawn_types[1],
         )
 
     def draw_orders(

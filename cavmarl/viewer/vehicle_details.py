@@ -13,6 +13,7 @@ from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
+    DRIVER_LEARNED,
     DRIVER_SCRIPTED,
     DRIVER_SUMO,
 )
@@ -33,6 +34,7 @@ DRIVERS = {
     DRIVER_SCRIPTED: "script",
     DRIVER_SUMO: "SUMO",
     DRIVER_EXTERNAL: "external",
+    DRIVER_LEARNED: "traffic (network)",
 }
 MOST_NUMBERS = 400  # largest number of observed values to show
 ZONE_MARGIN_M = 50.0  # margin around the map up to which zones are drawn

@@ -103,7 +103,7 @@ def test_the_built_in_driver_arrives_on_the_grid() -> None:
 def test_a_network_drives_on_its_own_grid_only(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra: train")
     from cavmarl.learning.actor_critic import ActorCritic, save_network
-    from cavmarl.policies.network_files import NetworkConfig
+    from cavmarl.networks.network_files import NetworkConfig
 
     vec = worlds()
     config = NetworkConfig("merge", 105, vec.config.sensors, vec.config.action, (8,))

@@ -10,7 +10,12 @@ from cavmarl.config.registry import find_entry
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_NONE, SIGNAL_RED
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.evaluate.traffic.junction_locks import STOP_LINE_M
-from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
+from cavmarl.evaluate.traffic.traffic_metrics import (
+    TrafficCounts,
+    TrafficMeter,
+    TrafficRun,
+    headways_s,
+)
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
@@ -165,3 +170,40 @@ def test_a_vehicle_off_the_map_counts_only_for_the_mean_speed(network: RoadNetwo
     run = measure(network, [rows(lost)])
     assert run.figures.mean_speed_mps == 2.0
     assert len(run.edge_minutes) == 0
+
+
+def test_headways_are_between_the_front_bumpers_of_a_lane(network: RoadNetwork, link: int) -> None:
+    lane = int(network.links["from_lane"][link])
+    other = int(network.links["to_lane"][link])
+    truck = car(network, 2, lane, 20.0, speed=5.0)
+    truck["length"] = 10.0
+    truck["s"] -= 2.5  # its front stays 20 m before the end of the lane
+    found = headways_s(
+        rows(
+            car(network, 0, lane, 60.0, speed=10.0),  # 40 m behind the truck
+            car(network, 1, lane, 5.0, speed=5.0),  # the first of its lane
+            truck,  # 15 m behind the first
+            car(network, 3, lane, 70.0, speed=0.5),  # too slow to follow
+            car(network, 4, other, 50.0, speed=9.0),  # alone
+        )
+    )
+    np.testing.assert_allclose(np.sort(found), [3.0, 4.0])
+    assert len(headways_s(rows())) == 0
+    far = rows(car(network, 0, lane, 80.0, speed=2.0), car(network, 1, lane, 5.0, speed=2.0))
+    assert len(headways_s(far)) == 0, "37.5 s behind is not following"
+
+
+def test_flow_and_contacts_refer_to_the_driven_distance(network: RoadNetwork, link: int) -> None:
+    lane = int(network.links["from_lane"][link])
+    cars = rows(car(network, 0, lane, 30.0, speed=8.0), car(network, 1, lane, 10.0, speed=12.0))
+    figures = measure(network, [cars] * 50).figures
+    assert figures.distance_km == pytest.approx(1.0)
+    edges = network.edges[~network.edges["internal"]]
+    lanes_km = float((edges["length_m"] * edges["num_lanes"]).sum()) / 1000.0
+    assert figures.flow_per_h == pytest.approx(1.0 / lanes_km / (50.0 / 3600.0))
+    assert figures.median_headway_s == pytest.approx(20.0 / 8.0)
+    assert (figures.contacts, figures.contacts_per_1000_km) == (0, 0.0)
+    touching = cars.copy()
+    touching["x"] = 0.0
+    assert measure(network, [touching] * 50).figures.contacts_per_1000_km == pytest.approx(1000.0)
+    assert measure(network, []).figures.contacts_per_1000_km is None

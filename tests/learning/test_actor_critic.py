@@ -10,7 +10,7 @@ import torch
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.learning.actor_critic import ActorCritic
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 
 def network(kind: str, *, residual: bool = False) -> ActorCritic:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning.actor_critic import ActorCritic
+from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.policies.loading import load_policy
-from cavmarl.policies.network_files import NetworkConfig
 from tests.support.training import load_program
 
 PPO = load_program("ppo")

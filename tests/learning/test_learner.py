@@ -10,7 +10,7 @@ import torch
 from cavmarl.config.action import ActionConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.learning.actor_critic import ActorCritic
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 from tests.support.training import load_program
 
 PPO = load_program("ppo")

@@ -14,7 +14,7 @@ from cavmarl.config.sensors import SensorsConfig
 from cavmarl.learning import observation_norm
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.observation_norm import Scales
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 
 def network() -> ActorCritic:

@@ -13,7 +13,7 @@ from cavmarl.config.sensors import ConflictsConfig, HistoryConfig, SensorsConfig
 from cavmarl.core.errors import PolicyError
 from cavmarl.learning.actor_critic import ActorCritic, save_network
 from cavmarl.learning.warm_start import begin_with
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.sensors.observed import feature_names
 
 FEWER = SensorsConfig(stack=2, conflicts=ConflictsConfig(count=2), history=HistoryConfig(steps=1))

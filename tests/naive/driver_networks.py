@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.networks.network_files import NetworkConfig
 
 Floats = NDArray[Any]
 

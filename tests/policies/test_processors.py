@@ -12,9 +12,9 @@ import pytest
 
 from cavmarl.core.compiled import IS_PLAIN
 from cavmarl.core.compiled.kernel_files import unpack
-from tests.policies.test_network_kernels import DIGEST
+from tests.networks.test_network_kernels import DIGEST
 
-CODE = "from tests.policies.test_network_kernels import run_all_kinds; print(run_all_kinds())"
+CODE = "from tests.networks.test_network_kernels import run_all_kinds; print(run_all_kinds())"
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")

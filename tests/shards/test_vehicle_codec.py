@@ -181,7 +181,7 @@ def test_sensor_readings_are_not_transferred() -> None:
         start(simulation, seed=0)
         return len(codec_of(simulation).pack(simulation.worlds.rows, 0, 0, 0))
 
-    assert size(1) < 450
+    assert size(1) < 480
     assert size(2) - size(1) > 4 * 360
     assert size(3) - size(2) == size(2) - size(1)
 

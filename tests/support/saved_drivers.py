@@ -19,7 +19,7 @@ def save_driver(folder: Path, vec: CavVectorEnv, **form: Any) -> Path:
     import torch
 
     from cavmarl.learning.actor_critic import ActorCritic, save_network
-    from cavmarl.policies.network_files import NetworkConfig
+    from cavmarl.networks.network_files import NetworkConfig
 
     torch.manual_seed(0)
     config = NetworkConfig(

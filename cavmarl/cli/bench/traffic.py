@@ -27,10 +27,21 @@ _ROWS = {
     "mean speed, m/s": "mean_speed_mps",
     "mean delay, s": "mean_delay_s",
     "queue at signals": "queue",
+    "flow per lane, 1/h": "flow_per_h",
+    "median headway, s": "median_headway_s",
     "contacts": "contacts",
+    "contacts per 1,000 km": "contacts_per_1000_km",
     "longest lock, s": "longest_lock_s",
     "locked junction": "locked_junction",
     "teleports": "teleports",
+}
+_OF_MODELS = {
+    "m/s": "mean_speed_mps",
+    "flow": "flow_per_h",
+    "headway": "median_headway_s",
+    "contacts": "contacts",
+    "per 1,000 km": "contacts_per_1000_km",
+    "km": "distance_km",
 }
 
 
@@ -51,6 +62,19 @@ def traffic(
             metavar="FILE",
         ),
     ] = None,
+    models: Annotated[
+        list[str] | None,
+        about(
+            "Without a demand: driver of generated vehicles, as in traffic.model (IDM, "
+            "zoo:cities_ippo), or drivers with shares (zoo:cities_ippo=0.7,IDM=0.3). Repeat it to "
+            "compare several; SUMO gets the trips of the first.",
+            "--model",
+            metavar="DRIVER",
+        ),
+    ] = None,
+    background: Annotated[
+        int, about("With --model: number of generated vehicles.", metavar="N")
+    ] = 100,
     seconds: Annotated[
         int, about("Simulated seconds, from the beginning of the demand.", metavar="S")
     ] = 900,
@@ -82,6 +106,12 @@ def traffic(
             "--plot and --speed: --plot draws flow and density, which --speed does not measure; "
             "use only one of the two"
         )
+    if models:
+        if demand or speed or plot is not None:
+            raise ConfigError(
+                "--model: the generator makes the vehicles; leave out --demand, --speed and --plot"
+            )
+        return _models(map_name, models, background, seconds, dt, seed, teleports, say)
     demand = demand or ([Path(map_name)] if is_sumo_config(Path(map_name)) else [])
     if speed:
         return _speed(map_name, demand, dt, seed, after, repeats, say)
@@ -147,6 +177,60 @@ def _comparison(
         notes=["tolerated while reading the demand:", *notes] if notes else [],
         facts=found.to_dict(),
     )
+
+
+def _models(
+    map_name: str,
+    models: list[str],
+    background: int,
+    seconds: int,
+    dt: float,
+    seed: int,
+    teleports: bool,
+    say: Say,
+) -> BenchmarkReport:
+    from cavmarl.evaluate.traffic.model_comparison import compare_models
+
+    found = compare_models(
+        map_name,
+        [_model(text) for text in models],
+        vehicles=background,
+        seconds=seconds,
+        dt_s=dt,
+        seed=seed,
+        teleports=teleports,
+        progress=say,
+    )
+    rows = [
+        {
+            "driver": escape(side.name),
+            **{label: _cell(getattr(side.figures, name)) for label, name in _OF_MODELS.items()},
+            "removed": _cell(side.removed),
+        }
+        for side in found.sides
+    ]
+    return BenchmarkReport(
+        f"{found.map_name}, {found.vehicles} vehicles, {found.seconds} s, step {found.dt_s:g} s, "
+        f"seed {found.seed}",
+        {label: label for label in ("driver", *_OF_MODELS, "removed")},
+        rows,
+        facts=found.to_dict(),
+        caption="mean speed; flow: vehicles per hour and lane; headway: median time headway in s; "
+        "contacts, also per 1,000 km of all vehicles",
+    )
+
+
+def _model(text: str) -> str | dict[str, float]:
+    """Read a driver, or drivers with shares, as the option states them."""
+    if "=" not in text:
+        return text
+    pairs = [part.rpartition("=") for part in text.split(",")]
+    try:
+        return {name.strip(): float(share) for name, _, share in pairs}
+    except ValueError:
+        raise ConfigError(
+            f"--model {text}: write each driver with its share, as in zoo:cities_ippo=0.7,IDM=0.3"
+        ) from None
 
 
 def _cell(value: float | str | None) -> str:

@@ -38,6 +38,7 @@ STREAM_V2X = 11 * DRAWS_PER_STREAM  # losses and delays of messages
 STREAM_DEMAND = 12 * DRAWS_PER_STREAM  # times, types and routes of a demand file
 STREAM_REROUTER = 13 * DRAWS_PER_STREAM  # which vehicles follow a rerouter, and their new goals
 STREAM_MAP = 14 * DRAWS_PER_STREAM  # the map of an episode, if there are several
+STREAM_MODEL = 16 * DRAWS_PER_STREAM  # the drivers of the generator's vehicles
 STREAM_CAMERA = 15 * DRAWS_PER_STREAM  # vehicles that the cameras of signals miss
 
 _MASK_16 = np.uint64(0xFFFF)

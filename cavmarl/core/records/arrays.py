@@ -192,6 +192,9 @@ class Demand(NamedTuple):
     speed_factor_spread: float
     blank: NDArray[np.void]  # VEHICLE (1,) initial value of a new record
     agent_types: NDArray[np.int32]  # VTYPE rows, which agents use in turn by their number
+    # (T,) VTYPE rows of background vehicles, which define their drivers
+    drawn_types: NDArray[np.int32]
+    drawn_ends: NDArray[np.float64]  # (T,) ends of their shares in [0, 1], rising
 
 
 class Scratch(NamedTuple):

@@ -6,11 +6,12 @@ from __future__ import annotations
 DRIVER_BACKGROUND = 0  # moves along lanes, driven by the models of driving/kernels/drivers.py
 DRIVER_AGENT = 1  # kinematic bicycle, driven by actions
 DRIVER_SCRIPTED = 2  # moves by its script: pedestrians, vehicles of scenarios
+DRIVER_SUMO = 3  # moved by SUMO, copied to the rows
+DRIVER_EXTERNAL = 4  # posed or driven by the caller, see `records.external_records`
+DRIVER_LEARNED = 5  # background vehicle: kinematic bicycle, driven by the network of its VTYPE
 
 # VTYPE["vclass"] of pedestrians; the classes of vehicles are positions in network.VEHICLE_CLASSES
 CLASS_PEDESTRIAN = 9
-DRIVER_SUMO = 3  # moved by SUMO, copied to the rows
-DRIVER_EXTERNAL = 4  # posed or driven by the caller, see `records.external_records`
 
 # VTYPE["model"]: the car-following models, a file each in driving/kernels/models
 MODEL_KRAUSS = 0

@@ -5,7 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.compiled import inlined_kernel
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_EXTERNAL, DRIVER_SCRIPTED
+from cavmarl.core.records.codes import (
+    DRIVER_AGENT,
+    DRIVER_EXTERNAL,
+    DRIVER_LEARNED,
+    DRIVER_SCRIPTED,
+)
 
 ENTER_REACH_M = 80.0  # how far ahead along its lane a departing vehicle looks for others
 SIZE_LENGTHS_M = (5.5, 8.0)  # longer vehicles are in the next class: car; van or truck; bus
@@ -19,17 +24,24 @@ WAIT_SLACK_M = 0.5  # a front this far beyond a waiting position inside a juncti
 MERGES_M = 300.0  # within this distance of a line, vehicles that turn into the lane watch a vehicle
 SWEPT_BEYOND_M = 9.0  # how far beyond a junction other drivers may watch a vehicle's rear
 FORK_BEYOND_M = 3.0  # how far beyond a junction paths from one lane can still overlap
-LOST_M = 10.0  # an agent's or a caller's vehicle that is farther from its lane counts as gone
+LOST_M = 10.0  # a steered or a caller's vehicle that is farther from its lane counts as gone
 OFF_LANES_M = 1.5  # a scripted vehicle farther from the middle of its lane is off the lanes
 
 
 @inlined_kernel
+def is_steered(row: np.void) -> bool:
+    """Return whether a policy or a network steers a vehicle, which can leave its lane."""
+    steered: bool = row["driver"] == DRIVER_AGENT or row["driver"] == DRIVER_LEARNED
+    return steered
+
+
+@inlined_kernel
 def is_lost(row: np.void) -> bool:
-    """Return whether an agent's or a caller's vehicle is on no lane.
+    """Return whether a steered vehicle or a vehicle of the caller is on no lane.
 
     Vehicles on its lane, which is the last or the nearest one, ignore it.
     """
-    is_free: bool = row["driver"] == DRIVER_AGENT or row["driver"] == DRIVER_EXTERNAL
+    is_free: bool = is_steered(row) or row["driver"] == DRIVER_EXTERNAL
     lost: bool = abs(row["d"]) > LOST_M and is_free
     return lost
 

@@ -30,7 +30,7 @@ from cavmarl.core.records.codes import (
     HOLD_SIGNAL,
     HOLD_YIELD,
 )
-from cavmarl.core.records.rows import is_lost
+from cavmarl.core.records.rows import is_lost, is_steered
 from cavmarl.driving.kernels.junctions.deadlocks import resolves_deadlocks
 from cavmarl.driving.kernels.junctions.gaps import is_minor
 from cavmarl.driving.kernels.junctions.junctions import (
@@ -170,7 +170,7 @@ def decide_at_line(
         swept = before_foe_sweep(roads, rows, i, kind, link, front, waits, dt, scratch)
         return max(constraint, swept), hold, math.inf
     merging = no_constraint(kind)
-    if row["driver"] == DRIVER_AGENT or speed > FAST_MPS:
+    if is_steered(row) or speed > FAST_MPS:
         merging = behind_merging(roads, kind, row, link, distance, scratch)
     if is_zipper(roads, link):
         zipper = behind_in_zipper(roads, travel, rows, i, kind, link, distance, scratch)
@@ -227,7 +227,7 @@ def _road_ahead(
     kind = travel.types[row["vtype"]]
     speed = row["speed"]
     half = own["half"]
-    steered = row["driver"] == DRIVER_AGENT
+    steered = is_steered(row)
     lane = row["lane"]
     here = roads.lanes[lane]
     distance = here["length_m"] - row["s"]

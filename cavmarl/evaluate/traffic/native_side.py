@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -54,13 +54,25 @@ def idle_commands(simulation: Simulation) -> Commands:
     return Commands(np.zeros((*shape, 2)), np.full(shape, ACTION_IDLE, dtype=np.int64))
 
 
-def run_native(simulation: Simulation, seconds: int) -> TrafficRun:
-    """Run and measure the world of `make_world`; a second must be a whole number of ticks."""
+def run_native(
+    simulation: Simulation,
+    seconds: int,
+    after_tick: Callable[[Simulation], None] = lambda simulation: None,
+) -> TrafficRun:
+    """Run and measure a world without agents; a second must be a whole number of steps.
+
+    `after_tick` is called with the world after each tick.
+    """
     meter = TrafficMeter(simulation.network)
     commands = idle_commands(simulation)
     ticks_per_s = round(1.0 / simulation.config.clock.sim_dt_s)
+    ticks_per_step = simulation.config.clock.ticks_per_step
     for tick in range(1, seconds * ticks_per_s + 1):
-        simulation.step(commands)
+        if ticks_per_step == 1:
+            simulation.step(commands)
+        else:
+            simulation.run_tick(commands, tick % ticks_per_step == 1, tick % ticks_per_step == 0)
+        after_tick(simulation)
         rows = simulation.vehicles()
         meter.see(rows)
         if tick % ticks_per_s == 0:

@@ -20,6 +20,8 @@ STANDING_MPS = 0.1  # slower vehicles stand, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60
 CELL_M = 10.0  # cell size of the grid for finding contacts
+FOLLOWS_MPS = 1.0  # slower vehicles have no time headway
+LONGEST_HEADWAY_S = 10.0  # vehicles farther behind do not follow
 
 EDGE_MINUTE = np.dtype(
     [
@@ -62,6 +64,18 @@ class TrafficFigures:
     longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
     locked_junction: str  # junction of the longest lock; empty: none was locked
     teleports: int  # see `TrafficCounts`
+    # vehicles per hour on one lane, mean over all lanes outside junctions and the whole run, by
+    # Edie's definition
+    flow_per_h: float | None = None
+    # median time between the front bumpers of a vehicle that drives at least 1 m/s and the next
+    # vehicle on its lane, if this is at most 10 s
+    median_headway_s: float | None = None
+    distance_km: float = 0.0  # driven by all vehicles together
+
+    @property
+    def contacts_per_1000_km(self) -> float | None:
+        """Contacts per 1,000 km that vehicles have driven; None if they have driven nothing."""
+        return 1000.0 * self.contacts / self.distance_km if self.distance_km > 0.0 else None
 
 
 @dataclass(frozen=True)
@@ -102,6 +116,21 @@ class TouchCounter:
         self._hit = np.zeros(capacity, dtype=np.int64)
 
 
+def headways_s(rows: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return the time headways of the vehicles that follow another one on their lane, in s.
+
+    Args:
+        rows: VEHICLE (n,) with lane, s, speed and length.
+    """
+    front = rows["s"] + 0.5 * rows["length"]
+    order = np.lexsort((front, rows["lane"]))
+    rows, front = rows[order], front[order]
+    follows = rows["lane"][:-1] == rows["lane"][1:]
+    follows &= rows["speed"][:-1] >= FOLLOWS_MPS
+    found: NDArray[np.float64] = np.diff(front)[follows] / rows["speed"][:-1][follows]
+    return found[found <= LONGEST_HEADWAY_S]
+
+
 class TrafficMeter:
     """Measures one world on one map."""
 
@@ -118,6 +147,7 @@ class TrafficMeter:
         self._queue_sum = 0
         self._seconds: list[NDArray[np.int64]] = []
         self._metres: list[NDArray[np.float64]] = []
+        self._headways_s: list[NDArray[np.float64]] = []
 
     def see(self, rows: NDArray[np.void]) -> None:
         """Check VEHICLE (num_vehicles,) for contacts after a tick."""
@@ -137,6 +167,7 @@ class TrafficMeter:
         self._speed_sum += float(rows["speed"].sum())
         self._queue_sum += int((standing & self._ends_at_signal[lanes]).sum())
         self._locks.sample(on_map, standing, codes)
+        self._headways_s.append(headways_s(on_map))
         edges = self._network.lanes["edge"][lanes]
         if self._samples % (MINUTE_S * SAMPLES_PER_S) == 0:
             self._seconds.append(np.zeros(len(self._network.edges), dtype=np.int64))
@@ -155,8 +186,25 @@ class TrafficMeter:
             contacts=self._touches.count,
             longest_lock_s=locks.get(worst, 0.0),
             locked_junction=worst,
+            flow_per_h=self._flow_per_h(),
+            median_headway_s=self._median_headway_s(),
+            distance_km=self._speed_sum / SAMPLES_PER_S / 1000.0,
         )
         return TrafficRun(figures, locks, self._edge_minutes())
+
+    def _flow_per_h(self) -> float | None:
+        """Return distance over area, as `_edge_minutes` does, for all edges outside junctions."""
+        edges = self._network.edges
+        outside = ~edges["internal"]
+        lanes_m = float((edges["length_m"] * edges["num_lanes"])[outside].sum())
+        driven_m = sum(float(metres[outside].sum()) for metres in self._metres)
+        if not self._samples or not lanes_m:
+            return None
+        return 3600.0 * driven_m / (lanes_m * self._samples)
+
+    def _median_headway_s(self) -> float | None:
+        found = np.concatenate([*self._headways_s, np.zeros(0)])
+        return float(np.median(found)) if len(found) else None
 
     def _edge_minutes(self) -> NDArray[np.void]:
         """Return flow and density of lanes by Edie's definitions.

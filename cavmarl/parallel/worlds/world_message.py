@@ -11,6 +11,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import WorkerError
 from cavmarl.core.extensions import extension_modules, load_plugins
 from cavmarl.engine.world_setup import World, make_world
+from cavmarl.networks.background_driver import background_drivers
 
 CHANGED = "have changed while workers started: try again"
 
@@ -49,5 +50,6 @@ def world_of(message: Mapping[str, Any], trouble: str = "") -> World:
 
 def fingerprint(world: World) -> str:
     """Return a text that differs if a file of the world has changed."""
-    made_of = (world.network, world.demand, world.partition)
+    drivers = background_drivers(world.config.traffic)
+    made_of = (world.network, world.demand, world.partition, *drivers)
     return " ".join("none" if part is None else part.content_hash for part in made_of)

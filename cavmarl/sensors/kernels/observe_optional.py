@@ -40,6 +40,48 @@ class OptionalSensors(NamedTuple):
 
 
 @kernel
+def observe_optional_frame(
+    roads: RoadArrays,  # of the world
+    travel: TripTables,
+    lane_grid: LaneGrid,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    controllers: NDArray[np.void],
+    phase: NDArray[np.int32],
+    reports: NDArray[np.void],  # REPORT (N,), the vehicle's inbox; N is 0 without messages
+    tick: int,
+    tick_s: float,
+    entered: bool,  # whether the vehicle entered during the last step
+    optional: OptionalSensors,
+    out: NDArray[np.float32],
+) -> None:
+    """Write the features of the optional sensors of row i to a frame."""
+    kinematics = optional.kinematics
+    occupancy_grid = optional.occupancy_grid
+    lidar_observation = optional.lidar_observation
+    way = optional.way
+    conflicts = optional.conflicts
+    history = optional.history
+    row = rows[i]
+    if kinematics.vehicles > 0:
+        observe_kinematics(roads, rows, i, grid, kinematics, out)
+    if occupancy_grid.features.size > 0:
+        observe_occupancy(roads, lane_grid, rows, i, grid, occupancy_grid, out)
+    if lidar_observation.cells > 0:
+        observe_lidar_cells(rows, i, grid, lidar_observation, out)
+    if way.distances_m.size > 0 or way.lines > 0:
+        time = tick * tick_s
+        observe_way(roads, travel, controllers, row, phase, time, tick_s, way, out)
+    if conflicts.most > 0:
+        observe_conflicts(
+            roads, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
+        )
+    if history.size > 0:
+        observe_history(row, entered, history.at, history.size, out)
+
+
+@kernel
 def observe_optional(
     roads: RoadArrays,
     travel: TripTables,
@@ -60,12 +102,6 @@ def observe_optional(
     more, N), the vehicles' inboxes; N is 0 without messages. `observations`: (W, A, D), whose
     optional parts are 0 before the call.
     """
-    kinematics = optional.kinematics
-    occupancy_grid = optional.occupancy_grid
-    lidar_observation = optional.lidar_observation
-    way = optional.way
-    conflicts = optional.conflicts
-    history = optional.history
     for w in range(chosen.size):
         if not chosen[w]:
             continue
@@ -78,26 +114,23 @@ def observe_optional(
                 continue
             if not is_filled:
                 fill_grid(rows, worlds.num_rows[w], grid)
-                forget_others(conflicts)
+                forget_others(optional.conflicts)
                 is_filled = True
             seen = observations[w, row["agent"]]
             out = seen[newest_frame(seen, stack) :]
-            if kinematics.vehicles > 0:
-                observe_kinematics(here, rows, i, grid, kinematics, out)
-            if occupancy_grid.features.size > 0:
-                observe_occupancy(here, lane_grid, rows, i, grid, occupancy_grid, out)
-            if lidar_observation.cells > 0:
-                observe_lidar_cells(rows, i, grid, lidar_observation, out)
-            phase = worlds.signal_phase[w]
-            if way.distances_m.size > 0 or way.lines > 0:
-                time = worlds.ticks[w] * tick_s
-                controllers = worlds.controllers[w]
-                observe_way(here, travel, controllers, row, phase, time, tick_s, way, out)
-            if conflicts.most > 0:
-                reports, tick = objects[w, row["agent"]], worlds.ticks[w]
-                observe_conflicts(
-                    here, travel, rows, i, grid, phase, reports, tick, tick_s, conflicts, out
-                )
-            if history.size > 0:
-                entered = has_entered(row, ticks_per_step)
-                observe_history(row, entered, history.at, history.size, out)
+            observe_optional_frame(
+                here,
+                travel,
+                lane_grid,
+                rows,
+                i,
+                grid,
+                worlds.controllers[w],
+                worlds.signal_phase[w],
+                objects[w, row["agent"]],
+                worlds.ticks[w],
+                tick_s,
+                has_entered(row, ticks_per_step),
+                optional,
+                out,
+            )

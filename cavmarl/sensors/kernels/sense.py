@@ -261,6 +261,36 @@ def observe_lidar(
 
 
 @kernel
+def observe_frame(
+    roads: RoadArrays,  # of the world
+    plans: NDArray[np.void],  # PLAN (G, L) that the vehicle follows
+    travel: TripTables,
+    rows: NDArray[np.void],
+    i: int,
+    grid: Grid,
+    controllers: NDArray[np.void],
+    phase: NDArray[np.int32],
+    tick: int,
+    tick_s: float,
+    sensors: Sensors,
+    out: NDArray[np.float32],
+) -> None:
+    """Write the features of row i to a frame; those of optional sensors are left out."""
+    row = rows[i]
+    if sensors.ego:
+        observe_ego(roads, plans, row, out)
+        if sensors.ego_size:
+            observe_size(travel.types[row["vtype"]], row, out)
+    observe_route(roads, plans, row, sensors, out)
+    observe_neighbors(rows, i, grid, sensors, out)
+    if sensors.signal:
+        time = tick * tick_s
+        observe_signal(roads, plans, controllers, row, phase, time, tick_s, sensors, out)
+    observe_lanes(roads, travel, rows, i, grid, phase, sensors, out)
+    observe_lidar(rows, i, grid, sensors, out)
+
+
+@kernel
 def sense(
     roads: RoadArrays,
     plans: NDArray[np.void],
@@ -301,19 +331,20 @@ def sense(
             seen = outputs.observations[w, agent]
             shift_frames(seen, sensors.stack, sensors.history_at, sensors.history)
             out = seen[newest_frame(seen, sensors.stack) :]
-            if sensors.ego:
-                observe_ego(here, own_plans, row, out)
-                if sensors.ego_size:
-                    observe_size(travel.types[row["vtype"]], row, out)
-            observe_route(here, own_plans, row, sensors, out)
-            observe_neighbors(rows, i, grid, sensors, out)
-            phase = worlds.signal_phase[w]
-            if sensors.signal:
-                time = worlds.ticks[w] * tick_s
-                controllers = worlds.controllers[w]
-                observe_signal(here, own_plans, controllers, row, phase, time, tick_s, sensors, out)
-            observe_lanes(here, travel, rows, i, grid, phase, sensors, out)
-            observe_lidar(rows, i, grid, sensors, out)
+            observe_frame(
+                here,
+                own_plans,
+                travel,
+                rows,
+                i,
+                grid,
+                worlds.controllers[w],
+                worlds.signal_phase[w],
+                worlds.ticks[w],
+                tick_s,
+                sensors,
+                out,
+            )
             outputs.present[w, agent] = True
             outputs.vehicle_ids[w, agent] = row["id"]
             outputs.places[w, agent, 0] = row["x"]

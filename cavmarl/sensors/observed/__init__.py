@@ -182,10 +182,21 @@ def optional_arrays(
 
     `most_told`: number of vehicles that an inbox keeps. `capacity`: rows per world.
     """
-    optional = [sensor for sensor in SENSORS if sensor.settings is not None]
     places = layout(config)
-    if not any(sensor.name in places for sensor in optional):
+    if not any(sensor.name in places for sensor in SENSORS if sensor.settings is not None):
         return None
+    return all_optional_arrays(config, network, plans, most_told, capacity)
+
+
+def all_optional_arrays(
+    config: SensorsConfig,
+    network: RoadNetwork,
+    plans: NDArray[np.void],
+    most_told: int,
+    capacity: int,
+) -> OptionalSensors:
+    """Return the settings of the optional sensors, on or off; arguments as `optional_arrays`."""
+    optional = [sensor for sensor in SENSORS if sensor.settings is not None]
     starts = _starts(config)
     goals = goal_places(network, plans)
     settings: dict[str, Any] = {

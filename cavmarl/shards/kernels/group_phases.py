@@ -8,6 +8,7 @@ from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
+    DRIVER_LEARNED,
     DRIVER_SUMO,
 )
 from cavmarl.rewards.kernels.reward import credit
@@ -16,6 +17,7 @@ from cavmarl.sensors.kernels.frame_stacks import fill_stacks
 from cavmarl.sensors.kernels.observe_optional import observe_optional
 from cavmarl.sensors.kernels.observing_messages import observe_messages
 from cavmarl.sensors.kernels.sense import sense
+from cavmarl.shards.kernels.learned_driving import drive_by_network
 from cavmarl.shards.kernels.world_phases import advance, begin_step, resolve
 from cavmarl.shards.kernels.zone_loop import COMMITTED, NEXT, Members, for_each_zone
 from cavmarl.traffic.kernels.admission import admit, propose, rank_lanes
@@ -27,8 +29,9 @@ from cavmarl.zones.kernels.zone_lookup import Halo, ZoneArrays
 
 @kernel
 def leave_background(departures: DepartureQueue, worlds: Worlds) -> None:
-    """Move arrived background vehicles of the next rows to the departure queue."""
+    """Move background vehicles of the next rows whose trip is over to the departure queue."""
     leave(departures, worlds, worlds.next_rows, DRIVER_BACKGROUND, 1)
+    leave(departures, worlds, worlds.next_rows, DRIVER_LEARNED, 1)
 
 
 @kernel
@@ -66,6 +69,7 @@ def gather_ghosts(
 
 
 begin_step_each = for_each_zone(begin_step)
+drive_by_network_each = for_each_zone(drive_by_network)
 advance_each = for_each_zone(advance)
 choose_goals_each = for_each_zone(choose_goals)
 leave_background_each = for_each_zone(leave_background)

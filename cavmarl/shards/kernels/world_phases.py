@@ -22,6 +22,7 @@ from cavmarl.core.records.codes import (
     ACTION_SLOWER,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_LEARNED,
     DRIVER_SCRIPTED,
     EVENT_ARRIVED,
     EVENT_COLLIDED,
@@ -147,6 +148,35 @@ def _drive_agent(
 
 
 @inlined_kernel
+def _drive_learned(
+    roads: RoadArrays,
+    plans: NDArray[np.void],
+    travel: TripTables,
+    lane_grid: LaneGrid,
+    phase: NDArray[np.int32],
+    row: np.void,
+    dt: float,
+) -> bool:
+    """Move a vehicle by the commands of its network; return whether its trip is over.
+
+    The trip also ends in the tick after a contact, off the road and at the time limit.
+    """
+    row["events"] = 0
+    if row["hit"] >= 0:
+        row["events"] = EVENT_COLLIDED
+        row["tick"] += 1
+        return True
+    note_stop(roads, plans, row, phase)
+    kind = travel.types[row["vtype"]]
+    move_agent(roads, plans, lane_grid, row, kind, row["throttle"], row["steering"], phase, dt)
+    if row["due"] >= 0 and row["tick"] >= row["due"]:
+        row["events"] |= EVENT_OUT_OF_TIME
+    row["blinker"] = needed_change(roads, travel, row, travel.steps[own_step(roads, row)])
+    is_over: bool = row["events"] & EVENTS_THAT_END != 0
+    return is_over
+
+
+@inlined_kernel
 def _fetch_lanes(roads: RoadArrays, rows: NDArray[np.void], k: int, scratch: Scratch) -> None:
     """Prefetch the lanes of the next rows, and the first points of these lanes."""
     prefetch(roads.lanes, rows[scratch.order[k + SOON]]["lane"], 0)
@@ -208,7 +238,7 @@ def advance(
     steering_limit: float,  # rad, of the agents' front wheels
     dt: float,  # seconds of the tick
     in_place: bool,  # whether `next_rows` is `rows`; if not, rows are sorted by lane
-) -> int:  # number of background vehicles that have arrived, in all worlds
+) -> int:  # number of background vehicles whose trip is over, in all worlds
     """Decide all controls from the committed rows, then move every owned row into `next_rows`."""
     arrived = 0
     for w in range(worlds.ticks.shape[0]):
@@ -235,6 +265,10 @@ def advance(
             elif row["driver"] == DRIVER_SCRIPTED:
                 row["events"] = 0
                 follow_script(here, travel, worlds.cues[w], row, dt)
+            elif row["driver"] == DRIVER_LEARNED:
+                own_plans = plans[plans_of(plans, row, w)]
+                phase = worlds.signal_phase[w]
+                through += _drive_learned(here, own_plans, travel, lane_grid, phase, row, dt)
             elif row["driver"] == DRIVER_AGENT:
                 _drive_agent(
                     here,

@@ -11,8 +11,9 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.core.compiled import kernel
+from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.rng import (
+    STREAM_MODEL,
     STREAM_ORIGIN,
     STREAM_PLACE,
     STREAM_ROUTE,
@@ -35,6 +36,7 @@ from cavmarl.core.records.codes import (
     COUNT_REROUTED,
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_LEARNED,
     EVENT_ARRIVED,
     INSERT_NONE,
     LANE_GIVEN,
@@ -44,6 +46,7 @@ from cavmarl.core.records.codes import (
     SUM_DISTANCE_M,
     SUM_TIME_S,
 )
+from cavmarl.core.records.rows import is_steered
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import place_on_lane
 from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
@@ -102,7 +105,7 @@ def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint6
     departure["id"] = vehicle
     departure["agent"] = -1
     departure["order"] = -1
-    departure["vtype"] = demand.blank[0]["vtype"]
+    departure["vtype"] = _drawn_type(demand, key, vehicle)
     departure["stop"] = -1
     departure["stops_end"] = -1
     departure["lane_code"] = LANE_GIVEN
@@ -112,6 +115,17 @@ def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint6
     spread = 2.0 * uniform(key, vehicle, 0, STREAM_SPEED_FACTOR) - 1.0
     departure["speed_factor"] = 1.0 + demand.speed_factor_spread * spread
     return place
+
+
+@inlined_kernel
+def _drawn_type(demand: Demand, key: np.uint64, vehicle: int) -> int:
+    """Draw the VTYPE row, and thus the driver, of a vehicle of the generator."""
+    last = demand.drawn_types.shape[0] - 1
+    share = uniform(key, vehicle, 0, STREAM_MODEL) if last > 0 else 0.0
+    k = 0
+    while k < last and share >= demand.drawn_ends[k]:
+        k += 1
+    return int(demand.drawn_types[k])
 
 
 @kernel
@@ -185,6 +199,8 @@ def enter(
     row["id"] = departure["id"]
     row["agent"] = departure["agent"]
     row["driver"] = DRIVER_BACKGROUND
+    if kind["network"] > 0:
+        row["driver"] = DRIVER_LEARNED
     if departure["agent"] >= 0:
         row["driver"] = DRIVER_AGENT
         worlds.pending[w, departure["agent"]] = 0.0
@@ -211,7 +227,7 @@ def enter(
     row["heading"] = place_on_lane(roads, travel, row)
     row["to_go"] = distance_left(roads, row, travel.steps[own_step(roads, row)])
     row["step_to_go"] = row["to_go"]
-    if row["agent"] >= 0 and travel.trip_horizon > 0.0:
+    if is_steered(row) and travel.trip_horizon > 0.0:
         most_s = route_time_s(roads, travel, row, worlds.ticks[w] * travel.tick_s)
         row["due"] = worlds.ticks[w] + math.ceil(most_s / travel.tick_s)
 
@@ -289,12 +305,15 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.v
     """Return whether a vehicle needs another goal: near its goal if trips are endless, or stuck.
 
     A background vehicle is stuck if it has waited for `GIVE_UP_S` at the end of a lane that its
-    way does not follow. Agents are never stuck.
+    way does not follow, or if a network has driven it to a lane without a way. Agents are never
+    stuck.
     """
     if row["driver"] == DRIVER_AGENT:
         return demand.endless and row["to_go"] <= WANDER_M
-    if row["driver"] != DRIVER_BACKGROUND:
+    if row["driver"] != DRIVER_BACKGROUND and row["driver"] != DRIVER_LEARNED:
         return False
+    if row["driver"] == DRIVER_LEARNED and row["to_go"] == math.inf:
+        return True  # it has taken a turn from which no way leads to its goal
     if row["order"] >= 0:
         return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:

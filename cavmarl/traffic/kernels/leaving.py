@@ -13,6 +13,7 @@ from cavmarl.core.records.arrays import DepartureQueue, Worlds
 from cavmarl.core.records.codes import (
     DRIVER_AGENT,
     DRIVER_BACKGROUND,
+    DRIVER_LEARNED,
     EVENT_ARRIVED,
     EVENTS_THAT_END,
 )
@@ -21,11 +22,13 @@ from cavmarl.zones.kernels.zone_lookup import note_outer
 
 @kernel
 def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
-    ending = EVENTS_THAT_END if driver == DRIVER_AGENT else EVENT_ARRIVED
+    ending = EVENT_ARRIVED
+    if driver == DRIVER_AGENT or driver == DRIVER_LEARNED:
+        ending = EVENTS_THAT_END
     if row["driver"] != driver or not row["events"] & ending:
         return False
     acted: bool = row["departed"] <= row["tick"] - ticks_per_step
-    return driver == DRIVER_BACKGROUND or acted
+    return driver != DRIVER_AGENT or acted
 
 
 @kernel
@@ -57,15 +60,16 @@ def leave(
 ) -> None:
     """Move owned vehicles of one driver kind whose trip has ended into `departures.passing`.
 
-    Trips of background vehicles end at arrival. Trips of agents that have acted also end after a
-    collision or off the road.
+    Trips of background vehicles end at arrival. Trips of agents that have acted, and of background
+    vehicles that a network drives, also end after a collision or off the road.
 
     `departures`: `passing` is written. `worlds`: the numbers of rows are written. `rows`: VEHICLE
     (W, C), the rows to take from. `ticks_per_step`: ticks of a step; agents that entered within
     the last step have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
-        if driver == DRIVER_BACKGROUND and worlds.num_through[w] == 0:
+        is_background = driver == DRIVER_BACKGROUND or driver == DRIVER_LEARNED
+        if is_background and worlds.num_through[w] == 0:
             continue
         i = 0
         while i < worlds.num_owned[w]:

@@ -8,7 +8,8 @@ import numpy as np
 
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables, Worlds
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND
+from cavmarl.core.records.codes import DRIVER_BACKGROUND
+from cavmarl.core.records.rows import is_steered
 from cavmarl.driving.kernels.lanes.route_following import distance_left, own_step, route_time_s
 from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.kernels.lanes_now import roads_in, shares_lanes
@@ -18,7 +19,7 @@ from cavmarl.traffic.kernels.way_requests import has_room
 @kernel
 def follows_plan(row: np.void) -> bool:
     """Return whether a vehicle drives to a goal of the generator."""
-    drives = row["driver"] == DRIVER_AGENT or row["driver"] == DRIVER_BACKGROUND
+    drives = is_steered(row) or row["driver"] == DRIVER_BACKGROUND
     follows: bool = drives and row["order"] < 0
     return follows
 
@@ -55,7 +56,7 @@ def take_plan(roads: RoadArrays, travel: TripTables, row: np.void, w: int) -> in
         return 0
     row["leg"] += 1
     to_go = distance_left(roads, row, step)
-    if row["driver"] == DRIVER_AGENT:
+    if is_steered(row):
         row["step_to_go"] += to_go - row["to_go"]
         row["to_go"] = to_go
         prolong_trip(roads, travel, row)
@@ -72,7 +73,7 @@ def renew_distances(roads: RoadArrays, travel: TripTables, worlds: Worlds, w: in
     here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
     for i in range(worlds.num_owned[w]):
         row = worlds.rows[w, i]
-        if row["driver"] != DRIVER_AGENT or row["way"] == row["goal"] * roads.lanes.shape[0]:
+        if not is_steered(row) or row["way"] == row["goal"] * roads.lanes.shape[0]:
             continue
         to_go = distance_left(here, row, travel.steps[own_step(here, row)])
         if to_go != row["to_go"]:

@@ -15,7 +15,6 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import (
-    DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_YIELD,
@@ -28,7 +27,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.core.records.rows import WAIT_SLACK_M
+from cavmarl.core.records.rows import WAIT_SLACK_M, is_steered
 from cavmarl.driving.kernels.junctions.deadlocks import STATE_EQUAL, drives_as_sumo
 from cavmarl.driving.kernels.junctions.stop_line_registration import (
     IMPATIENT_S,
@@ -125,14 +124,14 @@ def _has_turn(row: np.void, link: int) -> bool:
 
     For an agent, moving counts as taking the turn.
     """
-    goes: bool = row["driver"] != DRIVER_AGENT or row["wait_s"] == 0.0
+    goes: bool = not is_steered(row) or row["wait_s"] == 0.0
     return goes and row["hold"] == HOLD_NONE and row["stopped_at"] == link
 
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
     """Return whether a standing vehicle yields at `link`; an agent stopped at its line does."""
-    stands: bool = row["driver"] == DRIVER_AGENT and row["wait_s"] > 0.0
+    stands: bool = is_steered(row) and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
 
@@ -242,7 +241,7 @@ def _is_harmless(
 def assumed_accel_of(travel: TripTables, row: np.void) -> float:
     """Return the assumed acceleration of a vehicle in m/s², at most that of its type."""
     assumed_accel: float = BRISK_ACCEL
-    if row["driver"] != DRIVER_AGENT:
+    if not is_steered(row):
         assumed_accel = min(BRISK_ACCEL, travel.types[row["vtype"]]["accel"])
     return assumed_accel
 
@@ -273,7 +272,7 @@ def _comes_to_steered(
     arrives *= 1.0 + patience
     ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
     faster_mps = foe["speed"] - leaves_mps
-    if conflict["merging"] and row["driver"] == DRIVER_AGENT and faster_mps > 0.0:
+    if conflict["merging"] and is_steered(row) and faster_mps > 0.0:
         # A steered car is slow after a turn, so a fast foe needs room to brake.
         ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
     comes: bool = arrives < time_out + ahead_s
@@ -356,7 +355,7 @@ def _blocks_inside(
         )
     elif foe["speed"] * foe["speed"] < -2.0 * other["accel"] * to_clear:
         cleared = math.inf  # the foe brakes so hard that it stops before it clears the area
-    if row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT:
+    if is_steered(row) or is_steered(other):
         time_in -= 0.5 * GAP_S
     elif row["speed"] <= STANDING_MPS and not equal and not _has_turn(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
@@ -401,7 +400,7 @@ def hold_for_foe(
         return HOLD_NONE  # early exit for most foes, which does not read the VEHICLE row
     wait_m = foe_link["wait_m"]
     other = rows[foe["row"]]
-    steered = row["driver"] == DRIVER_AGENT or other["driver"] == DRIVER_AGENT
+    steered = is_steered(row) or is_steered(other)
     passes = front <= 0.0 or (not steered and _is_committed(foe, front))
     if passes and conflict["foe_enter_m"] >= wait_m - LINE_MARGIN_M:
         front += wait_m + WAIT_SLACK_M

@@ -17,7 +17,6 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
 from cavmarl.core.records.codes import (
-    DRIVER_AGENT,
     HOLD_EXIT_BLOCKED,
     HOLD_NONE,
     HOLD_SIGNAL,
@@ -30,7 +29,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.core.records.rows import WAIT_SLACK_M
+from cavmarl.core.records.rows import WAIT_SLACK_M, is_steered
 from cavmarl.driving.kernels.junctions.deadlocks import resolves_deadlocks, yields_in_deadlock
 from cavmarl.driving.kernels.junctions.gaps import (
     HARD_STOP,
@@ -93,7 +92,7 @@ def _hold_for_foes(
     row = rows[i]
     hold = HOLD_NONE
     limit = roads.lanes[roads.links[link]["next_lane"]]["speed_mps"]
-    if row["driver"] == DRIVER_AGENT:
+    if is_steered(row):
         limit = min(limit, STEERED_MPS)
     equal = resolves_deadlocks(roads, travel, row, link)
     zipper, front = is_zipper(roads, link), distance - 0.5 * row["length"]
@@ -280,7 +279,7 @@ def hold_at_line(
     target = roads.links[link]
     if target["num_conflicts"] == 0:
         return HOLD_NONE
-    stands = row["driver"] != DRIVER_AGENT and row["wait_s"] >= STOOD_S and front < STOP_LINE_M
+    stands = not is_steered(row) and row["wait_s"] >= STOOD_S and front < STOP_LINE_M
     if must_stop(roads, link, signal) and row["stopped_at"] != link and not stands:
         return HOLD_YIELD
     resolves = resolves_deadlocks(roads, travel, row, link)
@@ -306,7 +305,7 @@ def has_crept_over_red(
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
 ) -> bool:
     """Return whether an agent's vehicle has crept over a red line and has to stay there."""
-    if row["driver"] != DRIVER_AGENT or row["speed"] > CREPT_MPS:
+    if not is_steered(row) or row["speed"] > CREPT_MPS:
         return False
     if over_m >= min(CREPT_M, roads.links[link]["wait_m"] - INSIDE_M):
         return False
@@ -503,7 +502,7 @@ def _constraint_of(
     wait_m = roads.links[foe["link"]]["wait_m"]
     other = rows[foe["row"]]
     stops = foe["speed"] < STANDING_MPS
-    if row["driver"] != DRIVER_AGENT and other["driver"] != DRIVER_AGENT:
+    if not is_steered(row) and not is_steered(other):
         stops |= other["hold"] == HOLD_YIELD
     waits = (
         foe_front <= wait_m + WAIT_SLACK_M

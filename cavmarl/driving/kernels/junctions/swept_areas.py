@@ -15,8 +15,14 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_EXIT_BLOCKED, HOLD_NONE
-from cavmarl.core.records.rows import SIZE_BODIES_M, SIZE_LENGTHS_M, STEERED, SWEPT_BEYOND_M
+from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE
+from cavmarl.core.records.rows import (
+    SIZE_BODIES_M,
+    SIZE_LENGTHS_M,
+    STEERED,
+    SWEPT_BEYOND_M,
+    is_steered,
+)
 from cavmarl.driving.kernels.junctions.stop_line_registration import (
     APPROACH_STANDING_M,
     STANDING_MPS,
@@ -80,7 +86,7 @@ def stop_before_foe_sweep(
     row = rows[i]
     size = size_of(0.5 * row["length"])
     rear = place - _body_m(0.5 * row["length"], size)
-    own = STEERED if size == 0 and row["driver"] == DRIVER_AGENT else size
+    own = STEERED if size == 0 and is_steered(row) else size
     stop = math.inf
     if _nothing_sweeps(roads, own, link, scratch):
         return stop
@@ -100,7 +106,7 @@ def stop_before_foe_sweep(
         for n in range(scratch.link_start[sweep["foe"]], scratch.link_end[sweep["foe"]]):
             foe = scratch.approach[n]
             other = size_of(foe["half"])
-            if other == 0 and own == STEERED and rows[foe["row"]]["driver"] == DRIVER_AGENT:
+            if other == 0 and own == STEERED and is_steered(rows[foe["row"]]):
                 other = STEERED
             if foe["row"] == i or other != sweep["other"]:
                 continue

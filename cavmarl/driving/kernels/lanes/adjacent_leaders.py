@@ -11,7 +11,8 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import lane_pose
 from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
-from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_SCRIPTED
+from cavmarl.core.records.codes import DRIVER_SCRIPTED
+from cavmarl.core.records.rows import is_steered
 from cavmarl.driving.kernels.junctions.swept_areas import BUS_M
 from cavmarl.driving.kernels.lanes.lane_index import ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.models.following import behind, no_constraint
@@ -117,7 +118,7 @@ def next_askew(
         if entry["s"] - place > travel.view_m:
             break
         other = rows[entry["row"]]
-        passed_over = entry["side"] or entry["id"] == own_id or other["driver"] != DRIVER_AGENT
+        passed_over = entry["side"] or entry["id"] == own_id or not is_steered(other)
         if not passed_over and _sticks_out(roads, other, not to_left):
             return k, entry["s"] - place
         k += 1

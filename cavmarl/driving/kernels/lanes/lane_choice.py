@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
-from cavmarl.core.records.codes import DRIVER_AGENT
+from cavmarl.core.records.rows import is_steered
 from cavmarl.driving.kernels.lanes.lane_change import (
     LANE_CHANGE_DELAY_S,
     MAX_BRAKING_IMPOSED,
@@ -245,11 +245,11 @@ def rear_is_inside(lane: np.void, row: np.void) -> bool:
     waits with its rear in the junction (`lane_ends`), and would never change lanes.
     """
     room = SWAP_ROOM_M
-    if row["driver"] != DRIVER_AGENT:
+    if not is_steered(row):
         room = MERGE_ROOM_M + LEAST_SWAP_M + LINE_MARGIN_M + LINE_SLACK_M
     spare = lane["length_m"] - 2.0 * row["length"] - room
     near_m = min(TURN_IN_M, max(spare - SPARE_M, 0.0))
-    if row["driver"] == DRIVER_AGENT and row["speed"] < CREEP_MPS:
+    if is_steered(row) and row["speed"] < CREEP_MPS:
         near_m = 0.0  # the agent may have stopped there for the lane change
     inside: bool = spare > 0.0 and row["s"] < 0.5 * row["length"] + near_m
     return inside
@@ -294,7 +294,7 @@ def _may_change(
             return False
         # Do not change to a lane that leads to a turn that a steered car cannot take.
         turns = travel.steps[row["way"] + row["lane"]]["turnarounds"]
-        if row["driver"] == DRIVER_AGENT and beyond["turnarounds"] > turns:
+        if is_steered(row) and beyond["turnarounds"] > turns:
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0:
@@ -306,7 +306,7 @@ def _may_change(
         return False
     # A slow vehicle moves sideways almost in place.
     place = beside_s(roads, row["lane"], target, row["s"])
-    slow: bool = row["speed"] < SLOW_MPS and row["driver"] != DRIVER_AGENT
+    slow: bool = row["speed"] < SLOW_MPS and not is_steered(row)
     return not slow or has_side_clearance(roads, rows, row, target, place, 0.0, side, scratch)
 
 
@@ -318,7 +318,7 @@ def considers_lane_change(row: np.void, needed: int, tick: int, dt: float) -> bo
     moving driver whose route needs the change does so in every tick. Suggestions for agents are
     computed in every step.
     """
-    if row["driver"] == DRIVER_AGENT or (needed != 0 and row["speed"] > 0.0):
+    if is_steered(row) or (needed != 0 and row["speed"] > 0.0):
         return True
     turns = max(1, round(0.5 * LANE_CHANGE_DELAY_S / dt))
     turn: bool = (tick // 2 + row["id"]) % turns == 0
@@ -343,7 +343,7 @@ def choose_lane(
     rule does not hold for agents, because their suggestions are not binding.
     """
     row = rows[i]
-    if row["driver"] == DRIVER_AGENT:
+    if is_steered(row):
         for side in (1, -1):
             if _may_change(roads, travel, rows, i, side, needed, own_wish, scratch):
                 return side

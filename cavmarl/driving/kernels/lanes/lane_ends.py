@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, Scratch, TripTables
-from cavmarl.core.records.codes import DRIVER_AGENT, HOLD_NONE
+from cavmarl.core.records.codes import HOLD_NONE
+from cavmarl.core.records.rows import is_steered
 from cavmarl.driving.kernels.junctions.swept_areas import VAN_M, before_foe_sweep, behind_fork
 from cavmarl.driving.kernels.lanes.adjacent_leaders import behind_adjacent_leader, behind_entry
 from cavmarl.driving.kernels.lanes.lane_choice import LEAST_SWAP_M, MERGE_ROOM_SHARE, SWAP_ROOM_M
@@ -43,7 +44,7 @@ def lane_end(
     if step["change"] > 0 and merge_room_m > 0.0:
         swap = SWAP_ROOM_M
         # Background vehicles need no room to steer; on short lanes their rear has to fit.
-        if row["driver"] != DRIVER_AGENT:
+        if not is_steered(row):
             swap = min(swap, length - room - 2.0 * (row["length"] + LINE_MARGIN_M))
             swap = max(swap, LEAST_SWAP_M)
         room += row["length"] + swap
@@ -142,7 +143,7 @@ def constraint_over_lane_end(
     """
     row = rows[i]
     constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
-    if not is_near or row["driver"] == DRIVER_AGENT:
+    if not is_near or is_steered(row):
         return constraint
     if roads.lanes[lane]["num_links"] == 0:
         return max(constraint, behind_turning(roads, kind, row, lane, distance, scratch))

@@ -11,8 +11,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.config.registry import agent_entries
-from cavmarl.policies.driver_network import load_driver_network
-from cavmarl.policies.network_files import read_network
+from cavmarl.networks.driver_network import load_driver_network
+from cavmarl.networks.network_files import read_network
 from tests.support.saved_drivers import save_driver, small_vec
 
 DRIVERS = {name: path for name, path in sorted(agent_entries().items()) if path.is_dir()}

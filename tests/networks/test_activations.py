@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl.policies.kernels.activations import apply_clamp, apply_relu, apply_tanh, sigmoid
+from cavmarl.networks.kernels.activations import apply_clamp, apply_relu, apply_tanh, sigmoid
 
 INFINITY = 0x7F800000  # its bits; smaller bit patterns are finite numbers that are not negative
 TANH_ULP = 7.0

@@ -17,9 +17,9 @@ from safetensors.numpy import load_file, save_file
 from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import PolicyError
-from cavmarl.policies.driver_network import DriverNetwork, load_driver_network
+from cavmarl.networks.driver_network import DriverNetwork, load_driver_network
+from cavmarl.networks.network_files import read_network
 from cavmarl.policies.loading import load_policy
-from cavmarl.policies.network_files import read_network
 from tests.support.saved_drivers import save_driver, small_vec
 
 Tensors = dict[str, NDArray[Any]]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import PolicyError
-from cavmarl.policies.kernels.inference import (
+from cavmarl.networks.kernels.inference import (
     CLAMP,
     GRU,
     LAYER_NORM,
@@ -24,8 +24,8 @@ from cavmarl.policies.kernels.inference import (
     choose_largest,
     evaluate_network,
 )
-from cavmarl.policies.kernels.network_layers import PARTIAL_SUMS
-from cavmarl.policies.network_files import (
+from cavmarl.networks.kernels.network_layers import PARTIAL_SUMS
+from cavmarl.networks.network_files import (
     MAX_DEVIATIONS,
     RESIDUAL_PARTS,
     NetworkConfig,
@@ -105,6 +105,11 @@ class DriverNetwork:
     Args:
         weights: as `read_network` returns them.
         config: the configuration of the network.
+
+    Attributes:
+        best_layers: the layers (L, 4) that end in the most likely action, for `evaluate_network`.
+        weights: the weights of all layers, flat.
+        new_buffers: returns buffers for `evaluate_network`.
     """
 
     def __init__(self, weights: Weights, config: NetworkConfig) -> None:
@@ -119,9 +124,9 @@ class DriverNetwork:
             table.add(RESIDUAL, RESIDUAL_PARTS)
         if config.action.kind == "continuous":
             table.add(CLAMP, 1.0)
-        self._best_layers = table.layers()
-        self._weights = table.weights()
-        self._new_buffers = table.new_buffers
+        self.best_layers = table.layers()
+        self.weights = table.weights()
+        self.new_buffers = table.new_buffers
         self._no_states = np.empty(0, dtype=np.float32)
         self._evaluate = specialized(evaluate_network)
         self._choose = specialized(choose_largest)
@@ -142,7 +147,7 @@ class DriverNetwork:
 
         Arguments and errors are those of `outputs`.
         """
-        found = self._run(self._best_layers, observations)
+        found = self._run(self.best_layers, observations)
         if self.config.action.kind == "continuous":
             return found
         choices = np.empty(len(found), dtype=np.int64)
@@ -160,9 +165,9 @@ class DriverNetwork:
         given = np.require(observations, np.float32, ["C", "W"]).reshape(-1)
         outputs = np.empty((len(observations), self.config.num_outputs), dtype=np.float32)
         # Each call has its own buffers, since several threads may evaluate one network.
-        buffers = self._new_buffers()
+        buffers = self.new_buffers()
         flat = outputs.reshape(-1)
-        self._evaluate(layers, self._weights, given, self._no_states, buffers, flat)
+        self._evaluate(layers, self.weights, given, self._no_states, buffers, flat)
         return outputs
 
 

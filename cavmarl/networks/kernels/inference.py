@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.compiled import kernel
-from cavmarl.policies.kernels.activations import Float32s, apply_clamp, apply_relu, apply_tanh
-from cavmarl.policies.kernels.network_layers import gru_gates, layer_norm, linear, normalize
+from cavmarl.networks.kernels.activations import Float32s, apply_clamp, apply_relu, apply_tanh
+from cavmarl.networks.kernels.network_layers import gru_gates, layer_norm, linear, normalize
 
 NORMALIZE = 0
 CLAMP = 1

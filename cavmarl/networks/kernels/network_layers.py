@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl.core.compiled import kernel
-from cavmarl.policies.kernels.activations import ONE, ZERO, Float32s, sigmoid, tanh
+from cavmarl.networks.kernels.activations import ONE, ZERO, Float32s, sigmoid, tanh
 
 PARTIAL_SUMS = 16  # number of partial sums, so that the processor adds several numbers at once
 NORM_EPSILON = np.float32(1e-5)  # added to a variance, as torch's LayerNorm does

@@ -10,8 +10,8 @@ import pytest
 from numpy.typing import NDArray
 
 from cavmarl.config.registry import agent_entries
-from cavmarl.policies.driver_network import DriverNetwork, LayerTable
-from cavmarl.policies.kernels.inference import (
+from cavmarl.networks.driver_network import DriverNetwork, LayerTable
+from cavmarl.networks.kernels.inference import (
     CLAMP,
     GRU,
     LAYER_NORM,
@@ -24,7 +24,7 @@ from cavmarl.policies.kernels.inference import (
     choose_largest,
     evaluate_network,
 )
-from cavmarl.policies.network_files import read_network
+from cavmarl.networks.network_files import read_network
 from tests.naive.driver_networks import exact_actions, exact_outputs, layer_norm, linear
 
 Floats = NDArray[np.float32]

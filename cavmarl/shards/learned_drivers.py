@@ -1,0 +1,68 @@
+"""The networks of background vehicles, in the form that the kernel `drive_by_network` reads."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+from numpy.typing import NDArray
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.core.errors import PolicyError
+from cavmarl.networks.background_driver import BackgroundDriver, background_drivers
+from cavmarl.networks.kernels.inference import TILE_ROWS
+from cavmarl.roads.network import RoadNetwork
+from cavmarl.sensors.observed import all_optional_arrays, frame_size, sensor_arrays
+from cavmarl.shards.kernels.learned_driving import LearnedDriver
+from cavmarl.v2x.kernels.v2x_records import REPORT
+
+
+def learned_drivers(
+    config: EnvConfig,
+    network: RoadNetwork,
+    plans: NDArray[np.void],  # PLAN (G, L)
+    capacity: int,  # rows per world
+) -> tuple[LearnedDriver, ...]:
+    """Return the networks that `traffic.model` names, in its order.
+
+    Raises:
+        PolicyError: see `background_drivers`; or the sensors of a driver give another number of
+            features than it observes.
+    """
+    drivers = background_drivers(config.traffic)
+    return tuple(_learned(drivers, network, plans, capacity))
+
+
+def _learned(
+    drivers: tuple[BackgroundDriver, ...],
+    network: RoadNetwork,
+    plans: NDArray[np.void],
+    capacity: int,
+) -> Iterator[LearnedDriver]:
+    from cavmarl.networks.driver_network import load_driver_network  # imports pydantic
+
+    for number, driver in enumerate(drivers, start=1):
+        loaded = load_driver_network(driver.folder)
+        sensors, action = loaded.config.sensors, loaded.config.action
+        size = frame_size(sensors)
+        if loaded.config.observation_size != size:
+            raise PolicyError(
+                f"{driver.name}: observes {loaded.config.observation_size} numbers, but its "
+                f"sensors give {size} in this version; train it again, or name another driver in "
+                "traffic.model"
+            )
+        yield LearnedDriver(
+            number=number,
+            sensors=sensor_arrays(sensors, network),
+            optional=all_optional_arrays(sensors, network, plans, 0, capacity),
+            layers=loaded.best_layers,
+            weights=loaded.weights,
+            accel_mps2=action.acceleration_mps2,
+            steering_rad=action.steering_rad,
+            no_reports=np.zeros(0, dtype=REPORT),
+            observations=np.zeros(TILE_ROWS * size, dtype=np.float32),
+            actions=np.zeros(TILE_ROWS * loaded.config.num_outputs, dtype=np.float32),
+            states=np.zeros(0, dtype=np.float32),
+            buffers=loaded.new_buffers(),
+            places=np.zeros(TILE_ROWS, dtype=np.int64),
+        )
