@@ -322,6 +322,7 @@ methods = [
     lambda: world.get_spectator().set_transform(there),
     lambda: client.start_recorder("file.log"),
     lambda: client.replay_file("file.log", 0.0, 0.0, 0),
+    lambda: client.show_recorder_file_info("file.log", True),
 ]
 found["errors"], found["absent"] = [], []
 for method in methods:
@@ -344,8 +345,8 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
         + FREE,
     )
     if HAS_REASONS:
-        assert len(found["errors"]) == 2
-        assert all("CARLA's recorder is not available" in one for one in found["errors"])
+        assert len(found["errors"]) == 3
+        assert all("no folder for recordings" in one for one in found["errors"])
     else:  # physics are refused, too
         assert len(found["errors"]) >= 2
     assert VERSION != "0.9.16" or not found["absent"]
