@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 
 class SessionRecordings:
-    """The recording that a session makes, or the one that it shows instead of its world.
+    """The recording that a session makes, or the recording that it shows instead of its world.
 
     `session`: the session. `folder`: where recordings are; None: clients can make none.
     """

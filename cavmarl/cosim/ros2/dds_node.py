@@ -19,6 +19,10 @@ from cavmarl.cosim.ros2.ros_types import RosTypes
 MAX_DOMAIN = 101  # higher domains need ports that Linux gives to other programs
 _MAX_PARTICIPANTS = 32
 _KEPT_SAMPLES = 10
+# Types whose messages come one by one and have up to some MB. Of others, several may come at once,
+# and a node that is busy for a second must not lose them.
+LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
+_KEPT_SMALL = 200
 _PARTS = ("builtin", "core", "domain", "idl", "pub", "qos", "sub", "topic", "util")
 _MOST_ENDPOINTS = 4096  # read at a time
 _MAX_BLOCKING_S = 10
@@ -89,7 +93,7 @@ class DdsNode:
             )
             self._writers = {
                 topic: self._writer(
-                    f"rt{topic}", kind, topic in latched, 1 if topic in latched else _KEPT_SAMPLES
+                    f"rt{topic}", kind, topic in latched, 1 if topic in latched else _kept(kind)
                 )
                 for topic, kind in publishers.items()
             }
@@ -283,6 +287,11 @@ class DdsNode:
         fields = {"gid": gid(self._participant), "node_entities_info_seq": [node]}
         data = self._types.encode(_GRAPH_KIND, fields)
         self._graph.write(_sample(self._classes[_GRAPH_KIND], data))
+
+
+def _kept(kind: str) -> int:
+    """Return the number of messages that a publisher keeps for subscribers that are busy."""
+    return _KEPT_SAMPLES if kind in LARGE else _KEPT_SMALL
 
 
 def _dds_name(kind: str) -> str:

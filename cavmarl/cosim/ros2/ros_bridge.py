@@ -17,7 +17,7 @@ from typing import Any, Literal
 from cavmarl.core.errors import ConfigError, RosError
 from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.cosim.ros2.autoware_requests import AutowareRequests
-from cavmarl.cosim.ros2.dds_node import DdsNode
+from cavmarl.cosim.ros2.dds_node import LARGE, DdsNode
 from cavmarl.cosim.ros2.ros_bag import BagWriter
 from cavmarl.cosim.ros2.ros_controls import VehicleControls
 from cavmarl.cosim.ros2.ros_topics import (
@@ -38,10 +38,8 @@ _LOOK_S = 0.1  # how often matched subscribers are counted, wall time
 _SETTLED_S = 0.5  # a node's subscriptions are found one by one; then all are, wall time
 _REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
 
-# Messages that arrive in one burst of up to some MB, which the node's socket must hold.
-_LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
-BUFFER_BYTES = 4 << 20  # that `fast_dds.xml` asks for
+BUFFER_BYTES = 4 << 20  # that `fast_dds.xml` asks for: a large message arrives in one burst
 
 
 @dataclass(frozen=True)
@@ -169,7 +167,7 @@ class RosBridge:
         except BaseException:
             self._close_bag()
             raise
-        if any(kind in _LARGE for kind in self._topics.kinds.values()):
+        if any(kind in LARGE for kind in self._topics.kinds.values()):
             _warn_of_small_buffers()
 
     def run(self, steps: int | None = None) -> None:

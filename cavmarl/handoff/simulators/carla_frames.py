@@ -78,7 +78,7 @@ def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedCo
     """Check that CARLA's sensors can take the samples of a rig, if that is wanted.
 
     Raises:
-        ConfigError: the rig has a sensor of the surroundings of which CARLA gives no frames, a
+        ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a
             sensor with noise, or a radar with a wider field of view than CARLA's.
     """
     if not gives_frames(options):

@@ -66,7 +66,7 @@ class Car:
         self.is_owned = False
         self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
         self.left = PLACED_TICKS  # ticks for which it is still placed
-        self.sensors: dict[str, Sensor] = {}  # of an agent's vehicle, by their names
+        self.sensors: dict[str, MountedActor] = {}  # of an agent's vehicle, by their names
 
     def unmount(self) -> None:
         """Remove the sensors."""
@@ -75,7 +75,7 @@ class Car:
         self.sensors.clear()
 
 
-class Sensor:
+class MountedActor:
     """A sensor on a vehicle, and the data of its newest frame."""
 
     def __init__(self, actor: Any) -> None:
@@ -199,7 +199,7 @@ class Zone:
             place = carla.Location(*mount["place"])
             there = carla.Transform(place, carla.Rotation(*mount["turn"]))
             actor = self._world.spawn_actor(blueprint, there, attach_to=car.actor)
-            car.sensors[name] = Sensor(actor)
+            car.sensors[name] = MountedActor(actor)
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
         """Return the data of the last tick's frames in base64, of vehicles that have one."""
