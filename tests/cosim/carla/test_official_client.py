@@ -409,3 +409,37 @@ for sensor in (mounted, gnss):
     assert found["speed"] < 0.01
     assert found["box"] == 2.5
     assert {"Red", "Green"} <= set(found["lights"])
+
+
+def test_the_client_reads_optical_flow(port: int) -> None:
+    found = run_client(
+        port,
+        SYNCHRONOUS
+        + """
+agent = next(one for one in world.get_actors().filter("vehicle.*")
+             if one.attributes["role_name"] == "car_0")
+blueprint = world.get_blueprint_library().find("sensor.camera.optical_flow")
+blueprint.set_attribute("image_size_x", "64")
+blueprint.set_attribute("image_size_y", "48")
+place = carla.Transform(carla.Location(z=2.0))
+camera = world.spawn_actor(blueprint, place, attach_to=agent)
+images = queue.Queue()
+camera.listen(images.put)
+found["frames"], found["flows"] = [], []
+for _ in range(20):
+    frame = world.tick()
+    image = images.get(timeout=10.0)
+    found["frames"].append(image.frame - frame)
+    found["flows"].append(max(max(abs(one.x), abs(one.y)) for one in image))
+found["size"] = [image.width, image.height, len(image)]
+found["colours"] = image.get_color_coded_flow() is not None
+camera.stop()
+camera.destroy()
+"""
+        + FREE,
+    )
+    assert set(found["frames"]) == {0}
+    assert found["size"] == [64, 48, 64 * 48]
+    assert found["colours"]
+    assert found["flows"][0] == 0.0
+    assert 0.0 < max(found["flows"]) <= 2.0
