@@ -66,19 +66,18 @@ class RecordedActor:
         """Return an actor from the values of a line. Raises ValueError for others."""
         attributes, vectors = given["attributes"], (given["centre"], given["half_m"])
         texts = [given["type_id"], *attributes, *attributes.values()]
-        numbers = [given["vehicle"], given["number"]]
+        vehicle, number = given["vehicle"], given["number"]
         if (
             not all(isinstance(one, str) for one in texts)
             or given["type_id"] not in BLUEPRINTS
-            or not all(isinstance(one, int) and 0 <= one < 1 << 32 for one in numbers)
+            or not all(isinstance(one, int) and 0 <= one < 1 << 32 for one in (vehicle, number))
             or not all(len(one) == 3 and all(map(_is_small, one)) for one in vectors)
         ):
             raise ValueError("it is no actor")
         (cx, cy, cz), (hx, hy, hz) = vectors
         bytes.fromhex(given["tags"])
-        return cls(
-            *numbers, given["type_id"], attributes, (cx, cy, cz), (hx, hy, hz), given["tags"]
-        )
+        boxes = (cx, cy, cz), (hx, hy, hz)
+        return cls(vehicle, number, given["type_id"], attributes, *boxes, given["tags"])
 
     def actor(self, number: int) -> CarlaActor:
         """Return the actor, with the number that it gets."""
@@ -120,10 +119,10 @@ def read_session(path: Path) -> RecordedSession:
         head, *lines = file.read_text(encoding="utf-8").splitlines()
         first = json.loads(head)
         actors = [RecordedActor.read(json.loads(line)) for line in lines]
-        named, number = [first["map"], first["session"]], first["episode"]
-        if not all(isinstance(one, str) for one in named) or not isinstance(number, int):
+        name, key, number = first["map"], first["session"], first["episode"]
+        if not (isinstance(name, str) and isinstance(key, str) and isinstance(number, int)):
             raise ValueError("its first line is no session")
-        return RecordedSession(*named, number, {one.vehicle: one for one in actors})
+        return RecordedSession(name, key, number, {one.vehicle: one for one in actors})
     except OSError as error:
         raise RecordingError(
             f"{path.name}: is no recording of a CARLA server ({error.strerror}); start_recorder "

@@ -87,7 +87,8 @@ class OpticalFlowCamera(AttachedCamera):
     def _places(self, points: Floats) -> Floats:
         """Return where (H, W, 2) points are in the picture: from -1 to 1, to the right and up."""
         ahead = np.maximum(points[..., :1], _NEAR_M)
-        return points[..., 1:] / (ahead * np.array(self._slopes))
+        found: Floats = points[..., 1:] / (ahead * np.array(self._slopes))
+        return found
 
 
 def _moved_back(points: Floats, ids: NDArray[np.int64], now: _Bodies, before: _Bodies) -> Floats:
