@@ -108,7 +108,8 @@ libraries: $(LIBRARIES)/.ready ## what needs RLlib or BenchMARL, in an environme
 
 ros2: $(READY) $(ROS)/.ready ## the tests of the ROS 2 bridge with rclpy of Jazzy and Kilted (0.5 GB)
 	CAVMARL_RCLPY_PYTHON=$(CURDIR)/$(ROS)/kilted/bin/python:$(CURDIR)/$(ROS)/jazzy/bin/python \
-	    $(BIN)/pytest tests/cosim/ros2 tests/benchmarks/test_ros2_clock.py
+	    $(BIN)/pytest tests/cosim/ros2 tests/benchmarks/test_ros2_clock.py \
+	    tests/benchmarks/test_ros2_load.py
 
 # Without the comment that netconvert and netgenerate begin with (date, version, options), the same
 # options give the same bytes.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from rich.console import Console
@@ -41,6 +42,9 @@ def carla(
             "leading one (follow)."
         ),
     ] = "obey",
+    recordings: Annotated[
+        Path, about("Folder of the recordings that clients make.", metavar="FOLDER")
+    ] = Path("runs/carla"),
     max_clients: Annotated[
         int, about("Maximum number of clients at the same time.", metavar="N", panel=SERVICE)
     ] = 64,
@@ -78,5 +82,6 @@ def carla(
         client=client_version,
         limits=limits,
         other_ticks=other_ticks,
+        recordings=recordings,
         told=tell,
     )

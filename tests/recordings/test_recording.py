@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from cavmarl import CavEnv, RecordingError, make_vec, parallel_env
-from cavmarl.core.records.codes import EVENT_RED_LIGHT
+from cavmarl.core.records.codes import DRIVER_EXTERNAL, EVENT_RED_LIGHT
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.engine.world_setup import load_world
@@ -192,3 +192,18 @@ def test_a_process_that_ends_without_close_leaves_the_whole_run(tmp_path: Path) 
     recording = Recording.open(tmp_path / "run")
     assert recording.is_whole
     assert len(list(recording.frames())) == 10
+
+
+def test_a_recording_keeps_vehicles_of_the_caller(tmp_path: Path) -> None:
+    path = tmp_path / "run"
+    overrides = {"population.external": 2}
+    env = parallel_env("ring", agents=1, background=0, record=path, overrides=overrides)
+    with closing(env):
+        env.reset(seed=5)
+        x, y, _, heading, *_ = env.network.pose_on(0, 5.0)
+        env.external.spawn(float(x), float(y), float(heading))
+        env.step(env.suggest_actions())
+        driven = env.world_frames()[0]
+    frames = list(Recording.open(path).frames())
+    assert DRIVER_EXTERNAL in driven.vehicles["driver"]
+    assert frames[-1].vehicles.tobytes() == driven.vehicles.tobytes()

@@ -299,6 +299,7 @@ def apply_ackermann_control_to_vehicle(
 
 def _drive(caller: Caller, session: CarlaSession, number: int, control: Control, name: str) -> None:
     actor = session.actors.find(number, name)
+    session.recordings.refuse_in_replay()
     if actor.agent >= 0:
         session.world.controls[actor.agent] = control
         caller.agents.add(actor.agent)

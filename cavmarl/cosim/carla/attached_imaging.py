@@ -24,7 +24,7 @@ from cavmarl.sensors.kernels.panorama import (
 )
 from cavmarl.sensors.kernels.ray_caster import NO_HIT, WALL_HIT
 
-_CAMERA_RANGE_M = 300.0
+CAMERA_RANGE_M = 300.0
 _DEPTH_RANGE_M = 1000.0  # depth of pixels without an object
 _DEPTH_STEPS = (1 << 24) - 1
 _FACES_OF_PRISM = 6
@@ -281,7 +281,7 @@ class RadarSensor:
         return detections.tobytes()
 
 
-class _CameraSensor:
+class AttachedCamera:
     """Base class of the cameras. `picture`: what the kernel writes."""
 
     kind: ClassVar[int]
@@ -291,15 +291,15 @@ class _CameraSensor:
         width = settings.whole("image_size_x", 1, _MAX_PIXELS)
         height = settings.whole("image_size_y", 1, _MAX_PIXELS)
         fov = settings.number("fov", 0.1, 179.0)
-        self._lens = Lens(self.picture, width, height, math.radians(fov), _CAMERA_RANGE_M)
-        self._head = struct.pack("<IIf", width, height, fov)
+        self.lens = Lens(self.picture, width, height, math.radians(fov), CAMERA_RANGE_M)
+        self.head = struct.pack("<IIf", width, height, fov)
 
     def sense(self, context: SensorContext, actor: CarlaActor, elapsed_s: float) -> bytes:
         carrier = context.hidden_carrier_of(actor)
-        picture = context.surroundings.take_picture(self._lens, actor.pose, carrier)
-        pixels = np.full((self._lens.height, self._lens.width, 4), 255, np.uint8)
+        picture = context.surroundings.take_picture(self.lens, actor.pose, carrier)
+        pixels = np.full((self.lens.height, self.lens.width, 4), 255, np.uint8)
         self.fill(context, picture, pixels)
-        return self._head + pixels.tobytes()
+        return self.head + pixels.tobytes()
 
     def fill(
         self, context: SensorContext, picture: NDArray[Any], pixels: NDArray[np.uint8]
@@ -307,8 +307,16 @@ class _CameraSensor:
         """Write blue, green, red and alpha (H, W, 4) of a picture."""
         raise NotImplementedError
 
+    def bodies(self, context: SensorContext) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
+        """Return which pixels (H, W) show vehicles or walkers, and the ids (n,) of their rows."""
+        surroundings = context.surroundings
+        prisms = surroundings.panorama.prisms
+        body = (self.lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM
+        shown = (body >= 0) & (body < len(prisms))
+        return shown, prisms["id"][body[shown]]
 
-class RgbCameraSensor(_CameraSensor):
+
+class RgbCameraSensor(AttachedCamera):
     """Colours of classes, shaded."""
 
     kind = 13
@@ -320,7 +328,7 @@ class RgbCameraSensor(_CameraSensor):
         pixels[..., :3] = picture[..., ::-1]
 
 
-class DepthCameraSensor(_CameraSensor):
+class DepthCameraSensor(AttachedCamera):
     """Depth along the optical axis, in 24 bits from 0 to 1000 m."""
 
     kind = 1
@@ -329,13 +337,13 @@ class DepthCameraSensor(_CameraSensor):
     def fill(
         self, context: SensorContext, picture: NDArray[Any], pixels: NDArray[np.uint8]
     ) -> None:
-        depth = np.where(picture < _CAMERA_RANGE_M, picture, _DEPTH_RANGE_M)
+        depth = np.where(picture < CAMERA_RANGE_M, picture, _DEPTH_RANGE_M)
         steps = (depth.astype(np.float64) / _DEPTH_RANGE_M * _DEPTH_STEPS).astype(np.uint32)
         for channel, shift in enumerate((16, 8, 0)):
             pixels[..., channel] = steps >> shift & 255
 
 
-class SemanticCameraSensor(_CameraSensor):
+class SemanticCameraSensor(AttachedCamera):
     """The tag of each pixel, in red."""
 
     kind = 14
@@ -349,14 +357,6 @@ class SemanticCameraSensor(_CameraSensor):
         if context.session.actors.props.size:
             shown, ids = self.bodies(context)
             pixels[shown, 2] = context.tagged(pixels[shown, 2], ids)
-
-    def bodies(self, context: SensorContext) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return which pixels (H, W) show vehicles or walkers, and the ids (n,) of their rows."""
-        surroundings = context.surroundings
-        prisms = surroundings.panorama.prisms
-        body = (self._lens.picture_of(surroundings).face - FIRST_FACE) // _FACES_OF_PRISM
-        shown = (body >= 0) & (body < len(prisms))
-        return shown, prisms["id"][body[shown]]
 
 
 class InstanceCameraSensor(SemanticCameraSensor):

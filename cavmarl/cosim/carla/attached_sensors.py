@@ -26,6 +26,7 @@ from cavmarl.cosim.carla.carla_geodesy import geolocation
 from cavmarl.cosim.carla.carla_geometry import axes_of
 from cavmarl.cosim.carla.carla_records import packed_actor
 from cavmarl.cosim.carla.carla_streams import StreamHub
+from cavmarl.cosim.carla.optical_flow_camera import OpticalFlowCamera
 from cavmarl.cosim.carla.rpc_messages import pack
 from cavmarl.cosim.carla.sensor_settings import SensorContext, SensorSettings
 
@@ -178,6 +179,7 @@ _SENSORS: dict[str, Make] = {
     "sensor.camera.depth": DepthCameraSensor,
     "sensor.camera.semantic_segmentation": SemanticCameraSensor,
     "sensor.camera.instance_segmentation": InstanceCameraSensor,
+    "sensor.camera.optical_flow": OpticalFlowCamera,
     "sensor.lidar.ray_cast": LidarSensor,
     "sensor.lidar.ray_cast_semantic": SemanticLidarSensor,
     "sensor.other.radar": RadarSensor,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -125,10 +125,18 @@ class ActorTable:
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
     clients keep what they know of a number. `next_number`: least number of the first vehicle.
+    `known`: actors of vehicles that may appear, by the ids of the vehicles.
     """
 
-    def __init__(self, world: HostedWorld, first_number: int, next_number: int = 0) -> None:
+    def __init__(
+        self,
+        world: HostedWorld,
+        first_number: int,
+        next_number: int = 0,
+        known: Mapping[int, CarlaActor] | None = None,
+    ) -> None:
         self._next = first_number
+        self._known = known or {}
         self.actors: dict[int, CarlaActor] = {}
         self._by_vehicle: dict[int, CarlaActor] = {}
         self.spectator = self.add("spectator", SPECTATOR_POSE)
@@ -146,6 +154,10 @@ class ActorTable:
     def next_number(self) -> int:
         """The number of the next actor."""
         return self._next
+
+    def skip_to(self, number: int) -> None:
+        """Give no number below this one to the next actors."""
+        self._next = max(self._next, number)
 
     @property
     def vehicles(self) -> list[CarlaActor]:
@@ -323,7 +335,7 @@ class ActorTable:
         states = self._light_states
         if not len(states):
             return
-        states["light_state"] = world.lights.states()
+        states["light_state"] = world.light_states()
         states["elapsed_s"] = world.lights.elapsed_s
         states["times_s"] = world.lights.times_s
         states["is_frozen"] = world.lights.is_frozen
@@ -357,6 +369,10 @@ class ActorTable:
         return gone
 
     def _add_vehicle(self, world: HostedWorld, row: np.void) -> CarlaActor:
+        known = self._known.get(int(row["id"]))
+        if known is not None:
+            self.actors[known.number] = self._by_vehicle[known.vehicle] = known
+            return known
         vclass = int(world.simulation.types["vclass"][row["vtype"]])
         semantic = SEMANTIC_OF_CLASS[_CLASS_NAMES[vclass]]
         agent = int(row["agent"])

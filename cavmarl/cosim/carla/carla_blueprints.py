@@ -284,7 +284,6 @@ _PROPS = {
 _CHILDREN = (9, 10, 11, 12, 13, 14, 48, 49)
 # Programs look these up, but a server refuses to spawn them.
 _OTHER_CAMERAS = (
-    "camera.optical_flow",
     "camera.normals",
     "camera.dvs",
     "camera.cosmos_visualization",
@@ -349,6 +348,7 @@ BLUEPRINTS = {
         _sensor("camera.depth", *_CAMERA),
         _sensor("camera.semantic_segmentation", *_CAMERA),
         _sensor("camera.instance_segmentation", *_CAMERA),
+        _sensor("camera.optical_flow", *_CAMERA),
         _sensor("lidar.ray_cast", *_LIDAR, *_LIDAR_NOISE, *_SEED),
         _sensor("lidar.ray_cast_semantic", *_LIDAR),
         _sensor(

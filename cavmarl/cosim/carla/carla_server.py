@@ -20,7 +20,13 @@ from typing import Self
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.core.server_address import is_loopback, listen
-from cavmarl.cosim.carla import actor_calls, batch_calls, episode_calls, light_calls
+from cavmarl.cosim.carla import (
+    actor_calls,
+    batch_calls,
+    episode_calls,
+    light_calls,
+    recorder_calls,
+)
 from cavmarl.cosim.carla.call_table import Caller, answer
 from cavmarl.cosim.carla.carla_session import (
     DEFAULT_LIMITS,
@@ -44,6 +50,7 @@ CALL_MODULES = (
     batch_calls,
     episode_calls,
     light_calls,
+    recorder_calls,
 )  # they fill the table of calls
 _LATE_S = 0.5  # a free-running world that is later than this does not catch up
 _PATIENCE_S = 0.05  # how long a tick waits for listeners of new sensors
@@ -144,7 +151,7 @@ class CarlaServer:
         client: version of the clients.
         limits: limits of what clients may demand.
         step_s: length of a step before a client has set one.
-        other_ticks: see `CarlaSession`.
+        other_ticks, recordings: see `CarlaSession`.
 
     Attributes:
         session: the state that clients share.
@@ -165,6 +172,7 @@ class CarlaServer:
         limits: SessionLimits = DEFAULT_LIMITS,
         step_s: float = STEP_S,
         other_ticks: OtherTicks = "obey",
+        recordings: Path | None = None,
     ) -> None:
         if not 0 <= port <= _MAX_PORT:
             raise ConfigError(f"port = {port}: must be from 0 to {_MAX_PORT}")
@@ -174,7 +182,9 @@ class CarlaServer:
         self._streams = StreamHub(stream_port, limits.max_unsent)
         self._connections: set[ClientConnection] = set()
         try:
-            self.session = CarlaSession(source, version, self._streams, limits, step_s, other_ticks)
+            self.session = CarlaSession(
+                source, version, self._streams, limits, step_s, other_ticks, recordings
+            )
         except BaseException:
             self._close_sockets()
             source.close()
@@ -268,6 +278,7 @@ def serve(
     limits: SessionLimits = DEFAULT_LIMITS,
     map_file: Path | None = None,
     other_ticks: OtherTicks = "obey",
+    recordings: Path | None = None,
     told: Callable[[CarlaServer], None] = lambda server: None,
 ) -> None:
     """Let CARLA's clients use a world, until an interrupt.
@@ -281,6 +292,7 @@ def serve(
         client: version of the clients: `0.9.15`, `0.9.16` or `0.10.0`.
         limits: limits of what clients may demand.
         other_ticks: what happens if a client ticks that is not the first one; see `CarlaSession`.
+        recordings: folder of the recordings that clients make; None: they can make none.
         map_file: the map of `env`, if it is an environment that is not in the library.
         told: called with the server when it listens.
 
@@ -310,6 +322,7 @@ def serve(
         limits=limits,
         step_s=step_s,
         other_ticks=other_ticks,
+        recordings=recordings,
     )
     with server:
         told(server)

@@ -6,6 +6,7 @@ import logging
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal
 
 from cavmarl.core.errors import ClockError, ConfigError
@@ -26,6 +27,7 @@ from cavmarl.cosim.carla.hosted_world import (
     HostedWorld,
     WorldSource,
 )
+from cavmarl.cosim.carla.session_recordings import SessionRecordings
 
 log = logging.getLogger("cavmarl.carla")
 
@@ -57,6 +59,7 @@ class SessionLimits:
         max_clients: number of RPC connections.
         max_actors: actors that clients have spawned.
         max_unsent: bytes that wait for a client that does not read.
+        max_recorded: vehicles of a recording, summed over its ticks.
 
     Raises ConfigError: a limit is not above 0.
     """
@@ -65,6 +68,7 @@ class SessionLimits:
     max_clients: int = 64
     max_actors: int = 1024
     max_unsent: int = 1 << 26
+    max_recorded: int = 100_000_000
 
     def __post_init__(self) -> None:
         for name, limit in vars(self).items():
@@ -89,12 +93,14 @@ class CarlaSession:
             master: the client that has ticked first, until it disconnects. `obey`: the world
             advances, as CARLA's does. `refuse`: the client gets an error. `follow`: the client
             waits for the next tick of the master.
+        recordings: folder of the recordings that clients make; None: they can make none.
 
     Attributes:
         frame: number of ticks since the server has started; it numbers the snapshots.
         episode: number of the episode; it grows when a client loads a map.
         managers: ports and hosts of the clients' traffic managers.
         weather, gravity: values that clients have set; they have no effect.
+        recordings: what clients record and replay.
     """
 
     def __init__(
@@ -105,6 +111,7 @@ class CarlaSession:
         limits: SessionLimits = DEFAULT_LIMITS,
         step_s: float = STEP_S,
         other_ticks: OtherTicks = "obey",
+        recordings: Path | None = None,
     ) -> None:
         self.source, self.version, self.streams, self.limits = source, version, streams, limits
         self.settings = EpisodeSettings()
@@ -122,6 +129,7 @@ class CarlaSession:
         streams.first_frames[EPISODE_STREAM] = self._snapshot
         self._map_changed = True
         self._told: set[str] = set()
+        self.recordings = SessionRecordings(self, recordings)
 
     @property
     def map(self) -> CarlaMap:
@@ -140,11 +148,15 @@ class CarlaSession:
         """
         self.frame += 1
         self.time_s += self.delta_s
+        all_ended: list[EndedVehicle] = []
         for _ in range(max(1, round(self.delta_s / self.world.step_s))):
-            for ended in self.world.step(actions):
-                self._tell_end(ended)
+            all_ended += self.world.step(actions)
+        for ended in all_ended:
+            self._tell_end(ended)
+        self.recordings.end_replay(only_if_over=True)
         for actor in self.actors.take(self.world):
-            self._forget(actor)
+            self.forget(actor)
+        self.recordings.note_tick(all_ended)
         self.publish()
         return self.frame
 
@@ -221,6 +233,8 @@ class CarlaSession:
         self.settings = settings
 
     def _restart(self, step_s: float) -> None:
+        self.recordings.end_replay()
+        self.recordings.stop()
         before, controls = self.actors, self.world.external.controls
         driven = {
             actor.number: controls[actor.slot]
@@ -231,7 +245,7 @@ class CarlaSession:
         self.actors = ActorTable(self.world, before.spectator.number, before.next_number)
         for actor in self.actors.keep_spawned(self.world, before):
             log.warning("actor %d (%s) could not be kept", actor.number, actor.type_id)
-            self._forget(actor)
+            self.forget(actor)
         self.sensors.await_listeners()
         for number, control in driven.items():
             if number in self.actors.actors:
@@ -241,6 +255,8 @@ class CarlaSession:
         """Begin a new episode on a map; raise CavmarlError if there is no such map."""
         short = name.rpartition("/")[2]
         world = self.source.load(short, self.world.step_s)
+        self.recordings.end_replay()
+        self.recordings.stop()
         if reset_settings:
             self.settings = EpisodeSettings(no_rendering=self.settings.no_rendering)
         self.episode += 1
@@ -273,6 +289,7 @@ class CarlaSession:
             raise CallRefused("unable to attach actor: parent actor not found")
         if type_id.startswith(("sensor.", "controller.")):
             return self._attach(blueprint, attributes, pose, parent)
+        self.recordings.refuse_in_replay()
         there = compose(self.actors.pose_of(self.actors.actors[parent]), pose) if parent else pose
         if parent and blueprint.base_type == PROP:
             raise CallRefused(f"{type_id}: props cannot be attached; spawn it at a place")
@@ -308,7 +325,7 @@ class CarlaSession:
         elif not actor.is_attached:
             raise CallRefused(f"unable to destroy actor: {actor.type_id} belongs to the world")
         for one in self.actors.remove(number):
-            self._forget(one)
+            self.forget(one)
 
     def release(self, caller: Caller) -> None:
         """Give the agents of a client that has left back to the built-in driver."""
@@ -324,7 +341,9 @@ class CarlaSession:
             log.warning("%s", message)
 
     def close(self) -> None:
+        self.recordings.stop()
         self.source.close()
 
-    def _forget(self, actor: CarlaActor) -> None:
+    def forget(self, actor: CarlaActor) -> None:
+        """End the sensor of an actor that has gone."""
         self.sensors.remove(actor)

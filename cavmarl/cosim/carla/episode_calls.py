@@ -28,7 +28,6 @@ from cavmarl.cosim.carla.call_table import (
     answer_constant,
     answer_from,
     call,
-    refuse,
 )
 from cavmarl.cosim.carla.carla_blueprints import BLUEPRINTS
 from cavmarl.cosim.carla.carla_session import CarlaSession, EpisodeSettings
@@ -43,9 +42,6 @@ _SHORTEST_S, _LONGEST_S = 0.001, 10.0
 _settings = record_of(flag, flag, optional(number), *[anything] * 8, required=3)
 _weather = record_of(*[number] * 14, required=12)
 _xodr_options = anything
-_NO_RECORDER = (
-    "CARLA's recorder is not available; record with `record=` (docs/guides/recordings.md)"
-)
 
 
 def port(value: Any) -> int:
@@ -245,25 +241,6 @@ answer_constant([], "query_lights_state", checks=(text,), note="no street lights
 answer_constant([], "get_names_of_all_objects")
 answer_constant([], "get_environment_objects", "get_all_level_BBs", checks=(whole,))
 answer_constant(True, "is_weather_enabled")
-refuse("start_recorder", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
-refuse(
-    "replay_file",
-    checks=(anything,) * 6,
-    because=_NO_RECORDER,
-    returns=Returns.VALUE,
-    required=5,  # client 0.9.15 has no offset
-)
-refuse("show_recorder_file_info", checks=(text, flag), because=_NO_RECORDER, returns=Returns.VALUE)
-refuse(
-    "show_recorder_collisions",
-    "show_recorder_actors_blocked",
-    checks=(anything,) * 3,
-    because=_NO_RECORDER,
-    returns=Returns.VALUE,
-)
-accept("stop_recorder", checks=())
-accept("stop_replayer", "set_replayer_ignore_hero", "set_replayer_ignore_spectator", checks=(flag,))
-accept("set_replayer_time_factor", checks=(number,))
 
 
 @call("get_required_files", text, note="the navigation mesh")

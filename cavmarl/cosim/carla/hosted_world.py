@@ -10,7 +10,7 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, NamedTuple, Protocol
+from typing import TYPE_CHECKING, Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +31,9 @@ from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.maps.exports.opendrive import carla_document
 from cavmarl.maps.exports.opendrive_carla import origin_of
 from cavmarl.roads.sumo_net.reader import source_hash
+
+if TYPE_CHECKING:
+    from cavmarl.cosim.carla.carla_replay import CarlaReplay
 
 GENERATED_MAP = "OpenDriveMap"  # name of the map that a client has sent
 STEP_S = 0.05
@@ -83,6 +86,7 @@ class HostedWorld:
         controls: the clients' controls, by the index of the agent that they drive.
         external: the vehicles that clients have spawned.
         lights: the traffic lights.
+        replay: a recording that is shown instead of the world; the world then stands still.
 
     Raises:
         ConfigError: the actions are not continuous, or other processes run the world.
@@ -100,6 +104,7 @@ class HostedWorld:
         self.controls: dict[int, Control] = {}
         self.external = ExternalVehicles(env)
         self.lights = TrafficLights(env, carla_map)
+        self.replay: CarlaReplay | None = None
         self.master = TimeMaster(env)
         if not env.is_ready:
             self.master.reset(seed)
@@ -111,7 +116,13 @@ class HostedWorld:
     @property
     def rows(self) -> NDArray[np.void]:
         """VEHICLE (n,) of the present; the next step overwrites them."""
-        return self.simulation.vehicles(0)
+        return self.simulation.vehicles(0) if self.replay is None else self.replay.rows
+
+    def light_states(self) -> NDArray[np.uint8]:
+        """Return the state of each traffic light."""
+        if self.replay is not None:
+            return self.map.states_in(self.replay.signals)
+        return self.lights.states()
 
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
@@ -121,6 +132,9 @@ class HostedWorld:
         Returns the agents' vehicles that have left the world.
         """
         env = self.env
+        if self.replay is not None:
+            self.replay.advance(self.step_s)
+            return []
         if not env.agents:
             self.reset()
             return []

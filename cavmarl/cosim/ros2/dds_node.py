@@ -19,6 +19,12 @@ from cavmarl.cosim.ros2.ros_types import RosTypes
 MAX_DOMAIN = 101  # higher domains need ports that Linux gives to other programs
 _MAX_PARTICIPANTS = 32
 _KEPT_SAMPLES = 10
+# Types whose messages come one by one and have up to some MB. Of others, several may come at once,
+# and a node that is busy for a second must not lose them.
+LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
+_KEPT_SMALL = 200
+_PARTS = ("builtin", "core", "domain", "idl", "pub", "qos", "sub", "topic", "util")
+_MOST_ENDPOINTS = 4096  # read at a time
 _MAX_BLOCKING_S = 10
 _GRAPH = "ros_discovery_info"
 _GRAPH_KIND = "rmw_dds_common/msg/ParticipantEntitiesInfo"
@@ -75,10 +81,7 @@ class DdsNode:
         if not 0 <= domain <= MAX_DOMAIN:
             raise ConfigError(f"domain = {domain}: must be from 0 to {MAX_DOMAIN}")
         self._types, self._name = types, name
-        self._dds = {
-            part: require(f"cyclonedds.{part}", "ros2")
-            for part in ("core", "domain", "idl", "pub", "qos", "sub", "topic", "util")
-        }
+        self._dds = {part: require(f"cyclonedds.{part}", "ros2") for part in _PARTS}
         self._classes: dict[str, Any] = {}
         self._domain: Any = None
         try:
@@ -90,7 +93,7 @@ class DdsNode:
             )
             self._writers = {
                 topic: self._writer(
-                    f"rt{topic}", kind, topic in latched, 1 if topic in latched else _KEPT_SAMPLES
+                    f"rt{topic}", kind, topic in latched, 1 if topic in latched else _kept(kind)
                 )
                 for topic, kind in publishers.items()
             }
@@ -99,6 +102,14 @@ class DdsNode:
                 for topic, kind in subscriptions.items()
             }
             self._kinds = {**publishers, **subscriptions}
+            builtin = self._dds["builtin"]
+            self._endpoints = [
+                builtin.BuiltinDataReader(self._participant, topic)
+                for topic in (
+                    builtin.BuiltinTopicDcpsPublication,
+                    builtin.BuiltinTopicDcpsSubscription,
+                )
+            ]
             self._graph = self._writer(_GRAPH, _GRAPH_KIND, True, 1)
             self._tell_graph()
             core = self._dds["core"]
@@ -151,6 +162,25 @@ class DdsNode:
         """Return the number of publishers of a topic to which this node has subscribed."""
         return len(self._readers[topic].get_matched_publications())
 
+    def kind_of(self, topic: str) -> str:
+        """Return the type of one of this node's topics."""
+        return self._kinds[topic]
+
+    def mismatches(self) -> list[tuple[str, str]]:
+        """Return topic and type of each endpoint that has this node's topic with another type.
+
+        Such endpoints are not connected, and DDS reports no error. Each is returned once.
+        """
+        found = []
+        for reader in self._endpoints:
+            for endpoint in reader.take(_MOST_ENDPOINTS):
+                # Samples of endpoints that have gone have no names.
+                topic = (endpoint.topic_name or "").removeprefix("rt")
+                kind = self._kinds.get(topic)
+                if kind is not None and endpoint.type_name != _dds_name(kind):
+                    found.append((topic, _ros_name(endpoint.type_name)))
+        return found
+
     def close(self) -> None:
         """Leave the domain; repeated calls do nothing."""
         participant, self._participant = self._participant, None
@@ -158,7 +188,7 @@ class DdsNode:
             return
         # An entity ends when nothing refers to it any more.
         self._writers, self._readers = {}, {}
-        del self._graph, self._wait_set
+        del self._graph, self._wait_set, self._endpoints
         with suppress(Exception):
             self._dds["core"].Entity.__del__(participant)
         self._domain = None
@@ -223,9 +253,9 @@ class DdsNode:
                 return idl.types.array[inner, detail[1]]
             return idl.types.sequence[inner]
 
-        package, _, name = kind.split("/")
+        name = kind.rpartition("/")[2]
         fields = {field: described(node) for field, node in self._types.fields_of(kind)}
-        cls = idl.make_idl_struct(f"{name}_", f"{package}::msg::dds_::{name}_", fields)
+        cls = idl.make_idl_struct(f"{name}_", _dds_name(kind), fields)
 
         # The signatures are those of Cyclone DDS's own methods.
         def serialize(
@@ -257,6 +287,22 @@ class DdsNode:
         fields = {"gid": gid(self._participant), "node_entities_info_seq": [node]}
         data = self._types.encode(_GRAPH_KIND, fields)
         self._graph.write(_sample(self._classes[_GRAPH_KIND], data))
+
+
+def _kept(kind: str) -> int:
+    """Return the number of messages that a publisher keeps for subscribers that are busy."""
+    return _KEPT_SAMPLES if kind in LARGE else _KEPT_SMALL
+
+
+def _dds_name(kind: str) -> str:
+    """Return the name that a type of ROS has in DDS."""
+    package, folder, name = kind.split("/")
+    return f"{package}::{folder}::dds_::{name}_"
+
+
+def _ros_name(name: str) -> str:
+    """Return the name in ROS of a type of DDS."""
+    return name.replace("::dds_", "").replace("::", "/").removesuffix("_")
 
 
 def _loopback(make: Any, domain: int) -> Any:

@@ -17,7 +17,7 @@ from typing import Any, Literal
 from cavmarl.core.errors import ConfigError, RosError
 from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.cosim.ros2.autoware_requests import AutowareRequests
-from cavmarl.cosim.ros2.dds_node import DdsNode
+from cavmarl.cosim.ros2.dds_node import LARGE, DdsNode
 from cavmarl.cosim.ros2.ros_bag import BagWriter
 from cavmarl.cosim.ros2.ros_controls import VehicleControls
 from cavmarl.cosim.ros2.ros_topics import (
@@ -37,6 +37,9 @@ _NODE_NAME = "cavmarl"
 _LOOK_S = 0.1  # how often matched subscribers are counted, wall time
 _SETTLED_S = 0.5  # a node's subscriptions are found one by one; then all are, wall time
 _REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
+
+BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
+BUFFER_BYTES = 4 << 20  # that `fast_dds.xml` asks for: a large message arrives in one burst
 
 
 @dataclass(frozen=True)
@@ -132,6 +135,7 @@ class RosBridge:
             if not one.is_plain
         }
         self._warned: set[str] = set()  # topics of refused requests
+        self._mismatches: set[tuple[str, str]] = set()
         self._driven: dict[str, tuple[int, int]] = {}  # vehicle → episode and vehicle id
         self.sent = dict.fromkeys(self._topics.kinds, 0)
         self.steps, self.wait_wall_s = 0, 0.0
@@ -163,6 +167,8 @@ class RosBridge:
         except BaseException:
             self._close_bag()
             raise
+        if any(kind in LARGE for kind in self._topics.kinds.values()):
+            _warn_of_small_buffers()
 
     def run(self, steps: int | None = None) -> None:
         """Follow the world until it ends, or for a number of steps.
@@ -194,6 +200,7 @@ class RosBridge:
             "wait_wall_s": self.wait_wall_s,
             "time_s": 1e-9 * self._topics.clock.now_ns,
             "sent": {topic: count for topic, count in self.sent.items() if count},
+            "type_mismatches": [list(one) for one in sorted(self._mismatches)],
             "controls": {name: asdict(each.counts) for name, each in self._controls.items()},
             "requests": {
                 name: {topic: asdict(counts) for topic, counts in each.counts.items()}
@@ -245,7 +252,17 @@ class RosBridge:
         return tuple(map(self._node.subscribers_of, self._topics.kinds))
 
     def _look(self) -> None:
-        """Find the topics with subscribers, and refuse another clock."""
+        """Find the topics with subscribers, report wrong types, and refuse another clock."""
+        for topic, kind in self._node.mismatches():
+            if (topic, kind) not in self._mismatches:
+                self._mismatches.add((topic, kind))
+                log.warning(
+                    "%s: a node uses this topic with the type %s, but its type is %s; they are not "
+                    "connected: use the type of the bridge, or another topic",
+                    topic,
+                    kind,
+                    self._node.kind_of(topic),
+                )
         # This node subscribes to the clock itself. Late subscribers get latched topics, too.
         self._wanted = frozenset(
             topic
@@ -339,6 +356,22 @@ class RosBridge:
                     log.warning("%s: %s (later refusals are only counted)", name, refusal)
         vehicle.motion.turn_indicators = requests.turn_indicators
         vehicle.motion.hazard_lights = requests.hazard_lights
+
+
+def _warn_of_small_buffers() -> None:
+    """Log that nodes of this machine cannot receive large messages as a whole, if so."""
+    try:
+        limit = int(BUFFER_LIMIT.read_text())
+    except (OSError, ValueError):  # another system, whose limit is unknown
+        return
+    if limit < BUFFER_BYTES:
+        log.warning(
+            "net.core.rmem_max = %d: sockets of nodes cannot hold an image or a point cloud of "
+            "some MB, and lose parts of it; allow %d bytes: sysctl -w net.core.rmem_max=%d",
+            limit,
+            BUFFER_BYTES,
+            BUFFER_BYTES,
+        )
 
 
 class _Settled:

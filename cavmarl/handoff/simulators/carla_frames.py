@@ -1,15 +1,22 @@
-"""Frames of CARLA's cameras as samples of a rig: blueprints, poses and conversions."""
+"""Frames of CARLA's sensors as samples of a rig: blueprints, poses and conversions."""
 
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.rig import CameraConfig, MountedConfig, SampledConfig
+from cavmarl.config.rig import (
+    CameraConfig,
+    LidarRigConfig,
+    MountedConfig,
+    RadarConfig,
+    SampledConfig,
+)
 from cavmarl.core.errors import ConfigError
 from cavmarl.sensors.kernels.panorama import (
     BICYCLE,
@@ -24,13 +31,23 @@ from cavmarl.sensors.kernels.panorama import (
     TRAM,
     TRUCK,
 )
+from cavmarl.sensors.mounted.lidar import azimuths, elevations
+from cavmarl.sensors.mounted.mount_transforms import mount_matrix
 
 BLUEPRINTS = {
     "rgb_camera": "sensor.camera.rgb",
     "depth_camera": "sensor.camera.depth",
     "semantic_camera": "sensor.camera.semantic_segmentation",
+    "lidar": "sensor.lidar.ray_cast",
+    "radar": "sensor.other.radar",
 }
-_NOT_GIVEN = ("lidar", "radar", "bev_grid")  # sensors of the surroundings without such frames
+_NOT_GIVEN = ("bev_grid",)  # sensors of the surroundings without such frames
+MOST_RADAR_DEG = 179.0  # field of view of CARLA's radars
+_RADAR_HEIGHT_DEG = 0.1  # CARLA's radars look into a cone, those of a rig into a plane
+_PER_RAY = 2  # columns of a CARLA lidar for each ray of the rig: every other one is on the ray
+# Echoes next to each other are those of one target if they differ by at most this.
+_SAME_TARGET_M, _SAME_TARGET_MPS = 3.0, 1.0
+_ON_GROUND_M = 0.2  # echoes below this height are those of the ground
 _FARTHEST_M = 1000.0
 _DEPTH_STEPS = (1 << 24) - 1
 _CLASS_OF_TAG = {
@@ -44,7 +61,7 @@ for _tag, _class in _CLASS_OF_TAG.items():
 
 
 def gives_frames(options: Mapping[str, str]) -> bool:
-    """Return whether the samples of cameras come from CARLA."""
+    """Return whether the samples of sensors come from CARLA."""
     return options.get("frames", "own") == "backend"
 
 
@@ -53,16 +70,16 @@ def check_option(options: Mapping[str, str]) -> None:
     if (value := options.get("frames", "own")) not in ("own", "backend"):
         raise ConfigError(
             f"zones.simulators: frames = {value!r}: must be own (cavmarl's models) or backend "
-            "(CARLA's cameras)"
+            "(CARLA's sensors)"
         )
 
 
 def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedConfig]) -> None:
-    """Check that CARLA's cameras can take the samples of a rig, if that is wanted.
+    """Check that CARLA's sensors can take the samples of a rig, if that is wanted.
 
     Raises:
-        ConfigError: the rig has a sensor of the surroundings of which CARLA gives no frames, or a
-            camera with noise.
+        ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a
+            sensor with noise, or a radar with a wider field of view than CARLA's.
     """
     if not gives_frames(options):
         return
@@ -77,34 +94,80 @@ def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedCo
         is_noisy = isinstance(sensor, SampledConfig) and any((*sensor.noise, *sensor.bias))
         if kind in BLUEPRINTS and is_noisy:
             raise ConfigError(
-                f"{where}: rig.{name} has noise or bias, which CARLA's pictures do not get; set "
+                f"{where}: rig.{name} has noise or bias, which CARLA's frames do not get; set "
                 "both to 0, or use frames=own"
+            )
+        if isinstance(sensor, RadarConfig) and sensor.fov_deg > MOST_RADAR_DEG:
+            raise ConfigError(
+                f"{where}: rig.{name}.fov_deg = {sensor.fov_deg:g}: a radar of CARLA covers at "
+                f"most {MOST_RADAR_DEG:g} degrees; set a smaller angle, or use frames=own"
             )
 
 
-def cameras_of(rig: Mapping[str, MountedConfig]) -> dict[str, dict[str, Any]]:
-    """Return what the client needs to mount each camera of a rig, in CARLA's frame."""
+def mounts_of(rig: Mapping[str, MountedConfig], dt_s: float) -> dict[str, dict[str, Any]]:
+    """Return what the client needs to mount each sensor of a rig, in CARLA's frame.
+
+    `dt_s`: length of a tick; each sensor takes a whole frame in each tick.
+    """
     found = {}
     for name, sensor in rig.items():
-        if not isinstance(sensor, CameraConfig):
+        if isinstance(sensor, CameraConfig):
+            attributes = {
+                "image_size_x": sensor.width,
+                "image_size_y": sensor.height,
+                "fov": sensor.fov_deg,
+            }
+        elif isinstance(sensor, LidarRigConfig):
+            attributes = _lidar_attributes(sensor, dt_s)
+        elif isinstance(sensor, RadarConfig):
+            attributes = {
+                "horizontal_fov": sensor.fov_deg,
+                "vertical_fov": _RADAR_HEIGHT_DEG,
+                "range": sensor.range_m,
+                "points_per_second": round(sensor.rays / dt_s),
+            }
+        else:
             continue
         found[name] = {
             "blueprint": BLUEPRINTS[str(getattr(sensor, "type", ""))],
-            "attributes": {
-                "image_size_x": str(sensor.width),
-                "image_size_y": str(sensor.height),
-                "fov": str(sensor.fov_deg),
-            },
+            "attributes": {key: str(value) for key, value in attributes.items()},
             "place": [sensor.x_m, -sensor.y_m, sensor.z_m],
             "turn": [sensor.pitch_deg, -sensor.yaw_deg, sensor.roll_deg],
         }
     return found
 
 
-def sample_of(config: CameraConfig, picture: str) -> NDArray[Any]:
-    """Return the sample of a camera from CARLA's pixels: blue, green, red and alpha in base64."""
-    data = np.frombuffer(base64.b64decode(picture), np.uint8)
-    pixels = data.reshape(config.height, config.width, 4)
+def _lidar_attributes(sensor: LidarRigConfig, dt_s: float) -> dict[str, float]:
+    """Return the attributes of a lidar that turns once in each tick, without losses."""
+    _, step_rad, rays = azimuths(sensor.fov_deg, sensor.rays)
+    rising = np.degrees(elevations(sensor.lower_deg, sensor.upper_deg, sensor.layers))
+    return {
+        "channels": sensor.layers,
+        "points_per_second": round(sensor.layers * _PER_RAY * rays / dt_s),
+        "rotation_frequency": 1.0 / dt_s,
+        "range": sensor.range_m,
+        "lower_fov": float(rising[0]),
+        "upper_fov": float(rising[-1]),
+        "horizontal_fov": min(math.degrees(step_rad * rays), 360.0),
+        "atmosphere_attenuation_rate": 0.0,
+        "dropoff_general_rate": 0.0,
+        "dropoff_zero_intensity": 0.0,
+        "noise_stddev": 0.0,
+    }
+
+
+def sample_of(config: MountedConfig, frame: str) -> NDArray[Any]:
+    """Return the sample of a sensor from the data of CARLA's frame in base64.
+
+    The data of a camera are pixels: blue, green, red and alpha.
+    """
+    data = base64.b64decode(frame)
+    if isinstance(config, LidarRigConfig):
+        return _distances(config, np.frombuffer(data, "<f4").reshape(-1, 4)[:, :3])
+    if isinstance(config, RadarConfig):
+        return _targets(config, np.frombuffer(data, "<f4").reshape(-1, 4))
+    assert isinstance(config, CameraConfig)
+    pixels = np.frombuffer(data, np.uint8).reshape(config.height, config.width, 4)
     match getattr(config, "type", ""):
         case "rgb_camera":
             return pixels[..., 2::-1].copy()
@@ -114,3 +177,53 @@ def sample_of(config: CameraConfig, picture: str) -> NDArray[Any]:
             depth_m = steps / _DEPTH_STEPS * _FARTHEST_M
             return np.minimum(depth_m, config.range_m).astype(np.float16)
     return _CLASSES[pixels[..., 2]]
+
+
+def _distances(config: LidarRigConfig, points: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the distances (layers, rays) from points (n, 3): ahead, to the right, upwards.
+
+    A ray takes the point in its direction; points between two rays belong to none.
+    """
+    ahead, right, up = points.astype(np.float64).T
+    distance = np.sqrt(ahead * ahead + right * right + up * up)
+    first, step, rays = azimuths(config.fov_deg, config.rays)
+    half = 0.5 * (rays - 1)
+    aside = np.arctan2(-right, ahead) - (first + step * half)  # from the middle of all rays
+    beside = np.arctan2(np.sin(aside), np.cos(aside)) / step + half
+    column = np.rint(beside).astype(np.int64)
+    off = np.abs(beside - column)
+    if config.fov_deg == 360.0:
+        column %= rays
+    rising = elevations(config.lower_deg, config.upper_deg, config.layers)
+    layer = np.abs(np.arctan2(up, np.hypot(ahead, right))[:, np.newaxis] - rising).argmin(axis=1)
+    kept = (distance < config.range_m) & (off <= 0.5 / _PER_RAY) & (column >= 0) & (column < rays)
+    # Of several points, the closest to the ray is written last.
+    order = np.flatnonzero(kept)
+    order = order[np.argsort(-off[order], kind="stable")]
+    found = np.full(config.shape, config.range_m, np.float32)
+    found[layer[order], column[order]] = distance[order]
+    return found
+
+
+def _targets(config: RadarConfig, echoes: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Return the targets (targets, 3) from echoes (n, 4): speed, azimuth, altitude and distance.
+
+    Echoes next to each other that have nearly the same place and speed are those of one target,
+    whose nearest echo counts. The ground has no echo, as in cavmarl's model.
+    """
+    speed, azimuth, altitude, distance = echoes.astype(np.float64).T
+    azimuth = -azimuth  # CARLA's is clockwise
+    level = distance * np.cos(altitude)
+    x, y, z = level * np.cos(azimuth), level * np.sin(azimuth), distance * np.sin(altitude)
+    mount = mount_matrix(config)
+    height_m = mount[2, 3] + np.stack([x, y, z], axis=1) @ mount[2, :3]
+    kept = np.flatnonzero((height_m > _ON_GROUND_M) & (distance < config.range_m))
+    kept = kept[np.argsort(azimuth[kept], kind="stable")]
+    apart_m = np.hypot(np.diff(x[kept]), np.diff(y[kept]))
+    is_other = (apart_m > _SAME_TARGET_M) | (np.abs(np.diff(speed[kept])) > _SAME_TARGET_MPS)
+    groups = np.split(kept, np.flatnonzero(is_other) + 1) if len(kept) else []
+    nearest = sorted((group[distance[group].argmin()] for group in groups), key=distance.item)
+    chosen = np.array(nearest[: config.targets], np.int64)
+    found = np.zeros(config.shape, np.float32)
+    found[: len(chosen)] = np.stack([distance[chosen], azimuth[chosen], speed[chosen]], axis=1)
+    return found

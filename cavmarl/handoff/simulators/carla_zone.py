@@ -19,7 +19,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from cavmarl.config.rig import CameraConfig
 from cavmarl.core.errors import ConfigError, ZoneSimulatorError
 from cavmarl.handoff.simulators import carla_frames, carla_zone_client
 from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup, number_option
@@ -96,7 +95,7 @@ class CarlaZone:
                 timeout_s=self._timeout_s,
                 dt=setup.dt_s,
                 places=self._places(),
-                cameras=carla_frames.cameras_of(setup.rig) if gives_frames else {},
+                mounts=carla_frames.mounts_of(setup.rig, setup.dt_s) if gives_frames else {},
             )
         except BaseException:
             self._end()
@@ -149,9 +148,8 @@ class CarlaZone:
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> Mapping[int, NDArray[Any]]:
         config = self._setup.rig[sensor]
-        assert isinstance(config, CameraConfig)
-        found: dict[str, str] = self._call("sense", camera=sensor, vehicles=list(vehicles))
-        return {int(v): carla_frames.sample_of(config, picture) for v, picture in found.items()}
+        found: dict[str, str] = self._call("sense", sensor=sensor, vehicles=list(vehicles))
+        return {int(v): carla_frames.sample_of(config, frame) for v, frame in found.items()}
 
     def close(self) -> None:
         """Remove all actors, and end the client's process."""

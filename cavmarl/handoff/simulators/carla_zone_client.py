@@ -27,8 +27,8 @@ LARGE_M = 7.0  # longer vehicles are buses or trucks
 WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
 MOST_SLIP = 0.6  # largest sine of the slip angle
 PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
-FIRST_PICTURES = 20  # pictures of a new camera that may be missing
-FIRST_PICTURE_S = 0.2  # time to wait for each of them
+FIRST_FRAMES = 20  # frames of a new sensor that may be missing
+FIRST_FRAME_S = 0.2  # time to wait for each of them
 PREDECESSOR_S = 3.0  # longest wait for the end of the synchronous mode of another client
 SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
 STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
@@ -66,45 +66,45 @@ class Car:
         self.is_owned = False
         self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
         self.left = PLACED_TICKS  # ticks for which it is still placed
-        self.cameras: dict[str, Camera] = {}  # of an agent's vehicle, by their names
+        self.sensors: dict[str, MountedActor] = {}  # of an agent's vehicle, by their names
 
     def unmount(self) -> None:
-        """Remove the cameras."""
-        for camera in self.cameras.values():
-            camera.close()
-        self.cameras.clear()
+        """Remove the sensors."""
+        for sensor in self.sensors.values():
+            sensor.close()
+        self.sensors.clear()
 
 
-class Camera:
-    """A camera on a vehicle, and its newest picture."""
+class MountedActor:
+    """A sensor on a vehicle, and the data of its newest frame."""
 
     def __init__(self, actor: Any) -> None:
         self._actor = actor
         self._come = threading.Condition()
-        self._picture: tuple[int, bytes] = (-1, b"")  # frame, pixels
+        self._newest: tuple[int, bytes] = (-1, b"")  # number of the frame, its data
         self._asked = 0
         actor.listen(self._take)
 
-    def _take(self, image: Any) -> None:
+    def _take(self, taken: Any) -> None:
         with self._come:
-            self._picture = image.frame, bytes(image.raw_data)
+            self._newest = taken.frame, bytes(taken.raw_data)
             self._come.notify()
 
-    def picture(self, frame: int, timeout_s: float) -> bytes | None:
-        """Wait for the picture of a frame. Return None if none has come since the mounting."""
+    def data(self, frame: int, timeout_s: float) -> bytes | None:
+        """Wait for the data of a frame. Return None if no frame has come since the mounting."""
         self._asked += 1
         with self._come:
-            is_new = self._picture[0] < 0 and self._asked <= FIRST_PICTURES
+            is_new = self._newest[0] < 0 and self._asked <= FIRST_FRAMES
             if not self._come.wait_for(
-                lambda: self._picture[0] >= frame, FIRST_PICTURE_S if is_new else timeout_s
+                lambda: self._newest[0] >= frame, FIRST_FRAME_S if is_new else timeout_s
             ):
-                if is_new and self._picture[0] < 0:
+                if is_new and self._newest[0] < 0:
                     return None
                 raise ValueError(
-                    f"CARLA has sent no picture of frame {frame} within {timeout_s:g} s; the "
-                    f"newest one is of frame {self._picture[0]}"
+                    f"a sensor of CARLA has not sent frame {frame} within {timeout_s:g} s; its "
+                    f"newest frame is {self._newest[0]}"
                 )
-            return self._picture[1]
+            return self._newest[1]
 
     def close(self) -> None:
         self._actor.stop()
@@ -115,7 +115,7 @@ class Zone:
     """The vehicles of a zone in CARLA's world.
 
     Args:
-        start: host, port, timeout in s, length of a tick in s, places on lanes, and cameras that
+        start: host, port, timeout in s, length of a tick in s, places on lanes, and sensors that
             are mounted on agents' vehicles.
     """
 
@@ -133,7 +133,7 @@ class Zone:
         settings.synchronous_mode, settings.fixed_delta_seconds = True, self._dt
         self._world.apply_settings(settings)
         self._cars: dict[int, Car] = {}
-        self._cameras: dict[str, dict[str, Any]] = start["cameras"]
+        self._mounts: dict[str, dict[str, Any]] = start["mounts"]
         self._frame = 0  # number of the last tick
         lights = {
             light.get_opendrive_id(): light
@@ -190,24 +190,24 @@ class Zone:
                 self._mount(car)
 
     def _mount(self, car: Car) -> None:
-        """Mount all cameras on the vehicle of an agent."""
+        """Mount all sensors on the vehicle of an agent."""
         library, carla = self._world.get_blueprint_library(), self._carla
-        for name, camera in self._cameras.items():
-            blueprint = library.find(camera["blueprint"])
-            for attribute, value in camera["attributes"].items():
+        for name, mount in self._mounts.items():
+            blueprint = library.find(mount["blueprint"])
+            for attribute, value in mount["attributes"].items():
                 blueprint.set_attribute(attribute, value)
-            place = carla.Location(*camera["place"])
-            there = carla.Transform(place, carla.Rotation(*camera["turn"]))
+            place = carla.Location(*mount["place"])
+            there = carla.Transform(place, carla.Rotation(*mount["turn"]))
             actor = self._world.spawn_actor(blueprint, there, attach_to=car.actor)
-            car.cameras[name] = Camera(actor)
+            car.sensors[name] = MountedActor(actor)
 
-    def sense(self, camera: str, vehicles: Sequence[int]) -> dict[int, str]:
-        """Return the pictures of the last tick in base64, of vehicles that have one."""
+    def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
+        """Return the data of the last tick's frames in base64, of vehicles that have one."""
         found = {}
         for vehicle in vehicles:
-            picture = self._cars[vehicle].cameras[camera].picture(self._frame, self._timeout_s)
-            if picture is not None:
-                found[vehicle] = base64.b64encode(picture).decode()
+            data = self._cars[vehicle].sensors[sensor].data(self._frame, self._timeout_s)
+            if data is not None:
+                found[vehicle] = base64.b64encode(data).decode()
         return found
 
     def _place(self, vehicle: int, row: Row) -> str:

@@ -177,6 +177,80 @@ def test_a_camera_outside_of_its_vehicle_sees_it(session: CarlaSession, recorder
     assert 14 in pixels[..., 2]
 
 
+SIZE = {"image_size_x": 96, "image_size_y": 64}
+
+
+def test_optical_flow_leads_to_the_same_vehicle_in_the_last_picture(
+    session: CarlaSession, recorder: Recorder
+) -> None:
+    behind = CarlaPose(-8.0, 0.0, 3.0, -12.0)
+    flow, instances = (
+        attach(session, f"camera.{kind}", behind, **SIZE)
+        for kind in ("optical_flow", "instance_segmentation")
+    )
+    session.tick()
+    assert not np.frombuffer(newest(recorder, flow), "<f4", offset=12).any(), "the first picture"
+    row, column = np.mgrid[:64, :96]
+    others, roads = [], []
+    for _ in range(30):
+        before = numbers_in(picture_of(recorder, instances))
+        session.tick()
+        shown = numbers_in(picture_of(recorder, instances))
+        moved = np.frombuffer(newest(recorder, flow), "<f4", offset=12).reshape(64, 96, 2)
+        right, down = moved[..., 0] * 48.0, -moved[..., 1] * 32.0
+        own = shown == ego(session).number
+        assert own.any()
+        # The camera and its vehicle move together.
+        assert np.hypot(right[own], down[own]).max() < 0.02
+        roads.append(np.hypot(right, down)[~own].max())
+        was = np.rint(row - down).astype(int), np.rint(column - right).astype(int)
+        inside = (0 <= was[0]) & (was[0] < 64) & (0 <= was[1]) & (was[1] < 96)
+        inside &= (shown > 0) & ~own
+        others.append(shown[inside] == before[was[0][inside], was[1][inside]])
+    assert max(roads) > 2.0, "the vehicle drives"
+    found = np.concatenate(others)
+    assert len(found) > 50
+    assert found.mean() > 0.9
+
+
+def numbers_in(picture: NDArray[np.uint8]) -> NDArray[np.int64]:
+    """Return the number of the actor at each pixel of an instance camera; 0: none."""
+    return picture[..., 1].astype(np.int64) + 256 * picture[..., 0].astype(np.int64)
+
+
+def picture_of(recorder: Recorder, actor: CarlaActor) -> NDArray[np.uint8]:
+    return np.frombuffer(newest(recorder, actor), np.uint8, offset=12).reshape(64, 96, 4)
+
+
+def test_optical_flow_of_the_road_has_the_size_of_the_way_of_the_camera(
+    session: CarlaSession, recorder: Recorder
+) -> None:
+    """The flow of a row has a closed form if the camera drives straight on over a flat road."""
+    flow = attach(session, "camera.optical_flow", ROOF, **SIZE)
+    depth = attach(session, "camera.depth", ROOF, **SIZE)
+    session.tick()
+    for _ in range(40):
+        before = flow.pose
+        session.tick()
+        after = flow.pose
+        way = axes_of(after).T @ (np.array(after.place) - before.place)
+        turned = abs(math.remainder(after.yaw - before.yaw, 360.0))
+        if way[0] > 0.2 and turned < 1e-3:
+            break
+    else:
+        pytest.fail("the vehicle does not drive straight on")
+    moved = np.frombuffer(newest(recorder, flow), "<f4", offset=12).reshape(64, 96, 2)
+    depth_m = picture_of(recorder, depth)[..., :3].astype(float) @ [65536.0, 256.0, 1.0]
+    depth_m *= 1000.0 / (2**24 - 1)
+    # A point of the road, 2 m below the camera, is 48 · 2 / depth pixels below the middle.
+    for row in (56, 60, 63):
+        below = (row + 0.5 - 32.0) / 48.0  # tangent of the angle
+        assert depth_m[row, 48] == pytest.approx(2.0 / below, rel=1e-3), "it shows the road"
+        d, before_d = depth_m[row, 48], depth_m[row, 48] + way[0]
+        down = 48.0 * (2.0 / d - 2.0 / before_d)
+        assert moved[row, 48, 1] * 32.0 == pytest.approx(-down, rel=0.01)
+
+
 def test_a_radar_measures_within_its_cone(session: CarlaSession, recorder: Recorder) -> None:
     radar = attach(session, "other.radar", CarlaPose(2.4, 0.0, 1.0), points_per_second=20_000)
     session.tick()

@@ -322,6 +322,7 @@ methods = [
     lambda: world.get_spectator().set_transform(there),
     lambda: client.start_recorder("file.log"),
     lambda: client.replay_file("file.log", 0.0, 0.0, 0),
+    lambda: client.show_recorder_file_info("file.log", True),
 ]
 found["errors"], found["absent"] = [], []
 for method in methods:
@@ -344,8 +345,8 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
         + FREE,
     )
     if HAS_REASONS:
-        assert len(found["errors"]) == 2
-        assert all("CARLA's recorder is not available" in one for one in found["errors"])
+        assert len(found["errors"]) == 3
+        assert all("no folder for recordings" in one for one in found["errors"])
     else:  # physics are refused, too
         assert len(found["errors"]) >= 2
     assert VERSION != "0.9.16" or not found["absent"]
@@ -408,3 +409,37 @@ for sensor in (mounted, gnss):
     assert found["speed"] < 0.01
     assert found["box"] == 2.5
     assert {"Red", "Green"} <= set(found["lights"])
+
+
+def test_the_client_reads_optical_flow(port: int) -> None:
+    found = run_client(
+        port,
+        SYNCHRONOUS
+        + """
+agent = next(one for one in world.get_actors().filter("vehicle.*")
+             if one.attributes["role_name"] == "car_0")
+blueprint = world.get_blueprint_library().find("sensor.camera.optical_flow")
+blueprint.set_attribute("image_size_x", "64")
+blueprint.set_attribute("image_size_y", "48")
+place = carla.Transform(carla.Location(z=2.0))
+camera = world.spawn_actor(blueprint, place, attach_to=agent)
+images = queue.Queue()
+camera.listen(images.put)
+found["frames"], found["flows"] = [], []
+for _ in range(20):
+    frame = world.tick()
+    image = images.get(timeout=10.0)
+    found["frames"].append(image.frame - frame)
+    found["flows"].append(max(max(abs(one.x), abs(one.y)) for one in image))
+found["size"] = [image.width, image.height, len(image)]
+found["colours"] = image.get_color_coded_flow() is not None
+camera.stop()
+camera.destroy()
+"""
+        + FREE,
+    )
+    assert set(found["frames"]) == {0}
+    assert found["size"] == [64, 48, 64 * 48]
+    assert found["colours"]
+    assert found["flows"][0] == 0.0
+    assert 0.0 < max(found["flows"]) <= 2.0

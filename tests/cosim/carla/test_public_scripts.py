@@ -198,3 +198,23 @@ found["speed"] = moved
     assert found["away"] < 0.5
     assert found["speed"] > 3.0
     assert "Cleaning synchronization" in text
+
+
+def test_a_run_is_recorded_shown_and_replayed(tmp_path: Path) -> None:
+    where = folder("PythonAPI", "examples")
+    with running_server(env="town", agents=1, background=2, recordings=tmp_path) as port:
+
+        def run(name: str, *words: str) -> str:
+            process = started([name, "--port", str(port), *words], where)
+            text, _ = process.communicate(timeout=ENDS_S)
+            assert process.returncode == 0, text
+            assert "Traceback" not in text
+            return text
+
+        text = run("start_recording.py", "-n", "4", "-t", "3")
+        assert f"Recording on file: {tmp_path / 'test1.log'}" in text
+        assert "spawned 4 vehicles" in text
+        text = run("show_recorder_file_info.py", "-f", "test1.log")
+        assert text.count("role_name = autopilot") == 4
+        text = run("start_replaying.py", "-s", "1", "-d", "2")
+        assert "Replaying from 1 s - 3 s" in text
