@@ -1,8 +1,9 @@
-"""`cavmarl zoo`: lists, verifies and compares trained drivers."""
+"""`cavmarl zoo`: lists, verifies, compares and exports trained drivers."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -16,6 +17,7 @@ from cavmarl.cli.output import (
     Imports,
     JsonPath,
     about,
+    about_file,
     add_command,
     grid,
     number,
@@ -39,7 +41,7 @@ SHORT = {
 }
 
 app = typer.Typer(
-    cls=CliGroup, help="List, verify and compare trained drivers.", no_args_is_help=True
+    cls=CliGroup, help="List, verify, compare and export trained drivers.", no_args_is_help=True
 )
 
 
@@ -139,6 +141,40 @@ def cross(
     )
 
 
+def export(
+    name: Annotated[
+        str, typer.Argument(metavar="DRIVER", help="Name or folder of a trained driver.")
+    ],
+    onnx: Annotated[
+        Path, about_file("Write an ONNX model, whose metadata state the sensors.")
+    ],
+    json_path: JsonPath = None,
+) -> None:
+    """Write a trained driver as a model for other programs.
+
+    `--policy FILE.onnx` reads the model, too.
+    """
+    from cavmarl.policies.onnx_export import export_onnx
+
+    config = export_onnx(name, onnx)
+    told = {
+        "driver": name,
+        "onnx": str(onnx),
+        "observations": config.observation_size,
+        "outputs": config.num_outputs,
+        "action": config.action.kind,
+        "observes_built_in_action": config.residual,
+    }
+    Console().print(
+        f"{onnx}: observations (N, {config.observation_size}) to "
+        f"{'actions' if config.action.kind == 'continuous' else 'logits'} (N, {config.num_outputs})"
+        + ("; the last two observations are the built-in driver's action" * config.residual),
+        markup=False,
+        highlight=False,
+    )
+    write_json(json_path, told)
+
+
 def _matrix(found: Cross, column: str, title: str) -> Table:
     heads = ("", *(f"among {escape(name)}" for name in found.drivers))
     rows = [
@@ -165,4 +201,7 @@ add_command(
     "cross",
     cross,
     "cavmarl zoo cross merge --policy idm --policy cities_ippo",
+)
+add_command(
+    app, "export", export, "cavmarl zoo export cities_ippo --onnx cities_ippo.onnx"
 )

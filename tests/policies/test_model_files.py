@@ -174,6 +174,9 @@ class Session:
     def get_inputs(self) -> list[Any]:
         return [SimpleNamespace(name="seen")]
 
+    def get_modelmeta(self) -> Any:
+        return SimpleNamespace(custom_metadata_map={}, graph_name="")
+
     def run(self, outputs: None, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         return [np.full((len(feed["seen"]), 2), -0.5, dtype=np.float32)]
 
