@@ -20,6 +20,7 @@ from cavmarl.recordings.recording_format import dtype_of
 
 TABLE = "observations"
 _FLAGS = ("acted", "terminated", "truncated")
+_ACTIONS = (np.dtype(("<f4", (2,))), np.dtype("<i8"))  # throttle and steering, or a choice
 
 
 class RecordedTrip(NamedTuple):
@@ -89,8 +90,9 @@ def _check_columns(recording: Recording) -> None:
             f"{recording.path}: its observations have no {missing[0]}, because an earlier version "
             "of cavmarl recorded them; record the run again"
         )
-    for name in _FLAGS:
-        if kinds[name] != np.bool_:
+    wanted = dict.fromkeys(_FLAGS, (np.dtype(np.bool_),)) | {"action": _ACTIONS}
+    for name, allowed in wanted.items():
+        if kinds[name] not in allowed:
             raise RecordingError(
                 f"{recording.path}: column {name} of its observations is {kinds[name]}: is "
                 "damaged; get the recording again"
