@@ -121,7 +121,7 @@ def test_only_trained_drivers_are_exported_to_onnx_files(tmp_path: Path) -> None
         export_onnx("idm", tmp_path / "idm.onnx")
     with pytest.raises(ConfigError, match=r"must end in \.onnx"):
         export_onnx("merge_ippo", tmp_path / "merge.model")
-    with pytest.raises(ConfigError, match="cannot be written .* in an existing folder"):
+    with pytest.raises(ConfigError, match=r"cannot be written .* in an existing folder"):
         export_onnx("merge_ippo", tmp_path / "nowhere" / "merge.onnx")
     with pytest.raises(PolicyError, match="no policy, folder or file 'merge_ipo'"):
         export_onnx("merge_ipo", tmp_path / "merge.onnx")
