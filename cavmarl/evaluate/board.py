@@ -1,8 +1,8 @@
 """The board: entries of drivers whose results are driven again, shown on one page.
 
-An entry is a folder `NAME/` with a card (`README.md`), a closed evaluation of one driver
-(`result/`), and the driver: `model.safetensors`, `config.json` and the manifest of the training, or
-a script `NAME.py`. Without these files, the driver is cavmarl's script of that name.
+An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
+and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
+NAME.py. Without these files, the driver is cavmarl's script of that name.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ TITLES = {name: name.replace("_", " ") for name in SHARES}
 _CONDITIONS = ("agents", "background", "max_cycles")
 
 
-class Share(NamedTuple):
+class ShareOfTrips(NamedTuple):
     """A share of trips with its 95 % interval."""
 
     value: float
@@ -64,7 +64,7 @@ class BoardEntry:
     conditions: str = ""
     episodes: int = 0
     trips: int = 0
-    shares: Mapping[str, Share] | None = None
+    shares: Mapping[str, ShareOfTrips] | None = None
     digest: str = ""
     version: str = ""
     failure: str = ""
@@ -228,7 +228,7 @@ def _described(folder: Path, failure: str) -> BoardEntry:
             continue
         hits, total = int(counted[name].sum()), len(counted)
         if interval := share_interval(hits, total):
-            shares[name] = Share(hits / total, interval)
+            shares[name] = ShareOfTrips(hits / total, interval)
     return BoardEntry(
         folder.name,
         sentence_about(folder),

@@ -1,8 +1,8 @@
 """Writing of ONNX models as bytes, without a library.
 
-ONNX files are Protocol Buffers. Their fields and numbers are those of `onnx.proto3`
-(https://github.com/onnx/onnx/blob/main/onnx/onnx.proto3); only those that a driver needs are here.
-Equal arguments give equal bytes.
+ONNX files are Protocol Buffers. The numbers of their fields are from the file onnx.proto3 of ONNX
+(https://github.com/onnx/onnx/blob/main/onnx/onnx.proto3). This module has the fields that a driver
+needs. Equal arguments give equal bytes.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _ATTRIBUTE_FLOAT, _ATTRIBUTE_INT = 1, 2  # AttributeProto.AttributeType
 
 
 class OnnxGraph:
-    """A chain of operators, each of which reads the result of the previous one.
+    """A chain of operators; each operator reads the result of the previous one.
 
     Args:
         inputs: name of the input, float32 (rows, width).

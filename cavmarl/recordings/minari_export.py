@@ -1,8 +1,8 @@
 """Export of recorded trips as a data set of Minari (https://minari.farama.org).
 
-The files are those of Minari's storage `arrow`: `data/metadata.json`, and for each episode a folder
-`data/N` with `metadata.json` and an Arrow file. An episode of Minari is a recorded trip. Minari
-reads the folder with `minari.MinariDataset(FOLDER / "data")`.
+The layout is Minari's storage "arrow": a file data/metadata.json, and for each episode a folder
+data/N with the file metadata.json and an Arrow file. An episode of Minari is a recorded trip.
+Minari's class MinariDataset reads the folder data.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _METADATA_FILE = "metadata.json"
 def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
     """Write all trips of a recording to a new folder; return the numbers of trips and decisions.
 
-    The names of the observed numbers, the reward terms and the environment are in
-    `data/metadata.json`; world, episode, agent and vehicle of a trip in its `metadata.json`.
+    The metadata of the data set contain the names of the environment, the observed numbers and the
+    reward terms. The metadata of a trip contain its world, episode, agent and vehicle.
 
     Raises:
         ConfigError: the folder exists and is not empty, or cannot be written.

@@ -100,7 +100,7 @@ def _check_columns(recording: Recording) -> None:
 
 
 def _trip(world: int, episode: int, rows: NDArray[np.void]) -> RecordedTrip:
-    """Return the trip of rows (N + 1,), each of which follows the decision that it contains."""
+    """Return the trip of rows (N + 1,); each row contains a decision and what it led to."""
     after = rows[1:]
     # A vehicle that left at the horizon of its trip has both flags: its trip was cut.
     terminated = bool(after["terminated"][-1] and not after["truncated"][-1])
