@@ -57,7 +57,7 @@ class ModelPolicy(Policy):
         self._model, self._name, self._is_residual = model, name, is_residual
         self._actions = action_space(env.config.action)
         size = flat_observation_space(env.config).shape[0]
-        size += self._actions.shape[0] if is_residual else 0
+        size += sum(self._actions.shape or ()) if is_residual else 0
         try:
             self._decide(np.zeros((1, size), dtype=np.float32))
         except PolicyError:
