@@ -34,6 +34,7 @@ from cavmarl.learning import options
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import Trips, describe, progress_bar
+from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
 from cavmarl.learning.phase_times import PhaseTimes
@@ -96,7 +97,7 @@ class Args:
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_ALGORITHM_SEED"] = ""
     resume: Annotated[str, options.RESUME] = ""
-    tensorboard: Annotated[bool, "write files for TensorBoard"] = False
+    loggers: Annotated[str, options.LOGGERS] = ""
 
     def __post_init__(self) -> None:
         ones = "num_envs total_agent_steps num_steps epochs minibatches hidden threads"
@@ -107,6 +108,7 @@ class Args:
         options.check_above_zero(self, [*above.split(), "imitation_share"])
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
         options.check_device(self.device)
+        logger_names(self.loggers)
         if self.residual and self.imitation_weight:
             raise ConfigError("--residual: leave out --imitation-weight; it starts as that driver")
         if self.shared and self.mappo:

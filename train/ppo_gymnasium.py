@@ -30,7 +30,8 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
 from cavmarl.learning.log import WINDOW, curve_row
-from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
+from cavmarl.learning.loggers import logger_names
+from cavmarl.learning.options import LOGGERS, RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.networks.network_files import NetworkConfig
 
@@ -60,10 +61,12 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_gymnasium_SEED"] = ""
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     resume: Annotated[str, RESUME] = ""
+    loggers: Annotated[str, LOGGERS] = ""
 
     def __post_init__(self) -> None:
         least_one = ("total_agent_steps", "num_steps", "epochs", "minibatches")
         check_at_least(self, dict.fromkeys((*least_one, "checkpoint_updates"), 1))
+        logger_names(self.loggers)
 
     @property
     def folder(self) -> Path:

@@ -32,7 +32,9 @@ from cavmarl.adapters.rllib_env import CavRllibEnv
 from cavmarl.env.parallel import parallel_env
 from cavmarl.learning.actor_critic import ActorCritic, save_network
 from cavmarl.learning.log import WINDOW, curve_row
+from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import (
+    LOGGERS,
     check_at_least,
     parse_settings,
     run_folder,
@@ -65,10 +67,12 @@ class Args:
     initial_std: Annotated[float, "initial standard deviation of continuous actions"] = 0.3
     runs: Annotated[str, "folder of all runs"] = "runs"
     name: Annotated[str, "folder of this run; empty: ENV_rllib_SEED"] = ""
+    loggers: Annotated[str, LOGGERS] = ""
 
     def __post_init__(self) -> None:
         least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
         check_at_least(self, {"num_runners": 0, **dict.fromkeys(least_one, 1)})
+        logger_names(self.loggers)
 
     @property
     def folder(self) -> Path:

@@ -30,7 +30,8 @@ from cavmarl.config.registry import load_config
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of, writing
 from cavmarl.learning.log import WINDOW, curve_row
-from cavmarl.learning.options import RESUME, check_at_least, run_folder, run_program
+from cavmarl.learning.loggers import logger_names
+from cavmarl.learning.options import LOGGERS, RESUME, check_at_least, run_folder, run_program
 from cavmarl.learning.run_folder import DRIVER_FILES, RunFolder, parse_run
 from cavmarl.networks.network_files import MAX_DEVIATIONS, NetworkConfig
 
@@ -59,10 +60,12 @@ class Args:
     name: Annotated[str, "folder of this run; empty: ENV_sb3_SEED"] = ""
     checkpoint_updates: Annotated[int, "updates between two checkpoints"] = 20
     resume: Annotated[str, RESUME] = ""
+    loggers: Annotated[str, LOGGERS] = ""
 
     def __post_init__(self) -> None:
         least_one = ("num_worlds", "total_agent_steps", "num_steps", "epochs", "minibatches")
         check_at_least(self, dict.fromkeys((*least_one, "checkpoint_updates"), 1))
+        logger_names(self.loggers)
 
     @property
     def folder(self) -> Path:

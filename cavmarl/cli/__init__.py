@@ -17,6 +17,7 @@ import typer
 from cavmarl.cli import (
     baseline,
     bench,
+    board,
     carla,
     demand,
     demo,
@@ -135,6 +136,7 @@ _train("suite", suite.suite, "cavmarl suite standard --maps maps --policy cities
 _train("baseline", baseline.baseline, "cavmarl baseline city.net.xml --agents 8 --episodes 6")
 _train("manifest", service.manifest, "cavmarl manifest runs/evaluate/merge-1")
 app.add_typer(zoo.app, name="zoo", rich_help_panel=TRAIN)
+app.add_typer(board.app, name="board", rich_help_panel=TRAIN)
 app.add_typer(scenario.app, name="scenario", rich_help_panel=TRAIN)
 app.add_typer(demand.app, name="demand", rich_help_panel=MAPS)
 _divide(

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import ast
-import re
 from pathlib import Path
 
 from rich.console import Console
@@ -11,6 +9,7 @@ from rich.markup import escape
 from rich.table import Table
 
 from cavmarl.cli.output import JsonPath, write_json
+from cavmarl.config.entry_cards import sentence_about
 from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import ConfigError
 
@@ -47,22 +46,3 @@ def list_entries(json_path: JsonPath = None) -> None:
 
 def _kind(path: Path) -> str:
     return "scripted" if path.suffix == ".py" else "trained"
-
-
-def sentence_about(path: Path) -> str:
-    """Return the first sentence about an entry: of its README.md, or of a script's docstring.
-
-    If there is none, return the path of the entry.
-    """
-    try:
-        if path.suffix == ".py":
-            text = ast.get_docstring(ast.parse(path.read_bytes())) or ""
-        else:
-            text = (path / "README.md").read_text(encoding="utf-8")
-    except (OSError, ValueError, SyntaxError):
-        return str(path)
-    paragraphs = re.split(r"\n\s*\n", text.strip())
-    prose = (part for part in paragraphs if part[:1].isalnum())
-    words = " ".join(next(prose, str(path)).split())
-    plain = re.sub(r"\[([^]]*)\]\([^)]*\)", r"\1", words).replace("`", "")
-    return re.split(r"(?<=[.])\s+(?=[A-Z])", plain)[0] if words else str(path)

@@ -506,3 +506,13 @@ def print_error(message: str) -> None:
     """Print an error to stderr in red; control characters are escaped."""
     shown = "".join(c if c.isprintable() or c == "\n" else ascii(c)[1:-1] for c in message)
     Console(stderr=True).print(Text(f"error: {shown}", style="red"), soft_wrap=True)
+
+
+def driving_progress(bar: Any) -> Callable[[str, int, int], None]:
+    """Return a function that shows in a bar how far the driving of a policy is."""
+    task = bar.add_task("")
+
+    def show(policy: str, steps: int, most: int) -> None:
+        bar.update(task, description=policy, completed=steps, total=most)
+
+    return show

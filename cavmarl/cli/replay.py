@@ -61,6 +61,14 @@ def replay(
         Path | None,
         about("Write a bag of ROS 2, a new folder.", metavar="FOLDER", panel=OUTPUT),
     ] = None,
+    minari: Annotated[
+        Path | None,
+        about(
+            "Write the agents' trips of all worlds as a data set of Minari, a new folder.",
+            metavar="FOLDER",
+            panel=OUTPUT,
+        ),
+    ] = None,
     web: Annotated[
         bool, flag("Serve a page that shows the whole recording in a browser.", panel=PAGE)
     ] = False,
@@ -78,7 +86,7 @@ def replay(
     """
     from cavmarl.core.errors import ConfigError, RecordingError, require_all
 
-    given = {"fcd": fcd, "csv": csv, "mcap": mcap, "rosbag2": rosbag2}
+    given = {"fcd": fcd, "csv": csv, "mcap": mcap, "rosbag2": rosbag2, "minari": minari}
     wanted = {name: file for name, file in given.items() if file}
     shows = video is not None or not (web or wanted)
     require_all(
@@ -113,7 +121,14 @@ def replay(
         from cavmarl.cosim.ros2.recording_bag import write_recording_bag
 
         exports["rosbag2"] = write_recording_bag
+    if minari:
+        from cavmarl.recordings.minari_export import write_minari
+
+        trips, decisions = write_minari(recording, minari)
+        console.print(f"minari: {minari}, {trips} trips, {decisions} decisions", markup=False)
     for name, file in wanted.items():
+        if name not in exports:
+            continue
         with progress_bar(console) as bar:
             track = partial(bar.track, total=len(ticks), description=f"{name}: {file}")
             frames = exports[name](recording, file, world, episode, track)

@@ -1,33 +1,35 @@
-"""`cavmarl zoo`: lists, verifies and compares trained drivers."""
+"""`cavmarl zoo`: lists, verifies, compares and exports trained drivers."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Annotated, Any
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from cavmarl.cli.listing import sentence_about
 from cavmarl.cli.output import (
     CliGroup,
     Imports,
     JsonPath,
     about,
+    about_file,
     add_command,
+    driving_progress,
     grid,
     number,
     print_error,
     with_world,
     write_json,
 )
+from cavmarl.config.entry_cards import sentence_about
 from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from cavmarl.evaluate.episodes import Progress
     from cavmarl.evaluate.zoo import Cross
 
 # Metrics that fit eighty columns, and their headings.
@@ -39,7 +41,7 @@ SHORT = {
 }
 
 app = typer.Typer(
-    cls=CliGroup, help="List, verify and compare trained drivers.", no_args_is_help=True
+    cls=CliGroup, help="List, verify, compare and export trained drivers.", no_args_is_help=True
 )
 
 
@@ -87,7 +89,7 @@ def verify(
 
     console = Console()
     with progress_bar(console) as bar:
-        found = verify_entry(name, _progress(bar))
+        found = verify_entry(name, driving_progress(bar))
     for file, digest in found.expected.items():
         verdict = f"the same ({digest[:12]})"
         if file in found.differing:
@@ -124,7 +126,7 @@ def cross(
     console = Console()
     world = with_sensors_of_drivers(world, policy)
     with progress_bar(console) as bar:
-        found = run(world, policy, episodes=episodes, progress=_progress(bar))
+        found = run(world, policy, episodes=episodes, progress=driving_progress(bar))
     for column, title in (("success", "success, %"), ("collision", "collision, %")):
         console.print(_matrix(found, column, title))
     write_json(
@@ -139,6 +141,38 @@ def cross(
     )
 
 
+def export(
+    name: Annotated[
+        str, typer.Argument(metavar="DRIVER", help="Name or folder of a trained driver.")
+    ],
+    onnx: Annotated[Path, about_file("Write an ONNX model, whose metadata state the sensors.")],
+    json_path: JsonPath = None,
+) -> None:
+    """Write a trained driver as a model for other programs.
+
+    `--policy FILE.onnx` reads the model, too.
+    """
+    from cavmarl.policies.onnx_export import export_onnx
+
+    config = export_onnx(name, onnx)
+    told = {
+        "driver": name,
+        "onnx": str(onnx),
+        "observations": config.observation_size,
+        "outputs": config.num_outputs,
+        "action": config.action.kind,
+        "observes_built_in_action": config.residual,
+    }
+    Console().print(
+        f"{onnx}: observations (N, {config.observation_size}) to "
+        f"{'actions' if config.action.kind == 'continuous' else 'logits'} (N, {config.num_outputs})"
+        + ("; the last two observations are the built-in driver's action" * config.residual),
+        markup=False,
+        highlight=False,
+    )
+    write_json(json_path, told)
+
+
 def _matrix(found: Cross, column: str, title: str) -> Table:
     heads = ("", *(f"among {escape(name)}" for name in found.drivers))
     rows = [
@@ -146,16 +180,6 @@ def _matrix(found: Cross, column: str, title: str) -> Table:
         for a in found.drivers
     ]
     return grid(heads, rows, title)
-
-
-def _progress(bar: Any) -> Progress:
-    """Return a function that shows the progress of a driver."""
-    task = bar.add_task("")
-
-    def show(policy: str, steps: int, most: int) -> None:
-        bar.update(task, description=policy, completed=steps, total=most)
-
-    return show
 
 
 add_command(app, "list", list_drivers, "cavmarl zoo list")
@@ -166,3 +190,4 @@ add_command(
     cross,
     "cavmarl zoo cross merge --policy idm --policy cities_ippo",
 )
+add_command(app, "export", export, "cavmarl zoo export cities_ippo --onnx cities_ippo.onnx")

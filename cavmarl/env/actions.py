@@ -68,6 +68,11 @@ class ActionDecoder:
         self.ignored = np.zeros(num_worlds, dtype=np.int64)
 
     @property
+    def last(self) -> NDArray[Any]:
+        """The actions (W, A, …) of the last step, after clipping; idle ones after a reset."""
+        return self._last
+
+    @property
     def memory(self) -> tuple[NDArray[Any], ...]:
         """The last actions and the counts of `tolerated`, as arrays that can be saved."""
         return self._last, self.clipped, self.held, self.ignored

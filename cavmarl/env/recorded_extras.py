@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
+from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Nack, Record, Step
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.parallel.worlds.step_arrays import StepArrays
@@ -81,13 +82,26 @@ class RecordedExtras:
         self, config: EnvConfig, include: Iterable[str], arrays: StepArrays, simulation: Simulation
     ) -> None:
         self._arrays = arrays
+        self._ticks = np.full(len(arrays.mask), -1, dtype=np.int64)  # of the last frames
+        self._step_ticks = config.clock.ticks_per_step
         wanted = frozenset(include)
         self.dtypes: dict[str, np.dtype[Any]] = {}
         self.features: list[tuple[str, str]] = []
         if "observations" in wanted:
             numbers, terms = arrays.observations.shape[2], arrays.terms.shape[2]
-            more = [("reward", "<f4"), ("terms", "<f4", (terms,)), ("values", "<f4", (numbers,))]
-            self.dtypes["observations"] = np.dtype([*_WHOSE, *more])
+            is_pair = config.action.kind == "continuous"
+            self.dtypes["observations"] = np.dtype(
+                [
+                    *_WHOSE,
+                    ("acted", "|b1"),
+                    ("action", "<f4", (2,)) if is_pair else ("action", "<i8"),
+                    ("reward", "<f4"),
+                    ("terminated", "|b1"),
+                    ("truncated", "|b1"),
+                    ("terms", "<f4", (terms,)),
+                    ("values", "<f4", (numbers,)),
+                ]
+            )
             if config.observation.mode != "sensors":
                 self.features = feature_names(config.sensors)
         if "samples" in wanted:
@@ -110,27 +124,84 @@ class RecordedExtras:
             for world, coordinator in enumerate(simulation.coordinators):
                 coordinator.watch(_HandoverWatch(log, world))
 
-    def of(self, world: int, tick: int) -> Mapping[str, Rows]:
+    def of(self, frame: WorldFrame, actions: NDArray[Any] | None) -> Mapping[str, Rows]:
         """Return the new rows of a world since the last call, by table.
 
         Args:
-            world: number of the world.
-            tick: tick of the frame that the rows belong to.
+            frame: the frame that the rows belong to.
+            actions: (W, A, …) of the step that led to the frame; None: the episode was reset.
         """
         if not self.dtypes:
             return {}
-        arrays, found = self._arrays, {name: log.take(world) for name, log in self._logs.items()}
-        agents = np.flatnonzero(arrays.vehicle_ids[world] >= 0)
+        world, tick = frame.world, frame.tick
+        found = {name: log.take(world) for name, log in self._logs.items()}
+        agents = np.flatnonzero(self._arrays.vehicle_ids[world] >= 0)
         for name, dtype in self.dtypes.items():
             if name == "observations":
-                rows = self._whose(dtype, world, tick, agents)
-                rows["reward"] = arrays.rewards[world, agents]
-                rows["terms"] = arrays.terms[world, agents]
-                rows["values"] = arrays.observations[world, agents]
-                found[name] = rows
+                found[name] = self._observed(dtype, frame, actions)
             elif name.startswith(SAMPLES):
                 found[name] = self._samples(name, dtype, world, tick, agents)
+        self._ticks[world] = tick
         return found
+
+    def at_the_end(self, world: int, actions: NDArray[Any]) -> Mapping[str, Rows]:
+        """Return the rows of the last step of an episode, whose last frame is not available.
+
+        The arguments are those of `of`.
+        """
+        dtype = self.dtypes.get("observations")
+        return {} if dtype is None else {"observations": self._results(dtype, world, None, actions)}
+
+    def _observed(
+        self, dtype: np.dtype[Any], frame: WorldFrame, actions: NDArray[Any] | None
+    ) -> Rows:
+        """Return a row of each agent that acted in the step, or that acts next, by agent.
+
+        If the step has also reset the world, its results are those of the episode before.
+        """
+        arrays, world, tick = self._arrays, frame.world, frame.tick
+        is_new = actions is None or tick <= self._ticks[world]
+        begins = arrays.mask[world].copy()
+        parts = []
+        if actions is not None:
+            parts.append(self._results(dtype, world, None if is_new else tick, actions))
+            begins &= is_new | ~arrays.acted[world]
+        agents = np.flatnonzero(begins)
+        rows = self._whose(dtype, world, tick, agents)
+        driven = frame.vehicles[frame.vehicles["agent"] >= 0]
+        order = np.argsort(driven["agent"])
+        place = np.searchsorted(driven["agent"], agents, sorter=order)
+        rows["vehicle"] = driven["id"][order[place]]
+        if not is_new or actions is None:
+            rows["terms"] = arrays.terms[world, agents]
+        rows["values"] = arrays.observations[world, agents]
+        parts.append(rows)
+        found = np.concatenate(parts)
+        return found[np.lexsort((found["agent"], found["tick"]))]
+
+    def _results(
+        self, dtype: np.dtype[Any], world: int, tick: int | None, actions: NDArray[Any]
+    ) -> Rows:
+        """Return a row of each agent that acted in the last step; `tick`: None: the world's next.
+
+        The observations of agents and episodes that have ended are their last ones.
+        """
+        arrays = self._arrays
+        agents = np.flatnonzero(arrays.acted[world])
+        if tick is None:
+            tick = int(self._ticks[world]) + self._step_ticks
+        rows = self._whose(dtype, world, tick, agents)
+        has_ended = arrays.episode_over[world] or arrays.terminations[world].any()
+        seen = arrays.final_observations if has_ended else arrays.observations
+        taken = actions[world, agents]
+        rows["acted"] = True
+        rows["action"] = taken if taken.dtype.kind == "i" else taken.clip(-1.0, 1.0)
+        rows["reward"] = arrays.rewards[world, agents]
+        rows["terminated"] = arrays.terminations[world, agents]
+        rows["truncated"] = arrays.truncations[world, agents]
+        rows["terms"] = arrays.terms[world, agents]
+        rows["values"] = seen[world, agents]
+        return rows
 
     def _whose(self, dtype: np.dtype[Any], world: int, tick: int, agents: NDArray[np.intp]) -> Rows:
         rows = np.zeros(len(agents), dtype)

@@ -105,19 +105,31 @@ class WorldRecorder:
         """Return memory, SEEN (count,), for a frame that is only passed to `add`."""
         return self._writer.memory.take(count)
 
-    def add(self, frames: Iterable[WorldFrame], first: int = 0) -> None:
+    def add(
+        self, frames: Iterable[WorldFrame], actions: NDArray[Any] | None, first: int = 0
+    ) -> None:
         """Add frames of worlds as they are now.
 
         Args:
             frames: frames with the worlds' numbers in the environment.
+            actions: (W, A, …) of the step that led to the frames; None: the worlds were reset.
             first: number of world 0 in the recording.
 
         Raises:
             RecordingError: an earlier part could not be written.
         """
         these = list(frames)
-        extras = [self._extras.of(frame.world, frame.tick) for frame in these]
+        extras = [self._extras.of(frame, actions) for frame in these]
         self._writer.add((frame._replace(world=first + frame.world) for frame in these), extras)
+
+    def end(self, worlds: Iterable[int], actions: NDArray[Any], first: int = 0) -> None:
+        """Add what is left of episodes that have just ended, whose last frames are not available.
+
+        Raises:
+            RecordingError: an earlier part could not be written.
+        """
+        for world in worlds:
+            self._writer.add_rows(first + world, self._extras.at_the_end(world, actions))
 
     def close(self) -> None:
         """Write the remaining rows; raises as `add`."""

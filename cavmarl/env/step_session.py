@@ -272,7 +272,9 @@ class StepSession:
         if self._recorder is not None:
             every = range(len(self.worlds.arrays.mask))
             some = every if chosen is None else np.flatnonzero(chosen).tolist()
-            self._recorder.add(self._frames(some, ghosts=True, room=self._recorder.room))
+            actions = self.decoder.last if chosen is None else None
+            frames = self._frames(some, ghosts=True, room=self._recorder.room)
+            self._recorder.add(frames, actions)
         for watcher in self._watchers:
             watcher()
 

@@ -261,7 +261,7 @@ class _Part:
             done = infos["vehicle_done"] & acted
             arrivals = infos["arrivals"]
             ended = self._recorder.add(steps, acted, rewards, infos["terms"], done, over, arrivals)
-            self._seen.step(running, over, ended)
+            self._seen.step(running, over, ended, actions)
             self.borders.add(self._recorder.places_m, acted, infos["terms"])
             handed_over.collect(np.flatnonzero(running).tolist(), over)
             running &= ~over

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -60,10 +61,14 @@ class RunWatch:
         self._first = first
         if self._clips is not None:
             self._clips.begin()
-        self._look(running)
+        self._look(running, None)
 
     def step(
-        self, running: NDArray[np.bool_], over: NDArray[np.bool_], trips: NDArray[np.void]
+        self,
+        running: NDArray[np.bool_],
+        over: NDArray[np.bool_],
+        trips: NDArray[np.void],
+        actions: NDArray[Any],
     ) -> None:
         """Observe a step.
 
@@ -71,12 +76,15 @@ class RunWatch:
             running: (W,) worlds that were in their episode before the step.
             over: (W,) worlds whose episode ended in the step; they show the next episode already.
             trips: TRIP (n,) that ended in the step.
+            actions: (W, A, …) of the step.
         """
         if self._clips is not None:
             self._clips.take(trips, self._first)
-        self._look(running & ~over)
+        self._look(running & ~over, actions)
+        if self._writer is not None:
+            self._writer.end(np.flatnonzero(running & over).tolist(), actions, self._first)
 
-    def _look(self, chosen: NDArray[np.bool_]) -> None:
+    def _look(self, chosen: NDArray[np.bool_], actions: NDArray[Any] | None) -> None:
         if self._show is not None:
             self._show()
         if self._writer is None and self._clips is None:
@@ -85,7 +93,7 @@ class RunWatch:
         if self._clips is not None:
             self._clips.add(frames)
         if self._writer is not None:  # each world of the recording is an episode of the run
-            self._writer.add(frames, self._first)
+            self._writer.add(frames, actions, self._first)
 
     def close(self) -> None:
         """Close the recording, if there is one."""

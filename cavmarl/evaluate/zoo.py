@@ -128,17 +128,32 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         ManifestError: there is no result, or weights or world differ from those it was made with.
     """
     weights = policy_files(policy)
-    folder = weights[0].parent
     if len(weights) < 2:
         raise PolicyError(f"{policy}: is a script; the zoo contains only trained drivers")
+    folder = weights[0].parent
+    return verify_result(folder, folder, progress)
+
+
+def verify_result(folder: Path, driver: Path, progress: Progress | None = None) -> Verification:
+    """Drive the episodes of the result in a folder again.
+
+    Args:
+        folder: contains the result.
+        driver: the trained driver's folder, or the script.
+        progress: as in `evaluate`.
+
+    Raises:
+        PolicyError: the driver cannot be read.
+        ManifestError: as `verify_entry`.
+    """
     name = folder.name
     document = read_evaluation(folder / RESULT_FOLDER)
     job = entry_job(document, folder)
-    _check_weights(document, name, weights)
+    _check_weights(document, name, policy_files(driver))
     _check_world(document, name, job.world)
     with TemporaryDirectory() as room:
         out = Path(room) / "again"
-        job.drive(next(iter(document["policies"])), folder, out, progress)
+        job.drive(next(iter(document["policies"])), driver, out, progress)
         known = document["results_sha256"]
         expected = {file: known[file] for file in TABLES if file in known}
         return Verification(

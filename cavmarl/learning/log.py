@@ -1,11 +1,11 @@
-"""The metrics of every update: as a CSV table, for TensorBoard, and as text."""
+"""The metrics of every update: as a CSV table, for experiment trackers, and as text."""
 
 from __future__ import annotations
 
 import csv
 import os
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -17,11 +17,11 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from cavmarl.config.terms import TERMS
-from cavmarl.core.errors import TrainingError, require
+from cavmarl.core.errors import TrainingError
 from cavmarl.learning.checkpoint import Parts, writing
+from cavmarl.learning.loggers import BOARD_FILES, make_loggers
 
 CSV_FILE = "progress.csv"
-BOARD_FILES = "events.out.tfevents.*"
 
 WINDOW = 1000  # number of last trips that a row averages
 
@@ -85,17 +85,22 @@ class Trips:
 
 
 class Log:
-    """Writes the metrics of every update to CSV, and to TensorBoard if requested."""
+    """Writes the metrics of every update to a CSV table and to other loggers.
 
-    def __init__(self, folder: Path, tensorboard: bool = False) -> None:
+    Args:
+        folder: of the run.
+        loggers: names of `LOGGERS`.
+        settings: of the run, for loggers that show them.
+    """
+
+    def __init__(
+        self, folder: Path, loggers: Iterable[str] = (), settings: Mapping[str, Any] | None = None
+    ) -> None:
         self._path = folder / CSV_FILE
         self._writer: csv.DictWriter[str] | None = None
-        self._board: Any = None
         with writing(self._path):
             self._file = self._path.open("a", encoding="utf-8", newline="")
-            if tensorboard:
-                board = require("torch.utils.tensorboard", "train")
-                self._board = board.SummaryWriter(str(folder))
+            self._loggers = make_loggers(loggers, folder, settings or {}, read_rows(folder))
 
     def write(self, row: dict[str, float]) -> None:
         with writing(self._path):
@@ -105,16 +110,15 @@ class Log:
                     self._writer.writeheader()
             self._writer.writerow({name: f"{value:.6g}" for name, value in row.items()})
             self._file.flush()
-            if self._board is not None:
-                for name, value in row.items():
-                    self._board.add_scalar(name, value, int(row["agent_steps"]))
+            for logger in self._loggers:
+                logger.write(row)
 
     def sync(self) -> dict[str, int]:
         """Flush everything to the disk and return the size of each file in bytes."""
         sizes = {}
         with writing(self._path):
-            if self._board is not None:
-                self._board.flush()
+            for logger in self._loggers:
+                logger.flush()
             for path in _files(self._path.parent):
                 with path.open("rb") as file:
                     os.fsync(file.fileno())
@@ -125,9 +129,9 @@ class Log:
         """Close the files and ignore errors; after a full disk, failed writes are not repeated."""
         with suppress(OSError):
             self._file.close()
-        with suppress(OSError):
-            if self._board is not None:
-                self._board.close()
+        for logger in self._loggers:
+            with suppress(OSError):
+                logger.close()
 
 
 def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
@@ -147,6 +151,22 @@ def cut_logs(folder: Path, sizes: Mapping[str, int]) -> None:
             f"{table}: rows written before the checkpoint are missing; restore a copy of it, or "
             "train again under another --name"
         )
+
+
+def read_rows(folder: Path) -> list[dict[str, float]]:
+    """Return the rows of a run's table so far, with six digits; empty if there is none."""
+    path = folder / CSV_FILE
+    if not path.is_file():
+        return []
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = list(csv.DictReader(file))
+    try:
+        return [{name: float(value) for name, value in row.items()} for row in rows]
+    except (TypeError, ValueError) as error:
+        raise TrainingError(
+            f"{path}: is damaged ({error}); restore a copy of it, or train again under another "
+            "--name"
+        ) from error
 
 
 def _files(folder: Path) -> list[Path]:

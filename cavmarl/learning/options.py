@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from _typeshed import DataclassInstance
 
 RESUME = "folder of a run to continue; its settings apply, except for its length"
+LOGGERS = "trackers that log the run: tensorboard, wandb, mlflow; comma-separated"
 DRIVER = "driver: {folder}  (cavmarl evaluate ENV --policy {folder})"
 
 PLUGINS = "plugins"  # setting of the option --import, which can be repeated

@@ -39,6 +39,7 @@ from cavmarl.learning.checkpoint import (
     writing,
 )
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
+from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import given_options, settings_of
 from cavmarl.networks.network_files import NetworkConfig
 
@@ -62,7 +63,7 @@ DRIVER_FILES = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
 
 # Settings that may change when a run is resumed.
 CAN_CHANGE = frozenset(
-    "total_agent_steps minutes resume threads device zones backend workers tensorboard "
+    "total_agent_steps minutes resume threads device zones backend workers loggers "
     "checkpoint_updates".split()
 )
 
@@ -161,7 +162,8 @@ class RunFolder:
 
     @cached_property
     def log(self) -> Log:
-        return Log(self.path, getattr(self._settings, "tensorboard", False))
+        names = logger_names(getattr(self._settings, "loggers", ""))
+        return Log(self.path, names, asdict(self._settings))
 
     @property
     def seconds(self) -> float:

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import importlib.util
 import inspect
-from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,14 @@ from pettingzoo import ParallelEnv
 from cavmarl.config.driver_form import (
     CONFIG_FILE,
     WEIGHTS_FILE,
-    differing_keys,
-    form_of,
     form_of_driver,
 )
 from cavmarl.config.driver_names import SHIELDED, find_driver, name_of_driver, shared_drivers
 from cavmarl.core.errors import PolicyError
 from cavmarl.core.tracebacks import fault_in
-from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.driver_fit import check_fit
 from cavmarl.policies.model_files import make_policy, model_files
 from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPolicy
 from cavmarl.policies.shield import ShieldedPolicy
@@ -114,31 +111,9 @@ def _load_script(path: Path, env: Environment) -> Policy:
 def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
     from cavmarl.networks.driver_network import load_driver_network  # imports pydantic
 
-    network = load_driver_network(folder)
-    config, name, here = network.config, name_of_driver(folder), env.config
-    size = flat_observation_space(here).shape[0]
-    if unlike := differing_keys(form_of(config.sensors, config.action), here):
-        lines = (f"{key} is {there} for it, {ours} here" for key, (there, ours) in unlike.items())
-        cure = {key: there for key, (there, _) in unlike.items()}
-        raise PolicyError(
-            f"The policy {name} expects different {_parts(unlike)} than this "
-            f"environment provides ({'; '.join(lines)}). It observes {config.sensed} numbers, and "
-            f"this environment gives {size}. Add --sensors-of {name} to the command, or "
-            f"sensors_of={name!r} in Python, or pass these overrides: {cure}"
-        )
-    if config.sensed != size:
-        raise PolicyError(
-            f"{name}: observes {config.sensed} numbers, but its sensors give {size} in "
-            "this version; train it again"
-        )
+    network, name = load_driver_network(folder), name_of_driver(folder)
+    check_fit(network.config, env.config, name, name)
     return NetworkPolicy(env, network)
-
-
-def _parts(keys: Iterable[str]) -> str:
-    """Return the parts of an environment that the keys belong to, in words."""
-    found = {key.partition(".")[0] for key in keys}
-    names = {"sensors": "sensors", "action": "actions"}
-    return " and ".join(name for key, name in names.items() if key in found)
 
 
 def driver_keys(policy: str | Path) -> dict[str, Any]:

@@ -1,7 +1,7 @@
 """Drivers in model files of other libraries: stable-baselines3, TorchScript and ONNX.
 
 `make_policy` is the way in for all of them. A format is a suffix in `config/driver_names.py` and a
-reader in `_READERS`, which returns a `Model`.
+reader in `_READERS`, which returns a `Model`, and whether the model corrects the built-in driver.
 """
 
 from __future__ import annotations
@@ -27,10 +27,12 @@ from cavmarl.engine.spaces import (
     observation_parts,
     observation_space,
 )
-from cavmarl.policies.policy import Environment, Policy
+from cavmarl.policies.driver_fit import check_fit
+from cavmarl.policies.policy import Environment, Policy, built_in_actions
 
 Model = Callable[[NDArray[np.float32]], Any]
 """Maps flat observations (N, D) to actions (N, 2), choices (N,), or logits (N, choices)."""
+_Read = tuple[Model, bool]  # the model, and whether it corrects the built-in driver
 
 
 class ModelPolicy(Policy):
@@ -40,17 +42,22 @@ class ModelPolicy(Policy):
         env: environment of the policy.
         model: see `Model`. Actions are clipped to [-1, 1]; of logits, the largest is chosen.
         name: name of the model in messages.
+        is_residual: whether the model observes the built-in driver's action, too, as its last
+            numbers, and returns a corrected action.
 
     Raises:
         PolicyError: the model does not accept the observations of the environment, or its results
             are no actions of the environment.
     """
 
-    def __init__(self, env: Environment, model: Model, name: str = "the model") -> None:
+    def __init__(
+        self, env: Environment, model: Model, name: str = "the model", is_residual: bool = False
+    ) -> None:
         super().__init__(env)
-        self._model, self._name = model, name
+        self._model, self._name, self._is_residual = model, name, is_residual
         self._actions = action_space(env.config.action)
         size = flat_observation_space(env.config).shape[0]
+        size += sum(self._actions.shape or ()) if is_residual else 0
         try:
             self._decide(np.zeros((1, size), dtype=np.float32))
         except PolicyError:
@@ -65,6 +72,9 @@ class ModelPolicy(Policy):
         """Return the model's actions where `mask` is set, else 0."""
         shape = self._actions.shape or ()
         actions = np.zeros((*mask.shape, *shape), dtype=self._actions.dtype)
+        if self._is_residual:
+            proposed = built_in_actions(self.env, mask)
+            observations = np.concatenate([observations, proposed], axis=-1)
         if mask.any():
             actions[mask] = self._decide(observations[mask])
         return actions
@@ -101,14 +111,16 @@ def make_policy(path: Path, env: Environment) -> Policy:
 
     `.zip`: a model that stable-baselines3 saved (extra `train`); if it was trained with
     VecNormalize, the file NAME.pkl beside it has the statistics. `.pt`, `.ts`: a TorchScript
-    module (extra `train`). `.onnx`: an ONNX model with one input (extra `onnx`). Files of the first
-    two kinds can contain code, which this function runs.
+    module (extra `train`). `.onnx`: an ONNX model with one input (extra `onnx`); a model that
+    `export_onnx` wrote states its sensors and actions. Files of the first two kinds can contain
+    code, which this function runs.
 
     Raises:
         MissingExtraError: the library is not installed.
         PolicyError: the file cannot be read, or its model does not fit the environment.
     """
-    return ModelPolicy(env, _READERS[path.suffix](path, env.config), str(path))
+    model, is_residual = _READERS[path.suffix](path, env.config)
+    return ModelPolicy(env, model, str(path), is_residual)
 
 
 def model_files(path: Path) -> tuple[Path, ...]:
@@ -119,7 +131,7 @@ def model_files(path: Path) -> tuple[Path, ...]:
     return (path,)
 
 
-def _read_sb3(path: Path, config: EnvConfig) -> Model:
+def _read_sb3(path: Path, config: EnvConfig) -> _Read:
     require_all({"stable_baselines3": "train", "torch": "train"})
     from stable_baselines3.common.policies import BasePolicy
     from stable_baselines3.common.save_util import load_from_zip_file
@@ -158,7 +170,7 @@ def _read_sb3(path: Path, config: EnvConfig) -> Model:
             shown = named_observation(parts, observations.reshape(len(observations), stack, -1))
         return policy.predict(normalize(shown), deterministic=True)[0]
 
-    return act
+    return act, False
 
 
 def _no_learning(_: float) -> float:
@@ -214,7 +226,7 @@ def _read_statistics(path: Path, is_needed: bool) -> Callable[[Any], Any]:
     return lambda observations: observations
 
 
-def _read_torch_script(path: Path, _: EnvConfig) -> Model:
+def _read_torch_script(path: Path, _: EnvConfig) -> _Read:
     torch = require("torch", "train")
     try:
         with warnings.catch_warnings():
@@ -231,10 +243,10 @@ def _read_torch_script(path: Path, _: EnvConfig) -> Model:
         with torch.inference_mode():
             return module(torch.from_numpy(observations)).numpy()
 
-    return act
+    return act, False
 
 
-def _read_onnx(path: Path, _: EnvConfig) -> Model:
+def _read_onnx(path: Path, here: EnvConfig) -> _Read:
     runtime = require("onnxruntime", "onnx")
     try:
         session = runtime.InferenceSession(str(path), providers=["CPUExecutionProvider"])
@@ -245,7 +257,14 @@ def _read_onnx(path: Path, _: EnvConfig) -> Model:
         raise PolicyError(
             f"{path}: has the inputs {', '.join(inputs)}; it must have one, the observations (N, D)"
         )
-    return lambda observations: session.run(None, {inputs[0]: observations})[0]
+    from cavmarl.policies.onnx_export import read_onnx_config  # imports pydantic
+
+    about = session.get_modelmeta()
+    config = read_onnx_config(about.custom_metadata_map, path)
+    if config is not None:
+        check_fit(config, here, str(path), about.graph_name)
+    is_residual = config is not None and config.residual
+    return (lambda observations: session.run(None, {inputs[0]: observations})[0]), is_residual
 
 
 def _first_line(error: Exception) -> str:
@@ -253,7 +272,7 @@ def _first_line(error: Exception) -> str:
     return lines[0] if lines else type(error).__name__
 
 
-_READERS: Mapping[str, Callable[[Path, EnvConfig], Model]] = {
+_READERS: Mapping[str, Callable[[Path, EnvConfig], _Read]] = {
     SB3_FILE: _read_sb3,
     **dict.fromkeys(TORCH_SCRIPT_FILES, _read_torch_script),
     ONNX_FILE: _read_onnx,

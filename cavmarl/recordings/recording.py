@@ -208,6 +208,23 @@ class Recording:
             rows.append(found if episode is None else found[episodes == episode])
         return np.concatenate(rows)
 
+    def extra_by_episode(
+        self, table: str, world: int = 0
+    ) -> Iterator[tuple[int, NDArray[np.void]]]:
+        """Yield the rows of an optional table episode by episode: (index of episode, rows).
+
+        Only one episode is in memory at a time. Raises as `extra`.
+        """
+        present, parts = 0, [np.zeros(0, self._dtype(table))]
+        for frames in self._paths(world):
+            episodes, found = self._extra_of(table, frames)
+            for episode in np.unique(episodes).tolist():
+                if episode != present:
+                    yield present, np.concatenate(parts)
+                    present, parts = episode, parts[:0]
+                parts.append(found[episodes == episode])
+        yield present, np.concatenate(parts)
+
     def extra_at(self, table: str, tick: int, world: int = 0, episode: int = 0) -> Any:
         """Return the rows (n,) of an optional table at one tick that has a frame.
 

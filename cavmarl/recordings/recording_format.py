@@ -222,7 +222,8 @@ def vehicle_table(frames: Sequence[RecordedFrame]) -> Any:
         "episode": np.repeat(np.array([one.episode for one in frames], np.int32), counts),
         "tick": np.repeat(np.array([one.frame.tick for one in frames], np.int64), counts),
     }
-    columns |= _columns_of(np.concatenate([one.frame.vehicles.view(np.uint8) for one in frames]))
+    rows = [np.empty(0, np.uint8), *(one.frame.vehicles.view(np.uint8) for one in frames)]
+    columns |= _columns_of(np.concatenate(rows))
     arrays = [pa.array(column) for column in columns.values()]
     return pa.Table.from_arrays(arrays, schema=vehicle_schema())
 

@@ -131,6 +131,15 @@ class RecordingWriter:
         these, more = list(frames), list(extras)
         self._sink.add(list(zip(these, more or [none] * len(these), strict=True)))
 
+    def add_rows(self, world: int, extras: Extras) -> None:
+        """Add rows of the optional tables to the last episode of a world, without a frame.
+
+        Raises:
+            RecordingError: an earlier part could not be written.
+        """
+        if extras:
+            self._sink.add([(world, extras)])
+
     def close(self) -> None:
         """Write the remaining frames and mark the recording as closed.
 
@@ -144,7 +153,7 @@ class RecordingWriter:
 
 
 Extras = Mapping[str, NDArray[np.void]]
-_Moment = tuple[WorldFrame, Extras]
+_Moment = tuple[WorldFrame | int, Extras]  # a frame or, for rows without a frame, a world
 
 
 class _Sink:
@@ -170,11 +179,12 @@ class _Sink:
         self._worlds: dict[int, _WorldParts] = {}
         self._thread: threading.Thread | None = None
 
-    def add(self, moments: list[_Moment]) -> None:
+    def add(self, moments: Sequence[_Moment]) -> None:
         refuse_fork(self._pid, f"the frames of {self._path}")
         self.check()
         size = sum(
-            frame.vehicles.nbytes + sum(rows.nbytes for rows in extras.values())
+            (frame.vehicles.nbytes if isinstance(frame, WorldFrame) else 0)
+            + sum(rows.nbytes for rows in extras.values())
             for frame, extras in moments
         )
         with self._changed:
@@ -227,8 +237,11 @@ class _Sink:
     def _is_due(self) -> bool:
         return self._closing or self._waiting_bytes > MOST_WAITING_BYTES
 
-    def _commit(self, moments: list[_Moment]) -> None:
+    def _commit(self, moments: Sequence[_Moment]) -> None:
         for frame, extras in moments:
+            if not isinstance(frame, WorldFrame):
+                self._worlds[frame].take_rows(extras)
+                continue
             if frame.world not in self._worlds:
                 folder = self._path / f"world-{frame.world}"
                 self._worlds[frame.world] = _WorldParts(
@@ -279,6 +292,12 @@ class _WorldParts:
         for name, rows in take_rows(extras, episode, frame.tick):
             self._extras[name].append(rows)
 
+    def take_rows(self, extras: Extras) -> None:
+        """Add rows to the last episode."""
+        assert self._last is not None
+        for name, rows in extras.items():
+            self._extras[name].append(ExtraRows(self._last.episode, rows))
+
     def _at_the_end(self, last: WorldFrame, first: WorldFrame) -> Iterator[FrameEvent]:
         """Yield the events of an episode's last step, whose last frame is not available."""
         ended = first.ended["agent"]
@@ -296,7 +315,7 @@ class _WorldParts:
 
     def commit(self) -> None:
         """Write a part, unless it is empty; its frames are written last and commit it."""
-        if not self._frames:
+        if not self._frames and not any(self._extras.values()):
             return
         tables = {
             name: extra_table(rows, self._dtypes[name]) for name, rows in self._extras.items()

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 import cavmarl
 from cavmarl.cli import app
 from cavmarl.cli.evaluate import driver_cell
-from cavmarl.cli.listing import sentence_about
+from cavmarl.config.entry_cards import sentence_about
 from cavmarl.config.registry import agent_entries, entries
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.metrics import KM_PER_INFRACTION, METRICS

@@ -1,10 +1,11 @@
-"""Make the results of the zoo again: evaluate each trained driver, and replace its `result/`.
+"""Make the results of the zoo and the board again: evaluate each driver, replace its `result/`.
 
     python -m tests.golden.zoo [DRIVER ...]
 
-This command evaluates the named drivers, or all drivers. It takes the job of each driver (world,
-seed, episodes, runs) from the manifest of the driver's result. The command is the part `zoo` of
-`make record` (CONTRIBUTING.md). It stops at the first driver that cannot be recorded.
+This command evaluates the named drivers, or all trained drivers and the scripted drivers of
+`board/`. It takes the job of each driver (world, seed, episodes, runs) from the manifest of the
+driver's result. The command is the part `zoo` of `make record` (CONTRIBUTING.md). It stops at the
+first driver that cannot be recorded.
 """
 
 from __future__ import annotations
@@ -23,15 +24,19 @@ from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.zoo import RESULT_FOLDER, TABLES, entry_job
 from cavmarl.policies.loading import policy_files
 
+BOARD = Path(__file__).resolve().parents[2] / "board"
 SAME, OTHER = "same results as before", "recorded anew"
 
 
 def record(driver: str | Path) -> str:
     """Replace the result of a driver, given by its name or folder; return a word for the outcome.
 
+    The result of a script is in `board/`.
+
     The old result stays if the new one is the same, and if the evaluation fails or is interrupted.
     """
-    folder = policy_files(driver)[0].parent
+    files = policy_files(driver)
+    folder = files[0].parent if len(files) > 1 else BOARD / str(driver)
     result = folder / RESULT_FOLDER
     before = read_closed(result)
     with draft_folder(folder) as draft:
@@ -65,6 +70,7 @@ def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
 def main() -> int:
     """Record the results of drivers; return 1 if one of them cannot be recorded."""
     drivers = [name for name, path in sorted(agent_entries().items()) if path.is_dir()]
+    drivers += sorted(path.parent.name for path in BOARD.glob(f"*/{RESULT_FOLDER}"))
     parser = argparse.ArgumentParser(description=f"Drivers: {' '.join(drivers)}")
     parser.add_argument("drivers", nargs="*", metavar="DRIVER")
     has_failed = False

@@ -174,6 +174,9 @@ class Session:
     def get_inputs(self) -> list[Any]:
         return [SimpleNamespace(name="seen")]
 
+    def get_modelmeta(self) -> Any:
+        return SimpleNamespace(custom_metadata_map={}, graph_name="")
+
     def run(self, outputs: None, feed: dict[str, np.ndarray]) -> list[np.ndarray]:
         return [np.full((len(feed["seen"]), 2), -0.5, dtype=np.float32)]
 
@@ -190,6 +193,7 @@ def test_onnx_is_called_with_its_input(tmp_path: Path, monkeypatch: pytest.Monke
         load_policy(path, vec)
 
 
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the exporter warns about itself
 def test_a_real_onnx_model_gives_its_outputs_as_actions(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")

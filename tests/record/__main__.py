@@ -5,7 +5,7 @@
 Without a part, all four are recorded, in this order:
 
 golden: hashes of the results of worlds (tests.golden.worlds); names are rows.
-zoo: results of trained drivers (tests.golden.zoo); names are drivers.
+zoo: results of the zoo and the board (tests.golden.zoo); names are drivers.
 scores: tables of scores on pages (tests.record.score_tables); names are pages, or blocks as
     PAGE:BLOCK.
 blocks: what tests generate from the code; names are tests, as for pytest.
@@ -30,7 +30,14 @@ from tests.record.jobs import ROOT, finish_all, is_kept, results_folder
 from tests.record.score_tables import TABLES, Results, ScoreTable
 from tests.support.generated import write_block
 
-RECORDED = ("*.md", "docs/**/*.md", "envs/**/*.md", "agents/**/*", "tests/golden/*.json")
+RECORDED = (
+    "*.md",
+    "docs/**/*.md",
+    "envs/**/*.md",
+    "agents/**/*",
+    "board/**/*",
+    "tests/golden/*.json",
+)
 OF_INSTALLATION = "tests/test_licences.py"  # its table depends on the installation
 
 
@@ -44,7 +51,7 @@ def golden(names: Sequence[str], given: argparse.Namespace) -> None:
 
 
 def zoo(names: Sequence[str], given: argparse.Namespace) -> None:
-    """Drive the results of trained drivers."""
+    """Drive the results of drivers."""
     _run("-m", "tests.golden.zoo", *names)
 
 

@@ -18,6 +18,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from cavmarl import RecordOptions, parallel_env
+from cavmarl.recordings.offline_data import TABLE, recorded_trips, settings_of
 from cavmarl.recordings.recording import Recording
 from cavmarl.recordings.recording_exports import EXPORTS
 from cavmarl.recordings.replay_pictures import ReplayPictures
@@ -70,6 +71,9 @@ class Use:
                     recording.check_on_map(frame)
                 for table in recording.extras:
                     recording.extra(table, world, episode)
+                if TABLE in recording.extras:
+                    settings_of(recording)
+                    list(recorded_trips(recording))
                 if self.pictures:
                     _draw(recording, frames)
                 encoder = FrameEncoder(map_origin(network))

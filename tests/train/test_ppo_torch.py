@@ -189,7 +189,7 @@ def test_the_clock_ends_a_run(ippo: ModuleType, here: Path) -> None:
 
 def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None:
     pytest.importorskip("tensorboard")
-    words = [*TINY, "--total-agent-steps", "20", "--name", "board", "--tensorboard"]
+    words = [*TINY, "--total-agent-steps", "20", "--name", "board", "--loggers", "tensorboard"]
     assert ippo.main(words) == 0
     assert list((here / "runs" / "board").glob("events.*"))
 
@@ -201,6 +201,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--num-envs", "0"], "--num-envs 0: must be at least 1"),
         (["--learning-rate", "nan"], "--learning-rate nan: must be above 0"),
         (["--mappo", "--shared"], "--shared: leave out --mappo"),
+        (["--loggers", "tensorbord"], "--loggers tensorbord: no such logger; give some of"),
         (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),

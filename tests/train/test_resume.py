@@ -296,7 +296,7 @@ def test_tensorboard_is_cut_where_the_checkpoint_is(
             if value.tag not in TIMES
         )
 
-    words = [*TINY, *LENGTH, "--tensorboard"]
+    words = [*TINY, *LENGTH, "--loggers", "tensorboard"]
     assert ippo.main([*words, "--name", "whole"]) == 0
     cut(ippo, [*words, "--name", "cut"], monkeypatch)
     assert ippo.main(["--resume", "runs/cut"]) == 0

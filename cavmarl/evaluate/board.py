@@ -1,0 +1,297 @@
+"""The board: entries of drivers whose results are driven again, shown on one page.
+
+An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
+and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
+NAME.py. Without these files, the driver is cavmarl's script of that name.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from cavmarl.config.driver_form import WEIGHTS_FILE, form_of_driver
+from cavmarl.config.entry_cards import CARD_FILE, sentence_about
+from cavmarl.config.registry import agent_entries
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError, require
+from cavmarl.core.tracebacks import fault_in
+from cavmarl.engine.world_setup import load_world
+from cavmarl.evaluate.episodes import Progress
+from cavmarl.evaluate.evaluation import load_tables, read_evaluation
+from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, write_text
+from cavmarl.evaluate.statistics import Interval, share_interval
+from cavmarl.evaluate.zoo import RESULT_FOLDER, SHARES, Verification, entry_job, verify_result
+from cavmarl.policies.loading import policy_files
+
+_PAGE = Path(__file__).with_name("board.html.j2")
+TITLES = {name: name.replace("_", " ") for name in SHARES}
+_CONDITIONS = ("agents", "background", "max_cycles")
+
+
+class ShareOfTrips(NamedTuple):
+    """A share of trips with its 95 % interval."""
+
+    value: float
+    interval: Interval
+
+
+@dataclass(frozen=True)
+class BoardEntry:
+    """An entry as the page shows it.
+
+    Attributes:
+        name: of the folder.
+        about: first sentence of the card.
+        kind: `trained` or `scripted`; empty if unknown.
+        environment: with its version; empty if the result cannot be read.
+        conditions: what differs from the environment as it is, for example other agents.
+        episodes: number of episodes of all runs.
+        trips: number of counted trips.
+        shares: by the names of `SHARES`.
+        digest: SHA-256 of the driver's first file.
+        version: of cavmarl that made the result.
+        failure: why the entry failed, with the remedy; empty if it is verified.
+    """
+
+    name: str
+    about: str
+    kind: str = ""
+    environment: str = ""
+    conditions: str = ""
+    episodes: int = 0
+    trips: int = 0
+    shares: Mapping[str, ShareOfTrips] | None = None
+    digest: str = ""
+    version: str = ""
+    failure: str = ""
+
+
+def entry_driver(folder: Path) -> Path:
+    """Return the driver of an entry: its folder if trained, else the script.
+
+    Raises:
+        PolicyError: there is none.
+    """
+    name = folder.name
+    if (folder / WEIGHTS_FILE).is_file():
+        return folder
+    own, ours = folder / f"{name}.py", agent_entries().get(name)
+    if own.is_file():
+        return own
+    if ours is not None and ours.suffix == ".py":
+        return ours
+    raise PolicyError(
+        f"{folder}: has no driver; put model.safetensors and config.json, or a script {name}.py, "
+        "into it, or name it after a script of cavmarl"
+    )
+
+
+def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
+    """Check that an entry is complete and has the bytes of its result when it is driven again.
+
+    The driver's script, if there is one, is run.
+
+    Raises:
+        ConfigError: there is no such folder, or no card.
+        PolicyError: there is no driver, or it cannot be read.
+        ManifestError: a manifest is missing, of another version or of other files, a file was
+            changed, or driving again gave other bytes.
+    """
+    if not folder.is_dir():
+        raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
+    if not (folder / CARD_FILE).is_file():
+        raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that says what it is")
+    driver = entry_driver(folder)
+    if driver == folder:
+        _check_training(folder)
+    _read_result(folder, driver)
+    found = verify_result(folder, driver, progress)
+    if found.differing:
+        raise ManifestError(
+            f"{folder / RESULT_FOLDER}: {', '.join(found.differing)} of driving again on "
+            f"{found.found_on} differ from those made on {found.expected_on}; check that the "
+            "driver uses no random numbers but those of `reset(seed)` and no clock, and evaluate "
+            "it again with this version"
+        )
+    return found
+
+
+def entries_in(folders: Iterable[Path], only: Collection[str] = ()) -> list[Path]:
+    """Return the folders of entries: all subfolders with a result, a card or weights.
+
+    Args:
+        folders: folders of entries.
+        only: names of the wanted entries; empty: all.
+
+    Raises:
+        ConfigError: a folder does not exist, there are no entries, two have the same name, or a
+            wanted one is missing.
+    """
+    found: dict[str, Path] = {}
+    for folder in folders:
+        if not folder.is_dir():
+            raise ConfigError(f"{folder}: is not a folder; give folders that contain entries")
+        for path in sorted(folder.iterdir()):
+            if not any((path / name).exists() for name in (RESULT_FOLDER, CARD_FILE, WEIGHTS_FILE)):
+                continue
+            if path.name in found:
+                raise ConfigError(
+                    f"{path}: has the same name as {found[path.name]}; rename one of the two"
+                )
+            found[path.name] = path
+    if missing := [name for name in only if name not in found]:
+        raise ConfigError(
+            f"--entry {missing[0]}: there is no such entry; there are {', '.join(found) or 'none'}"
+        )
+    if not found:
+        raise ConfigError(
+            f"{', '.join(map(str, folders))}: contains no entries; an entry is a folder with "
+            f"{CARD_FILE}, a driver and {RESULT_FOLDER}/"
+        )
+    return [path for name, path in found.items() if not only or name in only]
+
+
+def build_board(
+    entries: Sequence[Path], out: Path, progress: Progress | None = None
+) -> list[BoardEntry]:
+    """Check each entry and write the page; an entry that fails is marked with the reason.
+
+    Args:
+        entries: folders of the entries.
+        out: file of the page.
+        progress: as in `evaluate`.
+
+    Raises:
+        MissingExtraError: Jinja2 is not installed.
+        ManifestError: the page cannot be written.
+    """
+    jinja2 = require("jinja2", "report")
+    found = [_entry(folder, progress) for folder in entries]
+    environment = jinja2.Environment(
+        autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
+    )
+    template = environment.from_string(_PAGE.read_text(encoding="utf-8"))
+    verified = sum(not entry.failure for entry in found)
+    page = template.render(
+        groups=_groups(found),
+        unread=[entry for entry in found if not entry.environment],
+        titles=TITLES,
+        entries=len(found),
+        verified=verified,
+    )
+    write_text(out, page)
+    return found
+
+
+def _read_result(folder: Path, driver: Path) -> dict[str, Any]:
+    """Return the manifest of an entry's result; raises as `check_entry`."""
+    result = folder / RESULT_FOLDER
+    document = read_evaluation(result)
+    if len(document["policies"]) != 1:
+        raise ManifestError(
+            f"{result}: is of {len(document['policies'])} drivers; evaluate this driver alone: "
+            f"cavmarl evaluate ENV --policy {driver} --out {result}"
+        )
+    return document
+
+
+def _entry(folder: Path, progress: Progress | None) -> BoardEntry:
+    """Check an entry; keep the reason if it fails."""
+    failure = ""
+    try:
+        check_entry(folder, progress)
+    except CavmarlError as error:
+        failure = str(error)
+    except Exception as error:  # the script of an entry may raise any exception
+        failure = f"{fault_in(folder, error)}; correct the script"
+    try:
+        return _described(folder, failure)
+    except CavmarlError as error:
+        return BoardEntry(folder.name, sentence_about(folder), failure=failure or str(error))
+
+
+def _described(folder: Path, failure: str) -> BoardEntry:
+    driver = entry_driver(folder)
+    result = folder / RESULT_FOLDER
+    document = _read_result(folder, driver)
+    trips, _ = load_tables(result)[next(iter(document["policies"]))]
+    counted = trips[trips["counted"]]
+    job = entry_job(document, folder)
+    is_endless = load_world(job.world.env, **job.world.keywords).config.traffic.endless
+    shares = {}
+    for name in SHARES:
+        if name == "success" and is_endless:  # no vehicle arrives
+            continue
+        hits, total = int(counted[name].sum()), len(counted)
+        if interval := share_interval(hits, total):
+            shares[name] = ShareOfTrips(hits / total, interval)
+    return BoardEntry(
+        folder.name,
+        sentence_about(folder),
+        "trained" if driver == folder else "scripted",
+        document["world"]["environment"],
+        _conditions(job.world, driver if driver == folder else None),
+        document["episodes"] * len(document["seeds"]),
+        len(counted),
+        shares,
+        hash_of_file(policy_files(driver)[0]),
+        document["software"]["packages"].get("cavmarl", "unknown"),
+        failure,
+    )
+
+
+def _conditions(spec: WorldSpec, trained: Path | None) -> str:
+    """Return the settings that are neither the environment's nor a trained driver's sensors."""
+    own = {} if trained is None else form_of_driver(trained)
+    given = {name: getattr(spec, name) for name in _CONDITIONS}
+    told = [f"{name} {value}" for name, value in given.items() if value is not None]
+    told += [
+        f"{key} = {json.dumps(value)}"
+        for key, value in sorted((spec.overrides or {}).items())
+        if key not in own
+    ]
+    return ", ".join(told)
+
+
+def _check_training(folder: Path) -> None:
+    """Raise ManifestError unless the manifest of the training names the weights."""
+    path = folder / MANIFEST_FILE
+    try:
+        known = json.loads(path.read_text(encoding="utf-8"))["results_sha256"][WEIGHTS_FILE]
+    except (OSError, ValueError, LookupError, TypeError, RecursionError) as error:
+        raise ManifestError(
+            f"{path}: does not name the trained weights ({type(error).__name__}); copy the "
+            "manifest of the training run's folder"
+        ) from error
+    if known != hash_of_file(folder / WEIGHTS_FILE):
+        raise ManifestError(
+            f"{folder / WEIGHTS_FILE}: is not the file that {path} names; copy both from the "
+            "folder of one training run"
+        )
+
+
+def _groups(entries: Iterable[BoardEntry]) -> dict[str, list[BoardEntry]]:
+    """Return the entries of each environment and conditions, the most successful first.
+
+    Entries that failed come last, because their figures are unproven.
+    """
+    groups: dict[str, list[BoardEntry]] = {}
+    for entry in entries:
+        if entry.environment:
+            heading = ", ".join(filter(None, (entry.environment, entry.conditions)))
+            groups.setdefault(heading, []).append(entry)
+    for group in groups.values():
+        group.sort(key=_rank)
+    return dict(sorted(groups.items()))
+
+
+def _rank(entry: BoardEntry) -> tuple[bool, float, float, str]:
+    shares = entry.shares or {}
+    success, collision = (
+        shares[name].value if name in shares else 0.0 for name in ("success", "collision")
+    )
+    return bool(entry.failure), -success, collision, entry.name
