@@ -185,7 +185,7 @@ class _GuardedWorlds:
     """Guards an environment's worlds: only their master can step and reset them."""
 
     def __init__(self, worlds: _Worlds, master: TimeMaster) -> None:
-        self.worlds = worlds
+        self.worlds = self.guarded = worlds  # `guarded`: see `env.drawn_worlds.unguarded`
         self._master = master
 
     def __getattr__(self, name: str) -> Any:

@@ -19,7 +19,7 @@ from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.world_frame import WorldFrame, frame_of
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
+from cavmarl.env.drawn_worlds import WorldCopy, unguarded, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.lane_changes import LaneChanges
@@ -248,7 +248,7 @@ class StepSession:
         room: Callable[[int], NDArray[np.void]] | None = None,
     ) -> list[WorldFrame]:
         key = kept_elsewhere(self.config)
-        if key and not isinstance(self.worlds, LocalWorlds):
+        if key and not isinstance(unguarded(self.worlds), LocalWorlds):
             raise ConfigError(
                 f"{key}: frames of such worlds are only available in the caller's process; use "
                 "backend='local'"

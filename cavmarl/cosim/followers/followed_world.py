@@ -12,20 +12,33 @@ Answers may arrive in any order without effect on the result.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from cavmarl.core.errors import ConfigError, EpisodeError, FollowerError, FollowerLostError
-from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
+from cavmarl.core.errors import (
+    CavmarlError,
+    ConfigError,
+    EpisodeError,
+    FollowerError,
+    FollowerLostError,
+)
+from cavmarl.cosim.actors.client_actors import ActorOrder, ClientActor, ClientActors
+from cavmarl.cosim.followers.follower_barrier import (
+    BadControls,
+    Barrier,
+    BarrierOutcome,
+    FollowerSeat,
+)
 from cavmarl.cosim.followers.follower_connection import (
     Address,
     FollowerConnection,
     Reception,
     refuse,
 )
-from cavmarl.cosim.followers.follower_messages import Hello, Say
+from cavmarl.cosim.followers.follower_messages import ActorRequest, Hello, Say
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, welcome_to
 from cavmarl.cosim.time_master import OwnTicks, Pacer, TimeMaster
 from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
@@ -54,6 +67,7 @@ class FollowedWorld:
     Attributes:
         master: the time master.
         address: path or port to which followers connect.
+        actors: the actors that followers have brought into the world.
 
     Raises:
         ConfigError: the address cannot be opened, a port has no secret, signals have agents, or a
@@ -90,11 +104,13 @@ class FollowedWorld:
             self.close_reception()
             raise
         self._timeout_s, self._truth = timeout_s, truth
-        self._barrier = Barrier(env, timeout_s, bad_controls)
+        self.actors = ClientActors(env)
+        self._barrier = Barrier(env, self.actors, timeout_s, bad_controls)
         self._trace = trace
         self._seats: list[FollowerSeat] = []
         self._queued: dict[str, Any] = {}
         self._frame = self._episode = -1
+        self._moment = SnapshotTime(-1, -1, int(self.master.world_ticks[0]), False)
         self._is_closed = False
 
     def __enter__(self) -> Self:
@@ -137,6 +153,7 @@ class FollowedWorld:
         self.master.reset(seed)
         self._episode += 1
         self._queued.clear()
+        self._refuse(self.actors.begin_episode())
         self._next_frame()
         self._exchange(self._seats)
 
@@ -155,6 +172,8 @@ class FollowedWorld:
             raise EpisodeError("the episode is over; call FollowedWorld.reset()")
         self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
+        self._hear_others()
+        self._refuse(self.actors.act(self._moment.tick * self.env.config.clock.sim_dt_s))
         agents = self.env.agents
         actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
         if len(actions) < len(agents):
@@ -174,7 +193,12 @@ class FollowedWorld:
             "control_latency_steps": 1,  # queued for the next cycle, as in Algorithm 1
             "control_latency_ticks": clock.control_latency_ticks,
             "followers": [
-                {"name": seat.clock.name, "agents": self._names(seat.agents)}
+                {
+                    "name": seat.clock.name,
+                    "agents": self._names(seat.agents),
+                    "actors": [asdict(actor.order) for actor in seat.actors],
+                    "waits": seat.waits,
+                }
                 for seat in self._seats
             ],
         }
@@ -211,10 +235,24 @@ class FollowedWorld:
                 f"'{hello.name[:80]}' requests the true state of all vehicles, which this world "
                 "does not give; start it with truth=True (cavmarl lead --truth)"
             )
+        if agents and not hello.waits:
+            raise FollowerError(
+                f"'{hello.name[:80]}' drives agents, so the world has to wait for its answers; "
+                "leave waits = True"
+            )
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
-        line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
+        try:
+            actors = self.actors.join(hello.name, map(_order_of, hello.actors))
+        except CavmarlError as error:
+            raise FollowerError(f"'{hello.name[:80]}': {error}") from error
+        try:
+            line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
+        except FollowerError:
+            self.actors.part(actors)
+            raise
         clock = self.master.follow(hello.name)
-        self._seats.append(FollowerSeat(line, clock, agents, truth=hello.truth))
+        seat = FollowerSeat(line, clock, agents, hello.truth, tuple(actors), hello.waits)
+        self._seats.append(seat)
         self._seats.sort(key=lambda each: each.rank)
 
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
@@ -222,13 +260,15 @@ class FollowedWorld:
 
         Raises FollowerError: an agent does not exist, or another follower drives it.
         """
-        known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
+        ids = self.env.possible_agents[: self.env.config.population.num_ids]
+        known = {agent: k for k, agent in enumerate(ids)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
         for agent in vehicles:
             if agent not in known:
                 raise FollowerError(
-                    f"no agent '{agent[:80]}'; choose among {self.env.possible_agents[0]} to "
-                    f"{self.env.possible_agents[-1]}"
+                    f"no agent '{agent[:80]}'; choose among {ids[0]} to {ids[-1]}"
+                    if ids
+                    else f"no agent '{agent[:80]}': this world has none; bring an actor"
                 )
             if known[agent] in taken:
                 raise FollowerError(
@@ -244,6 +284,7 @@ class FollowedWorld:
     def _drop(self, seat: FollowerSeat) -> None:
         seat.line.close()
         self._seats.remove(seat)
+        self.actors.part(seat.actors)
         if seat.clock in self.master.followers:
             seat.clock.leave()
 
@@ -264,6 +305,22 @@ class FollowedWorld:
         found = self._barrier.pass_through(list(seats), self._moment)
         self._note(QUEUE)
         self._queued |= found.actions
+        self._settle(found)
+
+    def _hear_others(self) -> None:
+        """Receive what followers have sent that the world does not wait for.
+
+        Raises FollowerError: the messages of one of them are invalid.
+        """
+        others = [seat for seat in self._seats if not seat.waits]
+        if others:
+            self._settle(self._barrier.hear_others(others, self._moment))
+
+    def _settle(self, found: BarrierOutcome) -> None:
+        """Drop the followers that have left or failed.
+
+        Raises FollowerError: that of the first follower that has failed, in their order.
+        """
         for seat in found.left:
             self._drop(seat)
         failed = sorted(found.failed, key=lambda seat: seat.rank)
@@ -273,6 +330,39 @@ class FollowedWorld:
         if failed:
             raise found.failed[failed[0]]
 
+    def _refuse(self, refused: Mapping[ClientActor, CavmarlError]) -> None:
+        """Drop the followers of refused actors, and tell them the reasons."""
+        for seat in list(self._seats):
+            for actor in seat.actors:
+                if actor in refused:
+                    refuse(seat.line, f"actor '{actor.name}': {refused[actor]}")
+                    self._drop(seat)
+                    break
+
     def _note(self, phase: str) -> None:
         if self._trace is not None:
             self._trace.note(phase)
+
+
+def _order_of(request: ActorRequest) -> ActorOrder:
+    """Return what a follower asks for. Raises FollowerError: the size has no three numbers."""
+    size = request.size_m
+    if size and len(size) != 3:
+        raise FollowerError(
+            f"actor '{request.name[:80]}': size_m has {len(size)} numbers: must be length, width "
+            "and height, or empty"
+        )
+    return ActorOrder(
+        name=request.name,
+        vtype=request.type,
+        x=request.x,
+        y=request.y,
+        heading=request.heading,
+        z=request.z,
+        size_m=(size[0], size[1], size[2]) if size else None,
+        speed=request.speed,
+        moved_by=request.moved_by,
+        rate_hz=request.rate_hz,
+        extrapolation_s=request.extrapolation_s,
+        rig=tuple(request.rig),
+    )

@@ -11,9 +11,19 @@ from typing import Any, Literal
 import numpy as np
 
 from cavmarl.core.errors import ActionError, ClockError, FollowerError, FollowerLostError
+from cavmarl.cosim.actors.client_actors import ClientActor, ClientActors
+from cavmarl.cosim.actors.pose_track import PoseSample
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
-from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_payload
-from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot
+from cavmarl.cosim.followers.follower_messages import (
+    MAX_POSES,
+    Control,
+    Poses,
+    PoseView,
+    Say,
+    Ticked,
+    read_payload,
+)
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, see_actors, take_snapshot
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
@@ -28,6 +38,8 @@ class FollowerSeat:
     clock: TimeFollower  # its view of the master's clock
     agents: tuple[int, ...]  # indices of the agents that it drives, ascending
     truth: bool = False  # whether it receives the true state of all vehicles
+    actors: tuple[ClientActor, ...] = ()  # that it has brought into the world
+    waits: bool = True  # whether the world waits for its answers
     frame: int = -1  # of the last snapshot sent to it; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
@@ -35,6 +47,7 @@ class FollowerSeat:
     bad: int = 0  # number of invalid controls of a vehicle
     wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
     slowest: int = 0  # number of steps in which it was the last to answer
+    unseen: int = 0  # number of snapshots not sent, because the follower has not read earlier ones
 
     @property
     def rank(self) -> tuple[float, str]:
@@ -59,8 +72,11 @@ class Barrier:
     `error`: a follower that sends invalid controls fails; `hold`: the vehicle's last ones are used.
     """
 
-    def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
+    def __init__(
+        self, env: CavEnv, actors: ClientActors, timeout_s: float, bad_controls: BadControls
+    ) -> None:
         self._env = env
+        self._actors = actors
         self._timeout_s = timeout_s
         self._bad_controls = bad_controls
 
@@ -71,16 +87,24 @@ class Barrier:
         """
         found = BarrierOutcome()
         asked: dict[FollowerSeat, list[str]] = {}
+        rows = self._actors.rows() if any(seat.actors for seat in seats) else {}
         for seat in seats:
-            snapshot, arrays = take_snapshot(self._env, seat.agents, moment, truth=seat.truth)
             seat.frame = moment.frame
-            asked[seat] = list(snapshot.vehicles)
+            if not seat.waits and not seat.line.can_send():
+                seat.unseen += 1
+                continue
+            actors = see_actors(self._env, seat.actors, rows)
+            snapshot, arrays = take_snapshot(
+                self._env, seat.agents, moment, truth=seat.truth, actors=actors
+            )
+            if seat.waits:
+                asked[seat] = list(snapshot.vehicles)
             try:
                 seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
             except FollowerLostError as error:
                 if error.is_late:  # else the messages read below may contain its goodbye
                     found.failed[seat] = error
-                    del asked[seat]
+                    asked.pop(seat, None)
         if moment.is_over or not asked:
             return found
         answers = self._collect(asked, moment, found)
@@ -91,6 +115,27 @@ class Barrier:
                     seat.answers += 1
                 except FollowerError as error:
                     found.failed[seat] = error
+        return found
+
+    def hear_others(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
+        """Receive what followers that the world does not wait for have sent.
+
+        A follower that has closed its connection has left. `moment`: time of the last snapshot.
+        """
+        found = BarrierOutcome()
+        for seat in seats:
+            answers: dict[FollowerSeat, Mapping[str, Any]] = {}
+            try:
+                while seat.line.has_come():
+                    if self._receive(seat, moment, answers, found, self._timeout_s):
+                        if seat in found.left:
+                            break
+                        self._checked(seat, answers.pop(seat), [])
+                        seat.answers += 1
+            except FollowerLostError:
+                found.left.append(seat)
+            except FollowerError as error:
+                found.failed[seat] = error
         return found
 
     def _collect(
@@ -142,6 +187,9 @@ class Barrier:
             case Say.GOODBYE:
                 found.left.append(seat)
                 return True
+            case Say.POSES:
+                self._take_poses(seat, moment, read_payload(Poses, frame.payload).poses)
+                return False
             case Say.CONTROL:
                 control = read_payload(Control, frame.payload)
             case kind:
@@ -152,11 +200,41 @@ class Barrier:
             raise FollowerError(
                 f"{seat.line.name} answers frame {control.frame}; the last is {moment.frame}"
             )
-        if control.frame < moment.frame:
+        if control.frame < moment.frame and seat.waits:
             seat.late += 1
             return False
+        self._take_poses(seat, moment, control.poses)
         answers[seat] = control.controls
         return True
+
+    def _take_poses(
+        self, seat: FollowerSeat, moment: SnapshotTime, poses: Mapping[str, Sequence[PoseView]]
+    ) -> None:
+        """Take the poses of a follower's actors.
+
+        Raises FollowerError: a pose is invalid, and `bad_controls` is `error`.
+        """
+        actors = {actor.name: actor for actor in seat.actors}
+        now_s = moment.tick * self._env.config.clock.sim_dt_s
+        for name, views in poses.items():
+            if name not in actors:
+                raise FollowerError(f"{seat.line.name}: poses of {name[:80]}, which it has not")
+            if len(views) > MAX_POSES:
+                raise FollowerError(
+                    f"{seat.line.name}: {len(views)} poses of {name} in a message; the limit is "
+                    f"{MAX_POSES}"
+                )
+            for view in views:
+                try:
+                    self._actors.add_pose(actors[name], PoseSample(**vars(view)), now_s)
+                except ActionError as error:
+                    self._note_bad(seat, error)
+
+    def _note_bad(self, seat: FollowerSeat, error: Exception) -> None:
+        """Count invalid controls or an invalid pose; raise FollowerError if it is an error."""
+        seat.bad += 1
+        if self._bad_controls == "error":
+            raise FollowerError(f"{seat.line.name}: {error}") from error
 
     def _answer_tick(self, seat: FollowerSeat, within_s: float) -> None:
         done, refused = False, ""
@@ -174,11 +252,17 @@ class Barrier:
 
         Raises FollowerError: an action is invalid, and `bad_controls` is `error`.
         """
-        unknown = controls.keys() - set(vehicles)
+        actors = {actor.name: actor for actor in seat.actors}
+        unknown = controls.keys() - set(vehicles) - actors.keys()
         if unknown:
             raise FollowerError(
                 f"{seat.line.name}: controls of {min(unknown)[:80]}, which is not in the frame"
             )
+        for name in controls.keys() & actors.keys():
+            try:
+                self._actors.drive(actors[name], controls[name])
+            except ActionError as error:
+                self._note_bad(seat, error)
         checked: dict[str, Any] = {}
         for vehicle in vehicles:
             try:
@@ -186,9 +270,7 @@ class Barrier:
                 self._env.check_action(vehicle, action)
                 checked[vehicle] = action
             except (FollowerError, ActionError) as error:
-                seat.bad += 1
-                if self._bad_controls == "error":
-                    raise FollowerError(f"{seat.line.name}: {error}") from error
+                self._note_bad(seat, error)
                 if vehicle in seat.held:
                     checked[vehicle] = seat.held[vehicle]
         seat.held = checked
