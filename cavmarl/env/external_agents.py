@@ -240,5 +240,3 @@ def check_external_rig(config: EnvConfig, names: Iterable[str]) -> None:
             raise ActionError(
                 f"no sensor '{name[:80]}'; the sensors of rig are {', '.join(config.rig)}"
             )
-
-

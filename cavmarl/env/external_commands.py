@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import ActionError, CapacityError, ConfigError
+from cavmarl.core.errors import ActionError, CapacityError, ConfigError, OccupiedPlaceError
 from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
@@ -124,7 +124,8 @@ class ExternalCommands:
             The vehicle's slot, by which the other methods name it.
 
         Raises:
-            ActionError: the place is occupied or outside of the map, or an argument is invalid.
+            ActionError: the place is outside of the map, or an argument is invalid.
+            OccupiedPlaceError: another vehicle covers the place.
             CapacityError: the world already has `population.external` such vehicles.
             ConfigError: `population.external` is 0; or it is to observe, and
                 `population.external_agents` is false.
@@ -318,7 +319,7 @@ class ExternalCommands:
             )
 
     def _check_free(self, simulation: Simulation, world: int, told: np.void) -> None:
-        """Raise an ActionError if another vehicle, present or waiting, covers the place."""
+        """Raise an OccupiedPlaceError if another vehicle, present or waiting, covers the place."""
         rows = simulation.vehicles(world)
         leaving = simulation.external.ids[world, self._told["kind"][world] == EXTERNAL_REMOVED]
         reach_m = float(diagonals_m(simulation.types).max())
@@ -329,7 +330,7 @@ class ExternalCommands:
         own = self._row(told)
         for other in others:
             if abs(other["z"] - own["z"]) <= LEVEL_HEIGHT_M and _overlap(own, other):
-                raise ActionError(
+                raise OccupiedPlaceError(
                     f"x = {told['x']:g}, y = {told['y']:g}: occupied by another vehicle; give a "
                     "free place"
                 )

@@ -240,9 +240,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._advance(commands, choices)
         return self._report(visited)
 
-    def _advance(
-        self, commands: Commands, choices: NDArray[np.int64] | None = None
-    ) -> None:
+    def _advance(self, commands: Commands, choices: NDArray[np.int64] | None = None) -> None:
         """Advance the world by a step, at whose end the external vehicles sense."""
         if self._visitors is not None:
             self._visitors.prepare()

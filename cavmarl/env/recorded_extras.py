@@ -1,10 +1,10 @@
-"""Optional tables of a recording: observations, sensor samples, messages."""
+"""Optional tables of a recording: observations, sensor samples, messages, commands."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
+from cavmarl.env.recorded_inputs import INPUTS, StepInputs, inputs_dtype, inputs_row
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Nack, Record, Step
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.parallel.worlds.step_arrays import StepArrays
@@ -39,6 +40,13 @@ _HANDOVERS = np.dtype(
 Rows = NDArray[np.void]
 
 
+class InputHistory(NamedTuple):
+    """The inputs of a session of one world, and the hashes of its states."""
+
+    inputs: StepInputs  # of the last reset or step
+    state_hash: Callable[[int], str]  # of a world
+
+
 def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> None:
     """Raise an error if a requested table cannot be recorded.
 
@@ -59,7 +67,7 @@ def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> No
         ),
     }
     for name in include:
-        if reasons[name]:
+        if reasons.get(name):
             raise ConfigError(f"record: include {name!r}: {reasons[name]}")
 
 
@@ -68,9 +76,10 @@ class RecordedExtras:
 
     Args:
         config: configuration of the worlds.
-        include: the wanted ones of `observations`, `samples` and `messages`.
+        include: the wanted ones of `observations`, `samples`, `messages` and `commands`.
         arrays: results of the worlds' steps.
         simulation: the worlds; their messages are logged from now on.
+        history: what gives the inputs and the hashes of states; None: `commands` are not available.
 
     Attributes:
         dtypes: dtypes of the tables, by table name.
@@ -78,9 +87,15 @@ class RecordedExtras:
     """
 
     def __init__(
-        self, config: EnvConfig, include: Iterable[str], arrays: StepArrays, simulation: Simulation
+        self,
+        config: EnvConfig,
+        include: Iterable[str],
+        arrays: StepArrays,
+        simulation: Simulation,
+        history: InputHistory | None = None,
     ) -> None:
         self._arrays = arrays
+        self._history = history
         wanted = frozenset(include)
         self.dtypes: dict[str, np.dtype[Any]] = {}
         self.features: list[tuple[str, str]] = []
@@ -95,6 +110,13 @@ class RecordedExtras:
                 data = ("data", frames.data.dtype.str, frames.data.shape[3:])
                 own = np.dtype([*_WHOSE, ("stamp_s", "<f8"), ("lost", "|b1"), data])
                 self.dtypes[SAMPLES + name] = own
+        if INPUTS in wanted:
+            if history is None or len(arrays.mask) > 1:
+                raise ConfigError(
+                    f"record: include {INPUTS!r}: only the commands of one world of `parallel_env` "
+                    "can be recorded; leave it out"
+                )
+            self.dtypes[INPUTS] = inputs_dtype(config, arrays)
         self._logs: dict[str, _SentLog] = {}
         if "messages" in wanted:
             self._listen(config, simulation)
@@ -128,6 +150,9 @@ class RecordedExtras:
                 rows["terms"] = arrays.terms[world, agents]
                 rows["values"] = arrays.observations[world, agents]
                 found[name] = rows
+            elif name == INPUTS and self._history is not None:
+                inputs, state_hash = self._history
+                found[name] = inputs_row(dtype, inputs, tick, state_hash(world))
             elif name.startswith(SAMPLES):
                 found[name] = self._samples(name, dtype, world, tick, agents)
         return found

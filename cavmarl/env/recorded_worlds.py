@@ -18,7 +18,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.drawn_worlds import why_not_copied
-from cavmarl.env.recorded_extras import RecordedExtras, check_extras
+from cavmarl.env.recorded_extras import InputHistory, RecordedExtras, check_extras
 from cavmarl.parallel.placement.backend_name import BackendName
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
@@ -57,6 +57,7 @@ class WorldRecorder:
         record: the new folder, or options with the optional tables.
         worlds: the worlds that are stepped.
         simulation: the worlds or a local copy, for the reach of their zones.
+        history: inputs and hashes, for the table `commands`; None: it is not available.
         more: additional entries of the manifest.
 
     Raises:
@@ -70,12 +71,13 @@ class WorldRecorder:
         record: Record,
         worlds: SteppedWorlds,
         simulation: Simulation,
+        history: InputHistory | None = None,
         **more: Any,
     ) -> None:
         options, world = RecordOptions.of(record), worlds.world
         config = world.config
         check_extras(config, options.include, is_here=isinstance(worlds, LocalWorlds))
-        self._extras = RecordedExtras(config, options.include, worlds.arrays, simulation)
+        self._extras = RecordedExtras(config, options.include, worlds.arrays, simulation, history)
         self._writer = RecordingWriter(
             options.path,
             environment=f"{config.name}-v{config.version}",

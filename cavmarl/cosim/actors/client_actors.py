@@ -239,7 +239,7 @@ class ClientActors:
                 "that can be printed"
             )
         if order.name in self._env.possible_agents:
-            raise ActionError(f"an actor's name is '{order.name}', which is an agent's; use another")
+            raise ActionError(f"an actor's name is '{order.name}', that of an agent; use another")
         if order.moved_by not in MOVERS:
             raise ActionError(
                 f"moved_by = {order.moved_by[:MOST_NAME]!r}: must be one of {', '.join(MOVERS)}"

@@ -26,6 +26,7 @@ from cavmarl.core.errors import (
     FollowerLostError,
 )
 from cavmarl.cosim.actors.client_actors import ActorOrder, ClientActor, ClientActors
+from cavmarl.cosim.actors.pose_traces import PoseTrace, TracePlayer
 from cavmarl.cosim.followers.follower_barrier import (
     BadControls,
     Barrier,
@@ -63,11 +64,13 @@ class FollowedWorld:
         pacer: pace by the wall clock; None: as fast as possible.
         trace: records the phases of each step.
         truth: whether followers may receive the true state of all vehicles.
+        traces: recorded poses of bodies that the world plays in each episode.
 
     Attributes:
         master: the time master.
         address: path or port to which followers connect.
-        actors: the actors that followers have brought into the world.
+        actors: the actors that followers and traces have brought into the world.
+        player: plays the traces.
 
     Raises:
         ConfigError: the address cannot be opened, a port has no secret, signals have agents, or a
@@ -88,6 +91,7 @@ class FollowedWorld:
         pacer: Pacer | None = None,
         trace: StepTrace | None = None,
         truth: bool = False,
+        traces: Sequence[PoseTrace] = (),
     ) -> None:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
@@ -105,6 +109,7 @@ class FollowedWorld:
             raise
         self._timeout_s, self._truth = timeout_s, truth
         self.actors = ClientActors(env)
+        self.player = TracePlayer(self.actors, traces, env.step_s)
         self._barrier = Barrier(env, self.actors, timeout_s, bad_controls)
         self._trace = trace
         self._seats: list[FollowerSeat] = []
@@ -150,6 +155,7 @@ class FollowedWorld:
         Raises FollowerError: see `step`.
         """
         self.admit(0.0)
+        self.player.begin_episode()
         self.master.reset(seed)
         self._episode += 1
         self._queued.clear()
@@ -166,6 +172,7 @@ class FollowedWorld:
                 world has advanced by one step, and the next call continues from there.
             FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
                 the consequences are those of a FollowerLostError.
+            ActionError, CapacityError, ConfigError: the world refuses a body of a trace.
             ClockError: another caller has advanced the world.
         """
         if self.is_over:
@@ -173,7 +180,9 @@ class FollowedWorld:
         self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
         self._hear_others()
-        self._refuse(self.actors.act(self._moment.tick * self.env.config.clock.sim_dt_s))
+        now_s = self._moment.tick * self.env.config.clock.sim_dt_s
+        self.player.act(now_s)
+        self._refuse(self.actors.act(now_s))
         agents = self.env.agents
         actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
         if len(actions) < len(agents):
@@ -331,17 +340,23 @@ class FollowedWorld:
             raise found.failed[failed[0]]
 
     def _refuse(self, refused: Mapping[ClientActor, CavmarlError]) -> None:
-        """Drop the followers of refused actors, and tell them the reasons."""
-        for seat in list(self._seats):
-            for actor in seat.actors:
-                if actor in refused:
-                    refuse(seat.line, f"actor '{actor.name}': {refused[actor]}")
-                    self._drop(seat)
-                    break
+        """Drop the followers of refused actors, and tell them the reasons.
+
+        Raises CavmarlError: the reason for which an actor of a trace is refused.
+        """
+        owners = {actor: seat for seat in self._seats for actor in seat.actors}
+        for actor, error in refused.items():
+            if actor not in owners:
+                raise error
+            if owners[actor] in self._seats:
+                refuse(owners[actor].line, f"actor '{actor.name}': {error}")
+                self._drop(owners[actor])
 
     def _note(self, phase: str) -> None:
         if self._trace is not None:
             self._trace.note(phase)
+        if self.master.watch is not None:
+            self.master.watch.note(phase)
 
 
 def _order_of(request: ActorRequest) -> ActorOrder:

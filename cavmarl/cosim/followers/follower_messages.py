@@ -136,8 +136,9 @@ class Welcome:
 class ArrayView:
     """One array of a snapshot; its bytes are in the frame's data, in the order of the list."""
 
-    # agent of the vehicle, or name of the actor; empty: the array is about the whole map: `signals`: (1, links) the
-    # SIGNAL_* code of each link's signal (255: no signal); `truth`: (1, n, columns of TRUTH)
+    # agent of the vehicle, or name of the actor; empty: the array is about the whole map:
+    # `signals`: (1, links) the SIGNAL_* code of each link's signal (255: no signal); `truth`:
+    # (1, n, columns of TRUTH)
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr  # NumPy's notation, little-endian

@@ -83,7 +83,8 @@ def see_actors(
         pose = (float(row[name]) for name in ("x", "y", "z", "heading", "pitch", "speed"))
         view = ActorView(int(row["id"]), agent, *pose, int(row["hit"]))
         frames = env.external_frames(actor.slot) if rig else {}
-        seen.append(SeenActor(actor.name, view, {name: frames[name] for name in rig}))
+        carried = _new_samples({name: frames[name] for name in rig})
+        seen.append(SeenActor(actor.name, view, carried))
     return seen
 
 
@@ -171,9 +172,13 @@ def _due(
         seen = arrays.observations[world, agent : agent + 1]
         now, lost = np.array([time_s]), np.zeros(1, dtype=np.bool_)
         return {"observation": SensorFrames(seen, now, lost, np.ones((), dtype=np.int64))}
+    return _new_samples({name: each.of(world, agent) for name, each in arrays.frames.items()})
+
+
+def _new_samples(frames: Mapping[str, SensorFrames]) -> dict[str, SensorFrames]:
+    """Return the samples of the last step, of the sensors of one vehicle."""
     found = {}
-    for name, frames in arrays.frames.items():
-        data, stamp_s, lost, fresh = (array[world, agent] for array in frames)
+    for name, (data, stamp_s, lost, fresh) in frames.items():
         if fresh:
             found[name] = SensorFrames(data[-fresh:], stamp_s[-fresh:], lost[-fresh:], fresh)
     return found
