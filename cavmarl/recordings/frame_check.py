@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.population import MAX_IDS
-from cavmarl.core.records.codes import CLASS_PEDESTRIAN, DRIVER_BACKGROUND, DRIVER_SUMO
+from cavmarl.core.records.codes import CLASS_PEDESTRIAN, DRIVER_BACKGROUND, DRIVER_EXTERNAL
 from cavmarl.engine.state_check import wrong_phases
 from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.roads.network import RoadNetwork
@@ -79,7 +79,7 @@ def _wrong_vehicles(frames: Sequence[RecordedFrame], rows: NDArray[np.void], num
         "vclass": range(CLASS_PEDESTRIAN + 1),
         "zone": range(num_zones),
         "target_zone": range(-1, num_zones),
-        "driver": range(DRIVER_BACKGROUND, DRIVER_SUMO + 1),
+        "driver": range(DRIVER_BACKGROUND, DRIVER_EXTERNAL + 1),
         "blinker": range(-1, 2),
     }
     if wrong := ColumnCheck(ints, _FLOATS, ("to_go",), {}).wrong(rows):

@@ -129,6 +129,11 @@ class FollowedWorld:
         return tuple(self._seats)
 
     @property
+    def leader(self) -> FollowerSeat | None:
+        """The follower whose ticks release the steps of the world; None: there is none."""
+        return next((seat for seat in self._seats if seat.leads), None)
+
+    @property
     def is_over(self) -> bool:
         return not self.env.agents
 
@@ -180,6 +185,7 @@ class FollowedWorld:
         self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
         self._hear_others()
+        self._await_leader()
         now_s = self._moment.tick * self.env.config.clock.sim_dt_s
         self.player.act(now_s)
         self._refuse(self.actors.act(now_s))
@@ -190,6 +196,7 @@ class FollowedWorld:
         _, rewards, *_ = self.master.step(actions)
         self._queued.clear()
         self._next_frame()
+        self._confirm_tick()
         self._exchange(self._seats)
         return dict(rewards)
 
@@ -207,6 +214,7 @@ class FollowedWorld:
                     "agents": self._names(seat.agents),
                     "actors": [asdict(actor.order) for actor in seat.actors],
                     "waits": seat.waits,
+                    "leads": seat.leads,
                 }
                 for seat in self._seats
             ],
@@ -249,6 +257,11 @@ class FollowedWorld:
                 f"'{hello.name[:80]}' drives agents, so the world has to wait for its answers; "
                 "leave waits = True"
             )
+        if hello.leads and self.leader is not None:
+            raise FollowerError(
+                f"'{hello.name[:80]}' asks to lead, but '{self.leader.clock.name}' leads already; "
+                "a world has one time master"
+            )
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
         try:
             actors = self.actors.join(hello.name, map(_order_of, hello.actors))
@@ -260,7 +273,9 @@ class FollowedWorld:
             self.actors.part(actors)
             raise
         clock = self.master.follow(hello.name)
-        seat = FollowerSeat(line, clock, agents, hello.truth, tuple(actors), hello.waits)
+        seat = FollowerSeat(
+            line, clock, agents, hello.truth, tuple(actors), hello.waits, hello.leads
+        )
         self._seats.append(seat)
         self._seats.sort(key=lambda each: each.rank)
 
@@ -324,6 +339,25 @@ class FollowedWorld:
         others = [seat for seat in self._seats if not seat.waits]
         if others:
             self._settle(self._barrier.hear_others(others, self._moment))
+
+    def _await_leader(self) -> None:
+        """Wait for the tick of the follower that leads.
+
+        Raises FollowerError: it does not tick in time, or its messages are invalid.
+        """
+        if (leader := self.leader) is not None:
+            self._settle(self._barrier.await_tick(leader, self._moment))
+
+    def _confirm_tick(self) -> None:
+        """Tell the follower that leads that its step has been made.
+
+        Raises FollowerLostError: it has ended.
+        """
+        if (leader := self.leader) is not None:
+            try:
+                self._barrier.confirm_tick(leader)
+            except FollowerLostError as error:
+                self._settle(BarrierOutcome(failed={leader: error}))
 
     def _settle(self, found: BarrierOutcome) -> None:
         """Drop the followers that have left or failed.

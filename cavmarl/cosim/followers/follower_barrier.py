@@ -40,6 +40,8 @@ class FollowerSeat:
     truth: bool = False  # whether it receives the true state of all vehicles
     actors: tuple[ClientActor, ...] = ()  # that it has brought into the world
     waits: bool = True  # whether the world waits for its answers
+    leads: bool = False  # whether its ticks release the steps of the world
+    has_ticked: bool = False  # whether it has released the next step
     frame: int = -1  # of the last snapshot sent to it; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
@@ -138,6 +140,35 @@ class Barrier:
                 found.failed[seat] = error
         return found
 
+    def await_tick(self, seat: FollowerSeat, moment: SnapshotTime) -> BarrierOutcome:
+        """Wait until the follower that leads releases the next step.
+
+        `moment`: time of the last snapshot.
+        """
+        found = BarrierOutcome()
+        answers: dict[FollowerSeat, Mapping[str, Any]] = {}
+        began = time.monotonic()
+        try:
+            while not seat.has_ticked and seat not in found.left:
+                left_s = began + self._timeout_s - time.monotonic()
+                if left_s <= 0.0:
+                    raise seat.line.too_late("answered with a tick", self._timeout_s)
+                if self._receive(seat, moment, answers, found, left_s) and seat in answers:
+                    self._checked(seat, answers.pop(seat), [])
+        except FollowerError as error:
+            found.failed[seat] = error
+        seat.wait_wall_s += time.monotonic() - began
+        return found
+
+    def confirm_tick(self, seat: FollowerSeat) -> None:
+        """Tell the follower that leads that its step has been made.
+
+        Raises FollowerLostError: it does not read, or has ended.
+        """
+        seat.has_ticked = False
+        tick = int(seat.clock.master.world_ticks[0])
+        seat.line.say(Say.TICKED, Ticked(True, "", tick), within_s=self._timeout_s)
+
     def _collect(
         self, asked: Mapping[FollowerSeat, list[str]], moment: SnapshotTime, found: BarrierOutcome
     ) -> dict[FollowerSeat, Mapping[str, Any]]:
@@ -181,6 +212,11 @@ class Barrier:
         frame = seat.line.hear(within_s)
         seat.line.skip(frame)
         match frame.kind:
+            case Say.TICK if seat.leads:
+                if seat.has_ticked:
+                    raise FollowerError(f"{seat.line.name} ticks twice; wait for TICKED first")
+                seat.has_ticked = True
+                return False
             case Say.TICK:
                 self._answer_tick(seat, within_s)
                 return False

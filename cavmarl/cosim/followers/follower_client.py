@@ -62,6 +62,7 @@ class Follower:
     has to allow. `actors`: vehicles, people or roadside units to bring into the world; they leave
     with the follower. `waits`: whether the world waits for the answers; if not, the follower may
     send poses and controls at any time, and misses snapshots that it does not read in time.
+    `leads`: whether each step of the world waits for a `tick` of this follower.
 
     Attributes:
         welcome: the world's clock and sensors.
@@ -81,10 +82,11 @@ class Follower:
         truth: bool = False,
         actors: Sequence[ActorRequest] = (),
         waits: bool = True,
+        leads: bool = False,
     ) -> None:
         self._line = call(address, CALL_S)
         self._waits = waits
-        hello = Hello(name, list(vehicles), secret, truth, list(actors), waits)
+        hello = Hello(name, list(vehicles), secret, truth, list(actors), waits, leads)
         try:
             self._line.say(Say.HELLO, hello, within_s=CALL_S)
             self.welcome = read_payload(Welcome, self._expect(joins_s, Say.WELCOME).payload)
@@ -151,7 +153,9 @@ class Follower:
         self._line.say(Say.POSES, Poses({actor: list(given) for actor, given in poses.items()}))
 
     def tick(self) -> Ticked:
-        """Try to advance the world, which a follower should not do; return the result.
+        """Advance the world by a step if this follower leads; otherwise, try to do so.
+
+        A follower that leads calls it once after each snapshot, after its answer.
 
         Raises ClockError: the world's master refuses.
         """

@@ -45,7 +45,7 @@ class Say(IntEnum):
     WELCOME = 1  # world: accepts the request and describes its clock and sensors
     SNAPSHOT = 2  # world: the clock, and the sensors' new samples
     CONTROL = 3  # follower: controls of its vehicles for the next step
-    TICK = 4  # follower: requests a tick of its own
+    TICK = 4  # follower: requests a tick of its own; one that leads: releases the next step
     TICKED = 5  # world: result of that tick
     REFUSAL = 6  # world: reason why it drops the follower
     GOODBYE = 7  # either: end of the connection
@@ -98,6 +98,7 @@ class Hello:
     actors: list[ActorRequest] = field(default_factory=list)  # actors that it brings
     # whether the world waits for its answers; if not, it sends poses and controls at any time
     waits: StrictBool = True
+    leads: StrictBool = False  # whether each step of the world waits for a TICK of this follower
 
 
 @with_config(_CLOSED)
