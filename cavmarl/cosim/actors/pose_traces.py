@@ -148,8 +148,7 @@ def _trace(
 
 
 def _type_of(vclass: str | None) -> str:
-    is_number = vclass is not None and vclass.isdecimal()
-    return _TYPES.get(int(vclass), "car") if is_number and vclass is not None else "car"
+    return next((kind for code, kind in _TYPES.items() if vclass == str(code)), "car")
 
 
 @dataclass(eq=False)

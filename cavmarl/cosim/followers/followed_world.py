@@ -264,7 +264,7 @@ class FollowedWorld:
             )
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
         try:
-            actors = self.actors.join(hello.name, map(_order_of, hello.actors))
+            actors = self.actors.join(hello.name, map(order_of, hello.actors))
         except CavmarlError as error:
             raise FollowerError(f"'{hello.name[:80]}': {error}") from error
         try:
@@ -393,7 +393,7 @@ class FollowedWorld:
             self.master.watch.note(phase)
 
 
-def _order_of(request: ActorRequest) -> ActorOrder:
+def order_of(request: ActorRequest) -> ActorOrder:
     """Return what a follower asks for. Raises FollowerError: the size has no three numbers."""
     size = request.size_m
     if size and len(size) != 3:
