@@ -31,11 +31,11 @@ from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import FollowerConnection, Reception, listen
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
+    ActorPoses,
     ActorRequest,
     Control,
     FollowerRefusal,
     Hello,
-    Poses,
     PoseView,
     Say,
     Ticked,
@@ -235,7 +235,12 @@ def _seeds() -> tuple[bytes, ...]:
     stacks: tuple[tuple[Words, ...], ...] = (
         (hello, control(0, *both), control(1, *both)),
         (hello, (Say.TICK,), control(0, *both), control(0, *both), goodbye),
-        (bringing, (Say.POSES, Poses({"own": [PoseView(0.01, 1.0, 2.0, 0.3)]})), answer, goodbye),
+        (
+            bringing,
+            (Say.POSES, ActorPoses({"own": [PoseView(0.01, 1.0, 2.0, 0.3)]})),
+            answer,
+            goodbye,
+        ),
     )
     worlds: tuple[tuple[Words, ...], ...] = (
         (welcome, ticked, snapshot(7, [0]), snapshot(8, [0, 1]), goodbye),

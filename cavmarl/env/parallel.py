@@ -23,7 +23,7 @@ from cavmarl.engine.spaces import (
 from cavmarl.env.actions import LENIENT
 from cavmarl.env.agent_dicts import AgentDicts, Listed, Observation
 from cavmarl.env.drawn_worlds import RENDER_MODES
-from cavmarl.env.external_agents import ExternalAgents, external_id
+from cavmarl.env.external_agents import ExternalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
@@ -365,24 +365,6 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             return self._visitors.frames_of(self._visitors.ids.index(agent))
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
-
-    def external_frames(self, slot: int) -> dict[str, SensorFrames]:
-        """Return the samples of the last step of an external vehicle, by sensor name.
-
-        Args:
-            slot: result of `external.spawn`, of a vehicle that observes.
-
-        Raises:
-            ActionError: there is no such slot.
-            ConfigError: `population.external_agents` is false.
-        """
-        if self._visitors is None:
-            raise ConfigError(
-                "external vehicles carry no sensors here: set population.external_agents = true"
-            )
-        if not 0 <= slot < self.config.population.external:
-            raise self._no_agent(external_id(slot))
-        return self._visitors.frames_of(slot)
 
     def check_action(self, agent: str, action: Any) -> None:
         """Raise the error that `step` would raise for an action, without acting.

@@ -34,13 +34,18 @@ class StepInputs:
 
 
 def inputs_dtype(config: EnvConfig, arrays: StepArrays) -> np.dtype[Any]:
-    """Return the dtype of a row: the commands of one world, without those that it cannot have."""
+    """Return the dtype of a row: the commands that one world can have."""
     columns: list[Any] = [("tick", "<i8"), ("kind", "O"), ("seed", "O"), ("state_hash", "O")]
     for name in COMMANDS:
         array = getattr(arrays, name)
         if array[0].size and (name != "declared" or config.v2x.enabled):
             columns.append((name, array.dtype.newbyteorder("<").str, array.shape[1:]))
     return np.dtype(columns)
+
+
+def command_names(dtype: np.dtype[Any]) -> tuple[str, ...]:
+    """Return the names of the commands in a row."""
+    return tuple(name for name in dtype.names or () if name in COMMANDS)
 
 
 def inputs_row(
@@ -52,7 +57,7 @@ def inputs_row(
     commands = inputs.commands
     rows["kind"] = RESET if commands is None else STEP
     rows["seed"] = "" if commands is not None or inputs.seed is None else str(inputs.seed)
-    for name in (dtype.names or ())[4:] if commands is not None else ():
+    for name in command_names(dtype) if commands is not None else ():
         rows[name] = getattr(commands, name)
     return rows
 
@@ -67,5 +72,5 @@ def commands_of(
         controls: `Commands.controls` without agents.
         choices: `Commands.meta_actions` without agents.
     """
-    told = {name: np.ascontiguousarray(row[name])[np.newaxis] for name in row.dtype.names[4:]}
+    told = {name: np.ascontiguousarray(row[name])[np.newaxis] for name in command_names(row.dtype)}
     return Commands(**{"controls": controls, "meta_actions": choices, **told})

@@ -71,7 +71,7 @@ class WorldRecorder:
         record: Record,
         worlds: SteppedWorlds,
         simulation: Simulation,
-        history: InputHistory | None = None,
+        history: InputHistory | None,
         **more: Any,
     ) -> None:
         options, world = RecordOptions.of(record), worlds.world

@@ -15,7 +15,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, RecordingError
 from cavmarl.env.parallel import CavEnv, parallel_env
-from cavmarl.env.recorded_inputs import INPUTS, RESET, commands_of
+from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of
 from cavmarl.recordings.recording import Recording
 
 _MAY_DIFFER = ("zones", "workers", "nodes")  # keys that no result depends on
@@ -79,7 +79,7 @@ def _repeat(
 ) -> RepeatedRun:
     worlds, agents = made.worlds, made.config.population.num_ids
     no_controls, no_choices = np.zeros((1, agents, 2)), np.zeros((1, agents), dtype=np.int64)
-    for name in rows.dtype.names[4:]:
+    for name in command_names(rows.dtype):
         expected = getattr(worlds.arrays, name, np.zeros((1, 0))).shape[1:]
         if rows.dtype[name].shape != expected:
             raise RecordingError(f"{path}: {name} has shape {rows.dtype[name].shape}; get it again")
@@ -137,7 +137,7 @@ def _plain(config: EnvConfig) -> dict[str, Any]:
 
 def _keys_of(sections: Any, start: str = "") -> dict[str, Any]:
     """Return all values that results depend on, by dotted key."""
-    found = {}
+    found: dict[str, Any] = {}
     for name, value in sections.items():
         if not start and name in _MAY_DIFFER:
             continue

@@ -76,7 +76,7 @@ def test_its_sensors_see_the_traffic_and_the_traffic_does_not_depend_on_them() -
             for _ in range(100):
                 advance(env)
                 if observes:
-                    ranges.append(env.external_frames(slot)["roof"].data.min())
+                    ranges.append(env.frames(f"external_{slot}")["roof"].data.min())
             rows = env.simulation.vehicles(0)
             states.append(np.sort(rows, order="id").tobytes())
             assert env.agents == (["car_0", f"external_{slot}"] if observes else ["car_0"])
@@ -195,6 +195,6 @@ def test_without_the_key_no_external_vehicle_observes() -> None:
     with closing(ring(overrides={"population.external_agents": False})) as env:
         with pytest.raises(ConfigError, match=r"set population\.external_agents = true"):
             env.external.spawn(*place_on(env, 0), observes=True)
-        with pytest.raises(ConfigError, match=r"set population\.external_agents = true"):
-            env.external_frames(0)
+        with pytest.raises(ActionError, match="no agent 'external_0'"):
+            env.frames("external_0")
         assert env.possible_agents == ["car_0"]

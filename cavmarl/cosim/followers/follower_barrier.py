@@ -16,8 +16,8 @@ from cavmarl.cosim.actors.pose_track import PoseSample
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
 from cavmarl.cosim.followers.follower_messages import (
     MAX_POSES,
+    ActorPoses,
     Control,
-    Poses,
     PoseView,
     Say,
     Ticked,
@@ -224,7 +224,7 @@ class Barrier:
                 found.left.append(seat)
                 return True
             case Say.POSES:
-                self._take_poses(seat, moment, read_payload(Poses, frame.payload).poses)
+                self._take_poses(seat, moment, read_payload(ActorPoses, frame.payload).poses)
                 return False
             case Say.CONTROL:
                 control = read_payload(Control, frame.payload)

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ClockError, FollowerError
 from cavmarl.cosim.followers.follower_connection import Address, call
 from cavmarl.cosim.followers.follower_messages import (
+    ActorPoses,
     ActorRequest,
     Control,
     FollowerRefusal,
     FollowerSnapshot,
     Hello,
-    Poses,
     PoseView,
     Say,
     Ticked,
@@ -150,7 +150,9 @@ class Follower:
 
         Raises FollowerLostError: the world has ended.
         """
-        self._line.say(Say.POSES, Poses({actor: list(given) for actor, given in poses.items()}))
+        self._line.say(
+            Say.POSES, ActorPoses({actor: list(given) for actor, given in poses.items()})
+        )
 
     def tick(self) -> Ticked:
         """Advance the world by a step if this follower leads; otherwise, try to do so.

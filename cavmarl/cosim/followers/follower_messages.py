@@ -45,7 +45,7 @@ class Say(IntEnum):
     WELCOME = 1  # world: accepts the request and describes its clock and sensors
     SNAPSHOT = 2  # world: the clock, and the sensors' new samples
     CONTROL = 3  # follower: controls of its vehicles for the next step
-    TICK = 4  # follower: requests a tick of its own; one that leads: releases the next step
+    TICK = 4  # follower: requests a tick of its own; a leading follower releases the next step
     TICKED = 5  # world: result of that tick
     REFUSAL = 6  # world: reason why it drops the follower
     GOODBYE = 7  # either: end of the connection
@@ -211,7 +211,7 @@ class PoseView:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
-class Poses:
+class ActorPoses:
     """Poses of actors, in any order."""
 
     poses: dict[StrictStr, list[PoseView]]  # by the name of the actor

@@ -82,7 +82,7 @@ def see_actors(
             continue
         pose = (float(row[name]) for name in ("x", "y", "z", "heading", "pitch", "speed"))
         view = ActorView(int(row["id"]), agent, *pose, int(row["hit"]))
-        frames = env.external_frames(actor.slot) if rig else {}
+        frames = env.frames(agent) if agent else {}
         carried = _new_samples({name: frames[name] for name in rig})
         seen.append(SeenActor(actor.name, view, carried))
     return seen
