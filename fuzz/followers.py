@@ -222,7 +222,7 @@ def _seeds() -> tuple[bytes, ...]:
     other = ActorRequest("other", "bus", -40.0, -60.0, 0.0, size_m=[9.0, 2.0, 3.0], speed=2.0)
     bringing = (Say.HELLO, Hello("a lab", list(AGENTS), actors=[own, other]))
     pose = PoseView(0.05, -39.0, -40.0, 0.1, z=0.1, pitch=0.0, speed=1.0)
-    given = {"car_0": [0.25, -0.5], "car_1": [1.0, 0.0]}
+    given: dict[str, list[float] | int] = {"car_0": [0.25, -0.5], "car_1": [1.0, 0.0]}
     answer = (Say.CONTROL, Control(0, given, {"own": [pose]}))
 
     def control(frame: int, *given: list[float] | int) -> tuple[Say, Control]:

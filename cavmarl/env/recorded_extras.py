@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping
 from functools import partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,13 +40,6 @@ _HANDOVERS = np.dtype(
 Rows = NDArray[np.void]
 
 
-class InputHistory(NamedTuple):
-    """The inputs of a session of one world, and the hashes of its states."""
-
-    inputs: StepInputs  # of the last reset or step
-    state_hash: Callable[[int], str]  # of a world
-
-
 def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> None:
     """Raise an error if a requested table cannot be recorded.
 
@@ -79,11 +72,12 @@ class RecordedExtras:
         include: the wanted ones of `observations`, `samples`, `messages` and `commands`.
         arrays: results of the worlds' steps.
         simulation: the worlds; their messages are logged from now on.
-        history: what gives the inputs and the hashes of states; None: `commands` are not available.
+        state_hash: returns the hash of a world; None: `commands` are not available.
 
     Attributes:
         dtypes: dtypes of the tables, by table name.
         features: sensor and name of each number of the newest frame of an observation.
+        inputs: of the last reset or step.
     """
 
     def __init__(
@@ -92,10 +86,11 @@ class RecordedExtras:
         include: Iterable[str],
         arrays: StepArrays,
         simulation: Simulation,
-        history: InputHistory | None = None,
+        state_hash: Callable[[int], str] | None = None,
     ) -> None:
         self._arrays = arrays
-        self._history = history
+        self._state_hash = state_hash
+        self.inputs = StepInputs()
         wanted = frozenset(include)
         self.dtypes: dict[str, np.dtype[Any]] = {}
         self.features: list[tuple[str, str]] = []
@@ -111,7 +106,7 @@ class RecordedExtras:
                 own = np.dtype([*_WHOSE, ("stamp_s", "<f8"), ("lost", "|b1"), data])
                 self.dtypes[SAMPLES + name] = own
         if INPUTS in wanted:
-            if history is None or len(arrays.mask) > 1:
+            if state_hash is None or len(arrays.mask) > 1:
                 raise ConfigError(
                     f"record: include {INPUTS!r}: only the commands of one world of `parallel_env` "
                     "can be recorded; leave it out"
@@ -150,9 +145,8 @@ class RecordedExtras:
                 rows["terms"] = arrays.terms[world, agents]
                 rows["values"] = arrays.observations[world, agents]
                 found[name] = rows
-            elif name == INPUTS and self._history is not None:
-                inputs, state_hash = self._history
-                found[name] = inputs_row(dtype, inputs, tick, state_hash(world))
+            elif name == INPUTS and self._state_hash is not None:
+                found[name] = inputs_row(dtype, self.inputs, tick, self._state_hash(world))
             elif name.startswith(SAMPLES):
                 found[name] = self._samples(name, dtype, world, tick, agents)
         return found

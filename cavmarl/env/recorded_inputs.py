@@ -22,11 +22,11 @@ RESET, STEP = "reset", "step"
 
 @dataclass
 class StepInputs:
-    """The last inputs of a session.
+    """The inputs of a reset or of a step.
 
     Attributes:
-        seed: of the last reset; None: it began the next episode of an earlier seed.
-        commands: of the last step; None: the last call was a reset.
+        seed: of a reset; None: it begins the next episode of an earlier seed.
+        commands: of a step; None: it is a reset.
     """
 
     seed: int | None = None
@@ -58,7 +58,9 @@ def inputs_row(
     rows["kind"] = RESET if commands is None else STEP
     rows["seed"] = "" if commands is not None or inputs.seed is None else str(inputs.seed)
     for name in command_names(dtype) if commands is not None else ():
-        rows[name] = getattr(commands, name)
+        array = getattr(commands, name)
+        if array.size:  # without events, no events are passed
+            rows[name] = array
     return rows
 
 
@@ -72,5 +74,9 @@ def commands_of(
         controls: `Commands.controls` without agents.
         choices: `Commands.meta_actions` without agents.
     """
-    told = {name: np.ascontiguousarray(row[name])[np.newaxis] for name in command_names(row.dtype)}
+    told = {
+        name: np.ascontiguousarray(row[name])[np.newaxis]
+        for name in command_names(row.dtype)
+        if name != "declared" or row[name].any()
+    }
     return Commands(**{"controls": controls, "meta_actions": choices, **told})

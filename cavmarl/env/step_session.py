@@ -25,7 +25,6 @@ from cavmarl.env.insertions import Insertions
 from cavmarl.env.lane_changes import LaneChanges
 from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.overridden_signals import SignalOverrides
-from cavmarl.env.recorded_extras import InputHistory
 from cavmarl.env.recorded_inputs import StepInputs
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.env.signal_agents import SignalAgents
@@ -88,7 +87,6 @@ class StepSession:
         self.simulated_s = 0.0
         self._in_place = in_place
         self._first_seed = None if seed is None else check_seed(seed)
-        self._inputs = StepInputs()
         self._copy = WorldCopy()
         self._recorder: WorldRecorder | None = None
         self._watchers: tuple[Callable[[], None], ...] = ()
@@ -117,7 +115,8 @@ class StepSession:
         self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
         self.forget(chosen)
-        self._inputs.seed, self._inputs.commands = seed, None
+        if self._recorder is not None:
+            self._recorder.note(StepInputs(seed=seed))
         self.is_ready = True
         self._notify(chosen)
 
@@ -134,7 +133,8 @@ class StepSession:
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
-        self._inputs.commands = commands
+        if self._recorder is not None:
+            self._recorder.note(StepInputs(commands=commands))
         for part in waiting:
             part.clear()
         self.simulated_s += time.perf_counter() - began
@@ -232,9 +232,7 @@ class StepSession:
                 "first"
             )
         standing = self._copy.standing(self.worlds)
-        self._recorder = WorldRecorder(
-            record, self.worlds, standing, InputHistory(self._inputs, self.worlds.state_hash)
-        )
+        self._recorder = WorldRecorder(record, self.worlds, standing, self.worlds.state_hash)
 
     def close(self) -> None:
         """End the recording, the window and the worlds; a second call does nothing more."""

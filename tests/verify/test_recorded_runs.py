@@ -149,3 +149,36 @@ def test_the_command_repeats_a_recording(recorded: tuple[Path, list[str]], tmp_p
     assert result.exit_code == 0, result.output
     assert "equal: 50 steps in 2 episodes" in result.output
     assert json.loads(file.read_text())["state_hash"] == recorded[1][-1]
+
+
+EVERY_INPUT = {
+    "v2x.enabled": True,
+    "map.changed_lanes": 8,
+    "population.insertions": 4,
+    "signals.controller": "max_pressure",
+}
+
+
+@pytest.mark.parametrize(
+    "overrides",
+    [EVERY_INPUT, {"action.kind": "discrete"}, {"signals.agents": "all"}],
+    ids=["messages, roads, insertions", "choices", "signals"],
+)
+def test_inputs_of_all_kinds_are_repeated(tmp_path: Path, overrides: dict[str, Any]) -> None:
+    spec = WorldSpec(env="grid4x4", agents=3, background=10, overrides=overrides)
+    record = RecordOptions(tmp_path / "run", (INPUTS,))
+    with closing(cavmarl.parallel_env(spec.env, record=record, **spec.keywords)) as env:
+        env.reset(seed=3)
+        for agent in env.agents:
+            env.action_space(agent).seed(0)
+        for step in range(20):
+            if overrides is EVERY_INPUT and step == 2:
+                env.close_road("B1B2")
+                lane = int(np.flatnonzero(~env.network.lanes["internal"])[4])
+                env.insert_vehicle(env.network.lane_ids[lane], 20.0)
+                env.declare_event(env.agents[0], "obstacle")
+            if env.agents:
+                env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        expected = env.state_hash()
+    repeated = repeat_recording(tmp_path / "run", spec)
+    assert (repeated.first_difference, repeated.state_hash) == (None, expected)

@@ -27,6 +27,7 @@ from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, see_actors,
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
+MOST_MESSAGES = 1000  # read from a follower before a step, if the world does not wait for it
 BadControls = Literal["error", "hold"]
 
 
@@ -128,7 +129,9 @@ class Barrier:
         for seat in seats:
             answers: dict[FollowerSeat, Mapping[str, Any]] = {}
             try:
-                while seat.line.has_come():
+                for _ in range(MOST_MESSAGES):
+                    if not seat.line.has_come():
+                        break
                     if self._receive(seat, moment, answers, found, self._timeout_s):
                         if seat in found.left:
                             break

@@ -80,8 +80,17 @@ def see_actors(
         if row is None:
             seen.append(SeenActor(actor.name, _coming(actor.order, agent), {}))
             continue
-        pose = (float(row[name]) for name in ("x", "y", "z", "heading", "pitch", "speed"))
-        view = ActorView(int(row["id"]), agent, *pose, int(row["hit"]))
+        view = ActorView(
+            vehicle_id=int(row["id"]),
+            agent=agent,
+            x=float(row["x"]),
+            y=float(row["y"]),
+            z=float(row["z"]),
+            heading=float(row["heading"]),
+            pitch=float(row["pitch"]),
+            speed=float(row["speed"]),
+            hit_id=int(row["hit"]),
+        )
         frames = env.frames(agent) if agent else {}
         carried = _new_samples({name: frames[name] for name in rig})
         seen.append(SeenActor(actor.name, view, carried))
