@@ -113,6 +113,12 @@ class HostedWorld:
         """VEHICLE (n,) of the present; the next step overwrites them."""
         return self.simulation.vehicles(0)
 
+    @property
+    def present_lanes(self) -> NDArray[np.void]:
+        """LANE (L,) as they are now, with limits that roadside units and callers have set."""
+        lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[0]
+        return lanes
+
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
 
