@@ -82,7 +82,10 @@ class ExternalAgents:
 
     def check(self, agent: str, action: Any) -> None:
         """Raise the ActionError of an action that is not two numbers in [-1, 1]."""
-        given = np.asarray(action)
+        try:
+            given = np.asarray(action)
+        except ValueError:  # lists of several lengths
+            given = np.zeros(0)
         is_number = given.dtype.kind in "fiu" and given.shape == (2,)
         if not is_number or not (np.abs(given) <= 1.0).all():
             raise ActionError(
@@ -90,16 +93,19 @@ class ExternalAgents:
                 "throttle and steering"
             )
 
-    def drive(self, actions: Mapping[str, Any]) -> None:
-        """Drive the agents that have an action; the others keep their last command.
+    def check_all(self, actions: Mapping[str, Any]) -> None:
+        """Check the actions of a step.
 
         Raises:
-            ActionError: an agent is not in the world, or an action is invalid; nothing has changed.
+            ActionError: an agent is not in the world, or an action is invalid.
         """
         for agent, action in actions.items():
             if agent not in self.shown:
                 raise ActionError(f"{agent}: is not in the world; give an id of env.agents")
             self.check(agent, action)
+
+    def drive(self, actions: Mapping[str, Any]) -> None:
+        """Drive the agents that have an action; the others keep their last command."""
         scale = self._config.action.acceleration_mps2, self._config.action.steering_rad
         for agent, action in actions.items():
             throttle, steering = (float(number) for number in action)

@@ -232,6 +232,9 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         if visitors is not None and isinstance(actions, Mapping):
             driven = {agent: each for agent, each in actions.items() if agent in visitors}
             actions = {agent: each for agent, each in actions.items() if agent not in visitors}
+            if self.config.action.late_actions != "error":
+                driven = {agent: driven[agent] for agent in visitors.shown if agent in driven}
+            visitors.check_all(driven)
         commands = self._session.decoder.from_dict(actions, self._cars, needed)
         visited: list[str] = []
         if visitors is not None:

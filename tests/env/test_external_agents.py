@@ -137,6 +137,7 @@ def test_an_action_drives_it_and_without_one_it_keeps_the_last_command() -> None
         before = env.state_hash()
         for action, match in (
             ([0.0], "must be two numbers"),
+            ([[0.0], [0.0, 1.0]], "must be two numbers"),
             ([2.0, 0.0], "must be two numbers"),
             ([math.nan, 0.0], "must be two numbers"),
         ):
@@ -145,6 +146,14 @@ def test_an_action_drives_it_and_without_one_it_keeps_the_last_command() -> None
         with pytest.raises(ActionError, match="external_1: is not in the world"):
             advance(env, external_1=[0.0, 0.0])
         assert env.state_hash() == before
+
+
+def test_actions_of_absent_vehicles_can_be_ignored() -> None:
+    with closing(ring(overrides={"action.late_actions": "ignore"})) as env:
+        before = env.state_hash()
+        advance(env, external_1=[0.5, 0.0])
+        assert env.state_hash() != before
+        assert env.agents == ["car_0"]
 
 
 def test_a_copy_continues_with_equal_samples() -> None:

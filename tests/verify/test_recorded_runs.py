@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 import cavmarl
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, RecordingError
+from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_messages import ActorRequest, PoseView
@@ -76,6 +77,10 @@ def test_the_recording_has_the_inputs_of_each_step(recorded: tuple[Path, list[st
     assert rows["kind"].tolist() == (["reset"] + ["step"] * 25) * 2
     assert [seed for seed in rows["seed"].tolist() if seed] == ["4"]
     assert rows["external"].any()
+    drivers = {
+        int(row["driver"]) for frame in Recording.open(path).frames() for row in frame.vehicles
+    }
+    assert DRIVER_EXTERNAL in drivers  # its frames can be read, too
 
 
 @pytest.mark.parametrize("zones", [1, 3])

@@ -240,6 +240,10 @@ class ClientActors:
             )
         if order.name in self._env.possible_agents:
             raise ActionError(f"an actor's name is '{order.name}', that of an agent; use another")
+        if len(order.vtype) > MOST_NAME:
+            raise ActionError(
+                f"an actor's type has {len(order.vtype)} letters; the limit is {MOST_NAME}"
+            )
         if order.moved_by not in MOVERS:
             raise ActionError(
                 f"moved_by = {order.moved_by[:MOST_NAME]!r}: must be one of {', '.join(MOVERS)}"
