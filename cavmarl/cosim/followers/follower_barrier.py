@@ -27,6 +27,7 @@ from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, see_actors,
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
+READS_S = 0.5  # for reading a snapshot, if the world does not wait for the follower
 MOST_MESSAGES = 1000  # read from a follower before a step, if the world does not wait for it
 BadControls = Literal["error", "hold"]
 
@@ -103,7 +104,8 @@ class Barrier:
             if seat.waits:
                 asked[seat] = list(snapshot.vehicles)
             try:
-                seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
+                within_s = self._timeout_s if seat.waits else min(self._timeout_s, READS_S)
+                seat.line.say(Say.SNAPSHOT, snapshot, arrays, within_s)
             except FollowerLostError as error:
                 if error.is_late:  # else the messages read below may contain its goodbye
                     found.failed[seat] = error
