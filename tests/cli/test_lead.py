@@ -137,6 +137,7 @@ def exit_code(words: list[str]) -> int:
     return int(ended.value.code or 0)
 
 
+@pytest.mark.integration
 def test_a_trace_is_played_with_a_deadline_and_recorded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:

@@ -26,6 +26,8 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.verify.recorded_runs import repeat_recording
 from tests.cosim.test_client_actors import SETTINGS
 
+pytestmark = pytest.mark.integration  # a recording asks git for the commit
+
 SPEC = WorldSpec(env="grid4x4", agents=2, background=12, overrides=SETTINGS)
 STEP_S = 0.05
 
