@@ -10,7 +10,7 @@ import json
 import os
 import subprocess
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from contextlib import closing
 from fractions import Fraction
 from itertools import groupby
@@ -27,6 +27,7 @@ from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ClockError, ConfigError, EvaluationError
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import Address
+from cavmarl.cosim.followers.follower_messages import PoseView
 from cavmarl.cosim.ros2 import FAST_DDS_PROFILE
 from cavmarl.cosim.ros2.bridged_world import BridgedWorld
 from cavmarl.cosim.ros2.ros_bridge import RosOptions
@@ -76,7 +77,11 @@ class _RogueFollower(Follower):
     share = Fraction(0)
     answers = own_ticks = 0
 
-    def answer(self, controls: Mapping[str, Any]) -> None:
+    def answer(
+        self,
+        controls: Mapping[str, Any] | None = None,
+        poses: Mapping[str, Sequence[PoseView]] | None = None,
+    ) -> None:
         self.answers += 1
         if is_due(self.answers, self.share):
             self.own_ticks += 1
@@ -84,7 +89,7 @@ class _RogueFollower(Follower):
                 self.tick()
             except ClockError:
                 pass
-        super().answer(controls)
+        super().answer(controls, poses)
 
 
 def measure_ros_drift(

@@ -24,14 +24,19 @@ from typing import Any
 import msgpack
 
 from cavmarl.core.errors import ClockError, FollowerError
+from cavmarl.cosim.actors.client_actors import ClientActors
+from cavmarl.cosim.followers.followed_world import order_of
 from cavmarl.cosim.followers.follower_barrier import Barrier, FollowerSeat
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_connection import FollowerConnection, Reception, listen
 from cavmarl.cosim.followers.follower_messages import (
     FOLLOWERS,
+    ActorPoses,
+    ActorRequest,
     Control,
     FollowerRefusal,
     Hello,
+    PoseView,
     Say,
     Ticked,
     payload_of,
@@ -102,7 +107,13 @@ def _place() -> tuple[Path, tempfile.TemporaryDirectory[str]]:
 
 @cache
 def _env() -> CavEnv:
-    settings = {"population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
+    settings = {
+        "population.mode": "respawn",
+        "clock.ctrl_dt_s": 0.05,
+        "population.external": 2,
+        "population.external_agents": True,
+        "rig": {"imu": {"type": "imu", "rate_hz": 20}},
+    }
     env = parallel_env("ring", agents=len(AGENTS), background=1, overrides=settings)
     env.reset(seed=0)
     return env
@@ -123,9 +134,13 @@ def _a_world_hears(said: bytes) -> None:
             if not found:
                 raise FollowerError("the caller was turned away")
             line, hello = found[0]
-            seat = FollowerSeat(line, master.follow(hello.name), tuple(range(len(AGENTS))))
-            barrier = Barrier(env, WITHIN_S, "error")
+            actors = ClientActors(env)
+            came = actors.join(hello.name, map(order_of, hello.actors))
+            agents = tuple(range(len(AGENTS)))
+            seat = FollowerSeat(line, master.follow(hello.name), agents, actors=tuple(came))
+            barrier = Barrier(env, actors, WITHIN_S, "error")
             for frame in range(2):
+                actors.act(0.0)
                 outcome = barrier.pass_through([seat], SnapshotTime(frame, 0, 0, False))
                 for error in outcome.failed.values():
                     raise error
@@ -133,6 +148,7 @@ def _a_world_hears(said: bytes) -> None:
                     break
     finally:
         master.release()
+        env.reset(seed=0)  # without actors
         reception.close()
         place.unlink(missing_ok=True)
         if line is not None:
@@ -202,6 +218,13 @@ def _seeds() -> tuple[bytes, ...]:
     ticked = (Say.TICKED, Ticked(False, "", 12))
     goodbye = (Say.GOODBYE,)
 
+    own = ActorRequest("own", "cyclist", -40.0, -40.0, 0.0, rate_hz=20.0, rig=["imu"])
+    other = ActorRequest("other", "bus", -40.0, -60.0, 0.0, size_m=[9.0, 2.0, 3.0], speed=2.0)
+    bringing = (Say.HELLO, Hello("a lab", list(AGENTS), actors=[own, other]))
+    pose = PoseView(0.05, -39.0, -40.0, 0.1, z=0.1, pitch=0.0, speed=1.0)
+    given: dict[str, list[float] | int] = {"car_0": [0.25, -0.5], "car_1": [1.0, 0.0]}
+    answer = (Say.CONTROL, Control(0, given, {"own": [pose]}))
+
     def control(frame: int, *given: list[float] | int) -> tuple[Say, Control]:
         return Say.CONTROL, Control(frame, dict(zip(AGENTS, given, strict=False)))
 
@@ -212,6 +235,12 @@ def _seeds() -> tuple[bytes, ...]:
     stacks: tuple[tuple[Words, ...], ...] = (
         (hello, control(0, *both), control(1, *both)),
         (hello, (Say.TICK,), control(0, *both), control(0, *both), goodbye),
+        (
+            bringing,
+            (Say.POSES, ActorPoses({"own": [PoseView(0.01, 1.0, 2.0, 0.3)]})),
+            answer,
+            goodbye,
+        ),
     )
     worlds: tuple[tuple[Words, ...], ...] = (
         (welcome, ticked, snapshot(7, [0]), snapshot(8, [0, 1]), goodbye),

@@ -6,7 +6,7 @@ from fuzz.followers import FOLLOWER
 from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import BUILDINGS, CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
 from fuzz.settings import CHECKPOINTS, DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
-from fuzz.traffic import DEMAND, SUMO_CONFIGS
+from fuzz.traffic import DEMAND, SUMO_CONFIGS, TRACES
 
 __all__ = ["TARGETS"]
 
@@ -19,6 +19,7 @@ TARGETS = {
     "zones": ZONES,
     "demand": DEMAND,
     "sumocfg": SUMO_CONFIGS,
+    "trace": TRACES,
     "entry": ENTRIES,
     "overrides": OVERRIDES,
     "driver": DRIVERS,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from dataclasses import replace
 from functools import partial
@@ -18,12 +18,15 @@ from cavmarl.cli.output import (
     WORLD,
     Backend,
     JsonPath,
+    RecordAlso,
+    RecordPath,
     Workers,
     Zones,
     about,
     flag,
     grid,
     print_error,
+    recorded,
     with_world,
     write_json,
 )
@@ -112,15 +115,38 @@ def lead(
         Literal["none", "reference", "camera"],
         about("Mount the sensors that the reference driving stack needs.", panel=WORLD),
     ] = "none",
+    deadline_s: Annotated[
+        float | None,
+        about(
+            "Count steps that need longer than this with --pace, by phase [default: one step].",
+            "--deadline",
+            metavar="S",
+        ),
+    ] = None,
+    trace: Annotated[
+        list[Path] | None,
+        about(
+            "Play recorded poses of other bodies from a CSV file. Repeat it for more files.",
+            "--trace",
+            metavar="FILE",
+            exists=True,
+        ),
+    ] = None,
     truth: Annotated[
         bool, flag("Give the true state of all vehicles to followers that request it.")
     ] = False,
     zones: Zones = None,
     backend: Backend = None,
     workers: Workers = None,
+    record: RecordPath = None,
+    record_also: RecordAlso = "",
     json_path: JsonPath = None,
 ) -> None:
-    """Run a world whose agents are driven by programs that join over a socket."""
+    """Run a world whose agents are driven by programs that join over a socket.
+
+    A program can also bring vehicles, people and roadside units of its own.
+    """
+    from cavmarl.cosim.actors.pose_traces import read_traces
     from cavmarl.cosim.followers.followed_world import FollowedWorld
     from cavmarl.cosim.stack.stack import RIGS
     from cavmarl.cosim.time_master import RealTime
@@ -131,12 +157,25 @@ def lead(
             f"--followers {followers}, --steps {steps}: --followers must be at least 0 and --steps "
             "at least 1"
         )
+    if deadline_s is not None and pace is None:
+        raise ConfigError(f"--deadline {deadline_s:g}: goes with --pace; add --pace 1")
     console = Console()
-    pacer = None if pace is None else RealTime(pace)
+    traces = [one for path in trace or () for one in read_traces(path)]
     if rig in RIGS:
         given = {"clock.ctrl_dt_s": 0.05, "rig": RIGS[rig], **world.overrides}
         world = replace(world, overrides=given)
-    made = parallel_env(world.env, zones=zones, backend=backend, workers=workers, **world.keywords)
+    made = parallel_env(
+        world.env,
+        zones=zones,
+        backend=backend,
+        workers=workers,
+        record=recorded(record, record_also),
+        **world.keywords,
+    )
+    pacer = None
+    if pace is not None:
+        step_s = made.step_s / pace if pace > 0.0 else made.step_s
+        pacer = RealTime(pace, deadline_s=step_s if deadline_s is None else deadline_s)
     with (
         closing(made),
         FollowedWorld(
@@ -148,6 +187,7 @@ def lead(
             bad_controls=bad_controls,
             pacer=pacer,
             truth=truth,
+            traces=traces,
         ) as led,
     ):
         console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
@@ -156,6 +196,12 @@ def lead(
         if pacer is not None:
             found["lateness"] = vars(pacer.lateness)
         console.print(_table(found))
+        if found["actors"]:
+            console.print(_actor_table(found["actors"]))
+        if pacer is not None and pacer.watch is not None:
+            pacer.watch.end()
+            found["deadline"] = pacer.watch.report()
+            console.print(_deadline_text(found["deadline"]), highlight=False)
     write_json(json_path, found)
 
 
@@ -186,6 +232,8 @@ def run_episode(world: FollowedWorld, seed: int, steps: int | None, on_lost: str
         "own_ticks": master.own_ticks,
         "state_hash": world.env.state_hash(),
         "traffic": world.env.traffic_stats(),
+        "actors": world.actors.report(),
+        "trace_steps_refused": world.player.refused,
         "barrier": [
             {
                 "name": seat.clock.name,
@@ -195,6 +243,7 @@ def run_episode(world: FollowedWorld, seed: int, steps: int | None, on_lost: str
                 "wait_wall_s": seat.wait_wall_s,
                 "wait_share": seat.wait_wall_s / waited if waited else 0.0,
                 "slowest_in": seat.slowest,
+                "unseen": seat.unseen,
             }
             for seat in world.seats
         ],
@@ -213,3 +262,25 @@ def _table(found: dict[str, Any]) -> Table:
     )
     heads = ("follower", "answers", "late", "invalid", "waited for, s", "slowest in")
     return grid(heads, rows, f"{found['steps']} steps, {found['time_s']:g} s")
+
+
+def _actor_table(actors: Sequence[dict[str, Any]]) -> Table:
+    names = ("received", "late", "lost", "extrapolated", "stopped")
+    rows = (
+        (
+            escape(f"{row['client']}: {row['name']}"),
+            escape(row["type"]),
+            *(str(row[name]) for name in names),
+            f"{1e3 * row['worst_age_s']:.0f}",
+        )
+        for row in actors
+    )
+    heads = ("actor", "type", "poses", "late", "lost", "extrapolated", "stopped", "oldest, ms")
+    return grid(heads, rows, "poses of actors; extrapolated and stopped: in steps", lefts=2)
+
+
+def _deadline_text(found: dict[str, Any]) -> str:
+    share = f"{found['missed']} of {found['steps']} steps"
+    phases = ", ".join(f"{phase} {count}" for phase, count in found["missed_in"].items())
+    ended = f" ({phases}; at most {1e3 * found['worst_wall_s']:.1f} ms late)" if phases else ""
+    return f"deadline of {1e3 * found['deadline_s']:g} ms missed in {share}{ended}"

@@ -293,7 +293,7 @@ RecordPath = Annotated[
 RecordAlso = Annotated[
     str,
     about(
-        "Additional data to record, comma-separated: observations, samples, messages.",
+        "Additional data to record, comma-separated: observations, samples, messages, commands.",
         "--record-also",
         metavar="NAME,…",
         panel=OUTPUT,

@@ -162,6 +162,8 @@ class EnvConfig(Section, key=""):
             not self.workers.sensors or bool(self.rig),
             "needs sensors under rig; mount some, or set it to 0",
         )
+        if self.population.external_agents:
+            self._check_external_agents()
         self.need(
             "observation.mode",
             self.observation.mode != "sensors" or bool(self.rig),
@@ -195,6 +197,18 @@ class EnvConfig(Section, key=""):
             self._drop_sight()
         if self.traffic.source != "native":
             self._check_sumo()
+
+    def _check_external_agents(self) -> None:
+        """Raise an error if external vehicles cannot observe."""
+        for key, is_met, expected in (
+            ("population.external_agents", self.population.external > 0,
+             "needs population.external above 0"),
+            ("population.external_agents", bool(self.rig), "needs sensors under rig; mount some"),
+            ("clock.ctrl_dt_s", self.clock.ticks_per_step == 1,
+             "must be clock.sim_dt_s with population.external_agents: their sensors sense at the "
+             "end of each step"),
+        ):  # fmt: skip
+            self.need(key, is_met, expected)
 
     def _check_horizon(self) -> None:
         """Raise an error for a horizon that is not a whole number of steps."""

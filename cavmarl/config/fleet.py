@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from cavmarl.config.checks import Within, check, check_ranges
 
 KNOWN_TYPES = ("car", "truck", "bus")
+RESERVED_TYPES = (*KNOWN_TYPES, "pedestrian", "cyclist", "roadside_unit")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -77,8 +78,8 @@ def check_fleet(own_types: Mapping[str, OwnType], fleet: Sequence[FleetPart]) ->
     """Check names and values. Raises ConfigError."""
     for name, own in own_types.items():
         key = f"population.own_types.{name}"
-        expected = "must be an identifier other than car, truck, bus and pedestrian"
-        free = name.isidentifier() and name not in (*KNOWN_TYPES, "pedestrian")
+        expected = f"must be an identifier other than {', '.join(RESERVED_TYPES)}"
+        free = name.isidentifier() and name not in RESERVED_TYPES
         check(free, "population.own_types", name, expected)
         check_ranges(key, own)
         if own.wheelbase_m is not None and own.length_m is not None:

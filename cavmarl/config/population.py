@@ -37,6 +37,8 @@ class PopulationConfig(Section, key="population"):
             (`insert_vehicle`); memory is reserved for them.
         external: number of vehicles that the caller may pose or drive in a world at the same time
             (`ExternalCommands`); memory is reserved for them.
+        external_agents: whether such vehicles can carry the sensors of `rig`; then they are agents
+            of a PettingZoo environment while they are in the world: `external_0` and so on.
         reroute: which vehicles take another way if lanes change (`map.changed_lanes`). `never`:
             none; they wait before a closed road. `blocked`: those whose way leads over a closed
             lane. `always`: all vehicles for which another way is faster, also if a speed limit
@@ -52,6 +54,7 @@ class PopulationConfig(Section, key="population"):
     fleet: tuple[FleetPart, ...] = ()
     insertions: Annotated[int, Whole(0, 10_000)] = 0
     external: Annotated[int, Whole(0, 10_000)] = 0
+    external_agents: bool = False
     reroute: Literal["never", "blocked", "always"] = "blocked"
 
     def __post_init__(self) -> None:

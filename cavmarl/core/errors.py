@@ -12,6 +12,7 @@
     ├── RegisteredFunctionError   a registered function returns an invalid result
     ├── MissingExtraError      an optional dependency is not installed
     ├── ActionError            an invalid action; no state has changed
+    │   └── OccupiedPlaceError    another vehicle covers the place of a new one
     ├── EpisodeError           a call that the episode's state does not allow: reset first
     ├── KernelError            a kernel must be compiled, which is not allowed or possible
     ├── CapacityError          more vehicles or agents than the world has room for
@@ -96,6 +97,10 @@ class ActionError(CavmarlError):
 
     No state has changed, and the step can be repeated.
     """
+
+
+class OccupiedPlaceError(ActionError):
+    """Another vehicle covers the place where a vehicle is to enter; it may be free later."""
 
 
 class EpisodeError(CavmarlError):

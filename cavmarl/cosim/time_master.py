@@ -24,6 +24,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ClockError, ConfigError
+from cavmarl.cosim.deadline_watch import DeadlineWatch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.step_trace import StepTrace
 from cavmarl.shards.shard import Commands
@@ -62,9 +63,13 @@ class RealTime:
     accumulate.
 
     `factor`: simulated seconds per second. `now`: the wall clock in seconds. `sleep`: waits for a
-    number of seconds.
+    number of seconds. `deadline_s`: time after a step is due at which its controls have to be
+    queued; None: no deadline. A missed deadline is counted and does not change results.
 
-    Raises ConfigError: the factor is not a finite number above 0.
+    Attributes:
+        watch: counts missed deadlines; None: no deadline.
+
+    Raises ConfigError: the factor or the deadline is not a finite number above 0.
     """
 
     def __init__(
@@ -72,6 +77,7 @@ class RealTime:
         factor: float = 1.0,
         now: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
+        deadline_s: float | None = None,
     ) -> None:
         if not 0.0 < factor < float("inf"):
             raise ConfigError(f"pacing by {factor}: must be a number above 0, such as 1 or 2.5")
@@ -80,8 +86,11 @@ class RealTime:
         self._origin: float | None = None
         self._steps = self._late = 0
         self._sum_s = self._worst_s = 0.0
+        self.watch = None if deadline_s is None else DeadlineWatch(deadline_s, now)
 
     def wait(self, elapsed_s: float) -> None:
+        if self.watch is not None:
+            self.watch.end()
         now = self._now()
         if self._origin is None:
             self._origin = now - elapsed_s / self._factor
@@ -95,6 +104,8 @@ class RealTime:
         self._steps += 1
         self._sum_s += late_s
         self._worst_s = max(self._worst_s, late_s)
+        if self.watch is not None:
+            self.watch.begin(self._origin + elapsed_s / self._factor)
 
     @property
     def lateness(self) -> Lateness:
@@ -185,7 +196,7 @@ class _GuardedWorlds:
     """Guards an environment's worlds: only their master can step and reset them."""
 
     def __init__(self, worlds: _Worlds, master: TimeMaster) -> None:
-        self.worlds = worlds
+        self.worlds = self.guarded = worlds  # `guarded`: see `env.drawn_worlds.unguarded`
         self._master = master
 
     def __getattr__(self, name: str) -> Any:
@@ -221,6 +232,7 @@ class TimeMaster:
         own_ticks: number of all followers' own ticks.
         drifts: number of detected drifts.
         drift_ticks: number of ticks by which the first world was advanced without the master.
+        watch: counts missed deadlines; None: the pacer has no deadline.
 
     Raises:
         ClockError: the environment already has a master.
@@ -247,6 +259,7 @@ class TimeMaster:
         self.events: list[ClockEvent] = []
         self.own_ticks = self.drifts = self.drift_ticks = 0
         self._pacer = Unpaced() if pacer is None else pacer
+        self.watch = pacer.watch if isinstance(pacer, RealTime) else None
         self._answer, self._on_drift, self._trace = own_ticks, on_drift, trace
         self._per_step = env.config.clock.ticks_per_step
         self._followers: list[TimeFollower] = []

@@ -175,6 +175,9 @@ AGENT_TYPES = {
 # Types of the vehicles that the caller poses or drives, besides the car.
 EXTERNAL_TYPES = AGENT_TYPES | {
     "pedestrian": AgentType("pedestrian", 0.5, 0.5, 1.75, 1.5, 2.0, 4.0, 0.5, 5.0, 0.5, 0.7),
+    "cyclist": AgentType("bicycle", 1.6, 0.65, 1.7, 1.2, 3.0, 7.0, 0.5, 13.9, 1.1, 0.7),
+    # A pole with antennas and sensors; in camera pictures, it has the class of a car.
+    "roadside_unit": AgentType("passenger", 0.4, 0.4, 3.0, 1.0, 1.0, 1.0, 0.5, 1.0, 0.4, 0.7),
 }
 # Fields of VTYPE that each key of a type of an environment sets.
 _OWN_FIELDS = {

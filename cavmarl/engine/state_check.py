@@ -225,7 +225,8 @@ class StateForm(NamedTuple):
             if len(rows) > capacity:
                 return f"world {w} has {len(rows)} vehicles, but room for only {capacity}"
             next_id = named["next_id"][w]
-            if (rows["id"] >= next_id).any() or (waiting["id"] >= next_id).any():
+            numbered = rows["id"][rows["driver"] != DRIVER_EXTERNAL]
+            if (numbered >= next_id).any() or (waiting["id"] >= next_id).any():
                 return f"world {w} has vehicles whose ids are not assigned yet"
             times = [rows[name] for name in ("tick", "departed", "last_change")]
             if any((time > named["ticks"][w]).any() for time in times):

@@ -69,6 +69,12 @@ def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
     return "" if shows_state(backend) else f"backend = '{backend}'"
 
 
+def unguarded(worlds: SteppedWorlds) -> SteppedWorlds:
+    """Return the worlds that a time master guards, or the worlds themselves."""
+    found: SteppedWorlds = getattr(worlds, "guarded", worlds)
+    return found
+
+
 class WorldCopy:
     """The worlds of an environment in this process: local worlds, or a copy of remote ones."""
 
@@ -77,6 +83,7 @@ class WorldCopy:
 
     def standing(self, worlds: SteppedWorlds) -> Simulation:
         """Return the local worlds, or a copy of remote worlds as of some earlier time."""
+        worlds = unguarded(worlds)
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation
         if self._copied is None:
@@ -85,6 +92,7 @@ class WorldCopy:
 
     def present(self, worlds: SteppedWorlds) -> Simulation:
         """Return the local worlds, or an up-to-date copy of remote worlds."""
+        worlds = unguarded(worlds)
         simulation = self.standing(worlds)
         if self._copied is not None:
             if isinstance(worlds, NodeWorlds):

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import ActionError, CapacityError, ConfigError
+from cavmarl.core.errors import ActionError, CapacityError, ConfigError, OccupiedPlaceError
 from cavmarl.core.math.elementary import cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import LEVEL_HEIGHT_M
 from cavmarl.core.records.arrays import LaneGrid
+from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.core.records.external_records import (
     EXTERNAL,
     EXTERNAL_DRIVEN,
@@ -60,6 +61,7 @@ class ExternalCommands:
         present: Callable[[], Simulation],
     ) -> None:
         self._most = config.population.external
+        self._may_observe = config.population.external_agents
         self._network = network
         self._present = present
         self._commands = np.zeros((num_worlds, self._most, EXTERNAL_FIELDS))
@@ -97,6 +99,7 @@ class ExternalCommands:
         vtype: str = "car",
         size_m: tuple[float, float, float] | None = None,
         speed: float = 0.0,
+        observes: bool = False,
         world: int = 0,
     ) -> int:
         """Let a vehicle enter a world in the next step.
@@ -109,22 +112,31 @@ class ExternalCommands:
             y: of its centre, in m.
             heading: in rad, counter-clockwise from east.
             z: height of the ground below its centre, in m; None: of the lane.
-            vtype: `car`, `truck`, `bus` or `pedestrian`.
+            vtype: `car`, `truck`, `bus`, `pedestrian`, `cyclist`, `roadside_unit`, or a type of
+                `population.fleet`.
             size_m: length, width and height, at most those of a bus; None: of its type.
             speed: in m/s along its heading, negative backwards.
+            observes: whether it carries the sensors of `rig`, and is an agent of a PettingZoo
+                environment (`population.external_agents`).
             world: number of the world.
 
         Returns:
             The vehicle's slot, by which the other methods name it.
 
         Raises:
-            ActionError: the place is occupied or outside of the map, or an argument is invalid.
+            ActionError: the place is outside of the map, or an argument is invalid.
+            OccupiedPlaceError: another vehicle covers the place.
             CapacityError: the world already has `population.external` such vehicles.
-            ConfigError: `population.external` is 0.
+            ConfigError: `population.external` is 0; or it is to observe, and
+                `population.external_agents` is false.
         """
         self._check_world(world)
+        if observes and not self._may_observe:
+            raise ConfigError(
+                "external vehicles carry no sensors here: set population.external_agents = true"
+            )
         told = np.zeros(1, dtype=EXTERNAL)[0]
-        told["kind"] = EXTERNAL_POSED
+        told["kind"], told["observes"] = EXTERNAL_POSED, observes
         self._set_pose(told, (x, y, z, heading, None, speed))
         simulation = self._present()
         rows = simulation.type_rows
@@ -233,6 +245,17 @@ class ExternalCommands:
         ids: NDArray[np.int64] = self._present().external.ids[world].copy()
         return ids
 
+    def vehicles(self, world: int = 0) -> NDArray[np.void]:
+        """Return the present external vehicles, VEHICLE (n,); `order` is the slot of each.
+
+        Raises:
+            ConfigError: `population.external` is 0.
+        """
+        self._check_world(world)
+        rows = self._present().vehicles(world)
+        found: NDArray[np.void] = rows[rows["driver"] == DRIVER_EXTERNAL].copy()
+        return found
+
     def add_to(self, commands: Commands) -> Commands:
         """Return the commands with the waiting ones, which are held until `clear`."""
         return replace(commands, external=self._commands.copy()) if self._most else commands
@@ -296,7 +319,7 @@ class ExternalCommands:
             )
 
     def _check_free(self, simulation: Simulation, world: int, told: np.void) -> None:
-        """Raise an ActionError if another vehicle, present or waiting, covers the place."""
+        """Raise an OccupiedPlaceError if another vehicle, present or waiting, covers the place."""
         rows = simulation.vehicles(world)
         leaving = simulation.external.ids[world, self._told["kind"][world] == EXTERNAL_REMOVED]
         reach_m = float(diagonals_m(simulation.types).max())
@@ -307,7 +330,7 @@ class ExternalCommands:
         own = self._row(told)
         for other in others:
             if abs(other["z"] - own["z"]) <= LEVEL_HEIGHT_M and _overlap(own, other):
-                raise ActionError(
+                raise OccupiedPlaceError(
                     f"x = {told['x']:g}, y = {told['y']:g}: occupied by another vehicle; give a "
                     "free place"
                 )

@@ -23,11 +23,13 @@ from cavmarl.engine.spaces import (
 from cavmarl.env.actions import LENIENT
 from cavmarl.env.agent_dicts import AgentDicts, Listed, Observation
 from cavmarl.env.drawn_worlds import RENDER_MODES
+from cavmarl.env.external_agents import ExternalAgents
 from cavmarl.env.step_session import StepSession
 from cavmarl.env.world_arguments import WorldArguments, start_worlds
 from cavmarl.env.worlds_environment import WorldsEnvironment
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
 from cavmarl.sensors.mounted.frames import SensorFrames
+from cavmarl.shards.shard import Commands
 
 Stepped = tuple[
     dict[str, Observation],
@@ -115,6 +117,12 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             self.possible_agents = [*cars, *self._roadside.agents]
             self.observation_spaces |= self._roadside.observation_spaces()
             self.action_spaces |= self._roadside.action_spaces()
+        self._visitors: ExternalAgents | None = None
+        if config.population.external_agents:
+            self._visitors = ExternalAgents(self._session)
+            self.possible_agents = [*self.possible_agents, *self._visitors.ids]
+            self.observation_spaces |= self._visitors.observation_spaces()
+            self.action_spaces |= self._visitors.action_spaces()
         self.state_space = state_space(worlds.arrays.states.shape[1] // STATE_FEATURES)
         self._dicts = AgentDicts(config)
         self._seats = config.population.mode == "respawn"
@@ -189,6 +197,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """
         self._session.reset(seed, np.ones(1, dtype=np.bool_))
         self._steps = 0
+        if self._visitors is not None:
+            self._visitors.reset()
         self._list(np.flatnonzero(self.worlds.arrays.mask[0] | self._seats))
         if not self.agents:
             self._wait_for_agents()
@@ -218,13 +228,35 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             actions = {
                 agent: each for agent, each in actions.items() if agent not in self._roadside
             }
+        visitors, driven = self._visitors, {}
+        if visitors is not None and isinstance(actions, Mapping):
+            driven = {agent: each for agent, each in actions.items() if agent in visitors}
+            actions = {agent: each for agent, each in actions.items() if agent not in visitors}
+            if self.config.action.late_actions != "error":
+                driven = {agent: driven[agent] for agent in visitors.shown if agent in driven}
+            visitors.check_all(driven)
         commands = self._session.decoder.from_dict(actions, self._cars, needed)
+        visited: list[str] = []
+        if visitors is not None:
+            visited = visitors.shown
+            visitors.drive(driven)
+        self._advance(commands, choices)
+        return self._report(visited)
+
+    def _advance(self, commands: Commands, choices: NDArray[np.int64] | None = None) -> None:
+        """Advance the world by a step, at whose end the external vehicles sense."""
+        if self._visitors is not None:
+            self._visitors.prepare()
         self._session.step(commands, choices)
         self._steps += 1
-        return self._report()
+        if self._visitors is not None:
+            self._visitors.sense()
 
-    def _report(self) -> Stepped:
-        """Return the results of a step, and drop the agents that have left."""
+    def _report(self, visited: list[str]) -> Stepped:
+        """Return the results of a step, and drop the agents that have left.
+
+        `visited`: ids of the observing external vehicles before the step.
+        """
         arrays, truncated = self.worlds.arrays, self._steps >= self.max_cycles
         if not truncated:
             entered = arrays.vehicle_ids[0] >= 0
@@ -233,6 +265,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
                 self._list(np.concatenate([self._rows, np.flatnonzero(entered)]))
         shown = self._cars
         ended = arrays.terminations[0, self._listed] & (not self._seats)
+        if self._visitors is not None:
+            self._list(self._rows)
         observations, infos = self._observations(), self._infos()
         rewards = dict(zip(shown, arrays.rewards[0, self._listed].tolist(), strict=True))
         late = ended & arrays.truncations[0, self._listed]
@@ -242,6 +276,14 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             rewards |= zip(self._roadside.agents, arrays.signal_rewards[0].tolist(), strict=True)
             terminations |= dict.fromkeys(self._roadside.agents, False)
             truncations |= dict.fromkeys(self._roadside.agents, truncated)
+        if self._visitors is not None:
+            left = [agent for agent in visited if agent not in self._visitors.shown]
+            observations |= self._visitors.observations(left)
+            infos |= self._visitors.infos(left)
+            agents = [*left, *self._visitors.shown]
+            rewards |= dict.fromkeys(agents, 0.0)
+            terminations |= {agent: agent in left for agent in agents}
+            truncations |= dict.fromkeys(agents, truncated)
         if truncated:
             self._list(self._rows[:0])
             self.agents.clear()
@@ -265,6 +307,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self.agents = (
             self._cars if self._roadside is None else [*self._cars, *self._roadside.agents]
         )
+        if self._visitors is not None:
+            self.agents = [*self.agents, *self._visitors.shown]
         # A slice takes agents in their usual order without a copy.
         in_order = bool((rows == np.arange(rows.size)).all())
         self._listed = slice(rows.size) if in_order else rows
@@ -273,18 +317,21 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """Advance an empty world until an agent enters, or until the horizon."""
         arrays = self.worlds.arrays
         while not arrays.episode_over[0] and self._steps < self._max_cycles:
-            self._session.step(self._session.decoder.idle())
-            self._steps += 1
+            self._advance(self._session.decoder.idle())
             if arrays.mask.any():
                 self._list(np.flatnonzero(arrays.mask[0]))
                 break
 
     def _observations(self) -> dict[str, Observation]:
         found = self._dicts.observations(self.worlds.arrays, self._cars, self._listed)
+        if self._visitors is not None:
+            found |= self._visitors.observations(self._visitors.shown)
         return found if self._roadside is None else {**found, **self._roadside.observations()}
 
     def _infos(self) -> dict[str, dict[str, Any]]:
         found = self._dicts.infos(self.worlds.arrays, self._cars, self._listed)
+        if self._visitors is not None:
+            found |= self._visitors.infos(self._visitors.shown)
         return found if self._roadside is None else {**found, **self._roadside.infos()}
 
     def declare_event(self, agent: str, cause: str) -> None:
@@ -298,7 +345,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             ActionError: there is no such agent, or it has left.
             ConfigError: there is no such cause, or this environment sends no messages.
         """
-        if agent not in self.agents or self._is_roadside(agent):
+        if agent not in self._cars:
             raise ActionError(
                 f"declare_event({agent!r}, …): not in the episode; give an id of a vehicle from "
                 "env.agents"
@@ -317,6 +364,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
             raise self._no_agent(agent)
         if self._is_roadside(agent):
             raise ActionError(f"frames({agent!r}): signals have no sensors; give a vehicle's id")
+        if self._visitors is not None and agent in self._visitors:
+            return self._visitors.frames_of(self._visitors.ids.index(agent))
         k = self.possible_agents.index(agent)
         return {name: sensor.of(0, k) for name, sensor in self.worlds.arrays.frames.items()}
 
@@ -328,6 +377,8 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """
         if self._roadside is not None and agent in self._roadside:
             self._roadside.check(agent, action)
+        elif self._visitors is not None and agent in self._visitors:
+            self._visitors.check(agent, action)
         else:
             self._session.decoder.check(agent, action)
 

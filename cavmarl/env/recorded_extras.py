@@ -1,8 +1,8 @@
-"""Optional tables of a recording: observations, sensor samples, messages."""
+"""Optional tables of a recording: observations, sensor samples, messages, commands."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import partial
 from typing import Any
 
@@ -13,6 +13,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_frame import WorldFrame
+from cavmarl.env.recorded_inputs import INPUTS, StepInputs, inputs_dtype, inputs_row
 from cavmarl.ownership.messages import COORDINATOR, Ack, Message, Nack, Record, Step
 from cavmarl.ownership.trace import LOG, TraceEntry, describe
 from cavmarl.parallel.worlds.step_arrays import StepArrays
@@ -60,7 +61,7 @@ def check_extras(config: EnvConfig, include: Iterable[str], is_here: bool) -> No
         ),
     }
     for name in include:
-        if reasons[name]:
+        if reasons.get(name):
             raise ConfigError(f"record: include {name!r}: {reasons[name]}")
 
 
@@ -69,21 +70,30 @@ class RecordedExtras:
 
     Args:
         config: configuration of the worlds.
-        include: the wanted ones of `observations`, `samples` and `messages`.
+        include: the wanted ones of `observations`, `samples`, `messages` and `commands`.
         arrays: results of the worlds' steps.
         simulation: the worlds; their messages are logged from now on.
+        state_hash: returns the hash of a world; None: `commands` are not available.
 
     Attributes:
         dtypes: dtypes of the tables, by table name.
         features: sensor and name of each number of the newest frame of an observation.
+        inputs: of the last reset or step.
     """
 
     def __init__(
-        self, config: EnvConfig, include: Iterable[str], arrays: StepArrays, simulation: Simulation
+        self,
+        config: EnvConfig,
+        include: Iterable[str],
+        arrays: StepArrays,
+        simulation: Simulation,
+        state_hash: Callable[[int], str] | None = None,
     ) -> None:
         self._arrays = arrays
         self._ticks = np.full(len(arrays.mask), -1, dtype=np.int64)  # of the last frames
         self._step_ticks = config.clock.ticks_per_step
+        self._state_hash = state_hash
+        self.inputs = StepInputs()
         wanted = frozenset(include)
         self.dtypes: dict[str, np.dtype[Any]] = {}
         self.features: list[tuple[str, str]] = []
@@ -109,6 +119,13 @@ class RecordedExtras:
                 data = ("data", frames.data.dtype.str, frames.data.shape[3:])
                 own = np.dtype([*_WHOSE, ("stamp_s", "<f8"), ("lost", "|b1"), data])
                 self.dtypes[SAMPLES + name] = own
+        if INPUTS in wanted:
+            if state_hash is None or len(arrays.mask) > 1:
+                raise ConfigError(
+                    f"record: include {INPUTS!r}: only the commands of one world of `parallel_env` "
+                    "can be recorded; leave it out"
+                )
+            self.dtypes[INPUTS] = inputs_dtype(config, arrays)
         self._logs: dict[str, _SentLog] = {}
         if "messages" in wanted:
             self._listen(config, simulation)
@@ -139,6 +156,8 @@ class RecordedExtras:
         for name, dtype in self.dtypes.items():
             if name == "observations":
                 found[name] = self._observed(dtype, frame, actions)
+            elif name == INPUTS and self._state_hash is not None:
+                found[name] = inputs_row(dtype, self.inputs, tick, self._state_hash(world))
             elif name.startswith(SAMPLES):
                 found[name] = self._samples(name, dtype, world, tick, agents)
         self._ticks[world] = tick

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeAlias
@@ -19,6 +19,7 @@ from cavmarl.engine.world_description import describe_world
 from cavmarl.engine.world_frame import WorldFrame
 from cavmarl.env.drawn_worlds import why_not_copied
 from cavmarl.env.recorded_extras import RecordedExtras, check_extras
+from cavmarl.env.recorded_inputs import StepInputs
 from cavmarl.parallel.placement.backend_name import BackendName
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
@@ -57,6 +58,8 @@ class WorldRecorder:
         record: the new folder, or options with the optional tables.
         worlds: the worlds that are stepped.
         simulation: the worlds or a local copy, for the reach of their zones.
+        state_hash: returns the hash of a world, for the table `commands`; None: it is not
+            available.
         more: additional entries of the manifest.
 
     Raises:
@@ -70,12 +73,15 @@ class WorldRecorder:
         record: Record,
         worlds: SteppedWorlds,
         simulation: Simulation,
+        state_hash: Callable[[int], str] | None,
         **more: Any,
     ) -> None:
         options, world = RecordOptions.of(record), worlds.world
         config = world.config
         check_extras(config, options.include, is_here=isinstance(worlds, LocalWorlds))
-        self._extras = RecordedExtras(config, options.include, worlds.arrays, simulation)
+        self._extras = RecordedExtras(
+            config, options.include, worlds.arrays, simulation, state_hash
+        )
         self._writer = RecordingWriter(
             options.path,
             environment=f"{config.name}-v{config.version}",
@@ -100,6 +106,10 @@ class WorldRecorder:
     def path(self) -> Path:
         """The folder of the recording."""
         return self._writer.path
+
+    def note(self, inputs: StepInputs) -> None:
+        """Note the inputs of a reset or a step, before its frames are added."""
+        self._extras.inputs = inputs
 
     def room(self, count: int) -> NDArray[np.void]:
         """Return memory, SEEN (count,), for a frame that is only passed to `add`."""

@@ -19,12 +19,13 @@ from cavmarl.engine.waiting_cycles import find_deadlocks
 from cavmarl.engine.world_frame import WorldFrame, frame_of
 from cavmarl.env.actions import ActionDecoder
 from cavmarl.env.declared_events import DeclaredEvents
-from cavmarl.env.drawn_worlds import WorldCopy, vehicles_that_ended
+from cavmarl.env.drawn_worlds import WorldCopy, unguarded, vehicles_that_ended
 from cavmarl.env.external_commands import ExternalCommands
 from cavmarl.env.insertions import Insertions
 from cavmarl.env.lane_changes import LaneChanges
 from cavmarl.env.limit_agents import LimitAgents
 from cavmarl.env.overridden_signals import SignalOverrides
+from cavmarl.env.recorded_inputs import StepInputs
 from cavmarl.env.recorded_worlds import Record, WorldRecorder
 from cavmarl.env.signal_agents import SignalAgents
 from cavmarl.limits.limit_controllers import make_limit_controller
@@ -114,6 +115,8 @@ class StepSession:
         self.worlds.arrays.chosen[:] = chosen
         self.worlds.reset(seed, first_world)
         self.forget(chosen)
+        if self._recorder is not None:
+            self._recorder.note(StepInputs(seed=seed))
         self.is_ready = True
         self._notify(chosen)
 
@@ -130,6 +133,8 @@ class StepSession:
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
+        if self._recorder is not None:
+            self._recorder.note(StepInputs(commands=commands))
         for part in waiting:
             part.clear()
         self.simulated_s += time.perf_counter() - began
@@ -227,7 +232,7 @@ class StepSession:
                 "first"
             )
         standing = self._copy.standing(self.worlds)
-        self._recorder = WorldRecorder(record, self.worlds, standing)
+        self._recorder = WorldRecorder(record, self.worlds, standing, self.worlds.state_hash)
 
     def close(self) -> None:
         """End the recording, the window and the worlds; a second call does nothing more."""
@@ -248,7 +253,7 @@ class StepSession:
         room: Callable[[int], NDArray[np.void]] | None = None,
     ) -> list[WorldFrame]:
         key = kept_elsewhere(self.config)
-        if key and not isinstance(self.worlds, LocalWorlds):
+        if key and not isinstance(unguarded(self.worlds), LocalWorlds):
             raise ConfigError(
                 f"{key}: frames of such worlds are only available in the caller's process; use "
                 "backend='local'"

@@ -48,7 +48,7 @@ class RunWatch:
         about = {"policy": policy, "run": run, "seed": seed}
         self._writer = None
         if record is not None:
-            self._writer = WorldRecorder(record, vec.worlds, standing, **about)
+            self._writer = WorldRecorder(record, vec.worlds, standing, None, **about)
         observations = vec.worlds.arrays.observations
         self._clips = FailureClips(failures, vec.config, about, observations) if failures else None
 

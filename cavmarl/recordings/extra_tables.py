@@ -19,7 +19,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.recordings.part_files import MOST_BYTES, damaged
 from cavmarl.recordings.recording_format import arrow
 
-KINDS = ("observations", "samples", "messages")
+KINDS = ("observations", "samples", "messages", "commands")
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,8 @@ class RecordOptions:
 
     Attributes:
         path: a new folder.
-        include: additional tables to record, of `observations`, `samples` and `messages`.
+        include: additional tables to record, of `observations`, `samples`, `messages` and
+            `commands`.
     """
 
     path: str | Path

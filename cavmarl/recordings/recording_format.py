@@ -54,7 +54,7 @@ MOST_LETTERS = 1000  # limit of a text in the head
 MOST_SHOWN = 100
 MOST_ROW_BYTES = 1 << 28  # of a table of samples
 SHORTEST_S, LONGEST_S = 1e-4, 1e3  # of a tick or step
-_EXTRA = re.compile(r"observations|v2x|handovers|samples-[^/\\\x00]{1,200}")
+_EXTRA = re.compile(r"observations|commands|v2x|handovers|samples-[^/\\\x00]{1,200}")
 _WHOSE = ("tick", "agent", "vehicle")
 _NEEDED = {
     "observations": (*_WHOSE, "reward", "terms", "values"),

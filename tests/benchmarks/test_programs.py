@@ -13,6 +13,7 @@ import pytest
 
 from benchmarks import (
     balance,
+    client_actors,
     inference,
     libraries,
     moving,
@@ -73,6 +74,23 @@ def test_driver_networks_are_compared_with_torch() -> None:
         assert row["ratio"] > 0.0
         assert row["difference"] < 2e-6
     assert inference.measure(rows=20, inputs=9, hidden=16, repeats=1).holds
+
+
+def test_actors_of_clients_are_there_after_one_step_and_change_no_other_vehicle(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "actors.json"
+    words = [
+        "ring", "--agents", "1", "--background", "4", "--visits", "2", "--actors", "2",
+        "--rate-hz", "60", "--steps", "4", "--json", str(path),
+    ]  # fmt: skip
+    with pytest.raises(SystemExit) as ended:
+        run(client_actors.measure, words)
+    assert not ended.value.code
+    found = json.loads(path.read_text())
+    row = next(row for row in found["rows"] if row["name"] == "with clients")
+    assert (row["most_steps"], row["poses"], row["late"], row["lost"]) == (1, 2 * 2 * 4 * 3, 0, 0)
+    assert found["others_equal"]
 
 
 def test_a_violated_bound_gives_exit_code_1() -> None:

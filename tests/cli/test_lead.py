@@ -129,3 +129,42 @@ def test_a_port_needs_a_file_with_a_secret(
     with pytest.raises(SystemExit):
         main([*words, "--secret-file", str(file)])
     assert "is empty" in capsys.readouterr().err
+
+
+def exit_code(words: list[str]) -> int:
+    with pytest.raises(SystemExit) as ended:
+        main(words)
+    return int(ended.value.code or 0)
+
+
+@pytest.mark.integration
+def test_a_trace_is_played_with_a_deadline_and_recorded(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    trace = tmp_path / "van.csv"
+    rows = [f"{0.02 * k:.2f},{-60 + 0.2 * k:.3f},-80,0" for k in range(50) if k not in (20, 21)]
+    trace.write_text("\n".join(["time_s,x,y,heading", *rows]), encoding="utf-8")
+    settings = ["--set", "population.external=2", "--set", "clock.ctrl_dt_s=0.05"]
+    world = ["ring", *settings, "--agents", "2", "--background", "2"]
+    report = tmp_path / "report.json"
+    code = exit_code([
+        "lead", *world, "--at", str(tmp_path / "s"), "--followers", "0", "--steps", "30",
+        "--trace", str(trace), "--pace", "20", "--deadline", "5", "--json", str(report),
+        "--record", str(tmp_path / "run"), "--record-also", "commands",
+    ])  # fmt: skip
+    assert code == 0
+    shown = capsys.readouterr().out
+    assert "trace: van" in shown
+    assert "deadline of 5000 ms missed in 0 of 30 steps" in shown
+    found = json.loads(report.read_text())
+    (actor,) = found["actors"]
+    assert (actor["received"], actor["late"], actor["lost"]) == (48, 0, 2)
+    assert (found["deadline"]["missed"], found["deadline"]["steps"]) == (0, 30)
+    words = ["verify", "recording", *world, "--recording", str(tmp_path / "run")]
+    assert exit_code(words) == 0
+    assert f"equal: 30 steps in 1 episodes; state {found['state_hash']}" in capsys.readouterr().out
+
+
+def test_a_deadline_needs_a_pace(capsys: pytest.CaptureFixture[str]) -> None:
+    assert exit_code(["lead", "ring", "--deadline", "0.1"]) == 2
+    assert "--deadline 0.1: goes with --pace" in capsys.readouterr().err

@@ -367,3 +367,88 @@ def test_the_socket_of_a_dead_world_is_taken_over(address: Path) -> None:
     dead.bind(str(address))
     dead.close()
     FollowedWorld(make_env(), address).close()
+
+
+def lead_steps(address: Path, steps: int, ticks: list[int]) -> None:
+    """Lead a world for some steps, and leave; note the ticks of the world."""
+    with Follower(address, ["car_1"], "bridge", leads=True) as follower:
+        for sight in follower:
+            if len(ticks) == steps:
+                follower.leave()
+                return
+            follower.answer(steer(sight))
+            ticked = follower.tick()
+            assert ticked.done
+            ticks.append(ticked.tick)
+
+
+def test_a_follower_that_leads_releases_each_step(address: Path, start: Start) -> None:
+    ticks: list[int] = []
+    with FollowedWorld(make_env(), address) as world:
+        start(lambda: lead_steps(address, 5, ticks))
+        world.wait_for(1, 10.0)
+        assert world.leader is not None
+        world.reset(seed=1)
+        assert world.manifest()["followers"][0]["leads"]
+        found = hashes(world, 5)
+        assert found == reference(5, {"car_1": None})
+        assert ticks == [1, 2, 3, 4, 5]
+        assert (world.master.own_ticks, world.master.drifts) == (0, 0)
+        world.step()  # the bridge has left, and the world is its own master again
+        assert world.leader is None
+
+
+def test_the_world_does_not_step_without_the_tick_of_its_leader(address: Path) -> None:
+    env = make_env()
+    with FollowedWorld(env, address, timeout_s=0.3) as world:
+        world.reset(seed=1)
+        before = env.state_hash()
+        found: list[Follower] = []
+        caller = threading.Thread(
+            target=lambda: found.append(Follower(address, [], "bridge", waits=False, leads=True))
+        )
+        caller.start()
+        world.wait_for(1, 10.0)
+        caller.join()
+        with (
+            found[0],
+            pytest.raises(FollowerLostError, match=r"'bridge' has not answered within 0\.3"),
+        ):
+            world.step()
+        assert env.state_hash() == before
+        assert hashes(world, 2) == reference(2, {})  # without a leader
+
+
+def test_a_world_has_one_leader(address: Path, start: Start) -> None:
+    refused: list[str] = []
+
+    def second() -> None:
+        try:
+            Follower(address, [], "second", leads=True)
+        except FollowerError as error:
+            refused.append(str(error))
+
+    ticks: list[int] = []
+    with FollowedWorld(make_env(), address) as world:
+        start(lambda: lead_steps(address, 3, ticks))
+        world.wait_for(1, 10.0)
+        world.reset(seed=1)
+        thread = start(second)
+        while thread.is_alive():
+            world.admit(0.1)
+        hashes(world, 3)
+    assert "'bridge' leads already; a world has one time master" in refused[0]
+    assert ticks == [1, 2, 3]
+
+
+def test_a_leader_ticks_once_for_each_step(address: Path) -> None:
+    with FollowedWorld(make_env(), address) as world:
+        world.reset(seed=1)
+        line = call(address, 5.0)
+        line.say(Say.HELLO, Hello("hasty", waits=False, leads=True))
+        world.wait_for(1, 10.0)
+        line.say(Say.TICK)
+        line.say(Say.TICK)
+        with pytest.raises(FollowerError, match="ticks twice"):
+            world.step()
+        line.close()

@@ -8,7 +8,7 @@ from typing import Any
 import typer
 
 from cavmarl.cli.output import CliGroup, add_command
-from cavmarl.cli.verify import determinism, nodes, workers, zones
+from cavmarl.cli.verify import determinism, nodes, recordings, workers, zones
 from cavmarl.core.errors import ConfigError
 
 __all__ = ["app"]
@@ -45,3 +45,8 @@ _add(
     "cavmarl verify workers merge --kill 10 --backend processes:2",
 )
 _add("determinism", determinism.verify_determinism, "cavmarl verify determinism town --steps 300")
+_add(
+    "recording",
+    recordings.verify_recording,
+    "cavmarl verify recording town --recording run --set population.external=4",
+)

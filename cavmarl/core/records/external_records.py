@@ -10,6 +10,10 @@ EXTERNAL_POSED = 1.0  # at the given pose at the end of the step
 EXTERNAL_DRIVEN = 2.0  # kinematic bicycle, driven by throttle and steering
 EXTERNAL_REMOVED = 3.0
 
+# Ids of external vehicles begin here, so that they change no id of another vehicle. The lowest 31
+# bits, which are the ids of ROS markers, differ from those of the other vehicles, too.
+FIRST_EXTERNAL_ID = (1 << 40) + (1 << 30)
+
 # All fields are float64, so that commands are plain arrays (W, E, K) between processes. A vehicle
 # enters with the first command of its slot, at the pose of that command and with its body.
 EXTERNAL = np.dtype(
@@ -29,6 +33,7 @@ EXTERNAL = np.dtype(
             "length",  # m
             "width",
             "height",
+            "observes",  # 1: it carries the sensors of `rig`, and is an agent; 0: it does not
         )
     ]
 )

@@ -425,8 +425,8 @@ class ActorTable:
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:
-        """Write the speed limit and the traffic light of each vehicle's lane."""
-        states, lanes = self.vehicle_states, world.map.network.lanes
+        """Write the present speed limit and the traffic light of each vehicle's lane."""
+        states, lanes = self.vehicle_states, world.present_lanes
         lane = rows["lane"]
         states["speed_limit"] = 3.6 * lanes["speed_mps"][lane]
         approach = world.map.approach_of_lane[lane]

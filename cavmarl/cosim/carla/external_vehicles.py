@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from cavmarl.core.compiled import specialized
-from cavmarl.core.errors import ActionError, CavmarlError
+from cavmarl.core.errors import ActionError, CavmarlError, OccupiedPlaceError
 from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.cosim.carla.call_arguments import CallRefused
 from cavmarl.cosim.carla.carla_blueprints import WALKER
@@ -105,10 +105,8 @@ class ExternalVehicles:
                 size_m=(length, width, height),
                 speed=body.speed_mps,
             )
-        except ActionError as error:
-            if "occupied" in str(error):
-                raise CallRefused(_OCCUPIED) from error
-            raise CallRefused(f"{body.type_id}: {error}") from error
+        except OccupiedPlaceError as error:
+            raise CallRefused(_OCCUPIED) from error
         except CavmarlError as error:
             raise CallRefused(f"{body.type_id}: {error}") from error
         lift_m = 0.5 * height if vtype == WALKER else 0.0

@@ -124,6 +124,12 @@ class HostedWorld:
             return self.map.states_in(self.replay.signals)
         return self.lights.states()
 
+    @property
+    def present_lanes(self) -> NDArray[np.void]:
+        """LANE (L,) as they are now, with limits that roadside units and callers have set."""
+        lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[0]
+        return lanes
+
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
 

@@ -12,20 +12,34 @@ Answers may arrive in any order without effect on the result.
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any, Literal, Self
 
-from cavmarl.core.errors import ConfigError, EpisodeError, FollowerError, FollowerLostError
-from cavmarl.cosim.followers.follower_barrier import BadControls, Barrier, FollowerSeat
+from cavmarl.core.errors import (
+    CavmarlError,
+    ConfigError,
+    EpisodeError,
+    FollowerError,
+    FollowerLostError,
+)
+from cavmarl.cosim.actors.client_actors import ActorOrder, ClientActor, ClientActors
+from cavmarl.cosim.actors.pose_traces import PoseTrace, TracePlayer
+from cavmarl.cosim.followers.follower_barrier import (
+    BadControls,
+    Barrier,
+    BarrierOutcome,
+    FollowerSeat,
+)
 from cavmarl.cosim.followers.follower_connection import (
     Address,
     FollowerConnection,
     Reception,
     refuse,
 )
-from cavmarl.cosim.followers.follower_messages import Hello, Say
+from cavmarl.cosim.followers.follower_messages import ActorRequest, Hello, Say
 from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, welcome_to
 from cavmarl.cosim.time_master import OwnTicks, Pacer, TimeMaster
 from cavmarl.engine.step_trace import QUEUE, STACK, StepTrace
@@ -50,10 +64,13 @@ class FollowedWorld:
         pacer: pace by the wall clock; None: as fast as possible.
         trace: records the phases of each step.
         truth: whether followers may receive the true state of all vehicles.
+        traces: recorded poses of bodies that the world plays in each episode.
 
     Attributes:
         master: the time master.
         address: path or port to which followers connect.
+        actors: the actors that followers and traces have brought into the world.
+        player: plays the traces.
 
     Raises:
         ConfigError: the address cannot be opened, a port has no secret, signals have agents, or a
@@ -74,6 +91,7 @@ class FollowedWorld:
         pacer: Pacer | None = None,
         trace: StepTrace | None = None,
         truth: bool = False,
+        traces: Sequence[PoseTrace] = (),
     ) -> None:
         if not 0.0 < timeout_s < float("inf"):
             raise ConfigError(f"timeout_s = {timeout_s}: must be a number above 0")
@@ -90,11 +108,14 @@ class FollowedWorld:
             self.close_reception()
             raise
         self._timeout_s, self._truth = timeout_s, truth
-        self._barrier = Barrier(env, timeout_s, bad_controls)
+        self.actors = ClientActors(env)
+        self.player = TracePlayer(self.actors, traces, env.step_s)
+        self._barrier = Barrier(env, self.actors, timeout_s, bad_controls)
         self._trace = trace
         self._seats: list[FollowerSeat] = []
         self._queued: dict[str, Any] = {}
         self._frame = self._episode = -1
+        self._moment = SnapshotTime(-1, -1, int(self.master.world_ticks[0]), False)
         self._is_closed = False
 
     def __enter__(self) -> Self:
@@ -106,6 +127,11 @@ class FollowedWorld:
     @property
     def seats(self) -> tuple[FollowerSeat, ...]:
         return tuple(self._seats)
+
+    @property
+    def leader(self) -> FollowerSeat | None:
+        """The follower whose ticks release the steps of the world; None: there is none."""
+        return next((seat for seat in self._seats if seat.leads), None)
 
     @property
     def is_over(self) -> bool:
@@ -134,9 +160,11 @@ class FollowedWorld:
         Raises FollowerError: see `step`.
         """
         self.admit(0.0)
+        self.player.begin_episode()
         self.master.reset(seed)
         self._episode += 1
         self._queued.clear()
+        self._refuse(self.actors.begin_episode())
         self._next_frame()
         self._exchange(self._seats)
 
@@ -149,12 +177,18 @@ class FollowedWorld:
                 world has advanced by one step, and the next call continues from there.
             FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
                 the consequences are those of a FollowerLostError.
+            ActionError, CapacityError, ConfigError: the world refuses a body of a trace.
             ClockError: another caller has advanced the world.
         """
         if self.is_over:
             raise EpisodeError("the episode is over; call FollowedWorld.reset()")
         self.admit(0.0)
         self._exchange([seat for seat in self._seats if seat.frame < self._frame])
+        self._hear_others()
+        self._await_leader()
+        now_s = self._moment.tick * self.env.config.clock.sim_dt_s
+        self.player.act(now_s)
+        self._refuse(self.actors.act(now_s))
         agents = self.env.agents
         actions = {agent: self._queued[agent] for agent in agents if agent in self._queued}
         if len(actions) < len(agents):
@@ -162,6 +196,7 @@ class FollowedWorld:
         _, rewards, *_ = self.master.step(actions)
         self._queued.clear()
         self._next_frame()
+        self._confirm_tick()
         self._exchange(self._seats)
         return dict(rewards)
 
@@ -174,7 +209,13 @@ class FollowedWorld:
             "control_latency_steps": 1,  # queued for the next cycle, as in Algorithm 1
             "control_latency_ticks": clock.control_latency_ticks,
             "followers": [
-                {"name": seat.clock.name, "agents": self._names(seat.agents)}
+                {
+                    "name": seat.clock.name,
+                    "agents": self._names(seat.agents),
+                    "actors": [asdict(actor.order) for actor in seat.actors],
+                    "waits": seat.waits,
+                    "leads": seat.leads,
+                }
                 for seat in self._seats
             ],
         }
@@ -211,10 +252,31 @@ class FollowedWorld:
                 f"'{hello.name[:80]}' requests the true state of all vehicles, which this world "
                 "does not give; start it with truth=True (cavmarl lead --truth)"
             )
+        if agents and not hello.waits:
+            raise FollowerError(
+                f"'{hello.name[:80]}' drives agents, so the world has to wait for its answers; "
+                "leave waits = True"
+            )
+        if hello.leads and self.leader is not None:
+            raise FollowerError(
+                f"'{hello.name[:80]}' asks to lead, but '{self.leader.clock.name}' leads already; "
+                "a world has one time master"
+            )
         welcome = welcome_to(self.env, self._names(agents), self.master.tick)
-        line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
+        try:
+            actors = self.actors.join(hello.name, map(order_of, hello.actors))
+        except CavmarlError as error:
+            raise FollowerError(f"'{hello.name[:80]}': {error}") from error
+        try:
+            line.say(Say.WELCOME, welcome, within_s=self._timeout_s)
+        except FollowerError:
+            self.actors.part(actors)
+            raise
         clock = self.master.follow(hello.name)
-        self._seats.append(FollowerSeat(line, clock, agents, truth=hello.truth))
+        seat = FollowerSeat(
+            line, clock, agents, hello.truth, tuple(actors), hello.waits, hello.leads
+        )
+        self._seats.append(seat)
         self._seats.sort(key=lambda each: each.rank)
 
     def _indices(self, vehicles: Sequence[str]) -> tuple[int, ...]:
@@ -222,13 +284,15 @@ class FollowedWorld:
 
         Raises FollowerError: an agent does not exist, or another follower drives it.
         """
-        known = {agent: k for k, agent in enumerate(self.env.possible_agents)}
+        ids = self.env.possible_agents[: self.env.config.population.num_ids]
+        known = {agent: k for k, agent in enumerate(ids)}
         taken = {k: seat.clock.name for seat in self._seats for k in seat.agents}
         for agent in vehicles:
             if agent not in known:
                 raise FollowerError(
-                    f"no agent '{agent[:80]}'; choose among {self.env.possible_agents[0]} to "
-                    f"{self.env.possible_agents[-1]}"
+                    f"no agent '{agent[:80]}'; choose among {ids[0]} to {ids[-1]}"
+                    if ids
+                    else f"no agent '{agent[:80]}': this world has none; bring an actor"
                 )
             if known[agent] in taken:
                 raise FollowerError(
@@ -244,6 +308,7 @@ class FollowedWorld:
     def _drop(self, seat: FollowerSeat) -> None:
         seat.line.close()
         self._seats.remove(seat)
+        self.actors.part(seat.actors)
         if seat.clock in self.master.followers:
             seat.clock.leave()
 
@@ -264,6 +329,41 @@ class FollowedWorld:
         found = self._barrier.pass_through(list(seats), self._moment)
         self._note(QUEUE)
         self._queued |= found.actions
+        self._settle(found)
+
+    def _hear_others(self) -> None:
+        """Receive what followers have sent that the world does not wait for.
+
+        Raises FollowerError: the messages of one of them are invalid.
+        """
+        others = [seat for seat in self._seats if not seat.waits]
+        if others:
+            self._settle(self._barrier.hear_others(others, self._moment))
+
+    def _await_leader(self) -> None:
+        """Wait for the tick of the follower that leads.
+
+        Raises FollowerError: it does not tick in time, or its messages are invalid.
+        """
+        if (leader := self.leader) is not None:
+            self._settle(self._barrier.await_tick(leader, self._moment))
+
+    def _confirm_tick(self) -> None:
+        """Tell the follower that leads that its step has been made.
+
+        Raises FollowerLostError: it has ended.
+        """
+        if (leader := self.leader) is not None:
+            try:
+                self._barrier.confirm_tick(leader)
+            except FollowerLostError as error:
+                self._settle(BarrierOutcome(failed={leader: error}))
+
+    def _settle(self, found: BarrierOutcome) -> None:
+        """Drop the followers that have left or failed.
+
+        Raises FollowerError: that of the first follower that has failed, in their order.
+        """
         for seat in found.left:
             self._drop(seat)
         failed = sorted(found.failed, key=lambda seat: seat.rank)
@@ -273,6 +373,45 @@ class FollowedWorld:
         if failed:
             raise found.failed[failed[0]]
 
+    def _refuse(self, refused: Mapping[ClientActor, CavmarlError]) -> None:
+        """Drop the followers of refused actors, and tell them the reasons.
+
+        Raises CavmarlError: the reason for which an actor of a trace is refused.
+        """
+        owners = {actor: seat for seat in self._seats for actor in seat.actors}
+        for actor, error in refused.items():
+            if actor not in owners:
+                raise error
+            if owners[actor] in self._seats:
+                refuse(owners[actor].line, f"actor '{actor.name}': {error}")
+                self._drop(owners[actor])
+
     def _note(self, phase: str) -> None:
         if self._trace is not None:
             self._trace.note(phase)
+        if self.master.watch is not None:
+            self.master.watch.note(phase)
+
+
+def order_of(request: ActorRequest) -> ActorOrder:
+    """Return what a follower asks for. Raises FollowerError: the size has no three numbers."""
+    size = request.size_m
+    if size and len(size) != 3:
+        raise FollowerError(
+            f"actor '{request.name[:80]}': size_m has {len(size)} numbers: must be length, width "
+            "and height, or empty"
+        )
+    return ActorOrder(
+        name=request.name,
+        vtype=request.type,
+        x=request.x,
+        y=request.y,
+        heading=request.heading,
+        z=request.z,
+        size_m=(size[0], size[1], size[2]) if size else None,
+        speed=request.speed,
+        moved_by=request.moved_by,
+        rate_hz=request.rate_hz,
+        extrapolation_s=request.extrapolation_s,
+        rig=tuple(request.rig),
+    )

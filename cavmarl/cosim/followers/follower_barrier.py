@@ -11,12 +11,24 @@ from typing import Any, Literal
 import numpy as np
 
 from cavmarl.core.errors import ActionError, ClockError, FollowerError, FollowerLostError
+from cavmarl.cosim.actors.client_actors import ClientActor, ClientActors
+from cavmarl.cosim.actors.pose_track import PoseSample
 from cavmarl.cosim.followers.follower_connection import FollowerConnection
-from cavmarl.cosim.followers.follower_messages import Control, Say, Ticked, read_payload
-from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, take_snapshot
+from cavmarl.cosim.followers.follower_messages import (
+    MAX_POSES,
+    ActorPoses,
+    Control,
+    PoseView,
+    Say,
+    Ticked,
+    read_payload,
+)
+from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, see_actors, take_snapshot
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
+READS_S = 0.5  # for reading a snapshot, if the world does not wait for the follower
+MOST_MESSAGES = 1000  # read from a follower before a step, if the world does not wait for it
 BadControls = Literal["error", "hold"]
 
 
@@ -28,6 +40,10 @@ class FollowerSeat:
     clock: TimeFollower  # its view of the master's clock
     agents: tuple[int, ...]  # indices of the agents that it drives, ascending
     truth: bool = False  # whether it receives the true state of all vehicles
+    actors: tuple[ClientActor, ...] = ()  # that it has brought into the world
+    waits: bool = True  # whether the world waits for its answers
+    leads: bool = False  # whether its ticks release the steps of the world
+    has_ticked: bool = False  # whether it has released the next step
     frame: int = -1  # of the last snapshot sent to it; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
@@ -35,6 +51,7 @@ class FollowerSeat:
     bad: int = 0  # number of invalid controls of a vehicle
     wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
     slowest: int = 0  # number of steps in which it was the last to answer
+    unseen: int = 0  # number of snapshots not sent, because the follower has not read earlier ones
 
     @property
     def rank(self) -> tuple[float, str]:
@@ -59,8 +76,11 @@ class Barrier:
     `error`: a follower that sends invalid controls fails; `hold`: the vehicle's last ones are used.
     """
 
-    def __init__(self, env: CavEnv, timeout_s: float, bad_controls: BadControls) -> None:
+    def __init__(
+        self, env: CavEnv, actors: ClientActors, timeout_s: float, bad_controls: BadControls
+    ) -> None:
         self._env = env
+        self._actors = actors
         self._timeout_s = timeout_s
         self._bad_controls = bad_controls
 
@@ -71,16 +91,25 @@ class Barrier:
         """
         found = BarrierOutcome()
         asked: dict[FollowerSeat, list[str]] = {}
+        rows = self._actors.rows() if any(seat.actors for seat in seats) else {}
         for seat in seats:
-            snapshot, arrays = take_snapshot(self._env, seat.agents, moment, truth=seat.truth)
             seat.frame = moment.frame
-            asked[seat] = list(snapshot.vehicles)
+            if not seat.waits and not seat.line.can_send():
+                seat.unseen += 1
+                continue
+            actors = see_actors(self._env, seat.actors, rows)
+            snapshot, arrays = take_snapshot(
+                self._env, seat.agents, moment, truth=seat.truth, actors=actors
+            )
+            if seat.waits:
+                asked[seat] = list(snapshot.vehicles)
             try:
-                seat.line.say(Say.SNAPSHOT, snapshot, arrays, self._timeout_s)
+                within_s = self._timeout_s if seat.waits else min(self._timeout_s, READS_S)
+                seat.line.say(Say.SNAPSHOT, snapshot, arrays, within_s)
             except FollowerLostError as error:
                 if error.is_late:  # else the messages read below may contain its goodbye
                     found.failed[seat] = error
-                    del asked[seat]
+                    asked.pop(seat, None)
         if moment.is_over or not asked:
             return found
         answers = self._collect(asked, moment, found)
@@ -92,6 +121,58 @@ class Barrier:
                 except FollowerError as error:
                     found.failed[seat] = error
         return found
+
+    def hear_others(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
+        """Receive what followers that the world does not wait for have sent.
+
+        A follower that has closed its connection has left. `moment`: time of the last snapshot.
+        """
+        found = BarrierOutcome()
+        for seat in seats:
+            answers: dict[FollowerSeat, Mapping[str, Any]] = {}
+            try:
+                for _ in range(MOST_MESSAGES):
+                    if not seat.line.has_come():
+                        break
+                    if self._receive(seat, moment, answers, found, self._timeout_s):
+                        if seat in found.left:
+                            break
+                        self._checked(seat, answers.pop(seat), [])
+                        seat.answers += 1
+            except FollowerLostError:
+                found.left.append(seat)
+            except FollowerError as error:
+                found.failed[seat] = error
+        return found
+
+    def await_tick(self, seat: FollowerSeat, moment: SnapshotTime) -> BarrierOutcome:
+        """Wait until the follower that leads releases the next step.
+
+        `moment`: time of the last snapshot.
+        """
+        found = BarrierOutcome()
+        answers: dict[FollowerSeat, Mapping[str, Any]] = {}
+        began = time.monotonic()
+        try:
+            while not seat.has_ticked and seat not in found.left:
+                left_s = began + self._timeout_s - time.monotonic()
+                if left_s <= 0.0:
+                    raise seat.line.too_late("answered with a tick", self._timeout_s)
+                if self._receive(seat, moment, answers, found, left_s) and seat in answers:
+                    self._checked(seat, answers.pop(seat), [])
+        except FollowerError as error:
+            found.failed[seat] = error
+        seat.wait_wall_s += time.monotonic() - began
+        return found
+
+    def confirm_tick(self, seat: FollowerSeat) -> None:
+        """Tell the follower that leads that its step has been made.
+
+        Raises FollowerLostError: it does not read, or has ended.
+        """
+        seat.has_ticked = False
+        tick = int(seat.clock.master.world_ticks[0])
+        seat.line.say(Say.TICKED, Ticked(True, "", tick), within_s=self._timeout_s)
 
     def _collect(
         self, asked: Mapping[FollowerSeat, list[str]], moment: SnapshotTime, found: BarrierOutcome
@@ -136,12 +217,20 @@ class Barrier:
         frame = seat.line.hear(within_s)
         seat.line.skip(frame)
         match frame.kind:
+            case Say.TICK if seat.leads:
+                if seat.has_ticked:
+                    raise FollowerError(f"{seat.line.name} ticks twice; wait for TICKED first")
+                seat.has_ticked = True
+                return False
             case Say.TICK:
                 self._answer_tick(seat, within_s)
                 return False
             case Say.GOODBYE:
                 found.left.append(seat)
                 return True
+            case Say.POSES:
+                self._take_poses(seat, moment, read_payload(ActorPoses, frame.payload).poses)
+                return False
             case Say.CONTROL:
                 control = read_payload(Control, frame.payload)
             case kind:
@@ -152,11 +241,41 @@ class Barrier:
             raise FollowerError(
                 f"{seat.line.name} answers frame {control.frame}; the last is {moment.frame}"
             )
-        if control.frame < moment.frame:
+        if control.frame < moment.frame and seat.waits:
             seat.late += 1
             return False
+        self._take_poses(seat, moment, control.poses)
         answers[seat] = control.controls
         return True
+
+    def _take_poses(
+        self, seat: FollowerSeat, moment: SnapshotTime, poses: Mapping[str, Sequence[PoseView]]
+    ) -> None:
+        """Take the poses of a follower's actors.
+
+        Raises FollowerError: a pose is invalid, and `bad_controls` is `error`.
+        """
+        actors = {actor.name: actor for actor in seat.actors}
+        now_s = moment.tick * self._env.config.clock.sim_dt_s
+        for name, views in poses.items():
+            if name not in actors:
+                raise FollowerError(f"{seat.line.name}: poses of {name[:80]}, which it has not")
+            if len(views) > MAX_POSES:
+                raise FollowerError(
+                    f"{seat.line.name}: {len(views)} poses of {name} in a message; the limit is "
+                    f"{MAX_POSES}"
+                )
+            for view in views:
+                try:
+                    self._actors.add_pose(actors[name], PoseSample(**vars(view)), now_s)
+                except ActionError as error:
+                    self._note_bad(seat, error)
+
+    def _note_bad(self, seat: FollowerSeat, error: Exception) -> None:
+        """Count invalid controls or an invalid pose; raise FollowerError if it is an error."""
+        seat.bad += 1
+        if self._bad_controls == "error":
+            raise FollowerError(f"{seat.line.name}: {error}") from error
 
     def _answer_tick(self, seat: FollowerSeat, within_s: float) -> None:
         done, refused = False, ""
@@ -174,11 +293,17 @@ class Barrier:
 
         Raises FollowerError: an action is invalid, and `bad_controls` is `error`.
         """
-        unknown = controls.keys() - set(vehicles)
+        actors = {actor.name: actor for actor in seat.actors}
+        unknown = controls.keys() - set(vehicles) - actors.keys()
         if unknown:
             raise FollowerError(
                 f"{seat.line.name}: controls of {min(unknown)[:80]}, which is not in the frame"
             )
+        for name in controls.keys() & actors.keys():
+            try:
+                self._actors.drive(actors[name], controls[name])
+            except ActionError as error:
+                self._note_bad(seat, error)
         checked: dict[str, Any] = {}
         for vehicle in vehicles:
             try:
@@ -186,9 +311,7 @@ class Barrier:
                 self._env.check_action(vehicle, action)
                 checked[vehicle] = action
             except (FollowerError, ActionError) as error:
-                seat.bad += 1
-                if self._bad_controls == "error":
-                    raise FollowerError(f"{seat.line.name}: {error}") from error
+                self._note_bad(seat, error)
                 if vehicle in seat.held:
                     checked[vehicle] = seat.held[vehicle]
         seat.held = checked

@@ -12,10 +12,13 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ClockError, FollowerError
 from cavmarl.cosim.followers.follower_connection import Address, call
 from cavmarl.cosim.followers.follower_messages import (
+    ActorPoses,
+    ActorRequest,
     Control,
     FollowerRefusal,
     FollowerSnapshot,
     Hello,
+    PoseView,
     Say,
     Ticked,
     Welcome,
@@ -56,7 +59,10 @@ class Follower:
     it only follows the clock and answers with {}. `joins_s`: maximum time for the world to accept
     the follower, which it does between two steps; None: no limit. `secret`: of the world, if it
     listens at a port. `truth`: whether snapshots contain all vehicles of the world, which the world
-    has to allow.
+    has to allow. `actors`: vehicles, people or roadside units to bring into the world; they leave
+    with the follower. `waits`: whether the world waits for the answers; if not, the follower may
+    send poses and controls at any time, and misses snapshots that it does not read in time.
+    `leads`: whether each step of the world waits for a `tick` of this follower.
 
     Attributes:
         welcome: the world's clock and sensors.
@@ -74,10 +80,15 @@ class Follower:
         joins_s: float | None = 60.0,
         secret: str = "",
         truth: bool = False,
+        actors: Sequence[ActorRequest] = (),
+        waits: bool = True,
+        leads: bool = False,
     ) -> None:
         self._line = call(address, CALL_S)
+        self._waits = waits
+        hello = Hello(name, list(vehicles), secret, truth, list(actors), waits, leads)
         try:
-            self._line.say(Say.HELLO, Hello(name, list(vehicles), secret, truth), within_s=CALL_S)
+            self._line.say(Say.HELLO, hello, within_s=CALL_S)
             self.welcome = read_payload(Welcome, self._expect(joins_s, Say.WELCOME).payload)
         except BaseException:
             self._line.close()
@@ -108,16 +119,21 @@ class Follower:
         if frame.kind is Say.GOODBYE:
             return None
         snapshot, arrays = self._line.take(frame)
-        if self._frame is not None and snapshot.frame != self._frame + 1:
+        if self._waits and self._frame is not None and snapshot.frame != self._frame + 1:
             raise FollowerError(f"frame {snapshot.frame} follows {self._frame}; a frame is missing")
         self._frame = snapshot.frame
         return sight_of(snapshot, arrays)
 
-    def answer(self, controls: Mapping[str, Any]) -> None:
+    def answer(
+        self,
+        controls: Mapping[str, Any] | None = None,
+        poses: Mapping[str, Sequence[PoseView]] | None = None,
+    ) -> None:
         """Send the controls of the last snapshot's vehicles for the next step.
 
         Args:
-            controls: by vehicle: two numbers in [-1, 1], or the number of a choice.
+            controls: by vehicle or actor: two numbers in [-1, 1], or the number of a choice.
+            poses: new poses by actor.
 
         Raises:
             FollowerLostError: the world has ended.
@@ -125,11 +141,23 @@ class Follower:
         """
         if self._frame is None:
             raise FollowerError("answer() before the first snapshot; call wait()")
-        plain = {vehicle: _plain(given) for vehicle, given in controls.items()}
-        self._line.say(Say.CONTROL, Control(self._frame, plain))
+        plain = {vehicle: _plain(given) for vehicle, given in (controls or {}).items()}
+        listed = {actor: list(given) for actor, given in (poses or {}).items()}
+        self._line.say(Say.CONTROL, Control(self._frame, plain, listed))
+
+    def send_poses(self, poses: Mapping[str, Sequence[PoseView]]) -> None:
+        """Send poses of actors, at any time, at a rate of their own.
+
+        Raises FollowerLostError: the world has ended.
+        """
+        self._line.say(
+            Say.POSES, ActorPoses({actor: list(given) for actor, given in poses.items()})
+        )
 
     def tick(self) -> Ticked:
-        """Try to advance the world, which a follower should not do; return the result.
+        """Advance the world by a step if this follower leads; otherwise, try to do so.
+
+        A follower that leads calls it once after each snapshot, after its answer.
 
         Raises ClockError: the world's master refuses.
         """

@@ -150,6 +150,12 @@ class FollowerConnection:
             head = self._socket.ahead[:HEAD_BYTES]
             return self._socket.read_ahead(bytes_before_data(head, FOLLOWERS))
 
+    def can_send(self) -> bool:
+        """Return whether the other end has read enough, so that a frame can be sent at once."""
+        with selectors.DefaultSelector() as selector:
+            selector.register(self._socket, selectors.EVENT_WRITE)
+            return bool(selector.select(0.0))
+
     def skip(self, frame: Frame) -> None:
         """Check that a frame has no data, and finish reading it.
 
@@ -411,6 +417,10 @@ class Reception:
         if len(hello.vehicles) > MAX_VEHICLES:
             raise FollowerError(
                 f"a caller requests {len(hello.vehicles)} vehicles; the limit is {MAX_VEHICLES}"
+            )
+        if len(hello.actors) > MAX_VEHICLES:
+            raise FollowerError(
+                f"a caller brings {len(hello.actors)} actors; the limit is {MAX_VEHICLES}"
             )
         line.name = f"follower '{hello.name[:80]}'"
         return hello

@@ -31,10 +31,11 @@ _msgpack: Any = require("msgpack", "followers")
 _ADAPTERS: dict[type, TypeAdapter[Any]] = {}  # cached, as they are slow to construct
 _CLOSED = ConfigDict(extra="forbid")
 
-VERSION = 3
+VERSION = 4
 MAX_LETTER = 1 << 22
 MAX_DATA = 1 << 28
 MAX_VEHICLES = 4096
+MAX_POSES = 4096  # of one actor in a message
 
 
 class Say(IntEnum):
@@ -44,10 +45,11 @@ class Say(IntEnum):
     WELCOME = 1  # world: accepts the request and describes its clock and sensors
     SNAPSHOT = 2  # world: the clock, and the sensors' new samples
     CONTROL = 3  # follower: controls of its vehicles for the next step
-    TICK = 4  # follower: requests a tick of its own
+    TICK = 4  # follower: requests a tick of its own; a leading follower releases the next step
     TICKED = 5  # world: result of that tick
     REFUSAL = 6  # world: reason why it drops the follower
     GOODBYE = 7  # either: end of the connection
+    POSES = 8  # follower: poses of its actors, at any time
 
 
 FOLLOWERS = Dialect(
@@ -64,6 +66,27 @@ FOLLOWERS = Dialect(
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
+class ActorRequest:
+    """An actor that a follower brings into the world; see `ActorOrder`."""
+
+    name: StrictStr  # unique among the actors of the follower
+    type: StrictStr  # car, truck, bus, pedestrian, cyclist, roadside_unit, or a type of the world
+    x: StrictFloat  # centre, in m
+    y: StrictFloat
+    heading: StrictFloat  # rad, counter-clockwise from east
+    z: StrictFloat | None = None  # height of the ground below the centre, in m; none: of the lane
+    # body: length, width and height in m; empty: of the type
+    size_m: list[StrictFloat] = field(default_factory=list)
+    speed: StrictFloat = 0.0  # at the start, in m/s
+    moved_by: StrictStr = "poses"  # or `controls`, `nothing`
+    rate_hz: StrictFloat = 0.0  # rate of its poses; 0: unknown
+    extrapolation_s: StrictFloat = 0.5  # largest time for which a pose is extrapolated
+    # names of the sensors that it carries, of the world's `rig`
+    rig: list[StrictStr] = field(default_factory=list)
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
 class Hello:
     """The first message of a follower."""
 
@@ -72,6 +95,10 @@ class Hello:
     vehicles: list[StrictStr] = field(default_factory=list)
     secret: StrictStr = ""  # of the world, if it listens at a port
     truth: StrictBool = False  # whether its snapshots are to contain all vehicles of the world
+    actors: list[ActorRequest] = field(default_factory=list)  # actors that it brings
+    # whether the world waits for its answers; if not, it sends poses and controls at any time
+    waits: StrictBool = True
+    leads: StrictBool = False  # whether each step of the world waits for a TICK of this follower
 
 
 @with_config(_CLOSED)
@@ -110,8 +137,9 @@ class Welcome:
 class ArrayView:
     """One array of a snapshot; its bytes are in the frame's data, in the order of the list."""
 
-    # agent of the vehicle; empty: the array is about the whole map: `signals`: (1, links) the
-    # SIGNAL_* code of each link's signal (255: no signal); `truth`: (1, n, columns of TRUTH)
+    # agent of the vehicle, or name of the actor; empty: the array is about the whole map:
+    # `signals`: (1, links) the SIGNAL_* code of each link's signal (255: no signal); `truth`:
+    # (1, n, columns of TRUTH)
     vehicle: StrictStr
     name: StrictStr
     dtype: StrictStr  # NumPy's notation, little-endian
@@ -137,6 +165,22 @@ class VehicleView:
 
 @with_config(_CLOSED)
 @dataclass(frozen=True)
+class ActorView:
+    """An actor of the follower."""
+
+    vehicle_id: StrictInt  # -1: it enters with the next step
+    agent: StrictStr  # PettingZoo's id; empty: it carries no sensors
+    x: StrictFloat  # as in `ActorRequest`
+    y: StrictFloat
+    z: StrictFloat
+    heading: StrictFloat
+    pitch: StrictFloat  # rad, positive uphill
+    speed: StrictFloat  # m/s along its heading
+    hit_id: StrictInt  # vehicle that it touches; -1: none
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
 class FollowerSnapshot:
     """The state of the world for a follower, sent after each step."""
 
@@ -147,7 +191,30 @@ class FollowerSnapshot:
     is_over: StrictBool  # whether the episode has ended; then no controls are due
     # the follower's vehicles in the world, which have to be driven
     vehicles: dict[StrictStr, VehicleView]
-    arrays: list[ArrayView]  # new samples of their sensors
+    arrays: list[ArrayView]  # new samples of their sensors, and of those of the actors
+    actors: dict[StrictStr, ActorView] = field(default_factory=dict)  # by name
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
+class PoseView:
+    """A pose of an actor; see `PoseSample`."""
+
+    stamp_s: StrictFloat  # simulated time since the reset, at most the end of the next step
+    x: StrictFloat
+    y: StrictFloat
+    heading: StrictFloat
+    z: StrictFloat | None = None
+    pitch: StrictFloat | None = None
+    speed: StrictFloat | None = None
+
+
+@with_config(_CLOSED)
+@dataclass(frozen=True)
+class ActorPoses:
+    """Poses of actors, in any order."""
+
+    poses: dict[StrictStr, list[PoseView]]  # by the name of the actor
 
 
 @with_config(_CLOSED)
@@ -156,8 +223,10 @@ class Control:
     """The answer to a snapshot."""
 
     frame: StrictInt  # of the snapshot
-    # of each vehicle: two numbers in [-1, 1], or the number of a meta-action
+    # of each vehicle: two numbers in [-1, 1], or the number of a meta-action; of an actor that is
+    # moved by controls: two numbers in [-1, 1]; without them, it keeps its last ones
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
+    poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
 
 
 @with_config(_CLOSED)

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import asdict
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.cosim.actors.client_actors import ActorOrder, ClientActor
 from cavmarl.cosim.followers.follower_messages import (
+    ActorView,
     ArrayView,
     FollowerSnapshot,
     SensorView,
@@ -17,6 +19,7 @@ from cavmarl.cosim.followers.follower_messages import (
     Welcome,
 )
 from cavmarl.cosim.stack.signal_reading import SPAT
+from cavmarl.env.external_agents import external_id
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.worlds.step_arrays import Driven
@@ -55,6 +58,51 @@ def welcome_to(env: CavEnv | CavVectorEnv, vehicles: Sequence[str], tick: int) -
     )
 
 
+class SeenActor(NamedTuple):
+    """An actor, for a snapshot."""
+
+    name: str
+    view: ActorView
+    frames: Mapping[str, SensorFrames]  # new samples of its sensors
+
+
+def see_actors(
+    env: CavEnv, actors: Iterable[ClientActor], rows: Mapping[int, np.void]
+) -> list[SeenActor]:
+    """Return actors as they are in the world, or as they will enter.
+
+    `rows`: VEHICLE of the actors in the world, by slot.
+    """
+    seen = []
+    for actor in actors:
+        row, rig = rows.get(actor.slot), actor.order.rig
+        agent = external_id(actor.slot) if rig and actor.slot >= 0 else ""
+        if row is None:
+            seen.append(SeenActor(actor.name, _coming(actor.order, agent), {}))
+            continue
+        view = ActorView(
+            vehicle_id=int(row["id"]),
+            agent=agent,
+            x=float(row["x"]),
+            y=float(row["y"]),
+            z=float(row["z"]),
+            heading=float(row["heading"]),
+            pitch=float(row["pitch"]),
+            speed=float(row["speed"]),
+            hit_id=int(row["hit"]),
+        )
+        frames = env.frames(agent) if agent else {}
+        carried = _new_samples({name: frames[name] for name in rig})
+        seen.append(SeenActor(actor.name, view, carried))
+    return seen
+
+
+def _coming(order: ActorOrder, agent: str) -> ActorView:
+    """Return the view of an actor that enters with the next step."""
+    z = 0.0 if order.z is None else order.z
+    return ActorView(-1, agent, order.x, order.y, z, order.heading, 0.0, order.speed, -1)
+
+
 class SnapshotTime(NamedTuple):
     """The time of a snapshot."""
 
@@ -70,11 +118,13 @@ def take_snapshot(
     moment: SnapshotTime,
     world: int = 0,
     truth: bool = False,
+    actors: Sequence[SeenActor] = (),
 ) -> tuple[FollowerSnapshot, list[NDArray[Any]]]:
     """Return the snapshot for a follower, and its arrays.
 
     `env`: the world or worlds. `agents`: indices of the follower's agents. `moment`: time of the
-    snapshot. `truth`: whether it contains all vehicles of the world.
+    snapshot. `truth`: whether it contains all vehicles of the world. `actors`: the follower's
+    actors.
     """
     worlds = env.worlds.arrays
     due = [k for k in agents if worlds.mask[world, k] and not moment.is_over]
@@ -101,11 +151,24 @@ def take_snapshot(
                 data = np.array(messages, dtype=np.int32).reshape(1, -1, 3)
                 views.append(_array(name, SPAT, data, np.array([time_s]), np.zeros(1, np.bool_)))
                 arrays.append(data)
+    for actor in actors:
+        for sensor, seen in actor.frames.items():
+            data = np.ascontiguousarray(seen.data)
+            views.append(_array(actor.name, sensor, data, seen.stamp_s, seen.lost))
+            arrays.append(data)
+    if due or (actors and not moment.is_over):
         shown = _signals(env, world)
         views.append(_array("", "signals", shown, np.array([time_s]), np.zeros(1, np.bool_)))
         arrays.append(shown)
     return FollowerSnapshot(
-        moment.frame, moment.episode, moment.tick, time_s, moment.is_over, vehicles, views
+        moment.frame,
+        moment.episode,
+        moment.tick,
+        time_s,
+        moment.is_over,
+        vehicles,
+        views,
+        {actor.name: actor.view for actor in actors},
     ), arrays
 
 
@@ -118,9 +181,13 @@ def _due(
         seen = arrays.observations[world, agent : agent + 1]
         now, lost = np.array([time_s]), np.zeros(1, dtype=np.bool_)
         return {"observation": SensorFrames(seen, now, lost, np.ones((), dtype=np.int64))}
+    return _new_samples({name: each.of(world, agent) for name, each in arrays.frames.items()})
+
+
+def _new_samples(frames: Mapping[str, SensorFrames]) -> dict[str, SensorFrames]:
+    """Return the samples of the last step, of the sensors of one vehicle."""
     found = {}
-    for name, frames in arrays.frames.items():
-        data, stamp_s, lost, fresh = (array[world, agent] for array in frames)
+    for name, (data, stamp_s, lost, fresh) in frames.items():
         if fresh:
             found[name] = SensorFrames(data[-fresh:], stamp_s[-fresh:], lost[-fresh:], fresh)
     return found

@@ -17,7 +17,7 @@ from cavmarl.core.math.geometry import lane_pose, project, wrap_angle
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import DepartureQueue, LaneGrid, RoadArrays, TripTables, ZoneState
 from cavmarl.core.records.codes import DRIVER_EXTERNAL, EVENT_ARRIVED
-from cavmarl.core.records.external_records import EXTERNAL_DRIVEN
+from cavmarl.core.records.external_records import EXTERNAL_DRIVEN, FIRST_EXTERNAL_ID
 from cavmarl.core.records.rows import LOST_M
 from cavmarl.driving.kernels.lanes.route_following import free_speed
 from cavmarl.driving.kernels.motion.bicycle import bicycle_step
@@ -246,11 +246,14 @@ def add_external(
     ids: NDArray[np.int64],  # (W, E), written
     blank: NDArray[np.void],  # VEHICLE (1,), template of every vehicle's record
     nowhere: int,  # the way of a vehicle without a route
-    departures: DepartureQueue,  # passing and ids are written
+    departures: DepartureQueue,  # passing is written
     ticks: NDArray[np.int64],  # (W,)
     keys: NDArray[np.uint64],  # (W,)
 ) -> None:
-    """Add a row with a new id to `departures.passing` for each vehicle that enters."""
+    """Add a row with a new id to `departures.passing` for each vehicle that enters.
+
+    A slot gets at most one vehicle in a tick, so tick and slot make a new id.
+    """
     for w in range(coming.shape[0]):
         for slot in range(coming.shape[1]):
             if not coming[w, slot]:
@@ -260,9 +263,9 @@ def add_external(
             departures.passing[w, place] = blank[0]
             departures.num_passing[w] = place + 1
             row = departures.passing[w, place]
-            ids[w, slot] = departures.next_id[w]
-            row["id"] = departures.next_id[w]
-            departures.next_id[w] += 1
+            vehicle = FIRST_EXTERNAL_ID + ticks[w] * coming.shape[1] + slot
+            ids[w, slot] = vehicle
+            row["id"] = vehicle
             row["driver"] = DRIVER_EXTERNAL
             row["order"] = slot
             enter_at(roads, grid, told, row)

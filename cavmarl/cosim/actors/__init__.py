@@ -1,0 +1,1 @@
+"""Vehicles, people and roadside units that clients and recorded traces bring into a world."""

@@ -1,0 +1,148 @@
+"""Repeat a recorded run from its inputs, without drivers and clients, and compare the states."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from cavmarl.config.env import EnvConfig
+from cavmarl.config.world_spec import WorldSpec
+from cavmarl.core.errors import ConfigError, RecordingError
+from cavmarl.env.parallel import CavEnv, parallel_env
+from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of
+from cavmarl.recordings.recording import Recording
+
+_MAY_DIFFER = ("zones", "workers", "nodes")  # keys that no result depends on
+_MOST_SHOWN = 5
+
+
+@dataclass(frozen=True)
+class RepeatedRun:
+    """The result of `repeat_recording`."""
+
+    environment: str
+    episodes: int
+    steps: int  # number of repeated steps
+    state_hash: str  # at the end
+    # step from 0 over all episodes whose state differs first, and its tick; None: all are equal
+    first_difference: tuple[int, int] | None
+
+
+def repeat_recording(
+    path: str | Path,
+    spec: WorldSpec,
+    *,
+    zones: int | None = None,
+    backend: str | None = None,
+    workers: int | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> RepeatedRun:
+    """Repeat a run from a recording with the table `commands`.
+
+    Args:
+        path: folder of the recording.
+        spec: the recorded world. Its zones may differ.
+        zones: number of zones.
+        backend: where the world runs.
+        workers: number of worker processes.
+        progress: called after each step with its number and the number of all steps.
+
+    Raises:
+        ConfigError: the recording has no commands, or is that of another world.
+        RecordingError: the recording cannot be read, or does not begin with a reset.
+    """
+    recording = Recording.open(path)
+    if INPUTS not in recording.extras:
+        raise ConfigError(
+            f"{path}: has no commands, so it cannot be repeated; record with --record-also "
+            f"{INPUTS}, or RecordOptions(path, include=('{INPUTS}',))"
+        )
+    rows = recording.extra(INPUTS)
+    if not len(rows) or rows["kind"][0] != RESET or not rows["seed"][0]:
+        raise RecordingError(
+            f"{path}: does not begin with a reset with a seed; start to record before reset(seed=…)"
+        )
+    made = parallel_env(spec.env, zones=zones, backend=backend, workers=workers, **spec.keywords)
+    with closing(made):
+        _check_world(recording, made)
+        return _repeat(path, made, rows, progress)
+
+
+def _repeat(
+    path: str | Path, made: CavEnv, rows: Any, progress: Callable[[int, int], None] | None
+) -> RepeatedRun:
+    worlds, agents = made.worlds, made.config.population.num_ids
+    no_controls, no_choices = np.zeros((1, agents, 2)), np.zeros((1, agents), dtype=np.int64)
+    for name in command_names(rows.dtype):
+        expected = getattr(worlds.arrays, name, np.zeros((1, 0))).shape[1:]
+        if rows.dtype[name].shape != expected:
+            raise RecordingError(f"{path}: {name} has shape {rows.dtype[name].shape}; get it again")
+    difference, episodes = None, 0
+    for step, row in enumerate(rows):
+        if row["kind"] == RESET:
+            worlds.arrays.chosen[:] = True
+            worlds.reset(int(row["seed"]) if row["seed"] else None, 0)
+            episodes += 1
+        else:
+            worlds.step(commands_of(row, no_controls, no_choices))
+        if worlds.state_hash(0) != row["state_hash"]:
+            difference = step, int(row["tick"])
+            break
+        if progress is not None:
+            progress(step, len(rows))
+    return RepeatedRun(
+        environment=f"{made.config.name}-v{made.config.version}",
+        episodes=episodes,
+        steps=step + 1 - episodes,
+        state_hash=worlds.state_hash(0),
+        first_difference=difference,
+    )
+
+
+def _check_world(recording: Recording, made: CavEnv) -> None:
+    """Raise ConfigError if the environment is not the recorded one."""
+    world = recording.manifest["world"]
+    if world.get("map_source_sha256") != made.network.source_hash:
+        raise ConfigError(
+            f"{recording.path}: was recorded on another map than that of {made.config.name}; name "
+            f"the environment of the recording, {recording.head.environment}"
+        )
+    recorded, present = _keys_of(world.get("config", {})), _keys_of(_plain(made.config))
+    names = sorted(recorded.keys() | present.keys())
+    differing = [
+        f"{name} = {present.get(name)}, recorded with {recorded.get(name)}"
+        for name in names
+        if recorded.get(name) != present.get(name)
+    ]
+    if differing:
+        shown = "; ".join(differing[:_MOST_SHOWN])
+        more = f"; and {len(differing) - _MOST_SHOWN} more" if len(differing) > _MOST_SHOWN else ""
+        raise ConfigError(
+            f"{recording.path}: was recorded in another world: {shown}{more}; pass the settings of "
+            "the recording (--set)"
+        )
+
+
+def _plain(config: EnvConfig) -> dict[str, Any]:
+    """Return a configuration with lists in place of tuples, as JSON has it."""
+    found: dict[str, Any] = json.loads(json.dumps(asdict(config)))
+    return found
+
+
+def _keys_of(sections: Any, start: str = "") -> dict[str, Any]:
+    """Return all values that results depend on, by dotted key."""
+    found: dict[str, Any] = {}
+    for name, value in sections.items():
+        if not start and name in _MAY_DIFFER:
+            continue
+        if isinstance(value, dict):
+            found |= _keys_of(value, f"{start}{name}.")
+        else:
+            found[f"{start}{name}"] = value
+    return found
