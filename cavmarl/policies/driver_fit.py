@@ -11,7 +11,7 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.engine.spaces import flat_observation_space
 
 if TYPE_CHECKING:
-    from cavmarl.policies.network_files import NetworkConfig
+    from cavmarl.networks.network_files import NetworkConfig
 
 
 def check_fit(config: NetworkConfig, here: EnvConfig, name: str, driver: str) -> None:

@@ -17,8 +17,8 @@ from cavmarl.config.driver_names import ONNX_FILE, find_driver
 from cavmarl.config.io import validate
 from cavmarl.core.atomic_file import write_whole
 from cavmarl.core.errors import ConfigError, PolicyError
-from cavmarl.policies.kernels.network_layers import NORM_EPSILON
-from cavmarl.policies.network_files import (
+from cavmarl.networks.kernels.network_layers import NORM_EPSILON
+from cavmarl.networks.network_files import (
     CONTINUOUS_ACTIONS,
     MAX_DEVIATIONS,
     RESIDUAL_PARTS,

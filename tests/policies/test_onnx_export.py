@@ -13,9 +13,9 @@ from cavmarl.config.registry import agent_entries, load_config
 from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.env.parallel import parallel_env
 from cavmarl.env.vector import make_vec
-from cavmarl.policies.driver_network import DriverNetwork, load_driver_network
+from cavmarl.networks.driver_network import DriverNetwork, load_driver_network
+from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.policies.loading import load_policy
-from cavmarl.policies.network_files import NetworkConfig
 from cavmarl.policies.onnx_export import export_onnx, onnx_model
 
 onnxruntime = pytest.importorskip("onnxruntime")
