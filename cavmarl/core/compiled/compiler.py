@@ -52,6 +52,7 @@ _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewr
 
 
 _copy: Any = alloca_once_value
+_place: Any = alloca_once
 _field: Any = gep_inbounds
 
 
@@ -215,7 +216,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
                 return
             address = value.operands[0] if _is_borrowed(value) else _copy(self.builder, value)
             if name not in self._addresses:
-                self._addresses[name] = alloca_once(self.builder, address.type)
+                self._addresses[name] = _place(self.builder, address.type)
             self.builder.store(address, self._addresses[name])
         else:
             self._alloca_var(name, self.typeof(name))

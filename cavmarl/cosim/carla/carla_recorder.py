@@ -191,7 +191,7 @@ class CarlaRecorder:
         if (path / ACTORS_FILE).is_file():
             shutil.rmtree(path)
         env = session.world.env
-        self._writer = WorldRecorder(path, env.worlds, env.simulation)
+        self._writer = WorldRecorder(path, env.worlds, env.simulation, None)
         self._list = (path / ACTORS_FILE).open("w", encoding="utf-8")
         self._listed, self._rows = set(), 0
         self._write(map=session.map.name, session=key, episode=session.episode)
@@ -213,7 +213,7 @@ class CarlaRecorder:
         try:
             left = np.array([one[:2] for one in ended], ENDED)
             frame = frame_of(session.world.simulation, ended=left, room=writer.room)
-            writer.add([frame])
+            writer.add([frame], None)
         except CavmarlError as problem:
             log.warning("the recording ends: %s", problem)
             self.stop()

@@ -19,7 +19,7 @@ def shares_lanes(lanes: NDArray[np.void]) -> bool:
 
     Most worlds do. Kernels then use the roads of the map, because to read `roads_in` costs more.
     """
-    return lanes.shape[0] == 1
+    return len(lanes) == 1
 
 
 @inlined_kernel
