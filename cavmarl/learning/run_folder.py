@@ -41,6 +41,7 @@ from cavmarl.learning.checkpoint import (
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.options import given_options, settings_of
 from cavmarl.policies.network_files import NetworkConfig
+from cavmarl.roads.map_kinds import map_kinds
 
 if sys.platform != "win32":
     import fcntl
@@ -104,6 +105,7 @@ class RunFolder:
         self.path = path = settings.folder
         self._settings = settings
         self._environment = _digest(world)
+        self._maps = map_kinds(world.network)
         resumes = bool(getattr(settings, "resume", ""))
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -209,9 +211,12 @@ class RunFolder:
             write_checkpoint(self.path, state)
 
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
-        """Write the present driver for evaluation; runs are not resumed from it."""
+        """Write the present driver for evaluation, with the kinds of the maps of its training.
+
+        Runs are not resumed from it.
+        """
         with writing(self.path / WEIGHTS_FILE):
-            save_network(self.path, network, config)
+            save_network(self.path, network, replace(config, maps=self._maps))
 
     def end(self, files: Sequence[str] = DRIVER_FILES, plans: Sequence[Plan] = ()) -> Path:
         """Complete the manifest with the files of the run."""

@@ -27,6 +27,7 @@ from cavmarl.core.tracebacks import fault_in
 from cavmarl.engine.spaces import flat_observation_space
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
+from cavmarl.policies.map_check import meet_map
 from cavmarl.policies.model_files import make_policy, model_files
 from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPolicy
 from cavmarl.policies.shield import ShieldedPolicy
@@ -47,9 +48,12 @@ def load_policy(policy: str | Path, env: Environment, *, beside_signals: bool = 
 
     Raises:
         PolicyError: the policy does not exist, a file is broken, or a network was made for other
-            observations or actions than this environment's; or signals have agents for which
-            nothing acts.
+            observations or actions than this environment's, or for the other side of the road with
+            sensors that cannot be mirrored; or signals have agents for which nothing acts.
         MissingExtraError: the library of a model file is not installed.
+
+    Warns:
+        UntrainedMapWarning: a trained driver was not trained on maps of this kind.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -131,7 +135,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
             f"{name}: observes {config.sensed} numbers, but its sensors give {size} in "
             "this version; train it again"
         )
-    return NetworkPolicy(env, network)
+    return NetworkPolicy(env, network, meet_map(env, name, config.maps))
 
 
 def _parts(keys: Iterable[str]) -> str:

@@ -23,7 +23,7 @@ from cavmarl.sensors.kernels.observing_conflicts import (
     WHEN_HALF_S,
     ConflictsSensor,
 )
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, hidden
 from cavmarl.sensors.observed.sensor_setup import walls_of
 
 _PLACE = f"x / ({PLACE_HALF_M:g} m + abs(x))"
@@ -107,6 +107,21 @@ def settings(
     )
 
 
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.conflicts
+    what = f"the {own.count} vehicles within {own.range_m:g} m that come closest to its path"
+    found = [
+        Reading("ideal sensors", f"{what}; {hidden(own.through_walls)}"),
+        Reading("map", "the right of way of the vehicles near its path"),
+    ]
+    if own.heard:
+        found.append(Reading("V2X", "messages about vehicles that it does not see"))
+    if own.indicators:
+        what = "the next turn of vehicles near its path, from their routes, as if always indicated"
+        found.append(Reading("world's state", what))
+    return found
+
+
 SENSOR = Sensor(
     "conflicts",
     features,
@@ -119,4 +134,6 @@ SENSOR = Sensor(
         made.most_told,
         made.capacity,
     ),
+    reads=reads,
+    sides=Sides(("y", "vy", "sin", "turn")),
 )
