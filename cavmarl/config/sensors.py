@@ -133,8 +133,8 @@ class SignalAheadConfig(
         range_m: distance ahead up to which it is seen.
         timing: adds the exact time until the signal changes, from the world's state. A vehicle on a
             road knows it only from messages (`sensors.messages.timing`).
-        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; or with a number
-            of its `own`, which is added.
+        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; or with an
+            additional number of its `own`.
     """
 
     enabled: bool = True
@@ -326,8 +326,8 @@ class WayConfig(
         range_m: distance ahead up to which a line is seen.
         timing: adds the exact time until a line's signal changes, from the world's state. A vehicle
             on a road knows it only from messages (`sensors.messages.timing`).
-        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; with a number of
-            its `own`, which is added; or like a `red` light, as for `tollgate_ippo`.
+        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; with an
+            additional number of its `own`; or like a `red` light, as `tollgate_ippo` needs it.
     """
 
     distances_m: tuple[float, ...] = ()

@@ -107,8 +107,12 @@ def lines(
     shown: dict[int, str],
     count: int,
     range_m: float,
+    stop_signs: str = "give_way",
 ) -> list[float]:
-    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link."""
+    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link.
+
+    With `stop_signs="own"`, the duty to stop follows.
+    """
     found = []
     for stretch in way_of(roads, plans, vehicle):
         if stretch.end_m > range_m:
@@ -119,15 +123,21 @@ def lines(
         link = roads.links[stretch.link]
         own = slice(link["first_conflict"], link["first_conflict"] + link["num_conflicts"])
         yields = letter not in ("G", "O") and bool(roads.conflicts["must_yield"][own].any())
-        stops = letter == "s" or (not letter and chr(link["state"]) in "sw")
-        if not letter and not yields and not stops:
+        has_sign = not letter and chr(link["state"]) in "sw"
+        if not letter and not yields and not has_sign:
             continue
-        colours = [letter in RED or stops, letter in YELLOW, letter in GREEN]
-        if not letter:
-            colours = [stops, False, False]
         near = 20.0 / (20.0 + max(stretch.end_m, 0.0))
-        found.append([near, *map(float, colours), float(yields)])
-    found = [*found, *([[0.0] * 5] * count)][:count]
+        if letter:
+            flags = [letter in (*RED, "s"), letter in YELLOW, letter in GREEN, yields]
+        elif stop_signs == "red":
+            flags = [has_sign, False, False, yields]
+        else:
+            flags = [False, False, False, True]
+        if stop_signs == "own":
+            flags.append(has_sign or letter == "s")
+        found.append([near, *map(float, flags)])
+    size = 6 if stop_signs == "own" else 5
+    found = [*found, *([[0.0] * size] * count)][:count]
     return [number for line in found for number in line]
 
 
