@@ -124,6 +124,13 @@ def test_plans_of_others_and_times_of_signals_are_labelled_as_state_of_the_world
     assert not any(one.source == "world's state" for one in readings_of(OFF))
 
 
+def test_an_indicator_that_is_visible_near_a_junction_is_not_state_of_the_world() -> None:
+    conflicts = ConflictsConfig(count=1, indicators=True, indicators_m=40.0)
+    readings = readings_of(replace(OFF, conflicts=conflicts))
+    assert not any(one.source == "world's state" for one in readings)
+    assert any("indicators of these vehicles, up to 40 m" in one.what for one in readings)
+
+
 def test_each_sensor_says_what_it_reads() -> None:
     config = SensorsConfig(
         lanes=LanesConfig(range_m=50.0),

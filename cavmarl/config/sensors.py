@@ -365,6 +365,8 @@ class ConflictsConfig(
             from the message; and two numbers per vehicle, see `seen` and `age`.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
             indicate at their present or next junction; and adds one number per vehicle, see `turn`.
+        indicators_m: distance to the junction from which vehicles indicate; before that, their turn
+            is unknown. 0: they indicate at any distance, which only the world's state can tell.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
@@ -372,6 +374,7 @@ class ConflictsConfig(
     through_walls: bool = True
     heard: bool = False
     indicators: bool = False
+    indicators_m: Annotated[float, Within(0.0, 300.0)] = 0.0
 
 
 @dataclass(frozen=True)

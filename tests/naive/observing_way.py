@@ -151,11 +151,17 @@ def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
 
 
 def indicated_way(
-    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void
+    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, from_m: float = 0.0
 ) -> tuple[list[Stretch], int]:
-    """Return the path up to the end of the lane behind the next junction, and its link or -1."""
+    """Return the path up to the end of the lane behind the next junction, and its link or -1.
+
+    If the junction is farther away than `from_m`, unless that is 0, the path ends before it.
+    """
     way = way_of(roads, plans, vehicle)
     here = roads.lanes[way[0].lane]
+    ends = [k for k, stretch in enumerate(way) if stretch.link >= 0]
+    if from_m and not here["internal"] and ends and way[ends[0]].end_m > from_m:
+        return way[: ends[0] + 1], -1
     links = [int(here["link"])] if here["internal"] else []
     for k, stretch in enumerate(way):
         if stretch.link >= 0:
@@ -262,6 +268,7 @@ def conflicts(
     hidden: Collection[int] = (),
     told: Mapping[int, tuple[np.void, float]] | None = None,
     indicators: bool = False,
+    from_m: float = 0.0,
 ) -> list[float]:
     """Return nine features of each of the `count` most critical vehicles; ten with `indicators`.
 
@@ -281,7 +288,7 @@ def conflicts(
             continue
         others = straight_looks(other)
         if indicators:
-            its_way = indicated_way(roads, plans, other)[0]
+            its_way = indicated_way(roads, plans, other, from_m)[0]
             others = looks_along(roads, its_way, other, float(other["speed"]))
         near, when = approach(looks, others, ego, other)
         # Rounding may differ between equally critical vehicles, so these are ordered by id.
@@ -304,6 +311,6 @@ def conflicts(
         if told is not None:
             numbers += [1.0, 0.0] if is_seen else [0.0, min(age_s, 1.0)]
         if indicators:
-            numbers.append(turn_over(roads, indicated_way(roads, plans, other)[1]))
+            numbers.append(turn_over(roads, indicated_way(roads, plans, other, from_m)[1]))
     size = (9 if told is None else 11) + int(indicators)
     return [*numbers, *([0.0] * (size * count))][: size * count]

@@ -49,6 +49,8 @@ SIGNS = {
     for shown in ("give_way", "own", "red")
 }
 INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
+NEAR_M = 25.0
+INDICATED_NEAR = replace(CONFIG, conflicts=replace(INDICATED.conflicts, indicators_m=NEAR_M))
 # The settings of the environment `cities`.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
@@ -128,10 +130,13 @@ def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
         assert seen == observed_conflicts(name, rows[order], place, phase)
         twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M)
         assert seen == pytest.approx(twin, abs=2e-5)
-        seen = observed_conflicts(name, rows, i, phase, INDICATED)
-        assert seen == observed_conflicts(name, rows[order], place, phase, INDICATED)
-        twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True)
-        assert seen == pytest.approx(twin, abs=2e-5)
+        for config, from_m in ((INDICATED, 0.0), (INDICATED_NEAR, NEAR_M)):
+            seen = observed_conflicts(name, rows, i, phase, config)
+            assert seen == observed_conflicts(name, rows[order], place, phase, config)
+            twin = naive.conflicts(
+                roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True, from_m=from_m
+            )
+            assert seen == pytest.approx(twin, abs=2e-5)
 
 
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:

@@ -97,6 +97,7 @@ def settings(
         given.heard,
         told=np.zeros(most_told, BODY),
         indicators=given.indicators,
+        indicators_m=given.indicators_m,
         looks=np.zeros((NUM_LOOKS, 4)),
         heard_looks=np.zeros((NUM_LOOKS, 4)),
         others=np.zeros((capacity, NUM_LOOKS, 4)),
@@ -116,7 +117,10 @@ def reads(config: SensorsConfig) -> list[Reading]:
     ]
     if own.heard:
         found.append(Reading("V2X", "messages about vehicles that it does not see"))
-    if own.indicators:
+    if own.indicators and own.indicators_m:
+        what = f"the indicators of these vehicles, up to {own.indicators_m:g} m before a junction"
+        found.append(Reading("ideal sensors", what))
+    elif own.indicators:
         what = "the next turn of vehicles near its path, from their routes, as if always indicated"
         found.append(Reading("world's state", what))
     return found
