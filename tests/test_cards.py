@@ -26,7 +26,7 @@ from cavmarl.config.sensors import (
 )
 from cavmarl.engine.spaces import flat_observation_space, observation_table
 from cavmarl.policies.network_files import read_network_config
-from cavmarl.roads.map_kinds import map_kinds
+from cavmarl.roads.road_kinds import road_kinds
 from cavmarl.sensors.observed import SENSORS, layout
 from cavmarl.sensors.observed.readings import readings_of, readings_table
 from tests.support.generated import check_block
@@ -104,7 +104,7 @@ def test_the_maps_of_an_environment_have_the_kinds_that_its_driver_was_trained_o
 ) -> None:
     config = read_network_config(TRAINED[name])
     network = cavmarl.make_vec(config.environment, num_envs=1).network
-    assert set(map_kinds(network)) <= set(config.maps)
+    assert set(road_kinds(network)) <= set(config.maps)
 
 
 @pytest.mark.parametrize(

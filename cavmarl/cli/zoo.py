@@ -65,9 +65,9 @@ def list_drivers(json_path: JsonPath = None) -> None:
     console.print(grid(("driver", "what it reads comes from"), sources, lefts=2))
     console.print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
-    told = {one.name: {field: getattr(one, field) for field in fields} for one in found}
-    for one in found:
-        told[one.name] |= _label(one)
+    told = {
+        one.name: {field: getattr(one, field) for field in fields} | _label(one) for one in found
+    }
     refused = {one.name: {"refused": one.refused} for one in entries if one.refused}
     write_json(json_path, told | refused)
     for one in refused.values():

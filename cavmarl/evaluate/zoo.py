@@ -37,7 +37,7 @@ from cavmarl.evaluate.evaluation import (
 from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.policies.loading import policy_files
 from cavmarl.policies.network_files import read_network_config
-from cavmarl.roads.map_kinds import MapKind
+from cavmarl.roads.road_kinds import RoadKind
 from cavmarl.sensors.observed.feature import Reading
 from cavmarl.sensors.observed.readings import readings_of
 
@@ -57,7 +57,7 @@ class ZooEntry:
     trips: int  # of the result
     shares: Mapping[str, float]  # shares of trips by the names of `SHARES`
     readings: tuple[Reading, ...] = ()  # what the driver reads, by source
-    maps: tuple[MapKind, ...] = ()  # kinds of the maps of its training
+    maps: tuple[RoadKind, ...] = ()  # kinds of the maps of its training
     refused: str = ""  # why the entry cannot be read, with the remedy; other fields are then empty
 
 

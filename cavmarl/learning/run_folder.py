@@ -41,7 +41,7 @@ from cavmarl.learning.checkpoint import (
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.options import given_options, settings_of
 from cavmarl.policies.network_files import NetworkConfig
-from cavmarl.roads.map_kinds import map_kinds
+from cavmarl.roads.road_kinds import road_kinds
 
 if sys.platform != "win32":
     import fcntl
@@ -105,7 +105,7 @@ class RunFolder:
         self.path = path = settings.folder
         self._settings = settings
         self._environment = _digest(world)
-        self._maps = map_kinds(world.network)
+        self._maps = road_kinds(world.network)
         resumes = bool(getattr(settings, "resume", ""))
         try:
             path.mkdir(parents=True, exist_ok=True)

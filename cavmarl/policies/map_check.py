@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from cavmarl.core.errors import PolicyError
 from cavmarl.policies.other_side import OtherSide
 from cavmarl.policies.policy import Environment
-from cavmarl.roads.map_kinds import MapKind, map_kinds
+from cavmarl.roads.road_kinds import RoadKind, road_kinds
 
 _OTHER_SIDE = "left and right are exchanged in its observations and actions"
-_WARNINGS: dict[MapKind, str] = {
+_WARNINGS: dict[RoadKind, str] = {
     "left_hand": "was trained in right-hand traffic, but this map has left-hand traffic; "
     + _OTHER_SIDE,
     "right_hand": "was trained in left-hand traffic, but this map has right-hand traffic; "
@@ -25,7 +25,7 @@ class UntrainedMapWarning(RuntimeWarning):
     """A trained driver drives on a map of a kind that was not part of its training."""
 
 
-def meet_map(env: Environment, name: str, trained_on: Sequence[MapKind]) -> OtherSide | None:
+def meet_map(env: Environment, name: str, trained_on: Sequence[RoadKind]) -> OtherSide | None:
     """Warn about kinds of the map that a driver was not trained on.
 
     Return the exchange of left and right, if the driver was trained on the other side of the road.
@@ -38,7 +38,7 @@ def meet_map(env: Environment, name: str, trained_on: Sequence[MapKind]) -> Othe
     Raises:
         PolicyError: left and right cannot be exchanged in its observations or actions.
     """
-    untrained = [kind for kind in map_kinds(env.network) if kind not in trained_on]
+    untrained = [kind for kind in road_kinds(env.network) if kind not in trained_on]
     other_side = None
     if any(kind != "stop_signs" for kind in untrained):
         try:

@@ -23,7 +23,7 @@ from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.io import validate
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError, PolicyError
-from cavmarl.roads.map_kinds import MapKind
+from cavmarl.roads.road_kinds import RoadKind
 
 CONTINUOUS_ACTIONS = 2
 # A residual driver's share of throttle and steering; small, to stay in the built-in driver's lane.
@@ -54,7 +54,7 @@ class NetworkConfig:
         shared: one body with LayerNorm and ReLU for actor and critic; else each is a tanh network.
         residual: the output, scaled by `RESIDUAL_PARTS`, is added to the built-in driver's action,
             which is observed last (residual learning: Silver et al. 2018, Johannink et al. 2019).
-        maps: kinds of the maps of the training, see `map_kinds`. Drivers without this key were
+        maps: kinds of the maps of the training, see `road_kinds`. Drivers without this key were
             trained on right-hand maps without stop signs.
     """
 
@@ -68,7 +68,7 @@ class NetworkConfig:
     state_size: int = 0
     shared: bool = False
     residual: bool = False
-    maps: tuple[MapKind, ...] = ("right_hand",)
+    maps: tuple[RoadKind, ...] = ("right_hand",)
 
     def __post_init__(self) -> None:
         if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:

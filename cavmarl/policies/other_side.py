@@ -52,7 +52,8 @@ class OtherSide:
     def actions(self, actions: NDArray[Any]) -> NDArray[Any]:
         """Return actions with left and right exchanged: pairs (…, 2), or choices (…)."""
         if self._choices is not None:
-            return self._choices[actions]
+            chosen: NDArray[Any] = self._choices[actions]
+            return chosen
         exchanged = actions.copy()
         exchanged[..., 1] = 0.0 - actions[..., 1]
         return exchanged

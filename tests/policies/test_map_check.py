@@ -27,7 +27,7 @@ from cavmarl.evaluate.evaluation import load_tables
 from cavmarl.policies.loading import load_policy
 from cavmarl.policies.map_check import UntrainedMapWarning
 from cavmarl.policies.other_side import OtherSide
-from cavmarl.roads.map_kinds import map_kinds
+from cavmarl.roads.road_kinds import road_kinds
 from tests.support.mirrored import mirror_net
 from tests.support.netgenerate import netgenerate
 from tests.support.saved_drivers import save_driver
@@ -61,9 +61,9 @@ def test_stop_signs_and_the_side_of_traffic_are_the_kinds_of_a_map(
     tmp_path: Path, junctions: str, kinds: set[str]
 ) -> None:
     path = netgenerate(tmp_path / "grid.net.xml", *GRID, junctions)
-    assert set(map_kinds(world(path).network)) == kinds
+    assert set(road_kinds(world(path).network)) == kinds
     mirror = mirror_net(path, tmp_path / "left.net.xml")
-    assert set(map_kinds(world(mirror).network)) == {*kinds - {"right_hand"}, "left_hand"}
+    assert set(road_kinds(world(mirror).network)) == {*kinds - {"right_hand"}, "left_hand"}
 
 
 def success(path: Path, driver: str, out: Path, **keys: Any) -> float:
