@@ -67,7 +67,7 @@ if TYPE_CHECKING:
     from cavmarl.policies.policy import Policy
     from cavmarl.recordings.extra_tables import RecordOptions
     from cavmarl.rewards.registered_terms import register_term
-    from cavmarl.sensors.observed.feature import Feature
+    from cavmarl.sensors.observed.feature import Feature, Sides
     from cavmarl.sensors.registry import register_sensor
     from cavmarl.viewer.live_env import show
 
@@ -107,6 +107,7 @@ __all__ = [
     "RouteError",
     "ScenarioError",
     "ServiceError",
+    "Sides",
     "SumoError",
     "TrainingError",
     "UnknownArgumentError",
@@ -136,6 +137,7 @@ _LATE = {
     "CavEnv": "env.parallel",
     "CavVectorEnv": "env.vector",
     "Feature": "sensors.observed.feature",
+    "Sides": "sensors.observed.feature",
     "Policy": "policies.policy",
     "env": "env.registration",
     "load_policy": "policies.loading",

@@ -2,26 +2,37 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
+from cavmarl.policies.network_files import read_network_config
 
-from cavmarl.config.registry import entries, load_config
+import cavmarl
+from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.config.sensors import (
+    ConflictsConfig,
     EgoConfig,
+    HistoryConfig,
     KinematicsConfig,
+    LanesConfig,
     LidarConfig,
     LidarObservationConfig,
+    MessagesConfig,
     NeighborsConfig,
     OccupancyGridConfig,
     RouteAheadConfig,
     SensorsConfig,
     SignalAheadConfig,
+    WayConfig,
 )
 from cavmarl.engine.spaces import flat_observation_space, observation_table
+from cavmarl.roads.road_kinds import road_kinds
 from cavmarl.sensors.observed import SENSORS, layout
+from cavmarl.sensors.observed.readings import readings_of, readings_table
 from tests.support.generated import check_block
 
 ROOT = Path(__file__).parent.parent
+TRAINED = {name: path for name, path in agent_entries().items() if path.is_dir()}
 
 OFF = SensorsConfig(
     ego=EgoConfig(enabled=False),
@@ -64,6 +75,75 @@ def test_a_page_has_the_sensors_that_can_be_switched_on(page: str) -> None:
 def test_a_card_has_the_observation_index_by_index(name: str) -> None:
     config, base_dir = load_config(name)
     check_block(base_dir / "README.md", "observation table", observation_table(config.sensors))
+
+
+@pytest.mark.parametrize("name", sorted(entries()))
+def test_the_card_of_an_environment_says_where_observations_come_from(name: str) -> None:
+    config, base_dir = load_config(name)
+    check_block(base_dir / "README.md", "reads", readings_table(readings_of(config.sensors)))
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_the_card_of_a_driver_says_what_it_reads(name: str) -> None:
+    config = read_network_config(TRAINED[name])
+    readings = readings_of(config.sensors, config.residual)
+    check_block(TRAINED[name] / "README.md", "reads", readings_table(readings))
+
+
+def test_a_driver_that_adds_to_the_built_in_driver_reads_the_state_of_the_world() -> None:
+    config = read_network_config(TRAINED["cities_residual"])
+    alone, residual = (readings_of(config.sensors, residual) for residual in (False, True))
+    (added,) = [reading for reading in residual if reading not in alone]
+    assert added.source == "world's state"
+    assert "positions and plans of all vehicles" in added.what
+
+
+@pytest.mark.parametrize("name", TRAINED)
+def test_the_maps_of_an_environment_have_the_kinds_that_its_driver_was_trained_on(
+    name: str,
+) -> None:
+    config = read_network_config(TRAINED[name])
+    network = cavmarl.make_vec(config.environment, num_envs=1).network
+    assert set(road_kinds(network)) <= set(config.maps)
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"signal": SignalAheadConfig(timing=True)}, "exact time until the next signal"),
+        ({"way": WayConfig(lines=1, timing=True)}, "exact time until the signals on its path"),
+        ({"conflicts": ConflictsConfig(count=1, indicators=True)}, "the next turn of vehicles"),
+        ({"lanes": LanesConfig(range_m=50.0)}, "the paths of vehicles on other lanes"),
+    ],
+)
+def test_plans_of_others_and_times_of_signals_are_labelled_as_state_of_the_world(
+    settings: dict[str, Any], said: str
+) -> None:
+    readings = readings_of(replace(OFF, **settings))
+    assert any(one.source == "world's state" and said in one.what for one in readings)
+    assert not any(one.source == "world's state" for one in readings_of(OFF))
+
+
+def test_an_indicator_that_is_visible_near_a_junction_is_not_state_of_the_world() -> None:
+    conflicts = ConflictsConfig(count=1, indicators=True, indicators_m=40.0)
+    readings = readings_of(replace(OFF, conflicts=conflicts))
+    assert not any(one.source == "world's state" for one in readings)
+    assert any("indicators of these vehicles, up to 40 m" in one.what for one in readings)
+
+
+def test_each_sensor_says_what_it_reads() -> None:
+    config = SensorsConfig(
+        lanes=LanesConfig(range_m=50.0),
+        kinematics=KinematicsConfig(vehicles_count=2),
+        occupancy_grid=OccupancyGridConfig(features=("presence",)),
+        lidar_observation=LidarObservationConfig(cells=4),
+        messages=MessagesConfig(objects=1),
+        way=WayConfig(lines=1),
+        conflicts=ConflictsConfig(count=1),
+        history=HistoryConfig(steps=1),
+    )
+    assert set(layout(config)) == {sensor.name for sensor in SENSORS}
+    assert all(sensor.reads(config) for sensor in SENSORS)
 
 
 @pytest.mark.parametrize("name", sorted(entries()))

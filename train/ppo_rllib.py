@@ -42,6 +42,7 @@ from cavmarl.learning.options import (
 )
 from cavmarl.learning.run_folder import RunFolder
 from cavmarl.networks.network_files import NetworkConfig
+from cavmarl.roads.road_kinds import road_kinds
 
 DRIVER = "driver"  # the policy that all agents share
 
@@ -176,6 +177,7 @@ def train(args: Args) -> Path:
         action=env.action,
         hidden=(args.hidden, args.hidden),
         seed=args.seed,
+        maps=road_kinds(world.network),
     )
     with RunFolder(args, world.simulation) as folder:
         ray.init(num_cpus=args.num_runners + 1, include_dashboard=False, log_to_driver=False)

@@ -55,6 +55,7 @@ RECIPE_KEYS: dict[str, Any] = {
     "sensors.ego.enabled": True,
     "sensors.way.distances_m": [5.0, 10.0, 20.0, 40.0, 60.0],
     "sensors.way.lines": 1,
+    "sensors.way.timing": True,
     "sensors.conflicts.count": 6,
     "sensors.history.steps": 2,
 }

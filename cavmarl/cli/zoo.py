@@ -1,10 +1,10 @@
-"""`cavmarl zoo`: lists, verifies, compares and exports trained drivers."""
+"""`cavmarl zoo`: lists, shows, verifies, compares and exports trained drivers."""
 
 from __future__ import annotations
 
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
@@ -30,7 +30,7 @@ from cavmarl.config.world_spec import WorldSpec, with_sensors_of_drivers
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from cavmarl.evaluate.zoo import Cross
+    from cavmarl.evaluate.zoo import Cross, ZooEntry
 
 # Metrics that fit eighty columns, and their headings.
 SHORT = {
@@ -41,7 +41,9 @@ SHORT = {
 }
 
 app = typer.Typer(
-    cls=CliGroup, help="List, verify, compare and export trained drivers.", no_args_is_help=True
+    cls=CliGroup,
+    help="List, show, verify, compare and export trained drivers.",
+    no_args_is_help=True,
 )
 
 
@@ -63,15 +65,38 @@ def list_drivers(json_path: JsonPath = None) -> None:
     console = Console()
     about_each = [(escape(one.name), escape(sentence_about(one.folder))) for one in found]
     console.print(grid(("driver", "what it is"), about_each, lefts=2))
+    sources = [(escape(one.name), escape(_sources(one))) for one in found]
+    console.print(grid(("driver", "what it reads comes from"), sources, lefts=2))
     console.print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
-    told = {one.name: {field: getattr(one, field) for field in fields} for one in found}
+    told = {
+        one.name: {field: getattr(one, field) for field in fields} | _label(one) for one in found
+    }
     refused = {one.name: {"refused": one.refused} for one in entries if one.refused}
     write_json(json_path, told | refused)
     for one in refused.values():
         Console(stderr=True).print(f"error: {one['refused']}", markup=False, highlight=False)
     if refused:
         raise typer.Exit(1)
+
+
+def show(
+    name: Annotated[
+        str, typer.Argument(metavar="DRIVER", help="Name or folder of a trained driver.")
+    ],
+    imports: Imports = None,
+    json_path: JsonPath = None,
+) -> None:
+    """Show what a driver reads, and the kinds of maps of its training."""
+    from cavmarl.evaluate.zoo import zoo_entry
+
+    entry = zoo_entry(name)
+    rows = [(reading.source, escape(reading.what)) for reading in entry.readings]
+    console = Console()
+    title = escape(f"{entry.name}: {sentence_about(entry.folder)}")
+    console.print(grid(("from", "it reads"), rows, title, lefts=2))
+    console.print(f"maps of its training: {', '.join(entry.maps)}", highlight=False)
+    write_json(json_path, {"name": entry.name, **_label(entry)})
 
 
 def verify(
@@ -173,6 +198,15 @@ def export(
     write_json(json_path, told)
 
 
+def _sources(entry: ZooEntry) -> str:
+    return ", ".join(dict.fromkeys(reading.source for reading in entry.readings))
+
+
+def _label(entry: ZooEntry) -> dict[str, Any]:
+    """Return what an entry reads and the kinds of its maps, for JSON."""
+    return {"reads": [asdict(reading) for reading in entry.readings], "maps": list(entry.maps)}
+
+
 def _matrix(found: Cross, column: str, title: str) -> Table:
     heads = ("", *(f"among {escape(name)}" for name in found.drivers))
     rows = [
@@ -183,6 +217,7 @@ def _matrix(found: Cross, column: str, title: str) -> Table:
 
 
 add_command(app, "list", list_drivers, "cavmarl zoo list")
+add_command(app, "show", show, "cavmarl zoo show cities_ippo")
 add_command(app, "verify", verify, "cavmarl zoo verify cities_ippo")
 add_command(
     app,

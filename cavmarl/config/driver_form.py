@@ -43,12 +43,17 @@ class _FormFile:
 
 
 def form_of(sensors: SensorsConfig, action: ActionConfig) -> Form:
-    """Return all keys that define the meaning of observations and actions, with their values."""
+    """Return all keys that define the meaning of observations and actions, with their values.
+
+    The keys of a sensor that is off have their defaults, so that forms are equal whenever
+    observations and actions are.
+    """
     from cavmarl.config.io import dotted_keys  # pydantic is slow to import
 
     names = ("kind", *SCALES[action.kind])
     actions = {f"action.{name}": getattr(action, name) for name in names}
-    values = {f"sensors.{key}": attrgetter(key)(sensors) for key in dotted_keys(SensorsConfig)}
+    plain = sensors.plain()
+    values = {f"sensors.{key}": attrgetter(key)(plain) for key in dotted_keys(SensorsConfig)}
     return actions | values
 
 
@@ -171,7 +176,11 @@ def with_form(overrides: Mapping[str, Any] | None, form: Form, driver: str) -> d
 
 def differing_keys(form: Form, config: EnvConfig) -> dict[str, tuple[Any, Any]]:
     """Return the keys with different values: (value in the form, value in the environment)."""
-    pairs = {key: (needed, attrgetter(key)(config)) for key, needed in form.items()}
+    here = form_of(config.sensors, config.action)
+    pairs = {
+        key: (needed, here[key] if key in here else attrgetter(key)(config))
+        for key, needed in form.items()
+    }
     return {key: (needed, here) for key, (needed, here) in pairs.items() if needed != here}
 
 

@@ -62,9 +62,20 @@ class SensorSection(Section, key=""):
         """Whether any of the switches is set."""
         return any(getattr(self, name) for name in self.switches)
 
+    def plain(self) -> Self:
+        """Return the section; if the sensor is off, with the defaults of its other keys.
+
+        The keys of a sensor that is off have no effect.
+        """
+        return self if self.is_on else type(self)(**self._cleared(self.switches))
+
     def without_sight(self) -> Self:
         """Return the same sensor with its perception of vehicles and signals switched off."""
-        return replace(self, **{name: type(getattr(self, name))() for name in self.sight})
+        return replace(self, **self._cleared(self.sight))
+
+    def _cleared(self, names: tuple[str, ...]) -> dict[str, Any]:
+        """Return 0, false or an empty value for each of these fields."""
+        return {name: type(getattr(self, name))() for name in names}
 
 
 @dataclass(frozen=True)
@@ -120,12 +131,16 @@ class SignalAheadConfig(
     Attributes:
         enabled: false switches the sensor off.
         range_m: distance ahead up to which it is seen.
-        timing: adds the time until the signal changes, which roadside units broadcast.
+        timing: adds the exact time until the signal changes, from the world's state. A vehicle on a
+            road knows it only from messages (`sensors.messages.timing`).
+        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; or with an
+            additional number of its `own`.
     """
 
     enabled: bool = True
     range_m: Annotated[float, Within(1.0, 300.0)] = 80.0
     timing: bool = False
+    stop_signs: Literal["give_way", "own"] = "give_way"
 
 
 @dataclass(frozen=True)
@@ -309,13 +324,17 @@ class WayConfig(
         distances_m: increasing distances at which the path is sampled; an empty list: none.
         lines: number of next stop lines with a signal or a duty to yield; 0: none.
         range_m: distance ahead up to which a line is seen.
-        timing: adds the time until a line's signal changes, which roadside units broadcast.
+        timing: adds the exact time until a line's signal changes, from the world's state. A vehicle
+            on a road knows it only from messages (`sensors.messages.timing`).
+        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; with an
+            additional number of its `own`; or like a `red` light, as `tollgate_ippo` needs it.
     """
 
     distances_m: tuple[float, ...] = ()
     lines: Annotated[int, Whole(0, 8)] = 0
     range_m: Annotated[float, Within(1.0, 300.0)] = 100.0
-    timing: bool = True
+    timing: bool = False
+    stop_signs: Literal["give_way", "own", "red"] = "give_way"
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -346,6 +365,8 @@ class ConflictsConfig(
             from the message; and two numbers per vehicle, see `seen` and `age`.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
             indicate at their present or next junction; and adds one number per vehicle, see `turn`.
+        indicators_m: distance to the junction from which vehicles indicate; before that, their turn
+            is unknown. 0: they indicate at any distance, which only the world's state can tell.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0
@@ -353,6 +374,7 @@ class ConflictsConfig(
     through_walls: bool = True
     heard: bool = False
     indicators: bool = False
+    indicators_m: Annotated[float, Within(0.0, 300.0)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -400,10 +422,10 @@ class SensorsConfig(Section, key="sensors"):
                 check(False, "sensors.registered", name, REGISTERED_SENSORS.advice())
         once = len(set(self.registered)) == len(self.registered)
         self.need("registered", once, "must name each sensor once")
-        is_any_on = bool(self.registered) or any(one.is_on for one in self._sections().values())
+        is_any_on = bool(self.registered) or any(one.is_on for one in self.sections().values())
         check(is_any_on, "sensors", "all off", "an agent must observe something; switch one on")
 
-    def _sections(self) -> dict[str, SensorSection]:
+    def sections(self) -> dict[str, SensorSection]:
         """Return the configuration of each sensor of the package, by name."""
         named = ((entry.name, getattr(self, entry.name)) for entry in fields(self))
         return {name: value for name, value in named if isinstance(value, SensorSection)}
@@ -411,9 +433,14 @@ class SensorsConfig(Section, key="sensors"):
     def without_sight(self) -> SensorsConfig:
         """Return the same sensors, except sensors that see other vehicles or signals."""
         blind: dict[str, Any] = {
-            name: section.without_sight() for name, section in self._sections().items()
+            name: section.without_sight() for name, section in self.sections().items()
         }
         return replace(self, registered=(), **blind)
+
+    def plain(self) -> SensorsConfig:
+        """Return the same sensors, with the defaults of all keys that have no effect."""
+        plain: dict[str, Any] = {name: section.plain() for name, section in self.sections().items()}
+        return replace(self, **plain)
 
 
 def _is_range(bounds: tuple[float, ...]) -> bool:

@@ -30,6 +30,7 @@ from cavmarl.limits.limit_table import limit_sizes
 from cavmarl.maps.buildings import with_buildings
 from cavmarl.maps.netconvert import conversion_notes, map_file
 from cavmarl.networks.background_driver import background_drivers
+from cavmarl.networks.trained_maps import note_of, untrained_kinds
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.default_horizon import horizon_of
 from cavmarl.roads.held_signals import held_signals_note
@@ -132,8 +133,11 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
 
     Raises the errors of `load_world`.
     """
-    background_drivers(config.traffic)  # refuse drivers that do not fit before reading the map
+    drivers = background_drivers(config.traffic)  # refuses drivers before the map is read
     network = load_roads(config, base_dir)
+    for driver in drivers:
+        for kind in untrained_kinds(network, driver.maps):
+            _warn_once(network.name, network.source_hash, note_of(driver.name, kind))
     if config.horizon_s == BY_MAP:
         step_s = config.clock.ctrl_dt_s
         config = replace(config, horizon_s=step_s * max(1, round(horizon_of(network) / step_s)))

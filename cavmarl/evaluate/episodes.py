@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -35,6 +36,7 @@ from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.placement.backend_name import LOCAL
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.policies.loading import load_policy
+from cavmarl.policies.map_check import UntrainedMapWarning
 from cavmarl.policies.policy import Policy
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.roads.kernels.map_choice import map_of
@@ -110,7 +112,10 @@ def drive_run(
     vec = CavVectorEnv(make_worlds(world, base_dir, num_envs, find_backend(job.backend)))
     copy = WorldCopy()
     try:
-        drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
+        with warnings.catch_warnings():
+            # `evaluate` has given this warning when it checked the drivers.
+            warnings.simplefilter("ignore", UntrainedMapWarning)
+            drivers = {name: load_policy(policy, vec) for name, policy in job.policies.items()}
         look = None if watcher is None else watcher(vec)
         return {
             name: _drive(vec, copy, driver, name, job, progress, look)

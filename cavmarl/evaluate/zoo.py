@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 from cavmarl.config.driver_names import TOGETHER
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.removed_keys import removed_key
+from cavmarl.config.sensors import SensorsConfig
 from cavmarl.config.world_spec import WorldKeys, WorldSpec
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.core.machine import describe_hardware
@@ -35,6 +36,10 @@ from cavmarl.evaluate.evaluation import (
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.policies.loading import policy_files
+from cavmarl.policies.network_files import read_network_config
+from cavmarl.roads.road_kinds import RoadKind
+from cavmarl.sensors.observed.feature import Reading
+from cavmarl.sensors.observed.readings import readings_of
 
 RESULT_FOLDER = "result"
 TABLES = (TRIPS_FILE, EPISODES_FILE, TRACKS_FILE)  # files whose bytes are reproducible
@@ -51,6 +56,8 @@ class ZooEntry:
     environment: str  # with its version, for example `merge-v6`; empty: no result
     trips: int  # of the result
     shares: Mapping[str, float]  # shares of trips by the names of `SHARES`
+    readings: tuple[Reading, ...] = ()  # what the driver reads, by source
+    maps: tuple[RoadKind, ...] = ()  # kinds of the maps of its training
     refused: str = ""  # why the entry cannot be read, with the remedy; other fields are then empty
 
 
@@ -127,10 +134,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
         PolicyError: there is no such driver, or it is not trained.
         ManifestError: there is no result, or weights or world differ from those it was made with.
     """
-    weights = policy_files(policy)
-    if len(weights) < 2:
-        raise PolicyError(f"{policy}: is a script; the zoo contains only trained drivers")
-    folder = weights[0].parent
+    folder = _trained(policy)[1]
     return verify_result(folder, folder, progress)
 
 
@@ -205,24 +209,50 @@ _WORLD_KEYS = ("environment", "map_source_sha256", "demand_content_sha256")
 _KEYS = ("agents", "background", "max_cycles", "seed", "overrides")
 
 
+def zoo_entry(policy: str | Path) -> ZooEntry:
+    """Return a trained driver with its result.
+
+    Args:
+        policy: name of a trained driver, or its folder.
+
+    Raises:
+        PolicyError: there is no such driver, or it is not trained.
+        ManifestError: its result cannot be read.
+    """
+    return _entry(*_trained(policy))
+
+
+def _trained(policy: str | Path) -> tuple[str, Path]:
+    """Return the name and the folder of a trained driver.
+
+    Raises PolicyError: there is no such driver, or it is not trained.
+    """
+    files = policy_files(policy)
+    if len(files) < 2:
+        raise PolicyError(f"{policy}: is a script; the zoo contains only trained drivers")
+    return files[0].parent.name, files[0].parent
+
+
 def _told(name: str, folder: Path) -> ZooEntry:
     try:
         return _entry(name, folder)
     except CavmarlError as error:
-        return ZooEntry(name, folder, 0, "", 0, {}, f"{name}: {error}")
+        return ZooEntry(name, folder, 0, "", 0, {}, refused=f"{name}: {error}")
 
 
 def _entry(name: str, folder: Path) -> ZooEntry:
     weights_bytes = policy_files(folder)[0].stat().st_size
+    config = read_network_config(folder)
+    label = tuple(readings_of(config.sensors, config.residual)), config.maps
     result = folder / RESULT_FOLDER
     if not result.is_dir():
-        return ZooEntry(name, folder, weights_bytes, "", 0, {})
+        return ZooEntry(name, folder, weights_bytes, "", 0, {}, *label)
     document = read_evaluation(result)
     trips, _ = load_tables(result)[next(iter(document["policies"]))]
     counted = trips[trips["counted"]]
     shares = {key: float(counted[key].mean()) for key in SHARES} if len(counted) else {}
     environment = document["world"]["environment"]
-    return ZooEntry(name, folder, weights_bytes, environment, len(counted), shares)
+    return ZooEntry(name, folder, weights_bytes, environment, len(counted), shares, *label)
 
 
 def _processor(hardware: Mapping[str, Any]) -> str:
@@ -264,7 +294,8 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
     others = [key for key in _WORLD_KEYS if here[key] != there[key]]
-    differing = _differing("config", there["config"], here["config"])
+    ours = here["config"]
+    differing = _differing("config", _without_idle_sensors(there["config"], ours), ours)
     others += [key for key in differing if removed_key(key.removeprefix("config.")) is None]
     if others:
         raise ManifestError(
@@ -272,6 +303,19 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
             f"version ({here['environment']}); figures of different worlds are not compared: "
             "evaluate the driver again"
         )
+
+
+def _without_idle_sensors(config: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a described configuration without the sensors that are off in both."""
+    switches = {name: own.switches for name, own in SensorsConfig().sections().items()}
+
+    def is_on(described: Mapping[str, Any], name: str) -> bool:
+        keys = described["sensors"].get(name, {})
+        return name not in switches or any(keys.get(switch) for switch in switches[name])
+
+    both = (config, other)
+    names = [name for name in config["sensors"] if any(is_on(one, name) for one in both)]
+    return {**config, "sensors": {name: config["sensors"][name] for name in names}}
 
 
 def _differing(key: str, there: Any, here: Any) -> Iterator[str]:

@@ -42,6 +42,7 @@ from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import given_options, settings_of
 from cavmarl.networks.network_files import NetworkConfig
+from cavmarl.roads.road_kinds import road_kinds
 
 if sys.platform != "win32":
     import fcntl
@@ -105,6 +106,7 @@ class RunFolder:
         self.path = path = settings.folder
         self._settings = settings
         self._environment = _digest(world)
+        self._maps = road_kinds(world.network)
         resumes = bool(getattr(settings, "resume", ""))
         try:
             path.mkdir(parents=True, exist_ok=True)
@@ -211,9 +213,12 @@ class RunFolder:
             write_checkpoint(self.path, state)
 
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
-        """Write the present driver for evaluation; runs are not resumed from it."""
+        """Write the present driver for evaluation, with the kinds of the maps of its training.
+
+        Runs are not resumed from it.
+        """
         with writing(self.path / WEIGHTS_FILE):
-            save_network(self.path, network, config)
+            save_network(self.path, network, replace(config, maps=self._maps))
 
     def end(self, files: Sequence[str] = DRIVER_FILES, plans: Sequence[Plan] = ()) -> Path:
         """Complete the manifest with the files of the run."""

@@ -19,6 +19,7 @@ from cavmarl.config.registry import agent_entries
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.config.traffic import ZOO, TrafficConfig
 from cavmarl.core.errors import PolicyError
+from cavmarl.roads.road_kinds import RoadKind
 
 if TYPE_CHECKING:
     from cavmarl.networks.network_files import NetworkConfig
@@ -34,12 +35,14 @@ class BackgroundDriver:
         name: its name or path, as `traffic.model` gives it.
         folder: its folder.
         sensors: the sensors that it observes.
+        maps: kinds of the maps of its training.
         content_hash: SHA-256 of its weights and its configuration.
     """
 
     name: str
     folder: Path
     sensors: SensorsConfig
+    maps: tuple[RoadKind, ...]
     content_hash: str
 
 
@@ -73,7 +76,7 @@ def _background_driver(name: str) -> BackgroundDriver:
         )
     files = [folder / WEIGHTS_FILE, folder / CONFIG_FILE]
     content = hashlib.sha256(b"".join(hashlib.sha256(one.read_bytes()).digest() for one in files))
-    return BackgroundDriver(name, folder, config.sensors, content.hexdigest())
+    return BackgroundDriver(name, folder, config.sensors, tuple(config.maps), content.hexdigest())
 
 
 def _read(name: str, folder: Path) -> NetworkConfig:

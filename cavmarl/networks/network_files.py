@@ -23,6 +23,7 @@ from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.config.io import validate
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.core.errors import ConfigError, PolicyError
+from cavmarl.roads.road_kinds import RoadKind
 
 CONTINUOUS_ACTIONS = 2
 # A residual driver's share of throttle and steering; small, to stay in the built-in driver's lane.
@@ -53,6 +54,8 @@ class NetworkConfig:
         shared: one body with LayerNorm and ReLU for actor and critic; else each is a tanh network.
         residual: the output, scaled by `RESIDUAL_PARTS`, is added to the built-in driver's action,
             which is observed last (residual learning: Silver et al. 2018, Johannink et al. 2019).
+        maps: kinds of the maps of the training, see `road_kinds`. Drivers without this key were
+            trained on right-hand maps without stop signs.
     """
 
     environment: str
@@ -65,6 +68,7 @@ class NetworkConfig:
     state_size: int = 0
     shared: bool = False
     residual: bool = False
+    maps: tuple[RoadKind, ...] = ("right_hand",)
 
     def __post_init__(self) -> None:
         if not 1 <= self.observation_size <= MAX_OBSERVATION_SIZE:
@@ -72,6 +76,8 @@ class NetworkConfig:
                 f"observation_size = {self.observation_size}: must be from 1 to "
                 f"{MAX_OBSERVATION_SIZE}"
             )
+        if not {"right_hand", "left_hand"} & set(self.maps):
+            raise ConfigError(f"maps = {list(self.maps)}: must contain right_hand or left_hand")
         if self.residual and self.action.kind != "continuous":
             raise ConfigError(
                 f"residual with action.kind = {self.action.kind}: choices cannot be added to the "
@@ -146,6 +152,15 @@ def read_network(folder: Path) -> tuple[Weights, NetworkConfig]:
     if not (weights["deviation"] > 0.0).all():
         raise PolicyError(f"{path}: 'deviation' holds numbers that are not greater than 0")
     return weights, config
+
+
+def read_network_config(folder: Path) -> NetworkConfig:
+    """Read the configuration of a trained driver's network, without its weights.
+
+    Raises:
+        PolicyError: the file is missing or broken.
+    """
+    return _read_config(folder / CONFIG_FILE)
 
 
 def _read_weights(path: Path, config: NetworkConfig) -> dict[str, NDArray[np.float32]]:

@@ -24,6 +24,7 @@ from cavmarl.core.tracebacks import fault_in
 from cavmarl.env.parallel import CavEnv
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.policies.driver_fit import check_fit
+from cavmarl.policies.map_check import meet_map
 from cavmarl.policies.model_files import make_policy, model_files
 from cavmarl.policies.policy import Environment, NetworkPolicy, Policy, SharedPolicy
 from cavmarl.policies.shield import ShieldedPolicy
@@ -44,9 +45,12 @@ def load_policy(policy: str | Path, env: Environment, *, beside_signals: bool = 
 
     Raises:
         PolicyError: the policy does not exist, a file is broken, or a network was made for other
-            observations or actions than this environment's; or signals have agents for which
-            nothing acts.
+            observations or actions than this environment's, or for the other side of the road with
+            sensors that cannot be mirrored; or signals have agents for which nothing acts.
         MissingExtraError: the library of a model file is not installed.
+
+    Warns:
+        UntrainedMapWarning: a trained driver was not trained on maps of this kind.
     """
     if isinstance(env, ParallelEnv):
         env = env.unwrapped
@@ -113,7 +117,7 @@ def _load_network_policy(folder: Path, env: Environment) -> NetworkPolicy:
 
     network, name = load_driver_network(folder), name_of_driver(folder)
     check_fit(network.config, env.config, name, name)
-    return NetworkPolicy(env, network)
+    return NetworkPolicy(env, network, meet_map(env, name, network.config.maps))
 
 
 def driver_keys(policy: str | Path) -> dict[str, Any]:

@@ -23,6 +23,7 @@ from cavmarl.env.vector import CavVectorEnv
 
 if TYPE_CHECKING:
     from cavmarl.networks.driver_network import DriverNetwork
+    from cavmarl.policies.other_side import OtherSide
 
 Environment = CavEnv | CavVectorEnv
 
@@ -90,18 +91,35 @@ class Policy(ABC):
 
 
 class NetworkPolicy(Policy):
-    """A trained network that drives with its most likely actions."""
+    """A trained network that drives with its most likely actions.
 
-    def __init__(self, env: Environment, network: DriverNetwork) -> None:
+    Args:
+        env: environment of the policy.
+        network: the network.
+        other_side: exchanges left and right, if the network was trained on maps with traffic on the
+            other side of the road.
+    """
+
+    def __init__(
+        self, env: Environment, network: DriverNetwork, other_side: OtherSide | None = None
+    ) -> None:
         super().__init__(env)
         self.network = network
+        self._other_side = other_side
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """Return the network's most likely actions where `mask` is set, else 0."""
+        exchange = self._other_side
+        if exchange is not None:
+            observations = exchange.observations(observations)
         if self.network.config.residual:
             proposed = built_in_actions(self.env, mask)
+            if exchange is not None:
+                proposed = exchange.actions(proposed)
             observations = np.concatenate([observations, proposed], axis=-1)
         best = self.network.best(observations[mask])
+        if exchange is not None:
+            best = exchange.actions(best)
         actions = np.zeros((*mask.shape, *best.shape[1:]), dtype=best.dtype)
         actions[mask] = best
         return actions

@@ -23,7 +23,7 @@ from cavmarl.sensors.mounted import cameras, lidar, own_motion
 from cavmarl.sensors.mounted.frames import SensorFrames
 from cavmarl.sensors.mounted.mounted_sensor import MountedSensor, Platform
 from cavmarl.sensors.observed import SENSORS
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides
 
 MountedType = type[MountedSensor[Any]]
 
@@ -61,6 +61,7 @@ def register_sensor(
     features: Sequence[Feature],
     reach_m: float = 0.0,
     batched: bool = False,
+    sides: Sides | None = None,
 ) -> None:
     """Register a sensor that agents observe; `sensors.registered` can then name it.
 
@@ -73,6 +74,8 @@ def register_sensor(
         reach_m: largest distance of the centres of `AgentView.others`; 0: there are no others.
         batched: whether `sense` is called once per world, with all its agents, instead of once per
             agent.
+        sides: what happens to the features if left and right are exchanged. Without it, trained
+            drivers that observe the sensor do not drive on the other side of the road.
 
     Raises:
         ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or
@@ -90,7 +93,13 @@ def register_sensor(
     def reach_of(config: SensorsConfig) -> float:
         return float(reach_m)
 
-    sensor = Sensor(name, features_of, reach_of, sense=sense, batched=batched)
+    def reads(config: SensorsConfig) -> list[Reading]:
+        others = f", from vehicles within {reach_m:g} m" if reach_m else ""
+        return [Reading("ideal sensors", f"the registered sensor {name}{others}")]
+
+    sensor = Sensor(
+        name, features_of, reach_of, sense=sense, batched=batched, sides=sides, reads=reads
+    )
     REGISTERED_SENSORS.add(name, sensor, sense, (*_OBSERVED, *_MOUNTED))
 
 

@@ -8,11 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.core.errors import PolicyError
+from cavmarl.config.traffic import ZOO
+from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.networks.background_driver import BackgroundDriver, background_drivers
 from cavmarl.networks.kernels.inference import TILE_ROWS
+from cavmarl.networks.trained_maps import is_other_side, untrained_kinds
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.observed import all_optional_arrays, frame_size, sensor_arrays
+from cavmarl.sensors.observed.exchanged_sides import exchange_sides
 from cavmarl.shards.kernels.learned_driving import LearnedDriver
 from cavmarl.v2x.kernels.v2x_records import REPORT
 
@@ -27,7 +30,7 @@ def learned_drivers(
 
     Raises:
         PolicyError: see `background_drivers`; or the sensors of a driver give another number of
-            features than it observes.
+            features than it observes, or left and right cannot be exchanged in them.
     """
     drivers = background_drivers(config.traffic)
     return tuple(_learned(drivers, network, plans, capacity))
@@ -51,6 +54,7 @@ def _learned(
                 f"sensors give {size} in this version; train it again, or name another driver in "
                 "traffic.model"
             )
+        exchanged, signs = _exchanged_sides(driver, network)
         yield LearnedDriver(
             number=number,
             sensors=sensor_arrays(sensors, network),
@@ -59,10 +63,29 @@ def _learned(
             weights=loaded.weights,
             accel_mps2=action.acceleration_mps2,
             steering_rad=action.steering_rad,
+            exchanged=exchanged,
+            signs=signs,
             no_reports=np.zeros(0, dtype=REPORT),
             observations=np.zeros(TILE_ROWS * size, dtype=np.float32),
+            frame=np.zeros(size, dtype=np.float32),
             actions=np.zeros(TILE_ROWS * loaded.config.num_outputs, dtype=np.float32),
             states=np.zeros(0, dtype=np.float32),
             buffers=loaded.new_buffers(),
             places=np.zeros(TILE_ROWS, dtype=np.int64),
         )
+
+
+def _exchanged_sides(
+    driver: BackgroundDriver, network: RoadNetwork
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """Return how to exchange left and right in an observation; empty: the sides are the same."""
+    if not is_other_side(untrained_kinds(network, driver.maps)):
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.float32)
+    try:
+        places, signs = exchange_sides(driver.sensors)
+    except ConfigError as error:
+        raise PolicyError(
+            f"traffic.model = '{ZOO}{driver.name}': cannot drive on this map: {error}; name a "
+            "driver that was trained on this side of the road"
+        ) from error
+    return places.astype(np.int64), signs

@@ -26,7 +26,7 @@ def test_a_trained_driver_drives_a_real_map_without_a_setting(
     assert run("evaluate", city, *drivers, "-n", "1", *QUICK, "--out", str(out)) == 0
     told = [line for line in capsys.readouterr().err.splitlines() if "sensors" in line]
     assert told == [
-        f"cavmarl: {city} gets the sensors and actions of cities_residual (9 keys, as with "
+        f"cavmarl: {city} gets the sensors and actions of cities_residual (10 keys, as with "
         "--sensors-of cities_residual)"
     ]
     job = json.loads((out / "manifest.json").read_text())["job"]

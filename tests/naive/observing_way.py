@@ -107,8 +107,12 @@ def lines(
     shown: dict[int, str],
     count: int,
     range_m: float,
+    stop_signs: str = "give_way",
 ) -> list[float]:
-    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link."""
+    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link.
+
+    With `stop_signs="own"`, the duty to stop follows.
+    """
     found = []
     for stretch in way_of(roads, plans, vehicle):
         if stretch.end_m > range_m:
@@ -119,15 +123,21 @@ def lines(
         link = roads.links[stretch.link]
         own = slice(link["first_conflict"], link["first_conflict"] + link["num_conflicts"])
         yields = letter not in ("G", "O") and bool(roads.conflicts["must_yield"][own].any())
-        stops = letter == "s" or (not letter and chr(link["state"]) in "sw")
-        if not letter and not yields and not stops:
+        has_sign = not letter and chr(link["state"]) in "sw"
+        if not letter and not yields and not has_sign:
             continue
-        colours = [letter in RED or stops, letter in YELLOW, letter in GREEN]
-        if not letter:
-            colours = [stops, False, False]
         near = 20.0 / (20.0 + max(stretch.end_m, 0.0))
-        found.append([near, *map(float, colours), float(yields)])
-    found = [*found, *([[0.0] * 5] * count)][:count]
+        if letter:
+            flags = [letter in (*RED, "s"), letter in YELLOW, letter in GREEN, yields]
+        elif stop_signs == "red":
+            flags = [has_sign, False, False, yields]
+        else:
+            flags = [False, False, False, True]
+        if stop_signs == "own":
+            flags.append(has_sign or letter == "s")
+        found.append([near, *map(float, flags)])
+    size = 6 if stop_signs == "own" else 5
+    found = [*found, *([[0.0] * size] * count)][:count]
     return [number for line in found for number in line]
 
 
@@ -141,11 +151,17 @@ def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
 
 
 def indicated_way(
-    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void
+    roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, from_m: float = 0.0
 ) -> tuple[list[Stretch], int]:
-    """Return the path up to the end of the lane behind the next junction, and its link or -1."""
+    """Return the path up to the end of the lane behind the next junction, and its link or -1.
+
+    If the junction is farther away than `from_m`, unless that is 0, the path ends before it.
+    """
     way = way_of(roads, plans, vehicle)
     here = roads.lanes[way[0].lane]
+    ends = [k for k, stretch in enumerate(way) if stretch.link >= 0]
+    if from_m and not here["internal"] and ends and way[ends[0]].end_m > from_m:
+        return way[: ends[0] + 1], -1
     links = [int(here["link"])] if here["internal"] else []
     for k, stretch in enumerate(way):
         if stretch.link >= 0:
@@ -252,6 +268,7 @@ def conflicts(
     hidden: Collection[int] = (),
     told: Mapping[int, tuple[np.void, float]] | None = None,
     indicators: bool = False,
+    from_m: float = 0.0,
 ) -> list[float]:
     """Return nine features of each of the `count` most critical vehicles; ten with `indicators`.
 
@@ -271,7 +288,7 @@ def conflicts(
             continue
         others = straight_looks(other)
         if indicators:
-            its_way = indicated_way(roads, plans, other)[0]
+            its_way = indicated_way(roads, plans, other, from_m)[0]
             others = looks_along(roads, its_way, other, float(other["speed"]))
         near, when = approach(looks, others, ego, other)
         # Rounding may differ between equally critical vehicles, so these are ordered by id.
@@ -294,6 +311,6 @@ def conflicts(
         if told is not None:
             numbers += [1.0, 0.0] if is_seen else [0.0, min(age_s, 1.0)]
         if indicators:
-            numbers.append(turn_over(roads, indicated_way(roads, plans, other)[1]))
+            numbers.append(turn_over(roads, indicated_way(roads, plans, other, from_m)[1]))
     size = (9 if told is None else 11) + int(indicators)
     return [*numbers, *([0.0] * (size * count))][: size * count]

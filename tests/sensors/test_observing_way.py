@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +23,19 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.sensors.kernels.observing_conflicts import observe_conflicts
 from cavmarl.sensors.kernels.observing_way import observe_way
-from cavmarl.sensors.observed import conflicts_sensor, frame_size, layout, way_sensor
+from cavmarl.sensors.observed import (
+    conflicts_sensor,
+    feature_names,
+    frame_size,
+    layout,
+    way_sensor,
+)
 from cavmarl.shards.shard import CONTROLLER
 from cavmarl.v2x.kernels.v2x_records import REPORT
+from cavmarl.verify.equivalence import verify_zones
 from tests.naive import observing_way as naive
 from tests.sensors.test_observing_lanes import phases, traffic
+from tests.support.netgenerate import netgenerate
 from tests.support.traffic import NAMES, network, on_lane, plans, travel
 
 DISTANCES_M = [3.0, 8.0, 20.0, 45.0, 90.0]
@@ -35,22 +44,31 @@ CONFIG = SensorsConfig(
     way=WayConfig(distances_m=tuple(DISTANCES_M), lines=LINES, timing=False),
     conflicts=ConflictsConfig(count=COUNT, range_m=RANGE_M),
 )
+SIGNS = {
+    shown: replace(CONFIG, way=replace(CONFIG.way, stop_signs=shown))
+    for shown in ("give_way", "own", "red")
+}
 INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
+NEAR_M = 25.0
+INDICATED_NEAR = replace(CONFIG, conflicts=replace(INDICATED.conflicts, indicators_m=NEAR_M))
 # The settings of the environment `cities`.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
     "sensors.way.lines": LINES,
+    "sensors.way.timing": True,
     "sensors.conflicts.count": 8,
     "sensors.history.steps": 3,
 }
 
 
-def observed_way(name: str, row: np.void, phase: NDArray[np.int32]) -> list[float]:
+def observed_way(
+    name: str, row: np.void, phase: NDArray[np.int32], config: SensorsConfig = CONFIG
+) -> list[float]:
     roads = network(name)
-    place = layout(CONFIG)["way"]
-    out = np.zeros(frame_size(CONFIG), np.float32)
+    place = layout(config)["way"]
+    out = np.zeros(frame_size(config), np.float32)
     controllers = np.zeros(roads.num_controllers, CONTROLLER)
-    sensor = way_sensor.settings(CONFIG, place.start)
+    sensor = way_sensor.settings(config, place.start)
     observe_way(roads.arrays, travel(name), controllers, row, phase, 0.0, 0.1, sensor, out)
     assert not out[: place.start].any()
     assert not out[place.stop :].any()
@@ -103,18 +121,22 @@ def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
     roads, ways = network(name), plans(name)
     order = data.draw(st.permutations(range(len(rows))))
     for place, i in enumerate(order):
-        found = observed_way(name, rows[i], phase)
-        twin = naive.places(roads, ways, rows[i], DISTANCES_M)
-        twin += naive.lines(roads, ways, rows[i], letters, LINES, 100.0)
-        assert found == pytest.approx(twin, abs=2e-5)
+        for stop_signs, config in SIGNS.items():
+            found = observed_way(name, rows[i], phase, config)
+            twin = naive.places(roads, ways, rows[i], DISTANCES_M)
+            twin += naive.lines(roads, ways, rows[i], letters, LINES, 100.0, stop_signs)
+            assert found == pytest.approx(twin, abs=2e-5)
         seen = observed_conflicts(name, rows, i, phase)
         assert seen == observed_conflicts(name, rows[order], place, phase)
         twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M)
         assert seen == pytest.approx(twin, abs=2e-5)
-        seen = observed_conflicts(name, rows, i, phase, INDICATED)
-        assert seen == observed_conflicts(name, rows[order], place, phase, INDICATED)
-        twin = naive.conflicts(roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True)
-        assert seen == pytest.approx(twin, abs=2e-5)
+        for config, from_m in ((INDICATED, 0.0), (INDICATED_NEAR, NEAR_M)):
+            seen = observed_conflicts(name, rows, i, phase, config)
+            assert seen == observed_conflicts(name, rows[order], place, phase, config)
+            twin = naive.conflicts(
+                roads, ways, rows, i, letters, COUNT, RANGE_M, indicators=True, from_m=from_m
+            )
+            assert seen == pytest.approx(twin, abs=2e-5)
 
 
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
@@ -212,7 +234,7 @@ def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
 @pytest.mark.parametrize("indicators", [False, True])
 def test_a_divided_world_observes_the_same(indicators: bool) -> None:
-    shown = {"sensors.conflicts.indicators": indicators}
+    shown = {"sensors.conflicts.indicators": indicators, "sensors.way.stop_signs": "own"}
     whole, divided = made(**shown), made(**shown, **{"zones.count": 4})
     rng = np.random.default_rng(1)
     one, other = whole.reset()[0], divided.reset()[0]
@@ -255,3 +277,51 @@ def test_sensors_without_sight_omit_visible_vehicles() -> None:
     assert {"way", "conflicts", "history"} <= set(layout(config))
     assert "conflicts" not in layout(config.without_sight())
     assert config.without_sight().way.lines == 0
+
+
+def test_the_time_of_change_is_off_unless_it_is_asked_for() -> None:
+    config = SensorsConfig(way=WayConfig(lines=1))
+    assert not config.way.timing
+    assert not config.signal.timing
+    names = [feature.name for feature in way_sensor.SENSOR.features(config)]
+    assert names == ["line_0", "line_red_0", "line_yellow_0", "line_green_0", "line_yields_0"]
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("kind", ["allway_stop", "priority_stop"])
+def test_stop_signs_are_shown_alike_in_any_division_and_in_any_process(
+    tmp_path: Path, kind: str
+) -> None:
+    path = netgenerate(
+        tmp_path / "stops.net.xml",
+        "--grid",
+        "--grid.number",
+        "3",
+        "--grid.length",
+        "90",
+        "-j",
+        kind,
+    )
+    keys = {**ON, "sensors.way.stop_signs": "own", "sensors.signal.stop_signs": "own"}
+    found = verify_zones(path, (2, 4), overrides=keys, agents=6, background=30, steps=30, seed=3)
+    assert all(result.difference is None for result in found.results)
+    whole, divided = (
+        cavmarl.make_vec(
+            path, num_envs=2, agents=6, background=20, overrides={**keys, "zones.count": zones},
+            workers=workers,
+        )
+        for zones, workers in ((1, 0), (2, 2))
+    )  # fmt: skip
+    one, other = whole.reset(seed=1)[0], divided.reset(seed=1)[0]
+    stops = [
+        name.startswith(("line_stop", "stop")) for _, name in feature_names(whole.config.sensors)
+    ]
+    seen = 0
+    for _ in range(10):
+        np.testing.assert_array_equal(one, other)
+        seen += int(one[..., stops].sum())
+        actions = whole.suggest_actions()
+        one, other = whole.step(actions)[0], divided.step(actions)[0]
+    assert seen > 20
+    whole.close()
+    divided.close()

@@ -237,6 +237,7 @@ class Sensors(NamedTuple):
     signal_at: int
     signal_range_m: float
     signal_timing: bool
+    signal_stop_signs: bool
     lanes_at: int
     lanes_range_m: float
     lidar_at: int

@@ -7,7 +7,8 @@ soonest comes first. Right of way follows from the lane that the other vehicle i
 it takes from there.
 
 With `indicators`, other vehicles are assumed to follow their lanes and, over the current or next
-junction, the link that they indicate. After that they go straight.
+junction, the link that they indicate. After that they go straight. A vehicle that is farther from
+its junction than `indicators_m` does not indicate yet, and goes straight from there.
 
 With `heard`, vehicles that are not seen but known from a message are included, extrapolated from
 the position and speed in the message. Their lanes are unknown.
@@ -71,6 +72,7 @@ class ConflictsSensor(NamedTuple):
     heard: bool  # whether vehicles known only from messages are included
     told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of vehicles in messages
     indicators: bool  # whether others indicate their link over the next junction
+    indicators_m: float  # distance to the junction from which they do; 0: any distance
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
     heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
     others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
@@ -169,6 +171,25 @@ def _turn_of(roads: RoadArrays, link: int) -> float:
 
 
 @kernel
+def _indicates(
+    roads: RoadArrays, travel: TripTables, row: np.void, sensor: ConflictsSensor
+) -> bool:
+    """Return whether a vehicle is on a junction, or near enough to the next one to indicate."""
+    lane, way = row["lane"], row["way"]
+    if sensor.indicators_m == 0.0 or roads.lanes[lane]["internal"]:
+        return True
+    distance = -row["s"]
+    for _ in range(MOST_LANES):
+        distance += roads.lanes[lane]["length_m"]
+        if distance > sensor.indicators_m:
+            return False
+        lane, way, link = next_step_of_plan(roads, travel, lane, way)
+        if link >= 0 or lane < 0:
+            return bool(link >= 0)
+    return False
+
+
+@kernel
 def forget_others(sensor: ConflictsSensor) -> None:
     """Mark the predictions as outdated, after the grid has been filled again."""
     sensor.filling[0] += 1
@@ -189,7 +210,8 @@ def _predict_other(
     sensor.foreseen[at] = sensor.filling[0]
     sensor.indicated[at] = 0.0
     if sensor.indicators and other["driver"] != DRIVER_SCRIPTED and not is_off_lanes(other):
-        link, _ = _predict_on_path(roads, travel, other, other["speed"], 1, sensor.others[at])
+        links = 1 if _indicates(roads, travel, other, sensor) else 0
+        link, _ = _predict_on_path(roads, travel, other, other["speed"], links, sensor.others[at])
         sensor.indicated[at] = _turn_of(roads, link)
     else:
         _predict_straight(body, sensor.others[at])

@@ -21,6 +21,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_NONE,
     SIGNAL_RED,
     SIGNAL_RED_YELLOW,
+    SIGNAL_STOP_THEN_GO,
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
@@ -30,8 +31,10 @@ from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 
 PLACE_FEATURES = 4  # per point of the path
-LINE_FEATURES = 5  # per stop line; one more with the signal's timing
+LINE_FEATURES = 5  # per stop line; one more with timing, then one more with `OWN`
 CURVATURE_SCALE = 0.2  # 1/m
+STOP_SIGNS = ("give_way", "own", "red")  # values of `sensors.way.stop_signs`
+GIVE_WAY, OWN, AS_RED = range(3)
 WIDTH_SCALE = 8.0  # m
 LINE_HALF_M = 20.0  # a line at this distance has a closeness of 0.5
 MOST_LANES = 48  # largest number of lanes that a path is followed over
@@ -45,6 +48,13 @@ class WaySensor(NamedTuple):
     lines: int  # number of stop lines
     range_m: float  # range of the stop lines
     timing: bool
+    stop_signs: int  # how they are shown: a place in `STOP_SIGNS`
+
+
+@kernel
+def line_size(sensor: WaySensor) -> int:
+    """Return the number of features per stop line."""
+    return LINE_FEATURES + int(sensor.timing) + int(sensor.stop_signs == OWN)
 
 
 @kernel
@@ -56,7 +66,7 @@ def _observe_line(
     phase: NDArray[np.int32],
     time: float,
     tick_s: float,
-    timing: bool,
+    sensor: WaySensor,
     out: NDArray[np.float32],
 ) -> bool:
     """Write the stop line before a link; return False if there is no reason to stop at it."""
@@ -65,16 +75,20 @@ def _observe_line(
     stops = must_stop(roads, link, signal)
     if signal == SIGNAL_NONE and not (gives_way or stops):
         return False
+    has_sign = stops and signal == SIGNAL_NONE
+    is_red = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or signal == SIGNAL_STOP_THEN_GO
     out[0] = LINE_HALF_M / (LINE_HALF_M + max(distance, 0.0))
-    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or stops:
+    if is_red or (has_sign and sensor.stop_signs == AS_RED):
         out[1] = 1.0
     elif signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
         out[2] = 1.0
     elif signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_GREEN_MINOR:
         out[3] = 1.0
-    out[4] = 1.0 if gives_way else 0.0
-    if timing and signal != SIGNAL_NONE:
+    out[4] = 1.0 if gives_way or (has_sign and sensor.stop_signs != AS_RED) else 0.0
+    if sensor.timing and signal != SIGNAL_NONE:
         out[5] = soonness(time_to_change(roads, controllers, link, phase, time, tick_s))
+    if sensor.stop_signs == OWN:
+        out[line_size(sensor) - 1] = 1.0 if stops else 0.0
     return True
 
 
@@ -98,7 +112,7 @@ def observe_way(
     cos_heading, sin_heading = cos_sin(row["heading"])
     distances = sensor.distances_m
     lines_at = sensor.at + PLACE_FEATURES * distances.size
-    size = LINE_FEATURES + 1 if sensor.timing else LINE_FEATURES
+    size = line_size(sensor)
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
     start = -row["s"]  # distance to the beginning of the lane
@@ -132,9 +146,7 @@ def observe_way(
             written += 1
         if link >= 0 and lines < sensor.lines and end <= sensor.range_m:
             out = observation[lines_at + size * lines : lines_at + size * (lines + 1)]
-            if _observe_line(
-                roads, controllers, link, end, phase, time, tick_s, sensor.timing, out
-            ):
+            if _observe_line(roads, controllers, link, end, phase, time, tick_s, sensor, out):
                 lines += 1
         is_beyond = lines == sensor.lines or end > sensor.range_m
         if following < 0 or (written == distances.size and is_beyond):

@@ -31,7 +31,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_YELLOW_MAJOR,
     SIGNAL_YELLOW_MINOR,
 )
-from cavmarl.driving.kernels.junctions.gaps import link_signal
+from cavmarl.driving.kernels.junctions.gaps import link_signal, must_stop
 from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.rewards.kernels.terms import write_terms
 from cavmarl.roads.kernels.lanes_now import plans_of, roads_in, shares_lanes
@@ -41,6 +41,7 @@ from cavmarl.sensors.kernels.observing_lanes import observe_lanes
 
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7
+SIGNAL_FEATURES = 6  # two more with the signal's timing, then one more with stop signs
 
 SPEED_SCALE = 40.0  # m/s
 ACCEL_SCALE = 10.0  # m/s²
@@ -208,9 +209,11 @@ def observe_signal(
 ) -> None:
     """Write the next stop line on the path with a signal or a duty to yield.
 
-    `time`: time of the tick, in s since the world's reset.
+    With `signal_stop_signs`, this includes stop signs without foes, and the last feature tells
+    lines with a stop. `time`: time of the tick, in s since the world's reset.
     """
     at = sensors.signal_at
+    stops = False
     lane = row["lane"]
     distance = -row["s"]
     while True:
@@ -221,7 +224,8 @@ def observe_signal(
         if step["link"] >= 0:
             signal = link_signal(roads, step["link"], phase)
             gives_way = gives_way_on(roads, step["link"], signal)
-            if signal != SIGNAL_NONE or gives_way:
+            stops = sensors.signal_stop_signs and must_stop(roads, step["link"], signal)
+            if signal != SIGNAL_NONE or gives_way or stops:
                 break
         lane = step["next"]
     out[at] = 1.0
@@ -232,7 +236,9 @@ def observe_signal(
         out[at + 3] = 1.0
     elif signal == SIGNAL_GREEN_MAJOR or signal == SIGNAL_GREEN_MINOR:
         out[at + 4] = 1.0
-    out[at + 5] = 1.0 if gives_way else 0.0
+    out[at + 5] = 1.0 if gives_way or (stops and signal == SIGNAL_NONE) else 0.0
+    if sensors.signal_stop_signs:
+        out[at + SIGNAL_FEATURES + (2 if sensors.signal_timing else 0)] = 1.0 if stops else 0.0
     if sensors.signal_timing and signal != SIGNAL_NONE:
         change = time_to_change(roads, controllers, step["link"], phase, time, tick_s)
         out[at + 6] = soonness(change)

@@ -155,6 +155,7 @@ def sensor_arrays(config: SensorsConfig, network: RoadNetwork) -> Sensors:
         signal_at=starts["signal"],
         signal_range_m=config.signal.range_m,
         signal_timing=config.signal.timing,
+        signal_stop_signs=config.signal.stop_signs == "own",
         lanes_at=starts["lanes"],
         lanes_range_m=config.lanes.range_m,
         lidar_at=starts["lidar"],

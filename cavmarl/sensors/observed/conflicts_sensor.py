@@ -23,7 +23,7 @@ from cavmarl.sensors.kernels.observing_conflicts import (
     WHEN_HALF_S,
     ConflictsSensor,
 )
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, hidden
 from cavmarl.sensors.observed.sensor_setup import walls_of
 
 _PLACE = f"x / ({PLACE_HALF_M:g} m + abs(x))"
@@ -97,6 +97,7 @@ def settings(
         given.heard,
         told=np.zeros(most_told, BODY),
         indicators=given.indicators,
+        indicators_m=given.indicators_m,
         looks=np.zeros((NUM_LOOKS, 4)),
         heard_looks=np.zeros((NUM_LOOKS, 4)),
         others=np.zeros((capacity, NUM_LOOKS, 4)),
@@ -105,6 +106,24 @@ def settings(
         filling=np.ones(1, np.int64),
         ranked=np.zeros(given.count, RANKED),
     )
+
+
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.conflicts
+    what = f"the {own.count} vehicles within {own.range_m:g} m that come closest to its path"
+    found = [
+        Reading("ideal sensors", f"{what}; {hidden(own.through_walls)}"),
+        Reading("map", "the right of way of the vehicles near its path"),
+    ]
+    if own.heard:
+        found.append(Reading("V2X", "messages about vehicles that it does not see"))
+    if own.indicators and own.indicators_m:
+        what = f"the indicators of these vehicles, up to {own.indicators_m:g} m before a junction"
+        found.append(Reading("ideal sensors", what))
+    elif own.indicators:
+        what = "the next turn of vehicles near its path, from their routes, as if always indicated"
+        found.append(Reading("world's state", what))
+    return found
 
 
 SENSOR = Sensor(
@@ -119,4 +138,6 @@ SENSOR = Sensor(
         made.most_told,
         made.capacity,
     ),
+    reads=reads,
+    sides=Sides(("y", "vy", "sin", "turn")),
 )

@@ -3,7 +3,14 @@
 from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.observed.feature import Feature, Sensor, features_of
+from cavmarl.sensors.observed.feature import (
+    Feature,
+    Reading,
+    Sensor,
+    Sides,
+    features_of,
+    left_for_right,
+)
 
 _EGO = (
     ("speed", "speed along the heading", "40 m/s"),
@@ -40,4 +47,13 @@ def features(config: SensorsConfig) -> list[Feature]:
     return features_of((*_EGO, *(_SIZE if config.ego.size else ())))
 
 
-SENSOR = Sensor("ego", features)
+def reads(config: SensorsConfig) -> list[Reading]:
+    return [
+        Reading("own vehicle", "its motion and controls, and its position on the lane"),
+        Reading("map", "the lanes beside it, their speed limit, and the lane change of its route"),
+    ]
+
+
+_NEGATED = ("steering", "yaw_rate", "lateral_offset", "heading_error", "lane_change")
+
+SENSOR = Sensor("ego", features, reads=reads, sides=Sides(_NEGATED, left_for_right))

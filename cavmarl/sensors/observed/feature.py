@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -53,6 +53,60 @@ def _float32(config: SensorsConfig) -> DTypeLike:
     return np.float32
 
 
+Source = Literal["own vehicle", "ideal sensors", "map", "V2X", "world's state"]
+
+
+@dataclass(frozen=True)
+class Reading:
+    """Something that an observation contains, and where a vehicle would have it from.
+
+    Ideal sensors measure without errors. Nothing on a vehicle knows the world's state, such as the
+    plans of other vehicles.
+    """
+
+    source: Source
+    what: str
+
+
+def hidden(through_walls: bool) -> str:
+    """Return what hides vehicles from a sensor that vehicles do not block."""
+    if through_walls:
+        return "neither buildings nor vehicles hide them"
+    return "buildings hide them, vehicles do not"
+
+
+def _nothing(config: SensorsConfig) -> list[Reading]:
+    return []
+
+
+def _unchanged(config: SensorsConfig, name: str) -> str:
+    return name
+
+
+def _never(config: SensorsConfig) -> str:
+    return ""
+
+
+@dataclass(frozen=True)
+class Sides:
+    """What happens to a sensor's features if left and right are exchanged, as in a mirror."""
+
+    # features whose sign changes, by name without the number at the end
+    negated: tuple[str, ...] = ()
+    # name of the feature whose value a feature gets
+    partner: Callable[[SensorsConfig, str], str] = _unchanged
+    # why these settings do not allow the exchange; empty: they do
+    refusal: Callable[[SensorsConfig], str] = _never
+
+    def is_negated(self, name: str) -> bool:
+        return name in self.negated or name.rstrip("_0123456789") in self.negated
+
+
+def left_for_right(config: SensorsConfig, name: str) -> str:
+    """Return the name with `left` instead of `right`, and the reverse."""
+    return "right".join(part.replace("right", "left") for part in name.split("left"))
+
+
 @dataclass(frozen=True)
 class Sensor:
     """A sensor that agents observe."""
@@ -71,6 +125,10 @@ class Sensor:
     # computes the numbers of a sensor of another package from an AgentView or a BatchView
     sense: Callable[[Any], Any] | None = None
     batched: bool = False
+    # what it reads if it is on
+    reads: Callable[[SensorsConfig], list[Reading]] = _nothing
+    # what happens if left and right are exchanged; None: not known, or not possible
+    sides: Sides | None = None
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:
         """Return the largest distance at which the sensor senses a vehicle's centre, in m."""

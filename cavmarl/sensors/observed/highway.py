@@ -46,6 +46,22 @@ _LIMITS = {
 _NO_LIMIT = (-math.inf, math.inf)
 
 
+# Features whose sign changes if north and south, or left and right, are exchanged.
+NEGATED = ("y", "vy", "heading", "sin_h", "sin_d", "lat_off", "ang_off")
+
+
+def off_centre(ranges: Mapping[str, tuple[float, ...]], features: tuple[str, ...]) -> str:
+    """Return which feature cannot be negated, because its range is not symmetric; else nothing."""
+    for name in NEGATED:
+        if name in features and name in ranges and ranges[name][0] != -ranges[name][1]:
+            low, high = ranges[name]
+            return (
+                f"left and right cannot be exchanged, because the range of {name} is from {low:g} "
+                f"to {high:g}, not symmetric"
+            )
+    return ""
+
+
 def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
     """Return highway-env's default ranges of features.
 

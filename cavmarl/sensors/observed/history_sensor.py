@@ -5,7 +5,7 @@ from __future__ import annotations
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.observing_history import HISTORY_FEATURES, HistorySensor
 from cavmarl.sensors.kernels.sense import SPEED_SCALE
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides
 
 _SPEED = f"{SPEED_SCALE:g} m/s"
 
@@ -32,6 +32,15 @@ def settings(config: SensorsConfig, at: int) -> HistorySensor:
     return HistorySensor(at, config.history.steps * HISTORY_FEATURES)
 
 
+def reads(config: SensorsConfig) -> list[Reading]:
+    return [Reading("own vehicle", f"its controls and speeds of {config.history.steps} steps")]
+
+
 SENSOR = Sensor(
-    "history", features, shape=shape, settings=lambda made: settings(made.config, made.at)
+    "history",
+    features,
+    shape=shape,
+    settings=lambda made: settings(made.config, made.at),
+    reads=reads,
+    sides=Sides(("steering",)),
 )

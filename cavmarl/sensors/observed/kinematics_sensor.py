@@ -10,8 +10,15 @@ from numpy.typing import NDArray
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.kinematics_observation import PERCEPTION_M, KinematicsSensor
-from cavmarl.sensors.observed.feature import Feature, Sensor
-from cavmarl.sensors.observed.highway import codes, default_ranges, range_table, vehicle_feature
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, hidden
+from cavmarl.sensors.observed.highway import (
+    NEGATED,
+    codes,
+    default_ranges,
+    off_centre,
+    range_table,
+    vehicle_feature,
+)
 
 # The map sets the range of y; whatever its size, it is mapped to [-1, 1].
 _DEFAULT_RANGES = {
@@ -73,10 +80,31 @@ def settings(
     )
 
 
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.kinematics
+    what = f"{own.vehicles_count - 1} vehicles within {PERCEPTION_M:g} m"
+    found = [
+        Reading("own vehicle", "its motion and its position on the map"),
+        Reading("ideal sensors", f"{what}; {hidden(through_walls=True)}"),
+    ]
+    if own.observe_intentions and {"cos_d", "sin_d"} & set(own.features):
+        found.append(Reading("world's state", "the destinations of other vehicles"))
+    return found
+
+
+def _refusal(config: SensorsConfig) -> str:
+    kinematics = config.kinematics
+    ranges = kinematics.features_range if kinematics.normalize else {}
+    return off_centre(ranges, kinematics.features)
+
+
+# The mirror lies along the x axis, as positions are in the world's frame.
 SENSOR = Sensor(
     "kinematics",
     features,
     reach_m,
     shape,
     settings=lambda made: settings(made.config, made.at, made.network, made.goals),
+    reads=reads,
+    sides=Sides(NEGATED, refusal=_refusal),
 )

@@ -4,7 +4,16 @@ from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.observing_lanes import HALF_M
-from cavmarl.sensors.observed.feature import Feature, Row, Sensor, features_of
+from cavmarl.sensors.observed.feature import (
+    Feature,
+    Reading,
+    Row,
+    Sensor,
+    Sides,
+    features_of,
+    hidden,
+    left_for_right,
+)
 
 # Distances are scaled as in `kernels.observing_lanes`.
 _NEARNESS = f"{HALF_M:g} m / ({HALF_M:g} m + distance)"
@@ -45,4 +54,14 @@ def reach_m(config: SensorsConfig) -> float:
     return config.lanes.range_m
 
 
-SENSOR = Sensor("lanes", features, reach_m)
+def reads(config: SensorsConfig) -> list[Reading]:
+    what = f"vehicles on the lanes around it within {config.lanes.range_m:g} m"
+    return [
+        Reading("ideal sensors", f"{what}; {hidden(through_walls=True)}"),
+        Reading(
+            "world's state", "the paths of vehicles on other lanes, and which of them cross its own"
+        ),
+    ]
+
+
+SENSOR = Sensor("lanes", features, reach_m, reads=reads, sides=Sides(partner=left_for_right))

@@ -7,7 +7,7 @@ import numpy as np
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.sensors.kernels.highway_lidar import LidarCells, cell_directions
 from cavmarl.sensors.kernels.lidar_2d import ECHO
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 
 # Within a body distances are negative, at most by the body's length.
@@ -70,10 +70,18 @@ def _scale(config: SensorsConfig) -> float:
     return lidar.maximum_range_m if lidar.normalize else 1.0
 
 
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.lidar_observation
+    what = f"the nearest vehicle and its speed in {own.cells} sectors of {own.maximum_range_m:g} m"
+    return [Reading("ideal sensors", f"{what}; buildings hide nothing")]
+
+
+# Left and right cannot be exchanged: each cell extends clockwise from its direction only.
 SENSOR = Sensor(
     "lidar_observation",
     features,
     reach_m,
     shape,
     settings=lambda made: settings(made.config, made.at),
+    reads=reads,
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.observed.feature import Feature, Sensor, features_of
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, features_of
 
 
 def features(config: SensorsConfig) -> list[Feature]:
@@ -25,4 +25,22 @@ def reach_m(config: SensorsConfig) -> float:
     return config.lidar.range_m * (config.lidar.rays > 0)
 
 
-SENSOR = Sensor("lidar", features, reach_m, sees_bodies=True)
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.lidar
+    what = f"{own.rays} rays of {own.range_m:g} m that end at vehicles, but not at buildings"
+    return [Reading("ideal sensors", what + (", with speeds" if own.speeds else ""))]
+
+
+def _ray_on_other_side(config: SensorsConfig, name: str) -> str:
+    number, kind = name.rpartition("_")[::-2]
+    return f"{kind}_{-int(number) % config.lidar.rays}"
+
+
+SENSOR = Sensor(
+    "lidar",
+    features,
+    reach_m,
+    sees_bodies=True,
+    reads=reads,
+    sides=Sides(partner=_ray_on_other_side),
+)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.observed.feature import Feature, Sensor, features_of, numbered
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, features_of, numbered
 
 _HEARD_SIGNAL = (
     ("signal_known", "1 if a message of the next signal's roadside unit was received", ""),
@@ -58,4 +58,14 @@ def features(config: SensorsConfig) -> list[Feature]:
 
 
 # The sensor has no reach: messages come from the bus, which is the same for all zones.
-SENSOR = Sensor("messages", features)
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.messages
+    counts = ((own.objects, "vehicles"), (own.events, "events"))
+    found = [f"{count} {what}" for count, what in counts if count]
+    if own.signal:
+        found.append("the next signal" + (" and its times of change" if own.timing else ""))
+    return [Reading("V2X", f"messages about {', '.join(found)}")]
+
+
+_NEGATED = ("object_y", "object_vy", "object_sin", "event_y")
+SENSOR = Sensor("messages", features, reads=reads, sides=Sides(_NEGATED))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.observed.feature import Feature, Sensor, numbered
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, hidden, numbered
 
 
 def features(config: SensorsConfig) -> list[Feature]:
@@ -25,4 +25,10 @@ def reach_m(config: SensorsConfig) -> float:
     return config.neighbors.range_m * (config.neighbors.count > 0)
 
 
-SENSOR = Sensor("neighbors", features, reach_m)
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.neighbors
+    what = f"the {own.count} nearest vehicles within {own.range_m:g} m"
+    return [Reading("ideal sensors", f"{what}; {hidden(own.through_walls)}")]
+
+
+SENSOR = Sensor("neighbors", features, reach_m, reads=reads, sides=Sides(("y", "vy", "sin")))

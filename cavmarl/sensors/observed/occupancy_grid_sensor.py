@@ -9,8 +9,14 @@ from cavmarl.config.sensors import OccupancyGridConfig, SensorsConfig
 from cavmarl.core.math.elementary import hypot
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.kernels.occupancy import OccupancyGrid
-from cavmarl.sensors.observed.feature import Feature, Sensor
-from cavmarl.sensors.observed.highway import codes, range_table, vehicle_feature
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides, hidden
+from cavmarl.sensors.observed.highway import (
+    NEGATED,
+    codes,
+    off_centre,
+    range_table,
+    vehicle_feature,
+)
 
 _DEFAULT_RANGES = {"vx": (-80.0, 80.0), "vy": (-80.0, 80.0)}
 
@@ -90,6 +96,35 @@ def settings(
     )
 
 
+def reads(config: SensorsConfig) -> list[Reading]:
+    own = config.occupancy_grid
+    what = f"vehicles within {reach_m(config):.0f} m, by cell; {hidden(through_walls=True)}"
+    found = [Reading("ideal sensors", what)]
+    if "on_road" in own.features:
+        found.append(Reading("map", "the lanes around it"))
+    if {"cos_d", "sin_d"} & set(own.features):
+        found.append(Reading("world's state", "the destinations of other vehicles"))
+    return found
+
+
+def _cell_on_other_side(config: SensorsConfig, name: str) -> str:
+    where, row = name.rpartition("_")[::2]
+    return f"{where}_{config.occupancy_grid.shape[1] - 1 - int(row)}"
+
+
+def _refusal(config: SensorsConfig) -> str:
+    grid = config.occupancy_grid
+    (low, high), step = grid.grid_size_m[1], grid.grid_step_m[1]
+    if low != -high or grid.shape[1] * step != high - low:
+        return (
+            f"left and right cannot be exchanged, because the grid from {low:g} m to {high:g} m "
+            f"with cells of {step:g} m is not symmetric"
+        )
+    if grid.as_image and set(NEGATED) & set(grid.features):
+        return "left and right cannot be exchanged, because as_image rounds the values"
+    return off_centre(grid.features_range, grid.features)
+
+
 SENSOR = Sensor(
     "occupancy_grid",
     features,
@@ -97,4 +132,6 @@ SENSOR = Sensor(
     shape,
     dtype,
     settings=lambda made: settings(made.config, made.at, made.network, made.goals),
+    reads=reads,
+    sides=Sides(NEGATED, _cell_on_other_side, _refusal),
 )

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from cavmarl.config.sensors import SensorsConfig
-from cavmarl.sensors.observed.feature import Feature, Sensor
+from cavmarl.sensors.observed.feature import Feature, Reading, Sensor, Sides
 
 
 def features(config: SensorsConfig) -> list[Feature]:
@@ -21,4 +21,9 @@ def features(config: SensorsConfig) -> list[Feature]:
     ]
 
 
-SENSOR = Sensor("route", features)
+def reads(config: SensorsConfig) -> list[Reading]:
+    reach_m = config.route.points * config.route.spacing_m
+    return [Reading("map", f"its path for {reach_m:g} m")]
+
+
+SENSOR = Sensor("route", features, reads=reads, sides=Sides(("y",)))

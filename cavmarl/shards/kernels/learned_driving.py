@@ -16,7 +16,7 @@ from cavmarl.core.math.neighbors import Grid, fill_grid
 from cavmarl.core.records.arrays import LaneGrid, RoadArrays, Sensors, TripTables, Worlds
 from cavmarl.core.records.codes import DRIVER_LEARNED
 from cavmarl.networks.kernels.inference import TILE_ROWS, evaluate_network
-from cavmarl.roads.kernels.lanes_now import plans_of, roads_in
+from cavmarl.roads.kernels.lanes_now import plans_of, roads_in, shares_lanes
 from cavmarl.sensors.kernels.frame_stacks import has_entered
 from cavmarl.sensors.kernels.observe_optional import OptionalSensors, observe_optional_frame
 from cavmarl.sensors.kernels.observing_conflicts import forget_others
@@ -34,9 +34,13 @@ class LearnedDriver(NamedTuple):
     weights: NDArray[np.float32]
     accel_mps2: float  # throttle of the action 1
     steering_rad: float  # angle of the front wheels of the action 1
+    # (D,) exchange of left and right as in `exchanged_sides`; (0,): the driver knows this side
+    exchanged: NDArray[np.int64]
+    signs: NDArray[np.float32]
     no_reports: NDArray[np.void]  # REPORT (0,), the empty inbox of each vehicle
     # scratch
     observations: NDArray[np.float32]  # (TILE_ROWS · D,)
+    frame: NDArray[np.float32]  # (D,)
     actions: NDArray[np.float32]  # (TILE_ROWS · 2,)
     states: NDArray[np.float32]  # (0,)
     buffers: NDArray[np.float32]
@@ -69,6 +73,17 @@ def _remember(row: np.void, at: int, size: int, frame: NDArray[np.float32]) -> N
         row["speed_2"] = frame[at + HISTORY_FEATURES + 2]
 
 
+@inlined_kernel
+def _exchange_sides(learned: LearnedDriver, frame: NDArray[np.float32]) -> None:
+    """Exchange left and right in an observation, if the driver knows the other side."""
+    if learned.exchanged.size == 0:
+        return
+    learned.frame[:] = frame
+    for k in range(frame.size):
+        # The sum turns -0.0 into 0.0.
+        frame[k] = learned.frame[learned.exchanged[k]] * learned.signs[k] + np.float32(0.0)
+
+
 @kernel
 def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
     """Evaluate the network for the observed rows, and set their commands."""
@@ -84,7 +99,10 @@ def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
     for k in range(num):
         row = rows[learned.places[k]]
         row["throttle"] = np.float64(learned.actions[2 * k]) * learned.accel_mps2
-        row["steering"] = np.float64(learned.actions[2 * k + 1]) * learned.steering_rad
+        steering = learned.actions[2 * k + 1]
+        if learned.exchanged.size > 0:
+            steering = np.float32(0.0) - steering
+        row["steering"] = np.float64(steering) * learned.steering_rad
 
 
 @kernel
@@ -107,7 +125,7 @@ def drive_by_network(
     history_at, history_size = learned.optional.history.at, learned.optional.history.size
     for w in range(worlds.ticks.shape[0]):
         rows = worlds.rows[w]
-        here = roads_in(roads, worlds.lanes, w)
+        here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
         is_filled = False
         num = 0
         for i in range(worlds.num_owned[w]):
@@ -154,6 +172,7 @@ def drive_by_network(
                 frame,
             )
             _remember(row, history_at, history_size, frame)
+            _exchange_sides(learned, frame)
             learned.places[num] = i
             num += 1
             if num == TILE_ROWS:
