@@ -33,7 +33,7 @@ def learned_drivers(
             features than it observes, or left and right cannot be exchanged in them.
     """
     drivers = background_drivers(config.traffic)
-    return tuple(_learned(drivers, network, plans, capacity))
+    return tuple(_learned(drivers, network, plans, capacity)) if drivers else ()
 
 
 def _learned(

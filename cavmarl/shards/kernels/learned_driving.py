@@ -78,7 +78,8 @@ def _exchange_sides(learned: LearnedDriver, frame: NDArray[np.float32]) -> None:
     """Exchange left and right in an observation, if the driver knows the other side."""
     if learned.exchanged.size == 0:
         return
-    learned.frame[:] = frame
+    for k in range(frame.size):
+        learned.frame[k] = frame[k]
     for k in range(frame.size):
         # The sum turns -0.0 into 0.0.
         frame[k] = learned.frame[learned.exchanged[k]] * learned.signs[k] + np.float32(0.0)
