@@ -91,8 +91,17 @@ class TrafficConfig(Section, key="traffic"):
 
     @property
     def models(self) -> dict[str, float]:
-        """The drivers of the generator's vehicles, with their shares."""
-        return {self.model: 1.0} if isinstance(self.model, str) else self.model
+        """The drivers of the generator's vehicles, with their shares.
+
+        Trained drivers come first, then larger shares, then names in alphabetical order. The order
+        of `model` does not matter, since digests of configurations leave it out.
+        """
+        if isinstance(self.model, str):
+            return {self.model: 1.0}
+        ranked = sorted(
+            self.model.items(), key=lambda item: (not item[0].startswith(ZOO), -item[1], item[0])
+        )
+        return dict(ranked)
 
     @property
     def networks(self) -> tuple[str, ...]:

@@ -47,7 +47,7 @@ class BackgroundDriver:
 
 
 def background_drivers(traffic: TrafficConfig) -> tuple[BackgroundDriver, ...]:
-    """Return the trained drivers that `traffic.model` names, in its order.
+    """Return the trained drivers that `traffic.model` names, ordered as `TrafficConfig.models`.
 
     Raises:
         PolicyError: a driver does not exist, its files are invalid, or it needs what background

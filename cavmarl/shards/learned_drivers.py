@@ -26,7 +26,7 @@ def learned_drivers(
     plans: NDArray[np.void],  # PLAN (G, L)
     capacity: int,  # rows per world
 ) -> tuple[LearnedDriver, ...]:
-    """Return the networks that `traffic.model` names, in its order.
+    """Return the networks that `traffic.model` names, ordered as `TrafficConfig.models`.
 
     Raises:
         PolicyError: see `background_drivers`; or the sensors of a driver give another number of

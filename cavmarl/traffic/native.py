@@ -199,7 +199,7 @@ class NativeTraffic:
     def own_types(self) -> NDArray[np.void]:
         """VTYPE rows of the generator's cars: one for each driver model, then for each network.
 
-        The first is also the type of agents' cars.
+        The first is also the type of agents' cars: the car-following model with the largest share.
         """
         codes = self._model_codes
         networks = len(self.traffic.networks)

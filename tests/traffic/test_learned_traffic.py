@@ -133,6 +133,18 @@ def test_shares_are_those_of_the_departures() -> None:
     np.testing.assert_array_equal(owned(world)["driver"], drivers)
 
 
+@pytest.mark.parametrize("model", [MIXED, {"Krauss": 1.0, "IDM": 2.0}])
+def test_the_order_of_the_shares_makes_no_difference(model: dict[str, float]) -> None:
+    turned = dict(reversed(model.items()))
+    hashes = set()
+    for one in (model, turned):
+        world = simulation("town", one, background=20, agents=2)
+        for _ in range(3):
+            world.step(idle_commands(world))
+        hashes.add(world.state_hash())
+    assert len(hashes) == 1
+
+
 def test_models_can_be_mixed_without_networks() -> None:
     world = simulation("town", {"IDM": 1, "Krauss": 1, "ACC": 0}, background=200)
     rows = owned(world)
