@@ -19,6 +19,7 @@ from cavmarl.core.records.external_records import (
     EXTERNAL_NONE,
     EXTERNAL_POSED,
     EXTERNAL_REMOVED,
+    FIRST_EXTERNAL_ID,
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
@@ -104,7 +105,10 @@ class ExternalComponent(Component):
         """Return what is wrong with saved arrays; empty if nothing."""
         held, ids = records_of(saved[0]), saved[1]
         is_held = held["kind"] != EXTERNAL_NONE
-        if ((ids < -1) | (ids >= MOST_IDS) | ((ids >= 0) != is_held)).any():
+        slots = np.arange(ids.shape[1])
+        is_own = (ids >= FIRST_EXTERNAL_ID) & (ids < MOST_IDS)
+        is_own &= (ids - FIRST_EXTERNAL_ID) % max(len(slots), 1) == slots
+        if (is_own != is_held).any() or (ids[~is_held] != -1).any():
             return "an external vehicle has an invalid id"
         kinds = EXTERNAL_POSED, EXTERNAL_DRIVEN
         held = held[is_held]

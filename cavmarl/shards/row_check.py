@@ -175,11 +175,12 @@ class RowCheck:
         wrong |= (driver == DRIVER_EXTERNAL) & (rows["way"] != self._nowhere)
         wrong |= (driver == DRIVER_EXTERNAL) & (self._num_external == 0)
         networks = travel.types["network"][rows["vtype"]]
-        wrong |= (driver == DRIVER_LEARNED) & ((networks == 0) | (rows["agent"] >= 0))
+        is_other = (networks == 0) | (rows["agent"] >= 0) | (rows["order"] >= 0)
+        wrong |= (driver == DRIVER_LEARNED) & is_other
         wrong |= rows["stop"] > rows["stops_end"]
         if not wrong.any():
             return ""
-        return _of(rows[np.argmax(wrong)], "goal", "does not fit its driver, agent or stop")
+        return _of(rows[np.argmax(wrong)], "goal", "does not fit its driver, order, agent or stop")
 
     def _wrong_identity(self, rows: NDArray[np.void], num_orders: int) -> str:
         for name, numbers in (

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from cavmarl import CavVectorEnv
 from cavmarl.core.errors import ConfigError, MessageError
+from cavmarl.core.records.codes import DRIVER_LEARNED
 from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.handoff.coordinator.saved_ownership import SavedOwnership
@@ -257,7 +258,7 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
         worlds.load(before)
 
 
-def _with_demand(make: Make, tmp_path: Path) -> CavVectorEnv:
+def _with_demand(make: Make, tmp_path: Path, **more: Any) -> CavVectorEnv:
     """Return two worlds whose vehicles look for faster routes."""
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
@@ -266,6 +267,7 @@ def _with_demand(make: Make, tmp_path: Path) -> CavVectorEnv:
         "clock.ctrl_dt_s": 1.0,
         "horizon_s": 600.0,
         "population.mode": "respawn",
+        **more,
     }
     vec = make(str(make_map(tmp_path)), num_envs=2, agents=1, background=0, overrides=overrides)
     vec.reset(seed=1)
@@ -307,6 +309,16 @@ def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make)
     (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(ids_of(vec))]
     for value in (-2, MANY, int(ids[1])):
         _refused(vec, with_id(at, value))
+    # An id that the world may give to another vehicle, in the slot and in the row alike.
+    for other in (MANY, int(ids[0]) + 1):
+
+        def renumber(state: State, other: int = other) -> None:
+            state[at][state[at] == ids[0]] = other
+            for rows in state:
+                if rows.dtype == VEHICLE:
+                    rows["id"][rows["id"] == ids[0]] = other
+
+        _refused(vec, renumber)
     for name, wrong in (
         ("kind", 0.0), ("kind", 3.0), ("x", np.nan), ("vtype", 9.5), ("length", 50.0),
     ):  # fmt: skip
@@ -386,6 +398,23 @@ def with_command(at: int, name: str, value: float) -> Forge:
         state[at].view(EXTERNAL)[name][1, 0] = value
 
     return forge
+
+
+def test_learned_drivers_that_follow_the_demand_file_are_refused(
+    make: Make, tmp_path: Path
+) -> None:
+    vec = _with_demand(make, tmp_path, **{"traffic.model": "zoo:ring22_ippo"})
+    types = _worlds(vec).simulation.shards[0].travel.types
+    network = int(np.argmax(types["network"]))
+    assert types["network"][network] == 1
+
+    def forge(state: State) -> None:
+        row = state[_index(state, VEHICLE, last=True)]
+        assert row["order"][-1] >= 0
+        row["driver"][-1], row["vtype"][-1] = DRIVER_LEARNED, network
+
+    with pytest.raises(ConfigError, match="does not fit its driver, order"):
+        _worlds(vec).load(_forged(_worlds(vec), forge))
 
 
 def test_messages_with_missing_reports_are_refused(make: Make) -> None:

@@ -12,7 +12,7 @@ ROW = {
     "side_lane": (-2, MANY),
     "target_lane": (-2, MANY),
     "vtype": (-1, 1),
-    "driver": (-1, 2, 4),
+    "driver": (-1, 2, 4, 5, 6),
     "link": (-2, MANY),
     "stopped_at": (-2, MANY),
     "hold": (-1, 4),
@@ -39,6 +39,8 @@ ROW = {
     "speed_factor": (0.0, -1.0),
     "wait_s": (-1.0,),
     "distance_m": (-1.0,),
+    "throttle_1": (np.nan, np.inf),
+    "speed_2": (np.nan, np.inf),
 }
 WAITING = {
     "lane": (-1, MANY),
