@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
-from cavmarl.config.traffic import ZOO
+from cavmarl.config.traffic import ZOO, TrafficConfig
 from cavmarl.core.errors import ConfigError, PolicyError
 from cavmarl.networks.background_driver import BackgroundDriver, background_drivers
 from cavmarl.networks.kernels.inference import TILE_ROWS
@@ -34,6 +34,18 @@ def learned_drivers(
     """
     drivers = background_drivers(config.traffic)
     return tuple(_learned(drivers, network, plans, capacity)) if drivers else ()
+
+
+def check_commands(drivers: Sequence[LearnedDriver], traffic: TrafficConfig) -> None:
+    """Raise a PolicyError if a network gave a command that is not a number."""
+    for driver in drivers:
+        if (vehicle := driver.failed.item()) >= 0:
+            driver.failed[0] = -1
+            name = traffic.networks[driver.number - 1]
+            raise PolicyError(
+                f"traffic.model = '{ZOO}{name}': its network gives NaN as the command of vehicle "
+                f"{vehicle}; commands must be numbers. Train the driver again, or name another one"
+            )
 
 
 def _learned(
@@ -66,6 +78,7 @@ def _learned(
             exchanged=exchanged,
             signs=signs,
             no_reports=np.zeros(0, dtype=REPORT),
+            failed=np.full(1, -1, dtype=np.int64),
             observations=np.zeros(TILE_ROWS * size, dtype=np.float32),
             frame=np.zeros(size, dtype=np.float32),
             actions=np.zeros(TILE_ROWS * loaded.config.num_outputs, dtype=np.float32),

@@ -13,6 +13,7 @@ from cavmarl.core.compiled.bound_call import BoundCall, bind_by_name, bound, kee
 from cavmarl.core.records.arrays import Demand, DepartureQueue
 from cavmarl.shards.kernels import group_phases
 from cavmarl.shards.kernels.zone_loop import FRAME, Members
+from cavmarl.shards.learned_drivers import check_commands
 from cavmarl.shards.shard import TICKS_IN_ORDER, Commands, Shard, common_of
 
 
@@ -38,12 +39,16 @@ class ShardGroup:
         return self.first.side, self.first.next_side
 
     def begin_step(self, commands: Commands) -> None:
-        """Clear the sums of a step, take its actions, and let networks choose their commands."""
+        """Clear the sums of a step, take its actions, and let networks choose their commands.
+
+        Raises PolicyError: a network gives NaN.
+        """
         if self.calls.has_agents:
             np.copyto(self.calls.meta_actions, commands.meta_actions)
             self.calls.begin_step()
         for drive in self.calls.drive_by_networks:
             drive()
+        check_commands(self.first.learned, self.first.config.traffic)
 
     def advance(self, commands: Commands) -> None:
         """Decide all controls from the committed rows, and move owned rows into the next rows."""

@@ -321,6 +321,23 @@ def test_weights_that_are_not_finite_are_refused(copied: Path) -> None:
         load(f"zoo:{copied}")
 
 
+@pytest.mark.parametrize("parts", [{}, {"zones": 4, "workers": 2}])
+def test_a_network_that_gives_nan_ends_the_step_with_its_name(
+    copied: Path, make: Make, parts: dict[str, int]
+) -> None:
+    from safetensors.numpy import load_file, save_file
+
+    path = copied / "model.safetensors"
+    weights = load_file(path)
+    weights["body.0.bias"] = np.full_like(weights["body.0.bias"], 3e38)  # sums of it overflow
+    save_file(weights, path)
+    wanted: dict[str, Any] = {"overrides": {"traffic.model": f"zoo:{copied}"}}
+    with pytest.raises(PolicyError, match=r"traffic.model = .*copied.* gives NaN .* vehicle \d+"):
+        vec = make("town", agents=1, background=12, **wanted, **parts)
+        vec.reset(seed=1)
+        vec.step(vec.suggest_actions())
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

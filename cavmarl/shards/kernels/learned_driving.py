@@ -6,6 +6,7 @@ earlier steps is in the vehicle's record, so it moves with the vehicle from zone
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -38,6 +39,7 @@ class LearnedDriver(NamedTuple):
     exchanged: NDArray[np.int64]
     signs: NDArray[np.float32]
     no_reports: NDArray[np.void]  # REPORT (0,), the empty inbox of each vehicle
+    failed: NDArray[np.int64]  # (1,) id of a vehicle for which the network gave NaN; -1: none
     # scratch
     observations: NDArray[np.float32]  # (TILE_ROWS · D,)
     frame: NDArray[np.float32]  # (D,)
@@ -87,7 +89,10 @@ def _exchange_sides(learned: LearnedDriver, frame: NDArray[np.float32]) -> None:
 
 @kernel
 def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
-    """Evaluate the network for the observed rows, and set their commands."""
+    """Evaluate the network for the observed rows, and set their commands.
+
+    Commands are 0 where the network gives NaN, and `failed` is written.
+    """
     width = learned.observations.shape[0] // TILE_ROWS
     evaluate_network(
         learned.layers,
@@ -99,6 +104,10 @@ def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
     )
     for k in range(num):
         row = rows[learned.places[k]]
+        if math.isnan(learned.actions[2 * k]) or math.isnan(learned.actions[2 * k + 1]):
+            learned.failed[0] = row["id"]
+            learned.actions[2 * k] = np.float32(0.0)
+            learned.actions[2 * k + 1] = np.float32(0.0)
         row["throttle"] = np.float64(learned.actions[2 * k]) * learned.accel_mps2
         steering = learned.actions[2 * k + 1]
         if learned.exchanged.size > 0:
