@@ -1,7 +1,7 @@
 """Drivers in model files of other libraries: stable-baselines3, TorchScript and ONNX.
 
 `make_policy` is the way in for all of them. A format is a suffix in `config/driver_names.py` and a
-reader in `_READERS`, which returns a `Model`, and whether the model corrects the built-in driver.
+reader in `_READERS`, which returns a `Model`, and the driver's configuration if the file states it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ import pickle
 import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from typing import Any, cast
+from typing import TYPE_CHECKING, Any, cast
 from zipfile import BadZipFile
 
 import numpy as np
@@ -28,11 +28,16 @@ from cavmarl.engine.spaces import (
     observation_space,
 )
 from cavmarl.policies.driver_fit import check_fit
+from cavmarl.policies.map_check import meet_map
+from cavmarl.policies.other_side import OtherSide
 from cavmarl.policies.policy import Environment, Policy, built_in_actions
+
+if TYPE_CHECKING:
+    from cavmarl.networks.network_files import NetworkConfig
 
 Model = Callable[[NDArray[np.float32]], Any]
 """Maps flat observations (N, D) to actions (N, 2), choices (N,), or logits (N, choices)."""
-_Read = tuple[Model, bool]  # the model, and whether it corrects the built-in driver
+_Read = tuple[Model, "NetworkConfig | None"]  # None: the file does not state the configuration
 
 
 class ModelPolicy(Policy):
@@ -44,6 +49,8 @@ class ModelPolicy(Policy):
         name: name of the model in messages.
         is_residual: whether the model observes the built-in driver's action, too, as its last
             numbers, and returns a corrected action.
+        other_side: exchanges left and right, if the model was trained on maps with traffic on the
+            other side of the road.
 
     Raises:
         PolicyError: the model does not accept the observations of the environment, or its results
@@ -51,10 +58,16 @@ class ModelPolicy(Policy):
     """
 
     def __init__(
-        self, env: Environment, model: Model, name: str = "the model", is_residual: bool = False
+        self,
+        env: Environment,
+        model: Model,
+        name: str = "the model",
+        is_residual: bool = False,
+        other_side: OtherSide | None = None,
     ) -> None:
         super().__init__(env)
         self._model, self._name, self._is_residual = model, name, is_residual
+        self._other_side = other_side
         self._actions = action_space(env.config.action)
         size = flat_observation_space(env.config).shape[0]
         size += sum(self._actions.shape or ()) if is_residual else 0
@@ -70,13 +83,18 @@ class ModelPolicy(Policy):
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
         """Return the model's actions where `mask` is set, else 0."""
-        shape = self._actions.shape or ()
+        shape, exchange = self._actions.shape or (), self._other_side
         actions = np.zeros((*mask.shape, *shape), dtype=self._actions.dtype)
+        if exchange is not None:
+            observations = exchange.observations(observations)
         if self._is_residual:
             proposed = built_in_actions(self.env, mask)
+            if exchange is not None:
+                proposed = exchange.actions(proposed)
             observations = np.concatenate([observations, proposed], axis=-1)
         if mask.any():
-            actions[mask] = self._decide(observations[mask])
+            decided = self._decide(observations[mask])
+            actions[mask] = decided if exchange is None else exchange.actions(decided)
         return actions
 
     def _decide(self, observations: NDArray[np.float32]) -> NDArray[Any]:
@@ -112,15 +130,21 @@ def make_policy(path: Path, env: Environment) -> Policy:
     `.zip`: a model that stable-baselines3 saved (extra `train`); if it was trained with
     VecNormalize, the file NAME.pkl beside it has the statistics. `.pt`, `.ts`: a TorchScript
     module (extra `train`). `.onnx`: an ONNX model with one input (extra `onnx`); a model that
-    `export_onnx` wrote states its sensors and actions. Files of the first two kinds can contain
-    code, which this function runs.
+    `export_onnx` wrote states its sensors, actions and maps. Files of the first two kinds can
+    contain code, which this function runs.
 
     Raises:
         MissingExtraError: the library is not installed.
         PolicyError: the file cannot be read, or its model does not fit the environment.
+
+    Warns:
+        UntrainedMapWarning: the model states its maps, and was not trained on maps of this kind.
     """
-    model, is_residual = _READERS[path.suffix](path, env.config)
-    return ModelPolicy(env, model, str(path), is_residual)
+    model, config = _READERS[path.suffix](path, env.config)
+    if config is None:
+        return ModelPolicy(env, model, str(path))
+    other_side = meet_map(env, str(path), config.maps)
+    return ModelPolicy(env, model, str(path), config.residual, other_side)
 
 
 def model_files(path: Path) -> tuple[Path, ...]:
@@ -170,7 +194,7 @@ def _read_sb3(path: Path, config: EnvConfig) -> _Read:
             shown = named_observation(parts, observations.reshape(len(observations), stack, -1))
         return policy.predict(normalize(shown), deterministic=True)[0]
 
-    return act, False
+    return act, None
 
 
 def _no_learning(_: float) -> float:
@@ -243,7 +267,7 @@ def _read_torch_script(path: Path, _: EnvConfig) -> _Read:
         with torch.inference_mode():
             return module(torch.from_numpy(observations)).numpy()
 
-    return act, False
+    return act, None
 
 
 def _read_onnx(path: Path, here: EnvConfig) -> _Read:
@@ -263,8 +287,7 @@ def _read_onnx(path: Path, here: EnvConfig) -> _Read:
     config = read_onnx_config(about.custom_metadata_map, path)
     if config is not None:
         check_fit(config, here, str(path), about.graph_name)
-    is_residual = config is not None and config.residual
-    return (lambda observations: session.run(None, {inputs[0]: observations})[0]), is_residual
+    return (lambda observations: session.run(None, {inputs[0]: observations})[0]), config
 
 
 def _first_line(error: Exception) -> str:

@@ -16,7 +16,10 @@ from cavmarl.env.vector import make_vec
 from cavmarl.networks.driver_network import DriverNetwork, load_driver_network
 from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.policies.loading import load_policy
+from cavmarl.policies.map_check import UntrainedMapWarning
 from cavmarl.policies.onnx_export import export_onnx, onnx_model
+from tests.support.mirrored import mirror_net
+from tests.support.netgenerate import netgenerate
 
 onnxruntime = pytest.importorskip("onnxruntime")
 
@@ -94,6 +97,30 @@ def test_a_world_is_driven_by_the_model_as_by_the_driver(name: str, tmp_path: Pa
         np.testing.assert_allclose(found, actions, rtol=0.0, atol=CLOSE)
         observations, _, _, _, infos = vec.step(actions)
     assert infos["mask"].sum() > 4
+    vec.close()
+
+
+@pytest.mark.integration
+@pytest.mark.parametrize("name", ["cities_ippo", "cities_residual"])
+def test_a_model_drives_on_the_other_side_as_the_driver(name: str, tmp_path: Path) -> None:
+    path = tmp_path / "driver.onnx"
+    export_onnx(name, path)
+    right = netgenerate(tmp_path / "right.net.xml", "--grid", "--grid.number", "3")
+    left = mirror_net(right, tmp_path / "left.net.xml")
+    vec = make_vec(left, agents=4, background=2, sensors_of=name)
+    said = "trained in right-hand traffic, but this map has left-hand traffic"
+    with pytest.warns(UntrainedMapWarning, match=said):
+        driver = load_policy(name, vec)
+    with pytest.warns(UntrainedMapWarning, match=rf"driver\.onnx was {said}") as warned:
+        model = load_policy(path, vec)
+    assert warned[0].filename == __file__
+    observations, infos = vec.reset(seed=4)
+    for _ in range(6):
+        actions = driver.act_batch(observations, infos["mask"])
+        found = model.act_batch(observations, infos["mask"])
+        np.testing.assert_allclose(found, actions, rtol=0.0, atol=CLOSE)
+        observations, _, _, _, infos = vec.step(actions)
+    assert np.abs(actions[infos["mask"], 1]).max() > 1e-3
     vec.close()
 
 

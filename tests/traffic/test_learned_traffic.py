@@ -332,10 +332,12 @@ def test_a_network_that_gives_nan_ends_the_step_with_its_name(
     weights["body.0.bias"] = np.full_like(weights["body.0.bias"], 3e38)  # sums of it overflow
     save_file(weights, path)
     wanted: dict[str, Any] = {"overrides": {"traffic.model": f"zoo:{copied}"}}
+
+    def run() -> None:
+        drive(make("town", agents=1, background=12, **wanted, **parts), 1)
+
     with pytest.raises(PolicyError, match=r"traffic.model = .*copied.* gives NaN .* vehicle \d+"):
-        vec = make("town", agents=1, background=12, **wanted, **parts)
-        vec.reset(seed=1)
-        vec.step(vec.suggest_actions())
+        run()
 
 
 @pytest.mark.parametrize(
