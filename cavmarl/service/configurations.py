@@ -61,7 +61,7 @@ def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
 
 
 def check_policies(policies: list[str]) -> None:
-    """Refuse texts that are not names of drivers, as a path could run code."""
+    """Refuse texts that are not names of drivers, as a path could run code or name any folder."""
     known = agent_entries()
     for policy in policies:
         if policy not in known:
@@ -101,6 +101,7 @@ def _check(document: dict[str, Any]) -> None:
         config = load_config(environment, **world_keywords(document))[0]
     except (CavmarlError, RecursionError) as error:
         raise problem("refused", str(error)) from error
+    check_policies(list(config.traffic.networks))
     if refusal := config.refusal_of_agents("a session of the service"):
         raise problem("refused", refusal)
     population = config.population

@@ -185,6 +185,16 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
             {"environment": "merge", "overrides": {"scenario.name": "/tmp/code.py"}},
             422, "refused", "code.py",
         ),
+        (
+            "/configurations",
+            {"environment": "merge", "overrides": {"traffic.model": {"zoo:/tmp/a": 1.0}}},
+            422, "refused", "there is no driver 'a': choose one of",
+        ),
+        (
+            "/configurations",
+            {"environment": "merge", "overrides": {"traffic": {"model": "zoo:cavmarl"}}},
+            422, "refused", "there is no driver 'cavmarl': choose one of",
+        ),
         ("/sessions", {"configuration": "0" * 64}, 404, "not-found", "add it first"),
         ("/sessions", {"configuration": "x"}, 422, "bad-body", "configuration"),
     ],
