@@ -41,6 +41,7 @@ from cavmarl.learning.checkpoint import (
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import given_options, settings_of
+from cavmarl.networks.background_driver import background_drivers
 from cavmarl.networks.network_files import NetworkConfig
 from cavmarl.roads.road_kinds import road_kinds
 
@@ -272,5 +273,6 @@ def _digest(world: World | Simulation) -> str:
     for name in ("zones", "workers"):
         del config[name]
     demand = "" if world.demand is None else world.demand.content_hash
-    text = json.dumps([config, world.network.content_hash, demand], sort_keys=True)
+    drivers = [driver.content_hash for driver in background_drivers(world.config.traffic)]
+    text = json.dumps([config, world.network.content_hash, demand, *drivers], sort_keys=True)
     return hashlib.sha256(text.encode()).hexdigest()

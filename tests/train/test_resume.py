@@ -8,6 +8,7 @@ from __future__ import annotations
 import csv
 import errno
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -278,6 +279,17 @@ def test_another_world_is_refused(
     assert ippo.main([*words, "--total-agent-steps", "20", "--name", "run"]) == 0
     (entry / "env.yaml").write_text(text + "horizon_s: 33.0\n")
     said = refusal("--resume", "runs/run", "--total-agent-steps", "60")
+    assert "--resume runs/run: the environment has changed since that run" in said
+
+
+def test_another_driver_of_the_background_is_another_environment(
+    ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
+) -> None:
+    shutil.copytree(TRAIN.parent / "agents" / "cities_ippo", here / "driver")
+    model = ["--set", f"traffic.model=zoo:{here / 'driver'}"]
+    cut(ippo, [*TINY, *LENGTH, *model, "--name", "run"], monkeypatch)
+    shutil.copytree(TRAIN.parent / "agents" / "merge_ippo", here / "driver", dirs_exist_ok=True)
+    said = refusal("--resume", "runs/run")
     assert "--resume runs/run: the environment has changed since that run" in said
 
 
