@@ -127,7 +127,8 @@ class HostedWorld:
     @property
     def present_lanes(self) -> NDArray[np.void]:
         """LANE (L,) as they are now, with limits that roadside units and callers have set."""
-        lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[0]
+        # The last table is that of the only world, or of the map if lanes never change.
+        lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[-1]
         return lanes
 
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
