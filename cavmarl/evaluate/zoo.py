@@ -35,8 +35,8 @@ from cavmarl.evaluate.evaluation import (
     read_evaluation,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
+from cavmarl.networks.network_files import read_network_config
 from cavmarl.policies.loading import policy_files
-from cavmarl.policies.network_files import read_network_config
 from cavmarl.roads.road_kinds import RoadKind
 from cavmarl.sensors.observed.feature import Reading
 from cavmarl.sensors.observed.readings import readings_of
