@@ -89,6 +89,8 @@ class ExternalComponent(Component):
             raise ActionError(
                 f"world {w}, external vehicle {slot}: it does not exist; spawn it first"
             )
+        if self.coming.any() and (wrong := wrong_bodies(told[self.coming], self._types)):
+            raise ActionError(f"{wrong}; pass commands that `ExternalCommands` has made")
         self.leaving[:] = (told["kind"] == EXTERNAL_REMOVED) & is_held
         held[self.coming] = told[self.coming]
         for changed, names in ((is_posed & is_held, _POSE), (is_driven & is_held, _CONTROLS)):

@@ -38,7 +38,7 @@ from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import enter_at
 
 MARGIN_M = 100.0  # around the lanes of the map, within which vehicles may be placed
-_KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
+KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
 
 
 class ExternalCommands:
@@ -82,7 +82,7 @@ class ExternalCommands:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
         told, is_used = records_of(memory[0]), memory[1]
         is_waiting = told["kind"] != EXTERNAL_NONE
-        if wrong := wrong_commands(told[is_waiting], _KINDS):
+        if wrong := wrong_commands(told[is_waiting], KINDS):
             return wrong
         comes = told[is_waiting & ~is_used]
         if not len(comes):
@@ -147,7 +147,7 @@ class ExternalCommands:
         sizes = [kind[name] for name in ("length", "width", "height")] if size_m is None else size_m
         told["length"], told["width"], told["height"] = sizes
         body = told.reshape(1)
-        if wrong_commands(body, _KINDS) or wrong_bodies(body, simulation.types):
+        if wrong_commands(body, KINDS) or wrong_bodies(body, simulation.types):
             raise ActionError(
                 f"size_m = {tuple(sizes)}: must be length, width and height above 0, at most those "
                 "of a bus"
