@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 
 _POSE = ("x", "y", "z", "heading", "pitch", "speed")
 _CONTROLS = ("throttle", "steering")
-_LARGEST = 1e12
+LARGEST = 1e12  # limit of all numbers of a command, as of those of a vehicle
 
 
 class ExternalComponent(Component):
@@ -206,7 +206,7 @@ def wrong_commands(told: NDArray[np.void], kinds: Sequence[float]) -> str:
     if not np.isin(told["kind"], kinds).all():
         return "a command to an external vehicle has an unknown kind"
     for name in EXTERNAL.names or ():
-        usual = np.abs(told[name]) <= _LARGEST
+        usual = np.abs(told[name]) <= LARGEST
         if name in ("z", "pitch", "speed"):
             usual |= np.isnan(told[name])
         if not usual.all():
