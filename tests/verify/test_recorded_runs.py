@@ -140,9 +140,10 @@ def test_a_recording_from_the_middle_cannot_be_repeated(tmp_path: Path) -> None:
         repeat_recording(tmp_path / "a", WorldSpec(env="ring", agents=1))
 
 
-def test_commands_of_several_worlds_cannot_be_recorded(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="only the commands of one world"):
-        cavmarl.make_vec("ring", num_envs=2, record=RecordOptions(tmp_path / "a", (INPUTS,)))
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_commands_of_vector_environments_cannot_be_recorded(num_envs: int, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="only the commands of one world of `parallel_env`"):
+        cavmarl.make_vec("ring", num_envs=num_envs, record=RecordOptions(tmp_path / "a", (INPUTS,)))
 
 
 def test_the_command_repeats_a_recording(recorded: tuple[Path, list[str]], tmp_path: Path) -> None:
