@@ -270,8 +270,11 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
         ManifestError: the manifest does not contain it.
     """
     job = document.get("job")
-    is_whole = isinstance(job, dict) and {"env", "episodes", *_KEYS} <= job.keys()
-    if not is_whole or not isinstance(job["overrides"], dict | None):
+    if (
+        not isinstance(job, dict)
+        or not {"env", "episodes", *_KEYS} <= job.keys()
+        or not isinstance(job["overrides"], dict | None)
+    ):
         raise ManifestError(
             f"{folder / RESULT_FOLDER}: its manifest does not say what was driven; make the result "
             f"again: `cavmarl evaluate ENV --policy {folder} --out {folder / RESULT_FOLDER}`"

@@ -15,16 +15,9 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, RecordingError
 from cavmarl.env.parallel import CavEnv, parallel_env
-from cavmarl.env.recorded_inputs import (
-    INPUTS,
-    RESET,
-    command_names,
-    commands_of,
-    inputs_dtype,
-    seed_of,
-    wrong_inputs,
-)
+from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of, inputs_dtype
 from cavmarl.recordings.recording import Recording
+from cavmarl.verify.recorded_command_check import seed_of, wrong_inputs
 
 _MAY_DIFFER = ("zones", "workers", "nodes")  # keys that no result depends on
 _MOST_SHOWN = 5
@@ -112,14 +105,13 @@ def _repeat(
 
 def _check_inputs(path: str | Path, made: CavEnv, rows: Any) -> None:
     """Raise RecordingError if the world cannot carry out the commands of a recording."""
-    kinds, expected = rows.dtype, inputs_dtype(made.config, made.worlds.arrays)
-    if differing := [
-        name
-        for name in dict.fromkeys([*(expected.names or ()), *command_names(kinds)])
-        if name not in kinds.fields or name not in expected.fields or kinds[name] != expected[name]
-    ]:
+    given, expected = rows.dtype, inputs_dtype(made.config, made.worlds.arrays)
+    wanted = set(expected.names or ())
+    differing = wanted ^ {*(wanted & set(given.names or ())), *command_names(given)}
+    differing |= {name for name in wanted - differing if given[name] != expected[name]}
+    if differing:
         raise RecordingError(
-            f"{path}: its commands have another column {differing[0]} than this world: it is "
+            f"{path}: its commands have another column {min(differing)} than this world: it is "
             "damaged, or of another version of cavmarl; record the run again"
         )
     controlled, num_choices = made.config.controlled, None

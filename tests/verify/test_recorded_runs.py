@@ -255,7 +255,7 @@ def test_commands_with_another_dtype_are_refused(
     read = Recording.extra
 
     def changed(self: Recording, table: str, *arguments: Any) -> Any:
-        rows = read(self, table, *arguments)
+        rows: Any = read(self, table, *arguments)
         return rows[[column for column in rows.dtype.names if column != "controls"]]
 
     monkeypatch.setattr(Recording, "extra", changed)
