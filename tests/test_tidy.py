@@ -73,7 +73,7 @@ PASSED_ON = {
 
 # A new capability raises these two bounds by the lines that it needs; the commit says why.
 PACKAGE_LINES = 145_800
-REACHABLE_LINES = 88_940  # lines that `make_vec` and `parallel_env` can reach
+REACHABLE_LINES = 88_900  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name
