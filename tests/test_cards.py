@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from cavmarl.policies.network_files import read_network_config
 
 import cavmarl
 from cavmarl.config.registry import agent_entries, entries, load_config
@@ -26,6 +25,7 @@ from cavmarl.config.sensors import (
     WayConfig,
 )
 from cavmarl.engine.spaces import flat_observation_space, observation_table
+from cavmarl.networks.network_files import read_network_config
 from cavmarl.roads.road_kinds import road_kinds
 from cavmarl.sensors.observed import SENSORS, layout
 from cavmarl.sensors.observed.readings import readings_of, readings_table

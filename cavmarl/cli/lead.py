@@ -172,13 +172,12 @@ def lead(
         record=recorded(record, record_also),
         **world.keywords,
     )
-    pacer = None
-    if pace is not None:
-        step_s = made.step_s / pace if pace > 0.0 else made.step_s
-        pacer = RealTime(pace, deadline_s=step_s if deadline_s is None else deadline_s)
-    with (
-        closing(made),
-        FollowedWorld(
+    with closing(made):
+        pacer = None
+        if pace is not None:
+            step_s = made.step_s / pace if pace > 0.0 else made.step_s
+            pacer = RealTime(pace, deadline_s=step_s if deadline_s is None else deadline_s)
+        with FollowedWorld(
             made,
             address_of(at),
             secret=read_secret(secret_file, may_make=True),
@@ -188,20 +187,19 @@ def lead(
             pacer=pacer,
             truth=truth,
             traces=traces,
-        ) as led,
-    ):
-        console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
-        led.wait_for(followers, joins_s)
-        found = run_episode(led, world.seed, steps, on_lost)
-        if pacer is not None:
-            found["lateness"] = vars(pacer.lateness)
-        console.print(_table(found))
-        if found["actors"]:
-            console.print(_actor_table(found["actors"]))
-        if pacer is not None and pacer.watch is not None:
-            pacer.watch.end()
-            found["deadline"] = pacer.watch.report()
-            console.print(_deadline_text(found["deadline"]), highlight=False)
+        ) as led:
+            console.print(f"waiting for {followers} followers at {led.address}", highlight=False)
+            led.wait_for(followers, joins_s)
+            found = run_episode(led, world.seed, steps, on_lost)
+            if pacer is not None:
+                found["lateness"] = vars(pacer.lateness)
+            console.print(_table(found))
+            if found["actors"]:
+                console.print(_actor_table(found["actors"]))
+            if pacer is not None and pacer.watch is not None:
+                pacer.watch.end()
+                found["deadline"] = pacer.watch.report()
+                console.print(_deadline_text(found["deadline"]), highlight=False)
     write_json(json_path, found)
 
 

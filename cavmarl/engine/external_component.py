@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 _POSE = ("x", "y", "z", "heading", "pitch", "speed")
 _CONTROLS = ("throttle", "steering")
-_LARGEST = 1e12
+LARGEST = 1e12  # limit of all numbers of a command, as of those of a vehicle
 
 
 class ExternalComponent(Component):
@@ -90,6 +90,8 @@ class ExternalComponent(Component):
             raise ActionError(
                 f"world {w}, external vehicle {slot}: it does not exist; spawn it first"
             )
+        if self.coming.any() and (wrong := wrong_bodies(told[self.coming], self._types)):
+            raise ActionError(f"{wrong}; pass commands that `ExternalCommands` has made")
         self.leaving[:] = (told["kind"] == EXTERNAL_REMOVED) & is_held
         held[self.coming] = told[self.coming]
         for changed, names in ((is_posed & is_held, _POSE), (is_driven & is_held, _CONTROLS)):
@@ -208,7 +210,7 @@ def wrong_commands(told: NDArray[np.void], kinds: Sequence[float]) -> str:
     if not np.isin(told["kind"], kinds).all():
         return "a command to an external vehicle has an unknown kind"
     for name in EXTERNAL.names or ():
-        usual = np.abs(told[name]) <= _LARGEST
+        usual = np.abs(told[name]) <= LARGEST
         if name in ("z", "pitch", "speed"):
             usual |= np.isnan(told[name])
         if not usual.all():

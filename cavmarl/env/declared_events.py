@@ -35,9 +35,7 @@ class DeclaredEvents:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
         if not self._enabled and causes.any():
             return "events are declared in worlds without messages"
-        return (
-            "" if np.isin(causes, (0, *CAUSES.values())).all() else "an event has an unknown code"
-        )
+        return wrong_causes(causes)
 
     def declare(self, world: int, agent: int, cause: str) -> None:
         if not self._enabled:
@@ -60,3 +58,9 @@ class DeclaredEvents:
         if self._are_any:
             self._causes[:] = 0
             self._are_any = False
+
+
+def wrong_causes(causes: NDArray[np.int32]) -> str:
+    """Return what is wrong with CAUSE_* codes, 0: none; empty if nothing."""
+    is_known = np.isin(causes, (0, *CAUSES.values())).all()
+    return "" if is_known else "an event has an unknown code"

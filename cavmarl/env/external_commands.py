@@ -29,7 +29,7 @@ from cavmarl.core.records.external_records import (
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
-from cavmarl.engine.external_component import records_of, wrong_bodies, wrong_commands
+from cavmarl.engine.external_component import LARGEST, records_of, wrong_bodies, wrong_commands
 from cavmarl.engine.simulation import Simulation
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import lane_grid
@@ -38,7 +38,7 @@ from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import enter_at
 
 MARGIN_M = 100.0  # around the lanes of the map, within which vehicles may be placed
-_KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
+KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
 
 
 class ExternalCommands:
@@ -82,7 +82,7 @@ class ExternalCommands:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
         told, is_used = records_of(memory[0]), memory[1]
         is_waiting = told["kind"] != EXTERNAL_NONE
-        if wrong := wrong_commands(told[is_waiting], _KINDS):
+        if wrong := wrong_commands(told[is_waiting], KINDS):
             return wrong
         comes = told[is_waiting & ~is_used]
         if not len(comes):
@@ -147,7 +147,7 @@ class ExternalCommands:
         sizes = [kind[name] for name in ("length", "width", "height")] if size_m is None else size_m
         told["length"], told["width"], told["height"] = sizes
         body = told.reshape(1)
-        if wrong_commands(body, _KINDS) or wrong_bodies(body, simulation.types):
+        if wrong_commands(body, KINDS) or wrong_bodies(body, simulation.types):
             raise ActionError(
                 f"size_m = {tuple(sizes)}: must be length, width and height above 0, at most those "
                 "of a bus"
@@ -218,8 +218,7 @@ class ExternalCommands:
         """
         told = self._of(world, slot)
         for name, value in (("throttle_mps2", throttle_mps2), ("steering_rad", steering_rad)):
-            if not math.isfinite(value):
-                raise ActionError(f"{name} = {value}: must be a finite number")
+            _check_number(name, value)
         told["kind"] = EXTERNAL_DRIVEN
         told["throttle"], told["steering"] = throttle_mps2, steering_rad
 
@@ -302,8 +301,8 @@ class ExternalCommands:
         pose: tuple[float, float, float | None, float, float | None, float | None],
     ) -> None:
         for name, value in zip(("x", "y", "z", "heading", "pitch", "speed"), pose, strict=True):
-            if value is not None and not math.isfinite(value):
-                raise ActionError(f"{name} = {value}: must be a finite number")
+            if value is not None:
+                _check_number(name, value)
             told[name] = math.nan if value is None else value
         if abs(told["speed"]) > MAX_SPEED_MPS:
             raise ActionError(
@@ -344,6 +343,14 @@ class ExternalCommands:
         row: np.void = blank_vehicle()[0]
         self._enter_at(self._network.arrays, self._grid, told, row)
         return row
+
+
+def _check_number(name: str, value: float) -> None:
+    """Raise an ActionError if a value is not finite, or so large that no state may contain it."""
+    if not abs(value) <= LARGEST:
+        raise ActionError(
+            f"{name} = {value:g}: must be a finite number from {-LARGEST:g} to {LARGEST:g}"
+        )
 
 
 def _overlap(own: np.void, other: np.void) -> bool:

@@ -51,20 +51,12 @@ class Insertions:
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
         rows, waiting, used = memory
-        lanes = self._network.lanes
         if ((waiting < 0) | (waiting > used) | (used > self._most)).any():
             return "the number of insertions is out of range"
         is_waiting = np.arange(self._most) < waiting[:, np.newaxis]
         if (rows[~is_waiting] != (INSERT_NONE, INSERT_NONE, INSERT_NONE)).any():
             return "an insertion is not counted"
-        kind, lane, position_m = rows[is_waiting].T
-        if not (kind == INSERT_VEHICLE).all():
-            return "an insertion has an unknown kind"
-        if not np.isin(lane, np.arange(len(lanes))).all():
-            return "an insertion is on a lane that does not exist"
-        if not ((position_m >= 0.0) & (position_m <= lanes["length_m"][lane.astype(int)])).all():
-            return "an insertion is beside its lane"
-        return ""
+        return wrong_insertions(rows[is_waiting], self._network.lanes)
 
     def vehicle(self, world: int, lane: str, position_m: float) -> None:
         """Let a car enter on a lane, with its front bumper at a given position.
@@ -140,3 +132,18 @@ class Insertions:
         self._waiting[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
             self._last[world] = ()
+
+
+def wrong_insertions(rows: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
+    """Return what is wrong with insertions; empty if nothing.
+
+    `rows`: (n, 3) of `Commands.inserted`, without unused ones. `lanes`: LANE (L,) of the map.
+    """
+    kind, lane, position_m = rows.T
+    if not (kind == INSERT_VEHICLE).all():
+        return "an insertion has an unknown kind"
+    if not np.isin(lane, np.arange(len(lanes))).all():
+        return "an insertion is on a lane that does not exist"
+    if not ((position_m >= 0.0) & (position_m <= lanes["length_m"][lane.astype(int)])).all():
+        return "an insertion is beside its lane"
+    return ""

@@ -232,7 +232,9 @@ class StepSession:
                 "first"
             )
         standing = self._copy.standing(self.worlds)
-        self._recorder = WorldRecorder(record, self.worlds, standing, self.worlds.state_hash)
+        # A vector environment begins episodes within steps and loads states; neither is a command.
+        state_hash = None if self._in_place else self.worlds.state_hash
+        self._recorder = WorldRecorder(record, self.worlds, standing, state_hash)
 
     def close(self) -> None:
         """End the recording, the window and the worlds; a second call does nothing more."""

@@ -30,6 +30,19 @@ from cavmarl.policies.loading import policy_files
 _PAGE = Path(__file__).with_name("board.html.j2")
 TITLES = {name: name.replace("_", " ") for name in SHARES}
 _CONDITIONS = ("agents", "background", "max_cycles")
+# Parts of a result's manifest that are read, by dotted key.
+_PARTS: Mapping[str, type] = {
+    "policies": dict,
+    "results_sha256": dict,
+    "seeds": list,
+    "episodes": int,
+    "world.environment": str,
+    "world.config": dict,
+    "software.packages": dict,
+}
+
+
+_MISSING = object()
 
 
 class ShareOfTrips(NamedTuple):
@@ -103,13 +116,17 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
+    folder = folder.resolve()  # the name of `.` is that of the folder
     if not (folder / CARD_FILE).is_file():
         raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that says what it is")
     driver = entry_driver(folder)
     if driver == folder:
         _check_training(folder)
     _read_result(folder, driver)
-    found = verify_result(folder, driver, progress)
+    try:
+        found = verify_result(folder, driver, progress)
+    except SystemExit as error:  # else a script could end the check as if it had passed
+        raise PolicyError(f"{driver}: ends the program ({error!r}); remove this call") from error
     if found.differing:
         raise ManifestError(
             f"{folder / RESULT_FOLDER}: {', '.join(found.differing)} of driving again on "
@@ -191,6 +208,14 @@ def _read_result(folder: Path, driver: Path) -> dict[str, Any]:
     """Return the manifest of an entry's result; raises as `check_entry`."""
     result = folder / RESULT_FOLDER
     document = read_evaluation(result)
+    for key, kind in _PARTS.items():
+        part: Any = document
+        for name in key.split("."):
+            part = part.get(name, _MISSING) if isinstance(part, dict) else _MISSING
+        if not isinstance(part, kind):
+            raise ManifestError(
+                f"{result / MANIFEST_FILE}: {key} is missing or damaged; evaluate this driver again"
+            )
     if len(document["policies"]) != 1:
         raise ManifestError(
             f"{result}: is of {len(document['policies'])} drivers; evaluate this driver alone: "

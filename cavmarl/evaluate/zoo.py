@@ -35,8 +35,8 @@ from cavmarl.evaluate.evaluation import (
     read_evaluation,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
+from cavmarl.networks.network_files import read_network_config
 from cavmarl.policies.loading import policy_files
-from cavmarl.policies.network_files import read_network_config
 from cavmarl.roads.road_kinds import RoadKind
 from cavmarl.sensors.observed.feature import Reading
 from cavmarl.sensors.observed.readings import readings_of
@@ -270,7 +270,11 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
         ManifestError: the manifest does not contain it.
     """
     job = document.get("job")
-    if not isinstance(job, dict) or not {"env", "episodes", *_KEYS} <= job.keys():
+    if (
+        not isinstance(job, dict)
+        or not {"env", "episodes", *_KEYS} <= job.keys()
+        or not isinstance(job["overrides"], dict | None)
+    ):
         raise ManifestError(
             f"{folder / RESULT_FOLDER}: its manifest does not say what was driven; make the result "
             f"again: `cavmarl evaluate ENV --policy {folder} --out {folder / RESULT_FOLDER}`"

@@ -36,7 +36,8 @@ def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
 
     Raises:
         ConfigError: the folder exists and is not empty, or cannot be written.
-        RecordingError: the recording cannot be read, has no observations, or has no whole trip.
+        RecordingError: the recording cannot be read, has no observations, has no whole trip, or has
+            other observations and actions than its settings.
         MissingExtraError: pyarrow is not installed.
     """
     arrow = require("pyarrow", "record")
@@ -46,6 +47,13 @@ def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
     if first is None:
         raise RecordingError(
             f"{recording.path}: no agent made a decision; record a run of several steps"
+        )
+    observed, acted = flat_observation_space(config), action_space(config.action)
+    shapes = first.observations.shape[1:], first.actions.shape[1:], first.actions.dtype.kind == "i"
+    if shapes != (observed.shape, acted.shape, isinstance(acted, spaces.Discrete)):
+        raise RecordingError(
+            f"{recording.path}: its observations and actions are not those of the settings in its "
+            "manifest; use the version of cavmarl that wrote it, or record the run again"
         )
     data = folder / DATA_FOLDER
     try:
@@ -60,8 +68,8 @@ def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
             "jpeg_encoding": False,
             "total_episodes": count,
             "total_steps": steps,
-            "observation_space": _space(flat_observation_space(config)),
-            "action_space": _space(action_space(config.action)),
+            "observation_space": _space(observed),
+            "action_space": _space(acted),
             "dataset_size": _megabytes(data),
             "description": f"Recorded by cavmarl in the environment {recording.head.environment}.",
             "cavmarl_environment": recording.head.environment,

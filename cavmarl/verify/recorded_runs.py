@@ -15,8 +15,9 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, RecordingError
 from cavmarl.env.parallel import CavEnv, parallel_env
-from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of
+from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of, inputs_dtype
 from cavmarl.recordings.recording import Recording
+from cavmarl.verify.recorded_command_check import seed_of, wrong_inputs
 
 _MAY_DIFFER = ("zones", "workers", "nodes")  # keys that no result depends on
 _MOST_SHOWN = 5
@@ -79,15 +80,12 @@ def _repeat(
 ) -> RepeatedRun:
     worlds, agents = made.worlds, made.config.population.num_ids
     no_controls, no_choices = np.zeros((1, agents, 2)), np.zeros((1, agents), dtype=np.int64)
-    for name in command_names(rows.dtype):
-        expected = getattr(worlds.arrays, name, np.zeros((1, 0))).shape[1:]
-        if rows.dtype[name].shape != expected:
-            raise RecordingError(f"{path}: {name} has shape {rows.dtype[name].shape}; get it again")
+    _check_inputs(path, made, rows)
     difference, episodes = None, 0
     for step, row in enumerate(rows):
         if row["kind"] == RESET:
             worlds.arrays.chosen[:] = True
-            worlds.reset(int(row["seed"]) if row["seed"] else None, 0)
+            worlds.reset(seed_of(row), 0)
             episodes += 1
         else:
             worlds.step(commands_of(row, no_controls, no_choices))
@@ -103,6 +101,25 @@ def _repeat(
         state_hash=worlds.state_hash(0),
         first_difference=difference,
     )
+
+
+def _check_inputs(path: str | Path, made: CavEnv, rows: Any) -> None:
+    """Raise RecordingError if the world cannot carry out the commands of a recording."""
+    given, expected = rows.dtype, inputs_dtype(made.config, made.worlds.arrays)
+    wanted = set(expected.names or ())
+    differing = wanted ^ {*(wanted & set(given.names or ())), *command_names(given)}
+    differing |= {name for name in wanted - differing if given[name] != expected[name]}
+    if differing:
+        raise RecordingError(
+            f"{path}: its commands have another column {min(differing)} than this world: it is "
+            "damaged, or of another version of cavmarl; record the run again"
+        )
+    controlled, num_choices = made.config.controlled, None
+    if controlled is not None:
+        places = made.signals if controlled is made.config.signals else made.limits
+        num_choices = places.num_choices
+    if wrong := wrong_inputs(rows, made.network, num_choices):
+        raise RecordingError(f"{path}: its commands are damaged: {wrong}; get the recording again")
 
 
 def _check_world(recording: Recording, made: CavEnv) -> None:

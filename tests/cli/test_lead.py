@@ -168,3 +168,12 @@ def test_a_trace_is_played_with_a_deadline_and_recorded(
 def test_a_deadline_needs_a_pace(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code(["lead", "ring", "--deadline", "0.1"]) == 2
     assert "--deadline 0.1: goes with --pace" in capsys.readouterr().err
+
+
+def test_a_wrong_pace_leaves_no_open_world(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    run = tmp_path / "run"
+    assert exit_code(["lead", "ring", "--pace", "0", "--record", str(run)]) == 2
+    assert "pacing by 0.0: must be a number above 0" in capsys.readouterr().err
+    assert json.loads((run / "recording.json").read_text())["status"] == "closed"

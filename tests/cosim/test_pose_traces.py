@@ -57,11 +57,19 @@ def test_a_file_has_one_trace_per_id_with_types_and_sizes(tmp_path: Path) -> Non
         (f"{HEAD}\n0,1,two,2\n", "y = two: must be a finite number"),
         (f"{HEAD}\n0,1,,2\n", "a row has no y"),
         (f"{HEAD},received_s\n5,1,2,0,4\n", "received_s before time_s"),
+        (f"{HEAD},vclass\n0,1,2,0,truck\n", "vclass = truck: must be from 0 to 9"),
+        (f"{HEAD},vclass\n0,1,2,0,99\n", "vclass = 99: must be from 0 to 9"),
+        (f"{HEAD},length,width\n0,1,2,0,4,2\n", "has no height; give length, width and"),
     ],
 )
 def test_invalid_files_are_refused(tmp_path: Path, text: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
         read_traces(written(tmp_path, text))
+
+
+def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
+    (trace,) = read_traces(written(tmp_path, f"\ufeff{HEAD}\n0,1,2,0\n"))
+    assert trace.samples[0].x == 1.0
 
 
 def test_a_missing_file_is_refused(tmp_path: Path) -> None:

@@ -112,6 +112,10 @@ def test_a_new_episode_forgets_the_poses_and_keeps_the_counts() -> None:
     [
         (PoseSample(0.0, math.nan, 0.0, 0.0), "x = nan: must be a finite number"),
         (PoseSample(0.0, 0.0, 0.0, math.inf), "heading = inf: must be a finite number"),
+        (
+            PoseSample(0.0, 0.0, 0.0, -1.7e308),
+            r"heading = -1.7e\+308: must be a finite number from",
+        ),
         (PoseSample(0.0, 0.0, 0.0, 0.0, z=math.nan), "z = nan"),
         (PoseSample(-0.1, 0.0, 0.0, 0.0), "since the reset, from 0"),
         (PoseSample(1.06, 0.0, 0.0, 0.0), "is in the future; must be at most 1.05"),

@@ -252,6 +252,11 @@ def test_invalid_commands_are_refused_with_a_fix() -> None:
             env.external.spawn(x + 0.5, y, heading)
         with pytest.raises(ActionError, match="must be a finite number"):
             env.external.drive(slot, math.inf, 0.0)
+        for name in ("z", "pitch"):  # a state with such a number could not be loaded
+            with pytest.raises(
+                ActionError, match=rf"{name} = 1e\+300: must be a finite number from"
+            ):
+                env.external.pose(slot, x, y, heading, **{name: 1e300})
         with pytest.raises(ActionError, match="there is no such vehicle"):
             env.external.drive(slot + 1, 0.0, 0.0)
         with pytest.raises(ActionError, match="there is no such vehicle"):

@@ -221,3 +221,45 @@ def test_the_commands_build_and_check(
     assert ended.value.code == 1
     assert "merge_ippo: " in capsys.readouterr().err
     assert "✗ failed" in out.read_text()
+
+
+@pytest.mark.parametrize(
+    ("keys", "wrong"),
+    [
+        ({"software": {}}, r"software\.packages"),
+        ({"world": []}, r"world\.environment"),
+        ({"policies": None}, "policies"),
+        ({"episodes": "x"}, "episodes"),
+        ({"seeds": 3}, "seeds"),
+    ],
+)
+def test_a_damaged_manifest_does_not_end_the_board(
+    keys: dict[str, Any], wrong: str, entry: Path, tmp_path: Path
+) -> None:
+    change_manifest(entry, **keys)
+    (found,) = build_board([entry], tmp_path / "board.html")
+    assert re.search(rf"manifest\.json: {wrong} is missing or damaged; evaluate", found.failure)
+
+
+def test_a_damaged_job_does_not_end_the_board(entry: Path, tmp_path: Path) -> None:
+    job = json.loads((entry / "result" / "manifest.json").read_text())["job"]
+    change_manifest(entry, job=job | {"overrides": 3})
+    (found,) = build_board([entry], tmp_path / "board.html")
+    assert "does not say what was driven" in found.failure
+
+
+def test_an_entry_is_checked_from_its_own_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT / "board" / "idm")
+    assert not check_entry(Path()).differing
+
+
+def test_a_script_cannot_end_the_check(tmp_path: Path) -> None:
+    own = script_entry(tmp_path / "entries")
+    script = own / "brake.py"
+    script.write_text(script.read_text() + "\n\nraise SystemExit(0)\n")
+    digest = hashlib.sha256(script.read_bytes()).hexdigest()
+    manifest = json.loads((own / "result" / "manifest.json").read_text())
+    manifest["policies"]["brake"]["sha256"] = {"brake.py": digest}
+    change_manifest(own, policies=manifest["policies"])
+    with pytest.raises(PolicyError, match=r"brake\.py: ends the program \(SystemExit\(0\)\)"):
+        check_entry(own)

@@ -246,3 +246,19 @@ def test_the_command_writes_to_a_new_folder(
     assert " trips, " in " ".join(capsys.readouterr().out.split())
     with pytest.raises(ConfigError, match="exists and is not an empty folder; give a new one"):
         write_minari(Recording.open(recorded), tmp_path / "set")
+
+
+@pytest.mark.parametrize(
+    ("section", "key", "value"), [("action", "kind", "discrete"), ("sensors", "stack", 2)]
+)
+def test_settings_of_other_data_are_refused(
+    section: str, key: str, value: Any, tmp_path: Path
+) -> None:
+    drive(tmp_path / "run", "SameStep")
+    head = tmp_path / "run" / "recording.json"
+    document = json.loads(head.read_text())
+    document["manifest"]["world"]["config"][section][key] = value
+    head.write_text(json.dumps(document))
+    with pytest.raises(RecordingError, match="are not those of the settings in its manifest; use"):
+        write_minari(Recording.open(tmp_path / "run"), tmp_path / "set")
+    assert not (tmp_path / "set").exists()

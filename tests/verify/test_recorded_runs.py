@@ -15,8 +15,9 @@ from typer.testing import CliRunner
 
 import cavmarl
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError, RecordingError
+from cavmarl.core.errors import ActionError, ConfigError, RecordingError
 from cavmarl.core.records.codes import DRIVER_EXTERNAL
+from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.cosim.followers.followed_world import FollowedWorld
 from cavmarl.cosim.followers.follower_client import Follower
 from cavmarl.cosim.followers.follower_messages import ActorRequest, PoseView
@@ -139,9 +140,10 @@ def test_a_recording_from_the_middle_cannot_be_repeated(tmp_path: Path) -> None:
         repeat_recording(tmp_path / "a", WorldSpec(env="ring", agents=1))
 
 
-def test_commands_of_several_worlds_cannot_be_recorded(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="only the commands of one world"):
-        cavmarl.make_vec("ring", num_envs=2, record=RecordOptions(tmp_path / "a", (INPUTS,)))
+@pytest.mark.parametrize("num_envs", [1, 2])
+def test_commands_of_vector_environments_cannot_be_recorded(num_envs: int, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="only the commands of one world of `parallel_env`"):
+        cavmarl.make_vec("ring", num_envs=num_envs, record=RecordOptions(tmp_path / "a", (INPUTS,)))
 
 
 def test_the_command_repeats_a_recording(recorded: tuple[Path, list[str]], tmp_path: Path) -> None:
@@ -189,3 +191,85 @@ def test_inputs_of_all_kinds_are_repeated(tmp_path: Path, overrides: dict[str, A
         expected = env.state_hash()
     repeated = repeat_recording(tmp_path / "run", spec)
     assert (repeated.first_difference, repeated.state_hash) == (None, expected)
+
+
+VTYPE = (EXTERNAL.names or ()).index("vtype")
+
+
+@pytest.fixture(scope="module")
+def with_every_command(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, WorldSpec]:
+    """A recording whose first step has a command of most kinds."""
+    more = {"signals.overrides": 4, "population.external": 2}
+    overrides = {**EVERY_INPUT, **more, "signals.agents": "all"}
+    spec = WorldSpec(env="grid4x4", agents=2, background=4, overrides=overrides)
+    path = tmp_path_factory.mktemp("every") / "run"
+    with closing(
+        cavmarl.parallel_env(spec.env, record=RecordOptions(path, (INPUTS,)), **spec.keywords)
+    ) as env:
+        env.reset(seed=3)
+        min_x, min_y, _, _ = env.network.extent_m
+        env.external.spawn(min_x, min_y, 0.0)
+        env.step(env.suggest_actions())
+    return path, spec
+
+
+@pytest.mark.parametrize(
+    ("name", "place", "value", "reason"),
+    [
+        ("kind", (), "y", "a row is neither a reset nor a step"),
+        ("controls", (0, 0), np.nan, "a control is not finite"),
+        ("meta_actions", (0,), 9, "a choice of a vehicle is unknown"),
+        ("declared", (0,), 9999, "an event has an unknown code"),
+        ("inserted", (0,), (1.0, 1e9, 1.0), "an insertion is on a lane that does not exist"),
+        ("external", (0, 1), np.nan, "an external vehicle has an invalid x"),
+        ("external", (0, VTYPE), 1e9, "an external vehicle has an unknown type"),
+        ("overridden", (0,), (1 << 30, 3), "a link without a signal shows a state"),
+        ("lane_changes", (0, 0), 1e9, "a changed lane does not exist"),
+        ("signal_choices", (0,), 99, "a choice of a signal or of a speed limit is out of range"),
+    ],
+)
+def test_a_forged_command_is_refused(
+    with_every_command: tuple[Path, WorldSpec],
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    place: tuple[int, ...],
+    value: Any,
+    reason: str,
+) -> None:
+    forge(monkeypatch, name, (1, *place), value)
+    with pytest.raises((RecordingError, ActionError), match=reason):
+        repeat_recording(*with_every_command)
+
+
+def test_a_forged_seed_is_refused(
+    with_every_command: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    forge(monkeypatch, "seed", (0,), "4x")
+    with pytest.raises(RecordingError, match=r"seed = '4x': must be a whole number; get the"):
+        repeat_recording(*with_every_command)
+
+
+def test_commands_with_another_dtype_are_refused(
+    with_every_command: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = Recording.extra
+
+    def changed(self: Recording, table: str, *arguments: Any) -> Any:
+        rows: Any = read(self, table, *arguments)
+        return rows[[column for column in rows.dtype.names if column != "controls"]]
+
+    monkeypatch.setattr(Recording, "extra", changed)
+    with pytest.raises(RecordingError, match="another column controls than this world"):
+        repeat_recording(*with_every_command)
+
+
+def forge(monkeypatch: pytest.MonkeyPatch, name: str, place: tuple[int, ...], value: Any) -> None:
+    """Let recordings have another value at a place of a column."""
+    read = Recording.extra
+
+    def changed(self: Recording, table: str, *arguments: Any) -> Any:
+        rows = read(self, table, *arguments)
+        rows[name][place] = value
+        return rows
+
+    monkeypatch.setattr(Recording, "extra", changed)

@@ -23,7 +23,8 @@ MOST_ROWS = 5_000_000
 _NEEDED = ("time_s", "x", "y", "heading")
 _OPTIONAL = ("z", "pitch", "speed", "received_s", "length", "width", "height")
 _SOON_S = 1e-9
-# Types of the numbers in the column `vclass` of `cavmarl replay --csv`; all others are cars.
+_SIZES = ("length", "width", "height")
+# Types of the numbers in the column `vclass` of `cavmarl replay --csv`; the other classes are cars.
 _TYPES = {
     VEHICLE_CLASSES.index("truck"): "truck",
     VEHICLE_CLASSES.index("bus"): "bus",
@@ -71,7 +72,7 @@ def read_traces(path: Path) -> list[PoseTrace]:
     """
     rows: dict[str, list[dict[str, str]]] = {}
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with path.open(newline="", encoding="utf-8-sig") as file:
             reader = csv.DictReader(file)
             missing = [name for name in _NEEDED if name not in (reader.fieldnames or ())]
             if missing:
@@ -137,18 +138,31 @@ def _trace(
             f"{path}: a row of '{name}' has received_s before time_s; must be at least time_s"
         )
     body = rows[0]
-    has_size = all(key in body for key in ("length", "width", "height"))
+    if missing := [key for key in _SIZES if key not in body]:
+        if len(missing) < len(_SIZES):
+            raise ConfigError(
+                f"{path}: the first row of '{name}' has no {missing[0]}; give length, width and "
+                "height, or none of them"
+            )
     return PoseTrace(
         name,
-        first.get("type") or _type_of(first.get("vclass")),
-        (body["length"], body["width"], body["height"]) if has_size else None,
+        first.get("type") or _type_of(path, first.get("vclass")),
+        None if missing else (body["length"], body["width"], body["height"]),
         samples,
         arrivals,
     )
 
 
-def _type_of(vclass: str | None) -> str:
-    return next((kind for code, kind in _TYPES.items() if vclass == str(code)), "car")
+def _type_of(path: Path, vclass: str | None) -> str:
+    """Return the type of a class. Raises ConfigError: it is no number of a class."""
+    if not vclass:
+        return "car"
+    if vclass not in map(str, range(CLASS_PEDESTRIAN + 1)):
+        raise ConfigError(
+            f"{path}: vclass = {vclass[:MOST_NAME]}: must be from 0 to {CLASS_PEDESTRIAN}, as "
+            "`cavmarl replay --csv` writes it; name types in the column type"
+        )
+    return _TYPES.get(int(vclass), "car")
 
 
 @dataclass(eq=False)

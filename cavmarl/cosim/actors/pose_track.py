@@ -16,6 +16,7 @@ from cavmarl.core.errors import ActionError
 from cavmarl.core.math.elementary import cos_sin
 from cavmarl.core.math.geometry import TWO_PI
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
+from cavmarl.engine.external_component import LARGEST
 
 MOST_RATE_HZ = 1000.0
 MOST_EXTRAPOLATION_S = 10.0
@@ -158,8 +159,10 @@ class PoseTrack:
 
 def _check(sample: PoseSample, latest_s: float) -> None:
     for name, value in sample._asdict().items():
-        if value is not None and not math.isfinite(value):
-            raise ActionError(f"{name} = {value}: must be a finite number")
+        if value is not None and not abs(value) <= LARGEST:
+            raise ActionError(
+                f"{name} = {value:g}: must be a finite number from {-LARGEST:g} to {LARGEST:g}"
+            )
     if sample.stamp_s < 0.0:
         raise ActionError(f"stamp_s = {sample.stamp_s:g}: must be a time since the reset, from 0")
     if sample.stamp_s > latest_s + _SAME_S:

@@ -11,6 +11,7 @@ import logging
 import re
 import shutil
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
@@ -128,7 +129,7 @@ def read_session(path: Path) -> RecordedSession:
             f"{path.name}: is no recording of a CARLA server ({error.strerror}); start_recorder "
             "makes one"
         ) from error
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
         raise RecordingError(
             f"{path.name}/{ACTORS_FILE}: is damaged ({error}); record again"
         ) from error
@@ -188,13 +189,20 @@ class CarlaRecorder:
         """
         path = self.path_of(name)
         self.stop()
-        if (path / ACTORS_FILE).is_file():
-            shutil.rmtree(path)
         env = session.world.env
-        self._writer = WorldRecorder(path, env.worlds, env.simulation, None)
-        self._list = (path / ACTORS_FILE).open("w", encoding="utf-8")
+        try:
+            if (path / ACTORS_FILE).is_file():
+                shutil.rmtree(path)
+            self._writer = WorldRecorder(path, env.worlds, env.simulation, None)
+            self._list = (path / ACTORS_FILE).open("w", encoding="utf-8")
+            self._write(map=session.map.name, session=key, episode=session.episode)
+        except OSError as error:
+            self.stop()
+            raise RecordingError(
+                f"{name}: cannot be written ({error.strerror}); use another name, or free space in "
+                "the server's folder of recordings"
+            ) from error
         self._listed, self._rows = set(), 0
-        self._write(map=session.map.name, session=key, episode=session.episode)
         self.take(session)
         return path
 
@@ -206,15 +214,15 @@ class CarlaRecorder:
         writer = self._writer
         if writer is None:
             return
-        for actor in session.actors.vehicles:
-            if actor.vehicle not in self._listed:
-                self._listed.add(actor.vehicle)
-                self._write(**vars(RecordedActor.of(actor)))
         try:
+            for actor in session.actors.vehicles:
+                if actor.vehicle not in self._listed:
+                    self._listed.add(actor.vehicle)
+                    self._write(**vars(RecordedActor.of(actor)))
             left = np.array([one[:2] for one in ended], ENDED)
             frame = frame_of(session.world.simulation, ended=left, room=writer.room)
             writer.add([frame], None)
-        except CavmarlError as problem:
+        except (CavmarlError, OSError) as problem:
             log.warning("the recording ends: %s", problem)
             self.stop()
             return
@@ -227,7 +235,8 @@ class CarlaRecorder:
         """End the recording, if there is one."""
         writer, self._writer = self._writer, None
         if self._list is not None:
-            self._list.close()
+            with suppress(OSError):  # a full disk has ended the recording already
+                self._list.close()
             self._list = None
         if writer is not None:
             try:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import errno
+import io
 import json
 from collections.abc import Iterator
 from pathlib import Path
@@ -336,6 +338,46 @@ def test_a_long_recording_ends(folder: Path, caplog: pytest.LogCaptureFixture) -
         recorded(server.session, calls_of(server.session))
     assert "it has reached its limit of 50 rows" in caplog.text
     assert len(Recording.open(folder / "test1.log").ticks()) == 5
+
+
+class FullDisk(io.StringIO):
+    """A file on a disk that has room for some lines."""
+
+    def __init__(self, lines: int) -> None:
+        super().__init__()
+        self.lines = lines
+
+    def flush(self) -> None:
+        self.lines -= 1
+        if self.lines < 0:
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+
+@pytest.mark.parametrize("lines", [0, 3])
+def test_a_full_disk_ends_the_recording_but_not_the_server(
+    lines: int,
+    own_session: CarlaSession,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    session, call = own_session, calls_of(own_session)
+    with monkeypatch.context() as patched:
+        opened = Path.open
+        patched.setattr(
+            Path,
+            "open",
+            lambda path, *mode, **more: (
+                FullDisk(lines) if path.name == ACTORS_FILE else opened(path, *mode, **more)
+            ),
+        )
+        if lines:
+            call("start_recorder", "full", False)
+            assert "the recording ends: [Errno 28] No space left on device" in caplog.text
+        else:
+            with pytest.raises(RuntimeError, match=r"full: cannot be written \(No space left on"):
+                call("start_recorder", "full", False)
+        session.tick()
+    recorded(session, call)  # another recording can be made
 
 
 def test_without_a_folder_nothing_is_recorded() -> None:
