@@ -18,6 +18,7 @@ from cavmarl.core.records.codes import (
     DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
     DRIVER_LEARNED,
+    DRIVER_SUMO,
     HOLD_EXIT_BLOCKED,
 )
 from cavmarl.driving.vehicles import VEHICLE
@@ -112,7 +113,7 @@ class RowCheck:
             "link": range(-1, num_links),
             "stopped_at": range(-1, num_links),
             "vtype": range(len(travel.types)),
-            "driver": range(DRIVER_BACKGROUND, DRIVER_LEARNED + 1),
+            "driver": range(DRIVER_BACKGROUND, 1 + self._last_driver()),
             "agent": range(-1, num_agents),
             "goal": range(-1, goals),
             "stop": range(-1, 1 + len(travel.stops)),
@@ -133,6 +134,12 @@ class RowCheck:
         types = travel.types
         self._radius_m = 0.5 * float(diagonals_m(types).max()) + 1e-6
         self._height_m = float(types["height"].max()) + 1e-6
+
+    def _last_driver(self) -> int:
+        """Return the largest number of a driver in these worlds."""
+        if self._travel.types["network"].any():
+            return DRIVER_LEARNED
+        return DRIVER_EXTERNAL if self._num_external else DRIVER_SUMO
 
     def wrong(
         self,

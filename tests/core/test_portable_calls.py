@@ -14,8 +14,13 @@ FOLDERS = """
     env policies config
 """.split()
 # These files do not build worlds: they compare maps with scans, and write files for other
-# programs. The last file drives CARLA, whose zones have a tolerance.
-OTHER = ("maps/fidelity/", "maps/exports/", "handoff/simulators/carla_zone_client.py")
+# programs. The last two drive CARLA and read its frames; such zones have a tolerance.
+OTHER = (
+    "maps/fidelity/",
+    "maps/exports/",
+    "handoff/simulators/carla_zone_client.py",
+    "handoff/simulators/carla_frames.py",
+)
 # These files make tables of results, or are drivers.
 FILES = ("evaluate/*.py", "evaluate/scenarios/criticality.py", "../agents/*.py")
 

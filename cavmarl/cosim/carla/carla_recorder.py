@@ -71,7 +71,8 @@ class RecordedActor:
         if (
             not all(isinstance(one, str) for one in texts)
             or given["type_id"] not in BLUEPRINTS
-            or not all(isinstance(one, int) and 0 <= one < 1 << 32 for one in (vehicle, number))
+            or not (isinstance(vehicle, int) and 0 <= vehicle < 1 << 63)
+            or not (isinstance(number, int) and 0 <= number < 1 << 32)
             or not all(len(one) == 3 and all(map(_is_small, one)) for one in vectors)
         ):
             raise ValueError("it is no actor")
