@@ -103,9 +103,7 @@ def measure_ros_drift(
         FollowerError, RosError: the bridge fails.
     """
     check_range(steps=(steps, 1, float("inf")), rogue=(rogue, 0.0, 1.0))
-    python = os.environ.get(PYTHON, "").split(":")[0]
-    if not python:
-        raise ConfigError(f"{PYTHON}: name a Python with rclpy; `make ros2` makes one")
+    python = rclpy_python()
     overrides = {
         "population.mode": "respawn",
         "rig": RIG,
@@ -169,6 +167,17 @@ def _run(bridged: BridgedWorld, seed: int, steps: int) -> tuple[list[int], float
     wall_s = time.monotonic() - began_s
     world.master.look_for_drift()
     return clock, wall_s
+
+
+def rclpy_python() -> str:
+    """Return the first Python with `rclpy` that the environment variable names.
+
+    Raises ConfigError: it names none.
+    """
+    python = os.environ.get(PYTHON, "").split(":")[0]
+    if not python:
+        raise ConfigError(f"{PYTHON}: name a Python with rclpy; `make ros2` makes one")
+    return python
 
 
 def ros_environment(domain: int) -> dict[str, str]:

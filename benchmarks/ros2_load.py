@@ -7,7 +7,6 @@ with reliable subscriptions and the profile of Fast DDS in `cavmarl/cosim/ros2/f
 from __future__ import annotations
 
 import json
-import os
 import subprocess
 import time
 from contextlib import closing
@@ -16,12 +15,12 @@ from typing import Annotated, Any
 
 from benchmarks import ros2_load_node
 from benchmarks.program import run
-from benchmarks.ros2_clock import JOINS_S, PYTHON, STEP_S, ros_environment
+from benchmarks.ros2_clock import JOINS_S, STEP_S, rclpy_python, ros_environment
 from benchmarks.ros2_load_node import CLOUD, IMU, PICTURE
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, about, with_world
 from cavmarl.config.world_spec import WorldSpec
-from cavmarl.core.errors import ConfigError, EvaluationError
+from cavmarl.core.errors import EvaluationError
 from cavmarl.cosim.ros2.bridged_world import BridgedWorld
 from cavmarl.cosim.ros2.ros_bridge import RosOptions
 from cavmarl.cosim.time_master import RealTime
@@ -98,9 +97,7 @@ def send(
         FollowerError, RosError: the bridge fails.
     """
     check_range(steps=(steps, 1, float("inf")), pace=(pace, 0.0, float("inf")))
-    python = os.environ.get(PYTHON, "").split(":")[0]
-    if not python:
-        raise ConfigError(f"{PYTHON}: name a Python with rclpy; `make ros2` makes one")
+    python = rclpy_python()
     overrides = {
         "population.mode": "respawn",
         **spec.overrides,
