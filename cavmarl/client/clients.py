@@ -86,7 +86,7 @@ class Client:
     """A synchronous client.
 
     Args:
-        url: of the service.
+        url: of the service; after a comma, those of its standbys.
         secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
@@ -102,7 +102,7 @@ class Client:
 
     def open(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         node: str | None = None,
         needs: Sequence[str] = (),
@@ -113,14 +113,17 @@ class Client:
         """Open a world on a node that the service selects.
 
         Args:
-            environment: name of an environment.
+            environment: name of an environment of the service, or the `Path` of your own: a folder
+                with an env.yaml, or a map. Its files are uploaded once.
             node: preferred node.
             needs: capabilities that the node must have.
             wait_s: longest wait for a node in s.
             recovery_s: longest search in s for another node after a loss.
             keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
                 `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
-                name under which the service numbers the versions of the configuration.
+                name under which the service numbers the versions of the configuration; `drivers`:
+                folders of trained drivers of yours, by the names with which `traffic.model` and
+                `policies` name them; `licence`: that of your files, as text.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.
@@ -137,7 +140,7 @@ class Client:
 
     def submit(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         policies: Sequence[str] = ("idm",),
         episodes: int = 32,
@@ -372,7 +375,7 @@ class AsyncClient:
 
     async def open(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         node: str | None = None,
         needs: Sequence[str] = (),
@@ -387,7 +390,7 @@ class AsyncClient:
 
     async def submit(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         policies: Sequence[str] = ("idm",),
         episodes: int = 32,

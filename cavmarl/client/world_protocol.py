@@ -13,6 +13,7 @@ import io
 import math
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
@@ -73,7 +74,7 @@ class WorldFlows:
 
     def open(
         self,
-        environment: str,
+        environment: str | Path,
         keys: Mapping[str, Any],
         wanted: Mapping[str, Any],
     ) -> Flow[None]:

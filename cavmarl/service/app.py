@@ -85,7 +85,9 @@ async def _sweep(service: Service, every_s: float) -> None:
         service.broker.sweep()
         try:
             await log.settle()
+            await asyncio.to_thread(log.store.check_lock)
         except ServiceError:
+            log.is_broken = True
             service.on_broken()
             return
 

@@ -37,13 +37,17 @@ def _answer(owner: str, sha256: str, one: ArtefactRecord) -> response_bodies.Art
 
 
 @artefacts.get("")
-async def list_artefacts(identity: Readers, service: TheService) -> response_bodies.ArtefactList:
+async def list_artefacts(
+    identity: Readers,
+    service: TheService,
+    own: Annotated[bool, Query(description="Only those of the caller")] = False,
+) -> response_bodies.ArtefactList:
     """Return artefacts: a client's own, or all of them."""
     known = service.broker.log.state.artefacts.items()
     shown = [
         _answer(owner, sha256, one)
         for owner, some in known
-        if identity.role != "client" or owner == identity.id
+        if (identity.role != "client" and not own) or owner == identity.id
         for sha256, one in some.items()
     ]
     return response_bodies.ArtefactList(artefacts=shown)

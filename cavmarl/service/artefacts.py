@@ -24,9 +24,6 @@ from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
 MOST_UNPACKED_BYTES = 1 << 30  # of a compressed file
-ENVIRONMENT_FILE = "env.yaml"
-DRIVER_FOLDER = "drivers"
-DRIVER_FILES = ("config.json", "model.safetensors")
 
 
 @dataclass(frozen=True)

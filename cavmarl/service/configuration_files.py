@@ -1,7 +1,7 @@
 """Files of a configuration: an environment and drivers that a client has uploaded as artefacts.
 
-A configuration names the files by their places in a folder. Files at the top belong to the
-environment; `drivers/NAME/` has the two files of a trained driver.
+A configuration names the files by their places in a folder. `drivers/NAME/` has the two files of a
+trained driver; the other files belong to the environment.
 """
 
 from __future__ import annotations
@@ -13,23 +13,29 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
+from cavmarl.client.uploads import DRIVER_FILES, DRIVER_FOLDER, ENVIRONMENT_FILE
 from cavmarl.config.env import EnvConfig
 from cavmarl.config.io import read_yaml
 from cavmarl.config.registry import MAP_SUFFIXES, load_config
 from cavmarl.config.traffic import ZOO
 from cavmarl.core.errors import CavmarlError
-from cavmarl.service.artefacts import DRIVER_FILES, DRIVER_FOLDER, ENVIRONMENT_FILE
 from cavmarl.service.error_names import problem
 
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9_-]+)+")
-_OF_OTHERS = ("plugins", "zones.journal", "zones.simulators", "workers.key_file")
+_RESERVED = ("agents", "configs", "envs")  # folders in which names are looked up
+_OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
 
 
 def drivers_of(files: Mapping[str, str]) -> list[str]:
     """Return the names of the uploaded drivers of a configuration."""
     prefix = f"{DRIVER_FOLDER}/"
     return sorted({place.split("/")[1] for place in files if place.startswith(prefix)})
+
+
+def has_environment(environment: str, files: Mapping[str, str]) -> bool:
+    """Return whether the environment of a configuration was uploaded."""
+    return ENVIRONMENT_FILE in files or environment in files
 
 
 def environment_of(environment: str, files: Mapping[str, str], folder: str | Path) -> str:
@@ -56,16 +62,17 @@ def check_files(environment: str, files: Mapping[str, str]) -> None:
                 f"files: driver '{name}' has {', '.join(there)}: it must have exactly "
                 f"{' and '.join(DRIVER_FILES)}",
             )
-    is_environment = ENVIRONMENT_FILE in files or environment in files
+    is_environment = has_environment(environment, files)
     if environment in files and not environment.endswith(MAP_SUFFIXES):
         raise problem("refused", f"environment: {environment} must be a map, or a name")
     for place in files:
-        if "/" not in place and not is_environment:
+        top = place.split("/")[0]
+        if top in _RESERVED and top != place:
+            raise problem("refused", f"files: {place}: the folder {top} must have another name")
+        if top != DRIVER_FOLDER and not is_environment:
             raise problem(
                 "refused", f"files: {place} belongs to no environment: add {ENVIRONMENT_FILE}"
             )
-        if "/" in place and not place.startswith(f"{DRIVER_FOLDER}/"):
-            raise problem("refused", f"files: {place} must be at the top, or in {DRIVER_FOLDER}/")
 
 
 def _is_of_driver(place: str, name: str) -> bool:
@@ -83,12 +90,11 @@ def load_uploaded(
     """
     with TemporaryDirectory(prefix="cavmarl-check-") as folder:
         for place, content in files.items():
-            if "/" in place:
-                continue
             path = Path(folder) / place
+            path.parent.mkdir(parents=True, exist_ok=True)
             path.write_bytes(content if place.endswith(".yaml") else b"")
             if place.endswith(".yaml"):
-                _check_texts(place, read_yaml(path), files)
+                _check_yaml(place, read_yaml(path), files)
         where = environment_of(environment, dict.fromkeys(files, ""), folder)
         try:
             config = load_config(where, **keys)[0]
@@ -100,6 +106,16 @@ def load_uploaded(
         if found[section][name] if name else found[section]:
             raise problem("refused", f"{key}: an uploaded environment must not set it; remove it")
     return config
+
+
+def _check_yaml(place: str, found: Any, files: Mapping[str, Any]) -> None:
+    """Refuse modules, which are code and would be imported, and files of the node."""
+    if place == ENVIRONMENT_FILE and isinstance(found, dict) and "plugins" in found:
+        raise problem(
+            "refused",
+            "plugins: name modules, which are code; an uploaded environment must not have the key",
+        )
+    _check_texts(place, found, files)
 
 
 def _check_texts(place: str, value: Any, files: Mapping[str, Any]) -> None:

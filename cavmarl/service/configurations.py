@@ -21,6 +21,7 @@ from cavmarl.service.configuration_files import (
     check_files,
     drivers_of,
     environment_of,
+    has_environment,
     load_uploaded,
     placed_overrides,
 )
@@ -125,7 +126,7 @@ def _check(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
     environment = document["environment"]
     hashes = document.get("files", {})
     check_files(environment, hashes)
-    is_uploaded = environment_of(environment, hashes, "") != environment
+    is_uploaded = has_environment(environment, hashes)
     if not is_uploaded and environment not in entries():
         known = ", ".join(entries())
         raise problem(
