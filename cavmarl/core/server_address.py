@@ -7,6 +7,8 @@ import socket
 
 from cavmarl.core.errors import ServiceError
 
+BACKLOG = 2048  # connections that wait to be accepted
+
 
 def is_loopback(host: str) -> bool:
     """Return whether an address can only be reached from this machine."""
@@ -31,7 +33,7 @@ def listen(host: str, port: int, *, is_open: bool = True) -> socket.socket:
     try:
         listener.bind((host, port))
         if is_open:
-            listener.listen(2048)
+            listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise ServiceError(f"{host}:{port}: {error.strerror}; give another --port") from error

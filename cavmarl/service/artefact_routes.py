@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
 from pydantic import StringConstraints
 
 from cavmarl.service import request_bodies, response_bodies
+from cavmarl.service.artefacts import check_content
 from cavmarl.service.route_access import TheService
 from cavmarl.service.route_common import (
     BYTES,
@@ -63,8 +65,10 @@ async def put_artefact(
     licence: Licence = "",
 ) -> response_bodies.Artefact:
     """Store a file of data under its SHA-256, or extend its lifetime; code is refused."""
-    content = await request.body()
-    found = service.broker.artefacts.add(identity, sha256, name, licence, content)
+    content, known = await request.body(), service.broker.artefacts
+    known.check_quota(identity, sha256, len(content))
+    await asyncio.to_thread(check_content, name, sha256, content)
+    found = known.add(identity, sha256, name, licence, content)
     return _answer(identity.id, sha256, found)
 
 

@@ -23,7 +23,9 @@ from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
-MOST_UNPACKED_BYTES = 1 << 30  # of a compressed file
+MOST_UNPACKED_BYTES = 1 << 29  # of a compressed file
+MOST_YAML_BYTES = 1 << 20
+MOST_JSON_BYTES = 1 << 24
 
 
 @dataclass(frozen=True)
@@ -56,21 +58,13 @@ class Artefacts:
             sha256: hash that the content must have.
             name: name of the file; its suffix says what the file is.
             licence: licence of the content, as text.
-            content: the file.
+            content: the file, which `check_content` has checked.
 
         Raises:
-            ServiceError: the content does not have the hash, is not data of its kind, or exceeds a
-                quota of the identity.
+            ServiceError: the content exceeds a quota of the identity.
         """
-        found = hashlib.sha256(content).hexdigest()
-        if found != sha256:
-            raise problem(
-                "refused", f"the content has the SHA-256 {found}, not {sha256}: send it again"
-            )
-        own = self.of(identity.id)
-        if sha256 not in own:
-            check_content(name, content)
-            self._check_quota(own, len(content))
+        self.check_quota(identity, sha256, len(content))
+        if sha256 not in self.of(identity.id):
             self._log.keep(content)
         data = {"name": name, "licence": licence, "bytes": len(content)}
         data |= {"until_s": self._until_s()}
@@ -126,7 +120,11 @@ class Artefacts:
     def _until_s(self) -> float:
         return self._log.wall_s() + 86_400.0 * self._quota.days
 
-    def _check_quota(self, own: Mapping[str, ArtefactRecord], more: int) -> None:
+    def check_quota(self, identity: IdentityRecord, sha256: str, more: int) -> None:
+        """Refuse a file of `more` bytes that an identity may not store."""
+        own = self.of(identity.id)
+        if sha256 in own:
+            return
         used = sum(one.size_bytes for one in own.values())
         if len(own) >= self._quota.files:
             raise problem(
@@ -149,12 +147,18 @@ class Artefacts:
         return {sha256 for one in configurations for sha256 in self._log.state.files_of(one)}
 
 
-def check_content(name: str, content: bytes) -> None:
-    """Check that a file is what the suffix of its name says.
+def check_content(name: str, sha256: str, content: bytes) -> None:
+    """Check that a file has its hash, and is what the suffix of its name says.
 
     Raises:
-        ServiceError: the suffix is not that of a kind of data, or the content is of another kind.
+        ServiceError: it has another hash, the suffix is not that of a kind of data, or the content
+            is of another kind.
     """
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256:
+        raise problem(
+            "refused", f"the content has the SHA-256 {found}, not {sha256}: send it again"
+        )
     for suffix, check in _CHECKS.items():
         if name.endswith(suffix):
             try:
@@ -191,6 +195,8 @@ def _check_gzip(content: bytes) -> None:
 def _check_yaml(content: bytes) -> None:
     from cavmarl.config.io import read_yaml
 
+    if len(content) > MOST_YAML_BYTES:
+        raise ValueError(f"it has {len(content)} bytes: at most {MOST_YAML_BYTES}")
     with tempfile.TemporaryDirectory(prefix="cavmarl-check-") as folder:
         path = Path(folder) / "file.yaml"
         path.write_bytes(content)
@@ -203,6 +209,8 @@ def _check_yaml(content: bytes) -> None:
 
 
 def _check_json(content: bytes) -> None:
+    if len(content) > MOST_JSON_BYTES:
+        raise ValueError(f"it has {len(content)} bytes: at most {MOST_JSON_BYTES}")
     try:
         found = json.loads(content)
     except RecursionError as error:

@@ -12,7 +12,7 @@ import uvicorn
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.private_files import check_private
 from cavmarl.core.request_heads import BoundedHeads
-from cavmarl.core.server_address import is_loopback, listen, shown_host
+from cavmarl.core.server_address import BACKLOG, is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
 from cavmarl.service.broker import Broker, BrokerRules
@@ -54,7 +54,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             store cannot be opened or written or was modified.
     """
     check_transport(options.host, options.certificate, options.key)
-    listener = listen(options.host, options.port, is_open=False)
+    listener = listen(options.host, options.port, is_open=not options.is_standby)
     scheme = "https" if options.certificate else "http"
     address = f"{scheme}://{shown_host(options.host)}:{listener.getsockname()[1]}"
     try:
@@ -81,6 +81,8 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             server.should_exit = True
 
         service.on_broken = end
+        if options.is_standby:
+            listener.listen(BACKLOG)
         tell(f"service: {address}, store {options.store}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")

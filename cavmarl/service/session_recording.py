@@ -7,6 +7,7 @@ commands, so no part is missing. A part that the lost node had begun is recorded
 from __future__ import annotations
 
 import io
+import json
 import zipfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -15,8 +16,10 @@ from typing import NamedTuple
 
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.recordings.extra_tables import RecordOptions
+from cavmarl.recordings.recording_format import HEAD_FILE
 from cavmarl.service.change_bodies import KeptRecording, Table
 
+COMMAND = ["cavmarl", "node"]
 PART = "recording-{:05d}.zip"  # name of the result with a part
 
 
@@ -69,6 +72,9 @@ class SessionRecording:
             return
         vec.record(None)
         place = Path(self._folder.name) / "recording"
+        head = json.loads((place / HEAD_FILE).read_text(encoding="utf-8"))
+        head["manifest"]["command"] = COMMAND  # the real one names folders of the node
+        (place / HEAD_FILE).write_text(json.dumps(head), encoding="utf-8")
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as packed:
             for file in sorted(place.rglob("*")):

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from sqlalchemy import create_engine, text
 from typer.testing import CliRunner
 
 import cavmarl
@@ -26,6 +27,7 @@ from cavmarl.service.event_store import EventStore
 from cavmarl.service.request_bodies import ConfigurationBody
 from tests.service.test_sessions import assert_same
 from tests.support.fleet import Fleet
+from tests.support.loopback_service import loopback_service
 from tests.support.service import Cluster, running_service
 
 NUMBERS = itertools.count()
@@ -57,13 +59,6 @@ def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
     return str(found["hash"])
 
 
-def test_content_that_is_not_what_its_hash_says_is_refused(fleet: Fleet) -> None:
-    before = fleet.log.sequence
-    with pytest.raises(ServiceError, match="the content has the SHA-256"):
-        fleet.broker.artefacts.add(fleet.client, "0" * 64, "map.net.xml", "", NET)
-    assert fleet.log.sequence == before
-
-
 @pytest.mark.parametrize(
     ("name", "content", "words"),
     [
@@ -78,13 +73,14 @@ def test_content_that_is_not_what_its_hash_says_is_refused(fleet: Fleet) -> None
         ("rig.yaml", b"a: !!python/object/apply:os.getcwd []", "is no .yaml file"),
         ("zones.json", b"[" * 100_000, "is no .json file"),
         ("zones.json", b"[]", "must be an object"),
+        ("rig.yaml", b"a: 1" + b" " * (1 << 20), "at most 1048576"),
         ("model.safetensors", b"\xff" * 64, "header"),
         ("model.safetensors", (2).to_bytes(8, "little") + b"[]", "must be an object"),
     ],
 )
 def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str) -> None:
     with pytest.raises(ServiceError, match=words) as refused:
-        check_content(name, content)
+        check_content(name, hashlib.sha256(content).hexdigest(), content)
     assert refused.value.problem == "refused"
 
 
@@ -92,8 +88,9 @@ def test_a_compressed_file_that_is_too_large_when_unpacked_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr("cavmarl.service.artefacts.MOST_UNPACKED_BYTES", 1 << 20)
+    content = gzip.compress(NET + b" " * (1 << 21))
     with pytest.raises(ServiceError, match="when unpacked"):
-        check_content("map.net.xml.gz", gzip.compress(NET + b" " * (1 << 21)))
+        check_content("map.net.xml.gz", hashlib.sha256(content).hexdigest(), content)
 
 
 def test_quotas_count_files_and_bytes_of_each_identity(fleet: Fleet) -> None:
@@ -282,6 +279,63 @@ def test_an_evaluation_of_one_s_own_driver_equals_the_local_one(
     assert "cavmarl-files-" not in manifest
     shown = CliRunner().invoke(app, ["artefacts", *words[-6:-2]], catch_exceptions=False)
     assert "env.yaml" in shown.output
+
+
+def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
+    cluster: Cluster, client: Client, tmp_path: Path
+) -> None:
+    cluster.start("late")
+    world = own_world(tmp_path)
+    keys: dict[str, Any] = {"episodes": 2, "repeats": 1, "agents": 3}
+    job = client.submit(world, node="late", wait_s=30.0, **keys)
+    killed = False
+
+    def kill_once(found: dict[str, Any]) -> None:
+        nonlocal killed
+        if not killed and found["progress"]:
+            assert found["node"] == "late"
+            cluster.processes["late"].kill()
+            killed = True
+
+    found = client.wait(job, tmp_path / "there", 120.0, kill_once)
+    assert killed
+    assert found["placements"] == 2
+    evaluate(str(world), ["idm"], out=tmp_path / "here", **keys)
+    for name in ("episodes.csv", "trips.csv"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> None:
+    with loopback_service(tmp_path / "store.sqlite") as service:
+        link = service.start_node("a", "node")
+        path = f"/artefacts/{hashlib.sha256(NET).hexdigest()}?name=map.net.xml"
+        assert service.ask("client", "PUT", path, content=NET).status_code == 200
+        files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
+        document = {"environment": "map.net.xml", "files": files}
+        folder = service.run(link.fetch_files(document))
+        assert folder is not None
+        assert (Path(folder.name) / "map.net.xml").read_bytes() == NET
+        folder.cleanup()
+        service.run(service.events.settle())
+        engine = create_engine(f"sqlite:///{tmp_path / 'store.sqlite'}")
+        with engine.begin() as connection:
+            connection.execute(text("UPDATE blobs SET content = 'x'"))
+        engine.dispose()
+        with pytest.raises(ServiceError, match="does not have its hash") as refused:
+            service.run(link.fetch_files(document))
+        assert refused.value.problem == "damaged"
+
+
+def test_a_node_checks_files_of_a_service_that_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with loopback_service(tmp_path / "store.sqlite") as service:
+        link = service.start_node("a", "node")
+        monkeypatch.setattr(type(service.broker.artefacts), "content", lambda *_: b"changed")
+        files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
+        with pytest.raises(ServiceError, match="does not have the SHA-256") as refused:
+            service.run(link.fetch_files({"environment": "map.net.xml", "files": files}))
+        assert refused.value.problem == "damaged"
 
 
 def table(path: Path) -> list[str]:
