@@ -78,7 +78,7 @@ class SetScenario(_Change):
     params: Annotated[dict[Plain, bool | Finite], Field(max_length=MOST_PARAMS)] = {}
 
 
-class Record(_Change):
+class BeginRecording(_Change):
     """Record the worlds from the next command on."""
 
     kind: Literal["record"]
@@ -86,7 +86,7 @@ class Record(_Change):
 
 
 Change = Annotated[
-    InsertVehicle | CloseRoad | OpenRoad | DamageRoad | DeclareEvent | SetScenario | Record,
+    InsertVehicle | CloseRoad | OpenRoad | DamageRoad | DeclareEvent | SetScenario | BeginRecording,
     Field(discriminator="kind"),
 ]
 

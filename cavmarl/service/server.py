@@ -65,7 +65,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
     try:
         if options.is_standby:
             tell(f"standby: {address}, follows store {options.store}")
-            log = follow_store(store)
+            log = follow_store(store, tell)
         else:
             log = EventLog(store)
         access = Access(log)
@@ -97,11 +97,11 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         store.close()
 
 
-def follow_store(store: EventStore) -> EventLog:
+def follow_store(store: EventStore, tell: Callable[[str], None]) -> EventLog:
     """Return the log of a store as soon as no other service has the store.
 
     Until then, the log is read as the other service writes it. So taking over takes the same time
-    for a log of any length.
+    for a log of any length. When all events so far have been read, a line is told.
 
     Raises:
         ServiceError: the server of the store does not answer, or the log was modified.
@@ -110,6 +110,7 @@ def follow_store(store: EventStore) -> EventLog:
     while not store.try_lock():
         if log is None and store.has_tables():
             log = EventLog(store, is_own=False)
+            tell(f"standby: ready to take over, {log.sequence} events read")
         elif log is not None:
             log.catch_up()
         time.sleep(POLL_S)

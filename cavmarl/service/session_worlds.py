@@ -19,6 +19,7 @@ from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere, missing_in_states
 from cavmarl.service.change_bodies import (
+    BeginRecording,
     Change,
     CloseRoad,
     DamageRoad,
@@ -26,7 +27,6 @@ from cavmarl.service.change_bodies import (
     InsertVehicle,
     KeptSession,
     OpenRoad,
-    Record,
     SetScenario,
 )
 from cavmarl.service.configurations import world_of
@@ -248,7 +248,7 @@ class SessionWorld:
                 vec.declare_event(change.world, change.agent, change.cause)
             case SetScenario():
                 self._begin_scenario(change)
-            case Record():
+            case BeginRecording():
                 self._begin_recording(change)
         return pack({})
 
@@ -274,7 +274,7 @@ class SessionWorld:
         if self.recording is not None:
             self.recording.begin(vec)
 
-    def _begin_recording(self, change: Record) -> None:
+    def _begin_recording(self, change: BeginRecording) -> None:
         if self.recording is not None:
             raise problem("conflict", "the session is being recorded already")
         if key := missing_in_states(self._vec.config):

@@ -36,7 +36,9 @@ def running_standby(store: str) -> Iterator[str]:
     process = ForkedProcess([*words, "--beat-s", "0.6"], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     try:
-        yield process.stdout.readline().split()[1].rstrip(",")
+        url = process.stdout.readline().split()[1].rstrip(",")
+        assert "ready to take over" in process.stdout.readline()
+        yield url
     finally:
         process.kill()
         process.wait()
@@ -104,7 +106,7 @@ def test_a_standby_follows_the_log_until_the_store_is_free(empty_postgresql: str
     assert log.state == fleet.log.state
     fleet.open()
     fleet.close()
-    found = follow_store(store)
+    found = follow_store(store, lambda _: None)
     assert found.sequence == fleet.log.sequence
     assert found.state == fleet.log.state
     store.close()
@@ -119,7 +121,7 @@ def test_a_changed_log_is_noticed_when_a_standby_takes_over(empty_postgresql: st
     )
     store = EventStore(empty_postgresql, is_standby=True)
     with pytest.raises(ServiceError, match="head"):
-        follow_store(store)
+        follow_store(store, lambda _: None)
     store.close()
 
 
