@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import uvicorn
@@ -16,7 +16,7 @@ from cavmarl.core.server_address import BACKLOG, is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
 from cavmarl.service.broker import Broker, BrokerRules
-from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_log import SERVICE, EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.route_access import Service
@@ -70,6 +70,8 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             log = EventLog(store)
         access = Access(log)
         admin = first_admin(log, access)
+        rules = {**asdict(options.rules), "is_standby": options.is_standby}
+        log.record("service.started", SERVICE, rules)
         log.flush()
         broker = Broker(log, options.rules)
         limits = RateLimit(options.rate_hz, 2.0 * options.rate_hz), RateLimit(20.0, 100.0)

@@ -207,6 +207,9 @@ class Infrastructure:
                 del own[event.subject]
                 self._replace_user(None, event.subject)
 
+    def _apply_service(self, word: str, event: LogEvent) -> None:
+        """Change nothing for a start of the service, whose rules the event has."""
+
     def _apply_clock(self, word: str, event: LogEvent) -> None:
         """Change nothing for an anomaly of a clock."""
 

@@ -88,7 +88,11 @@ def test_a_standby_takes_over_within_5_s_and_loses_nothing(empty_postgresql: str
             assert client.flows.url == other != primary
             with service.client() as admin:
                 known = {one["id"] for one in admin.get("/identities")["identities"]}
+                told = admin.get("/events", subject="service", limit=1000)["events"]
             assert known >= set(acknowledged)
+            starts = [one["data"] for one in told if one["kind"] == "service.started"]
+            assert [one["is_standby"] for one in starts] == [False, True]
+            assert starts[0]["load"]["weights"] == [0.6, 0.2, 0.2]
             remote.close()
             local.close()
         cluster.stop()
