@@ -184,6 +184,7 @@ _service(
 )
 _service("nodes", service.nodes, "cavmarl nodes", "cavmarl nodes --drain node-1")
 _service("sessions", service.sessions, "cavmarl sessions")
+_service("artefacts", service.artefacts, "cavmarl artefacts")
 _service("events", service.events, "cavmarl events --follow")
 
 

@@ -50,7 +50,7 @@ def node(
     service: Annotated[
         str | None,
         about(
-            "URL of the coordination service to work for.",
+            "URL of the coordination service to work for; after a comma, those of its standbys.",
             "--service",
             metavar="URL",
             panel=SERVICE,

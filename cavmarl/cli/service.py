@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
@@ -28,6 +29,7 @@ from cavmarl.cli.output import (
     with_world,
     write_json,
 )
+from cavmarl.config.registry import agent_entries, entries
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, ServiceError, require
 from cavmarl.core.private_files import read_private, write_private
@@ -44,7 +46,13 @@ DEFAULT_URL = "http://127.0.0.1:8700"
 
 Url = Annotated[
     str,
-    about("URL of the service.", "--service", metavar="URL", envvar=URL_VARIABLE, panel=SERVICE),
+    about(
+        "URL of the service; after a comma, those of its standbys.",
+        "--service",
+        metavar="URL",
+        envvar=URL_VARIABLE,
+        panel=SERVICE,
+    ),
 ]
 UserSecretFile = Annotated[
     Path | None,
@@ -124,19 +132,37 @@ def serve(
     weights: Annotated[
         str, about("Weights of CPU, RAM and GPU in the LoadScore.", metavar="CPU,RAM,GPU")
     ] = _joined(WEIGHTS),
+    artefact_mb: Annotated[
+        float, about("Megabytes of files that one user may store.", metavar="MB", min=0.0)
+    ] = 1024.0,
+    artefact_days: Annotated[
+        float,
+        about("Days after which an unused file is deleted.", metavar="DAYS", min=0.0),
+    ] = 30.0,
+    standby: Annotated[
+        bool,
+        flag(
+            "Follow the store of another service, and take over when it ends; needs PostgreSQL.",
+            "--standby",
+        ),
+    ] = False,
 ) -> None:
     """Run the coordination service.
 
     The first start prints the secret of the admin. It is not shown again.
     """
     require("fastapi", "service")
+    from cavmarl.service.artefacts import Quota
     from cavmarl.service.broker import BrokerRules
     from cavmarl.service.server import ServerOptions
     from cavmarl.service.server import serve as run
 
     load = LoadRule(_shares("--weights", weights), _shares("--thresholds", thresholds))
-    rules = BrokerRules(beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s, load=load)
-    options = ServerOptions(host, port, store, certificate, key, rules=rules)
+    quota = Quota(total_bytes=int(artefact_mb * 1e6), days=artefact_days)
+    rules = BrokerRules(
+        beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s, load=load, artefacts=quota
+    )
+    options = ServerOptions(host, port, store, certificate, key, rules=rules, is_standby=standby)
     run(options, _print)
 
 
@@ -177,14 +203,17 @@ def submit(
     env: Annotated[
         str,
         typer.Argument(
-            metavar="ENV", help="Name of an environment that the service and its nodes have."
+            metavar="ENV",
+            help="Name of an environment that the service and its nodes have, or the path of a "
+            "folder or map of yours, whose files are uploaded once.",
         ),
     ],
     policy: Annotated[
         list[str] | None,
         about(
-            "Driver to evaluate: the name of one that the service and its nodes have. Repeat the "
-            "option to compare drivers with the first one [default: idm].",
+            "Driver to evaluate: the name of one that the service and its nodes have, or the "
+            "folder of a trained driver of yours, which is uploaded once. Repeat the option to "
+            "compare drivers with the first one [default: idm].",
             "--policy",
             "-p",
             metavar="POLICY",
@@ -222,11 +251,12 @@ def submit(
     console = Console()
     keys = {**world.keywords, "overrides": dict(world.overrides)}
     del keys["max_cycles"]
+    environment, names, keys["drivers"] = _uploads(world.env, policy or ["idm"])
     seeds = run_seeds(world.seed, repeats) if spread else [world.seed]
     with connect(service, secret_file, authority, plain_http) as client:
         jobs = [
             client.submit(
-                world.env, policies=policy or ["idm"], episodes=episodes,
+                environment, policies=names, episodes=episodes,
                 repeats=1 if spread else repeats, wait_s=wait_s, seed=seed, **keys,
             )
             for seed in seeds
@@ -248,6 +278,46 @@ def submit(
     console.print(report_table(found))
     write_json(json_path, found.to_dict())
     _print(f"job: {', '.join(jobs)}\nresults: {folder} (`cavmarl report` shows them again)")
+
+
+def _uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict[str, Path]]:
+    """Return the environment, the names of the drivers, and the folders of those to upload."""
+    environment: str | Path = env
+    if env not in entries() and Path(env).exists():
+        environment = Path(env)
+    drivers = {
+        Path(policy).resolve().name: Path(policy)
+        for policy in policies
+        if policy not in agent_entries() and Path(policy).is_dir()
+    }
+    names = [Path(one).resolve().name if Path(one) in drivers.values() else one for one in policies]
+    if len(set(names)) < len(set(policies)):
+        raise ConfigError(f"--policy {' '.join(policies)}: drivers need folders of other names")
+    return environment, names, drivers
+
+
+def artefacts(
+    delete: Annotated[
+        str | None, about("Delete the file with this SHA-256.", metavar="SHA256")
+    ] = None,
+    service: Url = DEFAULT_URL,
+    secret_file: UserSecretFile = None,
+    authority: Authority = None,
+    plain_http: PlainHttp = False,
+    json_path: JsonPath = None,
+) -> None:
+    """Show the files that you have uploaded to the service, or delete one."""
+    with connect(service, secret_file, authority, plain_http) as client:
+        if delete is not None:
+            client.delete(f"/artefacts/{delete}")
+        found = client.get("/artefacts")
+    rows = [
+        (one["sha256"][:12], escape(one["name"]), escape(one["licence"]) or "-",
+         f"{one['size_bytes'] / 1e6:.2f}", f"{(one['until_s'] - time.time()) / 86_400.0:.1f}")
+        for one in found["artefacts"]
+    ]  # fmt: skip
+    Console().print(grid(("sha256", "name", "licence", "MB", "days left"), rows, lefts=3))
+    write_json(json_path, found)
 
 
 def _collect(client: Client, job: str, folder: Path, bar: Progress) -> None:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Iterator, Sequence
+from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import httpx
 
+from cavmarl.client.recording_parts import unpack_recordings
 from cavmarl.client.service_protocol import Ask, Flow, Rest, ServiceFlows, Told, check
 from cavmarl.client.world_protocol import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.server_address import is_loopback
+from cavmarl.sensors.mounted.frames import SensorFrames
 
 T = TypeVar("T")
 TIMEOUT = httpx.Timeout(300.0, connect=5.0)  # the first world may compile kernels
@@ -43,6 +45,10 @@ def _write(files: dict[str, bytes], folder: str | Path) -> Path:
     for name, content in files.items():
         (path / name).write_bytes(content)
     return path
+
+
+def _listed(lanes: Sequence[int] | None) -> list[int] | None:
+    return None if lanes is None else [int(lane) for lane in lanes]
 
 
 def _request(
@@ -80,7 +86,7 @@ class Client:
     """A synchronous client.
 
     Args:
-        url: of the service.
+        url: of the service; after a comma, those of its standbys.
         secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
@@ -96,7 +102,7 @@ class Client:
 
     def open(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         node: str | None = None,
         needs: Sequence[str] = (),
@@ -107,14 +113,17 @@ class Client:
         """Open a world on a node that the service selects.
 
         Args:
-            environment: name of an environment.
+            environment: name of an environment of the service, or the `Path` of your own: a folder
+                with an env.yaml, or a map. Its files are uploaded once.
             node: preferred node.
             needs: capabilities that the node must have.
             wait_s: longest wait for a node in s.
             recovery_s: longest search in s for another node after a loss.
             keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
                 `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
-                name under which the service numbers the versions of the configuration.
+                name under which the service numbers the versions of the configuration; `drivers`:
+                folders of trained drivers of yours, by the names with which `traffic.model` and
+                `policies` name them; `licence`: that of your files, as text.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.
@@ -131,7 +140,7 @@ class Client:
 
     def submit(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         policies: Sequence[str] = ("idm",),
         episodes: int = 32,
@@ -269,6 +278,80 @@ class RemoteWorld:
         found: list[dict[str, Any]] = self._client.run(self.flows.look("transfers"))["transfers"]
         return found
 
+    def frames(self, final: bool = False) -> dict[str, SensorFrames]:
+        """Return the samples of the mounted sensors, as `frames` of `make_vec` does.
+
+        With `final`, return those before the reset, as `final_frames` does.
+        """
+        return self._client.run(self.flows.frames(final))
+
+    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
+        """Let a car enter a world, as `insert_vehicle` of `make_vec` does."""
+        asked = self.flows.change(
+            "insert_vehicle", lane=lane, position_m=float(position_m), world=world
+        )
+        self._client.run(asked)
+
+    def close_road(
+        self,
+        edge: str,
+        lanes: Sequence[int] | None = None,
+        world: int = 0,
+        shuts_in: bool = False,
+    ) -> None:
+        """Close lanes of a road, as `close_road` of `make_vec` does."""
+        given = {"edge": edge, "lanes": _listed(lanes), "world": world, "shuts_in": shuts_in}
+        self._client.run(self.flows.change("close_road", **given))
+
+    def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
+        """Open lanes of a road, as `open_road` of `make_vec` does."""
+        asked = self.flows.change("open_road", edge=edge, lanes=_listed(lanes), world=world)
+        self._client.run(asked)
+
+    def damage_road(
+        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> None:
+        """Lower the speed limit of lanes of a road, as `damage_road` of `make_vec` does."""
+        given = {"edge": edge, "speed_mps": float(speed_mps), "lanes": _listed(lanes)}
+        self._client.run(self.flows.change("damage_road", **given, world=world))
+
+    def declare_event(self, world: int, agent: int | str, cause: str) -> None:
+        """Let the vehicle of an agent, given by index or id, announce an event."""
+        self._client.run(self.flows.declare_event(agent, cause, world))
+
+    def scenario(
+        self,
+        name: str,
+        place: str = "",
+        seed: int = 0,
+        params: Mapping[str, bool | float] | None = None,
+    ) -> None:
+        """Make the worlds again with a scenario; an empty name: without one. Reset them next.
+
+        The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
+        """
+        given = {"name": name, "place": place, "seed": seed, "params": dict(params or {})}
+        self._client.run(self.flows.change("scenario", **given))
+
+    def save_state(self) -> bytes:
+        """Store the state with the service now, and return it.
+
+        `load_state` of the same environment from `make_vec` takes it.
+        """
+        return self._client.run(self.flows.save())
+
+    def record(self, include: Sequence[str] = ()) -> None:
+        """Record the worlds on the node from the next command on; see `RecordOptions.include`."""
+        self._client.run(self.flows.change("record", include=list(include)))
+
+    def recording(self, folder: str | Path) -> list[Path]:
+        """Write what has been recorded so far to a new folder, and return its recordings.
+
+        A recording ends and the next one begins whenever the state is saved, so there are several.
+        Call this before `close`.
+        """
+        return unpack_recordings(self._client.run(self.flows.recording()), folder)
+
     def close(self) -> None:
         """End the session."""
         self._client.run(self.flows.close())
@@ -292,7 +375,7 @@ class AsyncClient:
 
     async def open(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         node: str | None = None,
         needs: Sequence[str] = (),
@@ -307,7 +390,7 @@ class AsyncClient:
 
     async def submit(
         self,
-        environment: str,
+        environment: str | Path,
         *,
         policies: Sequence[str] = ("idm",),
         episodes: int = 32,
@@ -417,6 +500,80 @@ class AsyncWorld:
     async def state_hash(self, world: int = 0) -> str:
         """Return the state hash of one world."""
         return str((await self._client.run(self.flows.look("hash")))["hashes"][world])
+
+    async def page(self) -> dict[str, str]:
+        """Like `RemoteWorld.page`."""
+        found: dict[str, str] = await self._client.run(self.flows.look("page"))
+        return found
+
+    async def transfers(self) -> list[dict[str, Any]]:
+        """Like `RemoteWorld.transfers`."""
+        told = await self._client.run(self.flows.look("transfers"))
+        found: list[dict[str, Any]] = told["transfers"]
+        return found
+
+    async def frames(self, final: bool = False) -> dict[str, SensorFrames]:
+        """Like `RemoteWorld.frames`."""
+        return await self._client.run(self.flows.frames(final))
+
+    async def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
+        """Like `RemoteWorld.insert_vehicle`."""
+        asked = self.flows.change(
+            "insert_vehicle", lane=lane, position_m=float(position_m), world=world
+        )
+        await self._client.run(asked)
+
+    async def close_road(
+        self,
+        edge: str,
+        lanes: Sequence[int] | None = None,
+        world: int = 0,
+        shuts_in: bool = False,
+    ) -> None:
+        """Like `RemoteWorld.close_road`."""
+        given = {"edge": edge, "lanes": _listed(lanes), "world": world, "shuts_in": shuts_in}
+        await self._client.run(self.flows.change("close_road", **given))
+
+    async def open_road(
+        self, edge: str, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> None:
+        """Like `RemoteWorld.open_road`."""
+        asked = self.flows.change("open_road", edge=edge, lanes=_listed(lanes), world=world)
+        await self._client.run(asked)
+
+    async def damage_road(
+        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> None:
+        """Like `RemoteWorld.damage_road`."""
+        given = {"edge": edge, "speed_mps": float(speed_mps), "lanes": _listed(lanes)}
+        await self._client.run(self.flows.change("damage_road", **given, world=world))
+
+    async def declare_event(self, world: int, agent: int | str, cause: str) -> None:
+        """Like `RemoteWorld.declare_event`."""
+        await self._client.run(self.flows.declare_event(agent, cause, world))
+
+    async def scenario(
+        self,
+        name: str,
+        place: str = "",
+        seed: int = 0,
+        params: Mapping[str, bool | float] | None = None,
+    ) -> None:
+        """Like `RemoteWorld.scenario`."""
+        given = {"name": name, "place": place, "seed": seed, "params": dict(params or {})}
+        await self._client.run(self.flows.change("scenario", **given))
+
+    async def save_state(self) -> bytes:
+        """Like `RemoteWorld.save_state`."""
+        return await self._client.run(self.flows.save())
+
+    async def record(self, include: Sequence[str] = ()) -> None:
+        """Like `RemoteWorld.record`."""
+        await self._client.run(self.flows.change("record", include=list(include)))
+
+    async def recording(self, folder: str | Path) -> list[Path]:
+        """Like `RemoteWorld.recording`."""
+        return unpack_recordings(await self._client.run(self.flows.recording()), folder)
 
     async def close(self) -> None:
         """End the session."""

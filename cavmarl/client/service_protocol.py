@@ -9,17 +9,20 @@ from __future__ import annotations
 import re
 import secrets
 import time
-from collections.abc import Callable, Generator, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping
+from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
 import httpx
 
+from cavmarl.client.uploads import Upload, driver_files, environment_files
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
 RENEW_BEFORE_S = 60.0  # time before its expiry at which a token is renewed
 AGAIN_S = 0.2  # time between two attempts
 PAGE = 1000  # maximum number of events in one answer
+TAKEOVER_S = 10.0  # how long the services are asked in turn until one answers
 RETRIED_S = 10.0  # how long a request is repeated after a lost answer
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,63}")
 
@@ -48,13 +51,45 @@ Told = Callable[[dict[str, Any]], None]
 
 
 class ServiceFlows:
-    """Requests to a service, with a token that is renewed in time."""
+    """Requests to a service, with a token that is renewed in time.
+
+    Args:
+        url: of the service; after a comma, those of its standbys. If one does not answer, the next
+            one is asked.
+        secret: of an identity.
+    """
 
     def __init__(self, url: str, secret: str) -> None:
-        self.url = url.rstrip("/")
+        self._urls = [one.strip().rstrip("/") for one in url.split(",")]
         self._secret = secret
         self._token = ""
         self._until_s = 0.0
+
+    @property
+    def url(self) -> str:
+        """The URL of the service that is asked first."""
+        return self._urls[0]
+
+    def _sent(self, ask: Ask, is_safe: bool) -> Flow[httpx.Response]:
+        """Return the answer of the service, or of the standby that takes over.
+
+        Args:
+            ask: a request with a path as URL.
+            is_safe: whether a request whose answer was lost may be repeated.
+        """
+        until_s = time.monotonic() + TAKEOVER_S
+        while True:
+            try:
+                answer: httpx.Response = yield ask._replace(url=f"{self.url}{ask.url}")
+            except httpx.TransportError as error:
+                self._urls.append(self._urls.pop(0))
+                is_unsent = isinstance(error, httpx.ConnectError | httpx.ConnectTimeout)
+                is_late = time.monotonic() > until_s
+                if len(self._urls) == 1 or is_late or not (is_unsent or is_safe):
+                    raise
+                yield Rest(AGAIN_S)
+            else:
+                return answer
 
     def ask(
         self,
@@ -70,8 +105,8 @@ class ServiceFlows:
         for is_second in (False, True):
             if is_second or time.monotonic() > self._until_s:
                 yield from self._renew()
-            url = f"{self.url}/v1{path}"
-            answer: httpx.Response = yield Ask(method, url, json, content, params, self._token, key)
+            sent = Ask(method, f"/v1{path}", json, content, params, self._token, key)
+            answer = yield from self._sent(sent, is_safe=method != "POST" or bool(key))
             if answer.status_code != 401:
                 break
         check(answer)
@@ -106,15 +141,35 @@ class ServiceFlows:
         """Delete a resource."""
         yield from self.ask("DELETE", path)
 
-    def add_configuration(self, environment: str, keys: Mapping[str, Any]) -> Flow[str]:
-        """Store a configuration and return its hash."""
-        body = {"environment": environment, **keys}
+    def upload(self, files: Iterable[Upload], licence: str = "") -> Flow[None]:
+        """Store the files that the service does not have from this identity yet."""
+        wanted = {one.sha256: one for one in files}
+        for one in (yield from self.get("/artefacts", own=1))["artefacts"]:
+            wanted.pop(one["sha256"], None)
+        for sha256, file in wanted.items():
+            params = {"name": file.name, "licence": licence}
+            yield from self.ask("PUT", f"/artefacts/{sha256}", content=file.content, params=params)
+
+    def add_configuration(self, environment: str | Path, keys: Mapping[str, Any]) -> Flow[str]:
+        """Store a configuration with its files, and return its hash.
+
+        `keys` may have `drivers`, a folder for each name of a trained driver, and `licence`, that
+        of the files.
+        """
+        given = dict(keys)
+        drivers, licence = given.pop("drivers", None) or {}, given.pop("licence", "")
+        name, files = environment_files(environment)
+        files |= driver_files(drivers)
+        body: dict[str, Any] = {"environment": name, **given}
+        if files:
+            yield from self.upload(files.values(), licence)
+            body["files"] = {place: one.sha256 for place, one in files.items()}
         found = yield from self.post("/configurations", body)
         return str(found["hash"])
 
     def submit(
         self,
-        environment: str,
+        environment: str | Path,
         keys: Mapping[str, Any],
         job: Mapping[str, Any],
     ) -> Flow[str]:
@@ -162,7 +217,8 @@ class ServiceFlows:
             after = found[-1]["sequence"]
 
     def _renew(self) -> Flow[None]:
-        answer = yield Ask("POST", f"{self.url}/v1/token", {"secret": self._secret})
+        sent = Ask("POST", "/v1/token", {"secret": self._secret})
+        answer = yield from self._sent(sent, is_safe=True)
         check(answer)
         found = answer.json()
         self._token = found["access_token"]

@@ -1,17 +1,19 @@
 """The client's protocol with a world on a node, including recovery from the loss of the node.
 
-Commands are numbered. A node answers a repeated command from memory, and from time to time stores
-the state of its worlds with the service. The client keeps the commands since the last stored state.
-If the node is lost, the service selects another node, which loads that state, and the client
-repeats the later commands. Equal commands give equal bytes. The address of a node is not used after
-its lease.
+Commands are numbered: resets, steps, and changes between steps. A node answers a repeated command
+from memory, and from time to time stores the state of its worlds with the service. The client keeps
+the commands since the last stored state. If the node is lost, the service selects another node,
+which loads that state, and the client repeats the later commands. Equal commands give equal bytes.
+The address of a node is not used after its lease.
 """
 
 from __future__ import annotations
 
 import io
+import math
 import time
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import httpx
@@ -20,6 +22,7 @@ from numpy.typing import NDArray
 
 from cavmarl.client.service_protocol import AGAIN_S, RETRIED_S, Ask, Flow, Rest, ServiceFlows, check
 from cavmarl.core.errors import ActionError, ServiceError
+from cavmarl.sensors.mounted.frames import SensorFrames
 
 RECOVERY_S = 60.0
 RETRY_S = 1.0
@@ -32,9 +35,10 @@ Arrays = dict[str, NDArray[Any]]
 class SentCommand(NamedTuple):
     """A command as sent."""
 
-    word: str  # reset or step
+    word: str  # reset, step or change
     params: dict[str, Any]
-    content: bytes
+    content: bytes | None = None
+    json: dict[str, Any] | None = None  # body of a change
 
 
 class WorldFlows:
@@ -70,7 +74,7 @@ class WorldFlows:
 
     def open(
         self,
-        environment: str,
+        environment: str | Path,
         keys: Mapping[str, Any],
         wanted: Mapping[str, Any],
     ) -> Flow[None]:
@@ -89,7 +93,7 @@ class WorldFlows:
     def reset(self, seed: int | None) -> Flow[tuple[Any, Arrays]]:
         """Start an episode in every world."""
         params = {} if seed is None else {"seed": seed}
-        arrays = yield from self._command(SentCommand("reset", params, b""))
+        arrays = yield from self._command(SentCommand("reset", params))
         return _join(arrays, "observations"), _infos(arrays)
 
     def step(self, actions: Any) -> Flow[tuple[Any, ...]]:
@@ -103,9 +107,47 @@ class WorldFlows:
         parts = [arrays[name] for name in ("rewards", "terminations", "truncations")]
         return _join(arrays, "observations"), *parts, _infos(arrays)
 
+    def change(self, kind: str, **given: Any) -> Flow[None]:
+        """Change the worlds between two steps; see `cavmarl.service.change_bodies`."""
+        for name, value in given.items():
+            if isinstance(value, float) and not math.isfinite(value):
+                raise ActionError(f"{name} = {value}: must be a finite number")
+        yield from self._command(SentCommand("change", {}, json={"kind": kind, **given}))
+
+    def declare_event(self, agent: int | str, cause: str, world: int) -> Flow[None]:
+        """Let the vehicle of an agent, given by its index or id, announce an event."""
+        names = self.description["agents"]
+        if isinstance(agent, str):
+            if agent not in names:
+                raise ActionError(f"no agent {agent!r}: choose one of {', '.join(names)}")
+            agent = names.index(agent)
+        yield from self.change("declare_event", agent=agent, cause=cause, world=world)
+
+    def save(self) -> Flow[bytes]:
+        """Store state and recording with the service now, and return the state of the worlds."""
+        answer = yield from self._asked("POST", SentCommand("save", {}))
+        self._trim(answer)
+        return answer.content
+
+    def frames(self, is_final: bool) -> Flow[dict[str, SensorFrames]]:
+        """Return the samples of the mounted sensors by name."""
+        params = {"final": 1} if is_final else {}
+        answer = yield from self._asked("GET", SentCommand("frames", params))
+        parts: dict[str, dict[str, Any]] = {}
+        for name, array in unpack(answer.content).items():
+            sensor, _, field = name.rpartition("/")
+            parts.setdefault(sensor, {})[field] = array
+        return {name: SensorFrames(**fields) for name, fields in parts.items()}
+
+    def recording(self) -> Flow[dict[str, bytes]]:
+        """Return all parts of the recording so far, each a ZIP file, by name."""
+        yield from self.save()
+        files = yield from self._service.results(self.session)
+        return {name: content for name, content in files.items() if name.startswith("recording-")}
+
     def look(self, word: str) -> Flow[Any]:
         """Send a query that changes nothing: `hash`, `suggestion` or `transfers`."""
-        answer = yield from self._asked("GET", word, {}, b"")
+        answer = yield from self._asked("GET", SentCommand(word, {}))
         if answer.headers["content-type"] == "application/json":
             return answer.json()
         return unpack(answer.content)
@@ -130,9 +172,8 @@ class WorldFlows:
         self._sent.append(sent)
         self._is_pending = True
         try:
-            answer = yield from self._asked(
-                "POST", sent.word, {**sent.params, "number": self.number}, sent.content
-            )
+            params = {**sent.params, "number": self.number}
+            answer = yield from self._asked("POST", sent._replace(params=params))
         except ServiceError as error:
             if error.status in (400, 409, 422):  # refused before any change
                 self._sent.pop()
@@ -142,18 +183,16 @@ class WorldFlows:
         self._trim(answer)
         return unpack(answer.content)
 
-    def _asked(
-        self, method: str, word: str, params: Mapping[str, Any], content: bytes
-    ) -> Flow[httpx.Response]:
+    def _asked(self, method: str, sent: SentCommand) -> Flow[httpx.Response]:
         """Return the answer of the node that has the session."""
         until_s = time.monotonic() + self._recovery_s
         while True:
             if time.monotonic() > self._renew_s:
                 yield from self._renew()
-            url = f"{self._url}/{word}"
+            url = f"{self._url}/{sent.word}"
             try:
                 answer: httpx.Response = yield Ask(
-                    method, url, None, content, params, self.assignment["token"]
+                    method, url, sent.json, sent.content, sent.params, self.assignment["token"]
                 )
                 check(answer)
             except (httpx.TransportError, ServiceError) as error:
@@ -232,7 +271,7 @@ class WorldFlows:
             sent = self._sent[place - self._saved - 1]
             params = {**sent.params, "number": place, "quiet": 1}
             url, token = f"{self._url}/{sent.word}", self.assignment["token"]
-            answer = yield Ask("POST", url, None, sent.content, params, token)
+            answer = yield Ask("POST", url, sent.json, sent.content, params, token)
             check(answer)
 
     def _take(self, answer: dict[str, Any]) -> None:

@@ -7,6 +7,8 @@ import socket
 
 from cavmarl.core.errors import ServiceError
 
+BACKLOG = 2048  # connections that wait to be accepted
+
 
 def is_loopback(host: str) -> bool:
     """Return whether an address can only be reached from this machine."""
@@ -16,8 +18,11 @@ def is_loopback(host: str) -> bool:
         return host == "localhost"
 
 
-def listen(host: str, port: int) -> socket.socket:
+def listen(host: str, port: int, *, is_open: bool = True) -> socket.socket:
     """Return a socket that listens at an address.
+
+    If `is_open` is false, the socket only has the address: connections are refused until a server
+    listens on it.
 
     Raises ServiceError: the address does not belong to this machine, or its port is in use.
     """
@@ -27,7 +32,8 @@ def listen(host: str, port: int) -> socket.socket:
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
         listener.bind((host, port))
-        listener.listen(2048)
+        if is_open:
+            listener.listen(BACKLOG)
     except OSError as error:
         listener.close()
         raise ServiceError(f"{host}:{port}: {error.strerror}; give another --port") from error

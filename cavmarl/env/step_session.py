@@ -223,12 +223,13 @@ class StepSession:
     def record(self, record: Record | None) -> None:
         """Record all worlds from now on; see `WorldsEnvironment.record`."""
         if record is None:
+            self._end_recording()
             return
         self._refuse_closed("record()")
         if self._recorder is not None:
             path = str(RecordOptions.of(record).path)
             raise EpisodeError(
-                f"record({path!r}): {self._recorder.path} is being recorded; close the environment "
+                f"record({path!r}): {self._recorder.path} is being recorded; call record(None) "
                 "first"
             )
         standing = self._copy.standing(self.worlds)
@@ -236,12 +237,15 @@ class StepSession:
         state_hash = None if self._in_place else self.worlds.state_hash
         self._recorder = WorldRecorder(record, self.worlds, standing, state_hash)
 
-    def close(self) -> None:
-        """End the recording, the window and the worlds; a second call does nothing more."""
-        self._is_closed = True
+    def _end_recording(self) -> None:
         if self._recorder is not None:
             recorder, self._recorder = self._recorder, None
             recorder.close()
+
+    def close(self) -> None:
+        """End the recording, the window and the worlds; a second call does nothing more."""
+        self._is_closed = True
+        self._end_recording()
         if self._view is not None:
             self._view.close()
             self._view = None

@@ -266,12 +266,12 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.watch(watcher)
 
     def record(self, record: Record | None) -> None:
-        """Record all worlds from the next reset or step on, until `close`.
+        """Record all worlds from the next reset or step on, until `record(None)` or `close`.
 
         See docs/guides/recordings.md.
 
         Args:
-            record: a new folder, or options with the optional tables; None: record nothing.
+            record: a new folder, or options with the optional tables; None: end the recording.
 
         Raises:
             ConfigError: a requested table is not available.

@@ -8,6 +8,7 @@ import warnings
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -92,6 +93,7 @@ class RunData:
     transfers: NDArray[np.void]
     transfer_counts: Mapping[str, int]  # counts of a `TransferLog`, summed over the episodes
     resources: NDArray[np.void]  # RESOURCE records; empty for worlds of this process
+    network: Sequence[Mapping[str, Any]] = ()  # nodes and their connections; empty without nodes
     failures: Sequence[Failure] = ()  # failed trips that are kept
     borders: Sequence[BorderTerms] = ()  # terms by zone and place
 
@@ -164,7 +166,7 @@ def _drive(
     counts: Counter[str] = Counter()
     for part in parts:
         counts.update(part.transfer_counts)
-    used = resources.rows()
+    used, network = resources.rows(), resources.network()
     for table in (trips, episodes, transfers, used):
         table["run"] = job.run
     return RunData(
@@ -177,6 +179,7 @@ def _drive(
         failures=list(watch.failures),
         borders=[part.borders for part in parts],
         resources=used,
+        network=network,
     )
 
 

@@ -387,7 +387,8 @@ def _drive_all(
     if jobs[0].failures:
         _write_failures(folder, jobs[0], [data for run in runs for data in run.values()])
         files.append(FAILURES_FILE)
-    close_manifest(folder, files)
+    network = {name: list(runs[0][name].network) for name in names if runs[0][name].network}
+    close_manifest(folder, files, {"network": network} if network else None)
 
 
 def _write_failures(folder: Path, job: EpisodeJob, results: list[RunData]) -> None:

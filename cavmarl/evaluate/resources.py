@@ -58,6 +58,10 @@ class ResourceWatch:
             self._read()
         return np.array([(0, *row) for row in self._rows], RESOURCE)
 
+    def network(self) -> list[dict[str, Any]]:
+        """Return machine, process and connections of each node; empty without nodes."""
+        return [] if self._nodes is None else self._nodes.describe_network()
+
     def _read(self) -> None:
         """Add a row for each process, for the window that ends now."""
         begin_s = self._steps_before * self._step_s

@@ -23,8 +23,8 @@ from cavmarl.service.routes import ROUTERS
 from cavmarl.service.service_metrics import ServiceMetrics
 
 MAX_BODY_BYTES = 256 * 1024
-MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state or of a file of results
-_CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+)")
+MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state, a result or an artefact
+_CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+|artefacts/[^/]+)")
 MAX_PATH_BYTES = 1024
 MAX_SECRET_BYTES = 64 * 1024  # of the body of POST /v1/token, which needs no token
 NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the environment configures
@@ -85,7 +85,9 @@ async def _sweep(service: Service, every_s: float) -> None:
         service.broker.sweep()
         try:
             await log.settle()
+            await asyncio.to_thread(log.store.check_lock)
         except ServiceError:
+            log.is_broken = True
             service.on_broken()
             return
 

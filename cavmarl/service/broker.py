@@ -10,10 +10,11 @@ import itertools
 import secrets
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from typing import Any
 
 from cavmarl.balance.load_score import DEFAULT_RULE, LoadRule, Utilisation
+from cavmarl.service.artefacts import Artefacts, Quota
 from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.job_queue import JobQueue
@@ -55,6 +56,7 @@ class BrokerRules:
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
+    artefacts: Quota = field(default_factory=Quota)  # of one identity
     load: LoadRule = DEFAULT_RULE  # thresholds and weights for the load of a node
 
 
@@ -89,6 +91,7 @@ class Broker:
             if session.node is not None:
                 self.live[session.node].hosted.add(session.id)
         self.zone_nodes = ZoneNodes(log, self.live, self._choose)
+        self.artefacts = Artefacts(log, self.rules.artefacts)
         self.jobs = JobQueue(log, self._choose, self._assign, self._fail, clock_s)
 
     # Nodes
@@ -217,6 +220,7 @@ class Broker:
         self.jobs.end_hopeless(self.rules.max_placements)
         self._reports.watch_own_clock(now_s)
         self.zone_nodes.sweep()
+        self.artefacts.sweep()
         self.jobs.place()
 
     # Sessions and jobs
@@ -260,6 +264,7 @@ class Broker:
             return known
         if len(own) >= self.rules.max_sessions:
             raise problem("too-many", f"{len(own)} sessions are open: close some", 60.0)
+        self.artefacts.use(identity, self.log.state.files_of(configuration))
         number = f"s-{secrets.token_hex(12)}"
         session = SessionRecord(id=number, owner=identity.id, **data)
         try:

@@ -1,7 +1,8 @@
 """Configurations of worlds: immutable, identified by hash, with numbered versions per name.
 
-A configuration from the network refers to entries of this installation only. It must not name files
-or code: keys with file names must have the same values as in the entry.
+A configuration from the network refers to entries of this installation, or to files that its owner
+has uploaded. It must not name other files or code: in an entry, keys with file names must have the
+same values as in the entry.
 """
 
 from __future__ import annotations
@@ -9,11 +10,21 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Mapping
 from dataclasses import asdict
 from typing import Any
 
 from cavmarl.config.registry import agent_entries, entries, load_config
-from cavmarl.core.errors import CavmarlError
+from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.service.artefacts import Artefacts
+from cavmarl.service.configuration_files import (
+    check_files,
+    drivers_of,
+    environment_of,
+    has_environment,
+    load_uploaded,
+    placed_overrides,
+)
 from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.request_bodies import ConfigurationBody
@@ -32,11 +43,26 @@ _OF_FILES = (
 
 
 def add_configuration(
-    log: EventLog, identity: IdentityRecord, body: ConfigurationBody
+    log: EventLog,
+    identity: IdentityRecord,
+    body: ConfigurationBody,
+    artefacts: Artefacts | None = None,
 ) -> dict[str, Any]:
-    """Check and store a configuration; equal content keeps its version."""
+    """Check and store a configuration; equal content keeps its version.
+
+    Args:
+        log: the log of the service.
+        identity: the owner of the configuration and of its files.
+        body: the configuration.
+        artefacts: those of the service; None: the configuration has no files.
+    """
     document = body.model_dump(exclude={"name"})
-    _check(document)
+    files: dict[str, str] = document["files"]
+    if not files:
+        del document["files"]  # so that configurations without files keep their hashes
+    elif artefacts is not None:
+        artefacts.use(identity, files.values())
+    _check(document, {place: log.content(sha256) for place, sha256 in files.items()})
     name = body.name or body.environment
     content = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
     found = hashlib.sha256(content).hexdigest()
@@ -46,7 +72,9 @@ def add_configuration(
             detail = f"{MOST_CONFIGURATIONS} configurations of yours are kept: use those"
             raise problem("too-many", detail)
         log.keep(content)
-        data = {"hash": found, "version": len(versions) + 1}
+        data: dict[str, Any] = {"hash": found, "version": len(versions) + 1}
+        if files:
+            data["files"] = sorted({*files.values()})
         log.record("configuration.added", name, data, actor=identity.id, owner=identity.id)
         versions = log.state.configurations[name]
     return {"name": name, "version": versions.index(found) + 1, "hash": found, **document}
@@ -60,14 +88,29 @@ def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
     return document
 
 
-def check_policies(policies: list[str]) -> None:
-    """Refuse texts that are not names of drivers, as a path could run code or name any folder."""
-    known = agent_entries()
+def check_policies(policies: list[str], files: Mapping[str, Any] | None = None) -> None:
+    """Refuse texts that are not names of drivers, as a path could run code or name any folder.
+
+    `files`: those of the configuration, with the uploaded drivers.
+    """
+    known = [*agent_entries(), *drivers_of(files or {})]
     for policy in policies:
         if policy not in known:
             raise problem(
                 "refused", f"there is no driver '{policy}': choose one of {', '.join(known)}"
             )
+
+
+def world_of(document: dict[str, Any], folder: str) -> tuple[str, dict[str, Any]]:
+    """Return the environment and the keywords of `make_vec` and `evaluate` for a world.
+
+    `folder`: the folder with the files of the configuration.
+    """
+    files = document.get("files", {})
+    environment = environment_of(document["environment"], files, folder)
+    keys = world_keywords(document)
+    keys["overrides"] |= placed_overrides(environment, keys, files, folder)
+    return environment, keys
 
 
 def world_keywords(document: dict[str, Any]) -> dict[str, Any]:
@@ -79,11 +122,20 @@ def world_keywords(document: dict[str, Any]) -> dict[str, Any]:
     return keys | {"overrides": document["overrides"] | divided}
 
 
-def _check(document: dict[str, Any]) -> None:
+def _check(document: dict[str, Any], files: Mapping[str, bytes]) -> None:
     environment = document["environment"]
-    if environment not in entries():
+    hashes = document.get("files", {})
+    check_files(environment, hashes)
+    is_uploaded = has_environment(environment, hashes)
+    if not is_uploaded and environment not in entries():
         known = ", ".join(entries())
-        raise problem("refused", f"there is no environment '{environment}': choose one of {known}")
+        raise problem(
+            "refused",
+            f"there is no environment '{environment}': choose one of {known}, or upload your own",
+        )
+    for name in drivers_of(hashes):
+        if name in agent_entries():
+            raise problem("refused", f"files: the service has a driver '{name}': give another name")
     if "plugins" in document["overrides"]:
         raise problem(
             "refused",
@@ -96,12 +148,19 @@ def _check(document: dict[str, Any]) -> None:
                 "refused",
                 f"overrides: {text[:64]!r} could name a file: use only letters, digits, _, + and -",
             )
+    keys = world_keywords(document)
     try:
-        own = asdict(load_config(environment)[0])
-        config = load_config(environment, **world_keywords(document))[0]
+        if is_uploaded:
+            own = asdict(load_uploaded(environment, files, {}))
+            config = load_uploaded(environment, files, keys)
+        else:
+            own = asdict(load_config(environment)[0])
+            config = load_config(environment, **keys)[0]
+    except ServiceError:
+        raise
     except (CavmarlError, RecursionError) as error:
         raise problem("refused", str(error)) from error
-    check_policies(list(config.traffic.networks))
+    check_policies(list(config.traffic.networks), hashes)
     if refusal := config.refusal_of_agents("a session of the service"):
         raise problem("refused", refusal)
     population = config.population

@@ -37,6 +37,10 @@ PROBLEMS = {
     "lost": (410, "the session is not on this node: resolve it again"),
     "damaged": (410, "stored content was changed, or a state cannot be used: open another session"),
     "too-large": (413, "the body is larger than the limit"),
+    "quota": (
+        409,
+        "a quota of this identity, which the message names, is exceeded: delete a file",
+    ),
     "too-many": (429, "too many requests: wait for the time in Retry-After"),
     "broken": (500, "the service has an internal error; its log has the place"),
     "paused": (503, "a page has paused the session: repeat the request after Retry-After"),

@@ -28,12 +28,19 @@ class EventLog:
     Args:
         store: where events are kept; the events that it holds are replayed.
         wall_s: the wall clock.
+        is_own: whether the store is that of this process; a standby calls `catch_up` until it is.
 
     Raises:
         ServiceError: the stored events were modified.
     """
 
-    def __init__(self, store: EventStore, wall_s: Callable[[], float] = time.time) -> None:
+    def __init__(
+        self,
+        store: EventStore,
+        wall_s: Callable[[], float] = time.time,
+        *,
+        is_own: bool = True,
+    ) -> None:
         self.store = store
         self.state = Infrastructure()
         self.sequence = 0  # sequence number of the last event
@@ -47,20 +54,31 @@ class EventLog:
         self._in_flight: dict[str, bytes] = {}  # content that is being written
         self._writing = asyncio.Lock()
         self.durable = 0  # sequence number of the last event on disk
-        for line in store.read_checked():
+        self.catch_up()
+        if is_own:
+            self.check_head()
+
+    def catch_up(self) -> int:
+        """Apply the events that another service has written since; return their number."""
+        before = self.sequence
+        for line in self.store.read_checked(before, self._digest):
             try:
                 self.state.apply(line)
             except Exception as error:
                 raise ServiceError(
-                    f"store {store.where}: event {line.sequence} contradicts earlier ones "
+                    f"store {self.store.where}: event {line.sequence} contradicts earlier ones "
                     f"({error!r}): the log was modified; restore an older copy"
                 ) from error
             self.sequence, self._digest = line.sequence, line.digest
         self.durable = self.sequence
         self.state.take_unused()  # it was deleted with the events that made it unused
-        if store.head() != self._signed_head():
+        return self.sequence - before
+
+    def check_head(self) -> None:
+        """Check that the stored head is that of the events; raise ServiceError if it is not."""
+        if self.store.head() != self._signed_head():
             raise ServiceError(
-                f"store {store.where}: its signed head is not that of its events: the log was "
+                f"store {self.store.where}: its signed head is not that of its events: the log was "
                 "modified; restore an older copy"
             )
 

@@ -33,7 +33,7 @@ from sqlalchemy import (
     select,
     text,
 )
-from sqlalchemy.engine import URL, make_url
+from sqlalchemy.engine import URL, RootTransaction, make_url
 from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 
 from cavmarl.core.errors import CavmarlError, ServiceError, require
@@ -43,6 +43,11 @@ from cavmarl.service.service_records import LogEvent
 SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
 _PAGE = 1000
+# PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s.
+_DEAD_CLIENTS = (
+    "-c tcp_keepalives_idle=1 -c tcp_keepalives_interval=1 -c tcp_keepalives_count=3 "
+    "-c tcp_user_timeout=4000"
+)
 
 _METADATA = MetaData()
 _ABOUT = Table("about", _METADATA, Column("schema", String(64), primary_key=True))
@@ -99,31 +104,39 @@ class EventStore:
 
     Args:
         where: an SQLite file, or the URL of a database.
+        is_standby: whether another service may use the store now, until `try_lock` returns true.
 
     Raises:
-            ServiceError: the store cannot be opened, is in use by another service, or has another
-                version.
-            ConfigError: other users can read its file.
+        ServiceError: the store cannot be opened, is in use by another service, or has another
+            version.
+        ConfigError: other users can read its file.
     """
 
-    def __init__(self, where: str | Path) -> None:
+    def __init__(self, where: str | Path, *, is_standby: bool = False) -> None:
         self.where = str(where)
         self._lock: IO[bytes] | None = None
         self._open = ExitStack()
         self._guard = threading.Lock()  # guards the only connection
         self.url = url = _url_of(self.where)
         self.is_embedded = url.get_backend_name() == "sqlite"
+        if self.is_embedded and is_standby:
+            raise ServiceError(
+                f"store {self.where}: two services cannot share an SQLite file; with --standby, "
+                "give --store postgresql://…"
+            )
         if self.is_embedded:
             self._lock = _lock_file(Path(str(url.database)))
         try:
-            engine = create_engine(url, pool_size=1, max_overflow=0)
+            given = {} if self.is_embedded else {"options": _DEAD_CLIENTS}
+            engine = create_engine(url, pool_size=1, max_overflow=0, connect_args=given)
             self._open.callback(engine.dispose)
             if self.is_embedded:
                 event.listen(engine, "connect", _make_durable)
             self._connection = self._open.enter_context(engine.connect())
-            if not self.is_embedded:
-                self._hold_advisory_lock()
-            self._check_schema()
+            if not is_standby:
+                if not self.is_embedded and not self._take_advisory_lock():
+                    raise _taken(self.url.render_as_string())
+                self._check_schema()
         except SQLAlchemyError as error:
             self.close()
             cause = str(getattr(error, "orig", error)).strip().splitlines()[0]
@@ -134,6 +147,57 @@ class EventStore:
         except ServiceError:
             self.close()
             raise
+
+    def try_lock(self) -> bool:
+        """Return whether this standby has the store for itself from now on.
+
+        The lock of another service ends with its connection.
+
+        Raises:
+            ServiceError: the connection is lost, or the store has another version.
+        """
+        try:
+            if not self._take_advisory_lock():
+                return False
+            self._check_schema()
+        except SQLAlchemyError as error:
+            raise self._lost(error) from error
+        return True
+
+    def has_tables(self) -> bool:
+        """Return whether a service has prepared the store."""
+        try:
+            with self._guard, self._begin():
+                return _HEAD.name in inspect(self._connection).get_table_names()
+        except SQLAlchemyError as error:
+            raise self._lost(error) from error
+
+    def check_lock(self) -> None:
+        """Check that the store is still that of this process.
+
+        Raises:
+            ServiceError: the connection, and with it the lock, is lost; the service must end.
+        """
+        if self.is_embedded:
+            return
+        try:
+            with self._guard, self._begin():
+                self._connection.execute(text("SELECT 1"))
+        except SQLAlchemyError as error:
+            raise self._lost(error) from error
+
+    def _begin(self) -> RootTransaction:
+        """Begin a transaction; a lost connection is never replaced, as its lock is lost, too."""
+        if self._connection.invalidated:
+            raise self._lost("the connection was lost")
+        return self._connection.begin()
+
+    def _lost(self, cause: object) -> ServiceError:
+        shown = str(getattr(cause, "orig", cause)).strip().splitlines()[0]
+        return ServiceError(
+            f"store {self.where}: its server does not answer ({shown}), so another service may "
+            "have the store; check the server, and start this service again"
+        )
 
     def append(
         self,
@@ -148,7 +212,7 @@ class EventStore:
             ServiceError: the store cannot be written; nothing was changed.
         """
         try:
-            with self._guard, self._connection.begin():
+            with self._guard, self._begin():
                 if lines:
                     self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
                 for sha256, content in blobs.items():
@@ -189,7 +253,7 @@ class EventStore:
             size = _PAGE if left is None else min(left, _PAGE)
             query = select(_EVENTS).where(_EVENTS.c.sequence > after, *wanted)
             ordered = query.order_by(_EVENTS.c.sequence).limit(size)
-            with self._guard, self._connection.begin():
+            with self._guard, self._begin():
                 rows = list(self._connection.execute(ordered))
             for row in rows:
                 yield _line(row)
@@ -201,24 +265,28 @@ class EventStore:
     def blob(self, sha256: str) -> bytes | None:
         """Return the content with this hash."""
         query = select(_BLOBS.c.content).where(_BLOBS.c.sha256 == sha256)
-        with self._guard, self._connection.begin():
+        with self._guard, self._begin():
             found = self._connection.execute(query).scalar()
         return found if isinstance(found, bytes) else None
 
     def head(self) -> SignedHead | None:
         """Return the head that was written with the last line."""
-        with self._guard, self._connection.begin():
+        with self._guard, self._begin():
             row = self._connection.execute(select(_HEAD)).one_or_none()
         return None if row is None else SignedHead(**row._asdict())
 
-    def read_checked(self) -> Iterator[LogEvent]:
-        """Return all lines after checking the chain of their digests.
+    def read_checked(self, after: int = 0, digest: str = "") -> Iterator[LogEvent]:
+        """Return lines after checking the chain of their digests.
+
+        Args:
+            after: number of the line before the first one.
+            digest: its digest.
 
         Raises:
             ServiceError: a line was changed, removed or inserted.
         """
-        last = ""
-        for count, line in enumerate(self._read_valid(), start=1):
+        last = digest
+        for count, line in enumerate(self._read_valid(after), start=after + 1):
             if line.sequence != count or line.digest != digest_of(last, line):
                 raise ServiceError(
                     f"store {self.where}: event {line.sequence} does not follow from the "
@@ -227,9 +295,9 @@ class EventStore:
             last = line.digest
             yield line
 
-    def _read_valid(self) -> Iterator[LogEvent]:
+    def _read_valid(self, after: int) -> Iterator[LogEvent]:
         try:
-            yield from self.read()
+            yield from self.read(after)
         except (SQLAlchemyError, TypeError, ValueError) as error:
             raise ServiceError(
                 f"store {self.where}: an event cannot be read ({error}): the log was modified; "
@@ -258,11 +326,10 @@ class EventStore:
             elif found != SCHEMA:
                 raise _foreign(self.where, found)
 
-    def _hold_advisory_lock(self) -> None:
-        with self._connection.begin():
+    def _take_advisory_lock(self) -> bool:
+        with self._guard, self._begin():
             query = text("SELECT pg_try_advisory_lock(:key)")
-            if not self._connection.execute(query, {"key": _LOCK_KEY}).scalar():
-                raise _taken(self.url.render_as_string())
+            return bool(self._connection.execute(query, {"key": _LOCK_KEY}).scalar())
 
 
 def _url_of(where: str) -> URL:

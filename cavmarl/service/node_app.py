@@ -21,9 +21,10 @@ from fastapi.security.base import SecurityBase
 from starlette.types import ASGIApp
 
 from cavmarl.client.world_protocol import SAVED_HEADER
-from cavmarl.core.errors import ServiceError, WorkerError
+from cavmarl.core.errors import CapacityError, CavmarlError, ServiceError, WorkerError
 from cavmarl.service import response_bodies
 from cavmarl.service.app import NO_TELEMETRY, GuardedRequests
+from cavmarl.service.change_bodies import Change
 from cavmarl.service.error_names import problem
 from cavmarl.service.node_link import NodeLink
 from cavmarl.service.problem_json import serve_routes
@@ -55,6 +56,9 @@ ANSWER: dict[int | str, dict[str, Any]] = {
             }
         },
     }
+}
+STATE: dict[int | str, dict[str, Any]] = {
+    200: {**ANSWER[200], "description": "The state, for `load_state` of a vector environment"}
 }
 ACTIONS = {
     "requestBody": {
@@ -142,20 +146,28 @@ async def open_worlds(
 
 async def _begin(link: NodeLink, worlds: SessionWorlds, session: str, configuration: str) -> None:
     """Create the worlds of a session; a session whose content cannot be used ends as failed."""
+    files, is_own = None, False  # files of the client, which may be unusable
     try:
         document = await link.configuration(configuration)
+        is_own = bool(document.get("files"))
         state, number = await link.saved_state(session)
+        files = await link.fetch_files(document)
         keys = await link.open_door(session, document)
-        await asyncio.to_thread(worlds.add, session, document, state, number, keys)
+        await asyncio.to_thread(worlds.add, session, document, state, number, keys, files)
     except WorkerError as error:
         raise problem("lost", f"its zone nodes are lost: {error}") from error
-    except ServiceError as error:
-        if error.problem == "damaged":
+    except CapacityError:
+        raise
+    except CavmarlError as error:
+        is_useless = is_own and not isinstance(error, ServiceError)
+        if is_useless or (isinstance(error, ServiceError) and error.problem == "damaged"):
             with suppress(ServiceError):  # another node has it, or the service ends it later
                 await link.fail(session, str(error))
         raise
     finally:
         link.close_key_file(session)
+        if files is not None and not (session in worlds and worlds[session].has_files(files)):
+            files.cleanup()
     link.expect(session)
 
 
@@ -180,7 +192,11 @@ async def reset(
     quiet: Quiet = False,
 ) -> Response:
     """Start an episode in every world."""
-    return await _command(request, session, "reset", number, seed=seed, is_quiet=quiet)
+
+    def act() -> bytes:
+        return _worlds(request)[session].reset(seed)
+
+    return await _command(request, session, number, act, quiet)
 
 
 @router.post("/step", response_class=Response, responses=ANSWER, openapi_extra=ACTIONS)
@@ -188,21 +204,39 @@ async def step(
     request: Request, session: str, _: Opened, number: Number, quiet: Quiet = False
 ) -> Response:
     """Step all worlds with one action per agent."""
-    return await _command(request, session, "step", number, seed=None, is_quiet=quiet)
+    content = await request.body()
+    worlds = _worlds(request)
+
+    def act() -> bytes:
+        answer = worlds[session].step(content)
+        worlds.count_step(session)
+        return answer
+
+    return await _command(request, session, number, act, quiet)
+
+
+@router.post("/change", response_class=Response, responses=ANSWER)
+async def change(
+    request: Request, session: str, _: Opened, number: Number, body: Change, quiet: Quiet = False
+) -> Response:
+    """Change the worlds between two steps: insert a vehicle, close a road, record them."""
+
+    def act() -> bytes:
+        return _worlds(request)[session].change(body)
+
+    return await _command(request, session, number, act, quiet)
 
 
 async def _command(
-    request: Request, session: str, word: str, number: int, *, seed: int | None, is_quiet: bool
+    request: Request, session: str, number: int, act: Callable[[], bytes], is_quiet: bool
 ) -> Response:
     link, worlds = _link(request), _worlds(request)
-    content = await request.body()
     world = worlds[session]
-    if number == world.number + 1:
-        if not is_quiet:
-            await _hold(link, worlds, world)
+    if number == world.number + 1 and not is_quiet:
+        await _hold(link, worlds, world)
 
-    def act() -> bytes:
-        return world.command(word, number, seed, content, is_quiet)
+    def command() -> bytes:
+        return world.command(number, act, is_quiet)
 
     world.is_commanded = (
         True  # pages wait: their change would be neither in this command nor in the saved state
@@ -210,13 +244,12 @@ async def _command(
     try:
         if number == world.number + 1:
             await _save_before(link, worlds, session)
-        answer = await in_turn(worlds, act)
+        answer = await in_turn(worlds, command)
     except WorkerError as error:  # the nodes of its zones are lost: restart from the saved state
         await asyncio.to_thread(worlds.close, session)
         raise problem("lost", f"its zone nodes are lost: {error}") from error
     finally:
         world.is_commanded = False
-    worlds.ended(session, word)
     headers = {SAVED_HEADER: str(world.saved)}
     return Response(answer, headers=headers, media_type=OCTETS)
 
@@ -265,6 +298,33 @@ async def get_suggestion(request: Request, session: str, _: Opened) -> Response:
     return Response(await in_turn(worlds, worlds[session].suggestion), media_type=OCTETS)
 
 
+@router.get("/frames", response_class=Response, responses=ANSWER)
+async def get_frames(
+    request: Request,
+    session: str,
+    _: Opened,
+    final: Annotated[bool, Query(description="Of worlds that were reset: the last ones")] = False,
+) -> Response:
+    """Return the samples of the mounted sensors as an .npz file with `SENSOR/FIELD`."""
+    worlds = _worlds(request)
+    content = await in_turn(worlds, lambda: worlds[session].frames(final))
+    return Response(content, media_type=OCTETS)
+
+
+@router.post("/save", response_class=Response, responses=STATE)
+async def save(request: Request, session: str, _: Opened) -> Response:
+    """Store state and recording with the service now, and return the state of the worlds."""
+    link, worlds = _link(request), _worlds(request)
+    world = worlds[session]
+    state = await in_turn(worlds, world.state_of_worlds)
+    number = world.number
+    await _save(link, worlds, session)
+    if world.saved < number:
+        raise problem("unreachable", "the service does not answer this node", 1.0)
+    headers = {SAVED_HEADER: str(world.saved)}
+    return Response(state, headers=headers, media_type=OCTETS)
+
+
 @router.get("/transfers")
 async def get_transfers(
     request: Request, session: str, _: Opened
@@ -303,6 +363,7 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
     if state is None:
         return
     try:
+        await _store_parts(link, session, world)
         await link.save_state(session, number, state)
     except ServiceError as error:
         world.is_changed |= was_changed
@@ -310,6 +371,25 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
             raise
         return  # the service is unreachable: the client keeps the commands since the last state
     world.saved = number
+
+
+async def _store_parts(link: NodeLink, session: str, world: SessionWorld) -> None:
+    """Store the parts of a recording that have ended; a refused one ends the recording."""
+    recording = world.recording
+    while recording is not None and recording.waiting:
+        part = recording.waiting[0]
+        try:
+            await link.ask("PUT", f"/jobs/{session}/results/{part.name}", content=part.content)
+        except ServiceError as error:
+            if error.problem not in ("too-many", "too-large"):
+                raise
+            world.drop_recording()
+            raise problem(
+                "refused",
+                f"the recording has ended, as the service does not store {part.name}: {error}; "
+                "earlier parts are stored, and the session continues without a recording",
+            ) from error
+        recording.waiting.pop(0)
 
 
 async def in_turn(worlds: SessionWorlds, act: Callable[[], Any]) -> Any:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import math
+import os
 import signal
 import subprocess
 import time
@@ -20,7 +21,8 @@ from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.core.server_address import listen
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
-from cavmarl.service.configurations import world_keywords
+from cavmarl.service.configuration_files import placed_policies
+from cavmarl.service.configurations import world_of
 from cavmarl.service.error_names import without_folders
 from cavmarl.service.node_app import in_turn, make_node_app
 from cavmarl.service.node_link import MOST_MESSAGE, NodeLink, is_final, must_register
@@ -190,9 +192,12 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
     link, path = host.link, f"/jobs/{job['id']}"
     status, message = "done", ""
     started: list[subprocess.Popen[bytes]] = []
-    with TemporaryDirectory() as folder:
+    with TemporaryDirectory() as folder, contextlib.ExitStack() as ended:
         try:
             document = await link.configuration(job["configuration"])
+            files = await link.fetch_files(document)
+            if files is not None:
+                ended.enter_context(files)
             what = f"job {job['id']}"
             place = Path(folder) / "results"
 
@@ -201,7 +206,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
 
             await asyncio.to_thread(
                 call_in_fresh_process, what, run_evaluation, document, job, place,
-                hear=hear, began=started.append,
+                None if files is None else files.name, hear=hear, began=started.append,
             )  # fmt: skip
             for file in sorted(place.iterdir()):
                 await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
@@ -219,9 +224,24 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
 
 
 def run_evaluation(
-    document: dict[str, Any], job: dict[str, Any], folder: Path, tell: Callable[[int, int], None]
+    document: dict[str, Any],
+    job: dict[str, Any],
+    folder: Path,
+    files: str | None,
+    tell: Callable[[int, int], None],
 ) -> None:
-    """Run a job; call `tell` twice a second with the steps done and the total."""
+    """Run a job in a process of its own.
+
+    Args:
+        document: the configuration.
+        job: the job.
+        folder: where to write the results.
+        files: folder with the files of the configuration, which becomes the working directory, so
+            that the results name no folder of the node; None: it has none.
+        tell: called twice a second with the steps done and the total.
+    """
+    if files is not None:
+        os.chdir(files)
     parts = job["repeats"] * len(job["policies"])
     ended, last, told_s = 0, ("", 0), -math.inf
 
@@ -234,13 +254,14 @@ def run_evaluation(
             told_s = time.monotonic()
             tell(ended * most + steps, parts * most)
 
+    environment, keys = world_of(document, ".")
     evaluate(
-        document["environment"],
-        job["policies"],
+        environment,
+        placed_policies(job["policies"], document.get("files", {}), "."),
         episodes=job["episodes"],
         repeats=job["repeats"],
         out=folder,
         seed=document["seed"],
         progress=progress,
-        **world_keywords(document),
+        **keys,
     )

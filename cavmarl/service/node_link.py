@@ -10,6 +10,8 @@ import socket
 import time
 from collections.abc import Mapping
 from importlib.metadata import version
+from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import jwt
@@ -19,8 +21,8 @@ from cavmarl.balance.probe import busiest_gpu
 from cavmarl.client.clients import AsyncClient
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.access import ALGORITHM, ISSUER
-from cavmarl.service.configurations import world_keywords
 from cavmarl.service.error_names import problem, without_folders
+from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.service_records import STATE_HEADER
 
 NEW_S = 5.0  # time for which a new session is kept without being announced by the service
@@ -165,6 +167,29 @@ class NodeLink:
         found: dict[str, Any] = (await self.ask("GET", f"/configurations/{sha256}")).json()
         return found
 
+    async def fetch_files(self, document: dict[str, Any]) -> TemporaryDirectory[str] | None:
+        """Return a new folder with the files of a configuration; None: it has none.
+
+        Raises:
+            ServiceError: a file is missing or does not have its hash.
+        """
+        files = ConfigurationBody(**document).files
+        if not files:
+            return None
+        folder = TemporaryDirectory(prefix="cavmarl-files-")
+        try:
+            for place, sha256 in files.items():
+                content: bytes = (await self.ask("GET", f"/artefacts/{sha256}")).content
+                if hashlib.sha256(content).hexdigest() != sha256:
+                    raise problem("damaged", f"file {place} does not have the SHA-256 {sha256}")
+                path = Path(folder.name) / place
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_bytes(content)
+        except BaseException:
+            folder.cleanup()
+            raise
+        return folder
+
     async def saved_state(self, session: str) -> tuple[bytes | None, int]:
         """Return the newest state of a session, and the number of commands that it includes.
 
@@ -212,7 +237,7 @@ class NodeLink:
         shown = f"[{host}]" if ":" in host else host
         return {
             "backend": f"nodes:{document['nodes']}@{shown}:{port}",
-            "overrides": world_keywords(document)["overrides"] | keys,
+            "overrides": keys,
         }
 
     def close_key_file(self, session: str) -> None:

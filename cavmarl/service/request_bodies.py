@@ -13,6 +13,12 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,6
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}$")]
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,254}$")]
 Subject = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")]
+Place = Annotated[  # of a file in a folder
+    str,
+    StringConstraints(
+        pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}(/[A-Za-z0-9][A-Za-z0-9_.-]{0,63}){0,2}$"
+    ),
+]
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
@@ -65,7 +71,12 @@ class BeatBody(_Body):
 
 
 class ConfigurationBody(_Body):
-    """A world, with the keywords of `cavmarl.make_vec`."""
+    """A world, with the keywords of `cavmarl.make_vec`.
+
+    `files` are artefacts of the caller, by their places in a folder. If `env.yaml` is one of them,
+    or the map that `environment` names, they are the environment. `drivers/NAME/` has the two files
+    of the driver NAME.
+    """
 
     name: Name | None = None
     environment: Name
@@ -79,6 +90,7 @@ class ConfigurationBody(_Body):
     num_envs: Annotated[int, Field(ge=1, le=MOST_WORLDS)] = 1
     seed: Seed = 0
     overrides: Annotated[dict[str, Any], Field(max_length=256)] = {}
+    files: Annotated[dict[Place, Sha256], Field(max_length=256, json_schema_extra=NO_OTHERS)] = {}
 
 
 class SessionBody(_Body):

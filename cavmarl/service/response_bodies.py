@@ -287,6 +287,23 @@ class NewKey(_Answer):
     key: str
 
 
+class Artefact(_Answer):
+    """A file that an identity has stored."""
+
+    sha256: Sha256
+    owner: str
+    name: str
+    licence: str
+    size_bytes: int
+    until_s: float  # wall-clock time at which it is deleted unless it is used
+
+
+class ArtefactList(_Answer):
+    """Files that identities have stored."""
+
+    artefacts: list[Artefact]
+
+
 class ArrayForm(_Answer):
     """Form of an array; `dtype` is written as in NumPy, for example `<f4`."""
 

@@ -8,6 +8,7 @@ from fastapi import Header, Path, Query, Request, Response
 from fastapi.responses import JSONResponse, PlainTextResponse, StreamingResponse
 
 from cavmarl.service import configurations, request_bodies, response_bodies
+from cavmarl.service.artefact_routes import artefacts
 from cavmarl.service.error_names import problem, without_folders
 from cavmarl.service.ownership_routes import ownership
 from cavmarl.service.response_builders import (
@@ -42,7 +43,14 @@ open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
 worlds = make_router("/v1", "sessions")
 records = make_router("/v1", "records")
-ROUTERS = (nodes, worlds, ownership, records, open_routes)  # most frequent first: heartbeats
+ROUTERS = (
+    nodes,
+    worlds,
+    ownership,
+    artefacts,
+    records,
+    open_routes,
+)  # most frequent first: heartbeats
 
 PAGE = 1000
 IdempotencyKey = Annotated[
@@ -140,7 +148,8 @@ async def add_configuration(
     identity: Clients, service: TheService, body: request_bodies.ConfigurationBody
 ) -> response_bodies.Configuration:
     """Check and store a configuration; new content gets a new version."""
-    found = configurations.add_configuration(service.broker.log, identity, body)
+    broker = service.broker
+    found = configurations.add_configuration(broker.log, identity, body, broker.artefacts)
     return response_bodies.Configuration(**found)
 
 
@@ -247,9 +256,10 @@ async def submit(
     identity: Clients, service: TheService, body: request_bodies.JobBody, key: IdempotencyKey = ""
 ) -> response_bodies.Session:
     """Evaluate drivers on a node; the job waits if no node is free."""
-    if configurations.read_configuration(service.broker.log, body.configuration).get("nodes"):
+    found = configurations.read_configuration(service.broker.log, body.configuration)
+    if found.get("nodes"):
         raise problem("refused", "nodes: an evaluation runs on one node; remove the key")
-    configurations.check_policies(body.policies)
+    configurations.check_policies(body.policies, found.get("files"))
     session = service.broker.open(
         identity,
         body.configuration,

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
 import uvicorn
@@ -11,17 +12,18 @@ import uvicorn
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.private_files import check_private
 from cavmarl.core.request_heads import BoundedHeads
-from cavmarl.core.server_address import is_loopback, listen, shown_host
+from cavmarl.core.server_address import BACKLOG, is_loopback, listen, shown_host
 from cavmarl.service.access import Access
 from cavmarl.service.app import make_app
 from cavmarl.service.broker import Broker, BrokerRules
-from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_log import SERVICE, EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.route_access import Service
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
+POLL_S = 0.25  # time between two attempts of a standby to take over
 SERVER_HEADER: list[tuple[str, str]] = [("server", "cavmarl")]
 
 
@@ -36,10 +38,11 @@ class ServerOptions:
     key: Path | None = None
     rate_hz: float = 200.0  # rate limit of one identity
     rules: BrokerRules = field(default_factory=BrokerRules)
+    is_standby: bool = False  # follow the store of another service until that one ends
 
 
 def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
-    """Run a service until it is interrupted.
+    """Run a service until it is interrupted; a standby first waits until it takes over.
 
     Args:
         options: address, store and rules.
@@ -51,11 +54,24 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             store cannot be opened or written or was modified.
     """
     check_transport(options.host, options.certificate, options.key)
-    store = EventStore(options.store)
+    listener = listen(options.host, options.port, is_open=not options.is_standby)
+    scheme = "https" if options.certificate else "http"
+    address = f"{scheme}://{shown_host(options.host)}:{listener.getsockname()[1]}"
     try:
-        log = EventLog(store)
+        store = EventStore(options.store, is_standby=options.is_standby)
+    except BaseException:
+        listener.close()
+        raise
+    try:
+        if options.is_standby:
+            tell(f"standby: {address}, follows store {options.store}")
+            log = follow_store(store, tell)
+        else:
+            log = EventLog(store)
         access = Access(log)
         admin = first_admin(log, access)
+        rules = {**asdict(options.rules), "is_standby": options.is_standby}
+        log.record("service.started", SERVICE, rules)
         log.flush()
         broker = Broker(log, options.rules)
         limits = RateLimit(options.rate_hz, 2.0 * options.rate_hz), RateLimit(20.0, 100.0)
@@ -67,10 +83,9 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             server.should_exit = True
 
         service.on_broken = end
-        listener = listen(options.host, options.port)
-        scheme = "https" if options.certificate else "http"
-        port = listener.getsockname()[1]
-        tell(f"service: {scheme}://{shown_host(options.host)}:{port}, store {options.store}")
+        if options.is_standby:
+            listener.listen(BACKLOG)
+        tell(f"service: {address}, store {options.store}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")
         server.run(sockets=[listener])
@@ -80,7 +95,32 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             )
         log.flush()
     finally:
+        listener.close()
         store.close()
+
+
+def follow_store(store: EventStore, tell: Callable[[str], None]) -> EventLog:
+    """Return the log of a store as soon as no other service has the store.
+
+    Until then, the log is read as the other service writes it. So taking over takes the same time
+    for a log of any length. When all events so far have been read, a line is told.
+
+    Raises:
+        ServiceError: the server of the store does not answer, or the log was modified.
+    """
+    log: EventLog | None = None
+    while not store.try_lock():
+        if log is None and store.has_tables():
+            log = EventLog(store, is_own=False)
+            tell(f"standby: ready to take over, {log.sequence} events read")
+        elif log is not None:
+            log.catch_up()
+        time.sleep(POLL_S)
+    if log is None:
+        return EventLog(store)
+    log.catch_up()
+    log.check_head()
+    return log
 
 
 def first_admin(log: EventLog, access: Access) -> str | None:

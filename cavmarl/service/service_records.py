@@ -96,6 +96,16 @@ class OwnerTable:
 
 
 @dataclass
+class ArtefactRecord:
+    """A file that an identity has stored."""
+
+    name: str  # its suffix is that of its kind
+    licence: str
+    size_bytes: int
+    until_s: float  # wall-clock time at which it is deleted unless it is used
+
+
+@dataclass
 class IdentityRecord:
     """A person, a program or a node with access to the service."""
 
@@ -119,10 +129,14 @@ class Infrastructure:
     configurations: dict[str, list[str]] = field(default_factory=dict)  # name → hashes, by version
     # identity → number of configurations added
     configurations_of: dict[str, int] = field(default_factory=dict)
+    # hash of a configuration → hashes of its files, if it has files
+    files: dict[str, list[str]] = field(default_factory=dict)
+    # identity → hash → file
+    artefacts: dict[str, dict[str, ArtefactRecord]] = field(default_factory=dict)
     waiting: dict[str, None] = field(
         default_factory=dict
     )  # jobs without a node, in order of arrival
-    # hash of content → number of configurations, states and results that refer to it
+    # hash of content → number of configurations, artefacts, states and results that refer to it
     users: Counter[str] = field(default_factory=Counter)
     # content without users that `take_unused` has not returned yet
     unused: set[str] = field(default_factory=set, compare=False)
@@ -142,6 +156,10 @@ class Infrastructure:
             if not self.users[old]:
                 del self.users[old]
                 self.unused.add(old)
+
+    def files_of(self, configuration: str) -> list[str]:
+        """Return the hashes of the files of a configuration."""
+        return self.files.get(configuration, [])
 
     def apply(self, event: LogEvent) -> None:
         """Apply an event that was checked before it was written."""
@@ -170,6 +188,27 @@ class Infrastructure:
         self.configurations.setdefault(event.subject, []).append(event.data["hash"])
         self._replace_user(event.data["hash"], None)
         self.configurations_of[event.owner] = self.configurations_of.get(event.owner, 0) + 1
+        if files := event.data.get("files"):
+            self.files[event.data["hash"]] = files
+
+    def _apply_artefact(self, word: str, event: LogEvent) -> None:
+        own = self.artefacts.setdefault(event.owner, {})
+        match word:
+            case "added":
+                if event.subject not in own:
+                    self._replace_user(event.subject, None)
+                data = event.data
+                own[event.subject] = ArtefactRecord(
+                    data["name"], data["licence"], data["bytes"], data["until_s"]
+                )
+            case "used":
+                own[event.subject].until_s = event.data["until_s"]
+            case "deleted" | "expired":
+                del own[event.subject]
+                self._replace_user(None, event.subject)
+
+    def _apply_service(self, word: str, event: LogEvent) -> None:
+        """Change nothing for a start of the service, whose rules the event has."""
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
         """Change nothing for an anomaly of a clock."""

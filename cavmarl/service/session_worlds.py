@@ -5,23 +5,40 @@ from __future__ import annotations
 import itertools
 import secrets
 import threading
+from collections.abc import Callable
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
+from pydantic import ValidationError
 
 from cavmarl.client.world_protocol import flatten, pack
 from cavmarl.core.errors import CapacityError, ConfigError, MissingExtraError
-from cavmarl.env.vector import make_vec
+from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.parallel.nodes.node_groups import NodeGroups
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere
-from cavmarl.service.configurations import world_keywords
+from cavmarl.parallel.worlds.local_worlds import LocalWorlds, kept_elsewhere, missing_in_states
+from cavmarl.service.change_bodies import (
+    BeginRecording,
+    Change,
+    CloseRoad,
+    DamageRoad,
+    DeclareEvent,
+    InsertVehicle,
+    KeptSession,
+    OpenRoad,
+    SetScenario,
+)
+from cavmarl.service.configurations import world_of
 from cavmarl.service.error_names import problem
+from cavmarl.service.session_recording import SessionRecording
+from cavmarl.traffic.scenarios.library import scenario_names
 from cavmarl.viewer.live_env import ShownEnv
 from cavmarl.viewer.web_options import WebOptions
 
 SAVED_EVERY = 50  # number of commands between two saved states
 TOLD_OF_TRANSFERS = ("episode", "tick", "vehicle", "source", "target", "epoch")
+_SIZE_BYTES = 4  # of the number at the end of a saved state
 
 
 class SessionWorld:
@@ -29,32 +46,33 @@ class SessionWorld:
 
     Args:
         document: configuration of the worlds.
-        keys: further keywords of `make_vec`.
+        keys: further keywords of `make_vec`; its overrides are added to those of the document.
         state: state that another node saved, or None for new worlds.
         number: number of commands that the state includes.
+        files: folder with the files of the configuration, which `close` deletes; None: it has none.
 
     Attributes:
         number: number of commands so far.
         saved: number of commands that the state stored with the service includes.
         is_changed: whether a page has changed the worlds since that state was stored.
         is_commanded: whether a command is running, so that pages have to wait.
+        recording: the recording of the worlds; None: they are not recorded.
     """
 
     def __init__(
-        self, document: dict[str, Any], state: bytes | None, number: int, keys: dict[str, Any]
+        self,
+        document: dict[str, Any],
+        state: bytes | None,
+        number: int,
+        keys: dict[str, Any],
+        files: TemporaryDirectory[str] | None = None,
     ) -> None:
+        self._files = files
         self.number = self.saved = number
-        self._vec = make_vec(
-            document["environment"],
-            num_envs=document["num_envs"],
-            seed=document["seed"],
-            **(world_keywords(document) | keys),
-        )
-        # Zones run in this process or on nodes, never in workers.
-        self._worlds: LocalWorlds | NodeWorlds | NodeGroups = self._vec.worlds  # type: ignore[assignment]
-        self._told = [0] * len(
-            self._worlds.transfers
-        )  # number of transfers of each world reported to the service
+        self.recording: SessionRecording | None = None
+        self._document, self._keys = document, keys
+        self._scenario: SetScenario | None = None  # None: that of the configuration
+        self._take(self._made(None))
         self._last = b""  # the answer to the last command
         self.is_changed = self.is_commanded = False
         self._page: ShownEnv | None = None  # the pages of the worlds
@@ -65,8 +83,34 @@ class SessionWorld:
             try:
                 self._load(state)
             except BaseException:
-                self._vec.close()
+                self.close()
                 raise
+
+    def _made(self, scenario: SetScenario | None) -> CavVectorEnv:
+        """Return new worlds of the configuration, with a scenario of a command."""
+        document, more = self._document, dict(self._keys)
+        environment, world = world_of(document, self._files.name if self._files else "")
+        overrides = {**world["overrides"], **more.pop("overrides", {})}
+        if scenario is not None:
+            chosen = scenario.model_dump(exclude={"kind"})
+            overrides = {
+                key: value for key, value in overrides.items() if not key.startswith("scenario.")
+            }
+            overrides["scenario"] = chosen
+        shape = {"num_envs": document["num_envs"], "seed": document["seed"]}
+        return make_vec(environment, **(world | more | shape | {"overrides": overrides}))
+
+    def _take(self, vec: CavVectorEnv) -> None:
+        """Step these worlds from now on."""
+        self._vec = vec
+        # Zones run in this process or on nodes, never in workers.
+        self._worlds: LocalWorlds | NodeWorlds | NodeGroups = vec.worlds  # type: ignore[assignment]
+        # number of transfers of each world reported to the service
+        self._told = [0] * len(self._worlds.transfers)
+
+    def has_files(self, files: TemporaryDirectory[str]) -> bool:
+        """Return whether the worlds were made with this folder."""
+        return self._files is files
 
     def describe(self) -> dict[str, Any]:
         """Return shapes and names that a client needs."""
@@ -86,47 +130,87 @@ class SessionWorld:
         }
 
     def _load(self, state: bytes) -> None:
-        marks = np.frombuffer(state[-len(self._anew) :], dtype=np.uint8)
-        if len(marks) != len(self._anew) or np.any(marks > 1):
-            raise problem("damaged", "the saved state does not end in a mark for each world")
+        size = int.from_bytes(state[-_SIZE_BYTES:], "little")
+        end = len(state) - _SIZE_BYTES - size
         try:
-            self._vec.load_state(state[: -len(self._anew)])
+            kept = KeptSession.model_validate_json(state[max(end, 0) : end + size])
+        except ValidationError as error:
+            raise problem("damaged", "the end of the saved state does not describe it") from error
+        if end < 0 or len(kept.begun_anew) != len(self._anew):
+            raise problem("damaged", "the saved state does not have a mark for each world")
+        try:
+            if kept.scenario is not None:
+                self._begin_scenario(kept.scenario)
+            self._vec.load_state(state[:end])
         except ConfigError as error:
             raise problem("damaged", f"the saved state cannot be used: {error}") from error
-        self._anew[:] = marks
+        self._anew[:] = kept.begun_anew
+        if kept.recording is not None:
+            include, part = kept.recording.include, kept.recording.part
+            self.recording = SessionRecording(self._vec, include, part)
 
     def state(self) -> bytes | None:
-        """Return the saved state, or None if part of it is in SUMO or in a journal."""
+        """Return the saved state, and end the present part of the recording.
+
+        None: part of the state is in SUMO or in a journal, or there has been no reset yet.
+        """
+        if not self._vec.is_ready:
+            return None
         try:
-            found = self._vec.save_state() + self._anew.tobytes() if self.number else b""
+            found = self._vec.save_state()
         except ConfigError:
             return None
+        if self.recording is not None:
+            self.recording.end_part(self._vec)
+            self.recording.begin(self._vec)
+        kept = KeptSession(
+            begun_anew=self._anew.tolist(),
+            scenario=self._scenario,
+            recording=None if self.recording is None else self.recording.kept,
+        )
+        end = kept.model_dump_json().encode()
         self.is_changed = False
-        return found
+        return found + end + len(end).to_bytes(_SIZE_BYTES, "little")
 
-    def command(
-        self, word: str, number: int, seed: int | None, content: bytes, is_quiet: bool
-    ) -> bytes:
-        """Execute a command and return its answer; a repeated command gets the same answer."""
+    def state_of_worlds(self) -> bytes:
+        """Return the state of the worlds alone, as `CavVectorEnv.save_state` does."""
+        return self._vec.save_state()
+
+    def drop_recording(self) -> None:
+        """End the recording without the parts that the service does not have."""
+        if self.recording is not None:
+            self.recording.close(self._vec)
+            self.recording = None
+
+    def command(self, number: int, act: Callable[[], bytes], is_quiet: bool) -> bytes:
+        """Execute a command and return its answer; a repeated command gets the same answer.
+
+        Args:
+            number: of the command.
+            act: executes it: `reset`, `step` or `change` with their arguments.
+            is_quiet: whether to return nothing.
+        """
         if number == self.number and number and self._last:
             return self._last
         if number != self.number + 1:
             raise problem(
                 "conflict", f"command {number} follows {self.number}: increase the number by one"
             )
-        answer = self._reset(seed) if word == "reset" else self._step(content)
+        answer = act()
         self.number, self._last = number, answer
         if self._page is not None:
-            self._page.moved()
             self._heed_pages(self._page)
         return b"" if is_quiet else answer
 
-    def _reset(self, seed: int | None) -> bytes:
+    def reset(self, seed: int | None) -> bytes:
+        """Start an episode in every world."""
         observations, infos = self._vec.reset(seed=seed)
         self._anew[:] = False
+        self._move_page()
         return pack(flatten("observations", observations) | _flat(infos))
 
-    def _step(self, content: bytes) -> bytes:
+    def step(self, content: bytes) -> bytes:
+        """Step all worlds with actions as bytes."""
         form: Any = self._vec.action_space
         dtype = np.dtype(_little(form.dtype))
         wanted = dtype.itemsize * int(np.prod(form.shape))
@@ -141,7 +225,76 @@ class SessionWorld:
         if self._anew.any():
             infos["begun_anew"] = self._anew.copy()
             self._anew[:] = False
+        self._move_page()
         return pack(flatten("observations", observations) | told | _flat(infos))
+
+    def _move_page(self) -> None:
+        if self._page is not None:
+            self._page.moved()
+
+    def change(self, change: Change) -> bytes:
+        """Change the worlds between two steps; a change that is refused changes nothing."""
+        vec = self._vec
+        match change:
+            case InsertVehicle():
+                vec.insert_vehicle(change.lane, change.position_m, change.world)
+            case CloseRoad():
+                vec.close_road(change.edge, change.lanes, change.world, change.shuts_in)
+            case OpenRoad():
+                vec.open_road(change.edge, change.lanes, change.world)
+            case DamageRoad():
+                vec.damage_road(change.edge, change.speed_mps, change.lanes, change.world)
+            case DeclareEvent():
+                vec.declare_event(change.world, change.agent, change.cause)
+            case SetScenario():
+                self._begin_scenario(change)
+            case BeginRecording():
+                self._begin_recording(change)
+        return pack({})
+
+    def _begin_scenario(self, scenario: SetScenario) -> None:
+        if self._keys:
+            raise problem(
+                "refused",
+                "scenario: worlds with zones on several nodes keep their scenario; give "
+                "scenario.name in overrides when you open the session",
+            )
+        if scenario.name and scenario.name not in scenario_names():
+            known = ", ".join(scenario_names())
+            raise problem("refused", f"no scenario '{scenario.name}': choose one of {known}")
+        vec = self._made(scenario)
+        if self.recording is not None:
+            self.recording.end_part(self._vec)
+        if self._page is not None:
+            self._page.close()  # it shows the earlier worlds
+            self._page = None
+        self._vec.close()
+        self._scenario = scenario
+        self._take(vec)
+        if self.recording is not None:
+            self.recording.begin(vec)
+
+    def _begin_recording(self, change: BeginRecording) -> None:
+        if self.recording is not None:
+            raise problem("conflict", "the session is being recorded already")
+        if key := missing_in_states(self._vec.config):
+            raise problem(
+                "refused",
+                f"{key}: the state of these worlds cannot be saved, so another node could not "
+                "continue their recording; record them in a process of your own",
+            )
+        self.recording = SessionRecording(self._vec, change.include)
+
+    def frames(self, is_final: bool) -> bytes:
+        """Return the samples of the mounted sensors, as `SENSOR/FIELD`."""
+        found = self._vec.final_frames() if is_final else self._vec.frames()
+        return pack(
+            {
+                f"{name}/{field}": array
+                for name, sensor in found.items()
+                for field, array in sensor._asdict().items()
+            }
+        )
 
     def suggestion(self) -> bytes:
         """Return the built-in driver's actions."""
@@ -245,7 +398,10 @@ class SessionWorld:
         if self._page is not None:
             self._page.close()
             self._page = None
+        self.drop_recording()
         self._vec.close()
+        if self._files is not None:
+            self._files.cleanup()
 
 
 class SessionWorlds:
@@ -277,21 +433,21 @@ class SessionWorlds:
         state: bytes | None,
         number: int,
         keys: dict[str, Any],
+        files: TemporaryDirectory[str] | None = None,
     ) -> None:
-        """Create the worlds of a session."""
+        """Create the worlds of a session; the arguments are those of `SessionWorld`."""
         if len(self._worlds) >= self._slots:
             raise CapacityError(
                 f"this node has {self._slots} sessions already: resolve the session again later"
             )
         with self.lock:
             if session not in self._worlds:
-                self._worlds[session] = SessionWorld(document, state, number, keys)
+                self._worlds[session] = SessionWorld(document, state, number, keys, files)
 
-    def ended(self, session: str, word: str) -> None:
-        """Note that a command of a session is done."""
-        if word == "step":
-            self.steps += 1
-            self.ticks += self[session].num_ticks
+    def count_step(self, session: str) -> None:
+        """Count a step of a session."""
+        self.steps += 1
+        self.ticks += self[session].num_ticks
 
     def counters(self) -> dict[str, float]:
         """Return the counters of a heartbeat."""

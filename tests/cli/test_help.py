@@ -35,14 +35,14 @@ def test_help_ends_with_valid_examples(words: str) -> None:
         check_command(line[line.index("cavmarl") :])
 
 
-def test_the_help_of_submit_offers_no_files_or_folders() -> None:
-    """A service refuses files, folders and modules of its callers."""
+def test_the_help_of_submit_offers_no_modules_and_says_what_is_uploaded() -> None:
+    """A service takes the data of its callers, but no modules."""
     command = COMMANDS["cavmarl submit"]
     options = {word for one in command.params for word in one.opts}
     assert "--import" not in options
     texts = [one.help for one in command.params if one.name in ("env", "policy")]
     assert len(texts) == 2
-    assert not [text for text in texts if "file" in text or "folder" in text]
+    assert all("uploaded once" in text for text in texts)
 
 
 @pytest.mark.parametrize("words", COMMANDS)

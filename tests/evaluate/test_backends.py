@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import json
+import socket
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +16,7 @@ from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate import EvaluationReport, evaluate
 from cavmarl.evaluate.evaluation import load_resources
+from cavmarl.parallel.network.code_stamp import code_stamp
 from tests.support.sumo_worlds import tiny_file
 
 WORLD: dict[str, Any] = {"agents": 4, "background": 30, "max_cycles": 30, "seed": 5}
@@ -69,6 +72,23 @@ def test_nodes_report_waits_traffic_and_changes_of_owner(tmp_path: Path) -> None
     rows = load_resources(tmp_path)["random_actions"]
     ticks_of_node = rows["ticks"][rows["process"] == 1]
     assert ticks_of_node.sum() == 30 * load_config("grid4x4")[0].clock.ticks_per_step
+
+
+def test_the_manifest_describes_the_nodes_and_their_connections(tmp_path: Path) -> None:
+    run(tmp_path, "nodes:2", episodes=1)
+    network = json.loads((tmp_path / "manifest.json").read_text(encoding="utf-8"))["network"]
+    assert network.keys() == {"idm", "random_actions"}
+    for nodes in network.values():
+        assert [one["node"] for one in nodes] == [0, 1]
+        assert len({one["process"] for one in nodes}) == 2
+        assert {one["code"] for one in nodes} == {code_stamp()}
+        for node in nodes:
+            assert node["machine"] == socket.gethostname()
+            assert {link["to"] for link in node["links"]} == {"caller", 1 - node["node"]}
+            for link in node["links"]:
+                assert not link["is_encrypted"]  # the connections stay on this machine
+                assert 0.0 < link["least_rtt_ms"] <= 1e3
+                assert link["rtt_ms"] > 0.0 < link["delivered_mbit_s"]
 
 
 def test_worlds_of_this_process_leave_no_table_of_processes(local: dict[int, Path]) -> None:

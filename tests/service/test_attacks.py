@@ -145,7 +145,7 @@ def test_a_changed_state_is_refused_as_damaged_or_can_be_used() -> None:
     """Nodes do not sign states, so a state from another node may be any bytes."""
     document = {**WORLD, "max_cycles": None, "num_envs": 2, "seed": 0, "overrides": {}}
     world = SessionWorld(document, None, 0, {})
-    world.command("reset", 1, 0, b"", False)
+    world.command(1, lambda: world.reset(0), is_quiet=False)
     state = world.state()
     world.close()
     assert state is not None

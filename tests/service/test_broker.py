@@ -89,7 +89,7 @@ def test_the_steps_of_a_job_count_all_its_runs_and_drivers(
     world = {"environment": "ring", "seed": 1, "overrides": {}}
     world |= dict.fromkeys(("agents", "background", "max_cycles"))
     job = {"policies": ["idm", "random"], "episodes": 1, "repeats": 2}
-    run_evaluation(world, job, tmp_path, lambda *counts: told.append(counts))
+    run_evaluation(world, job, tmp_path, None, lambda *counts: told.append(counts))
     assert told == [(done, 16) for done in (1, 2, 5, 6, 9, 10, 13, 14)]
 
 

@@ -101,11 +101,11 @@ def test_a_world_reports_each_transfer_once_and_prepared_transfers() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})
-    world.command("reset", 1, 0, b"", is_quiet=True)
+    world.command(1, lambda: world.reset(0), is_quiet=True)
     prepared, told = [], []
     idle = np.zeros(world.describe()["action"]["shape"], np.float32).tobytes()
     for number in range(2, 60):
-        world.command("step", number, None, idle, is_quiet=True)
+        world.command(number, lambda: world.step(idle), is_quiet=True)
         found = world.ownership()
         prepared += found["prepared"]
         told += found["transfers"]

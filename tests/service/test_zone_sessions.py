@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import psutil
 import pytest
@@ -14,7 +15,8 @@ from cavmarl.core.errors import ServiceError
 from tests.service.test_sessions import assert_same
 from tests.support.service import Cluster, running_service
 
-WORLD = {"zones": 2, "agents": 6, "background": 24}
+CHANGED: dict[str, Any] = {"map.changed_lanes": 8}
+WORLD: dict[str, Any] = {"zones": 2, "agents": 6, "background": 24, "overrides": CHANGED}
 SOON_S = 60.0
 
 
@@ -53,6 +55,9 @@ def test_a_session_over_nodes_survives_kills_of_its_nodes(cluster: Cluster, clie
     assert len(set(found["members"])) == 2
     victim = next(name for name in found["members"] if name != found["node"])
     cluster.processes[victim].kill()
+    edge = next(name for name in local.network.edge_ids if not name.startswith(":"))
+    for world in (remote, local):
+        world.close_road(edge, shuts_in=True)
     assert_same(remote, local, range(55, 65))
     wait_for(lambda: victim not in client.get(session)["members"])
     assert_same(remote, local, range(65, 70))

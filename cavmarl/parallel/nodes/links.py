@@ -9,6 +9,7 @@ from typing import NamedTuple, TypeAlias
 
 from cavmarl.core.errors import MessageError
 from cavmarl.ownership.messages import COORDINATOR
+from cavmarl.parallel.network.link_quality import LinkQuality, measure_link
 from cavmarl.parallel.network.transport import READS, READS_AND_WRITES, Bytes, Connection
 from cavmarl.parallel.nodes.link import FrameKind, Link, NodeFrame
 from cavmarl.parallel.nodes.node_system import MACHINE, NodeSystem
@@ -85,6 +86,10 @@ class Links:
     @property
     def numbers(self) -> tuple[int, ...]:
         return tuple(self._links)
+
+    def qualities(self) -> list[tuple[int, LinkQuality]]:
+        """Return what the system has measured about each connection."""
+        return [(number, measure_link(link.connection)) for number, link in self._links.items()]
 
     @property
     def awaited(self) -> list[int]:

@@ -138,6 +138,11 @@ class NodeGroups(CommandedWorlds):
         found = self._run_jobs(NodeWorlds.node_loads, self.groups, _ignore)
         return [load._replace(node=k) for k, loads in enumerate(found) for load in loads]
 
+    def describe_network(self) -> list[dict[str, Any]]:
+        """Return machine, process and connections of each node, for manifests."""
+        found = self._run_jobs(NodeWorlds.describe_network, self.groups, _ignore)
+        return [{**row, "node": k} for k, rows in enumerate(found) for row in rows]
+
     def in_flight(self, world: int) -> Sequence[TransferInFlight]:
         """Return the vehicles of a world whose next zone has their state already."""
         k = self._group_of(world)

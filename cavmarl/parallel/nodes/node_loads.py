@@ -18,6 +18,7 @@ from cavmarl.parallel.nodes.links import Links
 
 TOTALS = 7  # numbers that a node reports about itself
 TO_SHOW, TO_BALANCE = "to show", "to balance"  # purposes of requests about machines
+LINKS = "links"  # purpose of a request about connections
 
 
 class NodeLoad(NamedTuple):
@@ -71,9 +72,11 @@ def machine_watch(purpose: str) -> MachineWatch:
 def load_report(
     payload: Any, links: Links, simulation: Simulation, zones: Sequence[int]
 ) -> list[Any]:
-    """Return the load of the machine if a `MachineAsked` is given, else that of the node."""
+    """Return what a `MachineAsked` asks for, or the load of the node if it is None."""
     if payload is not None:
         asked = MachineAsked(*payload)
+        if asked.purpose == LINKS:
+            return [[number, *found] for number, found in links.qualities()]
         return machine_watch(asked.purpose).since(asked.processes.get(socket.gethostname(), ()))
     return totals(links, simulation, zones)
 

@@ -213,9 +213,9 @@ class NodePool:
         return len(self._homes)
 
     @property
-    def machines(self) -> list[tuple[str, int]]:
-        """Machine and process of each living node."""
-        return [(node.machine, node.pid) for node in self._nodes.values()]
+    def machines(self) -> dict[int, tuple[str, int]]:
+        """Machine and process of each living node, by its number."""
+        return {number: (node.machine, node.pid) for number, node in self._nodes.items()}
 
     @property
     def partition(self) -> ZoneRects:

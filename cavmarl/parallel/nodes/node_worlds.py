@@ -22,7 +22,10 @@ from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import WorldRun, prepare_runs
 from cavmarl.handoff.repartitioning import Repartition, is_due
 from cavmarl.handoff.zone_view import TransferInFlight
+from cavmarl.ownership.messages import COORDINATOR
 from cavmarl.ownership.transfers import TransferLog
+from cavmarl.parallel.network.code_stamp import code_stamp
+from cavmarl.parallel.network.link_quality import LinkQuality
 from cavmarl.parallel.nodes.agent_stream import ResultStream
 from cavmarl.parallel.nodes.node_actions import Actions, NodeCommand, ZoneRects
 from cavmarl.parallel.nodes.node_cuts import read_zones
@@ -32,6 +35,7 @@ from cavmarl.parallel.nodes.node_frames import (
     worlds_payload,
 )
 from cavmarl.parallel.nodes.node_loads import (
+    LINKS,
     TO_BALANCE,
     TO_SHOW,
     TOTALS,
@@ -336,12 +340,25 @@ class NodeWorlds(CommandedWorlds):
         count.
         """
         here: dict[str, list[int]] = {socket.gethostname(): [os.getpid()]}
-        for machine, pid in self.pool.machines:
+        for machine, pid in self.pool.machines.values():
             here.setdefault(machine, []).append(pid)
         found = self._run(Task.LOADS, MachineAsked(purpose, here), _read_watched)
         states = tuple(candidate for candidate, _ in found)
         source = next((source for _, source in found if source != NO_GPU), NO_GPU)
         return LoadSnapshot(states, source, MEASURED)
+
+    def describe_network(self) -> list[dict[str, Any]]:
+        """Return machine, process and connections of each node, for manifests.
+
+        Each end of a connection has measured its own round trips, under the traffic of this run.
+        """
+        machines = self.pool.machines
+        found = dict(self._run(Task.LOADS, MachineAsked(LINKS, {}), _read_links))
+        return [
+            {"node": node, "machine": machine, "process": pid, "code": code_stamp(),
+             "links": found[node]}
+            for node, (machine, pid) in sorted(machines.items())
+        ]  # fmt: skip
 
     def save_worlds(self) -> list[bytes]:
         saved: list[bytes] = self.ask(Task.SAVE)
@@ -421,6 +438,22 @@ def _read_watched(number: int, data: memoryview) -> tuple[Candidate, str]:
     """Read how busy the machine of a node is, and the source of the figure."""
     _, shares, source = read_json(data, list)
     return Candidate(number, Utilisation(*shares)), str(source)
+
+
+def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]]]:
+    """Read what a node reports about its connections."""
+    rows = read_json(data, list)
+    if rows.pop(0) != number:
+        raise MessageError("it reports the connections of another node")
+    links = []
+    for row in rows:
+        if not isinstance(row, list) or len(row) != 1 + len(LinkQuality._fields):
+            raise MessageError(f"it reports the connection {row!r}")
+        to, is_encrypted, *values = row
+        numbers = [None if value is None else float(value) for value in values]
+        quality = LinkQuality(bool(is_encrypted), *numbers)._asdict()
+        links.append({"to": "caller" if to == COORDINATOR else int(to), **quality})
+    return number, links
 
 
 def check_nodes(world: World, nodes: int) -> None:

@@ -1,0 +1,238 @@
+"""Artefacts: files of users, identified by their SHA-256, for configurations of their own.
+
+An artefact is data: a map, demand, a zone file, a configuration, or the weights of a driver. Code
+is refused. Each identity has quotas. An artefact that is not used is deleted after its lifetime.
+"""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import json
+import tempfile
+import zlib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+from cavmarl.core.errors import CavmarlError
+from cavmarl.core.xml_root import is_sumo_config, root_tag
+from cavmarl.service.error_names import problem
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
+
+MOST_UNPACKED_BYTES = 1 << 29  # of a compressed file
+MOST_YAML_BYTES = 1 << 20
+MOST_JSON_BYTES = 1 << 24
+
+
+@dataclass(frozen=True)
+class Quota:
+    """What one identity may store, and for how long."""
+
+    files: int = 1000
+    total_bytes: int = 1 << 30
+    days: float = 30.0  # after the last use
+
+
+class Artefacts:
+    """The artefacts of a service.
+
+    Args:
+        log: the log of the service.
+        quota: of each identity.
+    """
+
+    def __init__(self, log: EventLog, quota: Quota) -> None:
+        self._log, self._quota = log, quota
+
+    def add(
+        self, identity: IdentityRecord, sha256: str, name: str, licence: str, content: bytes
+    ) -> ArtefactRecord:
+        """Store a file, or extend the lifetime of a file that this identity stored earlier.
+
+        Args:
+            identity: its owner.
+            sha256: hash that the content must have.
+            name: name of the file; its suffix says what the file is.
+            licence: licence of the content, as text.
+            content: the file, which `check_content` has checked.
+
+        Raises:
+            ServiceError: the content exceeds a quota of the identity.
+        """
+        self.check_quota(identity, sha256, len(content))
+        if sha256 not in self.of(identity.id):
+            self._log.keep(content)
+        data = {"name": name, "licence": licence, "bytes": len(content)}
+        data |= {"until_s": self._until_s()}
+        self._log.record("artefact.added", sha256, data, actor=identity.id, owner=identity.id)
+        return self.of(identity.id)[sha256]
+
+    def of(self, identity: str) -> Mapping[str, ArtefactRecord]:
+        """Return the artefacts of an identity by hash."""
+        return self._log.state.artefacts.get(identity, {})
+
+    def content(self, identity: IdentityRecord, sha256: str) -> bytes:
+        """Return a file; clients get their own files only."""
+        if identity.role == "client" and sha256 not in self.of(identity.id):
+            raise problem("not-found", f"there is no artefact {sha256} of yours")
+        if not any(sha256 in some for some in self._log.state.artefacts.values()):
+            raise problem("not-found", f"there is no artefact {sha256}: upload it again")
+        return self._log.content(sha256)
+
+    def delete(self, identity: IdentityRecord, sha256: str) -> None:
+        """Delete a file of an identity that no open session or job of its needs."""
+        if sha256 not in self.of(identity.id):
+            raise problem("not-found", f"there is no artefact {sha256} of yours")
+        if sha256 in self._in_use(identity.id):
+            raise problem(
+                "conflict", f"an open session or job needs artefact {sha256}: end it first"
+            )
+        self._log.record("artefact.deleted", sha256, actor=identity.id, owner=identity.id)
+
+    def use(self, identity: IdentityRecord, files: Collection[str]) -> None:
+        """Extend the lifetime of files that an identity uses now.
+
+        Raises:
+            ServiceError: the identity does not have one of them.
+        """
+        own = self.of(identity.id)
+        for sha256 in files:
+            if sha256 not in own:
+                raise problem("not-found", f"there is no artefact {sha256} of yours: upload it")
+        until_s = self._until_s()
+        for sha256 in sorted(set(files)):
+            if own[sha256].until_s < until_s - 864.0 * self._quota.days:  # a hundredth has passed
+                data = {"until_s": until_s}
+                self._log.record("artefact.used", sha256, data, owner=identity.id)
+
+    def sweep(self) -> None:
+        """Delete files whose lifetime is over and that no open session or job needs."""
+        now_s = self._log.wall_s()
+        for owner, files in list(self._log.state.artefacts.items()):
+            old = [sha256 for sha256, one in files.items() if one.until_s < now_s]
+            for sha256 in set(old) - (self._in_use(owner) if old else set()):
+                self._log.record("artefact.expired", sha256, owner=owner)
+
+    def _until_s(self) -> float:
+        return self._log.wall_s() + 86_400.0 * self._quota.days
+
+    def check_quota(self, identity: IdentityRecord, sha256: str, more: int) -> None:
+        """Refuse a file of `more` bytes that an identity may not store."""
+        own = self.of(identity.id)
+        if sha256 in own:
+            return
+        used = sum(one.size_bytes for one in own.values())
+        if len(own) >= self._quota.files:
+            raise problem(
+                "quota", f"you have {len(own)} of at most {self._quota.files} artefacts: delete one"
+            )
+        if used + more > self._quota.total_bytes:
+            raise problem(
+                "quota",
+                f"your artefacts have {used} bytes, and {more} more exceed the limit of "
+                f"{self._quota.total_bytes}: delete one",
+            )
+
+    def _in_use(self, owner: str) -> set[str]:
+        """Return the hashes that open sessions and jobs of an identity need."""
+        configurations = {
+            one.configuration
+            for one in self._log.state.sessions.values()
+            if one.owner == owner and one.state not in SESSION_OVER
+        }
+        return {sha256 for one in configurations for sha256 in self._log.state.files_of(one)}
+
+
+def check_content(name: str, sha256: str, content: bytes) -> None:
+    """Check that a file has its hash, and is what the suffix of its name says.
+
+    Raises:
+        ServiceError: it has another hash, the suffix is not that of a kind of data, or the content
+            is of another kind.
+    """
+    found = hashlib.sha256(content).hexdigest()
+    if found != sha256:
+        raise problem(
+            "refused", f"the content has the SHA-256 {found}, not {sha256}: send it again"
+        )
+    for suffix, check in _CHECKS.items():
+        if name.endswith(suffix):
+            try:
+                check(content)
+            except (CavmarlError, ValueError, OSError, EOFError, zlib.error) as error:
+                raise problem("refused", f"{name}: is no {suffix} file ({error!s:.200})") from error
+            return
+    known = ", ".join(_CHECKS)
+    raise problem("refused", f"{name}: must end in one of {known}; code is never an artefact")
+
+
+def _check_xml(content: bytes) -> None:
+    with tempfile.TemporaryDirectory(prefix="cavmarl-check-") as folder:
+        path = Path(folder) / "file.xml"
+        path.write_bytes(content[: 1 << 17])
+        if is_sumo_config(path):
+            raise ValueError("a configuration of SUMO names other files; give these instead")
+        if not root_tag(path):
+            raise ValueError("it has no root element")
+
+
+def _check_gzip(content: bytes) -> None:
+    with gzip.open(BytesIO(content)) as packed:
+        head = part = packed.read(1 << 17)
+        total = len(part)
+        while part:
+            part = packed.read(1 << 20)
+            total += len(part)
+            if total > MOST_UNPACKED_BYTES:
+                raise ValueError(f"it has over {MOST_UNPACKED_BYTES} bytes when unpacked")
+    _check_xml(head)
+
+
+def _check_yaml(content: bytes) -> None:
+    from cavmarl.config.io import read_yaml
+
+    if len(content) > MOST_YAML_BYTES:
+        raise ValueError(f"it has {len(content)} bytes: at most {MOST_YAML_BYTES}")
+    with tempfile.TemporaryDirectory(prefix="cavmarl-check-") as folder:
+        path = Path(folder) / "file.yaml"
+        path.write_bytes(content)
+        try:
+            found = read_yaml(path)
+        except CavmarlError as error:
+            raise ValueError(str(error).replace(str(path), "the file")) from error
+    if not isinstance(found, dict):
+        raise ValueError("it must be a mapping")
+
+
+def _check_json(content: bytes) -> None:
+    if len(content) > MOST_JSON_BYTES:
+        raise ValueError(f"it has {len(content)} bytes: at most {MOST_JSON_BYTES}")
+    try:
+        found = json.loads(content)
+    except RecursionError as error:
+        raise ValueError("it is nested too deep") from error
+    if not isinstance(found, dict):
+        raise ValueError("it must be an object")
+
+
+def _check_weights(content: bytes) -> None:
+    size = int.from_bytes(content[:8], "little")
+    if len(content) < 8 or size > len(content) - 8:
+        raise ValueError("its header is longer than the file")
+    _check_json(content[8 : 8 + size])
+
+
+_CHECKS: dict[str, Callable[[bytes], Any]] = {
+    ".xml": _check_xml,
+    ".xml.gz": _check_gzip,
+    ".osm": _check_xml,
+    ".osm.gz": _check_gzip,
+    ".xodr": _check_xml,
+    ".yaml": _check_yaml,
+    ".json": _check_json,
+    ".safetensors": _check_weights,
+}

@@ -1,0 +1,377 @@
+"""Files that users upload: hashes, kinds, quotas, lifetimes; worlds and drivers made of them."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+import itertools
+import shutil
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from sqlalchemy import create_engine, text
+from typer.testing import CliRunner
+
+import cavmarl
+from cavmarl.cli import app
+from cavmarl.client import Client
+from cavmarl.config.registry import agent_entries, entries
+from cavmarl.core.errors import ServiceError
+from cavmarl.evaluate import evaluate
+from cavmarl.service.artefacts import Quota, check_content
+from cavmarl.service.configurations import add_configuration
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_store import EventStore
+from cavmarl.service.request_bodies import ConfigurationBody
+from tests.service.test_sessions import assert_same
+from tests.support.fleet import Fleet
+from tests.support.loopback_service import loopback_service
+from tests.support.service import Cluster, running_service
+
+NUMBERS = itertools.count()
+NET = b"<net><location/></net>"
+ENV = b"name: mine\nmap:\n  source: map.net.xml\n"
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    quota = Quota(files=4, total_bytes=1000, days=1.0)
+    made = Fleet(tmp_path / "store.sqlite", artefacts=quota)
+    yield made
+    made.close()
+
+
+def put(fleet: Fleet, name: str, content: bytes, owner: str = "client") -> str:
+    sha256 = hashlib.sha256(content).hexdigest()
+    fleet.broker.artefacts.add(getattr(fleet, owner), sha256, name, "CC0", content)
+    return sha256
+
+
+def put_world(fleet: Fleet, env: bytes = ENV) -> dict[str, str]:
+    return {"env.yaml": put(fleet, "env.yaml", env), "map.net.xml": put(fleet, "map.net.xml", NET)}
+
+
+def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
+    body = ConfigurationBody(**{"environment": "mine", "files": files, **given})
+    found = add_configuration(fleet.log, fleet.client, body, fleet.broker.artefacts)
+    return str(found["hash"])
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("code.py", b"import os", "code is never"),
+        ("model.pt", b"x", "code is never"),
+        ("map.net.xml", b"import os", "no root element"),
+        ("map.net.xml", b"<configuration><input/></configuration>", "names other files"),
+        ("map.net.xml.gz", NET, "is no .xml.gz file"),
+        ("map.net.xml.gz", gzip.compress(b"import os"), "no root element"),
+        ("map.net.xml.gz", gzip.compress(NET)[:-9], "is no .xml.gz file"),
+        ("rig.yaml", b"- 1\n- 2\n", "must be a mapping"),
+        ("rig.yaml", b"a: !!python/object/apply:os.getcwd []", "is no .yaml file"),
+        ("zones.json", b"[" * 100_000, "is no .json file"),
+        ("zones.json", b"[]", "must be an object"),
+        ("rig.yaml", b"a: 1" + b" " * (1 << 20), "at most 1048576"),
+        ("model.safetensors", b"\xff" * 64, "header"),
+        ("model.safetensors", (2).to_bytes(8, "little") + b"[]", "must be an object"),
+    ],
+)
+def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str) -> None:
+    with pytest.raises(ServiceError, match=words) as refused:
+        check_content(name, hashlib.sha256(content).hexdigest(), content)
+    assert refused.value.problem == "refused"
+
+
+def test_a_compressed_file_that_is_too_large_when_unpacked_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("cavmarl.service.artefacts.MOST_UNPACKED_BYTES", 1 << 20)
+    content = gzip.compress(NET + b" " * (1 << 21))
+    with pytest.raises(ServiceError, match="when unpacked"):
+        check_content("map.net.xml.gz", hashlib.sha256(content).hexdigest(), content)
+
+
+def test_quotas_count_files_and_bytes_of_each_identity(fleet: Fleet) -> None:
+    for k in range(3):
+        put(fleet, "map.net.xml", NET + b" " * k)
+    with pytest.raises(ServiceError, match="exceed the limit of 1000") as refused:
+        put(fleet, "map.net.xml", NET + b" " * 950)
+    assert refused.value.problem == "quota"
+    put(fleet, "map.net.xml", NET + b" " * 3)
+    put(fleet, "map.net.xml", NET)  # it is there already
+    with pytest.raises(ServiceError, match="4 of at most 4"):
+        put(fleet, "map.net.xml", NET + b" " * 4)
+    fleet.other = fleet.identity("bob", "client")  # type: ignore[attr-defined]
+    put(fleet, "map.net.xml", NET, owner="other")
+    assert len(fleet.broker.artefacts.of(fleet.client.id)) == 4
+
+
+def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path) -> None:
+    fleet.other = fleet.identity("bob", "client")  # type: ignore[attr-defined]
+    sha256 = put(fleet, "map.net.xml", NET)
+    with pytest.raises(ServiceError, match="of yours"):
+        fleet.broker.artefacts.content(fleet.other, sha256)  # type: ignore[attr-defined]
+    put(fleet, "map.net.xml", NET, owner="other")
+    fleet.broker.artefacts.delete(fleet.client, sha256)
+    assert fleet.broker.artefacts.content(fleet.nodes, sha256) == NET
+    with pytest.raises(ServiceError, match="of yours"):
+        fleet.broker.artefacts.delete(fleet.client, sha256)
+    fleet.broker.artefacts.delete(fleet.other, sha256)  # type: ignore[attr-defined]
+    fleet.log.flush()
+    assert fleet.log.store.blob(sha256) is None
+    state = fleet.log.state
+    fleet.close()
+    again = EventLog(EventStore(tmp_path / "store.sqlite"))
+    assert again.state == state
+    again.store.close()
+
+
+def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
+    files = put_world(fleet)
+    unused = put(fleet, "other.net.xml", NET + b" ")
+    configuration = configure(fleet, files)
+    fleet.join("a")
+    session = fleet.broker.open(fleet.client, configuration)
+    with pytest.raises(ServiceError, match="end it first"):
+        fleet.broker.artefacts.delete(fleet.client, files["map.net.xml"])
+    for _ in range(2):
+        fleet.now_s += 86_400.0
+        session = fleet.broker.resolve(fleet.client, session.id)  # it is not idle
+        fleet.beat("a")
+        fleet.broker.sweep()
+        fleet.now_s += 1.0
+    own = fleet.broker.artefacts.of(fleet.client.id)
+    assert unused not in own
+    assert set(files.values()) == set(own)
+    fleet.broker.close(fleet.client, session.id)
+    fleet.broker.sweep()
+    assert not fleet.broker.artefacts.of(fleet.client.id)
+    fleet.beat("a")
+    with pytest.raises(ServiceError, match="upload it") as refused:
+        fleet.broker.open(fleet.client, configuration)
+    assert refused.value.problem == "not-found"
+    assert fleet.kinds().count("artefact.expired") == 3
+
+
+@pytest.mark.parametrize(
+    ("env", "words"),
+    [
+        (b"map: {source: /etc/passwd}", "could name a file that was not uploaded"),
+        (b"map: {source: ../map.net.xml}", "could name a file that was not uploaded"),
+        (b"map: {source: 'sumo:../../map.net.xml'}", "could name a file that was not uploaded"),
+        (b"map: {source: map.net.xml}\ntraffic: {demand: [other.rou.xml]}", "not uploaded"),
+        (b"map: {source: map.net.xml}\nplugins: [antigravity]", "plugins: name modules"),
+        (b"map: {source: map.net.xml}\nzones: {journal: log}", "zones.journal: an uploaded"),
+        (b"map: {source: map.net.xml}\nzones: {simulators: {1: carla}}", "zones.simulators"),
+        (b"map: {source: map.net.xml}\nscenario: {name: code.py}", "code.py"),
+        (b"map: {source: map.net.xml}\nworkers: {key_file: key}", "workers.key_file"),
+        (b"map: {source: map.net.xml}\ntraffic: {model: 'zoo:tmp'}", "no driver 'tmp'"),
+        (b"map: {source: map.net.xml}\nrig: other", "no such rig"),
+        (b"map: {sauce: map.net.xml}", "map.sauce"),
+    ],
+)
+def test_an_environment_names_only_its_own_files(fleet: Fleet, env: bytes, words: str) -> None:
+    files = put_world(fleet, b"name: mine\n" + env)
+    with pytest.raises(ServiceError, match=words) as refused:
+        configure(fleet, files)
+    assert refused.value.problem == "refused"
+
+
+@pytest.mark.parametrize(
+    ("places", "words"),
+    [
+        (["map.net.xml"], "belongs to no environment"),
+        (["env.yaml", "agents/idm/config.json"], "the folder agents must have another name"),
+        (["env.yaml", "drivers/a/config.json"], "must have exactly"),
+        (["env.yaml", "drivers/idm/config.json", "drivers/idm/model.safetensors"], "driver 'idm'"),
+    ],
+)
+def test_files_have_their_places(fleet: Fleet, places: list[str], words: str) -> None:
+    sha256 = put(fleet, "env.yaml", ENV)
+    with pytest.raises(ServiceError, match=words):
+        configure(fleet, dict.fromkeys(places, sha256))
+    for place in ("../env.yaml", "/env.yaml", "a/b/c/d", "drivers/../env.yaml"):
+        with pytest.raises(ValueError, match="pattern"):
+            configure(fleet, {place: sha256})
+
+
+def test_a_configuration_needs_files_of_its_owner(fleet: Fleet) -> None:
+    files = put_world(fleet)
+    fleet.client = fleet.identity("bob", "client")
+    with pytest.raises(ServiceError, match="of yours: upload it"):
+        configure(fleet, files)
+
+
+@pytest.fixture(scope="module")
+def cluster(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Cluster]:
+    store = tmp_path_factory.mktemp("service") / "store.sqlite"
+    with running_service(store, "--lease-s", "6", "--beat-s", "0.6") as service:
+        started = Cluster(service)
+        started.start("a", "victim")
+        yield started
+        started.stop()
+
+
+@pytest.fixture
+def client(cluster: Cluster) -> Iterator[Client]:
+    secret = cluster.service.grant(f"user-{next(NUMBERS)}", "client")
+    with cluster.service.client(secret) as made:
+        yield made
+
+
+def own_world(folder: Path) -> Path:
+    """Return a copy of an environment and its map with a new name."""
+    path = folder / "mine"
+    shutil.copytree(entries()["merge"], path)
+    text = (path / "env.yaml").read_text(encoding="utf-8")
+    (path / "env.yaml").write_text(text.replace("name: merge", "name: mine"), encoding="utf-8")
+    return path
+
+
+def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
+    cluster: Cluster, client: Client, tmp_path: Path
+) -> None:
+    world = own_world(tmp_path)
+    driver = agent_entries()["merge_ippo"]
+    keys: dict[str, Any] = {"agents": 3, "background": 6}
+    remote = client.open(
+        world, node="victim", wait_s=30.0, drivers={"trained": driver}, licence="CC0",
+        overrides={"traffic.model": "zoo:trained"}, **keys,
+    )  # fmt: skip
+    model = f"zoo:{driver}"
+    local = cavmarl.make_vec(str(world), overrides={"traffic.model": model}, **keys)
+    remote.reset(seed=1)
+    local.reset(seed=1)
+    assert_same(remote, local, range(3))
+    remote.save_state()
+    cluster.processes["victim"].kill()
+    assert_same(remote, local, range(3))
+    assert remote.flows.moves == 1
+    own = {one["name"] for one in client.get("/artefacts")["artefacts"]}
+    assert own >= {"env.yaml", "config.json", "model.safetensors"}
+    before = client.get("/events", limit=1000)["events"][-1]["sequence"]
+    client.open(world, wait_s=30.0, **keys).close()  # nothing is uploaded again
+    kinds = [one["kind"] for one in client.get("/events", limit=1000, after=before)["events"]]
+    assert "artefact.added" not in kinds
+    remote.close()
+    local.close()
+
+
+def test_an_evaluation_of_one_s_own_driver_equals_the_local_one(
+    cluster: Cluster, client: Client, tmp_path: Path
+) -> None:
+    world, driver = own_world(tmp_path), tmp_path / "trained"
+    shutil.copytree(agent_entries()["merge_ippo"], driver)
+    secret = tmp_path / "secret"
+    secret.touch(mode=0o600)
+    secret.write_text(cluster.service.grant("bob", "client"), encoding="utf-8")
+    out = tmp_path / "there"
+    words = ["submit", str(world), "--policy", str(driver), "--episodes", "2", "--agents", "3"]
+    words += ["--service", cluster.service.url, "--secret-file", str(secret), "--out", str(out)]
+    found = CliRunner().invoke(app, words, catch_exceptions=False)
+    assert found.exit_code == 0, found.output
+    evaluate(str(world), [str(driver)], episodes=2, repeats=1, agents=3, out=tmp_path / "here")
+    for name in ("episodes.csv", "trips.csv"):
+        assert table(out / name) == table(tmp_path / "here" / name)
+    manifest = (out / "manifest.json").read_text(encoding="utf-8")
+    assert "cavmarl-files-" not in manifest
+    shown = CliRunner().invoke(app, ["artefacts", *words[-6:-2]], catch_exceptions=False)
+    assert "env.yaml" in shown.output
+
+
+def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
+    cluster: Cluster, client: Client, tmp_path: Path
+) -> None:
+    cluster.start("late")
+    world = own_world(tmp_path)
+    keys: dict[str, Any] = {"episodes": 2, "repeats": 1, "agents": 3}
+    job = client.submit(world, node="late", wait_s=30.0, **keys)
+    killed = False
+
+    def kill_once(found: dict[str, Any]) -> None:
+        nonlocal killed
+        if not killed and found["progress"]:
+            assert found["node"] == "late"
+            cluster.processes["late"].kill()
+            killed = True
+
+    found = client.wait(job, tmp_path / "there", 120.0, kill_once)
+    assert killed
+    assert found["placements"] == 2
+    evaluate(str(world), ["idm"], out=tmp_path / "here", **keys)
+    for name in ("episodes.csv", "trips.csv"):
+        assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> None:
+    with loopback_service(tmp_path / "store.sqlite") as service:
+        link = service.start_node("a", "node")
+        path = f"/artefacts/{hashlib.sha256(NET).hexdigest()}?name=map.net.xml"
+        assert service.ask("client", "PUT", path, content=NET).status_code == 200
+        files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
+        document = {"environment": "map.net.xml", "files": files}
+        folder = service.run(link.fetch_files(document))
+        assert folder is not None
+        assert (Path(folder.name) / "map.net.xml").read_bytes() == NET
+        folder.cleanup()
+        more = NET + b" "  # the log forgets what it has written when it writes something else
+        path = f"/artefacts/{hashlib.sha256(more).hexdigest()}?name=map.net.xml"
+        assert service.ask("client", "PUT", path, content=more).status_code == 200
+        service.run(service.events.settle())
+        engine = create_engine(f"sqlite:///{tmp_path / 'store.sqlite'}")
+        with engine.begin() as connection:
+            connection.execute(text("UPDATE blobs SET content = 'x'"))
+        engine.dispose()
+        with pytest.raises(ServiceError, match="the store was changed") as refused:
+            service.run(link.fetch_files(document))
+        assert refused.value.problem == "damaged"
+
+
+def test_a_node_checks_files_of_a_service_that_does_not(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with loopback_service(tmp_path / "store.sqlite") as service:
+        link = service.start_node("a", "node")
+        monkeypatch.setattr(type(service.broker.artefacts), "content", lambda *_: b"changed")
+        files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
+        with pytest.raises(ServiceError, match="does not have the SHA-256") as refused:
+            service.run(link.fetch_files({"environment": "map.net.xml", "files": files}))
+        assert refused.value.problem == "damaged"
+
+
+def table(path: Path) -> list[str]:
+    """Return the lines of a table without the name of the driver."""
+    lines = path.read_text(encoding="utf-8").splitlines()
+    return [",".join(line.split(",")[1:]) for line in lines]
+
+
+def test_a_map_that_cannot_be_read_ends_its_session(client: Client, tmp_path: Path) -> None:
+    (tmp_path / "broken.net.xml").write_bytes(b"<net><edge/></net>")
+    with pytest.raises(ServiceError) as refused:
+        client.open(tmp_path / "broken.net.xml", wait_s=30.0)
+    assert refused.value.problem == "refused"
+    assert "cavmarl-files-" not in str(refused.value)
+    (session,) = [one for one in client.get("/sessions")["sessions"] if one["state"] == "failed"]
+    assert session["message"]
+
+
+def test_paths_that_cannot_be_uploaded_are_refused(client: Client, tmp_path: Path) -> None:
+    with pytest.raises(ServiceError, match="neither a map nor a folder"):
+        client.open(tmp_path)
+    with pytest.raises(ServiceError, match="folder of a trained driver"):
+        client.open("merge", drivers={"x": tmp_path})
+
+
+def test_routes_check_the_hash_and_the_owner(cluster: Cluster, client: Client) -> None:
+    sha256 = hashlib.sha256(NET).hexdigest()
+    with pytest.raises(ServiceError, match="not " + "0" * 64):
+        client.run(client.flows.ask("PUT", f"/artefacts/{'0' * 64}", content=NET,
+                                    params={"name": "map.net.xml"}))  # fmt: skip
+    client.run(client.flows.ask("PUT", f"/artefacts/{sha256}", content=NET,
+                                params={"name": "map.net.xml"}))  # fmt: skip
+    assert client.run(client.flows.ask("GET", f"/artefacts/{sha256}")).content == NET
+    client.delete(f"/artefacts/{sha256}")
+    with pytest.raises(ServiceError, match="of yours"):
+        client.run(client.flows.ask("GET", f"/artefacts/{sha256}"))

@@ -1,0 +1,170 @@
+"""A standby takes over from a killed service, and nothing that was acknowledged is lost."""
+
+from __future__ import annotations
+
+import itertools
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from threading import Thread
+
+import pytest
+from sqlalchemy import create_engine, text
+
+from cavmarl.client import Client
+from cavmarl.core.errors import ServiceError
+from cavmarl.service.event_log import EventLog
+from cavmarl.service.event_store import EventStore
+from cavmarl.service.server import follow_store
+from tests.service.test_event_store import empty_postgresql, postgresql
+from tests.service.test_sessions import assert_same, make_local, open_world
+from tests.support.fleet import Fleet
+from tests.support.forked_processes import ForkedProcess
+from tests.support.service import Cluster, running_service
+
+__all__ = ["empty_postgresql", "postgresql"]
+
+TAKEOVER_S = 5.0
+
+
+@contextmanager
+def running_standby(store: str) -> Iterator[str]:
+    """Yield the URL of a standby, a process that ends with the block."""
+    words = ["-m", "cavmarl", "serve", "--standby", "--port", "0", "--store", store]
+    process = ForkedProcess([*words, "--beat-s", "0.6"], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        url = process.stdout.readline().split()[1].rstrip(",")
+        assert "ready to take over" in process.stdout.readline()
+        yield url
+    finally:
+        process.kill()
+        process.wait()
+        process.stdout.close()
+
+
+def test_a_standby_takes_over_within_5_s_and_loses_nothing(empty_postgresql: str) -> None:
+    acknowledged: list[str] = []
+    with (
+        running_service(empty_postgresql, "--beat-s", "0.6") as service,
+        running_standby(empty_postgresql) as other,
+    ):
+        primary, service.url = service.url, f"{service.url},{other}"
+        cluster = Cluster(service)
+        cluster.start("a")
+
+        def ask_without_end(asker: int) -> None:
+            with service.client() as client:
+                for k in itertools.count():
+                    body = {"name": f"guest-{asker}-{k}", "role": "viewer"}
+                    with suppress(ServiceError):
+                        acknowledged.append(client.post("/identities", body)["identity"])
+                    if is_over:
+                        return
+
+        is_over: list[bool] = []
+        with service.client(service.grant("ada", "client")) as client:
+            remote, local = open_world(client), make_local()
+            remote.reset(seed=5)
+            local.reset(seed=5)
+            assert_same(remote, local, range(3))
+            askers = [Thread(target=ask_without_end, args=(k,)) for k in range(2)]
+            for one in askers:
+                one.start()
+            while len(acknowledged) < 20:
+                time.sleep(0.001)
+            service.kill()
+            began_s, count = time.monotonic(), len(acknowledged) + len(askers)
+            while len(acknowledged) <= count:  # answers that were on their way do not count
+                assert time.monotonic() < began_s + TAKEOVER_S
+                time.sleep(0.001)
+            is_over.append(True)
+            for one in askers:
+                one.join()
+            assert_same(remote, local, range(3, 60))  # a state is saved with the new service
+            assert client.get(f"/sessions/{remote.flows.session}")["saved_number"] > 0
+            assert client.flows.url == other != primary
+            with service.client() as admin:
+                known = {one["id"] for one in admin.get("/identities")["identities"]}
+                told = admin.get("/events", subject="service", limit=1000)["events"]
+            assert known >= set(acknowledged)
+            starts = [one["data"] for one in told if one["kind"] == "service.started"]
+            assert [one["is_standby"] for one in starts] == [False, True]
+            assert starts[0]["load"]["weights"] == [0.6, 0.2, 0.2]
+            remote.close()
+            local.close()
+        cluster.stop()
+
+
+def test_a_standby_follows_the_log_until_the_store_is_free(empty_postgresql: str) -> None:
+    fleet = Fleet(empty_postgresql)
+    store = EventStore(empty_postgresql, is_standby=True)
+    assert not store.try_lock()
+    fleet.log.flush()
+    log = EventLog(store, is_own=False)
+    fleet.join("a", "b")
+    fleet.log.flush()
+    assert log.catch_up() > 0
+    assert log.state == fleet.log.state
+    fleet.open()
+    fleet.close()
+    found = follow_store(store, lambda _: None)
+    assert found.sequence == fleet.log.sequence
+    assert found.state == fleet.log.state
+    store.close()
+
+
+def test_a_changed_log_is_noticed_when_a_standby_takes_over(empty_postgresql: str) -> None:
+    fleet = Fleet(empty_postgresql)
+    fleet.join("a")
+    fleet.close()
+    change(
+        empty_postgresql, "DELETE FROM events WHERE sequence = (SELECT max(sequence) FROM events)"
+    )
+    store = EventStore(empty_postgresql, is_standby=True)
+    with pytest.raises(ServiceError, match="head"):
+        follow_store(store, lambda _: None)
+    store.close()
+
+
+def test_a_service_that_lost_its_connection_writes_nothing_more(empty_postgresql: str) -> None:
+    fleet = Fleet(empty_postgresql)
+    fleet.log.flush()
+    others = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
+    change(empty_postgresql, f"{others} AND datname = current_database()")
+    for _ in range(2):  # a new connection would not have the lock
+        with pytest.raises(ServiceError, match="does not answer"):
+            fleet.log.store.check_lock()
+    fleet.register("a")
+    with pytest.raises(ServiceError):
+        fleet.log.flush()
+    fleet.log.store.close()
+    again = EventLog(EventStore(empty_postgresql))
+    assert "a" not in again.state.nodes
+    again.store.close()
+
+
+def change(url: str, statement: str) -> None:
+    engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
+    with engine.begin() as connection:
+        connection.execute(text(statement))
+    engine.dispose()
+
+
+def test_a_standby_needs_a_store_that_two_services_can_use(tmp_path: Path) -> None:
+    with pytest.raises(ServiceError, match="postgresql://"):
+        EventStore(tmp_path / "store.sqlite", is_standby=True)
+    assert not (tmp_path / "store.sqlite").exists()
+
+
+def test_services_that_do_not_answer_are_asked_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cavmarl.client.service_protocol.TAKEOVER_S", 0.5)
+    began_s = time.monotonic()
+    with (
+        Client("http://127.0.0.1:9,http://127.0.0.1:19", "secret") as client,
+        pytest.raises(ServiceError, match=r"127\.0\.0\.1"),
+    ):
+        client.get("/nodes")
+    assert 0.4 < time.monotonic() - began_s < 5.0
