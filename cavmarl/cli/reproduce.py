@@ -111,9 +111,7 @@ def _files(given: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def _list(
-    console: Console, lines: Mapping[str, Line], root: Path, json_path: Path | None
-) -> None:
+def _list(console: Console, lines: Mapping[str, Line], root: Path, json_path: Path | None) -> None:
     from cavmarl.verify.published_lines import cells_of
 
     rows = []

@@ -1,4 +1,4 @@
-"""Published numbers: lines that name numbers of pages, the commands that repeat them, and tolerances.
+"""Published numbers: lines with numbers of pages, the commands that repeat them, and tolerances.
 
 `docs/figures/lines.yaml` has the lines. The published values are read from the pages themselves:
 from prose by patterns in which `{}` stands for a number, from tables by row and column.
@@ -35,16 +35,17 @@ class Line:
         values: an expression of the command's JSON for each `{}`; empty: a condition, which is not
             compared. With the tolerance `range`, there is one for two numbers.
         table: beginning of the header row of a table.
-        section: heading above the table; empty if the header row is unique in the page. Without text
-            and table, the line has all numbers of this section that no other line has.
+        section: heading above the table; empty if the header row is unique in the page. Without
+            text and table, the line has all numbers of this section that no other line has.
         nth: number of the table among those with this header in this section, from 1.
         row: path of the object to which the expressions of columns are relative.
-        word: word of the command and the expressions that stands for a row of the table, for example
-            `NAME`. `NAME_` stands for the same with `_` in place of `-`.
+        word: word of the command and the expressions that stands for a row of the table, for
+            example `NAME`. `NAME_` stands for the same with `_` in place of `-`.
         rows: label of a row → what replaces the word; empty: all rows, with their labels.
         columns: head → expression; empty: a condition, which is not compared.
         tolerance: `exact` (equal in the digits of the page), `N %` of the published number, `N`, or
-            `range`: measured values lie between two published ones, `range N %` wider on both sides.
+            `range`: measured values lie between two published ones, `range N %`: wider on both
+            sides.
         needs: what has to be there: `module:NAME`, `program:NAME`, `variable:NAME` of the
             environment, `file:WORD`, which is a word of the command that `--file` replaces.
         minutes: how long the command takes.
@@ -193,7 +194,7 @@ def cells_of(name: str, line: Line, root: Path, *, quick: bool = False) -> list[
 
 
 def find_text(where: str, pattern: str, text: str) -> re.Match[str]:
-    """Return the one match of a pattern in a page; raises ConfigError if there is none or several."""
+    """Return the one match of a pattern in a page; raises ConfigError if there is not one."""
     found = list(compile_pattern(pattern).finditer(text))
     if len(found) != 1:
         count = "no text" if not found else f"{len(found)} texts"
@@ -284,7 +285,9 @@ def _table_cells(where: str, line: Line, text: str, quick: bool) -> Iterator[Cel
     table = find_table(where, line, text)
     labels = {label_of(row): row for row in table.rows}
     if unknown := [*(line.rows.keys() | set(line.quick_rows)) - labels.keys()]:
-        raise ConfigError(f"{where}: the table has no row {unknown[0]!r}; it has {', '.join(labels)}")
+        raise ConfigError(
+            f"{where}: the table has no row {unknown[0]!r}; it has {', '.join(labels)}"
+        )
     if unknown := [head for head in line.columns if head not in table.heads]:
         raise ConfigError(
             f"{where}: the table has no column {unknown[0]!r}; it has {' | '.join(table.heads)}"

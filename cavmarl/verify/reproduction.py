@@ -23,7 +23,7 @@ from cavmarl.core.processes import dying_with_parent, last_words
 from cavmarl.verify.published_lines import Cell, Line, cells_of
 from cavmarl.verify.result_paths import as_number, numbers_at
 
-Verdict = Literal["same", "differs", "passed", "failed", "skipped", "by hand"]
+Verdict = Literal["same", "differs", "failed", "skipped", "by hand"]
 Say = Callable[[str], None]
 LEAST_S = 300.0  # a command may take this long, or `SLOWER` times its minutes
 SLOWER = 10.0
@@ -55,9 +55,8 @@ class LineResult:
 
     Attributes:
         name: of the line.
-        verdict: `same`: all numbers agree; `differs`; `passed`: the command checks its result itself
-            and has ended with 0; `failed`: it has not, or has no such result; `skipped` and
-            `by hand`: it did not run.
+        verdict: `same`: all numbers agree; `differs`; `failed`: the command has failed, or has no
+            such result; `skipped` and `by hand`: it did not run.
         comparisons: the compared numbers.
         reason: why it was not run or has failed.
     """
@@ -103,10 +102,10 @@ class CommandRunner:
         return ""
 
     def run(self, command: str, minutes: float) -> Any:
-        """Return the JSON of a command, or None if it writes none.
+        """Return the JSON of a command.
 
         Raises:
-            EvaluationError: the command has failed, or has not ended in time.
+            EvaluationError: the command has failed, has not ended in time, or writes no JSON.
         """
         if command not in self._found:
             try:
@@ -143,8 +142,12 @@ class CommandRunner:
             finally:
                 _end_group(program)
             if code:
-                raise EvaluationError(f"ended with exit code {code}: {_last_line(last_words(output))}")
-            return json.loads(result.read_text("utf-8")) if result.is_file() else None
+                raise EvaluationError(
+                    f"ended with exit code {code}: {_last_line(last_words(output))}"
+                )
+            if result.is_file():
+                return json.loads(result.read_text("utf-8"))
+            raise EvaluationError(f"has written no result: {command}")
 
     def _words(self, command: str) -> list[str]:
         for word, path in self._files.items():
@@ -194,7 +197,7 @@ def _repeated(name: str, line: Line, cells: Sequence[Cell], runner: CommandRunne
     except EvaluationError as error:
         return LineResult(name, "failed", tuple(found), str(error))
     if not found:
-        return LineResult(name, "passed")
+        return LineResult(name, "failed", reason="the line compares nothing; add an expression")
     is_same = all(comparison.is_same for comparison in found)
     return LineResult(name, "same" if is_same else "differs", tuple(found))
 
@@ -218,7 +221,7 @@ def _compared(cell: Cell, line: Line, document: Any) -> Iterator[Comparison]:
 
 
 def _as_shown(measured: list[float], count: int, cell: Cell) -> list[float]:
-    """Return mean and half width in place of a mean with the ends of its interval, if two are shown."""
+    """Return mean and half width for a mean with the ends of its interval, if two are shown."""
     if count == 2 and len(measured) == 3:
         mean, _, high = measured
         return [mean, high - mean]
@@ -240,7 +243,7 @@ def _comparison(
 
 
 def _is_close(published: str, measured: float, tolerance: str) -> bool:
-    """Return whether a measured number is the published one, in its digits or within a tolerance."""
+    """Return whether a measured number is the published one in its digits, or close to it."""
     expected = as_number(published)
     if tolerance == "exact":
         decimals = len(published.partition(".")[2])

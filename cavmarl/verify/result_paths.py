@@ -2,10 +2,11 @@ r"""Expressions that name numbers in the JSON of a command.
 
 An expression is a path, such as `policies.idm.metrics.success` or `rows[side=libsumo].median`. A
 step is a key, an index, `{a key with any characters}` or `*` for all elements; `[key=value,…]`
-chooses an element of a list, with braces around a value with commas. `100 max rows.*.share` applies operations from right to left: a factor,
-`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth` number of a text. `PATH / PATH`
-is a ratio, `PATH ; PATH` the first numbers of several paths. A metric of an evaluation is its mean
-with the ends of its interval, in the unit of the reports.
+chooses an element of a list, with braces around a value with commas. `100 max rows.*.share` applies
+operations from right to left: a factor, `min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to
+`fourth`. The numbers of a text are those that it shows. `PATH / PATH` is a ratio, `PATH ; PATH` the
+first numbers of several paths. A metric of an evaluation is its mean with the ends of its interval,
+in the unit of the reports.
 """
 
 from __future__ import annotations
@@ -42,15 +43,20 @@ def numbers_at(expression: str, document: Any) -> list[float]:
     found = _evaluate(over.strip(), document)
     if not is_ratio:
         return found
-    (below,) = _evaluate(under.strip(), document)
-    return [value / below for value in found]
+    below = _evaluate(under.strip(), document)
+    if len(below) != 1 or below[0] == 0.0:
+        raise _too_few(under, below)
+    return [value / below[0] for value in found]
 
 
 def _evaluate(expression: str, document: Any) -> list[float]:
     word, _, rest = expression.partition(" ")
     if rest and word in _OPERATIONS:
         values = _evaluate(rest, document)
-        return [float(_OPERATIONS[word](values))] if values else []
+        try:
+            return [float(_OPERATIONS[word](values))]
+        except (IndexError, ValueError) as error:  # also of statistics
+            raise _too_few(expression, values) from error
     if rest and re.fullmatch(NUMBER, word):
         return [float(word) * value for value in _evaluate(rest, document)]
     return _numbers(_at(expression, document), expression)
@@ -71,7 +77,9 @@ def _at(path: str, document: Any) -> Any:
                 key = quoted if quoted is not None else plain
                 found = found[int(key)] if isinstance(found, list) else found[key]
         except (LookupError, TypeError, ValueError) as error:
-            known = ", ".join(map(str, found)) if isinstance(found, Mapping) else type(found).__name__
+            known = (
+                ", ".join(map(str, found)) if isinstance(found, Mapping) else type(found).__name__
+            )
             raise EvaluationError(
                 f"the result has no {match[0]} at {seen or 'its top'} of {path!r} ({known}); "
                 "correct the expression"
@@ -109,6 +117,10 @@ def _numbers(found: Any, path: str) -> list[float]:
         case None:
             return []
     raise EvaluationError(f"{path!r} is {found!r}, which is no number; correct the expression")
+
+
+def _too_few(expression: str, values: Sequence[float]) -> EvaluationError:
+    return EvaluationError(f"{expression.strip()!r} has too few numbers: {list(values)}")
 
 
 def as_number(text: str) -> float:
