@@ -60,7 +60,7 @@ def reproduce(
     if listed:
         return _list(console, chosen, root, json_path)
     runner = CommandRunner(root, _files(files or ()))
-    results = []
+    results: list[LineResult] = []
     with progress_bar(console) as bar:
         task = bar.add_task("", total=len(chosen))
 
