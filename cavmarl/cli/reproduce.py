@@ -18,10 +18,10 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import progress_bar
 
 if TYPE_CHECKING:
-    from cavmarl.verify.published_lines import Line
+    from cavmarl.verify.published_lines import PublishedLine
     from cavmarl.verify.reproduction import LineResult
 
-ALL_SHOWN = 4  # a line with more numbers shows those that differ, and a count
+ALL_SHOWN = 4  # of a line with more numbers, only wrong numbers are shown, and a count
 
 
 def reproduce(
@@ -83,8 +83,8 @@ def reproduce(
 
 
 def _chosen(
-    lines: Mapping[str, Line], names: Sequence[str], quick: bool, every: bool, listed: bool
-) -> dict[str, Line]:
+    lines: Mapping[str, PublishedLine], names: Sequence[str], quick: bool, every: bool, listed: bool
+) -> dict[str, PublishedLine]:
     """Return the lines that the command line asks for; raises ConfigError."""
     if quick and every:
         raise ConfigError("--quick and --all: use only one of the two")
@@ -111,7 +111,9 @@ def _files(given: Sequence[str]) -> dict[str, Path]:
     return found
 
 
-def _list(console: Console, lines: Mapping[str, Line], root: Path, json_path: Path | None) -> None:
+def _list(
+    console: Console, lines: Mapping[str, PublishedLine], root: Path, json_path: Path | None
+) -> None:
     from cavmarl.verify.published_lines import cells_of
 
     rows = []
@@ -124,7 +126,7 @@ def _list(console: Console, lines: Mapping[str, Line], root: Path, json_path: Pa
     write_json(json_path, {"lines": {name: asdict(line) for name, line in lines.items()}})
 
 
-def _how(line: Line) -> str:
+def _how(line: PublishedLine) -> str:
     if line.by_hand:
         return "by hand"
     time = "quick" if line.is_quick else f"{line.minutes:g} min"

@@ -324,7 +324,7 @@ def _check_training(folder: Path) -> None:
 def _groups(entries: Iterable[BoardEntry]) -> dict[str, list[BoardEntry]]:
     """Return the entries of each environment and conditions, the most successful first.
 
-    Entries that are not verified and those that failed come last, as their figures are unproven.
+    Entries that failed or are not verified come last, because their figures are unproven.
     """
     groups: dict[str, list[BoardEntry]] = {}
     for entry in entries:

@@ -24,7 +24,7 @@ _NEEDS = ("module", "program", "variable", "file")
 
 
 @dataclass(frozen=True)
-class Line:
+class PublishedLine:
     """Numbers of a page and the command that repeats them.
 
     Attributes:
@@ -81,6 +81,8 @@ class Line:
             raise ConfigError(
                 f"tolerance = {self.tolerance!r}: must be exact, range, range N %, N % or N"
             )
+        if self.table and self.tolerance.startswith("range"):
+            raise ConfigError("tolerance = range: is for text; tables have N % or N")
         for need in self.needs:
             kind, _, name = need.partition(":")
             if kind not in _NEEDS or not name:
@@ -108,11 +110,11 @@ class PublishedLines:
         conditions: page → patterns of numbers that are conditions, settings or versions.
     """
 
-    lines: dict[str, Line]
+    lines: dict[str, PublishedLine]
     conditions: dict[str, tuple[str, ...]] = field(default_factory=dict)
 
 
-class Cell(NamedTuple):
+class PublishedCell(NamedTuple):
     """Published numbers that belong to one command.
 
     Attributes:
@@ -168,7 +170,9 @@ def read_lines(root: Path) -> PublishedLines:
     return validate(PublishedLines, read_yaml(path), str(path))
 
 
-def cells_of(name: str, line: Line, root: Path, *, quick: bool = False) -> list[Cell]:
+def cells_of(
+    name: str, line: PublishedLine, root: Path, *, quick: bool = False
+) -> list[PublishedCell]:
     """Return the published numbers of a line, as the page shows them.
 
     Args:
@@ -187,7 +191,7 @@ def cells_of(name: str, line: Line, root: Path, *, quick: bool = False) -> list[
     where = f"{LINES_FILE}: {name}: {line.page}"
     if line.is_section:
         numbers = re.findall(FREE_NUMBER, without_code(section_of(where, line.section, text)))
-        return [Cell(line.section, line.command, tuple(numbers), ())]
+        return [PublishedCell(line.section, line.command, tuple(numbers), ())]
     if line.text:
         return list(_text_cells(where, line, text))
     return list(_table_cells(where, line, text, quick))
@@ -241,7 +245,7 @@ def tables_of(text: str) -> Iterator[PageTable]:
             section = each.lstrip("# ")
 
 
-def find_table(where: str, line: Line, text: str) -> PageTable:
+def find_table(where: str, line: PublishedLine, text: str) -> PageTable:
     """Return the table of a line; raises ConfigError if the page does not have it."""
     wanted = " | ".join(part.strip() for part in line.table.split("|"))
     found = [
@@ -268,20 +272,26 @@ def label_of(row: tuple[str, ...]) -> str:
     return ""
 
 
-def _text_cells(where: str, line: Line, text: str) -> Iterator[Cell]:
+def _text_cells(where: str, line: PublishedLine, text: str) -> Iterator[PublishedCell]:
     left = list(line.values)
     for pattern in line.text:
         numbers = find_text(where, pattern, text).groups()
-        count = len(numbers) // 2 if line.tolerance.startswith("range") else len(numbers)
+        count = len(numbers)
+        if line.tolerance.startswith("range"):
+            count, odd = divmod(count, 2)
+            if odd:
+                raise ConfigError(f"{where}: {pattern!r} needs two numbers for each range")
         own, left = left[:count], left[count:]
         if not line.by_hand and line.values and len(own) < count:
             raise ConfigError(f"{where}: values has too few expressions for {pattern!r}")
-        yield Cell(pattern, line.command, numbers, tuple(own))
+        yield PublishedCell(pattern, line.command, numbers, tuple(own))
     if left:
         raise ConfigError(f"{where}: values has {len(left)} expressions without a number")
 
 
-def _table_cells(where: str, line: Line, text: str, quick: bool) -> Iterator[Cell]:
+def _table_cells(
+    where: str, line: PublishedLine, text: str, quick: bool
+) -> Iterator[PublishedCell]:
     table = find_table(where, line, text)
     labels = {label_of(row): row for row in table.rows}
     if unknown := [*(line.rows.keys() | set(line.quick_rows)) - labels.keys()]:
@@ -301,7 +311,7 @@ def _table_cells(where: str, line: Line, text: str, quick: bool) -> Iterator[Cel
             numbers = tuple(re.findall(FREE_NUMBER, cells[table.heads.index(head)]))
             if numbers and expression:
                 path = f"{line.row}.{expression}" if line.row else expression
-                yield Cell(
+                yield PublishedCell(
                     f"{label}, {head}",
                     with_row(line.command, line.word, value),
                     numbers,

@@ -20,7 +20,7 @@ from typing import Any, Literal
 
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.processes import dying_with_parent, last_words
-from cavmarl.verify.published_lines import Cell, Line, cells_of
+from cavmarl.verify.published_lines import PublishedCell, PublishedLine, cells_of
 from cavmarl.verify.result_paths import as_number, numbers_at
 
 Verdict = Literal["same", "differs", "failed", "skipped", "by hand"]
@@ -31,7 +31,7 @@ _WITH_JSON = ("cavmarl ", "python -m benchmarks")
 
 
 @dataclass(frozen=True)
-class Comparison:
+class ComparedNumber:
     """A published number beside the measured one.
 
     Attributes:
@@ -63,7 +63,7 @@ class LineResult:
 
     name: str
     verdict: Verdict
-    comparisons: tuple[Comparison, ...] = ()
+    comparisons: tuple[ComparedNumber, ...] = ()
     reason: str = ""
 
     @property
@@ -163,7 +163,7 @@ class CommandRunner:
 
 
 def reproduce(
-    lines: Mapping[str, Line], root: Path, runner: CommandRunner, *, quick: bool, say: Say
+    lines: Mapping[str, PublishedLine], root: Path, runner: CommandRunner, *, quick: bool, say: Say
 ) -> Iterator[LineResult]:
     """Repeat lines and yield their results.
 
@@ -188,8 +188,10 @@ def reproduce(
             yield _repeated(name, line, cells, runner)
 
 
-def _repeated(name: str, line: Line, cells: Sequence[Cell], runner: CommandRunner) -> LineResult:
-    found: list[Comparison] = []
+def _repeated(
+    name: str, line: PublishedLine, cells: Sequence[PublishedCell], runner: CommandRunner
+) -> LineResult:
+    found: list[ComparedNumber] = []
     try:
         for cell in cells:
             document = runner.run(cell.command, line.minutes)
@@ -202,25 +204,28 @@ def _repeated(name: str, line: Line, cells: Sequence[Cell], runner: CommandRunne
     return LineResult(name, "same" if is_same else "differs", tuple(found))
 
 
-def _compared(cell: Cell, line: Line, document: Any) -> Iterator[Comparison]:
-    """Yield the comparisons of a cell; its text is wrong if it has more numbers than the result."""
-    is_range = line.tolerance.startswith("range")
-    shown = list(zip(*[iter(cell.numbers)] * 2, strict=True)) if is_range else cell.numbers
+def _compared(cell: PublishedCell, line: PublishedLine, document: Any) -> Iterator[ComparedNumber]:
+    """Yield the comparisons of a cell; a number that the result does not have is wrong."""
+    shown = _shown_numbers(cell, line.tolerance)
     if line.table:
-        measured = numbers_at(cell.expressions[0], document)
-        if not is_range:
-            measured = _as_shown(measured, len(shown), cell)
-        pairs = zip(shown, [*measured, *[None] * len(shown)], strict=False)
-        yield from (_comparison(cell.place, *pair, line.tolerance) for pair in pairs)
+        measured = _as_shown(numbers_at(cell.expressions[0], document), len(shown))
+        for place, numbers in enumerate(shown):
+            value = measured[place] if place < len(measured) else None
+            yield _comparison(cell.place, numbers, value, line.tolerance)
         return
-    for number, expression in zip(shown, cell.expressions, strict=False):
+    for numbers, expression in zip(shown, cell.expressions, strict=False):
         if expression:
-            values = numbers_at(expression, document)
-            value = values[0] if values else None
-            yield _comparison(cell.place, number, value, line.tolerance)
+            found = numbers_at(expression, document)
+            yield _comparison(cell.place, numbers, found[0] if found else None, line.tolerance)
 
 
-def _as_shown(measured: list[float], count: int, cell: Cell) -> list[float]:
+def _shown_numbers(cell: PublishedCell, tolerance: str) -> list[tuple[str, ...]]:
+    """Return the published numbers of a cell, each alone; those of a range in pairs."""
+    step = 2 if tolerance.startswith("range") else 1
+    return [cell.numbers[k : k + step] for k in range(0, len(cell.numbers), step)]
+
+
+def _as_shown(measured: list[float], count: int) -> list[float]:
     """Return mean and half width for a mean with the ends of its interval, if two are shown."""
     if count == 2 and len(measured) == 3:
         mean, _, high = measured
@@ -229,17 +234,17 @@ def _as_shown(measured: list[float], count: int, cell: Cell) -> list[float]:
 
 
 def _comparison(
-    place: str, published: str | tuple[str, str], measured: float | None, tolerance: str
-) -> Comparison:
-    if isinstance(published, tuple):
+    place: str, published: tuple[str, ...], measured: float | None, tolerance: str
+) -> ComparedNumber:
+    text = " to ".join(published)
+    if measured is None or not math.isfinite(measured):
+        return ComparedNumber(place, text, measured, tolerance, False)
+    if tolerance.startswith("range"):
         low, high = map(as_number, published)
         share = float(tolerance.split()[1]) / 100.0 if " " in tolerance else 0.0
-        is_same = measured is not None and low - share * abs(low) <= measured <= high + share * abs(
-            high
-        )
-        return Comparison(place, " to ".join(published), measured, tolerance, is_same)
-    is_same = measured is not None and _is_close(published, measured, tolerance)
-    return Comparison(place, published, measured, tolerance, is_same)
+        is_same = low - share * abs(low) <= measured <= high + share * abs(high)
+        return ComparedNumber(place, text, measured, tolerance, is_same)
+    return ComparedNumber(place, text, measured, tolerance, _is_close(text, measured, tolerance))
 
 
 def _is_close(published: str, measured: float, tolerance: str) -> bool:
@@ -250,7 +255,7 @@ def _is_close(published: str, measured: float, tolerance: str) -> bool:
         return float(f"{measured:.{decimals}f}") == expected
     size, _, unit = tolerance.partition(" ")
     most = float(size) * (abs(expected) / 100.0 if unit else 1.0)
-    return math.isfinite(measured) and abs(measured - expected) <= most
+    return abs(measured - expected) <= most
 
 
 def _end_group(program: subprocess.Popen[Any]) -> None:

@@ -1,12 +1,11 @@
 r"""Expressions that name numbers in the JSON of a command.
 
-An expression is a path, such as `policies.idm.metrics.success` or `rows[side=libsumo].median`. A
-step is a key, an index, `{a key with any characters}` or `*` for all elements; `[key=value,…]`
-chooses an element of a list, with braces around a value with commas. `100 max rows.*.share` applies
-operations from right to left: a factor, `min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to
-`fourth`. The numbers of a text are those that it shows. `PATH / PATH` is a ratio, `PATH ; PATH` the
-first numbers of several paths. A metric of an evaluation is its mean with the ends of its interval,
-in the unit of the reports.
+An expression is a path, such as `rows[side=libsumo].median`. A step is a key, an index, `{any key}`
+or `*` for all elements; `[key=value,…]` chooses an element of a list, with braces around a value
+with commas. `100 max rows.*.share` applies operations from right to left: a factor,
+`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth`. A text has the numbers that it
+shows. `PATH / PATH` is a ratio, `PATH ; PATH` the first numbers of several paths. A metric of an
+evaluation is its mean with the ends of its interval, in the unit of the reports.
 """
 
 from __future__ import annotations

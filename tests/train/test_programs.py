@@ -16,6 +16,7 @@ from cavmarl.config.registry import entries, load_config
 from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
+from cavmarl.networks.driver_network import load_driver_network
 from tests.support.generated import check_block
 from tests.support.training import TRAIN, load_program
 

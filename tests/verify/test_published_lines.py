@@ -11,7 +11,7 @@ import pytest
 from cavmarl.core.errors import ConfigError
 from cavmarl.verify.published_lines import (
     FREE_NUMBER,
-    Line,
+    PublishedLine,
     PublishedLines,
     cells_of,
     compile_pattern,
@@ -89,7 +89,7 @@ def covered(
             yield from ((span, name) for span in table_spans(name, line, text))
 
 
-def table_spans(name: str, line: Line, text: str) -> Iterator[tuple[int, int]]:
+def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
     """Yield the places of the cells of a line, of the first cell of each row and of the heads."""
     table = find_table(name, line, text)
     wanted = {place for place, head in enumerate(table.heads) if head in line.columns}
@@ -110,13 +110,13 @@ def test_a_number_that_no_line_has_is_found() -> None:
     page = (
         "# A\n\nIt takes 3 s on 2 cores.\n\n| a | b |\n|---|---|\n| x | 4 |\n| y 7 | 5 |\n\n`8`\n"
     )
-    line = Line("page.md", "cavmarl list", table="a", rows={"x": "x"}, columns={"b": "at"})
+    line = PublishedLine("page.md", "cavmarl list", table="a", rows={"x": "x"}, columns={"b": "at"})
     published = PublishedLines({"line": line}, {"page.md": ("on {} cores",)})
     found = " ".join(uncovered("page.md", page, published))
     assert "takes 3 s" in found
     assert "| y 7" in found
-    line = Line("page.md", "cavmarl list", table="a", columns={"b": "at"})
-    more = {"line": line, "text": Line("page.md", "cavmarl list", text=("takes {} s",))}
+    line = PublishedLine("page.md", "cavmarl list", table="a", columns={"b": "at"})
+    more = {"line": line, "text": PublishedLine("page.md", "cavmarl list", text=("takes {} s",))}
     published = PublishedLines(more, {"page.md": ("on {} cores",)})
     assert list(uncovered("page.md", page, published)) == []
 
@@ -141,7 +141,7 @@ as fast, and 7 to 9 m.
 
 def cells(tmp_path: Path, quick: bool = False, **keys: object) -> list[tuple[str, ...]]:
     (tmp_path / "page.md").write_text(PAGE, encoding="utf-8")
-    line = Line("page.md", "cavmarl NAME NAME_ippo", **keys)  # type: ignore[arg-type]
+    line = PublishedLine("page.md", "cavmarl NAME NAME_ippo", **keys)  # type: ignore[arg-type]
     found = cells_of("line", line, tmp_path, quick=quick)
     return [(cell.command, *cell.numbers, "/", *cell.expressions) for cell in found]
 
@@ -187,6 +187,8 @@ def test_cells_of_tables_are_found_by_row_and_column(tmp_path: Path) -> None:
         ({"table": "name", "quick_rows": ("three",)}, "no row 'three'"),
         ({"section": "Other", "by_hand": "slow"}, "no heading 'Other'"),
         ({}, "either text or table"),
+        ({"table": "name", "tolerance": "range"}, "is for text; tables have N % or N"),
+        ({"text": ("is {} times",), "tolerance": "range"}, "two numbers for each range"),
         ({"text": ("a",), "table": "a"}, "either text or table"),
         ({"text": ("a",), "tolerance": "about"}, "must be exact, range, range N %, N % or N"),
         ({"text": ("a",), "needs": ("luck",)}, "'luck' must be KIND:NAME"),
@@ -205,7 +207,7 @@ def test_lines_need_a_checkout(tmp_path: Path) -> None:
 
 def test_a_page_must_exist(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"line: there is no page gone\.md"):
-        cells_of("line", Line("gone.md", "cavmarl list", text=("a",)), tmp_path)
+        cells_of("line", PublishedLine("gone.md", "cavmarl list", text=("a",)), tmp_path)
 
 
 def test_unknown_keys_of_lines_are_refused(tmp_path: Path) -> None:

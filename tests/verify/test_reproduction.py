@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from cavmarl.core.errors import ConfigError, EvaluationError
-from cavmarl.verify.published_lines import Line, read_lines
+from cavmarl.verify.published_lines import PublishedLine, read_lines
 from cavmarl.verify.reproduction import CommandRunner, LineResult, reproduce
 from cavmarl.verify.result_paths import numbers_at
 
@@ -50,14 +50,20 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def results(checkout: Path, *lines: Line, quick: bool = False, **files: Path) -> list[LineResult]:
+def results(
+    checkout: Path, *lines: PublishedLine, quick: bool = False, **files: Path
+) -> list[LineResult]:
     named = {f"line{number}": line for number, line in enumerate(lines)}
     runner = CommandRunner(checkout, files)
     return list(reproduce(named, checkout, runner, quick=quick, say=lambda name: None))
 
 
-def text(*patterns: str, values: tuple[str, ...] = (), name: str = "speed", **keys: Any) -> Line:
-    return Line("page.md", f"python -m benchmarks {name}", text=patterns, values=values, **keys)
+def text(
+    *patterns: str, values: tuple[str, ...] = (), name: str = "speed", **keys: Any
+) -> PublishedLine:
+    return PublishedLine(
+        "page.md", f"python -m benchmarks {name}", text=patterns, values=values, **keys
+    )
 
 
 @pytest.mark.parametrize(
@@ -85,7 +91,7 @@ def test_numbers_are_compared_within_a_tolerance(
 
 def test_rows_of_a_table_are_compared_and_a_command_runs_once(checkout: Path) -> None:
     command = "python -m benchmarks speed"
-    line = Line(
+    line = PublishedLine(
         "page.md", command, table="n", row="rows[n=ROW]", columns={"x": "x"}, quick_rows=("2",)
     )
     (all_rows,) = results(checkout, line)
@@ -101,7 +107,7 @@ def test_rows_of_a_table_are_compared_and_a_command_runs_once(checkout: Path) ->
 
 def test_a_wrong_number_of_a_page_is_found(checkout: Path) -> None:
     (checkout / "page.md").write_text(PAGE.replace("4.0", "4.1"))
-    line = Line(
+    line = PublishedLine(
         "page.md", "python -m benchmarks speed", table="n", row="rows[n=ROW]", columns={"x": "x"}
     )
     (found,) = results(checkout, line)
