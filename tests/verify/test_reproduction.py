@@ -15,6 +15,8 @@ from cavmarl.verify.published_lines import PublishedLine, read_lines
 from cavmarl.verify.reproduction import CommandRunner, LineResult, reproduce
 from cavmarl.verify.result_paths import numbers_at
 
+pytestmark = pytest.mark.integration  # commands are processes
+
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
 import json, os, sys, time
