@@ -122,12 +122,14 @@ class PublishedCell(NamedTuple):
         command: the command with the row's label.
         numbers: texts of the numbers.
         expressions: an expression for each number or, in a table, one for all of them.
+        row: path of the object to which the expressions are relative; empty: the whole JSON.
     """
 
     place: str
     command: str
     numbers: tuple[str, ...]
     expressions: tuple[str, ...]
+    row: str = ""
 
 
 @dataclass(frozen=True)
@@ -310,13 +312,9 @@ def _table_cells(
         for head, expression in line.columns.items():
             numbers = tuple(re.findall(FREE_NUMBER, cells[table.heads.index(head)]))
             if numbers and expression:
-                path = f"{line.row}.{expression}" if line.row else expression
-                yield PublishedCell(
-                    f"{label}, {head}",
-                    with_row(line.command, line.word, value),
-                    numbers,
-                    (with_row(path, line.word, value),),
-                )
+                given = (line.command, expression, line.row)
+                command, expression, row = (with_row(one, line.word, value) for one in given)
+                yield PublishedCell(f"{label}, {head}", command, numbers, (expression,), row)
 
 
 def with_row(text: str, word: str, value: str) -> str:

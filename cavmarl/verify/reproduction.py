@@ -21,7 +21,7 @@ from typing import Any, Literal
 from cavmarl.core.errors import ConfigError, EvaluationError
 from cavmarl.core.processes import dying_with_parent, last_words
 from cavmarl.verify.published_lines import PublishedCell, PublishedLine, cells_of
-from cavmarl.verify.result_paths import as_number, numbers_at
+from cavmarl.verify.result_paths import as_number, numbers_at, value_at
 
 Verdict = Literal["same", "differs", "failed", "skipped", "by hand"]
 Say = Callable[[str], None]
@@ -208,7 +208,8 @@ def _compared(cell: PublishedCell, line: PublishedLine, document: Any) -> Iterat
     """Yield the comparisons of a cell; a number that the result does not have is wrong."""
     shown = _shown_numbers(cell, line.tolerance)
     if line.table:
-        measured = _as_shown(numbers_at(cell.expressions[0], document), len(shown))
+        own = value_at(cell.row, document) if cell.row else document
+        measured = _as_shown(numbers_at(cell.expressions[0], own), len(shown))
         for place, numbers in enumerate(shown):
             value = measured[place] if place < len(measured) else None
             yield _comparison(cell.place, numbers, value, line.tolerance)

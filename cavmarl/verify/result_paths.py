@@ -58,10 +58,11 @@ def _evaluate(expression: str, document: Any) -> list[float]:
             raise _too_few(expression, values) from error
     if rest and re.fullmatch(NUMBER, word):
         return [float(word) * value for value in _evaluate(rest, document)]
-    return _numbers(_at(expression, document), expression)
+    return _numbers(value_at(expression, document), expression)
 
 
-def _at(path: str, document: Any) -> Any:
+def value_at(path: str, document: Any) -> Any:
+    """Return the value at a path; raises EvaluationError if the result does not have it."""
     found, seen = document, ""
     for match in _STEP.finditer(path):
         quoted, plain, chosen = match.groups()
@@ -71,7 +72,7 @@ def _at(path: str, document: Any) -> Any:
             elif plain == "*":
                 rest = path[match.end() :].lstrip(".")
                 elements = found.values() if isinstance(found, Mapping) else found
-                return [_at(rest, each) if rest else each for each in elements]
+                return [value_at(rest, each) if rest else each for each in elements]
             elif quoted is not None or plain is not None:
                 key = quoted if quoted is not None else plain
                 found = found[int(key)] if isinstance(found, list) else found[key]

@@ -143,7 +143,10 @@ def cells(tmp_path: Path, quick: bool = False, **keys: object) -> list[tuple[str
     (tmp_path / "page.md").write_text(PAGE, encoding="utf-8")
     line = PublishedLine("page.md", "cavmarl NAME NAME_ippo", **keys)  # type: ignore[arg-type]
     found = cells_of("line", line, tmp_path, quick=quick)
-    return [(cell.command, *cell.numbers, "/", *cell.expressions) for cell in found]
+    return [
+        (cell.command, *cell.numbers, "/", *cell.expressions, *filter(None, [cell.row]))
+        for cell in found
+    ]
 
 
 def test_numbers_of_prose_are_found_over_breaks_of_lines(tmp_path: Path) -> None:
@@ -170,7 +173,7 @@ def test_cells_of_tables_are_found_by_row_and_column(tmp_path: Path) -> None:
     assert cells(tmp_path, **keys) == expected
     assert cells(tmp_path, quick=True, quick_rows=("one",), **keys) == expected[:1]
     own = cells(tmp_path, **{**keys, "rows": {"one": "1"}, "row": "rows[n=NAME]"})
-    assert own == [("cavmarl 1 1_ippo", "3", "0.5", "/", "rows[n=1].at.1")]
+    assert own == [("cavmarl 1 1_ippo", "3", "0.5", "/", "at.1", "rows[n=1]")]
 
 
 @pytest.mark.parametrize(

@@ -110,7 +110,7 @@ def test_rows_of_a_table_are_compared_and_a_command_runs_once(checkout: Path) ->
 def test_a_wrong_number_of_a_page_is_found(checkout: Path) -> None:
     (checkout / "page.md").write_text(PAGE.replace("4.0", "4.1"))
     line = PublishedLine(
-        "page.md", "python -m benchmarks speed", table="n", row="rows[n=ROW]", columns={"x": "x"}
+        "page.md", "python -m benchmarks speed", table="n", row="rows[n=ROW]", columns={"x": "1 x"}
     )
     (found,) = results(checkout, line)
     assert found.verdict == "differs"
