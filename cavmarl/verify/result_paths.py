@@ -17,12 +17,10 @@ from statistics import fmean, median
 from typing import Any
 
 from cavmarl.core.errors import EvaluationError
-from cavmarl.evaluate.metrics import METRICS
 from cavmarl.verify.published_lines import NUMBER
 
 _STEP = re.compile(r"\{([^}]*)\}|([^.\[\]{}]+)|\[([^\]]*)\]|\.")
 _CONDITION = re.compile(r"(\w+)=(\{[^}]*\}|[^,]*)")
-_SCALES = {metric.name: metric.scale for metric in METRICS}
 _OPERATIONS: Mapping[str, Callable[[Sequence[float]], float]] = {
     "min": min, "max": max, "mean": fmean, "median": median, "sum": sum, "len": len,
     **{word: itemgetter(k) for k, word in enumerate(("first", "second", "third", "fourth"))},
@@ -110,13 +108,20 @@ def _numbers(found: Any, path: str) -> list[float]:
         case list():
             return [number for each in found for number in _numbers(each, path)]
         case {"mean": mean, "within_run": runs}:
-            scale = _SCALES[re.split(r"[.}]", path.rstrip("}"))[-1]]
+            scale = _scale_of(re.split(r"[.}]", path.rstrip("}"))[-1])
             ends = found["between_run_ci95"] or (runs[0]["wilson95"] if len(runs) == 1 else None)
             values = [mean, ends["low"], ends["high"]] if ends else [mean]
             return [] if mean is None else [scale * value for value in values]
         case None:
             return []
     raise EvaluationError(f"{path!r} is {found!r}, which is no number; correct the expression")
+
+
+def _scale_of(metric: str) -> float:
+    """Return the factor by which reports show a metric."""
+    from cavmarl.evaluate.metrics import METRICS  # takes seconds, and most lines do not need it
+
+    return next(one.scale for one in METRICS if one.name == metric)
 
 
 def _too_few(expression: str, values: Sequence[float]) -> EvaluationError:
