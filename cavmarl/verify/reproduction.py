@@ -91,7 +91,7 @@ class CommandRunner:
         """Return what a line needs and this machine does not have; empty: nothing."""
         for need in needs:
             kind, _, name = need.partition(":")
-            if kind == "module" and importlib.util.find_spec(name) is None:
+            if kind == "module" and importlib.util.find_spec(name.partition(".")[0]) is None:
                 return f"the Python module {name} is not installed"
             if kind == "program" and shutil.which(name) is None:
                 return f"the program {name} is not installed"
@@ -150,9 +150,11 @@ class CommandRunner:
             raise EvaluationError(f"has written no result: {command}")
 
     def _words(self, command: str) -> list[str]:
-        for word, path in self._files.items():
-            command = re.sub(rf"(?<![\w.]){re.escape(word)}(?![\w.])", str(path), command)
         words = shlex.split(command)
+        for given, path in self._files.items():
+            whole = re.compile(rf"(?<![\w.]){re.escape(given)}(?![\w.])")
+            text = str(path).replace("\\", r"\\")  # backslashes of a replacement are doubled
+            words = [whole.sub(text, word) for word in words]
         if words[0] in ("cavmarl", "python"):
             start = ["-m", "cavmarl"] if words[0] == "cavmarl" else []
             return [sys.executable, *start, *words[1:]]

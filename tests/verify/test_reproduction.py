@@ -150,9 +150,11 @@ def test_failures_are_told(checkout: Path) -> None:
 def test_words_of_a_command_are_replaced_by_files(checkout: Path) -> None:
     line = text("sometimes {} %", values=("len words",), name="speed MAPS/a.xml MAPS2")
     assert line.command.endswith("MAPS/a.xml MAPS2")
-    runner = CommandRunner(checkout, {"MAPS": checkout})
+    maps = checkout / "with a space"
+    maps.mkdir()
+    runner = CommandRunner(checkout, {"MAPS": maps})
     words = runner.run(line.command, 1.0)["words"]
-    assert words[:2] == [f"{checkout}/a.xml", "MAPS2"]
+    assert words[:2] == [f"{maps}/a.xml", "MAPS2"]
     with pytest.raises(ConfigError, match="--file MAPS=gone: there is no such file or folder"):
         CommandRunner(checkout, {"MAPS": Path("gone")})
 
