@@ -5,8 +5,10 @@
 
 The program uses BenchMARL's algorithm, model and experiment on `cavmarl.adapters.benchmarl_task`.
 The run's folder has its tables (`ippo_merge_mlp…/…/scalars/*.csv`), the policy's weights as
-`policy.pt`, and `manifest.json` with the conditions of the training. Other programs of cavmarl
-cannot read BenchMARL's networks.
+`policy.pt`, and `manifest.json` with the conditions of the training. With IPPO and continuous
+actions, it also has the same network as `model.safetensors` and `config.json`, which `cavmarl
+evaluate --policy FOLDER` reads. Other programs of cavmarl cannot read networks of the other
+algorithms.
 """
 
 from __future__ import annotations
@@ -23,7 +25,10 @@ from benchmarl.experiment import Experiment, ExperimentConfig
 from benchmarl.models.mlp import MlpConfig
 
 from cavmarl.adapters.benchmarl_task import CavTaskClass
+from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
+from cavmarl.config.registry import load_config
 from cavmarl.core.errors import ConfigError
+from cavmarl.learning.actor_critic import ActorCritic, save_network
 from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import (
     check_at_least,
@@ -32,6 +37,8 @@ from cavmarl.learning.options import (
     run_program,
 )
 from cavmarl.learning.run_folder import RunFolder
+from cavmarl.networks.network_files import NetworkConfig
+from cavmarl.roads.road_kinds import road_kinds
 
 POLICY_FILE = "policy.pt"
 
@@ -89,14 +96,54 @@ def make_experiment(args: Args) -> Experiment:
         activation_class=torch.nn.Tanh,
     )
     stem = Path(args.env).name.split(".")[0]
+    algorithm = algorithm_config_registry[args.algorithm].get_from_yaml()
+    if hasattr(algorithm, "use_tanh_normal"):  # drivers have clipped means, not squashed ones
+        algorithm.use_tanh_normal = False
     return Experiment(
-        task=CavTaskClass(stem, {"env": args.env}),
-        algorithm_config=algorithm_config_registry[args.algorithm].get_from_yaml(),
+        task=CavTaskClass(stem, {"env": args.env, "overrides": {"action.out_of_range": "clip"}}),
+        algorithm_config=algorithm,
         model_config=model,
         critic_model_config=model,
         seed=args.seed,
         config=config,
     )
+
+
+def save_driver(experiment: Experiment, args: Args) -> tuple[str, ...]:
+    """Write the network in the form of cavmarl's drivers; return the names of its files.
+
+    Networks other than those of IPPO with continuous actions have no such form; nothing is written.
+    """
+    env = load_config(args.env)[0]
+    if args.algorithm != "ippo" or env.action.kind != "continuous":
+        return ()
+    vec = experiment.test_env.base_env.vec
+    config = NetworkConfig(
+        environment=env.name,
+        observation_size=vec.single_observation_space.shape[-1],
+        sensors=env.sensors,
+        action=env.action,
+        hidden=(args.hidden, args.hidden),
+        seed=args.seed,
+        agent_steps=experiment.total_frames,
+        maps=road_kinds(vec.network),
+    )
+    network = ActorCritic(config)
+    (loss,) = experiment.losses.values()
+    found = {name: tensor.detach() for name, tensor in loss.named_parameters()}
+    weights = dict(network.state_dict())
+    for head in ("actor", "critic"):
+        (start,) = {
+            name[: name.index("mlp.params.")] for name in found if name.startswith(f"{head}_")
+        }
+        for name in weights:
+            if name.startswith(f"{head}."):
+                # BenchMARL's last layer also has outputs for the standard deviations.
+                tensor = found[f"{start}mlp.params.{name.removeprefix(f'{head}.')}"]
+                weights[name] = tensor[: len(weights[name])].clone()
+    network.load_state_dict(weights)
+    save_network(args.folder, network, config)
+    return WEIGHTS_FILE, CONFIG_FILE
 
 
 def train(args: Args) -> Path:
@@ -112,7 +159,7 @@ def train(args: Args) -> Path:
         experiment.run()
         with writing(args.folder / POLICY_FILE):
             torch.save(experiment.policy.state_dict(), args.folder / POLICY_FILE)
-        return folder.end((POLICY_FILE,))
+        return folder.end((POLICY_FILE, *save_driver(experiment, args)))
 
 
 def main(words: Sequence[str] | None = None) -> int:

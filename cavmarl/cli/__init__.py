@@ -29,6 +29,7 @@ from cavmarl.cli import (
     node,
     plan,
     replay,
+    reproduce,
     ros2,
     scenario,
     service,
@@ -154,6 +155,13 @@ _divide(
     allow_interspersed_args=False,
 )
 _divide("journal", journal.journal, "cavmarl journal run.jsonl --at 1200")
+_train(
+    "reproduce",
+    reproduce.reproduce,
+    "cavmarl reproduce --quick",
+    "cavmarl reproduce readme-speed",
+    "cavmarl reproduce --all --file MAPS=maps --json found.json",
+)
 app.add_typer(verify.app, name="verify", rich_help_panel=DIVIDE)
 app.add_typer(bench.app, name="bench", rich_help_panel=DIVIDE)
 _cosim("lead", lead.lead, "cavmarl lead town --at 7100 --secret-file world.secret --followers 1")

@@ -51,10 +51,7 @@ def build(
     console = Console()
     with progress_bar(console) as bar:
         found = build_board(entries_in(folders, entry or ()), out, driving_progress(bar))
-    rows = [
-        (escape(one.name), escape(one.environment), "failed" if one.failure else "verified")
-        for one in found
-    ]
+    rows = [(escape(one.name), escape(one.environment), one.state) for one in found]
     console.print(grid(("entry", "result of", "state"), rows, lefts=3))
     console.print(f"page: {out}", markup=False, highlight=False)
     write_json(json_path, {"entries": {one.name: asdict(one) for one in found}})
@@ -81,7 +78,13 @@ def check(
         found = check_entry(entry, driving_progress(bar))
     for file, digest in found.expected.items():
         console.print(f"{file}: the same ({digest[:12]})", markup=False, highlight=False)
-    console.print(f"{entry}: can be submitted", markup=False, highlight=False)
+    said = "can be submitted"
+    if not found.expected:
+        said += (
+            "; it is shown as not verified, because it is a model of another library: for a "
+            "verified entry, export it as model.safetensors and config.json"
+        )
+    console.print(f"{entry}: {said}", markup=False, highlight=False)
     write_json(json_path, asdict(found))
 
 

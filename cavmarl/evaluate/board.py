@@ -2,7 +2,9 @@
 
 An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
 and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
-NAME.py. Without these files, the driver is cavmarl's script of that name.
+NAME.py, or a model file of another library, such as NAME.zip. Without these files, the driver is
+cavmarl's script of that name. Models of other libraries are not verified, because their arithmetic
+differs between processors and versions; they are shown as such.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from cavmarl.config.driver_form import WEIGHTS_FILE, form_of_driver
+from cavmarl.config.driver_names import ONNX_FILE, SB3_FILE, TORCH_SCRIPT_FILES
 from cavmarl.config.entry_cards import CARD_FILE, sentence_about
 from cavmarl.config.registry import agent_entries
 from cavmarl.config.world_spec import WorldSpec
@@ -24,10 +27,19 @@ from cavmarl.evaluate.episodes import Progress
 from cavmarl.evaluate.evaluation import load_tables, read_evaluation
 from cavmarl.evaluate.provenance.manifest import MANIFEST_FILE, hash_of_file, write_text
 from cavmarl.evaluate.statistics import Interval, share_interval
-from cavmarl.evaluate.zoo import RESULT_FOLDER, SHARES, Verification, entry_job, verify_result
+from cavmarl.evaluate.zoo import (
+    RESULT_FOLDER,
+    SHARES,
+    Verification,
+    check_weights,
+    entry_job,
+    verify_result,
+)
 from cavmarl.policies.loading import policy_files
 
 _PAGE = Path(__file__).with_name("board.html.j2")
+NOT_VERIFIED = "not verified"
+_MODELS = (SB3_FILE, *TORCH_SCRIPT_FILES, ONNX_FILE)
 TITLES = {name: name.replace("_", " ") for name in SHARES}
 _CONDITIONS = ("agents", "background", "max_cycles")
 # Parts of a result's manifest that are read, by dotted key.
@@ -59,7 +71,7 @@ class BoardEntry:
     Attributes:
         name: of the folder.
         about: first sentence of the card.
-        kind: `trained` or `scripted`; empty if unknown.
+        kind: `trained`, `scripted` or `model`, which is of another library; empty if unknown.
         environment: with its version; empty if the result cannot be read.
         conditions: what differs from the environment as it is, for example other agents.
         episodes: number of episodes of all runs.
@@ -67,7 +79,7 @@ class BoardEntry:
         shares: by the names of `SHARES`.
         digest: SHA-256 of the driver's first file.
         version: of cavmarl that made the result.
-        failure: why the entry failed, with the remedy; empty if it is verified.
+        failure: why the entry failed, with the remedy; empty if it is verified or cannot be.
     """
 
     name: str
@@ -82,9 +94,14 @@ class BoardEntry:
     version: str = ""
     failure: str = ""
 
+    @property
+    def state(self) -> str:
+        """The state: `failed`, `not verified` or `verified`."""
+        return "failed" if self.failure else NOT_VERIFIED if self.kind == "model" else "verified"
+
 
 def entry_driver(folder: Path) -> Path:
-    """Return the driver of an entry: its folder if trained, else the script.
+    """Return the driver of an entry: its folder if trained, else the script or the model file.
 
     Raises:
         PolicyError: there is none.
@@ -93,20 +110,22 @@ def entry_driver(folder: Path) -> Path:
     if (folder / WEIGHTS_FILE).is_file():
         return folder
     own, ours = folder / f"{name}.py", agent_entries().get(name)
-    if own.is_file():
-        return own
+    for file in (own, *(folder / f"{name}{suffix}" for suffix in _MODELS)):
+        if file.is_file():
+            return file
     if ours is not None and ours.suffix == ".py":
         return ours
     raise PolicyError(
-        f"{folder}: has no driver; put model.safetensors and config.json, or a script {name}.py, "
-        "into it, or name it after a script of cavmarl"
+        f"{folder}: has no driver; put model.safetensors and config.json, a script {name}.py or a "
+        f"model {name}.zip, .pt, .ts or .onnx into it, or name it after a script of cavmarl"
     )
 
 
 def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
     """Check that an entry is complete and has the bytes of its result when it is driven again.
 
-    The driver's script, if there is one, is run.
+    The driver's script, if there is one, is run. A model file of another library is neither read
+    nor run: the files of the verification are then empty.
 
     Raises:
         ConfigError: there is no such folder, or no card.
@@ -122,7 +141,10 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
     driver = entry_driver(folder)
     if driver == folder:
         _check_training(folder)
-    _read_result(folder, driver)
+    document = _read_result(folder, driver)
+    if driver.suffix in _MODELS:
+        check_weights(document, folder.name, policy_files(driver))
+        return Verification(folder.name, {}, {}, "", "")
     try:
         found = verify_result(folder, driver, progress)
     except SystemExit as error:  # else a script could end the check as if it had passed
@@ -192,7 +214,7 @@ def build_board(
         autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
     template = environment.from_string(_PAGE.read_text(encoding="utf-8"))
-    verified = sum(not entry.failure for entry in found)
+    verified = sum(entry.state == "verified" for entry in found)
     page = template.render(
         groups=_groups(found),
         unread=[entry for entry in found if not entry.environment],
@@ -257,7 +279,7 @@ def _described(folder: Path, failure: str) -> BoardEntry:
     return BoardEntry(
         folder.name,
         sentence_about(folder),
-        "trained" if driver == folder else "scripted",
+        "trained" if driver == folder else "model" if driver.suffix in _MODELS else "scripted",
         document["world"]["environment"],
         _conditions(job.world, driver if driver == folder else None),
         document["episodes"] * len(document["seeds"]),
@@ -302,7 +324,7 @@ def _check_training(folder: Path) -> None:
 def _groups(entries: Iterable[BoardEntry]) -> dict[str, list[BoardEntry]]:
     """Return the entries of each environment and conditions, the most successful first.
 
-    Entries that failed come last, because their figures are unproven.
+    Entries that failed or are not verified come last, because their figures are unproven.
     """
     groups: dict[str, list[BoardEntry]] = {}
     for entry in entries:
@@ -314,9 +336,10 @@ def _groups(entries: Iterable[BoardEntry]) -> dict[str, list[BoardEntry]]:
     return dict(sorted(groups.items()))
 
 
-def _rank(entry: BoardEntry) -> tuple[bool, float, float, str]:
+def _rank(entry: BoardEntry) -> tuple[int, float, float, str]:
     shares = entry.shares or {}
     success, collision = (
         shares[name].value if name in shares else 0.0 for name in ("success", "collision")
     )
-    return bool(entry.failure), -success, collision, entry.name
+    order = ("verified", NOT_VERIFIED, "failed")
+    return order.index(entry.state), -success, collision, entry.name

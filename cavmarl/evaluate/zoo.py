@@ -153,7 +153,7 @@ def verify_result(folder: Path, driver: Path, progress: Progress | None = None) 
     name = folder.name
     document = read_evaluation(folder / RESULT_FOLDER)
     job = entry_job(document, folder)
-    _check_weights(document, name, policy_files(driver))
+    check_weights(document, name, policy_files(driver))
     _check_world(document, name, job.world)
     with TemporaryDirectory() as room:
         out = Path(room) / "again"
@@ -283,7 +283,8 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
     return EntryJob(world, job["episodes"], len(document["seeds"]))
 
 
-def _check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]) -> None:
+def check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]) -> None:
+    """Raise ManifestError unless the result of a driver was made with these files."""
     (described,) = list(document["policies"].values())[:1]
     for file in files:
         if described["sha256"].get(file.name) != hash_of_file(file):

@@ -17,6 +17,7 @@ from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.evaluate import evaluate
 from cavmarl.evaluate.board import build_board, check_entry, entries_in, entry_driver
+from cavmarl.policies.onnx_export import export_onnx
 
 pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
@@ -62,12 +63,46 @@ def flip_byte(path: Path) -> None:
     path.write_bytes(content)
 
 
-def test_the_scripted_entries_of_the_board_are_verified() -> None:
-    entries = entries_in([ROOT / "board"])
-    assert [path.name for path in entries] == ["idm", "random_actions"]
-    for path in entries:
-        assert entry_driver(path) == agent_entries()[path.name]
-        assert not check_entry(path).differing
+ENTRIES = {path.name: path for path in entries_in([ROOT / "board"])}
+
+
+@pytest.mark.parametrize("name", ENTRIES)
+def test_an_entry_of_the_board_is_verified(name: str) -> None:
+    """The entries of `agents/` are verified by the tests of the zoo."""
+    path = ENTRIES[name]
+    is_script = name in agent_entries()
+    assert entry_driver(path) == (agent_entries()[name] if is_script else path)
+    found = check_entry(path)
+    assert found.expected
+    assert not found.differing
+
+
+def test_a_model_of_another_library_is_shown_as_not_verified(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("onnxruntime", reason="needs the extra: onnx")
+    own = tmp_path / "entries" / "sailor"
+    own.mkdir(parents=True)
+    model = own / "sailor.onnx"
+    export_onnx("merge_ippo", model)
+    (own / "README.md").write_text("# sailor\n\nA model of another library.\n")
+    evaluate("merge", {"sailor": str(model)}, out=own / "result", **SMALL)
+    assert entry_driver(own) == model
+    assert not check_entry(own).expected
+    with pytest.raises(SystemExit) as ended:
+        main(["board", "check", str(own)])
+    assert ended.value.code == 0
+    assert "it is shown as not verified" in " ".join(capsys.readouterr().out.split())
+    out = tmp_path / "board.html"
+    (found,) = build_board([own], out)
+    assert (found.kind, found.state, found.failure) == ("model", "not verified", "")
+    page = out.read_text()
+    assert "0 of 1 entries are verified" in page
+    assert "<td>not verified</td>" in page
+    flip_byte(model)
+    (found,) = build_board([own], out)
+    assert "is not the file that the result of sailor was made with" in found.failure
+    assert found.state == "failed"
 
 
 def test_entries_are_the_drivers_of_the_zoo() -> None:
@@ -125,7 +160,7 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
     "driver": (
         lambda entry: (entry / "model.safetensors").unlink(),
         PolicyError,
-        r"has no driver; put model\.safetensors and config\.json",
+        r"has no driver; put model\.safetensors and config\.json, a script merge_ippo\.py or",
     ),
 }
 

@@ -2,10 +2,10 @@
 
     python -m tests.golden.zoo [DRIVER ...]
 
-This command evaluates the named drivers, or all trained drivers and the scripted drivers of
-`board/`. It takes the job of each driver (world, seed, episodes, runs) from the manifest of the
-driver's result. The command is the part `zoo` of `make record` (CONTRIBUTING.md). It stops at the
-first driver that cannot be recorded.
+This command evaluates the named drivers, or all trained drivers and the drivers of `board/`. It
+runs at the root of the repository. It takes the job of each driver (world, seed, episodes, runs)
+from the manifest of the driver's result. The command is the part `zoo` of `make record`
+(CONTRIBUTING.md). It stops at the first driver that cannot be recorded.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from cavmarl.config.driver_form import WEIGHTS_FILE
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.errors import CavmarlError
@@ -70,7 +71,9 @@ def _facts(document: Mapping[str, Any]) -> dict[str, Any]:
 def main() -> int:
     """Record the results of drivers; return 1 if one of them cannot be recorded."""
     drivers = [name for name, path in sorted(agent_entries().items()) if path.is_dir()]
-    drivers += sorted(path.parent.name for path in BOARD.glob(f"*/{RESULT_FOLDER}"))
+    entries = sorted(path.parent for path in BOARD.glob(f"*/{RESULT_FOLDER}"))
+    is_trained = {entry: (entry / WEIGHTS_FILE).is_file() for entry in entries}
+    drivers += [f"board/{one.name}" if is_trained[one] else one.name for one in entries]
     parser = argparse.ArgumentParser(description=f"Drivers: {' '.join(drivers)}")
     parser.add_argument("drivers", nargs="*", metavar="DRIVER")
     has_failed = False

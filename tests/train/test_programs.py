@@ -16,6 +16,7 @@ from cavmarl.config.registry import entries, load_config
 from cavmarl.config.signals import SIGNAL_CONTROLLERS
 from cavmarl.evaluate.provenance.manifest import read_closed
 from cavmarl.evaluate.provenance.training_record import is_trained
+from cavmarl.networks.driver_network import load_driver_network
 from tests.support.generated import check_block
 from tests.support.training import TRAIN, load_program
 
@@ -98,6 +99,27 @@ def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
     assert read_closed(tmp_path / "a")["program"] == "ippo_benchmarl.py"
     (table,) = (tmp_path / "a").rglob("collection_reward_reward_mean.csv")
     assert len(table.read_text().splitlines()) == 2
+    assert (tmp_path / "a/model.safetensors").exists() == (algorithm == "ippo")
+    if algorithm == "ippo":
+        check_driver_of_benchmarl(tmp_path / "a")
+
+
+def check_driver_of_benchmarl(folder: Path) -> None:
+    """Compare the driver's outputs with those of BenchMARL's weights."""
+    torch = pytest.importorskip("torch")
+    network = load_driver_network(folder)
+    seen = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 105)).astype(np.float32)
+    found = torch.load(folder / "policy.pt", weights_only=False)
+    layers = {
+        name.partition("mlp.params.")[2]: tensor
+        for name, tensor in found.items()
+        if "mlp.params." in name and isinstance(tensor, torch.Tensor)
+    }
+    expected = torch.from_numpy(seen)
+    for place in (0, 2, 4):
+        expected = expected @ layers[f"{place}.weight"].T + layers[f"{place}.bias"]
+        expected = torch.tanh(expected) if place < 4 else expected
+    assert network.outputs(seen) == pytest.approx(expected[:, :2].numpy(), abs=1e-5)
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,231 @@
+"""Published numbers have lines, and lines have numbers of pages, commands and tolerances."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from cavmarl.core.errors import ConfigError
+from cavmarl.verify.published_lines import (
+    FREE_NUMBER,
+    PublishedLine,
+    PublishedLines,
+    cells_of,
+    compile_pattern,
+    find_table,
+    label_of,
+    read_lines,
+    repository_root,
+    section_of,
+    tables_of,
+    with_row,
+    without_code,
+)
+
+ROOT = Path(__file__).resolve().parents[2]
+PUBLISHED = read_lines(ROOT)
+FIGURES = sorted(path.relative_to(ROOT).as_posix() for path in ROOT.glob("docs/figures/*.md"))
+PAGES = ["README.md", *(page for page in FIGURES if not page.endswith("README.md"))]
+
+
+@pytest.mark.parametrize("name", PUBLISHED.lines)
+def test_a_line_has_numbers_of_its_page(name: str) -> None:
+    line = PUBLISHED.lines[name]
+    cells = cells_of(name, line, ROOT)
+    assert any(cell.numbers for cell in cells)
+    if not line.by_hand:
+        assert any(any(cell.expressions) for cell in cells), "compares nothing"
+
+
+def test_the_command_of_a_line_is_on_a_page() -> None:
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("agents/*/README.md")]
+    text = " ".join(" ".join(page.read_text("utf-8").split()) for page in pages)
+    missing = [name for name, one in PUBLISHED.lines.items() if shown(one.command) not in text]
+    assert missing == []
+
+
+def shown(command: str) -> str:
+    """Return a command as the pages show it."""
+    return re.sub(r"--seed [56]000$", "--seed SEED", command)
+
+
+@pytest.mark.parametrize("page", PAGES)
+def test_no_number_is_outside_of_lines(page: str) -> None:
+    assert list(uncovered(page, (ROOT / page).read_text("utf-8"), PUBLISHED)) == []
+
+
+def uncovered(page: str, text: str, published: PublishedLines) -> Iterator[str]:
+    """Yield the numbers of a page that no line and no condition has, with the text around them."""
+    headings = re.compile("^#.*", re.MULTILINE)  # names of sections
+    seen = headings.sub(lambda found: " " * len(found[0]), without_code(text))
+    spans = [span for span, _ in covered(page, text, published)]
+    for number in re.finditer(FREE_NUMBER, seen):
+        start, end = number.span()
+        if not any(low <= start and end <= high for low, high in spans):
+            yield " ".join(text[max(start - 40, 0) : end + 30].split())
+
+
+def covered(
+    page: str, text: str, published: PublishedLines
+) -> Iterator[tuple[tuple[int, int], str]]:
+    """Yield the places of a page that lines and conditions have."""
+    for pattern in published.conditions.get(page, ()):
+        for match in compile_pattern(pattern).finditer(text):
+            yield match.span(), pattern
+    for name, line in published.lines.items():
+        if line.page != page:
+            continue
+        for pattern in line.text:
+            for match in compile_pattern(pattern).finditer(text):
+                yield match.span(), name
+        if line.is_section:
+            below = section_of(name, line.section, text)
+            start = text.index(below)
+            yield (start, start + len(below)), name
+        if line.table:
+            yield from ((span, name) for span in table_spans(name, line, text))
+
+
+def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
+    """Yield the places of the cells of a line, of the first cell of each row and of the heads."""
+    table = find_table(name, line, text)
+    wanted = {place for place, head in enumerate(table.heads) if head in line.columns}
+    section = 0 if not table.section else text.index(f"# {table.section}\n")
+    for row in (table.heads, *table.rows):
+        pattern = r"\|\s*" + r"\s*\|\s*".join(map(re.escape, row)) + r"\s*\|"
+        is_head = row is table.heads
+        for match in re.finditer(pattern, text[section:]):
+            if is_head or not line.rows or label_of(row) in line.rows:
+                start = section + match.start()
+                for place, cell in enumerate(match[0].split("|")[1:-1]):
+                    if is_head or place == 0 or place in wanted:
+                        yield start, start + len(cell) + 1
+                    start += len(cell) + 1
+
+
+def test_a_number_that_no_line_has_is_found() -> None:
+    page = (
+        "# A\n\nIt takes 3 s on 2 cores.\n\n| a | b |\n|---|---|\n| x | 4 |\n| y 7 | 5 |\n\n`8`\n"
+    )
+    line = PublishedLine("page.md", "cavmarl list", table="a", rows={"x": "x"}, columns={"b": "at"})
+    published = PublishedLines({"line": line}, {"page.md": ("on {} cores",)})
+    found = " ".join(uncovered("page.md", page, published))
+    assert "takes 3 s" in found
+    assert "| y 7" in found
+    line = PublishedLine("page.md", "cavmarl list", table="a", columns={"b": "at"})
+    more = {"line": line, "text": PublishedLine("page.md", "cavmarl list", text=("takes {} s",))}
+    published = PublishedLines(more, {"page.md": ("on {} cores",)})
+    assert list(uncovered("page.md", page, published)) == []
+
+
+def test_quick_lines_need_nothing_and_are_exact() -> None:
+    for name, line in PUBLISHED.lines.items():
+        if line.is_quick:
+            assert (line.needs, line.tolerance, line.by_hand) == ((), "exact", ""), name
+
+
+PAGE = """# Page
+
+It is 1,234.5 times
+as fast, and 7 to 9 m.
+
+| name | a | b |
+|---|---|---|
+| [`one`](x.md) | 3 ± 0.5 | - |
+| **two-2** | 4 [1, 8] | 5 |
+"""
+
+
+def cells(tmp_path: Path, quick: bool = False, **keys: object) -> list[tuple[str, ...]]:
+    (tmp_path / "page.md").write_text(PAGE, encoding="utf-8")
+    line = PublishedLine("page.md", "cavmarl NAME NAME_ippo", **keys)  # type: ignore[arg-type]
+    found = cells_of("line", line, tmp_path, quick=quick)
+    return [
+        (cell.command, *cell.numbers, "/", *cell.expressions, *filter(None, [cell.row]))
+        for cell in found
+    ]
+
+
+def test_numbers_of_prose_are_found_over_breaks_of_lines(tmp_path: Path) -> None:
+    found = cells(tmp_path, text=("is {} times as fast, and {} to {} m",), values=("a", "", "b"))
+    assert found == [("cavmarl NAME NAME_ippo", "1,234.5", "7", "9", "/", "a", "", "b")]
+
+
+def test_a_range_has_one_expression(tmp_path: Path) -> None:
+    found = cells(tmp_path, text=("and {} to {} m",), values=("b",), tolerance="range")
+    assert found == [("cavmarl NAME NAME_ippo", "7", "9", "/", "b")]
+
+
+def test_cells_of_tables_are_found_by_row_and_column(tmp_path: Path) -> None:
+    keys: dict[str, object] = {
+        "table": "name",
+        "word": "NAME",
+        "columns": {"a": "at.NAME", "b": "x"},
+    }
+    expected = [
+        ("cavmarl one one_ippo", "3", "0.5", "/", "at.one"),
+        ("cavmarl two-2 two_2_ippo", "4", "1", "8", "/", "at.two-2"),
+        ("cavmarl two-2 two_2_ippo", "5", "/", "x"),
+    ]
+    assert cells(tmp_path, **keys) == expected
+    assert cells(tmp_path, quick=True, quick_rows=("one",), **keys) == expected[:1]
+    own = cells(tmp_path, **{**keys, "rows": {"one": "1"}, "row": "rows[n=NAME]"})
+    assert own == [("cavmarl 1 1_ippo", "3", "0.5", "/", "at.1", "rows[n=1]")]
+
+
+@pytest.mark.parametrize(
+    ("keys", "message"),
+    [
+        ({"text": ("is {} slow",)}, r"has no text .*write the pattern so that it occurs once"),
+        ({"text": ("{}",)}, r"has \d+ texts '\{\}'"),
+        ({"text": ("is {} times",), "values": ("a", "b")}, "1 expressions without a number"),
+        ({"text": ("and {} to {} m",), "values": ("a",)}, "too few expressions"),
+        ({"table": "nam | c"}, "has 0 tables that begin with"),
+        ({"table": "name", "section": "Other"}, "below 'Other'; correct table, section or nth"),
+        ({"table": "name", "columns": {"c": "x"}}, "no column 'c'; it has name | a | b"),
+        ({"table": "name", "rows": {"three": ""}}, "no row 'three'; it has one, two-2"),
+        ({"table": "name", "quick_rows": ("three",)}, "no row 'three'"),
+        ({"section": "Other", "by_hand": "slow"}, "no heading 'Other'"),
+        ({}, "either text or table"),
+        ({"table": "name", "tolerance": "range"}, "is for text; tables have N % or N"),
+        ({"text": ("is {} times",), "tolerance": "range"}, "two numbers for each range"),
+        ({"text": ("a",), "table": "a"}, "either text or table"),
+        ({"text": ("a",), "tolerance": "about"}, "must be exact, range, range N %, N % or N"),
+        ({"text": ("a",), "needs": ("luck",)}, "'luck' must be KIND:NAME"),
+    ],
+)
+def test_wrong_lines_are_refused(keys: dict[str, object], message: str, tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=message):
+        cells(tmp_path, **keys)
+
+
+def test_lines_need_a_checkout(tmp_path: Path) -> None:
+    assert repository_root() == ROOT
+    with pytest.raises(ConfigError, match=r"has no docs/figures/lines\.yaml.*from one with"):
+        repository_root(tmp_path)
+
+
+def test_a_page_must_exist(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match=r"line: there is no page gone\.md"):
+        cells_of("line", PublishedLine("gone.md", "cavmarl list", text=("a",)), tmp_path)
+
+
+def test_unknown_keys_of_lines_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "docs/figures/lines.yaml"
+    path.parent.mkdir(parents=True)
+    path.write_text("lines: {one: {page: a.md, command: cavmarl list, text: [a], speedy: true}}\n")
+    with pytest.raises(ConfigError, match=r"lines\.one\.speedy: unknown key"):
+        read_lines(tmp_path)
+
+
+def test_words_are_replaced_as_words() -> None:
+    assert with_row("N --n N NAME N_ippo", "N", "u-turn") == "u-turn --n u-turn NAME u_turn_ippo"
+
+
+def test_tables_in_code_are_none() -> None:
+    text = "# A\n```\n| a |\n|---|\n| 1 |\n```\n## B\n| b | c |\n|---|---|\n| 1 | x \\| y |\n"
+    (table,) = tables_of(text)
+    assert (table.section, table.heads, table.rows) == ("B", ("b", "c"), (("1", "x \\| y"),))
