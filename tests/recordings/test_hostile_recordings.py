@@ -168,6 +168,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (map_with("lanes", "num_points", 2**31 - 1), "first_point and num_points"),
     (map_with("lanes", "length_m", 1e15), "length_m of lanes"),
     (map_with("points", "x", float("nan")), "x of points"),
+    (map_with("points", "cos", float("inf")), "cos of points is not a number from -1 to 1"),
     (pipe_at("network.bin"), "network.bin"),
     (pipe_at(VEHICLES), "it is no file"),
     (pipe_at("recording.json"), "it is no file"),
