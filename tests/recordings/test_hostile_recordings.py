@@ -164,6 +164,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (head_with("environment", value="a\x00b"), "cannot be printed"),
     (head_with("bounds", 0, value=float("nan")), "recording.json"),
     (head_with("features", value=[["a"]] * 3), "a feature has no sensor"),
+    (head_with("manifest", "world", "config", value={"a": 1, "b": 2}), "no settings that.*a.*;.*b"),
     (map_with("links", "next_lane", -(2**31)), "next_lane of links leads to no row of lanes"),
     (map_with("lanes", "num_points", 2**31 - 1), "first_point and num_points"),
     (map_with("lanes", "length_m", 1e15), "length_m of lanes"),
