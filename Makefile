@@ -36,7 +36,7 @@ FUZZ_TARGETS ?= network programs buildings map cached zones demand sumocfg entry
 # Tests start many processes: none is to parse the sources anew.
 export PYTHONDONTWRITEBYTECODE :=
 
-.PHONY: help demo test quick emulated ray check bench bounds rotation soak model fuzz oldest libraries ros2 maps rules lock sbom audit kernels wheel record pictures docs clean
+.PHONY: help demo test quick emulated ray check compiled bench bounds rotation soak model fuzz oldest libraries ros2 maps rules lock sbom audit kernels wheel record pictures docs clean
 .DEFAULT_GOAL := help
 
 help: ## say what there is
@@ -45,30 +45,30 @@ help: ## say what there is
 demo: $(DEMO)/.ready ## adapt a driver to merge, compare it, write a page with moving pictures (1.2 GB, some minutes)
 	$(DEMO)/bin/cavmarl demo
 
-test: $(READY) ## the tests but the slow ones; those of kernels that have a twin also without the compiler
-	$(BIN)/python $(KERNELS)
+test: compiled ## the tests but the slow ones; those of kernels that have a twin also without the compiler
 	rm -rf $(CALLS) && mkdir -p $(CALLS)
 	CAVMARL_KERNEL_CALLS=$(CURDIR)/$(CALLS) $(BIN)/pytest $(THREE) -m "not slow and not alone and not ray"
 	CAVMARL_KERNEL_CALLS=$(CURDIR)/$(CALLS) $(BIN)/pytest -m "alone and not slow"
 	$(BIN)/python -m cavmarl.prebuild check $(CALLS)
 	NUMBA_DISABLE_JIT=1 $(BIN)/pytest -n 2 $(SIDE_BY_SIDE) -m "twin and not slow"
 
-quick: $(READY) ## unit tests of what has changed since main, the nearest first, for a minute
-	$(BIN)/python $(KERNELS)
+quick: compiled ## unit tests of what has changed since main, the nearest first, for a minute
 	$(BIN)/python -m tests.support.touched
 
 emulated: $(READY) ## a step of a golden row on a processor that qemu-user emulates
 	$(BIN)/python -m tests.golden.portability --emulated
 
-ray: $(READY) ## the tests that start a Ray cluster
-	$(BIN)/python $(KERNELS)
-	$(BIN)/pytest -m "ray and not slow"
+ray: compiled ## the tests that start a Ray cluster, and a thirtieth of the slow ones
+	$(BIN)/pytest --turn $(TURN) -m ray
 
 check: $(READY) ## style, types, and the direction of imports
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+compiled: $(READY) ## compile the kernels that are not in this machine's cache
+	$(BIN)/python $(KERNELS)
 
 kernels: $(READY) ## add what the last `make test` has called to the list of kernels for the wheel
 	$(BIN)/python -m cavmarl.prebuild record $(CALLS)

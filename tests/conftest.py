@@ -56,7 +56,9 @@ def pytest_collection_finish() -> None:
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
     """Skip files that have no test of the tier that `-m` names."""
-    return None if is_needed(collection_path, config.rootpath, config.option.markexpr) else True
+    options = config.option
+    is_read = is_needed(collection_path, config.rootpath, options.markexpr, options.turn)
+    return None if is_read else True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:

@@ -258,6 +258,10 @@ def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
         assert fewest <= len(read) < 0.2 * len(files)
     for expression in ("", "slow", "not alone and not slow", "twin or slow"):
         assert all(is_needed(path, ROOT, expression) for path in files)
+    turns = [{path for path in files if is_needed(path, ROOT, "slow", turn)} for turn in range(30)]
+    assert max(map(len, turns)) < 0.3 * len(files)
+    listed = {name.partition("::")[0] for name in known_costs()}
+    assert listed <= {path.relative_to(ROOT).as_posix() for path in set().union(*turns)}
 
 
 def test_argued_tests_are_expensive() -> None:

@@ -11,7 +11,7 @@ from concurrent.futures import ProcessPoolExecutor, as_completed
 from multiprocessing import get_context
 from typing import Any, TextIO
 
-from cavmarl.core.compiled.arguments import type_of
+from cavmarl.core.compiled.arguments import accepts, type_of
 from cavmarl.core.compiled.compiler import compile_kernel
 from cavmarl.core.compiled.kernel_files import CompiledKernel, KernelFile
 from cavmarl.core.compiled.signatures import example_arguments
@@ -26,11 +26,30 @@ def kernel_file(call: KernelCall) -> KernelFile:
     return KernelFile(_function_of(call), types)
 
 
+def widest(calls: Iterable[KernelCall]) -> list[KernelCall]:
+    """Return the calls without those that the code of another of them also serves.
+
+    Code for an array of any layout, for example, also serves calls with a contiguous array.
+    """
+    kept: list[tuple[KernelCall, str]] = []
+    for call in calls:
+        types = kernel_file(call).types
+        if any(call.name == other.name and accepts(wide, types) for other, wide in kept):
+            continue
+        kept = [
+            (other, narrow)
+            for other, narrow in kept
+            if call.name != other.name or not accepts(types, narrow)
+        ]
+        kept.append((call, types))
+    return [call for call, _ in kept]
+
+
 def compile_into_cache(
     calls: Iterable[KernelCall], processes: int, output: TextIO = sys.stderr
 ) -> int:
     """Compile the kernels that are not in this machine's cache; return their number."""
-    missing = [call for call in calls if kernel_file(call).load() is None]
+    missing = [call for call in widest(calls) if kernel_file(call).load() is None]
     if not missing:
         return 0
     longest_first = sorted(missing, key=_weight, reverse=True)

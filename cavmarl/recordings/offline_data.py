@@ -71,9 +71,10 @@ def settings_of(recording: Recording) -> EnvConfig:
         settings = recording.manifest["world"]["config"]
         return validate(EnvConfig, settings, f"{recording.path}")
     except (ConfigError, KeyError, TypeError) as error:
+        faults = "; ".join(str(error).splitlines())
         raise RecordingError(
-            f"{recording.path}: its manifest has no settings that this version can read ({error}); "
-            "use the version of cavmarl that wrote it, or record the run again"
+            f"{recording.path}: its manifest has no settings that this version can read "
+            f"({faults}); use the version of cavmarl that wrote it, or record the run again"
         ) from error
 
 

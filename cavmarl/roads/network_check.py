@@ -16,6 +16,7 @@ from cavmarl.roads.network import RoadNetwork
 FARTHEST_M = 1e9  # limit of coordinates
 LONGEST_LANE_M = 1e6
 WIDEST_LANE_M = 1000.0
+ROUNDING = 1e-6  # by which the length of a direction may differ from 1
 LENGTH_OF_SMALL_MAPS_M = 1e7  # all lanes together; in larger maps, `MOST_M_PER_POINT` applies
 MOST_M_PER_POINT = 1000.0
 
@@ -134,6 +135,9 @@ def _wrong_shapes(network: RoadNetwork) -> Iterator[str]:
         for column in columns:
             if not (np.abs(rows[column]) <= FARTHEST_M).all():
                 yield f"{column} of {table} is not a number up to ±{FARTHEST_M:g} m"
+    for column in ("cos", "sin"):
+        if not (np.abs(network.points[column]) <= 1.0 + ROUNDING).all():
+            yield f"{column} of points is not a number from -1 to 1"
     lanes = network.lanes
     for column in ("min_x", "min_y", "max_x", "max_y"):
         if not (np.abs(lanes[column]) <= FARTHEST_M).all():

@@ -90,7 +90,7 @@ def test_worlds_run_in_workers_of_stable_baselines3(workers: int) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
-@pytest.mark.parametrize("workers", WORKERS)
+@pytest.mark.parametrize("workers", [pytest.param(0, marks=pytest.mark.slow), 1])
 def test_worlds_run_in_a_ray_actor(workers: int) -> None:
     ray = pytest.importorskip("ray", reason="needs the extra: ray")
     ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, logging_level="ERROR")

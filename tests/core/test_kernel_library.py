@@ -29,7 +29,7 @@ from cavmarl.prebuild.call_list import (
     recorded_calls,
     write_manifest,
 )
-from cavmarl.prebuild.compile_calls import compile_call
+from cavmarl.prebuild.compile_calls import compile_call, widest
 from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.linking import link
 
@@ -85,6 +85,23 @@ def test_a_kernel_with_other_types_or_sources_is_not_found(built: Path) -> None:
     assert opened.find(NAME, "float64;int64", _digest()) is None
     assert opened.find(NAME, TYPES, "0" * 16) is None
     assert opened.find("cavmarl.core.math.rng.below", TYPES, _digest()) is None
+
+
+@compiled_only
+def test_kernels_that_other_code_serves_are_not_compiled() -> None:
+    rows = np.zeros((4, 2))
+    wide, narrow, other = (
+        KernelCall(
+            f"cavmarl.core.math.elementary_arrays.{name}", json.dumps(signature_of((array,)))
+        )
+        for name, array in (
+            ("apply_sin", rows[:, 0]),
+            ("apply_sin", rows[0]),
+            ("apply_cos", rows[0]),
+        )
+    )
+    assert widest([wide, narrow, other]) == [wide, other]
+    assert widest([narrow, other, wide]) == [other, wide]
 
 
 def _flip(path: Path, place: int) -> None:

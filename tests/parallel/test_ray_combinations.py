@@ -22,9 +22,18 @@ def cluster() -> Iterator[None]:
     ray.shutdown()
 
 
-@pytest.mark.parametrize("feature", FEATURES)
+# In every run: a start of actors, a library of an actor's own, a file on its machine, a refusal.
+OFTEN = ("frames, discrete actions, seats", "SUMO's traffic", "a journal", "sensor workers")
+
+
 @pytest.mark.parametrize(
-    "place", [pytest.param("worlds on Ray", marks=pytest.mark.slow), "nodes on Ray"]
+    ("place", "feature"),
+    [
+        pytest.param(place, feature, marks=() if often else pytest.mark.slow)
+        for place in ("worlds on Ray", "nodes on Ray")
+        for feature in FEATURES
+        for often in (place == "nodes on Ray" and feature in OFTEN,)
+    ],
 )
-def test_features_on_ray(make: Make, tmp_path: Path, feature: str, place: str) -> None:
+def test_features_on_ray(make: Make, tmp_path: Path, place: str, feature: str) -> None:
     check(make, tmp_path, feature, place)

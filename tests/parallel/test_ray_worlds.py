@@ -32,6 +32,8 @@ __all__ = ["uneven"]
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 ROOT = Path(__file__).resolve().parents[2]
+# Nodes of cavmarl's own show the same in each run, in `test_node_groups.py`.
+slow = pytest.mark.slow
 WANTED = {"num_envs": 5, "agents": 4, "background": 12, "max_cycles": 8}
 
 
@@ -72,8 +74,11 @@ def nodes_of(pids: list[int]) -> list[int]:
     "arguments",
     [
         {"env": "grid4x4", "zones": 4},
-        {"env": "merge", "autoreset_mode": "NextStep"},
-        {"env": "town", "overrides": {"population.mode": "respawn", "action.kind": "discrete"}},
+        pytest.param({"env": "merge", "autoreset_mode": "NextStep"}, marks=slow),
+        pytest.param(
+            {"env": "town", "overrides": {"population.mode": "respawn", "action.kind": "discrete"}},
+            marks=slow,
+        ),
     ],
 )
 def test_machines_change_no_result(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
@@ -100,7 +105,7 @@ def test_chosen_worlds_are_reset_on_their_machines(make: Make, cluster: Any) -> 
     assert same(*found)
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
+@pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=slow)])
 def test_a_dead_actor_changes_no_result(
     make: Make, cluster: Any, whole: Any, how: signal.Signals
 ) -> None:
@@ -120,6 +125,7 @@ def test_a_dead_actor_changes_no_result(
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
+@slow
 def test_an_actor_that_dies_during_a_step_changes_no_result(
     make: Make, cluster: Any, whole: Any
 ) -> None:
@@ -139,7 +145,9 @@ def test_an_actor_that_dies_during_a_step_changes_no_result(
     assert losses_of(vec) == [1, 1]
 
 
-@pytest.mark.parametrize("more", [{"backend": "ray:1"}, {"backend": "ray"}])
+@pytest.mark.parametrize(
+    "more", [{"backend": "ray:1"}, pytest.param({"backend": "ray"}, marks=slow)]
+)
 def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict[str, Any]) -> None:
     whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", **settings("open", "dict"), **more)
@@ -158,6 +166,7 @@ def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))
 
 
+@slow
 def test_worlds_that_move_between_nodes_are_the_same(
     make: Make, cluster: Any, uneven: list[int]
 ) -> None:

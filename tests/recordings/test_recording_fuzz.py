@@ -12,7 +12,7 @@ from cavmarl import CavmarlError
 from tests.support.hostile_recordings import Forger, Use, limited_memory, make_recording
 
 MUTATIONS = 150
-MANY_MUTATIONS = int(os.environ.get("CAVMARL_RECORDING_MUTATIONS", "20000"))
+MANY_MUTATIONS = int(os.environ.get("CAVMARL_RECORDING_MUTATIONS", "1500"))
 EVERY = 10  # one in this number of recordings is also drawn and shown on a page
 
 

@@ -24,6 +24,7 @@ __all__ = [
     "CpuTimes",
     "argued",
     "costs_of_files",
+    "files_due",
     "is_due",
     "known_costs",
     "long_tests",
@@ -101,6 +102,13 @@ def is_due(name: str, turn: int, long: frozenset[str]) -> bool:
     if {name.partition("::")[0], name.partition("[")[0]} & long:
         return False
     return zlib.crc32(name.encode()) % TURNS == turn % TURNS
+
+
+@cache
+def files_due(turn: int) -> frozenset[str]:
+    """Return the files with a test in costs.txt whose turn it is."""
+    due = (name for name in known_costs() if is_due(name, turn, long_tests()))
+    return frozenset(name.partition("::")[0] for name in due)
 
 
 def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:

@@ -18,6 +18,8 @@ from typing import Any
 
 import pytest
 
+from tests.support.cpu_time import files_due
+
 __all__ = ["ALONE_FILES", "ProcessWatch", "TimeLimit", "is_needed", "mark"]
 
 _OF_PROCESSES = re.compile(
@@ -76,10 +78,14 @@ def mark(item: pytest.Item) -> None:
         assert is_needed(item.path, item.config.rootpath, tier), f"-m {tier} would not read {path}"
 
 
-def is_needed(path: Path, root: Path, expression: str) -> bool:
+def is_needed(path: Path, root: Path, expression: str, turn: int | None = None) -> bool:
     """Return whether a file may have tests for `-m`; for a small tier, most files are not read.
 
-    `expression`: of `-m`, such as `twin and not slow`; in other forms, any file may have some.
+    Args:
+        path: of the file.
+        root: of the repository.
+        expression: of `-m`, such as `twin and not slow`; in other forms, any file may have some.
+        turn: of `make rotation`; slow tests are marked, or expensive according to costs.txt.
     """
     if path.suffix != ".py" or not path.name.startswith("test_"):
         return True
@@ -91,6 +97,8 @@ def is_needed(path: Path, root: Path, expression: str) -> bool:
             return name in RAY_FILES or _IN_RAY in path.read_text(encoding="utf-8")
         case "twin":
             return _has_twin(path) and not name.startswith(_COMPILED_ONLY)
+        case "slow" if turn is not None:
+            return name in files_due(turn) or "mark.slow" in path.read_text(encoding="utf-8")
     return True
 
 
