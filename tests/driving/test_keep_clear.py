@@ -82,8 +82,11 @@ def ahead(
     pytest.fail(f"no phase with {light}")
 
 
-def is_blocked(scene: Ahead, *others: tuple[float, float, int]) -> bool:
-    """Return whether cars (place, speed, reason to stop) between the signals block the way."""
+def is_blocked(scene: Ahead, *others: tuple[float, float, int], turns: bool = False) -> bool:
+    """Return whether cars (place, speed, reason to stop) between the signals block the way.
+
+    `turns`: whether another car turns left inside the second junction.
+    """
     network = scene.network
     goal = network.edge_ids.index("jw2")
     travel = travel_by(make_plans(network, [goal]))
@@ -91,6 +94,9 @@ def is_blocked(scene: Ahead, *others: tuple[float, float, int]) -> bool:
         on_lane(network, scene.left_turns_from, s, travel, id=k, speed=speed, hold=hold)
         for k, (s, speed, hold) in enumerate(others)
     ]
+    if turns:
+        inside = network.links[network.lanes[scene.left_turns_from]["first_link"]]["next_lane"]
+        rows.append(on_lane(network, int(inside), 1.0, travel, id=8))
     before = int(network.links[scene.link]["from_lane"])
     rows.append(on_lane(network, before, 280.0, travel, id=9, speed=8.0))
     table = np.concatenate(rows)
@@ -112,6 +118,17 @@ def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_pat
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
     # The vehicles move on, but the own one has to expect to yield at that line.
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
+
+
+def test_a_free_waiting_position_in_the_next_junction_is_room(tmp_path: Path) -> None:
+    # A road of 14 m, and 2.4 m inside the junction: two cars of 5 m with 3 m behind each need 16 m.
+    for light, taken, blocked in (
+        (SIGNAL_GREEN_MINOR, False, False),
+        (SIGNAL_GREEN_MINOR, True, True),
+        (SIGNAL_RED, False, True),
+    ):
+        scene = ahead(tmp_path, light, apart_m=22.0)
+        assert is_blocked(scene, (8.0, 8.0, HOLD_NONE), turns=taken) == blocked
 
 
 def test_a_driver_does_not_expect_to_wait_where_no_signal_can_stop_it(tmp_path: Path) -> None:

@@ -28,6 +28,7 @@ from tests.support.world import traffic_of
 
 SECONDS = 1200
 ONCE = '<param key="has.rerouting.device" value="true"/>'
+NONE = '<param key="has.rerouting.device" value="false"/>'
 SOME = (
     '<param key="device.rerouting.probability" value="0.5"/>'
     '<param key="device.rerouting.period" value="20"/>'
@@ -49,8 +50,8 @@ def cars(device: str = "") -> str:
     return CARS.format(device=device)
 
 
-@pytest.mark.parametrize("device", [DEVICE, ONCE])
-def test_vehicles_with_a_device_choose_routes_as_in_sumo(
+@pytest.mark.parametrize("device", [DEVICE, ONCE, "", NONE])
+def test_vehicles_without_a_given_route_choose_it_as_in_sumo(
     net: Path, tmp_path: Path, device: str
 ) -> None:
     body = cars(device) + FLOW
@@ -66,8 +67,9 @@ def test_vehicles_with_a_device_choose_routes_as_in_sumo(
     assert stats.contacts == 0
 
 
-def test_vehicles_without_a_device_stand_in_the_jam(net: Path, tmp_path: Path) -> None:
-    simulation = two_ways(net, tmp_path, cars() + FLOW)
+def test_vehicles_of_a_route_stand_in_the_jam(net: Path, tmp_path: Path) -> None:
+    flow = FLOW.replace('from="in" to="out"', 'route="near"')
+    simulation = two_ways(net, tmp_path, cars() + ROUTES + flow)
     assert traffic_of(simulation).rerouting is None
     assert passed(simulation, SECONDS)["long1"] == 0
     assert simulation.traffic_stats().rerouted == 0

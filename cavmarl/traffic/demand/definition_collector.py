@@ -237,6 +237,9 @@ class DefinitionCollector:
                 self.report.tolerate(what, element.place)
         timing = self._timing(element, flow, start)
         self._check_room(element, timing)
+        chance, period_ms = device(element)
+        if _has_no_route(element):
+            chance = 1.0  # as in SUMO, it finds its way by the speeds at its departure
         row: Iterable[float] = (
             self.report.files.index(element.path),
             element.line,
@@ -246,7 +249,8 @@ class DefinitionCollector:
             self._route(element),
             self._stops(element),
             0,
-            *device(element),
+            chance,
+            period_ms,
             *_entry_and_exit(element),
         )
         self.ids.append(name)
@@ -281,7 +285,7 @@ class DefinitionCollector:
         return self._type_number[name]
 
     def _route(self, element: Element) -> int:
-        inside = [c for c in element.children if c.name in ("route", "routeDistribution")]
+        inside = _routes_inside(element)
         if len(inside) > 1:
             raise element.error("holds two routes", "put both into a <routeDistribution>")
         if inside:
@@ -310,6 +314,16 @@ class DefinitionCollector:
             self._stops_number[key] = len(self.stops)
             self.stops[key] = stops
         return self._stops_number[key]
+
+
+def _routes_inside(element: Element) -> list[Element]:
+    return [child for child in element.children if child.name in ("route", "routeDistribution")]
+
+
+def _has_no_route(element: Element) -> bool:
+    """Return whether a <trip> or <flow> has only places between which it finds its way."""
+    named = "route" in element.attrs and element.name != "trip"
+    return not named and not _routes_inside(element)
 
 
 def _key(element: Element) -> tuple[object, ...]:

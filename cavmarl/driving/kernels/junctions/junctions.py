@@ -160,6 +160,24 @@ def _waits_at(
     return waits
 
 
+@kernel
+def _room_inside(
+    roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch: Scratch
+) -> float:
+    """Return how far beyond its line a vehicle that yields on `link` can wait, in m.
+
+    It is 0 if the vehicle has to wait at the line: at red, without a waiting position inside, and
+    if another vehicle is on the way there.
+    """
+    signal = link_signal(roads, link, phase)
+    lane, wait_m = roads.links[link]["next_lane"], roads.links[link]["wait_m"]
+    taken = scratch.lane_start[lane] < scratch.lane_end[lane]
+    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or wait_m == np.inf or taken:
+        return 0.0
+    room: float = wait_m
+    return room
+
+
 @inlined_kernel
 def _goes_first_in_swap(
     roads: RoadArrays,
@@ -201,7 +219,8 @@ def exit_blocked(
     """Return whether a row could not clear the junction behind the next vehicle that waits ahead.
 
     The vehicles that move in between need room as well. The next line at which a vehicle of that
-    road, or the row itself, has to wait ends the room; the inside of a junction is no room.
+    road, or the row itself, has to wait ends the room. The inside of a junction is no room, except
+    up to a waiting position that is free.
     Vehicles more than `EXIT_LOOK_M` beyond the junction do not count.
     """
     target = roads.links[link]
@@ -244,7 +263,8 @@ def exit_blocked(
         if lane < 0:
             return False
         if ahead >= 0 and _waits_at(roads, ahead, road_m, needed, phase):
-            return True
+            full: bool = room + _room_inside(roads, ahead, phase, scratch) < needed
+            return full
     return False
 
 
