@@ -211,6 +211,7 @@ def _config_of_file(path: Path) -> EnvConfig:
             config,
             scenario=ScenarioConfig(name=path.name),
             population=PopulationConfig(agents=1, background=0),
+            traffic=TrafficConfig(min_trip_m=0.0),  # scenes are small
         )
     if not is_sumo_config(path):
         return config

@@ -37,7 +37,7 @@ class SceneLane(NamedTuple):
     exits: tuple[str, ...] | None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Track:
     """The poses of one road user at all T times of a scene.
 
@@ -78,7 +78,7 @@ class Track:
         return found
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class LoggedScene:
     """A logged scene.
 
