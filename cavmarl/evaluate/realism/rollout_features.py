@@ -162,9 +162,13 @@ def signed_distances(objects: Trajectories, corners: Numbers, k: int) -> Numbers
 
 
 def _times_to_collision(objects: Trajectories, evaluated: int, step_s: float) -> Numbers:
-    """Return (E, T) the time until each object reaches the object that it follows, 5 s at most."""
+    """Return (E, T) the time until each object reaches the object that it follows, 5 s at most.
+
+    It is 5 s, too, where the speed of one of them is unknown.
+    """
     moves = _half_steps(objects.poses[..., :2])
     speed = hypot_all(moves[..., 0], moves[..., 1]) / step_s
+    speed[~derivative_valid(objects.valid)] = np.nan
     heading, half = objects.poses[..., 2], 0.5 * objects.sizes_m
     found = np.full(objects.valid[:evaluated].shape, MOST_TTC_S)
     times = np.arange(objects.valid.shape[1])
