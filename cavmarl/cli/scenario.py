@@ -218,8 +218,12 @@ def realism(
     ] = "idm",
     agents: Annotated[
         int | None,
-        about("Number of agents [default: as configured, 1 for a file].", metavar="N", min=1,
-              panel=WORLD),
+        about(
+            "Number of agents [default: as configured, 1 for a file].",
+            metavar="N",
+            min=1,
+            panel=WORLD,
+        ),
     ] = None,
     rollouts: Annotated[int, about("Number of rollouts.", metavar="N", min=1)] = 32,
     json_path: JsonPath = None,

@@ -1,4 +1,4 @@
-"""`ScenarioConfig`: a scripted conflict for the agents of a world."""
+"""`ScenarioConfig`: a scripted conflict for the agents of a world, or a logged scene."""
 
 from __future__ import annotations
 

@@ -17,8 +17,8 @@ MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.x
 
 _KINDS = (
     "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
-    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz); or a logged scene (.pkl "
-    "of ScenarioNet, .json of GPUDrive)"
+    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz); or a logged scene "
+    "(.pkl of ScenarioNet, .json of GPUDrive)"
 )
 _ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
 

@@ -34,8 +34,8 @@ from cavmarl.traffic.lane_plans import LanePlans
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
-from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 from cavmarl.traffic.scenarios.logged_traffic import logged_commands
+from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
@@ -545,7 +545,8 @@ class NativeTraffic:
     def at_reset(self) -> NDArray[np.void]:
         """EXTERNAL (L,) of the replayed road users at the reset; those not there are removed."""
         log = None if self.scene is None else self.scene.log
-        return logged_commands(log, self.type_rows, self.dt)[0]
+        commands: NDArray[np.void] = logged_commands(log, self.type_rows, self.dt)[0]
+        return commands
 
     def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Count vehicles that have left, and order their successors."""

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 Point = tuple[float, float]
@@ -104,7 +105,7 @@ def edge_distance(point: Point, lines: Sequence[Sequence[Point]]) -> float:
 
 
 def _line_distance(point: Point, line: Sequence[Point]) -> float:
-    parts = list(zip(line, line[1:], strict=False))
+    parts = list(pairwise(line))
     is_ring = math.dist(line[0], line[-1]) < 1.0
     apart = [to_segment(point, a, b) for a, b in parts]
     k = apart.index(min(apart))

@@ -2,7 +2,7 @@
 
 For each component, the values of all rollouts and times of an object make a histogram. The
 component is the exponential of the mean log-likelihood of the logged values, and the meta-metric is
-the weighted sum. Settings: `challenge_2024_config.textproto` of waymo-open-dataset.
+the weighted sum. The settings are those of the file challenge_2024_config of waymo-open-dataset.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _SMOOTHING = 0.1  # added to each bin
 _EVENT_SMOOTHING = 0.001
 
 
-class Component(NamedTuple):
+class MetricComponent(NamedTuple):
     """A component of the meta-metric. `low`, `high`, `bins`: of its histogram; 0 bins: an event."""
 
     weight: float
@@ -35,16 +35,16 @@ class Component(NamedTuple):
     bins: int = 0
 
 
-COMPONENTS: Mapping[str, Component] = {
-    "linear_speed": Component(0.05, "kinematic", 0.0, 25.0, 10),
-    "linear_acceleration": Component(0.05, "kinematic", -12.0, 12.0, 11),
-    "angular_speed": Component(0.05, "kinematic", -0.628, 0.628, 11),
-    "angular_acceleration": Component(0.05, "kinematic", -3.14, 3.14, 11),
-    "distance_to_nearest_object": Component(0.1, "interactive", -5.0, 40.0, 10),
-    "collision_indication": Component(0.25, "interactive"),
-    "time_to_collision": Component(0.1, "interactive", 0.0, 5.0, 10),
-    "distance_to_road_edge": Component(0.1, "map_based", -20.0, 40.0, 10),
-    "offroad_indication": Component(0.25, "map_based"),
+COMPONENTS: Mapping[str, MetricComponent] = {
+    "linear_speed": MetricComponent(0.05, "kinematic", 0.0, 25.0, 10),
+    "linear_acceleration": MetricComponent(0.05, "kinematic", -12.0, 12.0, 11),
+    "angular_speed": MetricComponent(0.05, "kinematic", -0.628, 0.628, 11),
+    "angular_acceleration": MetricComponent(0.05, "kinematic", -3.14, 3.14, 11),
+    "distance_to_nearest_object": MetricComponent(0.1, "interactive", -5.0, 40.0, 10),
+    "collision_indication": MetricComponent(0.25, "interactive"),
+    "time_to_collision": MetricComponent(0.1, "interactive", 0.0, 5.0, 10),
+    "distance_to_road_edge": MetricComponent(0.1, "map_based", -20.0, 40.0, 10),
+    "offroad_indication": MetricComponent(0.25, "map_based"),
 }
 BUCKETS = tuple(dict.fromkeys(one.bucket for one in COMPONENTS.values()))
 
@@ -113,7 +113,7 @@ def _derivatives_valid(valid: NDArray[np.bool_]) -> tuple[NDArray[np.bool_], NDA
     return speed, derivative_valid(speed)
 
 
-def _log_likelihoods(component: Component, values: Numbers, samples: Numbers) -> Numbers:
+def _log_likelihoods(component: MetricComponent, values: Numbers, samples: Numbers) -> Numbers:
     """Return (E, T) the log-likelihoods of values (E, T), given samples (E, R, T); NaN: missing."""
     low, high, bins = component.low, component.high, component.bins
     edges = np.linspace(low, high, bins + 1)

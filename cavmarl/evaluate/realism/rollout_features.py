@@ -214,8 +214,9 @@ def _edge_distances(
             apart = _line_distance(points[part], line)
             closer = np.abs(apart) < np.abs(nearest[part])
             nearest[part] = np.where(closer, apart, nearest[part])
-    found: Numbers = nearest.reshape(corners.shape[:-1]).max(axis=-1)
-    return np.where(objects.valid[:evaluated], found, -NEVER_M)
+    largest = nearest.reshape(corners.shape[:-1]).max(axis=-1)
+    found: Numbers = np.where(objects.valid[:evaluated], largest, -NEVER_M)
+    return found
 
 
 def _without_repeats(line: Numbers) -> Numbers:

@@ -73,7 +73,7 @@ class Track:
         if not (self.valid[first] and self.valid[first + 1]):
             return None
         before, after = self.poses[first], self.poses[first + 1]
-        found = before + share * (after - before)
+        found: Numbers = before + share * (after - before)
         found[2] = before[2] + share * wrapped(after[2:] - before[2:])[0]
         return found
 

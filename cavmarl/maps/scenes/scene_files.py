@@ -36,7 +36,7 @@ MOST_BYTES = 1 << 30
 MOST_TIMES = 100_000
 GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
-_KMH = 1.0 / 3.6
+_KMH_PER_MPH = 1.609344
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
 _GPUDRIVE_FREEWAY, _GPUDRIVE_BIKE_LANE = 1, 3  # map_element_id
 
@@ -96,8 +96,9 @@ def _scenarionet(scene: Any) -> LoggedScene:
     counts = _Counts()
     meta = _mapping(scene.get("metadata", {}), "metadata")
     length = scene.get("length")
-    if not isinstance(length, int) or not 1 <= length <= MOST_TIMES:
+    if not isinstance(length, int | np.integer) or not 1 <= length <= MOST_TIMES:
         raise MapError(f"length = {length!r}: must be a whole number from 1 to {MOST_TIMES}")
+    length = int(length)
     step_s = _step_of(meta.get("ts"), length)
     tracks = []
     for name, entry in _mapping(scene.get("tracks"), "tracks").items():
@@ -127,7 +128,7 @@ def _scenarionet(scene: Any) -> LoggedScene:
         edges,
         tracks,
         own,
-        present if isinstance(present, int) and 0 <= present < length else 0,
+        int(present) if isinstance(present, int | np.integer) and 0 <= present < length else 0,
         counts,
     )
 
@@ -158,19 +159,23 @@ def _scenarionet_track(
 
 
 def _scenarionet_lane(name: str, entry: Mapping[str, Any], is_freeway: bool) -> SceneLane:
-    speed = entry.get("speed_limit_kmh")
-    if speed is None and entry.get("speed_limit_mph") is not None:
-        speed = float(entry["speed_limit_mph"]) * 1.609344
-    is_stated = isinstance(speed, int | float) and 0.0 < speed < 1000.0
+    kmh, mph = (_number(entry.get(f"speed_limit_{unit}")) for unit in ("kmh", "mph"))
+    speed = mph * _KMH_PER_MPH if kmh is None and mph is not None else kmh
     exits = entry.get("exit_lanes")
     return SceneLane(
         name,
         _points(entry.get("polyline"), f"lane '{name}'", 3),
         is_freeway,
-        float(speed) * _KMH if is_stated and speed is not None else None,
+        None if speed is None else speed / 3.6,
         None,
         tuple(map(str, exits)) if isinstance(exits, list | tuple | np.ndarray) else None,
     )
+
+
+def _number(value: Any) -> float | None:
+    """Return a speed limit; None: not stated."""
+    is_number = isinstance(value, int | float | np.number) and not isinstance(value, complex)
+    return float(value) if is_number and 0.0 < value < 1000.0 else None
 
 
 def _step_of(stamps: Any, length: int) -> float:
@@ -322,9 +327,7 @@ def _scene(
 
 def _mapping(value: Any, what: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
-        raise MapError(
-            f"{what}: must be a mapping, is {type(value).__name__}: give {_KNOWN}"
-        )
+        raise MapError(f"{what}: must be a mapping, is {type(value).__name__}: give {_KNOWN}")
     return value
 
 

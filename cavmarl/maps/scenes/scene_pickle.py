@@ -29,7 +29,8 @@ def _array(subtype: type[Any], shape: object, code: object) -> Any:
     return np.ndarray.__new__(np.ndarray, (0,), "b")
 
 
-def _dtype(code: str, *_: object) -> np.dtype[Any]:
+def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype[Any]:
+    del align, copy
     found = np.dtype(code)
     if found.kind not in _KINDS or found.names is not None:
         raise _ForbiddenError(f"an array of dtype {str(code)[:40]!r}")

@@ -1,8 +1,9 @@
 """Makes a SUMO network of the lanes of a logged scene.
 
 Each lane keeps its centre line. Parallel lanes become one edge, so that vehicles can change lanes.
-Lanes over junctions become internal lanes: those that cross, leave or join others, between two
-lanes that do not. Scenes state neither widths nor rights of way: these are guessed, and counted.
+A lane that crosses, leaves or joins other lanes becomes an internal lane of a junction, if it is
+between two other lanes. Scenes state neither widths nor rights of way: these are guessed, and
+counted.
 """
 
 from __future__ import annotations
@@ -159,7 +160,7 @@ def _dot(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def _near_pairs(lanes: Sequence[_Lane]) -> dict[int, set[int]]:
-    """Return the lanes whose centre lines come close, besides those that follow each other."""
+    """Return the lanes whose centre lines come close, besides lanes that follow each other."""
     near: dict[int, set[int]] = defaultdict(set)
     boxes = np.array([lane.box for lane in lanes])
     for k, lane in enumerate(lanes):
@@ -224,9 +225,7 @@ class _Sets:
 class _Drawing:
     """The network's elements."""
 
-    def __init__(
-        self, lanes: Sequence[_Lane], inner: set[int], near: dict[int, set[int]]
-    ) -> None:
+    def __init__(self, lanes: Sequence[_Lane], inner: set[int], near: dict[int, set[int]]) -> None:
         self._lanes = lanes
         self._outer = [k for k in range(len(lanes)) if k not in inner]
         self._edges = _edges_of(lanes, self._outer)
@@ -315,9 +314,7 @@ class _Drawing:
             found.setdefault(self._node(n, 1), []).extend(edge)
         return found
 
-    def _rights(
-        self, moves: Sequence[_Movement]
-    ) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    def _rights(self, moves: Sequence[_Movement]) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
         """Return (n, n) whether a movement yields to another, and whether two are in conflict."""
         count = len(moves)
         yields = np.zeros((count, count), dtype=np.bool_)
@@ -377,9 +374,7 @@ class _Drawing:
                 "".join("01"[int(bit)] for bit in reversed(row[number].tolist()))
                 for row in (yields, foes)
             )
-            lines.append(
-                f'<request index="{number}" response="{response}" foes="{foe}" cont="0"/>'
-            )
+            lines.append(f'<request index="{number}" response="{response}" foes="{foe}" cont="0"/>')
         return [*lines, "</junction>"]
 
     def _connection_text(self, move: _Movement, path: str | None, state: str) -> list[str]:
@@ -423,9 +418,11 @@ def _edges_of(lanes: Sequence[_Lane], outer: Sequence[int]) -> list[list[int]]:
     groups: dict[int, list[int]] = defaultdict(list)
     for k in outer:
         groups[sets.find(k)].append(k)
-    for first, group in groups.items():
-        group.sort(key=lambda k, first=first: _offset(lanes[first], lanes[k], 0)[1])
-    return list(groups.values())
+    return [_from_the_right(lanes, group) for group in groups.values()]
+
+
+def _from_the_right(lanes: Sequence[_Lane], group: Sequence[int]) -> list[int]:
+    return sorted(group, key=lambda k: _offset(lanes[group[0]], lanes[k], 0)[1])
 
 
 def _are_beside(one: _Lane, other: _Lane) -> bool:

@@ -83,4 +83,3 @@ class LaneMatcher:
             links = network.links[lane["first_link"] : lane["first_link"] + lane["num_links"]]
             found += network.lanes["edge"][links["to_lane"]].tolist()
         return list(dict.fromkeys(found))
-

@@ -30,11 +30,11 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import make_plans
 from cavmarl.traffic.scenarios.lane_matching import LaneMatcher, LanePlace
 from cavmarl.traffic.scenarios.scene import (
-    Body,
     LoggedTraffic,
-    Reaction,
+    ReactingVehicle,
     Scene,
     Seat,
+    SeatBody,
     checked,
     setting,
     switch,
@@ -99,7 +99,7 @@ class _Casting:
             for track in self._log.tracks
             if track.valid[self._first :].any() and track.name not in seated
         ]
-        reacting: list[Reaction] = []
+        reacting: list[ReactingVehicle] = []
         if reactive:
             found = [self._reaction(track) for track in others if track.kind == "vehicle"]
             reacting = [one for one in found if one is not None]
@@ -182,7 +182,7 @@ class _Casting:
 
     def _seat_at(self, track: Track, place: LanePlace, time: int, goal: int) -> Seat:
         x, y, heading = track.poses[time].tolist()
-        body = Body(x, y, heading, place.d, *clipped_size(track))
+        body = SeatBody(x, y, heading, place.d, *clipped_size(track))
         speed = float(speeds_of(track, self._log.step_s)[time])
         return Seat(place.lane, place.s, max(speed, 0.0), goal, body)
 
@@ -214,7 +214,7 @@ class _Casting:
                 return edge
         return self._matcher.edge(start.lane, is_start=False)
 
-    def _reaction(self, track: Track) -> Reaction | None:
+    def _reaction(self, track: Track) -> ReactingVehicle | None:
         """Return the way of a vehicle that drives by itself; None: it has to be replayed."""
         times = track.times[track.times >= self._first]
         first = int(times[0])
@@ -243,7 +243,7 @@ class _Casting:
         if any(one == other for one, other in pairwise(edges)):
             return None
         seat = self._seat_at(track, start, first, edges[-1])
-        return Reaction(track, seat, tuple(edges), (first - self._first) * self._log.step_s)
+        return ReactingVehicle(track, seat, tuple(edges), (first - self._first) * self._log.step_s)
 
 
 def clipped_size(track: Track) -> tuple[float, float, float]:

@@ -27,10 +27,10 @@ class Seat:
     s: float  # m, of the centre on the lane
     speed_mps: float  # initial speed, and the speed that its built-in driver keeps
     goal_edge: int  # EDGE row where the trip ends
-    body: Body | None = None  # None: on the lane, with the size of its type
+    body: SeatBody | None = None  # None: on the lane, with the size of its type
 
 
-class Body(NamedTuple):
+class SeatBody(NamedTuple):
     """The exact pose and the size of a vehicle at its start."""
 
     x: float  # m, of the centre
@@ -42,7 +42,7 @@ class Body(NamedTuple):
     height: float
 
 
-class Reaction(NamedTuple):
+class ReactingVehicle(NamedTuple):
     """A logged vehicle that a built-in driver drives along the logged way."""
 
     track: Track
@@ -58,7 +58,7 @@ class LoggedTraffic(NamedTuple):
     first: int  # number of the sample at the reset
     seated: Sequence[Track]  # tracks whose vehicles the agents drive
     replayed: Sequence[Track]
-    reacting: Sequence[Reaction]  # by departure
+    reacting: Sequence[ReactingVehicle]  # by departure
     notes: tuple[str, ...]  # what was changed, with counts
 
 

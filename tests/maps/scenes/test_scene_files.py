@@ -47,7 +47,7 @@ def test_headings_in_degrees_are_recognized_by_the_motion(tmp_path: Path) -> Non
 
 @pytest.mark.parametrize("protocol", range(2, pickle.HIGHEST_PROTOCOL + 1))
 def test_every_protocol_of_pickles_is_read(protocol: int) -> None:
-    plain = {
+    plain: dict[str, Any] = {
         "arrays": [np.arange(3.0), np.ones((2, 2), np.float32), np.array(["a", "b"])],
         "numbers": [np.float32(2.5), np.int64(3), True, None],
         "sets": {1, 2},
@@ -93,7 +93,9 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
     assert not Path("/tmp/never").exists()
 
 
-@pytest.mark.parametrize("content", [b"", b"no pickle", pickle.dumps(scenario())[:1000], b"\x80\x05"])
+@pytest.mark.parametrize(
+    "content", [b"", b"no pickle", pickle.dumps(scenario())[:1000], b"\x80\x05"]
+)
 def test_broken_pickles_are_refused(content: bytes, tmp_path: Path) -> None:
     path = tmp_path / "broken.pkl"
     path.write_bytes(content)

@@ -62,7 +62,9 @@ def test_of_two_foes_exactly_one_yields(tmp_path: Path) -> None:
     network = network_of(read_scene(write_pickle(tmp_path)), tmp_path)
     yields = set()
     for link, row in enumerate(network.links):
-        own = network.conflicts[row["first_conflict"] : row["first_conflict"] + row["num_conflicts"]]
+        own = network.conflicts[
+            row["first_conflict"] : row["first_conflict"] + row["num_conflicts"]
+        ]
         yields |= {(link, int(c["foe"])) for c in own if c["must_yield"]}
     assert yields
     assert not {(foe, link) for link, foe in yields} & yields
