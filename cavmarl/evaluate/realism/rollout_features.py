@@ -208,10 +208,12 @@ def _edge_distances(
     corners = corners_of(objects.poses[:evaluated], objects.sizes_m[:evaluated])
     points = corners.reshape(-1, 2)
     nearest = np.full(len(points), NEVER_M)
-    for line in lines:
-        for first in range(0, len(points), _POINTS):
-            part = slice(first, first + _POINTS)
-            apart = _line_distance(points[part], line)
+    least = np.stack([_box_distance(points, line) for line in lines])
+    for number in np.argsort(least.mean(axis=1), kind="stable").tolist():
+        near = np.flatnonzero(least[number] <= np.abs(nearest))
+        for first in range(0, len(near), _POINTS):
+            part = near[first : first + _POINTS]
+            apart = _line_distance(points[part], lines[number])
             closer = np.abs(apart) < np.abs(nearest[part])
             nearest[part] = np.where(closer, apart, nearest[part])
     largest = nearest.reshape(corners.shape[:-1]).max(axis=-1)
@@ -220,7 +222,15 @@ def _edge_distances(
 
 
 def _without_repeats(line: Numbers) -> Numbers:
-    return line[np.concatenate([[True], (np.diff(line, axis=0) != 0.0).any(axis=1)])]
+    found: Numbers = line[np.concatenate([[True], (np.diff(line, axis=0) != 0.0).any(axis=1)])]
+    return found
+
+
+def _box_distance(points: Numbers, line: Numbers) -> Numbers:
+    """Return (P,) the distance of points to the box around a polyline, a lower bound."""
+    low, high = line.min(axis=0), line.max(axis=0)
+    outside = np.maximum(np.maximum(low - points, points - high), 0.0)
+    return hypot_all(outside[:, 0], outside[:, 1])
 
 
 def _line_distance(points: Numbers, line: Numbers) -> Numbers:
