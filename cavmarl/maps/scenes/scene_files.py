@@ -6,10 +6,10 @@ The fields are described at https://metadriverse.github.io/scenarionet and in GP
 
 from __future__ import annotations
 
+import hashlib
 import json
 from collections import Counter
 from collections.abc import Mapping, Sequence
-from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -43,12 +43,12 @@ _GPUDRIVE_FREEWAY, _GPUDRIVE_BIKE_LANE = 1, 3  # map_element_id
 _KNOWN = "a ScenarioNet scene (.pkl) or a scene of GPUDrive (.json)"
 
 
-@lru_cache(maxsize=8)
-def _read(path: Path, modified_ns: int, size: int) -> LoggedScene:
-    del modified_ns
-    if size > MOST_BYTES:
-        raise MapError(f"has {size} bytes, more than {MOST_BYTES}: cut the scene into parts")
-    content = path.read_bytes()
+# Scenes by the hash of their files, because a world reads its scene several times.
+_SCENES: dict[str, LoggedScene] = {}
+_KEPT = 8
+
+
+def _parsed(path: Path, content: bytes) -> LoggedScene:
     if path.name.endswith(".pkl"):
         return _scenarionet(unpickle(content))
     try:
@@ -67,8 +67,16 @@ def read_scene(path: str | Path) -> LoggedScene:
     if not is_scene_file(path.name):
         raise MapError(f"{path}: not a scene file: give {_KNOWN}")
     try:
-        stat = path.stat()
-        return _read(path.resolve(), stat.st_mtime_ns, stat.st_size)
+        if (size := path.stat().st_size) > MOST_BYTES:
+            raise MapError(f"has {size} bytes, more than {MOST_BYTES}: cut the scene into parts")
+        content = path.read_bytes()
+        key = hashlib.sha256(content).hexdigest() + path.suffix
+        if key not in _SCENES:
+            scene = _parsed(path, content)
+            while len(_SCENES) >= _KEPT:
+                del _SCENES[next(iter(_SCENES))]
+            _SCENES[key] = scene
+        return _SCENES[key]
     except MapError as error:
         raise MapError(f"{path}: {error}") from error
     except OSError as error:
@@ -237,7 +245,7 @@ def _gpudrive(scene: Any) -> LoggedScene:
             points = _xyz(entry.get("geometry"), f"lane '{name}'")
             is_freeway = entry.get("map_element_id") == _GPUDRIVE_FREEWAY
             lanes.append(SceneLane(name, points, is_freeway, None, None, None))
-    if lights := len(scene.get("tl_states") or ()):
+    if lights := len(_mapping(scene.get("tl_states") or {}, "tl_states")):
         counts.add("traffic lights ignored", lights)
     name = str(scene.get("scenario_id") or scene.get("name") or "")
     return _scene(name, GPUDRIVE_STEP_S, lanes, edges, tracks, own, 0, counts)
@@ -267,7 +275,7 @@ def _gpudrive_object(number: int, entry: Any, counts: _Counts) -> _Object | None
         elif not isinstance(size, int | float):
             raise MapError(f"size {where}: must be numbers, is {str(size)[:40]!r}")
     poses = np.concatenate([position[:, :2], heading], axis=1)
-    return name, kind, poses, valid, np.array([sizes], dtype=np.float64)
+    return name, kind, poses, valid, _array([sizes], f"size {where}", 1, (3,))
 
 
 def _heading_unit(parts: Sequence[_Object]) -> float:
@@ -341,7 +349,7 @@ def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numb
     """Return numbers (length, one of `columns`)."""
     try:
         found = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapError(f"{what}: must be an array of numbers; export the scene again") from error
     if found.ndim == 1 and columns == (1,):
         found = found[:, None]
@@ -357,7 +365,7 @@ def _points(value: Any, what: str, columns: int) -> Numbers:
     """Return the points (n, columns) of a polyline; missing heights are 0."""
     try:
         found = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
+    except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapError(f"{what}: must have points x, y (z); export the scene again") from error
     if found.ndim != 2 or found.shape[1] not in (2, 3) or not len(found):
         raise MapError(f"{what}: has the shape {found.shape}: must have points x, y (z)")

@@ -1,12 +1,14 @@
 """Reads pickles of strangers: only builtins and NumPy's arrays of numbers and text.
 
 A pickle can call any function that it names. This reader knows a fixed list of names, and replaces
-NumPy's functions by versions that check their arguments.
+NumPy's functions by versions that check their arguments. Before that, it checks the operations: a
+place in the memo beyond their number would reserve any amount of memory.
 """
 
 from __future__ import annotations
 
 import pickle
+import pickletools
 from collections import OrderedDict, defaultdict
 from collections.abc import Callable
 from io import BytesIO
@@ -16,6 +18,9 @@ import numpy as np
 
 from cavmarl.core.errors import MapError
 
+_FORBIDDEN = frozenset(
+    "BYTEARRAY8 NEXT_BUFFER READONLY_BUFFER PERSID BINPERSID EXT1 EXT2 EXT4 INST OBJ".split()
+)
 _KINDS = "biufSU"  # kinds of numbers and text; objects and records could contain anything
 
 
@@ -83,12 +88,24 @@ class _RestrictedUnpickler(pickle.Unpickler):
         raise _ForbiddenError(f"{module[:60]}.{name[:60]}")
 
 
+def _check_operations(content: bytes) -> None:
+    count = 0
+    for operation, argument, _ in pickletools.genops(content):
+        count += 1
+        name = operation.name
+        if name in _FORBIDDEN:
+            raise _ForbiddenError(f"the operation {name}")
+        if name in ("PUT", "BINPUT", "LONG_BINPUT") and int(str(argument)) > count:
+            raise _ForbiddenError(f"{argument} as a place in the memo")
+
+
 def unpickle(content: bytes) -> Any:
     """Return the object of a pickle.
 
     Raises MapError: the pickle is broken, or names something else than builtins and arrays.
     """
     try:
+        _check_operations(content)
         return _RestrictedUnpickler(BytesIO(content)).load()
     except _ForbiddenError as error:
         raise MapError(
