@@ -2,7 +2,8 @@
 
 A pickle can call any function that it names. This reader knows a fixed list of names, and replaces
 NumPy's functions by versions that check their arguments. Before that, it checks the operations: a
-place in the memo beyond their number would reserve any amount of memory.
+place in the memo beyond their number, or a length beyond the content, could reserve any amount of
+memory.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ import numpy as np
 from cavmarl.core.errors import MapError
 
 _FORBIDDEN = frozenset(
-    "BYTEARRAY8 NEXT_BUFFER READONLY_BUFFER PERSID BINPERSID EXT1 EXT2 EXT4 INST OBJ".split()
+    "NEXT_BUFFER READONLY_BUFFER PERSID BINPERSID EXT1 EXT2 EXT4 INST OBJ".split()
 )
 _KINDS = "biufSU"  # kinds of numbers and text; objects and records could contain anything
 
