@@ -89,7 +89,8 @@ class ExternalComponent(Component):
     def begin(self, commands: Commands) -> None:
         """Take the commands of a step in its first tick."""
         self.leaving[:] = self.coming[:] = self.has_news = False
-        if not self._held.size or self._ticks.item(0) % self._ticks_per_step:
+        is_told = commands.external.size or self._replayed.shape[1]
+        if not is_told or self._ticks.item(0) % self._ticks_per_step:
             return
         told, held = self._commands_of(commands), self.held
         held["speed"][held["kind"] == EXTERNAL_POSED] = np.nan  # such vehicles are at their poses
