@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.memory import Zeros
 from cavmarl.core.records.arrays import Outputs, TripTables
-from cavmarl.core.records.external_records import EXTERNAL
 from cavmarl.handoff.division import ZonedShards
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.sensors.mounted.frames import Frames
@@ -40,7 +39,7 @@ class ComponentContext(NamedTuple):
     # (W,) the tick in which lanes last changed, -1: never; see `NativeTraffic`
     changed_at: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     # EXTERNAL (K, L) of the replayed road users of a logged scene, see `logged_commands`
-    replayed: NDArray[np.void] = np.zeros((1, 0), dtype=EXTERNAL)
+    replayed: NDArray[np.void] | None = None
 
 
 class Component(Protocol):

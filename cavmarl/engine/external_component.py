@@ -57,7 +57,8 @@ class ExternalComponent(Component):
 
     def __init__(self, host: ComponentContext) -> None:
         self._num_told = host.config.population.external
-        self._replayed = host.replayed
+        none = np.zeros((1, 0), dtype=EXTERNAL)
+        self._replayed = none if host.replayed is None else host.replayed
         shape = (host.num_worlds, self._num_told + self._replayed.shape[1])
         self._held = host.zeros((*shape, EXTERNAL_FIELDS))
         self.ids: NDArray[np.int64] = host.zeros(shape, dtype=np.int64)

@@ -76,11 +76,9 @@ def make_tick(
             frames=frames,
             lane_plans=traffic.lane_plans,
             changed_at=traffic.changed_at,
-            replayed=logged_commands(
-                None if traffic.scene is None else traffic.scene.log,
-                traffic.type_rows,
-                config.clock.ctrl_dt_s,
-            ),
+            replayed=None
+            if traffic.num_replayed == 0 or traffic.scene is None
+            else logged_commands(traffic.scene.log, traffic.type_rows, config.clock.ctrl_dt_s),
         )
     )
     departures = make_departure_queue(num_worlds, traffic.capacity, network.arrays, blank.dtype)
@@ -96,7 +94,7 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(lanes)
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
-    if host.config.population.external or host.replayed.shape[1]:
+    if host.config.population.external or host.replayed is not None:
         parts.append(ExternalComponent(host))
     if host.config.signals.overrides:
         parts.append(OverrideComponent(host))
