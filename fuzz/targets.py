@@ -5,6 +5,7 @@ from __future__ import annotations
 from fuzz.followers import FOLLOWER
 from fuzz.protocol import LOGS, MESSAGES
 from fuzz.roads import BUILDINGS, CACHED, MAPS, NETWORKS, PROGRAMS, ZONES
+from fuzz.scenes import DOCUMENTS, PICKLES
 from fuzz.settings import CHECKPOINTS, DRIVERS, ENTRIES, MANIFESTS, OVERRIDES, PLANS
 from fuzz.traffic import DEMAND, SUMO_CONFIGS, TRACES
 
@@ -20,6 +21,8 @@ TARGETS = {
     "demand": DEMAND,
     "sumocfg": SUMO_CONFIGS,
     "trace": TRACES,
+    "scene-pickle": PICKLES,
+    "scene-json": DOCUMENTS,
     "entry": ENTRIES,
     "overrides": OVERRIDES,
     "driver": DRIVERS,

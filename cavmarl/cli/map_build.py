@@ -30,7 +30,7 @@ Source = Annotated[
     Path,
     typer.Argument(
         metavar="MAP",
-        help="Map file: a SUMO network or .sumocfg, OSM or OpenDRIVE.",
+        help="Map file: a SUMO network or .sumocfg, OSM, OpenDRIVE, or a logged scene.",
         exists=True,
         dir_okay=False,
     ),

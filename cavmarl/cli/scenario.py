@@ -199,6 +199,79 @@ def sweep(
         raise typer.Exit(1)
 
 
+@with_world("agents", "seed", "settings", "sensors_of")
+def realism(
+    world: WorldSpec,
+    env: Annotated[
+        str,
+        typer.Argument(
+            metavar="SCENE",
+            help="Scene file (.pkl of ScenarioNet, .json of GPUDrive), or an environment with one.",
+        ),
+    ],
+    param: Annotated[
+        list[str] | None,
+        about("Set a parameter of the scene. Repeat it for more.", "--param", metavar="KEY=VALUE"),
+    ] = None,
+    driver: Annotated[
+        str, about("Driver of the agents: a name, a .py file or a folder.", metavar="POLICY")
+    ] = "idm",
+    agents: Annotated[
+        int | None,
+        about(
+            "Number of agents [default: as configured, 1 for a file].",
+            metavar="N",
+            min=1,
+            panel=WORLD,
+        ),
+    ] = None,
+    rollouts: Annotated[int, about("Number of rollouts.", metavar="N", min=1)] = 32,
+    json_path: JsonPath = None,
+) -> None:
+    """Measure how realistic rollouts of a logged scene are.
+
+    The meta-metric is that of the Waymo Open Sim Agents Challenge 2024, over the vehicles of agents
+    and, with --param reactive=true, of built-in drivers.
+    """
+    check_extras(world, [driver])
+    from cavmarl.evaluate.realism.logged_rollouts import measure_realism
+    from cavmarl.evaluate.realism.realism_metric import COMPONENTS, YEAR
+
+    world = with_sensors_of_drivers(world, [driver])
+    overrides = dict(world.overrides)
+    if param:
+        overrides["scenario.params"] = _params(param)
+    with counting(Console(), "steps") as told:
+        found = measure_realism(
+            env,
+            driver,
+            rollouts=rollouts,
+            agents=agents,
+            seed=world.seed,
+            overrides=overrides,
+            told=told,
+        )
+    table = Table("component", "weight", "likelihood", box=box.SIMPLE_HEAD)
+    for name, value in found.realism.likelihoods.items():
+        table.add_row(name, f"{COMPONENTS[name].weight:g}", f"{value:.4f}")
+    for name, value in found.realism.buckets.items():
+        table.add_row(f"all {name}", "", f"{value:.4f}")
+    table.add_row(f"meta-metric ({YEAR})", "", f"{found.realism.meta:.4f}")
+    console = Console()
+    console.print(
+        f"{escape(found.scene)}: {found.rollouts} rollouts of {found.steps} steps with "
+        f"{escape(driver)}, seed {found.seed}; {found.evaluated} vehicles driven, "
+        f"{found.replayed} road users replayed"
+    )
+    console.print(table)
+    console.print(
+        f"mean distance from the log {found.ade_m:.2f} m, of the best rollout "
+        f"{found.min_ade_m:.2f} m; {found.missing_percent:.1f} % of the logged steps are missing, "
+        "because vehicles had left"
+    )
+    write_json(json_path, found.to_dict())
+
+
 def _params(given: list[str] | None) -> dict[str, bool | float]:
     params: dict[str, bool | float] = {}
     for text in given or ():
@@ -242,6 +315,12 @@ add_command(
     "run",
     run,
     "cavmarl scenario run merge_conflict --map grid4x4 --driver idm --video merge_conflict.mp4",
+)
+add_command(
+    app,
+    "realism",
+    realism,
+    "cavmarl scenario realism scene.json --driver idm --param reactive=true --rollouts 32",
 )
 add_command(
     app,

@@ -17,7 +17,7 @@ import numpy as np
 
 from cavmarl.config.env import BY_MAP, EnvConfig, MapConfig
 from cavmarl.config.population import PopulationConfig
-from cavmarl.config.scenario import path_of_code
+from cavmarl.config.scenario import ScenarioConfig, path_of_code
 from cavmarl.config.traffic import TrafficConfig
 from cavmarl.config.zones import ZONE_LAYOUTS
 from cavmarl.core.errors import (
@@ -29,6 +29,7 @@ from cavmarl.core.errors import (
     require,
 )
 from cavmarl.core.extensions import load_plugins
+from cavmarl.core.scene_names import SCENE_SUFFIXES, is_scene_file
 from cavmarl.core.xml_root import SUMO_CONFIG_SUFFIX, is_sumo_config
 
 _NATIVE = (".net.xml", ".net.xml.gz")  # read as they are; SUMO's netconvert converts the others
@@ -84,8 +85,8 @@ def find_entry(env: str | Path) -> Path:
     """Return the entry folder or the map file that `env` means.
 
     Args:
-        env: a name from `entries()`, a folder with an `env.yaml`, a map file, or a configuration of
-            SUMO.
+        env: a name from `entries()`, a folder with an `env.yaml`, a map file, a configuration of
+            SUMO, or a logged scene.
 
     Raises:
         UnknownEnvironmentError: nothing has that name; the message lists all names.
@@ -101,9 +102,10 @@ def find_entry(env: str | Path) -> Path:
     if isfile(path / "env.yaml"):  # unlike Path.is_file, isfile accepts names that no file can have
         return path
     if isfile(path):
-        if not path.name.endswith(MAP_SUFFIXES) and not is_sumo_config(path):
+        suffixes = (*MAP_SUFFIXES, *SCENE_SUFFIXES)
+        if not path.name.endswith(suffixes) and not is_sumo_config(path):
             raise UnknownEnvironmentError(
-                f"{path}: not a map file; the name must end in {' or '.join(MAP_SUFFIXES)}, or its "
+                f"{path}: not a map file; the name must end in {' or '.join(suffixes)}, or its "
                 "root element must be the <configuration> of SUMO"
             )
         return path
@@ -129,8 +131,8 @@ def load_config(
 
     Args:
         env: see `find_entry`. A map file gets a default environment, whose horizon depends on the
-            map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and no
-            background vehicles are generated.
+            map: see `make_world`. A configuration of SUMO also sets `traffic.demand`, and a logged
+            scene `scenario.name`; then no background vehicles are generated.
         zones: sets `zones.count`.
         zone_simulators: sets `zones.simulators`.
         sensor_workers: sets `workers.sensors`.
@@ -188,12 +190,29 @@ def load_config(
         if max_cycles is not None:
             raw["horizon_s"] = _horizon_s(max_cycles, raw)
         config = validate(EnvConfig, raw, f"{where}, overridden")
-    return config, base_dir
+    return _with_scene_path(config, base_dir), base_dir
+
+
+def _with_scene_path(config: EnvConfig, base_dir: Path) -> EnvConfig:
+    """Make the path of a logged scene absolute, so that all processes of a world find it."""
+    name = config.scenario.name
+    if not is_scene_file(name) or Path(name).is_absolute():
+        return config
+    path = base_dir / name if isfile(base_dir / name) else Path(name)
+    scenario = dataclasses.replace(config.scenario, name=str(path.resolve()))
+    return dataclasses.replace(config, scenario=scenario)
 
 
 def _config_of_file(path: Path) -> EnvConfig:
-    """Return the default configuration of a map file, or of a configuration of SUMO."""
+    """Return the default configuration of a map file, a configuration of SUMO or a scene."""
     config = EnvConfig(name=_map_name(path), map=MapConfig(source=path.name), horizon_s=BY_MAP)
+    if is_scene_file(path.name):
+        return dataclasses.replace(
+            config,
+            scenario=ScenarioConfig(name=path.name),
+            population=PopulationConfig(agents=1, background=0),
+            traffic=TrafficConfig(min_trip_m=0.0),  # scenes are small
+        )
     if not is_sumo_config(path):
         return config
     return dataclasses.replace(
@@ -287,8 +306,8 @@ def _find_rig(name: str, base_dir: Path) -> Path:
 
 
 def is_converted(source: str) -> bool:
-    """Return whether a source in `map.source` is a map file that netconvert converts."""
-    return source.endswith(MAP_SUFFIXES) and not source.endswith(_NATIVE)
+    """Return whether a source in `map.source` is a map file that is converted to a network."""
+    return source.endswith((*MAP_SUFFIXES, *SCENE_SUFFIXES)) and not source.endswith(_NATIVE)
 
 
 def resolve_maps(config: EnvConfig, base_dir: Path) -> list[Path]:
@@ -419,7 +438,7 @@ def _advice(env: str | Path, known: Mapping[str, Path]) -> str:
 
 def _map_name(path: Path) -> str:
     """Return a map file's name without its suffix."""
-    suffixes = (*MAP_SUFFIXES, SUMO_CONFIG_SUFFIX)
+    suffixes = (*MAP_SUFFIXES, SUMO_CONFIG_SUFFIX, *SCENE_SUFFIXES)
     ending = max((s for s in suffixes if path.name.endswith(s)), key=len, default="")
     return path.name.removesuffix(ending)
 

@@ -1,4 +1,8 @@
-"""Vehicles that the caller poses or drives: their commands and ids, and their part of a tick."""
+"""Vehicles that the caller poses or drives: their commands and ids, and their part of a tick.
+
+The replayed road users of a logged scene are such vehicles, too. Their slots follow those of the
+caller, and their commands come from a table.
+"""
 
 from __future__ import annotations
 
@@ -20,6 +24,7 @@ from cavmarl.core.records.external_records import (
     EXTERNAL_POSED,
     EXTERNAL_REMOVED,
     FIRST_EXTERNAL_ID,
+    first_external_id,
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.driving.vehicles import blank_vehicle
@@ -51,13 +56,17 @@ class ExternalComponent(Component):
     """
 
     def __init__(self, host: ComponentContext) -> None:
-        shape = (host.num_worlds, host.config.population.external)
+        self._num_told = host.config.population.external
+        none = np.zeros((1, 0), dtype=EXTERNAL)
+        self._replayed = none if host.replayed is None else host.replayed
+        shape = (host.num_worlds, self._num_told + self._replayed.shape[1])
         self._held = host.zeros((*shape, EXTERNAL_FIELDS))
         self.ids: NDArray[np.int64] = host.zeros(shape, dtype=np.int64)
         self.ids[:] = -1
         self.leaving = np.zeros(shape, dtype=np.bool_)
         self.coming = np.zeros(shape, dtype=np.bool_)
         self.has_news = False
+        self._told = np.zeros((*shape, EXTERNAL_FIELDS))
         self._ticks = host.shards[0].worlds.ticks
         self._ticks_per_step = host.config.clock.ticks_per_step
         self._types = host.travel.types
@@ -68,16 +77,23 @@ class ExternalComponent(Component):
         return records_of(self._held)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
-        """Empty the slots of the chosen worlds (W,)."""
+        """Empty the slots of the chosen worlds (W,), except for road users replayed from tick 0."""
         self._held[chosen] = EXTERNAL_NONE
         self.ids[chosen] = -1
+        first, num_slots = self._replayed[0], self.ids.shape[1]
+        slots = np.flatnonzero(first["kind"] == EXTERNAL_POSED)
+        for w in np.flatnonzero(chosen).tolist():
+            self.held[w, self._num_told + slots] = first[slots]
+            own = self._num_told + slots
+            self.ids[w, own] = first_external_id(self._ticks[w], num_slots) + own
 
     def begin(self, commands: Commands) -> None:
         """Take the commands of a step in its first tick."""
         self.leaving[:] = self.coming[:] = self.has_news = False
-        if not commands.external.size or self._ticks.item(0) % self._ticks_per_step:
+        is_told = commands.external.size or self._replayed.shape[1]
+        if not is_told or self._ticks.item(0) % self._ticks_per_step:
             return
-        told, held = records_of(commands.external), self.held
+        told, held = self._commands_of(commands), self.held
         held["speed"][held["kind"] == EXTERNAL_POSED] = np.nan  # such vehicles are at their poses
         self.has_news = bool(told["kind"].any())
         if not self.has_news:
@@ -98,6 +114,17 @@ class ExternalComponent(Component):
             for name in ("kind", *names):
                 held[name][changed] = told[name][changed]
         held[self.leaving] = np.zeros((), dtype=EXTERNAL)
+
+    def _commands_of(self, commands: Commands) -> NDArray[np.void]:
+        """Return EXTERNAL (W, E), the commands of the caller and those of the table."""
+        self._told[:] = 0.0
+        if commands.external.size:
+            self._told[:, : self._num_told] = commands.external
+        told = records_of(self._told)
+        if self._replayed.shape[1]:
+            steps = np.minimum(self._ticks // self._ticks_per_step + 1, len(self._replayed) - 1)
+            told[:, self._num_told :] = self._replayed[steps]
+        return told
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the commands and the ids of all slots."""

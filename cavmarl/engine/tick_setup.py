@@ -24,6 +24,7 @@ from cavmarl.traffic.demand import DemandFile
 from cavmarl.traffic.departure_queue import make_departure_queue
 from cavmarl.traffic.native import NativeTraffic
 from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.scenarios.logged_traffic import logged_commands
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.zones.partition.zone_layouts import cut_map
 from cavmarl.zones.partition.zone_partition import ZonePartition
@@ -55,7 +56,7 @@ def make_tick(
             file=None if isinstance(demand, SumoDemand) else demand,
             num_worlds=num_worlds,
             zeros=zeros,
-            scene=plan_scene(config.scenario, network),
+            scene=plan_scene(config.scenario, network, config.population.agents),
             sumo=demand if isinstance(demand, SumoDemand) else None,
             lane_changes=config.map.changed_lanes > 0,
         )
@@ -75,6 +76,9 @@ def make_tick(
             frames=frames,
             lane_plans=traffic.lane_plans,
             changed_at=traffic.changed_at,
+            replayed=None
+            if traffic.num_replayed == 0 or traffic.scene is None
+            else logged_commands(traffic.scene.log, traffic.type_rows, config.clock.ctrl_dt_s),
         )
     )
     departures = make_departure_queue(num_worlds, traffic.capacity, network.arrays, blank.dtype)
@@ -90,7 +94,7 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(lanes)
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
-    if host.config.population.external:
+    if host.config.population.external or host.replayed is not None:
         parts.append(ExternalComponent(host))
     if host.config.signals.overrides:
         parts.append(OverrideComponent(host))

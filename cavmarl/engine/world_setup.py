@@ -45,6 +45,7 @@ from cavmarl.traffic.demand import DemandFile, read_demand
 from cavmarl.traffic.demand.sumo_config import read_sumo_config
 from cavmarl.traffic.native import capacity_of
 from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.scenarios.logged_demand import check_logged_world, demand_of_log
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand, read_sumo_demand
 from cavmarl.traffic.sumo.sumo_input import read_input
 from cavmarl.zones.partition.zone_file import zones_for
@@ -83,8 +84,8 @@ class World(NamedTuple):
         config = self.config
         dt, horizon_s = config.clock.sim_dt_s, config.horizon_s
         room = capacity_of(self.network, config.population, self.demand, dt, horizon_s)
-        scene = plan_scene(config.scenario, self.network)
-        return room + (0 if scene is None else len(scene.actors))
+        scene = plan_scene(config.scenario, self.network, config.population.agents)
+        return room + (0 if scene is None else scene.num_rows)
 
 
 def roadside_sizes(config: EnvConfig, network: RoadNetwork) -> SignalSizes:
@@ -138,11 +139,21 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     for driver in drivers:
         for kind in untrained_kinds(network, driver.maps):
             _warn_once(network.name, network.source_hash, note_of(driver.name, kind))
+    scene = plan_scene(config.scenario, network, config.population.agents)
     if config.horizon_s == BY_MAP:
         step_s = config.clock.ctrl_dt_s
-        config = replace(config, horizon_s=step_s * max(1, round(horizon_of(network) / step_s)))
+        rest_s = horizon_of(network)
+        if scene is not None and scene.log is not None:
+            log = scene.log
+            rest_s = (log.scene.num_times - 1 - log.first) * log.scene.step_s
+        config = replace(config, horizon_s=step_s * max(1, round(rest_s / step_s)))
     files = _demand_files(config, base_dir)
     demand: DemandFile | SumoDemand | None = None
+    if scene is not None and scene.log is not None:
+        check_logged_world(config)
+        for note in scene.log.notes:
+            _warn_once(network.name, network.source_hash, note)
+        demand = demand_of_log(scene.log, network, config.traffic)
     if config.traffic.source != "native":
         network = with_programs(network, read_input(files).additional_files)
         path = map_file(resolve_map(config, base_dir)).resolve()
@@ -154,7 +165,6 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
             on_bad_route=config.traffic.on_bad_route,
             programs=_program_files(config, base_dir),
         ).begun(config.horizon_s)
-    scene = plan_scene(config.scenario, network)
     if scene is not None and scene.outages:
         network = with_outages(network, dict(scene.outages))
     trim()  # return the memory that reading files has freed

@@ -106,7 +106,7 @@ class WorldViews:
 
     @property
     def external(self) -> ExternalComponent:
-        """The slots of the vehicles that the caller poses or drives."""
+        """The slots of the vehicles that the caller poses or drives, and of replayed ones."""
         missing = "population.external = 0: there is no room for such vehicles; set it higher"
         return self._part(ExternalComponent, missing)
 

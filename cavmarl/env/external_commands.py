@@ -241,7 +241,7 @@ class ExternalCommands:
             ConfigError: `population.external` is 0.
         """
         self._check_world(world)
-        ids: NDArray[np.int64] = self._present().external.ids[world].copy()
+        ids: NDArray[np.int64] = self._present().external.ids[world, : self._most].copy()
         return ids
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
@@ -252,7 +252,8 @@ class ExternalCommands:
         """
         self._check_world(world)
         rows = self._present().vehicles(world)
-        found: NDArray[np.void] = rows[rows["driver"] == DRIVER_EXTERNAL].copy()
+        is_own = (rows["driver"] == DRIVER_EXTERNAL) & (rows["order"] < self._most)
+        found: NDArray[np.void] = rows[is_own].copy()
         return found
 
     def add_to(self, commands: Commands) -> Commands:
@@ -320,7 +321,8 @@ class ExternalCommands:
     def _check_free(self, simulation: Simulation, world: int, told: np.void) -> None:
         """Raise an OccupiedPlaceError if another vehicle, present or waiting, covers the place."""
         rows = simulation.vehicles(world)
-        leaving = simulation.external.ids[world, self._told["kind"][world] == EXTERNAL_REMOVED]
+        leaves = self._told["kind"][world] == EXTERNAL_REMOVED
+        leaving = simulation.external.ids[world, : self._most][leaves]
         reach_m = float(diagonals_m(simulation.types).max())
         near = np.maximum(np.abs(rows["x"] - told["x"]), np.abs(rows["y"] - told["y"])) <= reach_m
         others = [row for row in rows[near] if row["id"] not in leaving]

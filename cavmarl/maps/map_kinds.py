@@ -8,15 +8,17 @@ from xml.sax import SAXParseException
 from xml.sax.handler import ContentHandler
 
 from cavmarl.core.errors import MapError
+from cavmarl.core.scene_names import is_scene_file
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-MapKind = Literal["sumo", "osm", "opendrive"]
+MapKind = Literal["sumo", "osm", "opendrive", "scene"]
 
 MAP_ENDINGS = (".net.xml", ".net.xml.gz", ".osm", ".osm.gz", ".osm.xml", ".osm.xml.gz", ".xodr")
 
 _KINDS = (
     "give a SUMO network (<net>, .net.xml), an OpenStreetMap extract (<osm>, .osm or .osm.xml) or "
-    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz)"
+    "an OpenDRIVE file (<OpenDRIVE>, .xodr); the first two also gzipped (.gz); or a logged scene "
+    "(.pkl of ScenarioNet, .json of GPUDrive)"
 )
 _ROOTS: dict[str, MapKind] = {"net": "sumo", "osm": "osm", "OpenDRIVE": "opendrive"}
 
@@ -35,8 +37,12 @@ class _Root(ContentHandler):
 def map_kind(path: Path) -> MapKind:
     """Read a map file to its end, and return the kind of its root element.
 
+    A logged scene is recognized by its suffix, and not read.
+
     Raises MapError: the file cannot be read, is broken or malicious XML, or is not a map.
     """
+    if is_scene_file(path.name):
+        return "scene"
     root = _Root()
     try:
         read_xml(path, root)

@@ -1,5 +1,7 @@
 """Converts OpenStreetMap and OpenDRIVE to SUMO networks with netconvert (`eclipse-sumo` wheel).
 
+The lanes of logged scenes are converted without netconvert, in `maps.scenes`.
+
 The same source and options give the same bytes: netconvert's comment with the date is removed.
 
 Each network file names its source (`maps.provenance`). This module also adds heights.
@@ -21,6 +23,7 @@ from typing import Any
 from cavmarl.core.atomic_file import draft_folder
 from cavmarl.core.cache_folder import cache_dir
 from cavmarl.core.errors import ConfigError, MapError, require
+from cavmarl.core.scene_names import is_scene_file
 from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.maps.heights.draping import HeightOptions, HeightReport, drape, raise_levels
 from cavmarl.maps.map_kinds import MapKind, map_kind
@@ -48,6 +51,8 @@ from cavmarl.maps.provenance import (
     read_provenance,
     road_defaults,
 )
+from cavmarl.maps.scenes.scene_files import read_scene
+from cavmarl.maps.scenes.scene_roads import scene_network
 from cavmarl.maps.traffic_sides import NEAR_M, Side, sides_at
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 from cavmarl.roads.sumo_net.sumo_options import map_of_config
@@ -71,13 +76,16 @@ OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
 _INPUT = {"sumo": "--sumo-net-file", "osm": "--osm-files", "opendrive": "--opendrive-files"}
 _TYPE_MAP = {"osm": "osmNetconvert.typ.xml", "opendrive": "opendriveNetconvert.typ.xml"}
-_OPTIONS = {"sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS}
+_OPTIONS: dict[MapKind, tuple[str, ...]] = {
+    "sumo": (), "osm": OSM_OPTIONS, "opendrive": OPENDRIVE_OPTIONS, "scene": ()
+}  # fmt: skip
 
 _ISOLATED = "Removed a road without junctions"  # begins a warning
 _TOLERANT = "--ignore-errors"
 _LEFT_HAND = "--lefthand"
 # Increase the number if a source is converted in another way, so that the cache converts it anew.
 _CONVERSION = "conversion 2"
+_SCENE_CONVERSION = "scene 1"  # the same for logged scenes
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
 _FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
@@ -135,7 +143,7 @@ def build_network(
     Args:
         source: OpenStreetMap or OpenDRIVE, which netconvert converts to a network, or a SUMO
             network, which is copied, or a configuration of SUMO, which names a network. May be
-            gzipped.
+            gzipped. Or a logged scene, whose lanes become a network.
         target: path of the network, gzipped if it ends in `.gz`. Default: in the cache, or the
             source itself if it needs no changes.
         options: additional options for netconvert.
@@ -154,7 +162,7 @@ def build_network(
 
     Raises:
         ConfigError: `bbox` is empty, the origin is not on the earth or too far from the map, or the
-            source is a SUMO network and `side` is given.
+            source is a SUMO network and `side` is given, or a logged scene and an option is given.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
             the message); the result has no drivable lane; the heights cannot be used; the roads
             have no common traffic side; or the target cannot be written.
@@ -172,7 +180,12 @@ def build_network(
             f"--traffic-side {side}: {source} is a SUMO network, which has its own side "
             "(lefthand of <net>): remove the option, or build the network from its source again"
         )
-    if target is None and not chosen and heights is None:
+    if kind == "scene" and (chosen or side is not None or heights is not None):
+        raise ConfigError(
+            f"{source} is a logged scene, which is converted as it is: leave out all options that "
+            "change the map"
+        )
+    if target is None and not chosen and heights is None and kind != "scene":
         read_network(source)
         return BuildResult(source, source, kind, (), {}, (), (), read_provenance(source))
     place = Path(target) if target else _cache_entry(source, chosen, heights)
@@ -235,6 +248,8 @@ def _cache_entry(
 ) -> Path:
     require("sumo", "sumo")
     words = [source_hash(source), version("eclipse-sumo"), _CONVERSION, *options]
+    if is_scene_file(source.name):
+        words += [_SCENE_CONVERSION, source.suffix]
     if heights is None:
         words.append("levels 4")  # version of the algorithm for bridges and tunnels
     else:
@@ -301,7 +316,9 @@ class _Build:
         with draft_folder(cache if place.is_relative_to(cache) else place.parent) as folder:
             draft = folder / f"{map_name(place)}.net.xml"
             self.told(STAGES[0])
-            if self.options:
+            if self.kind == "scene":
+                self._draw_scene(draft)
+            elif self.options:
                 self.log = self._convert(self._prepared(folder), draft)
             else:
                 draft.write_bytes(read_bytes(self.source))
@@ -310,6 +327,16 @@ class _Build:
             self.told(STAGES[3])
             _check_readable(self.source, draft, self.log)
             os.replace(draft, place)
+
+    def _draw_scene(self, draft: Path) -> None:
+        """Write the network of a logged scene."""
+        scene = read_scene(self.source)
+        try:
+            drawn = scene_network(scene)
+        except MapError as error:
+            raise MapError(f"{self.source}: {error}") from error
+        self.notes = (*scene.notes, *drawn.notes)
+        draft.write_text(drawn.text, encoding="utf-8")
 
     def _prepared(self, folder: Path) -> Path:
         """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
@@ -383,7 +410,7 @@ class _Build:
 
     def _finished(self, draft: Path) -> bytes:
         """Return the network with the map's origin and heights added to netconvert's output."""
-        if not self.options and self.heights is None:
+        if not self.options and self.heights is None and self.kind != "scene":
             return draft.read_bytes()
         self.told(STAGES[1])
         roads = self.roads

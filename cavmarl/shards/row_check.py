@@ -98,7 +98,7 @@ class RowCheck:
         none = np.zeros(0, dtype=np.int32)
         self._step_lanes = none if traffic.schedule is None else traffic.schedule.step_lanes
         self._is_moved = traffic.sumo is not None
-        self._num_external, self._nowhere = traffic.population.external, traffic.nowhere
+        self._num_external, self._nowhere = traffic.num_external, traffic.nowhere
         num_lanes, num_links = len(roads.lanes), len(roads.links)
         self._num_lanes = num_lanes
         self._num_goals, self._plan_steps = len(traffic.plans), traffic.plans.size

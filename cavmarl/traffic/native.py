@@ -34,6 +34,7 @@ from cavmarl.traffic.lane_plans import LanePlans
 from cavmarl.traffic.map_trips import MapTrips, for_each_map, together
 from cavmarl.traffic.rerouting import Rerouting
 from cavmarl.traffic.scenarios.cast import Cast
+from cavmarl.traffic.scenarios.logged_traffic import logged_commands
 from cavmarl.traffic.scenarios.movement_scripts import NO_SCRIPTS
 from cavmarl.traffic.scenarios.scene import Scene
 from cavmarl.traffic.schedule import Schedule
@@ -235,12 +236,19 @@ class NativeTraffic:
         return found._replace(types=np.concatenate([found.types, more])) if len(more) else found
 
     @property
+    def num_replayed(self) -> int:
+        """Number of road users of a logged scene that are replayed."""
+        return 0 if self.scene is None or self.scene.log is None else len(self.scene.log.replayed)
+
+    @property
+    def num_external(self) -> int:
+        """Slots of vehicles that are posed: those of the caller, then the replayed ones."""
+        return self.population.external + self.num_replayed
+
+    @property
     def _other_types(self) -> list[str]:
         """Names of the types of agents' and of the caller's vehicles, without the car."""
-        names = [
-            *self.population.agent_types,
-            *(EXTERNAL_TYPES if self.population.external else ()),
-        ]
+        names = [*self.population.agent_types, *(EXTERNAL_TYPES if self.num_external else ())]
         return [name for name in dict.fromkeys(names) if name != "car"]
 
     @cached_property
@@ -293,13 +301,13 @@ class NativeTraffic:
 
     @property
     def nowhere(self) -> int:
-        """The way of the vehicles that the caller poses or drives; its steps lead nowhere."""
+        """The way of vehicles that are posed, or driven by the caller; its steps lead nowhere."""
         return self.plans.size + (0 if self.schedule is None else len(self.schedule.steps))
 
     @property
     def _nowhere_steps(self) -> NDArray[np.void]:
-        """PLAN (L,) that end every way; empty without vehicles of the caller."""
-        steps = np.zeros(len(self.network.lanes) if self.population.external else 0, dtype=PLAN)
+        """PLAN (L,) that end every way; empty without vehicles that are posed."""
+        steps = np.zeros(len(self.network.lanes) if self.num_external else 0, dtype=PLAN)
         steps["next"] = steps["link"] = -1
         steps["to_go"] = np.inf
         return steps
@@ -460,7 +468,7 @@ class NativeTraffic:
         """Number of vehicle rows that one world needs."""
         if self.sumo is not None:
             return _capacity_of_sumo(self.population, self.sumo)
-        actors = 0 if self.scene is None else len(self.scene.actors)
+        actors = 0 if self.scene is None else self.scene.num_rows
         args = (self.network, self.population, self.schedule, self.dt, self.horizon_s)
         return _capacity(*args) + actors
 
@@ -527,7 +535,18 @@ class NativeTraffic:
         worlds.cues[chosen] = -1
         if self.cast is not None:
             for w in np.flatnonzero(chosen).tolist():
-                self.cast.enter(self.network.arrays, self.travel, departures, worlds, w, self.blank)
+                entered = self.network.arrays, self.travel, departures, worlds, w, self.blank
+                self.cast.enter(*entered)
+                if self.cast.scene.log is not None:
+                    first = self.population.external
+                    self.cast.enter_logged(*entered, first, self.at_reset, self.nowhere)
+
+    @cached_property
+    def at_reset(self) -> NDArray[np.void]:
+        """EXTERNAL (L,) of the replayed road users at the reset; those not there are removed."""
+        log = None if self.scene is None else self.scene.log
+        commands: NDArray[np.void] = logged_commands(log, self.type_rows, self.dt)[0]
+        return commands
 
     def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Count vehicles that have left, and order their successors."""

@@ -14,6 +14,12 @@ EXTERNAL_REMOVED = 3.0
 # bits, which are the ids of ROS markers, differ from those of the other vehicles, too.
 FIRST_EXTERNAL_ID = (1 << 40) + (1 << 30)
 
+
+def first_external_id(tick: int, slots: int) -> int:
+    """Return the id of a vehicle that enters the first of `slots` slots in a tick."""
+    return FIRST_EXTERNAL_ID + int(tick) * slots
+
+
 # All fields are float64, so that commands are plain arrays (W, E, K) between processes. A vehicle
 # enters with the first command of its slot, at the pose of that command and with its body.
 EXTERNAL = np.dtype(

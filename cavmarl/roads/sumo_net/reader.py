@@ -17,6 +17,7 @@ from cavmarl.core.math.elementary_arrays import atan2_all
 from cavmarl.core.math.geometry import project
 from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
+from cavmarl.core.scene_names import SCENE_SUFFIXES
 from cavmarl.roads.network import (
     EDGE,
     JUNCTION,
@@ -64,7 +65,7 @@ FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up t
 MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
 _NAMED = 5  # maximum number of changed lanes that are named
-_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg")
+_ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg", *SCENE_SUFFIXES)
 
 
 def map_name(path: Path) -> str:

@@ -238,6 +238,32 @@ def enter_at(roads: RoadArrays, grid: LaneGrid, told: np.void, row: np.void) -> 
 
 
 @kernel
+def write_external(
+    roads: RoadArrays,
+    grid: LaneGrid,
+    told: np.void,  # EXTERNAL
+    vehicle: int,  # its id
+    slot: int,
+    nowhere: int,  # the way of a vehicle without a route
+    key: np.uint64,  # of the world
+    tick: int,
+    row: np.void,  # VEHICLE, blank; written
+) -> None:
+    """Write the row of a vehicle that enters."""
+    row["id"] = vehicle
+    row["driver"] = DRIVER_EXTERNAL
+    row["order"] = slot
+    enter_at(roads, grid, told, row)
+    row["goal"] = -1
+    row["way"] = nowhere
+    row["to_go"] = math.inf
+    row["step_to_go"] = math.inf
+    row["rng_key"] = key
+    row["departed"] = tick
+    row["tick"] = tick
+
+
+@kernel
 def add_external(
     roads: RoadArrays,
     grid: LaneGrid,
@@ -258,21 +284,11 @@ def add_external(
         for slot in range(coming.shape[1]):
             if not coming[w, slot]:
                 continue
-            told = held[w, slot]
             place = departures.num_passing[w]
             departures.passing[w, place] = blank[0]
             departures.num_passing[w] = place + 1
             row = departures.passing[w, place]
             vehicle = FIRST_EXTERNAL_ID + ticks[w] * coming.shape[1] + slot
             ids[w, slot] = vehicle
-            row["id"] = vehicle
-            row["driver"] = DRIVER_EXTERNAL
-            row["order"] = slot
-            enter_at(roads, grid, told, row)
-            row["goal"] = -1
-            row["way"] = nowhere
-            row["to_go"] = math.inf
-            row["step_to_go"] = math.inf
-            row["rng_key"] = keys[w]
-            row["departed"] = ticks[w]
-            row["tick"] = ticks[w]
+            told = held[w, slot]
+            write_external(roads, grid, told, vehicle, slot, nowhere, keys[w], ticks[w], row)

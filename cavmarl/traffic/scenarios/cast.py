@@ -11,15 +11,26 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
 from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.geometry import lane_pose
-from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, Scripts, TripTables, Worlds
+from cavmarl.core.records.arrays import (
+    DepartureQueue,
+    LaneGrid,
+    RoadArrays,
+    Scripts,
+    TripTables,
+    Worlds,
+)
 from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SCRIPTED
+from cavmarl.core.records.external_records import EXTERNAL_POSED, first_external_id
 from cavmarl.driving.kernels.motion.scripted_rows import stand_at
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.roads.routing import lane_grid
 from cavmarl.traffic.departure_queue import DEPARTURE
 from cavmarl.traffic.kernels.demand_generator import enter
+from cavmarl.traffic.kernels.external_rows import write_external
 from cavmarl.traffic.scenarios.motions import Ride
 from cavmarl.traffic.scenarios.movement_scripts import actor_types, bodies_of, compile_scripts
 from cavmarl.traffic.scenarios.scene import Scene, Seat
@@ -75,7 +86,8 @@ class Cast:
     types: NDArray[np.void]  # VTYPE rows of all bodies
     vtypes: list[int]  # (n,) VTYPE row of each actor, among all types of a world
     seats: list[Seat]  # of the agents
-    goal: int  # row of the plans' table; the same for all agents
+    goals: list[int]  # row of the plans' table, of each agent
+    grid: LaneGrid  # of the map
 
     @staticmethod
     def of(
@@ -93,11 +105,12 @@ class Cast:
 
         Raises ConfigError: the scene has no room for this many agents.
         """
-        seats = take_seats(Streets(network), scene, num_agents)
+        seats = list(scene.seats) or take_seats(Streets(network), scene, num_agents)
         scripts, firsts = compile_scripts(network, scene.actors, scene.cues, goals, dt)
         vtypes = [first_type + number for number in bodies_of(scene.actors)]
-        goal = goals[scene.seat.goal_edge]
-        return Cast(scene, scripts, firsts, actor_types(), vtypes, seats, goal)
+        own = [goals[seat.goal_edge] for seat in seats]
+        grid = lane_grid(network)
+        return Cast(scene, scripts, firsts, actor_types(), vtypes, seats, own, grid)
 
     def enter(
         self,
@@ -126,7 +139,7 @@ class Cast:
             row = rows[agent]
             rows[agent] = blank[0]
             departure = self._departure(roads, agent, seat)
-            enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, row)
+            _enter_seat(roads, travel, worlds, w, departure, seat, row)
         num = len(self.seats)
         rows[num : num + len(others)] = others
         num += len(others)
@@ -147,6 +160,48 @@ class Cast:
         departures.counts[w, COUNT_DEPARTED] = num
         worlds.num_owned[w] = worlds.num_rows[w] = num
 
+    def enter_logged(
+        self,
+        roads: RoadArrays,
+        travel: TripTables,
+        departures: DepartureQueue,
+        worlds: Worlds,
+        w: int,
+        blank: NDArray[np.void],
+        first_slot: int,  # slot of the first replayed road user
+        first_commands: NDArray[np.void],  # EXTERNAL (L,), the state of those at the reset
+        nowhere: int,  # the way of a vehicle without a route
+    ) -> None:
+        """Place the logged vehicles that are present at the reset, besides those of the agents.
+
+        Vehicles with an order get the next ids, replayed vehicles the ids of their slots.
+        """
+        log = self.scene.log
+        assert log is not None, "the scene of a file has a log"
+        rows, num = worlds.rows[w], int(worlds.num_owned[w])
+        orders = departures.orders[w, : departures.num_orders[w]]
+        for order, one in zip(orders[orders["due"] <= 0], log.reacting, strict=False):
+            row = rows[num]
+            rows[num] = blank[0]
+            order["id"] = departures.next_id[w]
+            _enter_seat(roads, travel, worlds, w, order, one.seat, row)
+            departures.next_id[w] += 1
+            departures.next_order[w] += 1
+            num += 1
+        departures.counts[w, COUNT_DEPARTED] = num
+        slots = first_slot + len(first_commands)
+        for k, told in enumerate(first_commands):
+            if told["kind"] != EXTERNAL_POSED:
+                continue
+            rows[num] = blank[0]
+            slot = first_slot + k
+            vehicle = first_external_id(worlds.ticks[w], slots) + slot
+            write = specialized(write_external)
+            write(roads, self.grid, told, vehicle, slot, nowhere, worlds.keys[w],
+                  worlds.ticks[w], rows[num])  # fmt: skip
+            num += 1
+        worlds.num_owned[w] = worlds.num_rows[w] = num
+
     def _is_clear(self, roads: RoadArrays, rows: NDArray[np.void]) -> NDArray[np.bool_]:
         """Return which vehicles (n,) are neither in the scene nor near the seat of an agent."""
         clear: NDArray[np.bool_] = (
@@ -164,7 +219,25 @@ class Cast:
         for name in ("order", "stop", "stops_end"):
             departure[name] = -1
         departure["id"] = departure["agent"] = agent
-        departure["goal"] = self.goal
-        departure["way"] = self.goal * len(roads.lanes)
+        departure["goal"] = self.goals[agent]
+        departure["way"] = self.goals[agent] * len(roads.lanes)
         departure["speed_factor"] = seat.speed_mps / roads.lanes["speed_mps"][seat.lane]
         return departure
+
+
+def _enter_seat(
+    roads: RoadArrays,
+    travel: TripTables,
+    worlds: Worlds,
+    w: int,
+    departure: np.void,
+    seat: Seat,
+    row: np.void,  # VEHICLE, blank; written
+) -> None:
+    """Write the record of a vehicle that starts in a seat."""
+    if roads.lanes["internal"][seat.lane]:
+        row["link"] = roads.lanes["link"][seat.lane]
+    enter(roads, travel, worlds, w, departure, seat.lane, seat.s, seat.speed_mps, row)
+    if seat.body is not None:
+        for name in ("x", "y", "heading", "d", "length", "width", "height"):
+            row[name] = getattr(seat.body, name)

@@ -13,6 +13,7 @@ from difflib import get_close_matches
 from typing import Any, NamedTuple, TypeVar
 
 from cavmarl.core.errors import ConfigError
+from cavmarl.maps.scenes.logged_scene import LoggedScene, Track
 from cavmarl.traffic.scenarios.motions import Ride, path_of
 from cavmarl.traffic.scenarios.movement_scripts import Actor, Cue
 from cavmarl.traffic.scenarios.streets import Crossing, Streets
@@ -26,6 +27,39 @@ class Seat:
     s: float  # m, of the centre on the lane
     speed_mps: float  # initial speed, and the speed that its built-in driver keeps
     goal_edge: int  # EDGE row where the trip ends
+    body: SeatBody | None = None  # None: on the lane, with the size of its type
+
+
+class SeatBody(NamedTuple):
+    """The exact pose and the size of a vehicle at its start."""
+
+    x: float  # m, of the centre
+    y: float
+    heading: float  # rad
+    d: float  # m, left of the middle of the lane
+    length: float  # m
+    width: float
+    height: float
+
+
+class ReactingVehicle(NamedTuple):
+    """A logged vehicle that a built-in driver drives along the logged way."""
+
+    track: Track
+    seat: Seat
+    edges: tuple[int, ...]  # EDGE rows of its way
+    depart_s: float  # after the reset
+
+
+class LoggedTraffic(NamedTuple):
+    """The vehicles of a logged scene."""
+
+    scene: LoggedScene
+    first: int  # number of the sample at the reset
+    seated: Sequence[Track]  # tracks whose vehicles the agents drive
+    replayed: Sequence[Track]
+    reacting: Sequence[ReactingVehicle]  # by departure
+    notes: tuple[str, ...]  # what was changed, with counts
 
 
 class Outage(NamedTuple):
@@ -47,11 +81,19 @@ class Scene:
     cues: Sequence[Cue] = ()  # cues by the numbers in the actors' `Await`s
     clear_m: float = 90.0  # radius around the centre without other vehicles at the start
     outages: Sequence[Outage] = ()  # signals that go dark and stay dark
+    seats: Sequence[Seat] = ()  # of all agents, if they have places of their own
+    log: LoggedTraffic | None = None
 
     @property
     def goal_edges(self) -> list[int]:
         released = [a.released_to for a in self.actors if a.released_to is not None]
-        return list(dict.fromkeys([self.seat.goal_edge, *released]))
+        seats = [seat.goal_edge for seat in self.seats]
+        return list(dict.fromkeys([self.seat.goal_edge, *released, *seats]))
+
+    @property
+    def num_rows(self) -> int:
+        """Number of vehicles besides the agents and those with an order."""
+        return len(self.actors) + (0 if self.log is None else len(self.log.replayed))
 
 
 T = TypeVar("T")

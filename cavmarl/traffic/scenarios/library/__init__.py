@@ -25,8 +25,10 @@ import numpy as np
 from cavmarl.config.scenario import ScenarioConfig, path_of_code
 from cavmarl.core.errors import ConfigError, ScenarioError
 from cavmarl.core.math.rng import STREAM_PLACE, below, world_key
+from cavmarl.core.scene_names import is_scene_file
 from cavmarl.core.tracebacks import fault_in
 from cavmarl.roads.network import RoadNetwork
+from cavmarl.traffic.scenarios.logged_traffic import plan_logged_scene
 from cavmarl.traffic.scenarios.scene import Scene, checked
 from cavmarl.traffic.scenarios.streets import Streets
 
@@ -83,14 +85,19 @@ def summary_of(name: str) -> str:
     return " ".join(text.strip().split("\n\n")[0].split())
 
 
-def plan_scene(config: ScenarioConfig, network: RoadNetwork) -> Scene | None:
+def plan_scene(config: ScenarioConfig, network: RoadNetwork, agents: int = 1) -> Scene | None:
     """Return the scene for a map; None without a scenario.
 
+    `agents`: number of agents; a logged scene has a seat for each of them.
+
     Raises ConfigError: the scenario or the place does not exist, or a parameter is unknown or out
-    of range; ScenarioError: the map has no place for the scenario.
+    of range; ScenarioError: the map has no place for the scenario; MapError: the file of a logged
+    scene cannot be read.
     """
     if not config.name:
         return None
+    if is_scene_file(config.name):
+        return plan_logged_scene(config, network, agents)
     scenario = load_scenario(config.name)
     parameters = checked(scenario.Parameters, config.params, config.name)
     places = _places(config.name, network, parameters)

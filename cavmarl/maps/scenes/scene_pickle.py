@@ -1,0 +1,119 @@
+"""Reads pickles of strangers: only builtins and NumPy's arrays of numbers and text.
+
+A pickle can call any function that it names. This reader knows a fixed list of names, and replaces
+NumPy's functions by versions that check their arguments. Before that, it checks the operations: a
+place in the memo beyond their number, or a length beyond the content, could reserve any amount of
+memory.
+"""
+
+from __future__ import annotations
+
+import pickle
+import pickletools
+from collections import OrderedDict, defaultdict
+from collections.abc import Callable
+from io import BytesIO
+from typing import Any
+
+import numpy as np
+
+from cavmarl.core.errors import MapError
+
+_FORBIDDEN = frozenset(
+    "NEXT_BUFFER READONLY_BUFFER PERSID BINPERSID EXT1 EXT2 EXT4 INST OBJ".split()
+)
+_KINDS = "biufSU"  # kinds of numbers and text; objects and records could contain anything
+
+
+class _ForbiddenError(pickle.UnpicklingError):
+    """The pickle names something that is not on the list."""
+
+
+def _array(subtype: type[Any], shape: object, code: object) -> Any:
+    """Return an empty array; its content follows in the pickle, and memory only with it."""
+    del subtype, shape, code
+    return np.ndarray.__new__(np.ndarray, (0,), "b")
+
+
+def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype[Any]:
+    del align, copy
+    found = np.dtype(code)
+    if found.kind not in _KINDS or found.names is not None:
+        raise _ForbiddenError(f"an array of dtype {str(code)[:40]!r}")
+    return found
+
+
+def _scalar(dtype: np.dtype[Any], data: bytes) -> Any:
+    return np.frombuffer(data, _dtype(dtype.str), 1)[0]
+
+
+def _from_buffer(data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], order: str) -> Any:
+    found = np.frombuffer(data, _dtype(dtype.str))
+    return found.reshape(shape, order="F" if order == "F" else "C")
+
+
+def _encoded(text: str, encoding: str = "latin1") -> bytes:
+    if encoding not in ("latin1", "latin-1"):
+        raise _ForbiddenError(f"text in the encoding {encoding[:40]!r}")
+    return text.encode("latin1")
+
+
+_NUMPY: dict[str, Callable[..., Any]] = {
+    "_reconstruct": _array,
+    "scalar": _scalar,
+    "_frombuffer": _from_buffer,
+}
+_NAMES: dict[tuple[str, str], Any] = {
+    ("numpy", "ndarray"): "ndarray",  # only the first argument of `_reconstruct`: not callable
+    ("numpy", "dtype"): _dtype,
+    ("_codecs", "encode"): _encoded,
+    ("collections", "OrderedDict"): OrderedDict,
+    ("collections", "defaultdict"): defaultdict,
+    **{
+        ("builtins", kind.__name__): kind
+        for kind in (int, float, set, frozenset)  # the others have opcodes of their own
+    },
+}
+_MODULES = ("numpy.core.multiarray", "numpy._core.multiarray", "numpy.core.numeric",
+            "numpy._core.numeric")  # fmt: skip
+
+
+class _RestrictedUnpickler(pickle.Unpickler):
+    def find_class(self, module: str, name: str) -> Any:
+        """Return what a name stands for; raise an error for a name that is not on the list."""
+        module = module.replace("__builtin__", "builtins")
+        if (module, name) in _NAMES:
+            return _NAMES[module, name]
+        if module in _MODULES and name in _NUMPY:
+            return _NUMPY[name]
+        raise _ForbiddenError(f"{module[:60]}.{name[:60]}")
+
+
+def _check_operations(content: bytes) -> None:
+    count = 0
+    for operation, argument, _ in pickletools.genops(content):
+        count += 1
+        name = operation.name
+        if name in _FORBIDDEN:
+            raise _ForbiddenError(f"the operation {name}")
+        if name in ("PUT", "BINPUT", "LONG_BINPUT") and int(str(argument)) > count:
+            raise _ForbiddenError(f"{argument} as a place in the memo")
+
+
+def unpickle(content: bytes) -> Any:
+    """Return the object of a pickle.
+
+    Raises MapError: the pickle is broken, or names something else than builtins and arrays.
+    """
+    try:
+        _check_operations(content)
+        return _RestrictedUnpickler(BytesIO(content)).load()
+    except _ForbiddenError as error:
+        raise MapError(
+            f"the pickle contains {error}: only builtins and NumPy's arrays of numbers and text "
+            "are read, because a pickle may run code; export the scene as plain dictionaries"
+        ) from error
+    except Exception as error:  # a damaged pickle raises almost any exception
+        raise MapError(
+            f"broken pickle ({type(error).__name__}: {str(error)[:200]}): export the scene again"
+        ) from error
