@@ -181,9 +181,10 @@ class WorldsEnvironment(OwnWorlds):
         self._session.lane_changes.close(world, edge, lanes, shuts_in=shuts_in)
 
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
-        """Give lanes of a closed or damaged road the state that they have on the map.
+        """Give lanes of a closed, damaged or reversed road the state that they have on the map.
 
-        Vehicles that wait before them drive on from the next step on.
+        Vehicles that wait before them drive on from the next step on. A reversed road opens with
+        all its lanes, once its contraflow lanes are closed and empty.
 
         Args:
             edge: id of a road.
@@ -195,6 +196,26 @@ class WorldsEnvironment(OwnWorlds):
             ConfigError: `map.changed_lanes` is 0.
         """
         self._session.lane_changes.open(world, edge, lanes)
+
+    def reverse_road(self, edge: str, world: int = 0, shuts_in: bool = False) -> None:
+        """Let all lanes of a road lead in the opposite direction, until it is opened.
+
+        The road closes with the next step, as with `close_road`. Its contraflow lanes open after
+        10 s or more, as soon as no vehicle is on the road. The lanes of both directions count in
+        `map.changed_lanes`.
+
+        Args:
+            edge: id of a road in `map.contraflow`.
+            world: number of the world.
+            shuts_in: whether the road may be the last way out of other roads.
+
+        Raises:
+            ActionError: there is no such world or road, it is not in `map.contraflow`, or it is the
+                last way out.
+            CapacityError: more than `map.changed_lanes` lanes would differ from the map.
+            ConfigError: `map.changed_lanes` is 0.
+        """
+        self._session.lane_changes.reverse(world, edge, shuts_in)
 
     def damage_road(
         self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
@@ -237,6 +258,15 @@ class WorldsEnvironment(OwnWorlds):
             EpisodeError: before the first reset.
         """
         return self._session.deadlocks(world)
+
+    def vehicle_rows(self, world: int = 0) -> NDArray[np.void]:
+        """Return a copy of the VEHICLE rows of a world, by id, wherever the world runs.
+
+        Raises:
+            ConfigError: there is no such world, or its state is not available in this process.
+            EpisodeError: before the first reset.
+        """
+        return self._session.vehicle_rows(world)
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
         """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.

@@ -63,12 +63,13 @@ class LanePlans:
         """
         on_map = self._roads.lanes
         closed = ((on_map["permissions"] & CARS) != 0) & ((lanes["permissions"] & CARS) == 0)
-        differs = closed.copy()
+        opened = (on_map["permissions"] == 0) & ((lanes["permissions"] & CARS) != 0)
+        differs = closed | opened
         if self._follows_limits:
             differs |= lanes["speed_mps"] != on_map["speed_mps"]
         speed_mps = (lanes if self._follows_limits else on_map)["speed_mps"].copy()
         speed_mps[closed] = on_map["length_m"][closed] / CLOSED_S
-        key = speed_mps.tobytes() if differs.any() else b""
+        key = speed_mps.tobytes() + opened.tobytes() if differs.any() else b""
         if key == self._known[world]:
             return False
         self._known[world] = key
@@ -79,6 +80,7 @@ class LanePlans:
             return True
         now = on_map.copy()
         now["speed_mps"] = speed_mps
+        now["permissions"][opened] = lanes["permissions"][opened]
         # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
         now.setflags(write=False)
         roads = self._roads._replace(lanes=now)

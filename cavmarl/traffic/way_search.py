@@ -215,6 +215,8 @@ class WaySearch:
                 self._roads, self._traffic.speed_sums, samples, self._traffic.closed,
                 self._traffic.lanes, permission, lanes,
             )  # fmt: skip
+            contraflow = lanes["permissions"] == 0
+            lanes["permissions"][contraflow] = self._traffic.lanes["permissions"][contraflow]
             # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
             lanes.setflags(write=False)
             self._speeds[key] = self._roads._replace(lanes=lanes)
