@@ -19,7 +19,8 @@ from cavmarl.roads.network import CARS, RoadNetwork
 SHORTEST_M = 15.0  # on a shorter lane, no vehicle begins its trip
 MOST_EXITS = 8  # number of exits that are chosen if the plan names none
 FAR_SHARE = 0.6  # chosen exits are at least this share of the largest distance away
-WHOLE_MAP = "map"
+RADIUS_SHARE = 0.4  # of the radius that 90 % of the roads fill: the area if none is given
+AREA = "area"  # name of the area if none is given
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -132,20 +133,20 @@ def car_roads(network: RoadNetwork) -> NDArray[np.bool_]:
     return usable
 
 
-def default_area(network: RoadNetwork) -> Area:
-    """Return the middle of a map: a circle with 40 % of the radius that its roads fill."""
+def middle_of(network: RoadNetwork) -> tuple[float, float, float]:
+    """Return x and y of the middle of the roads in m, and the default radius of an area there."""
     x, y = _middles(network)
     usable = car_roads(network)
-    centre = np.median(x[usable]), np.median(y[usable])
-    radius_m = 0.4 * float(np.percentile(np.hypot(x - centre[0], y - centre[1])[usable], 90))
-    return circle(float(centre[0]), float(centre[1]), radius_m)
+    at = float(np.median(x[usable])), float(np.median(y[usable]))
+    away_m = np.hypot(x - at[0], y - at[1])[usable]
+    return *at, RADIUS_SHARE * float(np.percentile(away_m, 90))
 
 
-def circle(x: float, y: float, radius_m: float) -> Area:
-    """Return an area around a place, without vehicles."""
+def circle(x: float, y: float, radius_m: float, vehicles: int) -> Area:
+    """Return an area around a place, as a polygon with 24 corners."""
     angles = np.linspace(0.0, 2.0 * np.pi, 24, endpoint=False)
     corners = zip(x + radius_m * np.cos(angles), y + radius_m * np.sin(angles), strict=True)
-    return Area(polygon=tuple((round(a, 3), round(b, 3)) for a, b in corners), vehicles=0)
+    return Area(polygon=tuple((round(a, 3), round(b, 3)) for a, b in corners), vehicles=vehicles)
 
 
 def default_exits(plan: EvacuationPlan, network: RoadNetwork) -> tuple[str, ...]:
