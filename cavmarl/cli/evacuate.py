@@ -75,9 +75,7 @@ def evacuate(
     within_s: Annotated[
         float | None, about("Vehicles depart within this time.", metavar="S", min=0.0)
     ] = None,
-    seconds: Annotated[
-        float | None, about("Longest simulated time.", metavar="S", min=1.0)
-    ] = None,
+    seconds: Annotated[float | None, about("Longest simulated time.", metavar="S", min=1.0)] = None,
     repeats: Annotated[
         int, about("Number of runs, with consecutive seeds.", "--repeats", "-r", min=1)
     ] = 1,
@@ -137,14 +135,13 @@ def evacuate(
                 console.print(f"exits, chosen: {escape(', '.join(prepared.exits))}")
             for note in prepared.evacuees.notes:
                 console.print(f"left out: {escape(note)}")
-        total = len(prepared.evacuees.area)
         with counting(console, f"arrivals, seed {number}") as told:
             run = run_evacuation(
                 prepared,
                 seed=number,
                 zones=zones,
                 backend=backend_text(backend, workers),
-                told=lambda time_s, departed, arrived, told=told: told(arrived, total),  # type: ignore[misc]
+                told=told,
             )
         found.append(run)
         names, *columns = zip(*table_of(run), strict=True)
@@ -187,9 +184,7 @@ def _changed(
 
     more = ()
     if close:
-        more = (
-            RoadEvent(at_s=plan.start_s, action="close", edges=tuple(close), shuts_in=True),
-        )
+        more = (RoadEvent(at_s=plan.start_s, action="close", edges=tuple(close), shuts_in=True),)
     return replace(
         plan,
         exits=tuple(exits) if exits else plan.exits,

@@ -219,9 +219,7 @@ def _program_files(config: EnvConfig, base_dir: Path) -> list[Path]:
     return [*(file for file in named if file.resolve() not in known), *programs]
 
 
-def _joined(
-    paths: Sequence[Path], is_steered: bool, contraflow: Sequence[str] = ()
-) -> RoadNetwork:
+def _joined(paths: Sequence[Path], is_steered: bool, contraflow: Sequence[str] = ()) -> RoadNetwork:
     """Return the network of map files. Worlds of one process share a network of the same files.
 
     If policies or networks steer vehicles, the roads include the swept areas of steered vehicles.

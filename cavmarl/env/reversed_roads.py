@@ -1,4 +1,4 @@
-"""`ReversedRoads`: roads of `map.contraflow`, from the order to reverse them until they are back."""
+"""`ReversedRoads`: the roads of `map.contraflow`, and which of them are reversed."""
 
 from __future__ import annotations
 

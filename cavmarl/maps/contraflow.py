@@ -79,7 +79,9 @@ def _make(path: Path, roads: Sequence[str], folder: Path) -> Path:
     facts = read_provenance(path) or {"source": path.name, "source sha256": source_hash(path)}
     facts["contraflow"] = " ".join(roads)
     start = content.index(b"<net ")
-    draft.write_bytes(b'<?xml version="1.0" encoding="UTF-8"?>\n' + head_of(facts) + content[start:])
+    draft.write_bytes(
+        b'<?xml version="1.0" encoding="UTF-8"?>\n' + head_of(facts) + content[start:]
+    )
     return draft
 
 
@@ -100,9 +102,7 @@ class _Contraflow:
         self.side = ("--lefthand",) if left_hand else ()
         self.edges = [_reversed(self._road(name)) for name in roads]
         self._reverses: Mapping[str, Element] = {name: self._roads[name] for name in roads}
-        self.connections = [
-            element for name in roads for element in self._connections(name)
-        ]
+        self.connections = [element for name in roads for element in self._connections(name)]
 
     def controlled(self, signals: Element) -> Iterable[Element]:
         """Yield the movements that a signal controls, with the letters of movements beside them.
@@ -124,7 +124,9 @@ class _Contraflow:
 
     def _beside(self, name: str) -> str:
         """Return the road that leads in the direction of contraflow lanes; else the road itself."""
-        road = next((edge for key, edge in self._reverses.items() if contraflow_of(key) == name), None)
+        road = next(
+            (edge for key, edge in self._reverses.items() if contraflow_of(key) == name), None
+        )
         if road is None:
             return name
         ends = road.get("to"), road.get("from")

@@ -108,9 +108,7 @@ class Bus:
         self._network: NetworkSimulator | None = None
         self._watchers: tuple[Watch, ...] = ()
         # closed lanes of a world, and what each unit says about them
-        self._closures: dict[
-            int, tuple[NDArray[np.bool_], tuple[NDArray[np.float64], ...]]
-        ] = {}
+        self._closures: dict[int, tuple[NDArray[np.bool_], tuple[NDArray[np.float64], ...]]] = {}
         self._exchange = specialized(exchange_messages)
         self._hand_out = specialized(hand_out)
         self.mail.owner[:] = -1

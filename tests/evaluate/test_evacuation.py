@@ -213,9 +213,7 @@ def test_areas_are_polygons_or_lists_of_roads(network: RoadNetwork) -> None:
         ({"map": "no_such_map"}, "there is no file no_such_map and no such environment"),
     ],
 )
-def test_impossible_plans_are_refused(
-    change: dict[str, Any], message: str, tmp_path: Path
-) -> None:
+def test_impossible_plans_are_refused(change: dict[str, Any], message: str, tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=message):
         prepared(replace(PLAN, **change), tmp_path)
     assert not (tmp_path / "env.yaml").exists()

@@ -67,7 +67,7 @@ def test_agents_hear_of_closed_roads_until_they_open() -> None:
         assert away_m.min() < 1e-9
         assert row["heading"] == begins["heading"][away_m.argmin()]
     names = feature_names(vec.config.sensors)
-    assert seen[names.index(("messages", "event 0 event_other"))] == 1.0
+    assert seen[names.index(("messages", "event_other_0"))] == 1.0
 
 
 def test_units_report_only_roads_near_them() -> None:

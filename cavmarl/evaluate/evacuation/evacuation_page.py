@@ -37,9 +37,7 @@ FIGURES = {
 }
 
 
-def results_of(
-    prepared: PreparedEvacuation, found: Sequence[EvacuationResult]
-) -> dict[str, Any]:
+def results_of(prepared: PreparedEvacuation, found: Sequence[EvacuationResult]) -> dict[str, Any]:
     """Return the plan, the map and all runs as plain values."""
     return {
         "plan": asdict(prepared.plan),

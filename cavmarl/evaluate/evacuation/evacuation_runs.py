@@ -27,7 +27,7 @@ STANDING_MPS = 0.5
 SHARES = (0.5, 0.9, 1.0)
 RECOVERED_SHARE = 1.1  # traffic has recovered if at most this multiple stands as before the closure
 ENTRY, DEMAND = "env.yaml", "demand.rou.xml"
-Told = Callable[[float, int, int], None]
+Told = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
@@ -161,7 +161,7 @@ def run_evacuation(
     zones: int | None = None,
     backend: str | None = None,
     overrides: Mapping[str, Any] | None = None,
-    told: Told = lambda time_s, departed, arrived: None,
+    told: Told = lambda arrived, vehicles: None,
 ) -> EvacuationResult:
     """Run an evacuation to its horizon, or until all vehicles have reached an exit.
 
@@ -171,7 +171,7 @@ def run_evacuation(
         zones: see `make_vec`; results do not depend on it.
         backend: see `make_vec`; results do not depend on it.
         overrides: values of further keys.
-        told: called in each second with the time, the departures and the arrivals.
+        told: called in each second with the number of arrivals and of all vehicles.
 
     Raises the errors of `make_vec`.
     """
@@ -194,7 +194,7 @@ def _run(
     for second in range(1, int(prepared.plan.horizon_s / STEP_S) + 1):
         vec.step(idle)
         meter.sample(second * STEP_S, vec.vehicle_rows())
-        told(second * STEP_S, meter.departed, meter.arrived)
+        told(meter.arrived, len(prepared.evacuees.area))
         if meter.is_over:
             break
     return meter.result(vec, seed)
@@ -204,7 +204,11 @@ class _Meter:
     """What is measured in each second of a run."""
 
     def __init__(self, prepared: PreparedEvacuation, vec: CavVectorEnv) -> None:
-        self._plan, self._exits, self._ids = prepared.plan, prepared.exits, prepared.network.edge_ids
+        self._plan, self._exits, self._ids = (
+            prepared.plan,
+            prepared.exits,
+            prepared.network.edge_ids,
+        )
         self._evacuees, self._network = prepared.evacuees, vec.network
         count = len(self._evacuees.area)
         self._departed_s = np.full(count, np.nan)

@@ -50,7 +50,10 @@ BANDS_PER_M = 1.0 / BAND_M
 MAX_NEAR = 64  # number of nearest bodies that a station examines
 
 REPORT = record(
-    ("subject", np.int64),  # subject: a vehicle, or a SIGNAL row; for an event, its sender or a closed road
+    (
+        "subject",
+        np.int64,
+    ),  # subject: a vehicle, or a SIGNAL row; for an event, its sender or a closed road
     ("sender", np.int64),  # station; -1: no report
     ("tick", np.int64),  # tick of the reported state
     ("expires", np.int64),  # last tick in which a receiver keeps it
