@@ -46,7 +46,7 @@ class MapConfig(Section, key="map"):
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
             each world has its own table of lanes and its own plans.
-        contraflow: ids of roads that can be reversed (`reverse_road`). The map gets lanes in the
+        contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
             opposite direction on them, which are closed until then. A reversed road counts in
             `map.changed_lanes` with the lanes of both directions.
         events: roads that close, open, slow down or are reversed during each episode; see

@@ -134,15 +134,21 @@ class LaneChanges:
         limit_mps[rows], closed[rows] = own[rows], 0
         self._tell(world, limit_mps, closed, (OPENED, _detail(edge, lanes)))
 
-    def reverse(self, world: int, edge: str, shuts_in: bool = False) -> None:
+    def reverse(
+        self, world: int, edge: str, lanes: Sequence[int] | None = None, shuts_in: bool = False
+    ) -> None:
         """Close a road, and open its contraflow lanes once no vehicle is on it.
 
         Raises:
-            ActionError: there is no such world or road, it is the last way out of others, or it is
-                not one of `map.contraflow`.
+            ActionError: there is no such world or road, it is the last way out of others, it is
+                not one of `map.contraflow`, or `lanes` does not name all of its lanes.
             CapacityError, ConfigError: see `close`.
         """
-        self._rows(world, edge, None)
+        if len(self._rows(world, edge, lanes)) < len(self._rows(world, edge, None)):
+            raise ActionError(
+                f"lanes = {list(lanes or ())!r}: edge {edge!r} is reversed with all its lanes; "
+                "leave lanes out"
+            )
         self._reversed.check(edge)
         before = self._reversed.states[world].copy()
         self._reversed.begin(world, edge, CLEARING)
@@ -188,7 +194,7 @@ class LaneChanges:
                 self.limit(world, edge, event.speed_mps or 0.0, event.lanes)
             elif event.action == "reverse":
                 if self._reversed.state(world, edge) not in (CLEARING, REVERSED_NOW):
-                    self.reverse(world, edge, event.shuts_in)
+                    self.reverse(world, edge, shuts_in=event.shuts_in)
             elif self._differs(world, edge, event.lanes):
                 self.open(world, edge, event.lanes)
             if np.array_equal(before, self._told[world]):

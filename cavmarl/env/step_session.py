@@ -185,13 +185,11 @@ class StepSession:
             simulation.network, simulation.travel.steps, simulation.vehicles(world)
         )
 
-    def vehicle_rows(self, world: int) -> NDArray[np.void]:
-        """Return the vehicles of a world; see `WorldsEnvironment.vehicle_rows`."""
-        self.refuse_unready("vehicle_rows()")
-        self._check_world(world)
+    def shown(self) -> Simulation:
+        """Return the worlds as they are now; see `WorldsEnvironment.present`."""
+        self.refuse_unready("present")
         self._refuse_kept_elsewhere()
-        rows = self.present().vehicles(world)
-        return rows[np.argsort(rows["id"], kind="stable")]
+        return self.present()
 
     def _refuse_kept_elsewhere(self) -> None:
         key = kept_elsewhere(self.config)

@@ -77,6 +77,16 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.worlds.simulation
 
     @property
+    def present(self) -> Simulation:
+        """The worlds as they are now, for tools; if other processes run them, a copy.
+
+        Raises:
+            ConfigError: their state is not available in this process.
+            EpisodeError: before the first reset.
+        """
+        return self._session.shown()
+
+    @property
     def step_s(self) -> float:
         """Duration of a step in seconds."""
         return self.config.clock.ctrl_dt_s
@@ -159,6 +169,7 @@ class WorldsEnvironment(OwnWorlds):
         lanes: Sequence[int] | None = None,
         world: int = 0,
         shuts_in: bool = False,
+        contraflow: bool = False,
     ) -> None:
         """Close lanes of a road, until they are opened or the episode is over.
 
@@ -172,12 +183,18 @@ class WorldsEnvironment(OwnWorlds):
             lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
             shuts_in: whether the road may be the last way out of other roads.
+            contraflow: whether the road is reversed: its lanes open in the opposite direction after
+                10 s or more, as soon as no vehicle is on it. The lanes of both directions count.
 
         Raises:
-            ActionError: there is no such world, road or lane; or the road is the last way out.
+            ActionError: there is no such world, road or lane; the road is the last way out; or it
+                is to be reversed and is not in `map.contraflow`, or only with some lanes.
             CapacityError: more than `map.changed_lanes` lanes would differ from the map.
             ConfigError: `map.changed_lanes` is 0.
         """
+        if contraflow:
+            self._session.lane_changes.reverse(world, edge, lanes, shuts_in)
+            return
         self._session.lane_changes.close(world, edge, lanes, shuts_in=shuts_in)
 
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
@@ -196,26 +213,6 @@ class WorldsEnvironment(OwnWorlds):
             ConfigError: `map.changed_lanes` is 0.
         """
         self._session.lane_changes.open(world, edge, lanes)
-
-    def reverse_road(self, edge: str, world: int = 0, shuts_in: bool = False) -> None:
-        """Let all lanes of a road lead in the opposite direction, until it is opened.
-
-        The road closes with the next step, as with `close_road`. Its contraflow lanes open after
-        10 s or more, as soon as no vehicle is on the road. The lanes of both directions count in
-        `map.changed_lanes`.
-
-        Args:
-            edge: id of a road in `map.contraflow`.
-            world: number of the world.
-            shuts_in: whether the road may be the last way out of other roads.
-
-        Raises:
-            ActionError: there is no such world or road, it is not in `map.contraflow`, or it is the
-                last way out.
-            CapacityError: more than `map.changed_lanes` lanes would differ from the map.
-            ConfigError: `map.changed_lanes` is 0.
-        """
-        self._session.lane_changes.reverse(world, edge, shuts_in)
 
     def damage_road(
         self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
@@ -258,15 +255,6 @@ class WorldsEnvironment(OwnWorlds):
             EpisodeError: before the first reset.
         """
         return self._session.deadlocks(world)
-
-    def vehicle_rows(self, world: int = 0) -> NDArray[np.void]:
-        """Return a copy of the VEHICLE rows of a world, by id, wherever the world runs.
-
-        Raises:
-            ConfigError: there is no such world, or its state is not available in this process.
-            EpisodeError: before the first reset.
-        """
-        return self._session.vehicle_rows(world)
 
     def world_frames(self, chosen: Sequence[int] = (0,), ghosts: bool = False) -> list[WorldFrame]:
         """Return the visible state of some worlds now; see `engine.world_frame.WorldFrame`.

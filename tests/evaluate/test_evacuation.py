@@ -104,7 +104,7 @@ def test_the_vehicles_begin_on_their_roads_in_the_order_of_trips(
     idle = vec.suggest_actions()
     for _ in range(1500):
         vec.step(idle)
-        rows = vec.vehicle_rows()
+        rows = vec.present.vehicles(0)
         for order, lane in zip(rows["order"].tolist(), rows["lane"].tolist(), strict=True):
             begun.setdefault(order, int(network.lanes["edge"][lane]))
     vec.close()

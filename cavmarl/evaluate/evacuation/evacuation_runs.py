@@ -48,7 +48,7 @@ class AreaResult:
     vehicles: int
     departed: int
     arrived: int
-    unserved: int  # that have not reached an exit, also those that could not depart
+    unserved: int  # that have not reached an exit, including vehicles that could not depart
     clearance_50_s: float | None
     clearance_90_s: float | None
     clearance_s: float | None
@@ -190,10 +190,10 @@ def _run(
     meter = _Meter(prepared, vec)
     vec.reset(seed=seed)
     idle = vec.suggest_actions()
-    meter.sample(0.0, vec.vehicle_rows())
+    meter.sample(0.0, vec.present.vehicles(0))
     for second in range(1, int(prepared.plan.horizon_s / STEP_S) + 1):
         vec.step(idle)
-        meter.sample(second * STEP_S, vec.vehicle_rows())
+        meter.sample(second * STEP_S, vec.present.vehicles(0))
         told(meter.arrived, len(prepared.evacuees.area))
         if meter.is_over:
             break
