@@ -182,7 +182,7 @@ def _changed(
     """Return the plan with the values of options."""
     from cavmarl.config.road_events import RoadEvent
 
-    more = ()
+    more: tuple[RoadEvent, ...] = ()
     if close:
         more = (RoadEvent(at_s=plan.start_s, action="close", edges=tuple(close), shuts_in=True),)
     return replace(

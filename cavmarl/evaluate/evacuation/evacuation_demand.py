@@ -166,11 +166,11 @@ def _refuse_closed_for_good(
         rows = edge_rows(event.edges, "events", network)
         lanes = np.isin(network.lanes["edge"], rows)
         if event.lanes is not None:
-            lanes &= np.isin(network.lanes["index"], event.lanes)
+            lanes = lanes & np.isin(network.lanes["index"], event.lanes)
         if event.action in ("close", "reverse"):
-            at_last |= lanes
+            at_last[lanes] = True
         elif event.action == "open":
-            at_last &= ~lanes
+            at_last[lanes] = False
     if np.array_equal(at_last, closed):
         return
     later = _times_s(network, goals, at_last)

@@ -225,7 +225,8 @@ class _Meter:
         self._counts: list[tuple[int, int]] = []
 
     def _of_area(self, number: int) -> NDArray[np.int64]:
-        return self._evacuees.edge[self._evacuees.area == number]
+        found: NDArray[np.int64] = self._evacuees.edge[self._evacuees.area == number]
+        return found
 
     @property
     def departed(self) -> int:
