@@ -175,9 +175,9 @@ def _refuse_closed_for_good(
         return
     later = _times_s(network, goals, at_last)
     for name, area in plan.areas.items():
-        lanes = _origins(network, roads_of(area, name, network), closed)
-        had_way = np.isfinite(times[:, lanes]).any()
-        if had_way and not np.isfinite(later[:, lanes]).any():
+        begins = _origins(network, roads_of(area, name, network), closed)
+        had_way = np.isfinite(times[:, begins]).any()
+        if had_way and not np.isfinite(later[:, begins]).any():
             raise ConfigError(
                 f"events: they close the last way from {name} to an exit, and do not open it "
                 "again; open a road later, or name another exit"
