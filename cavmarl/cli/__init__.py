@@ -21,6 +21,7 @@ from cavmarl.cli import (
     carla,
     demand,
     demo,
+    evacuate,
     evaluate,
     follow,
     journal,
@@ -133,6 +134,12 @@ _train(
     "cavmarl evaluate merge --set sensors.lidar.rays=32 --json result.json",
 )
 _train("report", evaluate.report, "cavmarl report runs/evaluate/merge-1 --html report.html")
+_train(
+    "evacuate",
+    evacuate.evacuate,
+    "cavmarl evacuate city.osm.gz --vehicles 500 --out runs/city",
+    "cavmarl evacuate plan.yaml --repeats 3",
+)
 _train("suite", suite.suite, "cavmarl suite standard --maps maps --policy cities_ippo")
 _train("baseline", baseline.baseline, "cavmarl baseline city.net.xml --agents 8 --episodes 6")
 _train("manifest", service.manifest, "cavmarl manifest runs/evaluate/merge-1")

@@ -9,6 +9,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 from functools import cache
+from itertools import chain
 from operator import attrgetter
 from typing import Any, ClassVar, get_args, get_type_hints
 
@@ -84,7 +85,8 @@ def _ranges(kind: type[Any]) -> tuple[tuple[str, Within], ...]:
     return tuple(
         (name, mark)
         for name, hint in hints.items()
-        for mark in get_args(hint)
+        # the marks are in the hint, or in a member of a union such as `Annotated[int, …] | None`
+        for mark in (*get_args(hint), *chain.from_iterable(map(get_args, get_args(hint))))
         if isinstance(mark, Within)
     )
 

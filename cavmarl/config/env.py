@@ -15,6 +15,7 @@ from cavmarl.config.checks import Section, Whole, Within, check, check_finite
 from cavmarl.config.limits import LimitsConfig
 from cavmarl.config.population import PopulationConfig
 from cavmarl.config.rig import Rig, check_rig
+from cavmarl.config.road_events import RoadEvent, check_events
 from cavmarl.config.scenario import ScenarioConfig
 from cavmarl.config.sensors import SensorsConfig
 from cavmarl.config.signals import SignalsConfig
@@ -45,6 +46,11 @@ class MapConfig(Section, key="map"):
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
             each world has its own table of lanes and its own plans.
+        contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
+            opposite direction on them, which are closed until then. A reversed road counts in
+            `map.changed_lanes` with the lanes of both directions.
+        events: roads that close, open, slow down or are reversed during each episode; see
+            `config.road_events.RoadEvent`.
     """
 
     source: str | tuple[str, ...]
@@ -52,9 +58,18 @@ class MapConfig(Section, key="map"):
     program: dict[str, str] = field(default_factory=dict)
     buildings: str = ""
     changed_lanes: Annotated[int, Whole(0, 1_000_000)] = 0
+    contraflow: tuple[str, ...] = ()
+    events: tuple[RoadEvent, ...] = ()
 
     def __post_init__(self) -> None:
         super().__post_init__()
+        check_events(self.events, self.contraflow)
+        for name in ("contraflow", "events"):
+            self.need(
+                "changed_lanes",
+                self.changed_lanes > 0 or not getattr(self, name),
+                f"map.{name} needs lanes that may change: set it to their number",
+            )
         self.need("source", bool(self.source) and all(self.sources), "must name a map file")
         self.need("programs", all(self.programs), "must name files")
 
@@ -336,6 +351,11 @@ class EnvConfig(Section, key=""):
     def may_change_lanes(self) -> bool:
         """Whether lanes of a world may differ from the map: closed, or with a lower limit."""
         return self.map.changed_lanes > 0 or self.limits.are_controlled
+
+    @property
+    def drives_alone(self) -> bool:
+        """Whether no agent drives, and the vehicles of a demand do; only the horizon ends that."""
+        return self.population.agents == 0 and bool(self.traffic.demand)
 
     @property
     def controlled(self) -> SignalsConfig | LimitsConfig | None:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.engine.component import Component, ComponentContext
+from cavmarl.roads.network import CARS
 from cavmarl.shards.shard import Commands, common_of
 from cavmarl.v2x.bus import Bus
 
@@ -37,6 +38,11 @@ class V2xComponent(Component):
         )
         for shard in host.shards:
             shard.mail = self.bus.mail
+        # permissions (W, L) in the worlds and (L,) on the map; None: lanes do not change
+        self._permissions: NDArray[np.uint32] | None = None
+        if host.config.map.changed_lanes and len(self.bus.units):
+            self._permissions = host.shards[0].own_lanes["permissions"]
+        self._on_map: NDArray[np.uint32] = host.network.lanes["permissions"]
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
         self.bus.reset(chosen)
@@ -45,6 +51,10 @@ class V2xComponent(Component):
         """Pass the events that agents declare to the bus, in the first tick of a step."""
         if commands.declared.size and self._ticks.item(0) % self._ticks_per_step == 0:
             self.bus.declare(commands.declared)
+        if self._permissions is not None:
+            for world, permissions in enumerate(self._permissions):
+                is_closed = (permissions & CARS == 0) & (self._on_map & CARS != 0)
+                self.bus.tell_closures(world, is_closed)
 
     def end(self) -> None:
         self.bus.exchange(self._division.side)

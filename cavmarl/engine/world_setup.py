@@ -28,6 +28,7 @@ from cavmarl.core.xml_root import is_sumo_config
 from cavmarl.driving.steered_sweeps import load_steered
 from cavmarl.limits.limit_table import limit_sizes
 from cavmarl.maps.buildings import with_buildings
+from cavmarl.maps.contraflow import contraflow_network
 from cavmarl.maps.netconvert import conversion_notes, map_file
 from cavmarl.networks.background_driver import background_drivers
 from cavmarl.networks.trained_maps import note_of, untrained_kinds
@@ -179,7 +180,8 @@ def load_roads(config: EnvConfig, base_dir: Path) -> RoadNetwork:
             the map.
     """
     paths = resolve_maps(config, base_dir)
-    network = _joined(paths, config.population.agents > 0 or bool(config.traffic.networks))
+    is_steered = config.population.agents > 0 or bool(config.traffic.networks)
+    network = _joined(paths, is_steered, config.map.contraflow)
     if len(network.maps) > 1:
         _refuse_single_map_keys(config)
     buildings = resolve_buildings(config, base_dir)
@@ -227,10 +229,11 @@ def _program_files(config: EnvConfig, base_dir: Path) -> list[Path]:
     return [*(file for file in named if file.resolve() not in known), *programs]
 
 
-def _joined(paths: Sequence[Path], is_steered: bool) -> RoadNetwork:
+def _joined(paths: Sequence[Path], is_steered: bool, contraflow: Sequence[str] = ()) -> RoadNetwork:
     """Return the network of map files. Worlds of one process share a network of the same files.
 
     If policies or networks steer vehicles, the roads include the swept areas of steered vehicles.
+    `contraflow`: ids of roads that can be reversed.
 
     Raises MapError with the errors of all files.
     """
@@ -240,6 +243,8 @@ def _joined(paths: Sequence[Path], is_steered: bool) -> RoadNetwork:
     for path in paths:
         try:
             file = map_file(path)
+            if contraflow:
+                file = contraflow_network(file, contraflow)
             contents.append((map_name(file), source_hash(file)))
             files.append(file)
         except MapError as error:
@@ -278,6 +283,7 @@ def _refuse_single_map_keys(config: EnvConfig) -> None:
         "population.external": config.population.external,
         "signals.overrides": config.signals.overrides,
         "map.changed_lanes": config.map.changed_lanes,
+        "map.contraflow": config.map.contraflow,
         "zones.layout": config.zones.layout not in ZONE_LAYOUTS and config.zones.layout,
     }
     for key, value in named.items():
@@ -320,9 +326,13 @@ def find_map(env: str | Path) -> Path:
     return map_file(resolve_map(*load_config(env))).resolve()
 
 
-def check_agents(config: EnvConfig) -> None:
-    """Refuse a world without agents where a caller wants to drive one."""
-    if config.population.agents == 0 and config.roadside is None:
+def check_agents(config: EnvConfig, *, may_be_alone: bool = False) -> None:
+    """Refuse a world without agents where a caller wants to drive one.
+
+    `may_be_alone`: whether a world of `traffic.demand` needs no agents.
+    """
+    is_alone = may_be_alone and config.drives_alone
+    if config.population.agents == 0 and config.roadside is None and not is_alone:
         raise ConfigError(
             "population.agents = 0: an environment needs at least one agent; set it higher, or let "
             "agents control signals (signals.agents) or speed limits (limits.agents)"

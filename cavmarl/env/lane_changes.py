@@ -1,8 +1,9 @@
-"""`LaneChanges`: roads that the caller closes or slows down, from the next step on."""
+"""`LaneChanges`: roads that the caller closes, slows down or reverses, from the next step on."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import math
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -10,14 +11,26 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
+from cavmarl.config.road_events import RoadEvent
 from cavmarl.core.errors import ActionError, CapacityError, ConfigError
-from cavmarl.core.records.changed_lanes import CHANGED, CLOSED_TO, LIMIT_MPS, wrong_changes
+from cavmarl.core.records.changed_lanes import CHANGED, CLASSES, LIMIT_MPS, wrong_changes
 from cavmarl.driving.vehicle_types import ALL_PERMISSIONS
+from cavmarl.engine.world_views import WorldViews
+from cavmarl.env.reversed_roads import (
+    AS_ON_MAP,
+    CLEARING,
+    RETURNING,
+    REVERSED_NOW,
+    ReversedRoads,
+    wrong_reversals,
+)
+from cavmarl.roads.contraflow_ids import contraflow_of, is_contraflow
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.ways_out import shut_in_roads
 from cavmarl.shards.shard import Commands
 
-CLOSED, OPENED, DAMAGED = "closed", "opened", "damaged"  # kinds of frame events
+# kinds of frame events
+CLOSED, OPENED, DAMAGED, REVERSED = "closed", "opened", "damaged", "reversed"
 
 Asked = tuple[tuple[str, str], ...]
 
@@ -25,34 +38,51 @@ Asked = tuple[tuple[str, str], ...]
 class LaneChanges:
     """The lanes of W worlds that differ from the map, at most N = `map.changed_lanes` of each.
 
-    The changes stay until they are undone, or until the world is reset.
+    The changes stay until they are undone, or until the world is reset. The events of `map.events`
+    happen in all worlds.
 
     Args:
         config: configuration of the worlds.
         network: map of the worlds.
         num_worlds: number of worlds, W.
+        present: returns the worlds as they are now.
+
+    Raises:
+        ConfigError: an event of `map.events` is impossible on this map.
     """
 
-    def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
+    def __init__(
+        self,
+        config: EnvConfig,
+        network: RoadNetwork,
+        num_worlds: int,
+        present: Callable[[], WorldViews],
+    ) -> None:
         self._most = config.map.changed_lanes
         self._network = network
+        self._present = present
         self._edges = {name: row for row, name in enumerate(network.edge_ids)} if self._most else {}
         self._told = np.zeros((num_worlds, self._most, 3))  # `Commands.lane_changes`
         self._waiting: list[Asked] = [()] * num_worlds  # changes for the next step
         self._last: list[Asked] = [()] * num_worlds  # changes of the last step
+        self._reversed = ReversedRoads(config, network, num_worlds)
+        self._clock = config.clock
+        self._events = config.map.events
+        self._check_events()
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """The changes that hold from the next step on."""
-        return (self._told,)
+        """The changes that hold from the next step on, and the states of reversed roads."""
+        return self._told, self._reversed.states
 
     @memory.setter
     def memory(self, memory: tuple[NDArray[Any], ...]) -> None:
-        (self._told[:],) = memory
+        self._told[:], self._reversed.states[:] = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
-        return wrong_changes(memory[0], self._network.lanes)
+        told, states = memory
+        return wrong_changes(told, self._network.lanes) or wrong_reversals(states)
 
     def close(
         self,
@@ -84,8 +114,16 @@ class LaneChanges:
         self._tell(world, limit_mps, closed, (CLOSED, _detail(edge, lanes)))
 
     def open(self, world: int, edge: str, lanes: Sequence[int] | None = None) -> None:
-        """Give lanes of a road the limits and permissions of the map; raises as `close`."""
+        """Give lanes of a road the limits and permissions of the map; raises as `close`.
+
+        A reversed road gets its direction back, with all its lanes.
+        """
         rows = self._rows(world, edge, lanes)
+        state = self._reversed.state(world, edge)
+        if state != AS_ON_MAP:
+            if state != RETURNING:
+                self._turn_back(world, edge)
+            return
         limit_mps, closed = self._now(world)
         own = self._network.lanes["speed_mps"]
         if not ((closed[rows] != 0) | (limit_mps[rows] != own[rows])).any():
@@ -95,6 +133,93 @@ class LaneChanges:
             )
         limit_mps[rows], closed[rows] = own[rows], 0
         self._tell(world, limit_mps, closed, (OPENED, _detail(edge, lanes)))
+
+    def reverse(
+        self, world: int, edge: str, lanes: Sequence[int] | None = None, shuts_in: bool = False
+    ) -> None:
+        """Close a road, and open its contraflow lanes once no vehicle is on it.
+
+        Raises:
+            ActionError: there is no such world or road, it is the last way out of others, it is
+                not one of `map.contraflow`, or `lanes` does not name all of its lanes.
+            CapacityError, ConfigError: see `close`.
+        """
+        if len(self._rows(world, edge, lanes)) < len(self._rows(world, edge, None)):
+            raise ActionError(
+                f"lanes = {list(lanes or ())!r}: edge {edge!r} is reversed with all its lanes; "
+                "leave lanes out"
+            )
+        self._reversed.check(edge)
+        before = self._reversed.states[world].copy()
+        self._reversed.begin(world, edge, CLEARING)
+        try:
+            self.close(world, edge, shuts_in=shuts_in)
+        except (ActionError, CapacityError):
+            self._reversed.states[world] = before
+            raise
+
+    def _turn_back(self, world: int, edge: str) -> None:
+        """Close the contraflow lanes of a road; it opens once no vehicle is on them."""
+        limit_mps, classes = self._now(world)
+        classes[self._reversed.lanes(edge)] = 0
+        self._reversed.begin(world, edge, RETURNING)
+        self._tell(world, limit_mps, classes, (CLOSED, contraflow_of(edge)))
+
+    def advance(self, ticks: NDArray[np.int64]) -> None:
+        """Let the events of the next step happen, and open reversed roads that are empty.
+
+        `ticks`: (W,) of the worlds, before the step.
+        """
+        for world, tick in enumerate(ticks.tolist() if self._events else ()):
+            for event in self._events:
+                due = math.ceil(event.at_s / self._clock.sim_dt_s - 1e-9)
+                if tick - self._clock.ticks_per_step < due <= tick:
+                    self._happen(world, event)
+        for world, edge, is_reversed in self._reversed.cleared(ticks, self._present):
+            limit_mps, classes = self._now(world)
+            road, back = self._rows(world, edge, None), self._reversed.lanes(edge)
+            classes[back] = ALL_PERMISSIONS if is_reversed else 0
+            classes[road] = ALL_PERMISSIONS if is_reversed else 0
+            kind = REVERSED if is_reversed else OPENED
+            self._tell(world, limit_mps, classes, (kind, edge))
+
+    def _happen(self, world: int, event: RoadEvent) -> None:
+        """Let an event happen in one world; what has happened already is left out."""
+        for edge in event.edges:
+            before = self._told[world].copy()
+            waiting = self._waiting[world]
+            if event.action == "close":
+                self.close(world, edge, event.lanes, shuts_in=event.shuts_in)
+            elif event.action == "damage":
+                self.limit(world, edge, event.speed_mps or 0.0, event.lanes)
+            elif event.action == "reverse":
+                if self._reversed.state(world, edge) not in (CLEARING, REVERSED_NOW):
+                    self.reverse(world, edge, shuts_in=event.shuts_in)
+            elif self._differs(world, edge, event.lanes):
+                self.open(world, edge, event.lanes)
+            if np.array_equal(before, self._told[world]):
+                self._waiting[world] = waiting
+
+    def _differs(self, world: int, edge: str, lanes: Sequence[int] | None) -> bool:
+        """Return whether lanes of a road differ from the map."""
+        rows = self._rows(world, edge, lanes)
+        limit_mps, classes = self._now(world)
+        is_slower = limit_mps[rows] != self._network.lanes["speed_mps"][rows]
+        return bool((is_slower | (classes[rows] != 0)).any())
+
+    def _check_events(self) -> None:
+        """Let all events happen in turn. Raises ConfigError for the first that is impossible."""
+        order = sorted(range(len(self._events)), key=lambda k: self._events[k].at_s)
+        for k in order:
+            event = self._events[k]
+            try:
+                if event.action == "open":
+                    for edge in event.edges:
+                        self._rows(0, edge, event.lanes)
+                self._happen(0, event)
+            except (ActionError, CapacityError) as error:
+                raise ConfigError(f"map.events.{k}: {error}") from error
+        self.forget(np.ones(len(self._told), dtype=np.bool_))
 
     def limit(
         self, world: int, edge: str, speed_mps: float, lanes: Sequence[int] | None = None
@@ -127,7 +252,8 @@ class LaneChanges:
     def closed(self, world: int) -> tuple[str, ...]:
         """Return the ids of the roads with a closed lane, from the next step on."""
         told = self._told[self._checked(world)]
-        lanes = told[told[:, CLOSED_TO] > 0.0, CHANGED].astype(np.int64) - 1
+        lanes = told[told[:, CLASSES] > 0.0, CHANGED].astype(np.int64) - 1
+        lanes = lanes[self._network.lanes["permissions"][lanes] != 0]
         edges = np.unique(self._network.lanes["edge"][lanes])
         return tuple(self._network.edge_ids[edge] for edge in edges.tolist())
 
@@ -147,6 +273,7 @@ class LaneChanges:
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Begin an episode in the chosen worlds (W,)."""
         self._told[chosen] = 0.0
+        self._reversed.states[chosen] = 0
         for world in np.flatnonzero(chosen).tolist():
             self._waiting[world] = self._last[world] = ()
 
@@ -166,6 +293,10 @@ class LaneChanges:
         number = self._edges.get(edge, -1)
         if number < 0 or self._network.edges["internal"][number]:
             raise ActionError(f"edge {edge!r}: the map has no such road; give the id of one")
+        if is_contraflow(edge):
+            raise ActionError(
+                f"edge {edge!r} are contraflow lanes: reverse or open the road below instead"
+            )
         first = int(self._network.edges["first_lane"][number])
         count = int(self._network.edges["num_lanes"][number])
         if lanes is None:
@@ -179,14 +310,17 @@ class LaneChanges:
         return first + np.unique(np.asarray(lanes, dtype=np.intp))
 
     def _now(self, world: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-        """Return the limit in m/s (L,) and the classes (L,) each lane is closed to."""
+        """Return the limit in m/s (L,) and the classes (L,) each lane is closed to.
+
+        Of contraflow lanes, return the classes that they are open to.
+        """
         told = self._told[world]
         used = told[told[:, CHANGED] > 0.0]
         lanes = used[:, CHANGED].astype(np.int64) - 1
         limit_mps = self._network.lanes["speed_mps"].copy()
         closed = np.zeros(len(limit_mps), dtype=np.uint32)
         limit_mps[lanes] = used[:, LIMIT_MPS]
-        closed[lanes] = used[:, CLOSED_TO].astype(np.uint32)
+        closed[lanes] = used[:, CLASSES].astype(np.uint32)
         return limit_mps, closed
 
     def _tell(
@@ -198,16 +332,17 @@ class LaneChanges:
     ) -> None:
         """Let the changes hold from the next step on."""
         differs = np.flatnonzero((limit_mps != self._network.lanes["speed_mps"]) | (closed != 0))
-        if len(differs) > self._most:
+        number = len(differs) + self._reversed.reserved(world)
+        if number > self._most:
             raise CapacityError(
-                f"world {world}: {len(differs)} lanes would differ from the map, but "
+                f"world {world}: {number} lanes would differ from the map, but "
                 f"map.changed_lanes = {self._most}; set it higher, or open a road"
             )
         told = self._told[world]
         told[:] = 0.0
         told[: len(differs), CHANGED] = differs + 1
         told[: len(differs), LIMIT_MPS] = limit_mps[differs]
-        told[: len(differs), CLOSED_TO] = closed[differs]
+        told[: len(differs), CLASSES] = closed[differs]
         self._waiting[world] = (*self._waiting[world], event)
 
     def _refuse_last_way(self, world: int, edge: str, closed: NDArray[np.uint32]) -> None:

@@ -78,7 +78,7 @@ class StepSession:
         self.insertions = Insertions(config, worlds.world.network, num_worlds)
         self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
         self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
-        self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds)
+        self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds, self.present)
         self.controlled = _controlled(config, worlds)
         self.roadside = None if config.roadside is None else self.controlled
         self._choose = _choices_of_controller(self.controlled, config)
@@ -130,6 +130,7 @@ class StepSession:
         waiting = (
             self.events, self.insertions, self.external, self.overrides, self.lane_changes
         )  # fmt: skip
+        self.lane_changes.advance(self._ticks_of_running())
         for part in waiting:
             commands = part.add_to(commands)
         self.worlds.step(commands)
@@ -139,6 +140,12 @@ class StepSession:
             part.clear()
         self.simulated_s += time.perf_counter() - began
         self._notify()
+
+    def _ticks_of_running(self) -> NDArray[np.int64]:
+        """Return (W,) the ticks of the worlds; -1: the next step begins an episode."""
+        arrays = self.worlds.arrays
+        begins = arrays.episode_over if self.worlds.in_next_step else np.zeros(1, dtype=np.bool_)
+        return np.where(begins, -1, arrays.ticks)
 
     def forget(self, chosen: NDArray[np.bool_]) -> None:
         """Drop the last actions and the waiting inputs of the chosen worlds (W,)."""
@@ -177,6 +184,20 @@ class StepSession:
         return find_deadlocks(
             simulation.network, simulation.travel.steps, simulation.vehicles(world)
         )
+
+    def shown(self) -> Simulation:
+        """Return the worlds as they are now; see `WorldsEnvironment.present`."""
+        self.refuse_unready("present")
+        self._refuse_kept_elsewhere()
+        return self.present()
+
+    def _refuse_kept_elsewhere(self) -> None:
+        key = kept_elsewhere(self.config)
+        if key and not isinstance(unguarded(self.worlds), LocalWorlds):
+            raise ConfigError(
+                f"{key}: the state of such worlds is only available in the caller's process; use "
+                "backend='local'"
+            )
 
     def _check_world(self, world: int) -> None:
         count = len(self.worlds.arrays.mask)
@@ -258,12 +279,7 @@ class StepSession:
         ghosts: bool,
         room: Callable[[int], NDArray[np.void]] | None = None,
     ) -> list[WorldFrame]:
-        key = kept_elsewhere(self.config)
-        if key and not isinstance(unguarded(self.worlds), LocalWorlds):
-            raise ConfigError(
-                f"{key}: frames of such worlds are only available in the caller's process; use "
-                "backend='local'"
-            )
+        self._refuse_kept_elsewhere()
         simulation, arrays = self.present(), self.worlds.arrays
         inserted, changed = self.insertions.last, self.lane_changes.last
         return [

@@ -67,7 +67,8 @@ def make_vec(
     """
     num_envs, mode = _checked(num_envs), known_mode(autoreset_mode)
     in_next_step = mode is not AutoresetMode.SAME_STEP
-    worlds = start_worlds(env, num_envs, in_next_step, ("rgb_array",), **world)
+    modes = ("rgb_array",)
+    worlds = start_worlds(env, num_envs, in_next_step, modes, may_be_alone=True, **world)
     made = CavVectorEnv(
         worlds,
         seed=world.get("seed"),

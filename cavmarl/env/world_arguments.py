@@ -70,6 +70,7 @@ def start_worlds(
     num_worlds: int,
     in_next_step: bool,
     render_modes: tuple[str, ...],
+    may_be_alone: bool = False,
     **given: Unpack[WorldArguments],
 ) -> SteppedWorlds:
     """Make the worlds that the arguments describe, after a check of all arguments.
@@ -79,6 +80,7 @@ def start_worlds(
         num_worlds: number of worlds.
         in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
         render_modes: allowed render modes.
+        may_be_alone: whether a world of `traffic.demand` needs no agents.
         given: see `WorldArguments`.
 
     Raises:
@@ -109,7 +111,7 @@ def start_worlds(
         overrides=with_sensors_of(given.get("overrides"), given.get("sensors_of")),
     )
     backend = find_backend(given.get("backend"), given.get("workers"), given.get("nodes"))
-    check_agents(config)
+    check_agents(config, may_be_alone=may_be_alone)
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
     world = make_world(config, base_dir)

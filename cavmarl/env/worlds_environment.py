@@ -77,6 +77,16 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.worlds.simulation
 
     @property
+    def present(self) -> Simulation:
+        """The worlds as they are now, for tools; if other processes run them, a copy.
+
+        Raises:
+            ConfigError: their state is not available in this process.
+            EpisodeError: before the first reset.
+        """
+        return self._session.shown()
+
+    @property
     def step_s(self) -> float:
         """Duration of a step in seconds."""
         return self.config.clock.ctrl_dt_s
@@ -159,6 +169,7 @@ class WorldsEnvironment(OwnWorlds):
         lanes: Sequence[int] | None = None,
         world: int = 0,
         shuts_in: bool = False,
+        contraflow: bool = False,
     ) -> None:
         """Close lanes of a road, until they are opened or the episode is over.
 
@@ -172,18 +183,25 @@ class WorldsEnvironment(OwnWorlds):
             lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
             shuts_in: whether the road may be the last way out of other roads.
+            contraflow: whether the road is reversed: its lanes open in the opposite direction after
+                10 s or more, as soon as no vehicle is on it. The lanes of both directions count.
 
         Raises:
-            ActionError: there is no such world, road or lane; or the road is the last way out.
+            ActionError: there is no such world, road or lane; the road is the last way out; or it
+                is to be reversed and is not in `map.contraflow`, or only with some lanes.
             CapacityError: more than `map.changed_lanes` lanes would differ from the map.
             ConfigError: `map.changed_lanes` is 0.
         """
+        if contraflow:
+            self._session.lane_changes.reverse(world, edge, lanes, shuts_in)
+            return
         self._session.lane_changes.close(world, edge, lanes, shuts_in=shuts_in)
 
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
-        """Give lanes of a closed or damaged road the state that they have on the map.
+        """Give lanes of a closed, damaged or reversed road the state that they have on the map.
 
-        Vehicles that wait before them drive on from the next step on.
+        Vehicles that wait before them drive on from the next step on. A reversed road opens with
+        all its lanes, once its contraflow lanes are closed and empty.
 
         Args:
             edge: id of a road.

@@ -223,6 +223,40 @@ def plot_learning(rows: Sequence[Mapping[str, str]]) -> str:
         return _svg(figure)
 
 
+def plot_series(series: Mapping[str, Sequence[float]], shown: Sequence[str], label: str) -> str:
+    """Plot columns of a table of times, `time_s`, in one figure."""
+    with mpl.rc_context(STYLE):
+        figure, axes = _figure(2.8)
+        for place, name in enumerate(shown):
+            axes.plot(series["time_s"], series[name], color=color_of(place), label=name)
+        axes.set(xlabel="time, s", ylabel=label)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=len(shown))
+        return _svg(figure)
+
+
+def plot_roads(
+    lines: Sequence[NDArray[np.float64]], marked: Mapping[str, Sequence[NDArray[np.float64]]]
+) -> str:
+    """Plot roads to scale, and some of them in colours with a legend.
+
+    `lines`: (n, 2) each, in m. `marked`: label → lines.
+    """
+    places = np.concatenate(lines)
+    width, height = np.maximum(np.ptp(places, axis=0), 1.0).tolist()
+    with mpl.rc_context(STYLE):
+        figure, axes = _figure(WIDTH_IN * min(max(height / width, 0.2), 0.75))
+        axes.add_collection(LineCollection(lines, colors=ROAD, linewidths=1.2))
+        for place, (label, some) in enumerate(marked.items()):
+            color = color_of(place)
+            axes.add_collection(LineCollection(some, colors=color, linewidths=2.4, label=label))
+        axes.autoscale_view()
+        axes.set_aspect("equal")
+        axes.set(xlabel="x, m", ylabel="y, m")
+        axes.grid(visible=False)
+        axes.legend(loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=4)
+        return _svg(figure)
+
+
 def _figure(height_in: float) -> tuple[Figure, Axes]:
     figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
     return figure, figure.subplots()

@@ -87,7 +87,8 @@ LANE = record(
     ("first_into", np.int32),
     ("num_into", np.int32),
     # bit k set: VEHICLE_CLASSES[k] may drive here; bit NO_CHANGE_LEFT + k or NO_CHANGE_RIGHT + k
-    # set: it must not change lanes to that side (a solid line)
+    # set: it must not change lanes to that side (a solid line). 0: a contraflow lane, see
+    # `maps.contraflow`
     ("permissions", np.uint32),
     ("index", np.int32),  # position on its edge, 0 = at the kerb
     ("min_x", np.float64),  # bounding box of the polyline, m

@@ -14,6 +14,9 @@ from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import CARS
 from cavmarl.traffic.kernels.way_requests import CLOSED_S
 
+# s to drive along a closed contraflow lane; any way over closed lanes of roads is faster
+SHUT_S = 1000.0 * CLOSED_S
+
 
 class LanePlans:
     """The plans of W worlds to G goals.
@@ -63,12 +66,14 @@ class LanePlans:
         """
         on_map = self._roads.lanes
         closed = ((on_map["permissions"] & CARS) != 0) & ((lanes["permissions"] & CARS) == 0)
-        differs = closed.copy()
+        contraflow = on_map["permissions"] == 0
+        opened = contraflow & ((lanes["permissions"] & CARS) != 0)
+        differs = closed | opened
         if self._follows_limits:
             differs |= lanes["speed_mps"] != on_map["speed_mps"]
         speed_mps = (lanes if self._follows_limits else on_map)["speed_mps"].copy()
         speed_mps[closed] = on_map["length_m"][closed] / CLOSED_S
-        key = speed_mps.tobytes() if differs.any() else b""
+        key = speed_mps.tobytes() + opened.tobytes() if differs.any() else b""
         if key == self._known[world]:
             return False
         self._known[world] = key
@@ -79,6 +84,10 @@ class LanePlans:
             return True
         now = on_map.copy()
         now["speed_mps"] = speed_mps
+        # Vehicles that are on contraflow lanes when these close have to find a way out.
+        now["permissions"][contraflow] = CARS
+        shut = contraflow & ~opened
+        now["speed_mps"][shut] = on_map["length_m"][shut] / SHUT_S
         # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
         now.setflags(write=False)
         roads = self._roads._replace(lanes=now)

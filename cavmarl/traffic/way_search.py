@@ -27,9 +27,11 @@ from cavmarl.traffic.kernels.way_requests import (
     take_slot,
     time_left,
 )
+from cavmarl.traffic.lane_plans import SHUT_S
 from cavmarl.traffic.schedule import MAX_STEPS, Schedule
 
 LEAST_STEPS = 128  # minimum size of a slot, if the map has as many lanes
+PREFERENCE = 1.2  # factor of speed by which contraflow lanes seem faster to some vehicles
 DETOUR_RATIO = 3  # a found way may have this many times the steps of the longest known way
 
 
@@ -144,8 +146,9 @@ class WaySearch:
         self._first_slot = slots.first_of(world)
         self._rows = rows
         self._traffic = traffic
-        self._speeds: dict[tuple[int, bool], RoadArrays] = {}
-        self._plans: dict[tuple[int, int, bool], NDArray[np.void]] = {}
+        self._contraflow = roads.lanes["permissions"] == 0
+        self._speeds: dict[tuple[int, bool, bool], RoadArrays] = {}
+        self._plans: dict[tuple[int, int, bool, bool], NDArray[np.void]] = {}
         self._used = np.zeros(slots.number, dtype=np.bool_)
         mark_slots(roads, rows, num, self._first_slot, slots.steps, self._used)
         self._edges = np.zeros(slots.steps, dtype=np.int32)
@@ -155,9 +158,20 @@ class WaySearch:
     def meets_closing(self, i: int) -> bool:
         """Return whether the way of row i leads over a lane that is closed to the vehicle."""
         row = self._rows[i]
-        roads = self._roads_now(self._permission(i), False)
+        permission = self._permission(i)
+        roads = self._roads_now(permission, False, False)
         time: float = time_left(roads, self._travel.steps, row["way"], row["lane"])
-        return CLOSED_S <= time < np.inf
+        return CLOSED_S <= time - self._own_s(roads, row, permission) < np.inf
+
+    def _own_s(self, roads: RoadArrays, row: np.void, permission: int) -> float:
+        """Return the time on the vehicle's own lane if the caller has closed it, else 0.
+
+        A vehicle that is on a closed lane leaves it.
+        """
+        lane = int(row["lane"])
+        if int(self._traffic.lanes["permissions"][lane]) & permission:
+            return 0.0
+        return float(roads.lanes["length_m"][lane] / roads.lanes["speed_mps"][lane])
 
     def send(
         self, i: int, goal: int, knows: bool, anyhow: bool, stands: bool = False
@@ -171,15 +185,16 @@ class WaySearch:
         """
         row = self._rows[i]
         permission = self._permission(i)
-        roads = self._roads_now(permission, knows)
-        plan = self._plan(goal, permission, knows)
+        prefers = self._prefers_contraflow(row)
+        roads = self._roads_now(permission, knows, prefers)
+        plan = self._plan(goal, permission, knows, prefers)
         lane = int(row["lane"])
         number = find_way(roads, plan, lane, permission, self._edges, self._steps, self._cost)
         way = -int(self._roads.edges[self._roads.lanes[lane]["edge"]]["first_lane"])
         if number == 0:
             return WaySearchResult.NO_WAY
         time = time_left(roads, self._steps, way, lane)
-        if time >= CLOSED_S:
+        if time - self._own_s(roads, row, permission) >= CLOSED_S:
             return WaySearchResult.NO_WAY
         if not anyhow and time >= time_left(roads, self._travel.steps, row["way"], lane):
             return WaySearchResult.KEPT
@@ -205,9 +220,17 @@ class WaySearch:
     def _permission(self, i: int) -> int:
         return int(self._travel.types[self._rows[i]["vtype"]]["permissions"])
 
-    def _roads_now(self, permission: int, knows: bool) -> RoadArrays:
+    def _prefers_contraflow(self, row: np.void) -> bool:
+        """Return whether a vehicle takes contraflow lanes if both ways are about as fast.
+
+        Every second vehicle does. Otherwise all vehicles would stay on the road beside them until
+        it is slow.
+        """
+        return bool(self._contraflow.any()) and int(row["id"]) % 2 == 0
+
+    def _roads_now(self, permission: int, knows: bool, prefers: bool) -> RoadArrays:
         """Return the roads with the speeds that a class can expect as their speed limits."""
-        key = permission, knows
+        key = permission, knows, prefers
         if key not in self._speeds:
             lanes = self._roads.lanes.copy()
             samples = self._traffic.samples if knows else 0
@@ -215,15 +238,22 @@ class WaySearch:
                 self._roads, self._traffic.speed_sums, samples, self._traffic.closed,
                 self._traffic.lanes, permission, lanes,
             )  # fmt: skip
+            contraflow = self._contraflow
+            lanes["permissions"][contraflow] = permission
+            shut = contraflow & (self._traffic.lanes["permissions"] & permission == 0)
+            lanes["speed_mps"][shut] = lanes["length_m"][shut] / SHUT_S
+            if prefers:
+                lanes["speed_mps"][contraflow & ~shut] *= PREFERENCE
             # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
             lanes.setflags(write=False)
             self._speeds[key] = self._roads._replace(lanes=lanes)
         return self._speeds[key]
 
-    def _plan(self, goal: int, permission: int, knows: bool) -> NDArray[np.void]:
-        key = goal, permission, knows
+    def _plan(self, goal: int, permission: int, knows: bool, prefers: bool) -> NDArray[np.void]:
+        key = goal, permission, knows, prefers
         if key not in self._plans:
             plan = np.zeros(len(self._roads.lanes), dtype=PLAN)
-            plan_goal(self._roads_now(permission, knows), goal, permission, 1.0, plan)
+            roads = self._roads_now(permission, knows, prefers)
+            plan_goal(roads, goal, permission, 1.0, plan)
             self._plans[key] = plan
         return self._plans[key]

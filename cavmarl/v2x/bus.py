@@ -19,6 +19,7 @@ from cavmarl.config.env import EnvConfig
 from cavmarl.config.v2x import V2xConfig, period_ticks
 from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import ConfigError
+from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.core.math.neighbors import make_grid
 from cavmarl.core.math.walls import make_walls
 from cavmarl.core.records.arrays import RoadArrays, SharedState, ZoneState
@@ -26,6 +27,8 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.v2x.channel import make_channel
 from cavmarl.v2x.kernels.v2x_exchange import exchange_messages, hand_out
 from cavmarl.v2x.kernels.v2x_records import (
+    CAUSE_NONE,
+    CAUSE_ROAD_CLOSED,
     COUNT_NO_ACCESS,
     COUNT_OVERFLOW,
     COUNT_REACHABLE,
@@ -62,6 +65,7 @@ Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
 """A function of a world, a tick, and views of the PACKET (n,) and REPORT (m,) sent in the tick."""
 
 CELL_M = 100.0  # cell size of the grid of packets of a tick
+CLOSURE_RANGE_M = 500.0  # a roadside unit reports closed roads that begin within this distance
 BODY_CELL_M = 25.0  # cell size of the grid of perceived vehicles
 
 
@@ -103,6 +107,8 @@ class Bus:
         self._scratch = _make_scratch(network, self.mail, zoned, num_receivers)
         self._network: NetworkSimulator | None = None
         self._watchers: tuple[Watch, ...] = ()
+        # closed lanes of a world, and what each unit says about them
+        self._closures: dict[int, tuple[NDArray[np.bool_], tuple[NDArray[np.float64], ...]]] = {}
         self._exchange = specialized(exchange_messages)
         self._hand_out = specialized(hand_out)
         self.mail.owner[:] = -1
@@ -246,6 +252,48 @@ class Bus:
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 
+    def tell_closures(self, world: int, closed: NDArray[np.bool_]) -> None:
+        """Let the roadside units that are due report a closed road near them in this tick.
+
+        The roads near a unit take turns. A unit that declares an event of its own reports that.
+
+        `closed`: (L,) lanes that are closed.
+        """
+        self.mail.closures[world] = 0.0
+        period = self._sending.denm_period
+        if not period or not len(self.units) or not closed.any():
+            return
+        near = self._closures_near(world, closed)
+        tick, declared = self._common.ticks.item(world), self.mail.declared[world]
+        for unit, places in enumerate(near):
+            turn, rest = divmod(tick + 1 + unit, period)
+            receiver = self._num_agents + unit
+            if rest == 0 and len(places) and declared[receiver] == CAUSE_NONE:
+                declared[receiver] = CAUSE_ROAD_CLOSED
+                self.mail.closures[world, unit] = places[turn % len(places)]
+
+    def _closures_near(
+        self, world: int, closed: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.float64], ...]:
+        """Return, for each unit, x, y, z, heading and EDGE row + 1 of closed roads near it."""
+        known = self._closures.get(world)
+        if known is None or not np.array_equal(known[0], closed):
+            lanes, points = self._roads.lanes, self._roads.points
+            rows = np.flatnonzero(closed & ~lanes["internal"])
+            rows = rows[np.unique(lanes["edge"][rows], return_index=True)[1]]
+            begin = points[lanes["first_point"][rows]]
+            places = np.stack(
+                [*(begin[name] for name in ("x", "y", "z", "heading")), lanes["edge"][rows] + 1.0],
+                axis=1,
+            )
+            found = []
+            for unit in self.units:
+                away_m = hypot_all(places[:, 0] - unit["x"], places[:, 1] - unit["y"])
+                found.append(places[away_m <= CLOSURE_RANGE_M])
+            known = closed.copy(), tuple(found)
+            self._closures[world] = known
+        return known[1]
+
     def statistics(self, world: int = 0) -> V2xStatistics:
         """Return the message statistics of a world since its reset."""
         return statistics_of(self.mail, world, self._dt_s)
@@ -301,6 +349,7 @@ def _make_mail(
         signals=zeros((*boxes, v2x.inbox.signals), dtype=REPORT),
         owner=zeros(boxes, dtype=np.int64),
         declared=zeros(boxes, dtype=np.int32),
+        closures=zeros((num_worlds, num_units, 5)),
         packets=zeros((num_worlds, slots, most), dtype=PACKET),
         num_packets=zeros((num_worlds, slots), dtype=np.int64),
         reports=zeros((num_worlds, slots, most_reports), dtype=REPORT),

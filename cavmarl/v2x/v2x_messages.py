@@ -39,6 +39,7 @@ from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
     CAUSE_OBSTACLE,
+    CAUSE_ROAD_CLOSED,
     CAUSE_STATIONARY,
     FIRST_ROADSIDE_ID,
     KIND_CAM,
@@ -98,7 +99,7 @@ DENM = np.dtype(
         ("sender", "<i8"),
         ("tick", "<i8"),  # tick of the event
         ("expires", "<i8"),  # last tick in which the event is valid
-        ("cause", "<i4"),  # ETSI cause code: 2, 10, 94, 99
+        ("cause", "<i4"),  # ETSI cause code: 2, 5, 10, 94, 99
         ("x", "<f8"),  # m, position of the event
         ("y", "<f8"),
         ("z", "<f8"),
@@ -140,6 +141,7 @@ KINDS: dict[int, np.dtype[Any]] = {
 # Causes of events, with ETSI's cause codes.
 CAUSES = {
     "collision": CAUSE_COLLISION,
+    "road_closed": CAUSE_ROAD_CLOSED,
     "obstacle": CAUSE_OBSTACLE,
     "stationary": CAUSE_STATIONARY,
     "hard_braking": CAUSE_HARD_BRAKING,

@@ -1,6 +1,7 @@
 """Lanes that differ from the map: the form of the caller's changes, and the table that follows.
 
 A change is a row of three numbers, see `LANE_CHANGE`; rows whose first number is 0 are unused.
+Lanes without permissions on the map are contraflow lanes (`maps.contraflow`).
 """
 
 from __future__ import annotations
@@ -11,7 +12,9 @@ from numpy.typing import NDArray
 # Columns of LANE_CHANGE (N, 3), float64.
 CHANGED = 0  # 1 + LANE row; 0: the row is unused
 LIMIT_MPS = 1  # speed limit in m/s, at most that of the map
-CLOSED_TO = 2  # bits of the vehicle classes that may not use the lane, see LANE["permissions"]
+# Bits of the vehicle classes that may not use the lane, see LANE["permissions"]. Of a contraflow
+# lane: of the classes that may use it.
+CLASSES = 2
 
 
 def wrong_changes(told: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
@@ -30,8 +33,8 @@ def wrong_changes(told: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
     lane = row.astype(np.int64)
     if (used[:, LIMIT_MPS] <= 0.0).any() or (used[:, LIMIT_MPS] > lanes["speed_mps"][lane]).any():
         return "a speed limit is 0 or above that of the map"
-    closed = used[:, CLOSED_TO]
-    if (closed != np.floor(closed)).any() or (closed >= 1 << 32).any():
+    classes = used[:, CLASSES]
+    if (classes != np.floor(classes)).any() or (classes >= 1 << 32).any():
         return "a lane is closed to an unknown class"
     world = np.broadcast_to(np.arange(len(told))[:, np.newaxis], told.shape[:2])
     pairs = np.stack([world[told[..., CHANGED] > 0.0], lane])
@@ -54,4 +57,6 @@ def apply_changes(
     world, place = np.nonzero(told[..., CHANGED])
     lane = told[world, place, CHANGED].astype(np.int64) - 1
     speed_mps[world, lane] = told[world, place, LIMIT_MPS]
-    permissions[world, lane] &= ~told[world, place, CLOSED_TO].astype(np.uint32)
+    classes = told[world, place, CLASSES].astype(np.uint32)
+    on_map = lanes["permissions"][lane]
+    permissions[world, lane] = np.where(on_map == 0, classes, on_map & ~classes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
@@ -264,7 +265,8 @@ class NodePeers(Peers):
                     agents, at = _read(data, at, np.int64, int(num))
                     check_indices("agent", agents, self.own.size)
                     for array in map(_by_agent, arrays):
-                        found, at = _read(data, at, array.dtype, int(num) * array[0].size)
+                        size = math.prod(array.shape[1:])
+                        found, at = _read(data, at, array.dtype, int(num) * size)
                         array[agents] = found.reshape(int(num), *array.shape[1:])
                     _check_end(data, at)
             yield
@@ -334,7 +336,7 @@ class NodePeers(Peers):
 
 def _by_agent(array: Array) -> Array:
     """Return (W, A, …) as (W · A, …), a view."""
-    return array.reshape(-1, *array.shape[2:])
+    return array.reshape(array.shape[0] * array.shape[1], *array.shape[2:])
 
 
 def _bytes(array: Array) -> Bytes:

@@ -60,7 +60,8 @@ class LocalWorlds:
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
         self._shows_signals = world.config.controlled is not None
-        self._has_signals = world.config.roadside is not None
+        # whether an episode goes on without agents that drive
+        self._goes_on = world.config.roadside is not None or world.config.drives_alone
         self.simulation: Simulation = Simulation(
             world.config,
             world.network,
@@ -115,7 +116,7 @@ class LocalWorlds:
         arrays.vehicle_done[chosen] = False
         arrays.terms[chosen] = outputs.terms[chosen]
         arrays.ticks[:] = self.simulation.ticks()
-        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come() | self._has_signals
+        goes_on = arrays.mask.any(axis=1) | self.simulation.agents_to_come() | self._goes_on
         arrays.episode_over[chosen] = ~goes_on[chosen]
         if not chosen.all():
             arrays.observations[~arrays.mask] = 0.0
@@ -151,7 +152,7 @@ class LocalWorlds:
             simulation.departures,
             self._steps,
             self._horizon,
-            self._has_signals,
+            self._goes_on,
             self._results,
         )
 

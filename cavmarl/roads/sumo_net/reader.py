@@ -18,6 +18,7 @@ from cavmarl.core.math.geometry import project
 from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 from cavmarl.core.records.rows import FORK_BEYOND_M, STEERED, SWEPT_BEYOND_M
 from cavmarl.core.scene_names import SCENE_SUFFIXES
+from cavmarl.roads.contraflow_ids import is_contraflow
 from cavmarl.roads.network import (
     EDGE,
     JUNCTION,
@@ -248,13 +249,14 @@ def _some(ids: Sequence[str]) -> str:
 
 
 def _roads(chosen: NetworkSelection, num_normal: int) -> list[Road]:
-    """Return the edges that are not inside a junction."""
+    """Return the edges that are not inside a junction, without contraflow lanes."""
     edges = [id(lane.getEdge()) for lane in chosen.lanes[:num_normal]]
     starts = [row for row in range(num_normal) if row == 0 or edges[row] != edges[row - 1]]
     owners = [chosen.lanes[row].getEdge() for row in starts]
     return [
         Road(range(*bounds), id(edge.getFromNode()), id(edge.getToNode()))
         for edge, bounds in zip(owners, pairwise([*starts, num_normal]), strict=True)
+        if not is_contraflow(edge.getID())
     ]
 
 
@@ -340,7 +342,10 @@ def _lane_rows(
     lanes["length_m"] = points["s"][first_point[1:] - 1]
     lanes["width_m"] = [lane.getWidth() for lane in chosen.lanes]
     lanes["speed_mps"] = [lane.getSpeed() for lane in chosen.lanes]
-    lanes["permissions"] = [permission_bits(lane.getPermissions()) for lane in chosen.lanes]
+    lanes["permissions"] = [
+        0 if is_contraflow(lane.getEdge().getID()) else permission_bits(lane.getPermissions())
+        for lane in chosen.lanes
+    ]
     for axis in ("x", "y"):
         lanes[f"min_{axis}"] = np.minimum.reduceat(points[axis], first_point[:-1])
         lanes[f"max_{axis}"] = np.maximum.reduceat(points[axis], first_point[:-1])

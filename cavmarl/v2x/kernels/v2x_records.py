@@ -25,12 +25,16 @@ NUM_KINDS = 4
 # Values of REPORT["code"] of an event: ETSI cause codes (EN 302 637-3, table 10).
 CAUSE_NONE = 0
 CAUSE_COLLISION = 2
+CAUSE_ROAD_CLOSED = 5
 CAUSE_OBSTACLE = 10
 CAUSE_STATIONARY = 94
 CAUSE_HARD_BRAKING = 99
 
 # Roadside unit k is station FIRST_ROADSIDE_ID + k; vehicles have smaller ids.
 FIRST_ROADSIDE_ID = 1 << 46
+
+# REPORT["subject"] of a closed road is FIRST_CLOSED_ROAD + EDGE row.
+FIRST_CLOSED_ROAD = 1 << 47
 
 # Indices of Mail.counts; counts are since the reset.
 COUNT_SENT = 0  # four numbers, by kind
@@ -46,7 +50,10 @@ BANDS_PER_M = 1.0 / BAND_M
 MAX_NEAR = 64  # number of nearest bodies that a station examines
 
 REPORT = record(
-    ("subject", np.int64),  # subject: a vehicle, or a SIGNAL row; for an event, its sender
+    (
+        "subject",
+        np.int64,
+    ),  # subject: a vehicle, or a SIGNAL row; for an event, its sender or a closed road
     ("sender", np.int64),  # station; -1: no report
     ("tick", np.int64),  # tick of the reported state
     ("expires", np.int64),  # last tick in which a receiver keeps it
@@ -141,6 +148,8 @@ class Mail(NamedTuple):
     signals: NDArray[np.void]  # REPORT (W, R, G)
     owner: NDArray[np.int64]  # (W, R) id of the inboxes' owner; -1: unused
     declared: NDArray[np.int32]  # (W, R) cause of an event to send in the next tick
+    # (W, U, 5) x, y, z, heading and EDGE row + 1 of the closed road that a unit declares; 0: none
+    closures: NDArray[np.float64]
     packets: NDArray[np.void]  # PACKET (W, L + 1, P) by sender, then kind
     num_packets: NDArray[np.int64]  # (W, L + 1)
     reports: NDArray[np.void]  # REPORT (W, L + 1, Q)

@@ -22,9 +22,11 @@ from cavmarl.v2x.kernels.v2x_records import (
     CAUSE_COLLISION,
     CAUSE_HARD_BRAKING,
     CAUSE_NONE,
+    CAUSE_ROAD_CLOSED,
     CAUSE_STATIONARY,
     COUNT_OVERFLOW,
     COUNT_SENT,
+    FIRST_CLOSED_ROAD,
     FIRST_ROADSIDE_ID,
     KIND_CAM,
     KIND_CPM,
@@ -340,6 +342,13 @@ def send_from_units(
                 _write_unit(report, unit, sender, KIND_DENM, cause, tick)
                 report["subject"] = sender
                 report["expires"] = tick + sending.denm_ticks
+                closure = mail.closures[w, k]
+                if cause == CAUSE_ROAD_CLOSED and closure[4] > 0.0:
+                    report["subject"] = FIRST_CLOSED_ROAD + int(closure[4]) - 1
+                    report["x"] = closure[0]
+                    report["y"] = closure[1]
+                    report["z"] = closure[2]
+                    report["heading"] = closure[3]
         if _is_due(tick, k, sending.unit_cpm_period):
             seen = visible(
                 scratch, -1, unit["x"], unit["y"], unit["z"],

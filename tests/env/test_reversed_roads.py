@@ -1,0 +1,232 @@
+"""Roads that are reversed, and events of `map.events`: equal in all divisions, saved, refused."""
+
+from __future__ import annotations
+
+from contextlib import closing
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+pytest.importorskip("sumo", reason="needs the extra 'sumo'")
+
+from cavmarl import ActionError, CapacityError, ConfigError, make_vec, parallel_env
+from cavmarl.recordings.recording import Recording
+from tests.support.saved_midway import check_resumed
+
+ROOM: dict[str, Any] = {
+    "map.changed_lanes": 12,
+    "map.contraflow": ["B1B2", "C1B1"],
+    "population.reroute": "always",
+}
+
+
+def reverse(env: Any, step: int) -> None:
+    """Reverse two roads, and turn one of them back."""
+    if step == 3:
+        env.close_road("B1B2", contraflow=True)
+        env.close_road("C1B1", contraflow=True)
+    if step == 70:
+        env.open_road("B1B2")
+
+
+def hashes(act: Any = reverse, overrides: dict[str, Any] = ROOM, **more: Any) -> list[str]:
+    with closing(
+        parallel_env("grid4x4", agents=2, background=50, overrides=overrides, **more)
+    ) as env:
+        env.reset(seed=2)
+        found = []
+        for step in range(140):
+            act(env, step)
+            env.step(env.suggest_actions())
+            if step % 20 == 19:
+                found.append(env.state_hash())
+        return found
+
+
+def test_a_divided_world_with_reversed_roads_equals_the_undivided_one() -> None:
+    undivided = hashes()
+    assert hashes(zones=4) == undivided
+    assert hashes(zones=4, workers=2) == undivided
+    assert hashes(act=lambda env, step: None) != undivided
+
+
+@pytest.mark.slow
+def test_worlds_with_reversed_roads_over_nodes_are_equal() -> None:
+    assert hashes(zones=2, nodes=2) == hashes()
+
+
+def test_saved_states_include_reversed_roads() -> None:
+    # The state is saved while the roads are being cleared.
+    check_resumed(reverse, ROOM, at=30, steps=120)
+
+
+def test_a_reversed_road_opens_when_it_is_empty_and_turns_back() -> None:
+    with closing(parallel_env("grid4x4", agents=1, background=80, overrides=ROOM)) as env:
+        env.reset(seed=2)
+        network = env.network
+        edges = network.lanes["edge"]
+        below = edges == network.edge_ids.index("B1B2")
+        above = edges == network.edge_ids.index("contraflow:B1B2")
+        used = 0
+        for step in range(700):
+            if step == 3:
+                env.close_road("B1B2", contraflow=True)
+            if step == 250:
+                env.open_road("B1B2")
+                assert "B1B2" in env.closed_roads()
+            env.step(env.suggest_actions())
+            lanes = env.present.vehicles(0)["lane"]
+            assert not (below[lanes].any() and above[lanes].any())
+            used += int(above[lanes].any())
+        assert used > 20
+        assert env.closed_roads() == ()
+        assert below[env.present.vehicles(0)["lane"]].any()
+        assert env.traffic_stats()["contacts"] == 0
+
+
+def test_impossible_reversals_are_refused_with_a_fix() -> None:
+    keys = {**ROOM, "map.changed_lanes": 5}
+    with closing(parallel_env("grid4x4", overrides=keys)) as env:
+        env.reset(seed=1)
+        with pytest.raises(ActionError, match=r"cannot be reversed: give one of map\.contraflow"):
+            env.close_road("B2B1", contraflow=True)
+        with pytest.raises(ActionError, match="the map has no such road"):
+            env.close_road("Z9", contraflow=True)
+        for change in (env.close_road, env.open_road):
+            with pytest.raises(ActionError, match="are contraflow lanes: reverse or open the road"):
+                change("contraflow:B1B2")
+        with pytest.raises(ActionError, match="world 1: must be from 0 to 0"):
+            env.close_road("B1B2", world=1, contraflow=True)
+        with pytest.raises(ActionError, match="is reversed with all its lanes; leave lanes out"):
+            env.close_road("B1B2", lanes=[0], contraflow=True)
+        env.close_road("B1B2", contraflow=True)
+        # Four lanes will have changed then, so two more do not fit.
+        with pytest.raises(CapacityError, match=r"map\.changed_lanes = 5; set it higher"):
+            env.close_road("C1B1", contraflow=True)
+        assert env.closed_roads() == ("B1B2",)
+    with pytest.raises(ConfigError, match=r"map\.changed_lanes = 0: map\.contraflow needs lanes"):
+        parallel_env("grid4x4", overrides={"map.contraflow": ["B1B2"]})
+    with pytest.raises(ConfigError, match=r"map\.contraflow: the map has no road 'Z9'"):
+        parallel_env("grid4x4", overrides={**ROOM, "map.contraflow": ["Z9"]})
+
+
+EVENTS = {
+    "map.changed_lanes": 16,
+    "map.contraflow": ["C1B1"],
+    "map.events": [
+        {"at_s": 0.4, "action": "close", "edges": ["B1B2", "B2B1"]},
+        {"at_s": 1.0, "action": "reverse", "edges": ["C1B1"]},
+        {"at_s": 1.0, "action": "damage", "edges": ["A1B1"], "lanes": [0], "speed_mps": 3},
+        {"at_s": 5.0, "action": "open", "edges": ["B1B2", "C2B2"]},
+    ],
+}
+
+
+def by_hand(env: Any, step: int) -> None:
+    """Do what the events say."""
+    if step == 2:
+        env.close_road("B1B2")
+        env.close_road("B2B1")
+    if step == 5:
+        env.close_road("C1B1", contraflow=True)
+        env.damage_road("A1B1", 3.0, lanes=[0])
+    if step == 25:
+        env.open_road("B1B2")
+
+
+def test_events_are_what_a_caller_would_do() -> None:
+    def nothing(env: Any, step: int) -> None:
+        pass
+
+    wanted = hashes(by_hand, {**EVENTS, "map.events": []})
+    assert hashes(nothing, EVENTS) == wanted
+    assert hashes(nothing, EVENTS, zones=2) == wanted
+
+
+def test_events_happen_in_each_episode_of_each_world() -> None:
+    with closing(
+        make_vec("grid4x4", num_envs=2, background=20, max_cycles=12, overrides=EVENTS)
+    ) as vec:
+        vec.reset(seed=1)
+        closed = []
+        for _ in range(30):
+            vec.step(vec.suggest_actions())
+            closed.append([vec.closed_roads(world) for world in range(2)])
+        assert closed[1] == [(), ()]
+        assert closed[3] == [("B1B2", "B2B1")] * 2
+        over = closed.index([(), ()], 4)  # the episodes have ended
+        again = closed[over:]
+        assert again[again.index([("B1B2", "B2B1")] * 2) - 1] == [(), ()]
+
+
+def test_a_run_with_events_is_recorded(tmp_path: Path) -> None:
+    keys = {"agents": 2, "overrides": EVENTS, "record": tmp_path / "run"}
+    with closing(parallel_env("grid4x4", **keys)) as env:  # type: ignore[arg-type]
+        env.reset(seed=2)
+        for _ in range(80):
+            env.step(env.suggest_actions())
+    events = [found.event for found in Recording.open(tmp_path / "run").events()]
+    told = [
+        (event.kind, event.detail)
+        for event in events
+        if event.kind in ("closed", "opened", "damaged", "reversed")
+    ]
+    assert told[:4] == [
+        ("closed", "B1B2"), ("closed", "B2B1"), ("closed", "C1B1"), ("damaged", "A1B1 0 3.0")
+    ]  # fmt: skip
+    assert ("opened", "B1B2") in told
+    assert ("reversed", "C1B1") in told
+    assert ("opened", "C2B2") not in told
+
+
+@pytest.mark.parametrize(
+    ("event", "message"),
+    [
+        ({"at_s": 1, "action": "close", "edges": ["Z9"]}, r"events\.0: edge 'Z9': the map has no"),
+        ({"at_s": 1, "action": "open", "edges": ["Z9"]}, r"events\.0: edge 'Z9': the map has no"),
+        ({"at_s": 1, "action": "close", "edges": []}, "must name a road"),
+        ({"at_s": -1, "action": "close", "edges": ["B1B2"]}, "at_s = -1"),
+        ({"at_s": 1, "action": "burn", "edges": ["B1B2"]}, "must be 'close'"),
+        ({"at_s": 1, "action": "damage", "edges": ["B1B2"]}, "must be given for damage"),
+        ({"at_s": 1, "action": "close", "edges": ["B1B2"], "speed_mps": 3}, "only there"),
+        ({"at_s": 1, "action": "damage", "edges": ["B1B2"], "speed_mps": 90}, "at most that"),
+        ({"at_s": 1, "action": "reverse", "edges": ["B1B2"]}, r"only roads in map\.contraflow"),
+        ({"at_s": 1, "action": "reverse", "edges": ["C1B1"], "lanes": [0]}, "leave the key out"),
+        ({"at_s": 1, "action": "close", "edges": ["B1B2"], "lanes": [7]}, "has the lanes 0 to 1"),
+    ],
+)
+def test_impossible_events_are_refused(event: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        parallel_env("grid4x4", overrides={**EVENTS, "map.events": [event]})
+
+
+def test_events_that_need_too_many_lanes_or_close_the_last_way_are_refused() -> None:
+    with pytest.raises(ConfigError, match=r"map\.events\.0: world 0: .* map\.changed_lanes = 3"):
+        parallel_env("grid4x4", overrides={**EVENTS, "map.changed_lanes": 3})
+    last = {"at_s": 1, "action": "close", "edges": ["main_out"]}
+    keys = {"map.changed_lanes": 9, "map.events": [last]}
+    with pytest.raises(ConfigError, match=r"map\.events\.0: edge 'main_out': it is the last way"):
+        parallel_env("merge", overrides=keys)
+    with closing(
+        parallel_env("merge", overrides={**keys, "map.events": [{**last, "shuts_in": True}]})
+    ) as env:
+        env.reset(seed=1)
+        for _ in range(12):
+            env.step(env.suggest_actions())
+        assert env.closed_roads() == ("main_out",)
+
+
+def test_the_rows_of_vehicles_are_the_same_wherever_the_world_runs() -> None:
+    def rows(**more: Any) -> np.ndarray[Any, Any]:
+        with closing(make_vec("grid4x4", num_envs=1, background=20, **more)) as vec:
+            vec.reset(seed=1)
+            for _ in range(5):
+                vec.step(vec.suggest_actions())
+            found = vec.present.vehicles(0)
+            return found[np.argsort(found["id"])]
+
+    here = rows()
+    for name in ("id", "x", "y", "speed", "order"):
+        assert (rows(zones=2, workers=2)[name] == here[name]).all()
