@@ -27,7 +27,7 @@ def kernel_file(call: KernelCall) -> KernelFile:
 
 
 def widest(calls: Iterable[KernelCall]) -> list[KernelCall]:
-    """Return the calls without those that the code of another of them also serves.
+    """Return the calls, except calls that the code of another one also serves.
 
     Code for an array of any layout, for example, also serves calls with a contiguous array.
     """

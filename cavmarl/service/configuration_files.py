@@ -138,7 +138,7 @@ def _check_texts(place: str, value: Any, files: Mapping[str, Any]) -> None:
 
 
 def placed_policies(policies: Sequence[str], files: Mapping[str, str], folder: str) -> list[str]:
-    """Return the drivers of a job, with the folders of those that were uploaded."""
+    """Return the drivers of a job, with the folders of the uploaded ones."""
     own = drivers_of(files)
     return [str(Path(folder, DRIVER_FOLDER, name)) if name in own else name for name in policies]
 

@@ -161,9 +161,7 @@ def _waits_at(
 
 
 @kernel
-def _room_inside(
-    roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch: Scratch
-) -> float:
+def _room_inside(roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch: Scratch) -> float:
     """Return how far beyond its line a vehicle that yields on `link` can wait, in m.
 
     It is 0 if the vehicle has to wait at the line: at red, without a waiting position inside, and
