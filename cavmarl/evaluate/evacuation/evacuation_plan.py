@@ -55,7 +55,7 @@ class EvacuationPlan(Section, key=""):
         horizon_s: simulated time.
         background: vehicles of the generator, which drive to goals of their own.
         reroute_s: time between two searches of a vehicle for a faster way, which considers the
-            speeds of the last minutes; 0: vehicles only leave ways that are closed.
+            speeds of the last minutes; 0: one search, after its departure.
         events: roads that close, open, or slow down; see `map.events`.
     """
 
