@@ -61,18 +61,18 @@ def reproduce(
         return _list(console, chosen, root, json_path)
     runner = CommandRunner(root, _files(files or ()))
     results: list[LineResult] = []
-    with progress_bar(console) as bar:
-        task = bar.add_task("", total=len(chosen))
+    try:
+        with progress_bar(console) as bar:
+            task = bar.add_task("", total=len(chosen))
 
-        def say(name: str) -> None:
-            bar.update(task, description=name, completed=len(results))
+            def say(name: str) -> None:
+                bar.update(task, description=name, completed=len(results))
 
-        for result in reproduce(chosen, root, runner, quick=quick, say=say):
-            results.append(result)
-    console.print(_table(results))
-    counts = Counter(result.verdict for result in results)
-    console.print(", ".join(f"{count} {verdict}" for verdict, count in counts.items()))
-    write_json(json_path, {"lines": [asdict(result) for result in results]})
+            for result in reproduce(chosen, root, runner, quick=quick, say=say):
+                results.append(result)
+    finally:  # also of an interrupted call, which may have taken hours
+        if results:
+            _show(console, results, len(chosen), json_path)
     wrong = [result.name for result in results if result.is_wrong]
     if wrong:
         print_error(
@@ -80,6 +80,18 @@ def reproduce(
             "the code if the change was not intended"
         )
         raise typer.Exit(1)
+
+
+def _show(
+    console: Console, results: Sequence[LineResult], lines: int, json_path: Path | None
+) -> None:
+    console.print(_table(results))
+    counts = Counter(result.verdict for result in results)
+    shown = [f"{count} {verdict}" for verdict, count in counts.items()]
+    if len(results) < lines:
+        shown.append(f"{lines - len(results)} not repeated")
+    console.print(", ".join(shown))
+    write_json(json_path, {"lines": [asdict(result) for result in results]})
 
 
 def _chosen(

@@ -257,8 +257,9 @@ def _entry(folder: Path, progress: Progress | None) -> BoardEntry:
         failure = f"{fault_in(folder, error)}; correct the script"
     try:
         return _described(folder, failure)
-    except CavmarlError as error:
-        return BoardEntry(folder.name, sentence_about(folder), failure=failure or str(error))
+    except Exception as error:  # a damaged result must not prevent the page of the others
+        failure = failure or f"its result cannot be shown ({error}); evaluate the driver again"
+        return BoardEntry(folder.name, sentence_about(folder), failure=failure)
 
 
 def _described(folder: Path, failure: str) -> BoardEntry:

@@ -40,6 +40,7 @@ from cavmarl.evaluate.episodes import (
 )
 from cavmarl.evaluate.failure_page import write_failures
 from cavmarl.evaluate.provenance.manifest import (
+    MANIFEST_FILE,
     close_manifest,
     describe_policies,
     open_manifest,
@@ -203,7 +204,8 @@ def load_report(folder: Path) -> EvaluationReport:
 def read_evaluation(folder: Path) -> dict[str, Any]:
     """Return the closed manifest of an evaluation with the metrics of this version.
 
-    Raises ManifestError if it is missing or open, if a result is not listed, or for other metrics.
+    Raises ManifestError if it is missing or open, if a table is not listed or was changed, or for
+    other metrics.
     """
     manifest = read_closed(folder)
     version = manifest.get("metrics_version", 1)
@@ -212,6 +214,12 @@ def read_evaluation(folder: Path) -> dict[str, Any]:
             f"{folder}: its metrics are of version {version}, those of this cavmarl of version "
             f"{METRICS_VERSION}; figures of different versions cannot be compared: evaluate again"
         )
+    for name in (TRIPS_FILE, EPISODES_FILE):
+        if name not in manifest["results_sha256"]:
+            raise ManifestError(
+                f"{folder / MANIFEST_FILE}: has no hash of {name}, so the table may be of another "
+                "run; evaluate again"
+            )
     return manifest
 
 

@@ -33,6 +33,7 @@ from cavmarl.evaluate.evaluation import (
     evaluate,
     load_tables,
     read_evaluation,
+    run_seeds,
 )
 from cavmarl.evaluate.provenance.manifest import hash_of_file
 from cavmarl.networks.network_files import read_network_config
@@ -280,14 +281,22 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
             f"again: `cavmarl evaluate ENV --policy {folder} --out {folder / RESULT_FOLDER}`"
         )
     world = WorldSpec.of(job["env"], **{key: job[key] for key in _KEYS})
-    return EntryJob(world, job["episodes"], len(document["seeds"]))
+    seeds = document["seeds"]
+    driven = (job["episodes"], run_seeds(world.seed, len(seeds)))
+    if driven != (document.get("episodes"), seeds):
+        raise ManifestError(
+            f"{folder / RESULT_FOLDER}: its manifest shows other episodes or seeds than those that "
+            "were driven; evaluate the driver again"
+        )
+    return EntryJob(world, job["episodes"], len(seeds))
 
 
 def check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path]) -> None:
     """Raise ManifestError unless the result of a driver was made with these files."""
     (described,) = list(document["policies"].values())[:1]
+    known = described.get("sha256") if isinstance(described, dict) else None
     for file in files:
-        if described["sha256"].get(file.name) != hash_of_file(file):
+        if not isinstance(known, dict) or known.get(file.name) != hash_of_file(file):
             raise ManifestError(
                 f"{file}: is not the file that the result of {name} was made with; restore it, or "
                 "evaluate the driver again"
@@ -298,16 +307,27 @@ def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> Non
     """Raise an error if the world is not the result's; new and removed keys do not count."""
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
-    others = [key for key in _WORLD_KEYS if here[key] != there[key]]
-    ours = here["config"]
-    differing = _differing("config", _without_idle_sensors(there["config"], ours), ours)
-    others += [key for key in differing if removed_key(key.removeprefix("config.")) is None]
+    try:
+        others = _other_keys(here, there)
+    except (LookupError, TypeError, AttributeError) as error:
+        raise ManifestError(
+            f"{name}: the manifest of its result describes no world ({type(error).__name__}: "
+            f"{error}); evaluate the driver again"
+        ) from error
     if others:
         raise ManifestError(
             f"{name}: its result is of {there['environment']}, but {others[0]} is another in this "
             f"version ({here['environment']}); figures of different worlds are not compared: "
             "evaluate the driver again"
         )
+
+
+def _other_keys(here: Mapping[str, Any], there: Mapping[str, Any]) -> list[str]:
+    """Return the keys of a described world that differ from this version's."""
+    ours = here["config"]
+    differing = _differing("config", _without_idle_sensors(there["config"], ours), ours)
+    others = [key for key in _WORLD_KEYS if here[key] != there[key]]
+    return others + [key for key in differing if removed_key(key.removeprefix("config.")) is None]
 
 
 def _without_idle_sensors(config: Mapping[str, Any], other: Mapping[str, Any]) -> dict[str, Any]:

@@ -19,7 +19,9 @@ from cavmarl.core.errors import ConfigError
 LINES_FILE = Path("docs/figures/lines.yaml")
 NUMBER = r"[-+]?(?:[0-9]{1,3}(?:,[0-9]{3})+|[0-9]+)(?:\.[0-9]+)?"
 FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # not the end of a name or of a version
-_TOLERANCE = re.compile(r"exact|range(?: [0-9.]+ %)?|[0-9.]+(?: %)?")
+_TOLERANCE = re.compile(
+    r"exact|range(?: {0}{1} %)?|{0}{1} %|[0-9]+{1}".format("[0-9]{1,2}", r"(?:\.[0-9]+)?")
+)  # less than 100 %, as any published number that is too large would be within 100 %
 _NEEDS = ("module", "program", "variable", "file")
 
 
@@ -32,8 +34,9 @@ class PublishedLine:
         command: as a page shows it.
         text: patterns of prose or of whole rows, in which `{}` stands for a number. Each occurs
             once in the page.
-        values: an expression of the command's JSON for each `{}`; empty: a condition, which is not
-            compared. With the tolerance `range`, there is one for two numbers.
+        values: an expression of the command's JSON for each `{}`; empty: not compared, so the
+            number is a condition of the page or has a line with by_hand. With the tolerance
+            `range`, there is one for two numbers.
         table: beginning of the header row of a table.
         section: heading above the table; empty if the header row is unique in the page. Without
             text and table, the line has all numbers of this section that no other line has.
@@ -42,7 +45,7 @@ class PublishedLine:
         word: word of the command and the expressions that stands for a row of the table, for
             example `NAME`. `NAME_` stands for the same with `_` in place of `-`.
         rows: label of a row → what replaces the word; empty: all rows, with their labels.
-        columns: head → expression; empty: a condition, which is not compared.
+        columns: head → expression.
         tolerance: `exact` (equal in the digits of the page), `N %` of the published number, `N`, or
             `range`: measured values lie between two published ones, `range N %`: wider on both
             sides.
@@ -79,7 +82,8 @@ class PublishedLine:
             )
         if not _TOLERANCE.fullmatch(self.tolerance):
             raise ConfigError(
-                f"tolerance = {self.tolerance!r}: must be exact, range, range N %, N % or N"
+                f"tolerance = {self.tolerance!r}: must be exact, range, range N %, N % or N, with "
+                "N % below 100 %"
             )
         if self.table and self.tolerance.startswith("range"):
             raise ConfigError("tolerance = range: is for text; tables have N % or N")
@@ -87,6 +91,10 @@ class PublishedLine:
             kind, _, name = need.partition(":")
             if kind not in _NEEDS or not name:
                 raise ConfigError(f"needs: {need!r} must be KIND:NAME; KIND is {', '.join(_NEEDS)}")
+        if unused := [head for head, expression in self.columns.items() if not expression]:
+            raise ConfigError(
+                f"columns: {unused[0]!r} has no expression; leave out columns that are not compared"
+            )
         if not self.by_hand and not self.command:
             raise ConfigError("command: missing; give the command that repeats the numbers")
 
@@ -296,6 +304,9 @@ def _table_cells(
 ) -> Iterator[PublishedCell]:
     table = find_table(where, line, text)
     labels = {label_of(row): row for row in table.rows}
+    names = [label_of(row) for row in table.rows if not line.rows or label_of(row) in line.rows]
+    if twice := _twice([head for head in table.heads if head in line.columns]) or _twice(names):
+        raise ConfigError(f"{where}: the table has {twice!r} twice; rename one of the two")
     if unknown := [*(line.rows.keys() | set(line.quick_rows)) - labels.keys()]:
         raise ConfigError(
             f"{where}: the table has no row {unknown[0]!r}; it has {', '.join(labels)}"
@@ -311,10 +322,15 @@ def _table_cells(
         value = line.rows.get(label, label)
         for head, expression in line.columns.items():
             numbers = tuple(re.findall(FREE_NUMBER, cells[table.heads.index(head)]))
-            if numbers and expression:
+            if numbers:
                 given = (line.command, expression, line.row)
                 command, expression, row = (with_row(one, line.word, value) for one in given)
                 yield PublishedCell(f"{label}, {head}", command, numbers, (expression,), row)
+
+
+def _twice(texts: list[str]) -> str:
+    """Return the first text that occurs again; empty: none."""
+    return next((text for text in texts if texts.count(text) > 1), "")
 
 
 def with_row(text: str, word: str, value: str) -> str:

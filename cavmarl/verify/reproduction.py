@@ -145,9 +145,14 @@ class CommandRunner:
                 raise EvaluationError(
                     f"ended with exit code {code}: {_last_line(last_words(output))}"
                 )
-            if result.is_file():
+            if not result.is_file():
+                raise EvaluationError(f"has written no result: {command}")
+            try:
                 return json.loads(result.read_text("utf-8"))
-            raise EvaluationError(f"has written no result: {command}")
+            except (ValueError, RecursionError) as error:
+                raise EvaluationError(
+                    f"has written a result that is no JSON ({error}): {command}"
+                ) from error
 
     def _words(self, command: str) -> list[str]:
         words = shlex.split(command)

@@ -90,6 +90,19 @@ def test_a_wrong_number_is_shown(checkout: Path, capsys: pytest.CaptureFixture[s
     assert "error: rows: measured numbers are not those of the page; correct the page, or" in err
 
 
+def test_results_before_an_interrupt_are_shown(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    told = checkout / "told.json"
+    (checkout / "page.md").write_text(PAGE.replace("| n | x |", "| m | x |"))
+    code, out, err = called(capsys, "--all", "--json", str(told))
+    assert code == 2
+    assert "rate 12 12 exact same" in out
+    assert "1 same, 2 not repeated" in out
+    assert "has 0 tables" in err
+    assert len(json.loads(told.read_text())["lines"]) == 1
+
+
 def test_lines_are_listed(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = called(capsys, "--list")
     assert code == 0

@@ -17,6 +17,7 @@ from cavmarl.config.registry import agent_entries
 from cavmarl.core.errors import CavmarlError, ConfigError, ManifestError, PolicyError
 from cavmarl.evaluate import evaluate
 from cavmarl.evaluate.board import build_board, check_entry, entries_in, entry_driver
+from cavmarl.evaluate.evaluation import run_seeds
 from cavmarl.policies.onnx_export import export_onnx
 
 pytestmark = pytest.mark.integration  # a manifest reads the commit from git
@@ -137,6 +138,33 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
         ManifestError,
         "does not say what was driven; make the result again",
     ),
+    "unlisted tables": (
+        lambda entry: change_manifest(entry, results_sha256={}),
+        ManifestError,
+        r"has no hash of trips\.csv, so the table may be of another run; evaluate again",
+    ),
+    "episodes": (
+        lambda entry: change_manifest(entry, episodes=1_000_000),
+        ManifestError,
+        "shows other episodes or seeds than those that were driven; evaluate the driver again",
+    ),
+    "seeds": (
+        lambda entry: change_manifest(entry, seeds=[7]),
+        ManifestError,
+        "shows other episodes or seeds",
+    ),
+    "files of the driver": (
+        lambda entry: change_manifest(entry, policies={"merge_ippo": []}),
+        ManifestError,
+        "is not the file that the result of merge_ippo was made with",
+    ),
+    "world": (
+        lambda entry: change_manifest(
+            entry, world={"environment": "merge-v6", "config": {"sensors": {"ego": 1}}}
+        ),
+        ManifestError,
+        "the manifest of its result describes no world",
+    ),
     "drivers": (
         lambda entry: change_manifest(entry, policies={"a": {}, "b": {}}),
         ManifestError,
@@ -182,8 +210,10 @@ def test_a_spoilt_entry_is_refused_and_marked(spoilt: str, entry: Path, tmp_path
 
 def test_other_bytes_of_driving_again_are_refused(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
-    job = json.loads(path.read_text())["job"]
-    change_manifest(entry, job=job | {"episodes": 1, "seed": 3})
+    document = json.loads(path.read_text())
+    job = document["job"] | {"episodes": 1, "seed": 3}
+    seeds = run_seeds(3, len(document["seeds"]))
+    change_manifest(entry, job=job, episodes=1, seeds=seeds)
     with pytest.raises(ManifestError, match=r"trips\.csv, .* of driving again on .* differ from"):
         check_entry(entry)
 

@@ -395,7 +395,7 @@ def _pages() -> Iterator[ScoreTable]:
     heads = [
         (title, filled(RESIDUAL, seed), driver)
         for seed in SEEDS
-        for title, driver in ((f"seed {seed}", "cities_residual"), ("`idm`", "idm"))
+        for title, driver in ((f"seed {seed}", "cities_residual"), (f"`idm`, seed {seed}", "idm"))
     ]
     write = partial(drivers_table, heads, RESIDUAL_ROWS)
     yield ScoreTable(learning, "cities of other seeds", (RESIDUAL,), write, SEEDS)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
@@ -23,13 +24,19 @@ def check_command(line: str) -> None:
         assert found is not None, line
         context = type(context)(found, parent=context, **found.context_settings)
         command, words = found, words[1:]
+    check_options(command, words, context)
+
+
+def check_options(command: Any, words: Sequence[str], context: Any = None) -> None:
+    """Parse the options and arguments of a command, without running it."""
+    context = context or command.make_context(command.name, [], resilient_parsing=True)
     try:
-        _, left, _ = command.make_parser(context).parse_args(words)
+        _, left, _ = command.make_parser(context).parse_args([*words])
     except USAGE as error:
         if "requires an argument" not in str(error):  # pages may name an option with a value
             raise
         left = []
-    assert not left or context.ignore_unknown_options, line
+    assert not left or context.ignore_unknown_options, f"{command.name}: {left}"
 
 
 @cache

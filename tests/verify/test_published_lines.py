@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import re
+import shlex
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+import typer
 
+from cavmarl.cli.report_command import report_command
 from cavmarl.core.errors import ConfigError
 from cavmarl.verify.published_lines import (
     FREE_NUMBER,
@@ -16,6 +20,7 @@ from cavmarl.verify.published_lines import (
     cells_of,
     compile_pattern,
     find_table,
+    find_text,
     label_of,
     read_lines,
     repository_root,
@@ -24,6 +29,7 @@ from cavmarl.verify.published_lines import (
     with_row,
     without_code,
 )
+from tests.support.command_lines import check_command, check_options
 
 ROOT = Path(__file__).resolve().parents[2]
 PUBLISHED = read_lines(ROOT)
@@ -40,15 +46,39 @@ def test_a_line_has_numbers_of_its_page(name: str) -> None:
         assert any(any(cell.expressions) for cell in cells), "compares nothing"
 
 
-def test_the_command_of_a_line_is_on_a_page() -> None:
-    pages = [*ROOT.glob("*.md"), *ROOT.glob("docs/**/*.md"), *ROOT.glob("agents/*/README.md")]
-    text = " ".join(" ".join(page.read_text("utf-8").split()) for page in pages)
-    missing = [name for name, one in PUBLISHED.lines.items() if shown(one.command) not in text]
-    assert missing == []
+def test_the_command_of_a_line_is_on_its_page() -> None:
+    texts = {page: " ".join((ROOT / page).read_text("utf-8").split()) for page in PAGES}
+    lines = PUBLISHED.lines.items()
+    assert [name for name, one in lines if shown(one.command) not in texts[one.page]] == []
+
+
+def test_each_condition_is_in_its_page() -> None:
+    for page, patterns in PUBLISHED.conditions.items():
+        text = (ROOT / page).read_text("utf-8")
+        assert [one for one in patterns if not compile_pattern(one).search(text)] == []
+
+
+BENCHMARK = re.compile(r"python -m benchmarks[. ](\w+)(.*)")
+
+
+@pytest.mark.parametrize(
+    "command", sorted({one.command for one in PUBLISHED.lines.values() if one.command})
+)
+def test_a_command_has_its_options(command: str) -> None:
+    if found := BENCHMARK.search(command):
+        app = typer.Typer()
+        app.command()(report_command(import_module(f"benchmarks.{found[1]}").measure))
+        check_options(typer.main.get_command(app), shlex.split(found[2].replace("…", "")))
+    elif command.startswith("cavmarl "):
+        check_command(command)
+    else:
+        words = [word for word in shlex.split(command) if "/" in word]
+        assert command == "make soak" or all((ROOT / word).exists() for word in words)
 
 
 def shown(command: str) -> str:
     """Return a command as the pages show it."""
+    command = re.sub(r"--agents (25|50|100) --background 0", "--agents N --background 0", command)
     return re.sub(r"--seed [56]000$", "--seed SEED", command)
 
 
@@ -71,16 +101,14 @@ def uncovered(page: str, text: str, published: PublishedLines) -> Iterator[str]:
 def covered(
     page: str, text: str, published: PublishedLines
 ) -> Iterator[tuple[tuple[int, int], str]]:
-    """Yield the places of a page that lines and conditions have."""
+    """Yield the places of a page that are compared, told by hand, or conditions."""
     for pattern in published.conditions.get(page, ()):
         for match in compile_pattern(pattern).finditer(text):
             yield match.span(), pattern
     for name, line in published.lines.items():
         if line.page != page:
             continue
-        for pattern in line.text:
-            for match in compile_pattern(pattern).finditer(text):
-                yield match.span(), name
+        yield from ((span, name) for span in text_spans(name, line, text))
         if line.is_section:
             below = section_of(name, line.section, text)
             start = text.index(below)
@@ -89,8 +117,22 @@ def covered(
             yield from ((span, name) for span in table_spans(name, line, text))
 
 
+def text_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
+    """Yield the places of compared numbers, or all patterns of a line with by_hand."""
+    size = 2 if line.tolerance.startswith("range") else 1
+    expressions = [each for each in line.values for _ in range(size)]
+    for pattern in line.text:
+        match = find_text(name, pattern, text)
+        if line.by_hand:
+            yield match.span()
+        for number, expression in enumerate(expressions[: len(match.groups())], start=1):
+            if expression:
+                yield match.span(number)
+        del expressions[: len(match.groups())]
+
+
 def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
-    """Yield the places of the cells of a line, of the first cell of each row and of the heads."""
+    """Yield the places of the cells of a line, of the label of each row and of the heads."""
     table = find_table(name, line, text)
     wanted = {place for place, head in enumerate(table.heads) if head in line.columns}
     section = 0 if not table.section else text.index(f"# {table.section}\n")
@@ -100,8 +142,9 @@ def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int
         for match in re.finditer(pattern, text[section:]):
             if is_head or not line.rows or label_of(row) in line.rows:
                 start = section + match.start()
+                label = next((at for at, cell in enumerate(row) if label_of((cell,))), 0)
                 for place, cell in enumerate(match[0].split("|")[1:-1]):
-                    if is_head or place == 0 or place in wanted:
+                    if is_head or place == label or place in wanted:
                         yield start, start + len(cell) + 1
                     start += len(cell) + 1
 
@@ -116,9 +159,28 @@ def test_a_number_that_no_line_has_is_found() -> None:
     assert "takes 3 s" in found
     assert "| y 7" in found
     line = PublishedLine("page.md", "cavmarl list", table="a", columns={"b": "at"})
-    more = {"line": line, "text": PublishedLine("page.md", "cavmarl list", text=("takes {} s",))}
-    published = PublishedLines(more, {"page.md": ("on {} cores",)})
+    seconds = PublishedLine("page.md", "cavmarl list", text=("takes {} s",), values=("s",))
+    published = PublishedLines({"line": line, "s": seconds}, {"page.md": ("on {} cores",)})
     assert list(uncovered("page.md", page, published)) == []
+
+
+@pytest.mark.parametrize(
+    ("text", "values", "by_hand", "left"),
+    [
+        ("takes {} s on {} cores", ("s", "cores"), "", []),
+        ("takes {} s on 2 cores", ("s",), "", ["2"]),
+        ("takes {} s on {} cores", ("s", ""), "", ["2"]),
+        ("takes {} s on 2 cores", (), "It takes a week.", []),
+    ],
+)
+def test_only_compared_numbers_are_covered(
+    text: str, values: tuple[str, ...], by_hand: str, left: list[str]
+) -> None:
+    page = "It takes 3 s on 2 cores."
+    line = PublishedLine("page.md", "cavmarl list", text=(text,), values=values, by_hand=by_hand)
+    found = list(uncovered("page.md", page, PublishedLines({"line": line})))
+    assert len(found) == len(left)
+    assert all(number in one for number, one in zip(left, found, strict=True))
 
 
 def test_quick_lines_need_nothing_and_are_exact() -> None:
@@ -136,6 +198,11 @@ as fast, and 7 to 9 m.
 |---|---|---|
 | [`one`](x.md) | 3 ± 0.5 | - |
 | **two-2** | 4 [1, 8] | 5 |
+
+| twice | b | b | c |
+|---|---|---|---|
+| one | 1 | 2 | 3 |
+| one | 4 | 5 | 6 |
 """
 
 
@@ -194,6 +261,12 @@ def test_cells_of_tables_are_found_by_row_and_column(tmp_path: Path) -> None:
         ({"text": ("is {} times",), "tolerance": "range"}, "two numbers for each range"),
         ({"text": ("a",), "table": "a"}, "either text or table"),
         ({"text": ("a",), "tolerance": "about"}, "must be exact, range, range N %, N % or N"),
+        ({"text": ("a",), "tolerance": "100 %"}, "with N % below 100 %"),
+        ({"text": ("a",), "tolerance": "range 150 %"}, "with N % below 100 %"),
+        ({"text": ("a",), "tolerance": "1.2.3"}, "must be exact"),
+        ({"table": "name", "columns": {"a": ""}}, "'a' has no expression; leave out columns"),
+        ({"table": "twice", "columns": {"b": "x"}}, "the table has 'b' twice; rename one"),
+        ({"table": "twice", "columns": {"c": "x"}}, "the table has 'one' twice; rename one"),
         ({"text": ("a",), "needs": ("luck",)}, "'luck' must be KIND:NAME"),
     ],
 )

@@ -31,7 +31,9 @@ if name == "hangs":
     time.sleep(60)
 document = {"rate": 1234.56, "rows": [{"n": 1, "x": 0.25}, {"n": 2, "x": 4}], "name": name}
 document["words"] = words
-if name != "silent":
+if name == "broken":
+    open(words[words.index("--json") + 1], "w").write('{"rate": 12')
+elif name != "silent":
     json.dump(document, open(words[words.index("--json") + 1], "w"))
 """
 PAGE = """It makes 1,235 steps in 0.3 s, or 1,000 to 1,200 on others; sometimes 4 %.
@@ -139,12 +141,14 @@ def test_failures_are_told(checkout: Path) -> None:
         text("sometimes {} %", values=("rate",), name="fails"),
         text("sometimes {} %", values=("speed",)),
         text("sometimes {} %", values=("rate",), name="silent"),
+        text("sometimes {} %", values=("rate",), name="broken"),
     ]
     found = results(checkout, *lines)
     assert {one.verdict for one in found} == {"failed"}
     assert "ended with exit code 1: out of paint" in found[0].reason
     assert "has no speed at its top" in found[1].reason
     assert "has written no result" in found[2].reason
+    assert "has written a result that is no JSON" in found[3].reason
 
 
 def test_words_of_a_command_are_replaced_by_files(checkout: Path) -> None:
