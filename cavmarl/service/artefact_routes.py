@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
@@ -67,7 +66,7 @@ async def put_artefact(
     """Store a file of data under its SHA-256, or extend its lifetime; code is refused."""
     content, known = await request.body(), service.broker.artefacts
     known.check_quota(identity, sha256, len(content))
-    await asyncio.to_thread(check_content, name, sha256, content)
+    await known.check(check_content, name, sha256, content)
     found = known.add(identity, sha256, name, licence, content)
     return _answer(identity.id, sha256, found)
 
