@@ -73,7 +73,7 @@ async def put_artefact(
 
 @artefacts.get("/{sha256}", response_class=Response, responses=BYTES)
 async def get_artefact(identity: Everyone, service: TheService, sha256: Digest) -> Response:
-    """Return a file to its owner, or to a node."""
+    """Return a file to its owner, or to a node that hosts a session or job that needs it."""
     content = service.broker.artefacts.content(identity, sha256)
     return Response(content, media_type="application/octet-stream")
 

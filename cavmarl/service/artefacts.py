@@ -92,12 +92,23 @@ class Artefacts:
         return self._log.state.artefacts.get(identity, {})
 
     def content(self, identity: IdentityRecord, sha256: str) -> bytes:
-        """Return a file; clients get their own files only."""
-        if identity.role == "client" and sha256 not in self.of(identity.id):
-            raise problem("not-found", f"there is no artefact {sha256} of yours")
-        if not any(sha256 in some for some in self._log.state.artefacts.values()):
-            raise problem("not-found", f"there is no artefact {sha256}: upload it again")
+        """Return a file to an owner, or to a node that hosts a session or job that needs it."""
+        if sha256 not in self.of(identity.id) and not self._is_needed_by(identity.id, sha256):
+            raise problem(
+                "not-found", f"there is no artefact {sha256} of yours, or of a session on your node"
+            )
         return self._log.content(sha256)
+
+    def _is_needed_by(self, identity: str, sha256: str) -> bool:
+        """Return whether a node of an identity hosts a session or job that needs a file."""
+        nodes, known = self._log.state.nodes, self._log.state
+        return any(
+            one.node is not None
+            and nodes[one.node].identity == identity
+            and sha256 in known.files_of(one.configuration)
+            and sha256 in self.of(one.owner)
+            for one in known.sessions.values()
+        )
 
     def delete(self, identity: IdentityRecord, sha256: str) -> None:
         """Delete a file of an identity that no open session or job of its needs."""

@@ -93,8 +93,8 @@ def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str
 
 
 def test_files_may_include_others_of_their_folder() -> None:
-    for text in ("<include href='b/c.rou.xml'/>", "<e1Detector file='/dev/null'/>"):
-        content = f"<additional>{text}</additional>".encode()
+    for inner in ("<include href='b/c.rou.xml'/>", "<e1Detector file='/dev/null'/>"):
+        content = f"<additional>{inner}</additional>".encode()
         check_content("a.add.xml", hashlib.sha256(content).hexdigest(), content)
 
 
@@ -136,7 +136,7 @@ def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path
         fleet.broker.artefacts.content(fleet.other, sha256)  # type: ignore[attr-defined]
     put(fleet, "map.net.xml", NET, owner="other")
     fleet.broker.artefacts.delete(fleet.client, sha256)
-    assert fleet.broker.artefacts.content(fleet.nodes, sha256) == NET
+    assert fleet.broker.artefacts.content(fleet.other, sha256) == NET  # type: ignore[attr-defined]
     with pytest.raises(ServiceError, match="of yours"):
         fleet.broker.artefacts.delete(fleet.client, sha256)
     fleet.broker.artefacts.delete(fleet.other, sha256)  # type: ignore[attr-defined]
@@ -147,6 +147,22 @@ def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path
     again = EventLog(EventStore(tmp_path / "store.sqlite"))
     assert again.state == state
     again.store.close()
+
+
+def test_only_the_owner_and_nodes_that_need_a_file_get_it(fleet: Fleet) -> None:
+    files = put_world(fleet)
+    sha256 = files["map.net.xml"]
+    others = [fleet.identity(role, role) for role in ("viewer", "operator", "admin")]
+    others += [fleet.identity("other-node", "node"), fleet.nodes]
+    fleet.join("a")
+    session = fleet.broker.open(fleet.client, configure(fleet, files))
+    assert fleet.broker.artefacts.content(fleet.client, sha256) == NET
+    assert fleet.broker.artefacts.content(fleet.nodes, sha256) == NET
+    fleet.broker.close(fleet.client, session.id)
+    for one in others:
+        with pytest.raises(ServiceError, match="of yours, or of a session") as refused:
+            fleet.broker.artefacts.content(one, sha256)
+        assert refused.value.problem == "not-found"
 
 
 def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
@@ -374,6 +390,9 @@ def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> No
         assert service.ask("client", "PUT", path, content=NET).status_code == 200
         files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
         document = {"environment": "map.net.xml", "files": files}
+        found = service.ask("client", "POST", "/configurations", json=document).json()
+        opened = {"configuration": found["hash"]}
+        assert service.ask("client", "POST", "/sessions", json=opened).status_code == 201
         folder = service.run(link.fetch_files(document))
         assert folder is not None
         assert (Path(folder.name) / "map.net.xml").read_bytes() == NET
