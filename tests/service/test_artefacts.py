@@ -6,6 +6,8 @@ import gzip
 import hashlib
 import itertools
 import shutil
+import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,6 +22,7 @@ from cavmarl.client import Client
 from cavmarl.config.registry import agent_entries, entries
 from cavmarl.core.errors import ServiceError
 from cavmarl.evaluate import evaluate
+from cavmarl.recordings.recording import Recording
 from cavmarl.service.artefacts import Quota, check_content, is_same_kind
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
@@ -320,6 +323,7 @@ def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
     )  # fmt: skip
     model = f"zoo:{driver}"
     local = cavmarl.make_vec(str(world), overrides={"traffic.model": model}, **keys)
+    remote.record()
     remote.reset(seed=1)
     local.reset(seed=1)
     assert_same(remote, local, range(3))
@@ -327,6 +331,11 @@ def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
     cluster.processes["victim"].kill()
     assert_same(remote, local, range(3))
     assert remote.flows.moves == 1
+    for part in remote.recording(tmp_path / "recording"):
+        head = (part / "recording.json").read_text(encoding="utf-8")
+        assert "zoo:trained" in head
+        assert tempfile.gettempdir() not in head
+        assert list(Recording.open(part).frames())
     own = {one["name"] for one in client.get("/artefacts")["artefacts"]}
     assert own >= {"env.yaml", "config.json", "model.safetensors"}
     before = client.get("/events", limit=1000)["events"][-1]["sequence"]
@@ -381,6 +390,24 @@ def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
     evaluate(str(world), ["idm"], out=tmp_path / "here", **keys)
     for name in ("episodes.csv", "trips.csv"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
+
+
+def test_a_job_ends_though_the_service_is_restarted_meanwhile(tmp_path: Path) -> None:
+    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.6") as service:
+        cluster = Cluster(service)
+        cluster.start("a")
+        with service.client(service.grant("ada", "client")) as client:
+            job = client.submit("merge", episodes=1, agents=2, background=0, wait_s=30.0)
+            while client.get(f"/sessions/{job}")["state"] != "active":
+                time.sleep(0.02)
+            time.sleep(0.5)  # the node has the job
+            service.kill()
+            time.sleep(6.0)  # the job ends
+            service.start_again("--beat-s", "0.6")
+            found = client.wait(job, tmp_path / "there", 60.0)
+            assert found["placements"] == 1
+            assert (tmp_path / "there" / "episodes.csv").is_file()
+        cluster.stop()
 
 
 def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> None:
