@@ -8,10 +8,11 @@ import itertools
 import shutil
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
+import psutil
 import pytest
 from sqlalchemy import create_engine, text
 from typer.testing import CliRunner
@@ -392,17 +393,23 @@ def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
+def wait_until(is_so: Callable[[], bool]) -> None:
+    until_s = time.monotonic() + 120.0
+    while not is_so():
+        assert time.monotonic() < until_s
+        time.sleep(0.02)
+
+
 def test_a_job_ends_though_the_service_is_restarted_meanwhile(tmp_path: Path) -> None:
     with running_service(tmp_path / "store.sqlite", "--beat-s", "0.6") as service:
         cluster = Cluster(service)
         cluster.start("a")
         with service.client(service.grant("ada", "client")) as client:
             job = client.submit("merge", episodes=1, agents=2, background=0, wait_s=30.0)
-            while client.get(f"/sessions/{job}")["state"] != "active":
-                time.sleep(0.02)
-            time.sleep(0.5)  # the node has the job
+            node = psutil.Process(cluster.processes["a"].pid)
+            wait_until(lambda: bool(node.children()))
             service.kill()
-            time.sleep(6.0)  # the job ends
+            wait_until(lambda: not node.children())  # the job has ended
             service.start_again("--beat-s", "0.6")
             found = client.wait(job, tmp_path / "there", 60.0)
             assert found["placements"] == 1
