@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
@@ -66,7 +67,7 @@ async def put_artefact(
     """Store a file of data under its SHA-256, or extend its lifetime; code is refused."""
     content, known = await request.body(), service.broker.artefacts
     known.check_quota(identity, sha256, len(content))
-    await known.check(check_content, name, sha256, content)
+    await known.check(partial(check_content, name, sha256, content))
     found = known.add(identity, sha256, name, licence, content)
     return _answer(identity.id, sha256, found)
 

@@ -32,7 +32,7 @@ MOST_ELEMENTS = 10_000_000  # of an XML file
 MOST_YAML_BYTES = 1 << 20
 MOST_JSON_BYTES = 1 << 24
 _HEAD_BYTES = 1 << 17
-_NOWHERE = ("/dev/null", "NUL")  # usual names for output that nobody wants
+_NOWHERE = ("/dev/null", "NUL")  # usual names of the null device
 
 
 @dataclass(frozen=True)
@@ -56,13 +56,13 @@ class Artefacts:
         self._log, self._quota = log, quota
         self._checks = ThreadPoolExecutor(1, "checks-of-artefacts")
 
-    async def check(self, call: Callable[..., T], *given: Any) -> T:
-        """Return `call(*given)`, run in the thread of checks.
+    async def check(self, call: Callable[[], T]) -> T:
+        """Return the result of `call`, which the thread of checks runs.
 
         A check of large files takes seconds. All checks share one thread, so that the event loop,
         and threads that write the log, have time meanwhile.
         """
-        return await asyncio.get_running_loop().run_in_executor(self._checks, call, *given)
+        return await asyncio.get_running_loop().run_in_executor(self._checks, call)
 
     def add(
         self, identity: IdentityRecord, sha256: str, name: str, licence: str, content: bytes
@@ -238,7 +238,7 @@ def _check_elements(file: BinaryIO | gzip.GzipFile) -> None:
     """Check that a file is XML without a document type, and names no file outside its folder."""
     left = MOST_ELEMENTS
 
-    def refuse_doctype(*_: object) -> None:
+    def refuse_doctype(name: str, system: str | None, public: str | None, inside: int) -> None:
         raise ValueError("it declares a document type; remove its <!DOCTYPE …>")
 
     def check(name: str, attributes: dict[str, str]) -> None:

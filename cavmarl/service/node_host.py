@@ -9,15 +9,14 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any, TypeVar
+from typing import Any
 
 import uvicorn
 
-from cavmarl.client.service_protocol import AGAIN_S
 from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.core.scratch_folder import scratch_folder
 from cavmarl.core.server_address import listen
@@ -32,7 +31,6 @@ from cavmarl.service.server import ServerOptions, check_transport, uvicorn_confi
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
-T = TypeVar("T")
 TELL_S = 0.5  # time between two progress reports of a job
 DRAIN_S = 60.0  # after which a drained node ends even if sessions are left
 
@@ -198,8 +196,8 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
     started: list[subprocess.Popen[bytes]] = []
     with TemporaryDirectory() as folder, contextlib.ExitStack() as ended:
         try:
-            document = await _answered(link.configuration, job["configuration"])
-            files = await _answered(link.fetch_files, document)
+            document = await link.configuration(job["configuration"])
+            files = await link.fetch_files(document)
             if files is not None:
                 ended.enter_context(files)
             what = f"job {job['id']}"
@@ -213,8 +211,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
                 None if files is None else files.name, hear=hear, began=started.append,
             )  # fmt: skip
             for file in sorted(place.iterdir()):
-                place_there, content = f"{path}/results/{file.name}", file.read_bytes()
-                await _answered(link.ask, "PUT", place_there, content=content)
+                await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", without_folders(str(error))[:MOST_MESSAGE]
         except asyncio.CancelledError:  # the job is closed, or another node has it
@@ -223,23 +220,9 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             raise
         finally:
             host.steps.pop(job["id"], None)
-    outcome = {"status": status, "message": message}
-    with contextlib.suppress(ServiceError):  # the job is closed, or another node has it
-        await _answered(link.ask, "POST", f"{path}/outcome", json=outcome)
-
-
-async def _answered(ask: Callable[..., Awaitable[T]], *given: Any, **named: Any) -> T:
-    """Return the answer of the service; ask again while it is unreachable or too busy.
-
-    A job ends neither as failed nor without an outcome because the service is restarted.
-    """
-    while True:
-        try:
-            return await ask(*given, **named)
-        except ServiceError as error:
-            if error.status and error.retry_s is None:
-                raise
-            await asyncio.sleep(error.retry_s or AGAIN_S)
+    # If the service is unreachable or has reassigned the job, the job runs again elsewhere.
+    with contextlib.suppress(ServiceError):
+        await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})
 
 
 def run_evaluation(

@@ -7,12 +7,10 @@ import hashlib
 import itertools
 import shutil
 import tempfile
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import psutil
 import pytest
 from sqlalchemy import create_engine, text
 from typer.testing import CliRunner
@@ -391,30 +389,6 @@ def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
     evaluate(str(world), ["idm"], out=tmp_path / "here", **keys)
     for name in ("episodes.csv", "trips.csv"):
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
-
-
-def wait_until(is_so: Callable[[], bool]) -> None:
-    until_s = time.monotonic() + 120.0
-    while not is_so():
-        assert time.monotonic() < until_s
-        time.sleep(0.02)
-
-
-def test_a_job_ends_though_the_service_is_restarted_meanwhile(tmp_path: Path) -> None:
-    with running_service(tmp_path / "store.sqlite", "--beat-s", "0.6") as service:
-        cluster = Cluster(service)
-        cluster.start("a")
-        with service.client(service.grant("ada", "client")) as client:
-            job = client.submit("merge", episodes=1, agents=2, background=0, wait_s=30.0)
-            node = psutil.Process(cluster.processes["a"].pid)
-            wait_until(lambda: bool(node.children()))
-            service.kill()
-            wait_until(lambda: not node.children())  # the job has ended
-            service.start_again("--beat-s", "0.6")
-            found = client.wait(job, tmp_path / "there", 60.0)
-            assert found["placements"] == 1
-            assert (tmp_path / "there" / "episodes.csv").is_file()
-        cluster.stop()
 
 
 def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> None:
