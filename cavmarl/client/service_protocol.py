@@ -100,13 +100,18 @@ class ServiceFlows:
         content: bytes | None = None,
         params: Mapping[str, Any] | None = None,
         key: str = "",
+        is_repeatable: bool = False,
     ) -> Flow[httpx.Response]:
-        """Return the answer to a request; raise ServiceError if it is refused."""
+        """Return the answer to a request; raise ServiceError if it is refused.
+
+        `is_repeatable`: a `POST` that has the same effect if a standby receives it again.
+        """
+        is_safe = method != "POST" or bool(key) or is_repeatable
         for is_second in (False, True):
             if is_second or time.monotonic() > self._until_s:
                 yield from self._renew()
             sent = Ask(method, f"/v1{path}", json, content, params, self._token, key)
-            answer = yield from self._sent(sent, is_safe=method != "POST" or bool(key))
+            answer = yield from self._sent(sent, is_safe)
             if answer.status_code != 401:
                 break
         check(answer)
@@ -164,8 +169,8 @@ class ServiceFlows:
         if files:
             yield from self.upload(files.values(), licence)
             body["files"] = {place: one.sha256 for place, one in files.items()}
-        found = yield from self.post("/configurations", body)
-        return str(found["hash"])
+        answer = yield from self.ask("POST", "/configurations", json=body, is_repeatable=True)
+        return str(answer.json()["hash"])
 
     def submit(
         self,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
+from functools import partial
 from typing import Annotated
 
 from fastapi import Path, Query, Request, Response
@@ -67,14 +67,14 @@ async def put_artefact(
     """Store a file of data under its SHA-256, or extend its lifetime; code is refused."""
     content, known = await request.body(), service.broker.artefacts
     known.check_quota(identity, sha256, len(content))
-    await asyncio.to_thread(check_content, name, sha256, content)
+    await known.check(partial(check_content, name, sha256, content))
     found = known.add(identity, sha256, name, licence, content)
     return _answer(identity.id, sha256, found)
 
 
 @artefacts.get("/{sha256}", response_class=Response, responses=BYTES)
 async def get_artefact(identity: Everyone, service: TheService, sha256: Digest) -> Response:
-    """Return a file to its owner, or to a node."""
+    """Return a file to its owner, or to a node that hosts a session or job that needs it."""
     content = service.broker.artefacts.content(identity, sha256)
     return Response(content, media_type="application/octet-stream")
 

@@ -6,16 +6,19 @@ is refused. Each identity has quotas. An artefact that is not used is deleted af
 
 from __future__ import annotations
 
+import asyncio
 import gzip
 import hashlib
 import json
 import tempfile
 import zlib
 from collections.abc import Callable, Collection, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from io import BytesIO
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO, TypeVar
+from xml.parsers import expat
 
 from cavmarl.core.errors import CavmarlError
 from cavmarl.core.xml_root import is_sumo_config, root_tag
@@ -23,9 +26,13 @@ from cavmarl.service.error_names import problem
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
+T = TypeVar("T")
 MOST_UNPACKED_BYTES = 1 << 29  # of a compressed file
+MOST_ELEMENTS = 10_000_000  # of an XML file
 MOST_YAML_BYTES = 1 << 20
 MOST_JSON_BYTES = 1 << 24
+_HEAD_BYTES = 1 << 17
+_NOWHERE = ("/dev/null", "NUL")  # usual names of the null device
 
 
 @dataclass(frozen=True)
@@ -47,6 +54,15 @@ class Artefacts:
 
     def __init__(self, log: EventLog, quota: Quota) -> None:
         self._log, self._quota = log, quota
+        self._checks = ThreadPoolExecutor(1, "checks-of-artefacts")
+
+    async def check(self, call: Callable[[], T]) -> T:
+        """Return the result of `call`, which the thread of checks runs.
+
+        A check of large files takes seconds. All checks share one thread, so that the event loop,
+        and threads that write the log, have time meanwhile.
+        """
+        return await asyncio.get_running_loop().run_in_executor(self._checks, call)
 
     def add(
         self, identity: IdentityRecord, sha256: str, name: str, licence: str, content: bytes
@@ -76,12 +92,23 @@ class Artefacts:
         return self._log.state.artefacts.get(identity, {})
 
     def content(self, identity: IdentityRecord, sha256: str) -> bytes:
-        """Return a file; clients get their own files only."""
-        if identity.role == "client" and sha256 not in self.of(identity.id):
-            raise problem("not-found", f"there is no artefact {sha256} of yours")
-        if not any(sha256 in some for some in self._log.state.artefacts.values()):
-            raise problem("not-found", f"there is no artefact {sha256}: upload it again")
+        """Return a file to an owner, or to a node that hosts a session or job that needs it."""
+        if sha256 not in self.of(identity.id) and not self._is_needed_by(identity.id, sha256):
+            raise problem(
+                "not-found", f"there is no artefact {sha256} of yours, or of a session on your node"
+            )
         return self._log.content(sha256)
+
+    def _is_needed_by(self, identity: str, sha256: str) -> bool:
+        """Return whether a node of an identity hosts a session or job that needs a file."""
+        nodes, known = self._log.state.nodes, self._log.state
+        return any(
+            one.node is not None
+            and nodes[one.node].identity == identity
+            and sha256 in known.files_of(one.configuration)
+            and sha256 in self.of(one.owner)
+            for one in known.sessions.values()
+        )
 
     def delete(self, identity: IdentityRecord, sha256: str) -> None:
         """Delete a file of an identity that no open session or job of its needs."""
@@ -159,37 +186,89 @@ def check_content(name: str, sha256: str, content: bytes) -> None:
         raise problem(
             "refused", f"the content has the SHA-256 {found}, not {sha256}: send it again"
         )
-    for suffix, check in _CHECKS.items():
+    suffix = suffix_of(name)
+    try:
+        _CHECKS[suffix](content)
+    except (CavmarlError, ValueError, OSError, EOFError, zlib.error, expat.ExpatError) as error:
+        raise problem("refused", f"{name}: is no {suffix} file ({error!s:.200})") from error
+
+
+def suffix_of(name: str) -> str:
+    """Return the suffix that says what a file is.
+
+    Raises:
+        ServiceError: the name has no suffix of data.
+    """
+    for suffix in _CHECKS:
         if name.endswith(suffix):
-            try:
-                check(content)
-            except (CavmarlError, ValueError, OSError, EOFError, zlib.error) as error:
-                raise problem("refused", f"{name}: is no {suffix} file ({error!s:.200})") from error
-            return
+            return suffix
     known = ", ".join(_CHECKS)
     raise problem("refused", f"{name}: must end in one of {known}; code is never an artefact")
 
 
+def is_same_kind(name: str, other: str) -> bool:
+    """Return whether the content of two names is checked in the same way; errors: `suffix_of`."""
+    return _CHECKS[suffix_of(name)] is _CHECKS[suffix_of(other)]
+
+
 def _check_xml(content: bytes) -> None:
+    _check_elements(BytesIO(content))
+    _check_root(content[:_HEAD_BYTES])
+
+
+def _check_gzip(content: bytes) -> None:
+    with gzip.open(BytesIO(content)) as packed:
+        _check_elements(packed)
+        packed.seek(0)
+        _check_root(packed.read(_HEAD_BYTES))
+
+
+def _check_root(head: bytes) -> None:
+    """Refuse configurations of SUMO, and files whose root element is not near their beginning."""
     with tempfile.TemporaryDirectory(prefix="cavmarl-check-") as folder:
         path = Path(folder) / "file.xml"
-        path.write_bytes(content[: 1 << 17])
+        path.write_bytes(head)
         if is_sumo_config(path):
             raise ValueError("a configuration of SUMO names other files; give these instead")
         if not root_tag(path):
             raise ValueError("it has no root element")
 
 
-def _check_gzip(content: bytes) -> None:
-    with gzip.open(BytesIO(content)) as packed:
-        head = part = packed.read(1 << 17)
-        total = len(part)
-        while part:
-            part = packed.read(1 << 20)
-            total += len(part)
-            if total > MOST_UNPACKED_BYTES:
-                raise ValueError(f"it has over {MOST_UNPACKED_BYTES} bytes when unpacked")
-    _check_xml(head)
+def _check_elements(file: BinaryIO | gzip.GzipFile) -> None:
+    """Check that a file is XML without a document type, and names no file outside its folder."""
+    left = MOST_ELEMENTS
+
+    def refuse_doctype(name: str, system: str | None, public: str | None, inside: int) -> None:
+        raise ValueError("it declares a document type; remove its <!DOCTYPE …>")
+
+    def check(name: str, attributes: dict[str, str]) -> None:
+        nonlocal left
+        left -= 1
+        if left < 0:
+            raise ValueError(f"it has over {MOST_ELEMENTS} elements")
+        for key in ("href", "file"):
+            if key in attributes and not _is_inside(attributes[key]):
+                raise ValueError(
+                    f"<{name} {key}={attributes[key][:64]!r}> could name a file that was not "
+                    "uploaded; use a path below the folder of this file"
+                )
+
+    parser = expat.ParserCreate()
+    parser.StartDoctypeDeclHandler = refuse_doctype
+    parser.StartElementHandler = check
+    total = 0
+    while part := file.read(1 << 20):
+        total += len(part)
+        if total > MOST_UNPACKED_BYTES:
+            raise ValueError(f"it has over {MOST_UNPACKED_BYTES} bytes when unpacked")
+        parser.Parse(part)
+    parser.Parse(b"", True)
+
+
+def _is_inside(path: str) -> bool:
+    """Return whether a path in a file cannot lead out of the file's folder."""
+    is_plain = not path.startswith(("/", "~")) and not set(path) & set("\\:$")
+    return path in _NOWHERE or (is_plain and ".." not in path.split("/"))
 
 
 def _check_yaml(content: bytes) -> None:

@@ -14,7 +14,7 @@ Finite = Annotated[float, Field(allow_inf_nan=False)]
 World = Annotated[int, Field(ge=0, lt=1024)]
 Lanes = Annotated[list[Annotated[int, Field(ge=0, lt=MOST_LANES)]], Field(max_length=MOST_LANES)]
 Plain = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,64}$")]  # never a path
-Table = Literal["observations", "samples", "messages", "commands"]
+Table = Literal["observations", "samples", "messages"]  # those of several worlds
 
 
 class _Change(BaseModel):
@@ -82,7 +82,7 @@ class BeginRecording(_Change):
     """Record the worlds from the next command on."""
 
     kind: Literal["record"]
-    include: Annotated[list[Table], Field(max_length=4)] = []
+    include: Annotated[list[Table], Field(max_length=3)] = []
 
 
 Change = Annotated[
@@ -94,7 +94,7 @@ Change = Annotated[
 class KeptRecording(_Change):
     """The recording of a session in its saved state."""
 
-    include: Annotated[list[Table], Field(max_length=4)]
+    include: Annotated[list[Table], Field(max_length=3)]
     part: Annotated[int, Field(ge=0, lt=1 << 31)]  # number of the next part
 
 

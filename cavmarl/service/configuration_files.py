@@ -19,10 +19,15 @@ from cavmarl.config.io import read_yaml
 from cavmarl.config.registry import MAP_SUFFIXES, load_config
 from cavmarl.config.traffic import ZOO
 from cavmarl.core.errors import CavmarlError
+from cavmarl.service.artefacts import is_same_kind
 from cavmarl.service.error_names import problem
+from cavmarl.service.service_records import ArtefactRecord
 
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9_-]+)+")
+YAML = ".yaml"  # the only files that the service reads itself
+MOST_YAML_BYTES = 1 << 18  # of all YAML files of a configuration; reading 64 KiB takes a second
+MOST_FILES_BYTES = 1 << 30  # of all files of a configuration, which a node keeps for each session
 _RESERVED = ("agents", "configs", "envs")  # folders in which names are looked up
 _OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
 
@@ -79,10 +84,43 @@ def _is_of_driver(place: str, name: str) -> bool:
     return place.startswith(f"{DRIVER_FOLDER}/{name}/")
 
 
+def check_artefacts(files: Mapping[str, str], own: Mapping[str, ArtefactRecord]) -> None:
+    """Check that each place of a file has the kind of its artefact, and check sizes.
+
+    Args:
+        files: hashes by place.
+        own: artefacts by hash; each was checked as the kind that the suffix of its name states.
+
+    Raises:
+        ServiceError: a place has the suffix of another kind or of no kind, or the files are too
+            large.
+    """
+    for place, sha256 in files.items():
+        if not is_same_kind(place, own[sha256].name):
+            raise problem(
+                "refused",
+                f"files: {place} was uploaded as {own[sha256].name}, a file of another kind: "
+                "upload it again with a name that has the suffix of its place",
+            )
+    sizes = {place: own[sha256].size_bytes for place, sha256 in files.items()}
+    read = sum(size for place, size in sizes.items() if place.endswith(YAML))
+    for what, size, most in (
+        ("files", sum(sizes.values()), MOST_FILES_BYTES),
+        ("YAML files", read, MOST_YAML_BYTES),
+    ):
+        if size > most:
+            raise problem(
+                "refused",
+                f"files: all {what} together have {size} bytes: at most {most}; remove some",
+            )
+
+
 def load_uploaded(
     environment: str, files: Mapping[str, bytes], keys: Mapping[str, Any]
 ) -> EnvConfig:
     """Return the configuration of an uploaded environment; `files` are its files by place.
+
+    Only the content of YAML files is needed.
 
     Raises:
         ServiceError: it names a file that was not uploaded, or code.
@@ -92,8 +130,8 @@ def load_uploaded(
         for place, content in files.items():
             path = Path(folder) / place
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(content if place.endswith(".yaml") else b"")
-            if place.endswith(".yaml"):
+            path.write_bytes(content)
+            if place.endswith(YAML):
                 _check_yaml(place, read_yaml(path), files)
         where = environment_of(environment, dict.fromkeys(files, ""), folder)
         try:

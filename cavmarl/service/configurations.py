@@ -12,12 +12,14 @@ import json
 import re
 from collections.abc import Mapping
 from dataclasses import asdict
-from typing import Any
+from typing import Any, NamedTuple
 
 from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.service.artefacts import Artefacts
 from cavmarl.service.configuration_files import (
+    YAML,
+    check_artefacts,
     check_files,
     drivers_of,
     environment_of,
@@ -42,28 +44,48 @@ _OF_FILES = (
 )
 
 
-def add_configuration(
-    log: EventLog,
-    identity: IdentityRecord,
-    body: ConfigurationBody,
-    artefacts: Artefacts | None = None,
-) -> dict[str, Any]:
-    """Check and store a configuration; equal content keeps its version.
+class NewConfiguration(NamedTuple):
+    """A configuration that is not stored yet."""
 
-    Args:
-        log: the log of the service.
-        identity: the owner of the configuration and of its files.
-        body: the configuration.
-        artefacts: those of the service; None: the configuration has no files.
+    name: str
+    document: dict[str, Any]
+    contents: dict[str, bytes]  # of its YAML files by place; those of other files are empty
+
+    def check(self) -> None:
+        """Check the configuration; this takes seconds if it has many files.
+
+        Raises:
+            ServiceError: the configuration is refused.
+        """
+        _check(self.document, self.contents)
+
+
+def collect_configuration(
+    log: EventLog, identity: IdentityRecord, body: ConfigurationBody, artefacts: Artefacts
+) -> NewConfiguration:
+    """Return a configuration with the files that its check needs.
+
+    Raises:
+        ServiceError: a file is missing, of another kind than its place, or too large.
     """
     document = body.model_dump(exclude={"name"})
     files: dict[str, str] = document["files"]
     if not files:
         del document["files"]  # so that configurations without files keep their hashes
-    elif artefacts is not None:
-        artefacts.use(identity, files.values())
-    _check(document, {place: log.content(sha256) for place, sha256 in files.items()})
-    name = body.name or body.environment
+    artefacts.use(identity, files.values())
+    check_artefacts(files, artefacts.of(identity.id))
+    contents = {
+        place: log.content(sha256) if place.endswith(YAML) else b""
+        for place, sha256 in files.items()
+    }
+    return NewConfiguration(body.name or body.environment, document, contents)
+
+
+def add_configuration(
+    log: EventLog, identity: IdentityRecord, new: NewConfiguration
+) -> dict[str, Any]:
+    """Store a configuration that was checked; equal content keeps its version."""
+    name, document = new.name, new.document
     content = json.dumps(document, sort_keys=True, separators=(",", ":")).encode()
     found = hashlib.sha256(content).hexdigest()
     versions = log.state.configurations.get(name, [])
@@ -73,7 +95,7 @@ def add_configuration(
             raise problem("too-many", detail)
         log.keep(content)
         data: dict[str, Any] = {"hash": found, "version": len(versions) + 1}
-        if files:
+        if files := document.get("files"):
             data["files"] = sorted({*files.values()})
         log.record("configuration.added", name, data, actor=identity.id, owner=identity.id)
         versions = log.state.configurations[name]

@@ -43,11 +43,16 @@ from cavmarl.service.service_records import LogEvent
 SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
 _PAGE = 1000
-# PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s.
-_DEAD_CLIENTS = (
-    "-c tcp_keepalives_idle=1 -c tcp_keepalives_interval=1 -c tcp_keepalives_count=3 "
-    "-c tcp_user_timeout=4000"
-)
+# PostgreSQL ends the connection, and so the lock, of a machine that does not answer for 4 s. The
+# service ends the connection to a machine of PostgreSQL that does not answer after the same time.
+_DEAD_PEERS = {
+    "options": "-c tcp_keepalives_idle=1 -c tcp_keepalives_interval=1 -c tcp_keepalives_count=3 "
+    "-c tcp_user_timeout=4000",
+    "keepalives_idle": 1,
+    "keepalives_interval": 1,
+    "keepalives_count": 3,
+    "tcp_user_timeout": 4000,
+}
 
 _METADATA = MetaData()
 _ABOUT = Table("about", _METADATA, Column("schema", String(64), primary_key=True))
@@ -113,11 +118,11 @@ class EventStore:
     """
 
     def __init__(self, where: str | Path, *, is_standby: bool = False) -> None:
-        self.where = str(where)
         self._lock: IO[bytes] | None = None
         self._open = ExitStack()
         self._guard = threading.Lock()  # guards the only connection
-        self.url = url = _url_of(self.where)
+        self.url = url = _url_of(str(where))
+        self.where = url.render_as_string() if "://" in str(where) else str(where)  # no password
         self.is_embedded = url.get_backend_name() == "sqlite"
         if self.is_embedded and is_standby:
             raise ServiceError(
@@ -127,7 +132,7 @@ class EventStore:
         if self.is_embedded:
             self._lock = _lock_file(Path(str(url.database)))
         try:
-            given = {} if self.is_embedded else {"options": _DEAD_CLIENTS}
+            given = {} if self.is_embedded else _DEAD_PEERS
             engine = create_engine(url, pool_size=1, max_overflow=0, connect_args=given)
             self._open.callback(engine.dispose)
             if self.is_embedded:
@@ -135,13 +140,13 @@ class EventStore:
             self._connection = self._open.enter_context(engine.connect())
             if not is_standby:
                 if not self.is_embedded and not self._take_advisory_lock():
-                    raise _taken(self.url.render_as_string())
+                    raise _taken(self.where)
                 self._check_schema()
         except SQLAlchemyError as error:
             self.close()
             cause = str(getattr(error, "orig", error)).strip().splitlines()[0]
             raise ServiceError(
-                f"store {url.render_as_string()}: cannot be opened ({cause}); check that its "
+                f"store {self.where}: cannot be opened ({cause}); check that its "
                 "folder or server exists and can be written"
             ) from error
         except ServiceError:

@@ -18,6 +18,7 @@ from typing import Any
 import uvicorn
 
 from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.core.scratch_folder import scratch_folder
 from cavmarl.core.server_address import listen
 from cavmarl.evaluate.evaluation import evaluate
 from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
@@ -77,7 +78,8 @@ def host_node(options: NodeOptions, tell: Callable[[str], None]) -> None:
             no TLS.
     """
     check_transport(options.host, options.certificate, options.key)
-    asyncio.run(_run(options, tell))
+    with scratch_folder():  # files of sessions, recordings and jobs
+        asyncio.run(_run(options, tell))
 
 
 async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:

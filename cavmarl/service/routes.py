@@ -149,7 +149,13 @@ async def add_configuration(
 ) -> response_bodies.Configuration:
     """Check and store a configuration; new content gets a new version."""
     broker = service.broker
-    found = configurations.add_configuration(broker.log, identity, body, broker.artefacts)
+    log, known = broker.log, broker.artefacts
+    new = configurations.collect_configuration(log, identity, body, known)
+    if new.contents:
+        await known.check(new.check)
+    else:
+        new.check()
+    found = configurations.add_configuration(log, identity, new)
     return response_bodies.Configuration(**found)
 
 

@@ -64,7 +64,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         raise
     try:
         if options.is_standby:
-            tell(f"standby: {address}, follows store {options.store}")
+            tell(f"standby: {address}, follows store {store.where}")
             log = follow_store(store, tell)
         else:
             log = EventLog(store)
@@ -85,14 +85,12 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         service.on_broken = end
         if options.is_standby:
             listener.listen(BACKLOG)
-        tell(f"service: {address}, store {options.store}")
+        tell(f"service: {address}, store {store.where}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")
         server.run(sockets=[listener])
         if log.is_broken:
-            raise ServiceError(
-                f"store {options.store}: could not be written; the log has the reason"
-            )
+            raise ServiceError(f"store {store.where}: could not be written; the log has the reason")
         log.flush()
     finally:
         listener.close()

@@ -14,6 +14,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
 
+from cavmarl.client.uploads import DRIVER_FOLDER
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording_format import HEAD_FILE
@@ -37,6 +38,7 @@ class SessionRecording:
         vec: the worlds.
         include: additional tables.
         part: number of the first part that this node records.
+        files: folder with the files of the session, which parts do not name; empty: it has none.
 
     Attributes:
         waiting: parts that have ended and are not stored with the service yet.
@@ -45,9 +47,11 @@ class SessionRecording:
         ConfigError, MissingExtraError: the worlds or a table cannot be recorded.
     """
 
-    def __init__(self, vec: CavVectorEnv, include: Sequence[Table], part: int = 0) -> None:
+    def __init__(
+        self, vec: CavVectorEnv, include: Sequence[Table], part: int = 0, files: str = ""
+    ) -> None:
         self.waiting: list[RecordingPart] = []
-        self._include, self._part = tuple(include), part
+        self._include, self._part, self._files = tuple(include), part, files
         self._folder: TemporaryDirectory[str] | None = None
         self.begin(vec)
 
@@ -74,7 +78,11 @@ class SessionRecording:
         place = Path(self._folder.name) / "recording"
         head = json.loads((place / HEAD_FILE).read_text(encoding="utf-8"))
         head["manifest"]["command"] = COMMAND  # the real one names folders of the node
-        (place / HEAD_FILE).write_text(json.dumps(head), encoding="utf-8")
+        told = json.dumps(head)
+        if self._files:  # a path of letters, digits, _ and - needs no escapes in JSON
+            for folder in (f"{self._files}/{DRIVER_FOLDER}/", f"{self._files}/"):
+                told = told.replace(folder, "")
+        (place / HEAD_FILE).write_text(told, encoding="utf-8")
         content = io.BytesIO()
         with zipfile.ZipFile(content, "w") as packed:
             for file in sorted(place.rglob("*")):

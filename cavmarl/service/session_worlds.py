@@ -89,7 +89,7 @@ class SessionWorld:
     def _made(self, scenario: SetScenario | None) -> CavVectorEnv:
         """Return new worlds of the configuration, with a scenario of a command."""
         document, more = self._document, dict(self._keys)
-        environment, world = world_of(document, self._files.name if self._files else "")
+        environment, world = world_of(document, self._folder)
         overrides = {**world["overrides"], **more.pop("overrides", {})}
         if scenario is not None:
             chosen = scenario.model_dump(exclude={"kind"})
@@ -107,6 +107,10 @@ class SessionWorld:
         self._worlds: LocalWorlds | NodeWorlds | NodeGroups = vec.worlds  # type: ignore[assignment]
         # number of transfers of each world reported to the service
         self._told = [0] * len(self._worlds.transfers)
+
+    @property
+    def _folder(self) -> str:
+        return "" if self._files is None else self._files.name
 
     def has_files(self, files: TemporaryDirectory[str]) -> bool:
         """Return whether the worlds were made with this folder."""
@@ -147,7 +151,7 @@ class SessionWorld:
         self._anew[:] = kept.begun_anew
         if kept.recording is not None:
             include, part = kept.recording.include, kept.recording.part
-            self.recording = SessionRecording(self._vec, include, part)
+            self.recording = SessionRecording(self._vec, include, part, self._folder)
 
     def state(self) -> bytes | None:
         """Return the saved state, and end the present part of the recording.
@@ -283,7 +287,7 @@ class SessionWorld:
                 f"{key}: the state of these worlds cannot be saved, so another node could not "
                 "continue their recording; record them in a process of your own",
             )
-        self.recording = SessionRecording(self._vec, change.include)
+        self.recording = SessionRecording(self._vec, change.include, files=self._folder)
 
     def frames(self, is_final: bool) -> bytes:
         """Return the samples of the mounted sensors, as `SENSOR/FIELD`."""

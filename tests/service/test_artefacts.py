@@ -6,6 +6,7 @@ import gzip
 import hashlib
 import itertools
 import shutil
+import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -20,8 +21,8 @@ from cavmarl.client import Client
 from cavmarl.config.registry import agent_entries, entries
 from cavmarl.core.errors import ServiceError
 from cavmarl.evaluate import evaluate
-from cavmarl.service.artefacts import Quota, check_content
-from cavmarl.service.configurations import add_configuration
+from cavmarl.recordings.recording import Recording
+from cavmarl.service.artefacts import Quota, check_content, is_same_kind
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.request_bodies import ConfigurationBody
@@ -55,8 +56,7 @@ def put_world(fleet: Fleet, env: bytes = ENV) -> dict[str, str]:
 
 def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
     body = ConfigurationBody(**{"environment": "mine", "files": files, **given})
-    found = add_configuration(fleet.log, fleet.client, body, fleet.broker.artefacts)
-    return str(found["hash"])
+    return str(fleet.add_configuration(body)["hash"])
 
 
 @pytest.mark.parametrize(
@@ -64,10 +64,20 @@ def configure(fleet: Fleet, files: dict[str, str], **given: Any) -> str:
     [
         ("code.py", b"import os", "code is never"),
         ("model.pt", b"x", "code is never"),
-        ("map.net.xml", b"import os", "no root element"),
+        ("map.net.xml", b"import os", "syntax error"),
         ("map.net.xml", b"<configuration><input/></configuration>", "names other files"),
+        ("map.net.xml", b"<net>\0", "is no .xml file"),
+        ("map.net.xml", b"<net><a></net>", "mismatched tag"),
+        ("map.net.xml", b"<!DOCTYPE net [<!ENTITY a SYSTEM '/etc/passwd'>]><net>&a;</net>", "DOCT"),
+        ("a.osm", "<!DOCTYPE a SYSTEM 'http://a/a.dtd'><a/>".encode("utf-16"), "document type"),
+        ("a.rou.xml", b"<routes><include href='/etc/passwd'/></routes>", "could name a file"),
+        ("a.rou.xml", b"<routes><include href='a/../../b.xml'/></routes>", "could name a file"),
+        ("a.rou.xml", "<routes><include href='/dev/zero'/></routes>".encode("utf-16"), "could"),
+        ("a.rou.xml", b"<routes><include href='&#47;etc/passwd'/></routes>", "could name a file"),
+        ("a.add.xml", b"<additional><rerouter file='/etc/passwd'/></additional>", "could name"),
+        ("a.add.xml.gz", gzip.compress(b"<a><rerouter file='~/a'/></a>", mtime=0), "could name"),
         ("map.net.xml.gz", NET, "is no .xml.gz file"),
-        ("map.net.xml.gz", gzip.compress(b"import os", mtime=0), "no root element"),
+        ("map.net.xml.gz", gzip.compress(b"import os", mtime=0), "syntax error"),
         ("map.net.xml.gz", gzip.compress(NET, mtime=0)[:-9], "is no .xml.gz file"),
         ("rig.yaml", b"- 1\n- 2\n", "must be a mapping"),
         ("rig.yaml", b"a: !!python/object/apply:os.getcwd []", "is no .yaml file"),
@@ -82,6 +92,19 @@ def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str
     with pytest.raises(ServiceError, match=words) as refused:
         check_content(name, hashlib.sha256(content).hexdigest(), content)
     assert refused.value.problem == "refused"
+
+
+def test_files_may_include_others_of_their_folder() -> None:
+    for inner in ("<include href='b/c.rou.xml'/>", "<e1Detector file='/dev/null'/>"):
+        content = f"<additional>{inner}</additional>".encode()
+        check_content("a.add.xml", hashlib.sha256(content).hexdigest(), content)
+
+
+def test_the_number_of_elements_is_limited(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("cavmarl.service.artefacts.MOST_ELEMENTS", 100)
+    content = gzip.compress(b"<a>" + 100 * b"<b/>" + b"</a>", mtime=0)
+    with pytest.raises(ServiceError, match="over 100 elements"):
+        check_content("a.xml.gz", hashlib.sha256(content).hexdigest(), content)
 
 
 def test_a_compressed_file_that_is_too_large_when_unpacked_is_refused(
@@ -115,7 +138,7 @@ def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path
         fleet.broker.artefacts.content(fleet.other, sha256)  # type: ignore[attr-defined]
     put(fleet, "map.net.xml", NET, owner="other")
     fleet.broker.artefacts.delete(fleet.client, sha256)
-    assert fleet.broker.artefacts.content(fleet.nodes, sha256) == NET
+    assert fleet.broker.artefacts.content(fleet.other, sha256) == NET  # type: ignore[attr-defined]
     with pytest.raises(ServiceError, match="of yours"):
         fleet.broker.artefacts.delete(fleet.client, sha256)
     fleet.broker.artefacts.delete(fleet.other, sha256)  # type: ignore[attr-defined]
@@ -126,6 +149,22 @@ def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path
     again = EventLog(EventStore(tmp_path / "store.sqlite"))
     assert again.state == state
     again.store.close()
+
+
+def test_only_the_owner_and_nodes_that_need_a_file_get_it(fleet: Fleet) -> None:
+    files = put_world(fleet)
+    sha256 = files["map.net.xml"]
+    others = [fleet.identity(role, role) for role in ("viewer", "operator", "admin")]
+    others += [fleet.identity("other-node", "node"), fleet.nodes]
+    fleet.join("a")
+    session = fleet.broker.open(fleet.client, configure(fleet, files))
+    assert fleet.broker.artefacts.content(fleet.client, sha256) == NET
+    assert fleet.broker.artefacts.content(fleet.nodes, sha256) == NET
+    fleet.broker.close(fleet.client, session.id)
+    for one in others:
+        with pytest.raises(ServiceError, match="of yours, or of a session") as refused:
+            fleet.broker.artefacts.content(one, sha256)
+        assert refused.value.problem == "not-found"
 
 
 def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
@@ -190,11 +229,52 @@ def test_an_environment_names_only_its_own_files(fleet: Fleet, env: bytes, words
 )
 def test_files_have_their_places(fleet: Fleet, places: list[str], words: str) -> None:
     sha256 = put(fleet, "env.yaml", ENV)
+    kinds = {place: Path(place).suffix for place in places}
+    files = {place: put(fleet, f"a{kind}", kind.encode()) for place, kind in kinds.items()}
     with pytest.raises(ServiceError, match=words):
-        configure(fleet, dict.fromkeys(places, sha256))
+        configure(fleet, files)
     for place in ("../env.yaml", "/env.yaml", "a/b/c/d", "drivers/../env.yaml"):
         with pytest.raises(ValueError, match="pattern"):
             configure(fleet, {place: sha256})
+
+
+@pytest.mark.parametrize(
+    ("place", "words"),
+    [
+        ("sitecustomize.py", "must end in one of"),
+        ("matplotlibrc", "must end in one of"),
+        ("a.net.xml", "uploaded as rig.yaml, a file of another kind"),
+        ("drivers/a/config.json", "uploaded as rig.yaml"),
+    ],
+)
+def test_a_file_has_the_kind_as_which_it_was_checked(fleet: Fleet, place: str, words: str) -> None:
+    code = put(fleet, "rig.yaml", b'x: int = __import__("os").system("id")\n')
+    with pytest.raises(ServiceError, match=words) as refused:
+        configure(fleet, {**put_world(fleet), place: code})
+    assert refused.value.problem == "refused"
+    assert is_same_kind("map.net.xml", "map.osm")
+
+
+def test_a_file_in_many_places_is_not_read_for_each(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    files = put_world(fleet)
+    read: list[str] = []
+    content = EventLog.content
+
+    def note(log: EventLog, sha256: str) -> bytes:
+        read.append(sha256)
+        return content(log, sha256)
+
+    monkeypatch.setattr(EventLog, "content", note)
+    configure(fleet, files | {f"{k}.net.xml": files["map.net.xml"] for k in range(200)})
+    assert read == [files["env.yaml"]]
+    monkeypatch.setattr("cavmarl.service.configuration_files.MOST_FILES_BYTES", 1000)
+    with pytest.raises(ServiceError, match=r"all files together have \d+ bytes: at most 1000"):
+        configure(fleet, files | {f"{k}.net.xml": files["map.net.xml"] for k in range(200)})
+    monkeypatch.setattr("cavmarl.service.configuration_files.MOST_YAML_BYTES", 100)
+    with pytest.raises(ServiceError, match="all YAML files together"):
+        configure(fleet, files | {f"{k}.yaml": files["env.yaml"] for k in range(9)})
 
 
 def test_a_configuration_needs_files_of_its_owner(fleet: Fleet) -> None:
@@ -242,6 +322,7 @@ def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
     )  # fmt: skip
     model = f"zoo:{driver}"
     local = cavmarl.make_vec(str(world), overrides={"traffic.model": model}, **keys)
+    remote.record()
     remote.reset(seed=1)
     local.reset(seed=1)
     assert_same(remote, local, range(3))
@@ -249,6 +330,11 @@ def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
     cluster.processes["victim"].kill()
     assert_same(remote, local, range(3))
     assert remote.flows.moves == 1
+    for part in remote.recording(tmp_path / "recording"):
+        head = (part / "recording.json").read_text(encoding="utf-8")
+        assert "zoo:trained" in head
+        assert tempfile.gettempdir() not in head
+        assert list(Recording.open(part).frames())
     own = {one["name"] for one in client.get("/artefacts")["artefacts"]}
     assert own >= {"env.yaml", "config.json", "model.safetensors"}
     before = client.get("/events", limit=1000)["events"][-1]["sequence"]
@@ -312,6 +398,9 @@ def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> No
         assert service.ask("client", "PUT", path, content=NET).status_code == 200
         files = {"map.net.xml": hashlib.sha256(NET).hexdigest()}
         document = {"environment": "map.net.xml", "files": files}
+        found = service.ask("client", "POST", "/configurations", json=document).json()
+        opened = {"configuration": found["hash"]}
+        assert service.ask("client", "POST", "/sessions", json=opened).status_code == 201
         folder = service.run(link.fetch_files(document))
         assert folder is not None
         assert (Path(folder.name) / "map.net.xml").read_bytes() == NET

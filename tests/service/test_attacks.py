@@ -22,7 +22,7 @@ from cavmarl.client import Client
 from cavmarl.client.service_protocol import Ask, Flow, ServiceFlows
 from cavmarl.core.errors import ConfigError, ServiceError
 from cavmarl.service.broker import MOST_RESULTS
-from cavmarl.service.configurations import add_configuration, read_configuration
+from cavmarl.service.configurations import read_configuration
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore, digest_of
 from cavmarl.service.node_app import make_node_app
@@ -183,7 +183,7 @@ def test_the_signature_of_a_state_is_no_session_token(service: LoopbackService) 
 @pytest.mark.parametrize("how", ["state", "result", "closed", "forgotten"])
 def test_shared_content_is_kept_for_its_other_users(fleet: Fleet, how: str) -> None:
     """A node stores the bytes of a configuration, and then its reference to them ends."""
-    found = add_configuration(fleet.log, fleet.client, ConfigurationBody(environment="merge"))
+    found = fleet.add_configuration(ConfigurationBody(environment="merge"))
     fleet.log.flush()
     content = fleet.log.content(found["hash"])
     fleet.join("a")

@@ -20,7 +20,6 @@ from schemathesis.checks import not_a_server_error
 from schemathesis.specs.openapi.checks import positive_data_acceptance
 
 from cavmarl.service.app import make_app
-from cavmarl.service.configurations import add_configuration
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.route_access import Service, open_to_all, rule_of
@@ -44,7 +43,7 @@ class Served:
         self.fleet = Fleet(store, max_nodes=50, max_sessions=20)
         self.fleet.identity("root", "admin")
         body = ConfigurationBody(environment="merge")
-        found = add_configuration(self.fleet.log, self.fleet.client, body)
+        found = self.fleet.add_configuration(body)
         self.configuration = str(found["hash"])
         never = RateLimit(1e9, 1e9)
         app = make_app(Service(self.fleet.broker, self.fleet.access, never, never))

@@ -13,7 +13,7 @@ import httpx
 import pytest
 
 from cavmarl.core.errors import ServiceError
-from cavmarl.service.configurations import MOST_CONFIGURATIONS, add_configuration
+from cavmarl.service.configurations import MOST_CONFIGURATIONS
 from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.route_access import MOST_HELD
 from cavmarl.service.service_records import ROLES
@@ -103,10 +103,10 @@ def test_vehicles_that_pages_may_insert_count_for_the_size_of_a_world(tmp_path: 
         overrides = {"population.insertions": insertions}
         body = ConfigurationBody(**keys, overrides=overrides)
         if insertions == 195:
-            add_configuration(fleet.log, fleet.client, body)
+            fleet.add_configuration(body)
             continue
         with pytest.raises(ServiceError, match=r"201000 .* in 1000 worlds: at most 200000"):
-            add_configuration(fleet.log, fleet.client, body)
+            fleet.add_configuration(body)
     fleet.close()
 
 
@@ -116,10 +116,10 @@ def test_the_number_of_configurations_of_an_identity_is_limited(tmp_path: Path) 
     for agents, refused in ((3, False), (3, False), (4, True)):
         body = ConfigurationBody(environment="merge", agents=agents)
         if not refused:
-            add_configuration(fleet.log, fleet.client, body)
+            fleet.add_configuration(body)
             continue
         with pytest.raises(ServiceError, match="configurations of yours"):
-            add_configuration(fleet.log, fleet.client, body)
+            fleet.add_configuration(body)
     fleet.close()
 
 

@@ -10,10 +10,12 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from threading import Thread
 
+import httpx
 import pytest
 from sqlalchemy import create_engine, text
 
 from cavmarl.client import Client
+from cavmarl.client.service_protocol import Ask, Rest, ServiceFlows
 from cavmarl.core.errors import ServiceError
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
@@ -146,6 +148,27 @@ def test_a_service_that_lost_its_connection_writes_nothing_more(empty_postgresql
     again.store.close()
 
 
+def test_no_message_shows_the_password_of_the_store(
+    empty_postgresql: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    user, at, place = empty_postgresql.removeprefix("postgresql://").partition("@")
+    secret = f"postgresql://{user if at else 'postgres'}:hidden@{place if at else user}"
+    store = EventStore(secret)
+    assert "hidden" not in store.where
+    with pytest.raises(ServiceError, match=r"\*\*\*.* is in use") as taken:
+        EventStore(secret)
+    assert "hidden" not in str(taken.value)
+    others = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
+    change(empty_postgresql, f"{others} AND datname = current_database()")
+    with pytest.raises(ServiceError, match="does not answer") as lost:
+        store.check_lock()
+    assert "hidden" not in str(lost.value)
+    store.close()
+    with running_service(secret) as service:
+        assert service.url.startswith("http://")
+    assert "hidden" not in "".join(capfd.readouterr())
+
+
 def change(url: str, statement: str) -> None:
     engine = create_engine(url.replace("postgresql:", "postgresql+psycopg:"))
     with engine.begin() as connection:
@@ -157,6 +180,23 @@ def test_a_standby_needs_a_store_that_two_services_can_use(tmp_path: Path) -> No
     with pytest.raises(ServiceError, match="postgresql://"):
         EventStore(tmp_path / "store.sqlite", is_standby=True)
     assert not (tmp_path / "store.sqlite").exists()
+
+
+def test_a_configuration_is_sent_again_to_the_service_that_takes_over() -> None:
+    flow = ServiceFlows("http://a,http://b", "secret").add_configuration("merge", {})
+    request = httpx.Request("POST", "http://a")
+    tokens = httpx.Response(200, json={"access_token": "t", "expires_in": 900}, request=request)
+    assert isinstance(next(flow), Ask)
+    sent = flow.send(tokens)
+    assert isinstance(sent, Ask)
+    assert sent.url == "http://a/v1/configurations"
+    assert isinstance(flow.throw(httpx.ReadError("the service was killed")), Rest)
+    again = flow.send(None)
+    assert isinstance(again, Ask)
+    assert again.url == "http://b/v1/configurations"
+    with pytest.raises(StopIteration) as end:
+        flow.send(httpx.Response(201, json={"hash": "0" * 64}, request=request))
+    assert end.value.value == "0" * 64
 
 
 def test_services_that_do_not_answer_are_asked_in_turn(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,9 +8,10 @@ from typing import Any
 
 from cavmarl.service.access import Access
 from cavmarl.service.broker import Broker, BrokerRules
+from cavmarl.service.configurations import add_configuration, collect_configuration
 from cavmarl.service.event_log import EventLog
 from cavmarl.service.event_store import EventStore
-from cavmarl.service.request_bodies import BeatBody, NodeBody
+from cavmarl.service.request_bodies import BeatBody, ConfigurationBody, NodeBody
 from cavmarl.service.service_records import IdentityRecord, Role
 
 CONFIGURATION = "0" * 64
@@ -33,6 +34,11 @@ class Fleet:
     def identity(self, name: str, role: Role) -> IdentityRecord:
         found, self.secrets[name] = self.access.add_identity(name, role)
         return found
+
+    def add_configuration(self, body: ConfigurationBody) -> dict[str, Any]:
+        new = collect_configuration(self.log, self.client, body, self.broker.artefacts)
+        new.check()
+        return add_configuration(self.log, self.client, new)
 
     def token(self, name: str) -> str:
         return str(self.access.exchange(self.secrets[name])["access_token"])
