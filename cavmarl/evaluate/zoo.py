@@ -285,8 +285,8 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
     driven = (job["episodes"], run_seeds(world.seed, len(seeds)))
     if driven != (document.get("episodes"), seeds):
         raise ManifestError(
-            f"{folder / RESULT_FOLDER}: its manifest shows other episodes or seeds than those that "
-            "were driven; evaluate the driver again"
+            f"{folder / RESULT_FOLDER}: its manifest shows episodes or seeds that were not driven; "
+            "evaluate the driver again"
         )
     return EntryJob(world, job["episodes"], len(seeds))
 
