@@ -146,12 +146,12 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
     "episodes": (
         lambda entry: change_manifest(entry, episodes=1_000_000),
         ManifestError,
-        "shows other episodes or seeds than those that were driven; evaluate the driver again",
+        "shows episodes or seeds that were not driven; evaluate the driver again",
     ),
     "seeds": (
         lambda entry: change_manifest(entry, seeds=[7]),
         ManifestError,
-        "shows other episodes or seeds",
+        "shows episodes or seeds that were not",
     ),
     "files of the driver": (
         lambda entry: change_manifest(entry, policies={"merge_ippo": []}),
