@@ -36,7 +36,8 @@ MOST_BYTES = 1 << 30
 MOST_TIMES = 100_000
 GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
-_KMH_PER_MPH = 1.609344
+# Waymo states the first two, and nuPlan the last one.
+_MPS_PER_UNIT = (("kmh", 1.0 / 3.6), ("mph", 0.44704), ("mps", 1.0))
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
 _GPUDRIVE_FREEWAY, _GPUDRIVE_BIKE_LANE = 1, 3  # map_element_id
 
@@ -117,7 +118,9 @@ def _scenarionet(scene: Any) -> LoggedScene:
     for name, entry in _mapping(scene.get("map_features"), "map_features").items():
         entry = _mapping(entry, f"map feature '{name}'")
         kind = str(entry.get("type", ""))
-        if kind.startswith("ROAD_EDGE"):
+        if kind == "ROAD_EDGE_SIDEWALK" and "polyline" not in entry:
+            counts.add("sidewalks ignored")  # areas, with a polygon instead of a line
+        elif kind.startswith("ROAD_EDGE"):
             edges.append(_points(entry.get("polyline"), f"road edge '{name}'", 2))
         elif not kind.startswith("LANE"):
             counts.add(_ignored(kind.startswith("ROAD_LINE"), kind))
@@ -167,14 +170,16 @@ def _scenarionet_track(
 
 
 def _scenarionet_lane(name: str, entry: Mapping[str, Any], is_freeway: bool) -> SceneLane:
-    kmh, mph = (_number(entry.get(f"speed_limit_{unit}")) for unit in ("kmh", "mph"))
-    speed = mph * _KMH_PER_MPH if kmh is None and mph is not None else kmh
+    limits = (
+        (_number(entry.get(f"speed_limit_{unit}")), factor) for unit, factor in _MPS_PER_UNIT
+    )
+    speed = next((value * factor for value, factor in limits if value is not None), None)
     exits = entry.get("exit_lanes")
     return SceneLane(
         name,
         _points(entry.get("polyline"), f"lane '{name}'", 3),
         is_freeway,
-        None if speed is None else speed / 3.6,
+        speed,
         None,
         tuple(map(str, exits)) if isinstance(exits, list | tuple | np.ndarray) else None,
     )

@@ -203,6 +203,45 @@ def test_jumps_cut_a_track_and_overlaps_are_counted(tmp_path: Path) -> None:
     assert second.times.tolist() == list(range(50, TIMES))
 
 
+def test_parts_of_tracks_get_names_of_their_own(tmp_path: Path) -> None:
+    scene = scenario()
+    scene["tracks"]["8"]["state"]["position"][50:, 0] -= 60.0
+    scene["tracks"]["8#2"] = scene["tracks"]["parked"]
+    names = [track.name for track in read_scene(write_pickle(tmp_path, scene)).tracks]
+    assert names == ["7", "8", "8#3", "9", "walker", "rider", "parked", "8#2"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "mps"),
+    [
+        ({"speed_limit_kmh": 72.0, "speed_limit_mph": 45.0}, 20.0),
+        ({"speed_limit_kmh": 0.0, "speed_limit_mph": 45.0}, 20.1168),
+        ({"speed_limit_mps": 11.2}, 11.2),  # nuPlan
+        ({"speed_limit_mps": None}, None),
+        ({"speed_limit_kmh": 1000.0}, None),  # MetaDrive's default
+        ({}, None),
+    ],
+)
+def test_speed_limits_are_read_in_all_units(
+    stated: dict[str, Any], mps: float | None, tmp_path: Path
+) -> None:
+    scene = scenario()
+    lane = scene["map_features"]["inE"]
+    del lane["speed_limit_kmh"]
+    lane.update(stated)
+    found = read_scene(write_pickle(tmp_path, scene)).lanes[0].speed_mps
+    assert found == (None if mps is None else pytest.approx(mps))
+
+
+def test_sidewalks_are_ignored_and_counted(tmp_path: Path) -> None:
+    """nuPlan and nuScenes state sidewalks as areas, with a type of road edges."""
+    scene = scenario()
+    scene["map_features"]["walk"] = {"type": "ROAD_EDGE_SIDEWALK", "polygon": np.zeros((4, 2))}
+    found = read_scene(write_pickle(tmp_path, scene))
+    assert "1 sidewalks ignored" in found.notes
+    assert len(found.road_edges) == 4
+
+
 def test_what_is_ignored_is_counted(tmp_path: Path) -> None:
     scene = scenario()
     scene["tracks"]["cone"] = {**scene["tracks"]["parked"], "type": "TRAFFIC_CONE"}
