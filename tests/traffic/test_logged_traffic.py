@@ -279,6 +279,25 @@ def test_a_recorded_run_is_repeated(scene: Path, tmp_path: Path) -> None:
         assert (found.first_difference, found.state_hash) == (None, wanted)
 
 
+def test_a_recorded_run_is_repeated_with_a_moved_scene_only_if_it_is_the_same(
+    scene: Path, tmp_path: Path
+) -> None:
+    record = RecordOptions(tmp_path / "run", include=(INPUTS,))
+    with closing(parallel_env(scene, record=record)) as env:
+        env.reset(seed=0)
+        advance(env, 10)
+        wanted = env.state_hash()
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (moved / scene.name).write_bytes(scene.read_bytes())
+    found = repeat_recording(tmp_path / "run", WorldSpec.of(moved / scene.name))
+    assert (found.first_difference, found.state_hash) == (None, wanted)
+    changed = scenario()
+    changed["tracks"]["8"]["state"]["position"][:, 0] += 1.0
+    with pytest.raises(ConfigError, match="was recorded on another map"):
+        repeat_recording(tmp_path / "run", WorldSpec.of(write_pickle(moved, changed)))
+
+
 def test_the_caller_can_pose_vehicles_beside_the_replayed_ones(scene: Path) -> None:
     with closing(made(scene, overrides={"population.external": 2})) as env:
         slot = env.external.spawn(-30.0, 40.0, 0.0)
