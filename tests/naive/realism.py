@@ -198,9 +198,7 @@ def series(
         ]
         nearest = min(
             (
-                object_distance(
-                    (pose, own.length, own.width), (there, body.length, body.width)
-                )
+                object_distance((pose, own.length, own.width), (there, body.length, body.width))
                 for body, there in others
             ),
             default=NONE_M,

@@ -32,8 +32,10 @@ from cavmarl.maps.scenes.logged_scene import (
 )
 from cavmarl.maps.scenes.scene_pickle import unpickle
 
-MOST_BYTES = 1 << 30
+MOST_BYTES = 1 << 26
 MOST_TIMES = 100_000
+MOST_TRACKS = 4_000  # 900 in Waymo's scenes
+MOST_SAMPLES = 10_000_000  # of all tracks; in a pickle, tracks may share their arrays
 GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
 # Waymo states the first two, and nuPlan the last one.
@@ -109,6 +111,7 @@ def _scenarionet(scene: Any) -> LoggedScene:
         raise MapError(f"length = {length!r}: must be a whole number from 1 to {MOST_TIMES}")
     length = int(length)
     step_s = _step_of(meta.get("ts"), length)
+    _check_size(len(_mapping(scene.get("tracks"), "tracks")), length)
     tracks = []
     for name, entry in _mapping(scene.get("tracks"), "tracks").items():
         track = _scenarionet_track(str(name), _mapping(entry, f"track '{name}'"), length, counts)
@@ -170,9 +173,7 @@ def _scenarionet_track(
 
 
 def _scenarionet_lane(name: str, entry: Mapping[str, Any], is_freeway: bool) -> SceneLane:
-    limits = (
-        (_number(entry.get(f"speed_limit_{unit}")), factor) for unit, factor in _MPS_PER_UNIT
-    )
+    limits = ((_number(entry.get(f"speed_limit_{unit}")), factor) for unit, factor in _MPS_PER_UNIT)
     speed = next((value * factor for value, factor in limits if value is not None), None)
     exits = entry.get("exit_lanes")
     return SceneLane(
@@ -224,6 +225,7 @@ def _gpudrive(scene: Any) -> LoggedScene:
             f"objects have {sorted(lengths)[:5]} samples: must all have the same number; pad them "
             "with samples that are not valid"
         )
+    _check_size(len(parts), max(lengths, default=0))
     factor = _heading_unit([part for part in parts if part is not None])
     if factor != 1.0:
         counts.add("scene with headings in degrees, as their directions of motion show")
@@ -338,6 +340,14 @@ def _scene(
     return LoggedScene(name, step_s, lanes, edges, tracks, own, present, counts.notes())
 
 
+def _check_size(tracks: int, length: int) -> None:
+    if tracks > MOST_TRACKS or tracks * length > MOST_SAMPLES:
+        raise MapError(
+            f"{tracks} tracks of {length} samples: must be at most {MOST_TRACKS} tracks, and "
+            f"{MOST_SAMPLES} samples of all together; cut the scene into parts"
+        )
+
+
 def _mapping(value: Any, what: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise MapError(f"{what}: must be a mapping, is {type(value).__name__}: give {_KNOWN}")
@@ -350,12 +360,31 @@ def _list(value: Any, what: str) -> list[Any]:
     return value
 
 
-def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numbers:
-    """Return numbers (length, one of `columns`)."""
+def _numbers(value: Any, what: str) -> Numbers:
+    """Return an array; rows of lists have at most 3 numbers.
+
+    In a pickle, lists of shared lists could stand for any amount of memory.
+    """
     try:
-        found = np.asarray(value, dtype=np.float64)
+        if isinstance(value, list | tuple) and not all(map(_is_row, value)):
+            raise ValueError("long rows")
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapError(f"{what}: must be an array of numbers; export the scene again") from error
+
+
+def _is_row(value: object) -> bool:
+    """Return whether a value is a number or has at most 3 numbers."""
+    if isinstance(value, list | tuple):
+        return len(value) <= 3 and not any(
+            isinstance(one, list | tuple | np.ndarray) for one in value
+        )
+    return not isinstance(value, np.ndarray) or value.size <= 3
+
+
+def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numbers:
+    """Return numbers (length, one of `columns`)."""
+    found = _numbers(value, what)
     if found.ndim == 1 and columns == (1,):
         found = found[:, None]
     if found.ndim != 2 or found.shape[0] != length or found.shape[1] not in columns:
@@ -368,10 +397,7 @@ def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numb
 
 def _points(value: Any, what: str, columns: int) -> Numbers:
     """Return the points (n, columns) of a polyline; missing heights are 0."""
-    try:
-        found = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise MapError(f"{what}: must have points x, y (z); export the scene again") from error
+    found = _numbers(value, what)
     if found.ndim != 2 or found.shape[1] not in (2, 3) or not len(found):
         raise MapError(f"{what}: has the shape {found.shape}: must have points x, y (z)")
     if not (np.abs(found) <= FARTHEST_M).all():

@@ -96,6 +96,9 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "content",
     [
+        # a function of the reader with other defaults, which later scenes would get
+        b"\x80\x02c_codecs\nencode\nN}X\x0c\x00\x00\x00__defaults__)s\x86b.",
+        b"\x80\x02c_codecs\nencode\n}X\x01\x00\x00\x00aNsb.",
         b"\x80\x02Nr\xff\xff\xff\x7f.",  # a place in the memo that needs 32 GB
         b"\x80\x05\x96\x00\x00\x00\x00\x01\x00\x00\x00.",  # a bytearray of 4 GB
         b"\x80\x05\x97.",  # a buffer outside of the pickle
@@ -105,6 +108,68 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
 def test_pickles_that_reserve_memory_or_call_back_are_refused(content: bytes) -> None:
     with pytest.raises(MapError, match=r"only builtins|broken pickle"):
         unpickle(content)
+
+
+@pytest.mark.parametrize("code", [">f8", ">f4", ">i4", ">U3", "<f8"])
+def test_arrays_of_any_byte_order_are_read(code: str) -> None:
+    numbers = np.arange(3).astype(code)
+    for protocol in (2, 5):
+        assert unpickle(pickle.dumps(numbers, protocol)).tolist() == numbers.tolist()
+        assert unpickle(pickle.dumps(numbers[1], protocol)) == numbers[1]
+
+
+def test_a_state_cannot_make_objects_of_the_bytes_of_an_array() -> None:
+    content = pickle.dumps(np.array([b"abcdefgh"]), 2)
+    state = b"NNNK\x08K\x01K\x00t"  # subtype, names, fields, size, alignment and flags
+    assert content.count(state) == 1
+    found = unpickle(content.replace(state, b"NNNK\x08K\x01K\x3ft"))  # flags: contains objects
+    assert not found.dtype.hasobject
+    assert found.tolist() == [b"abcdefgh"]
+    named = content.replace(state, b"N)}K\x08K\x01K\x00t")
+    with pytest.raises(MapError, match="an array of records"):
+        unpickle(named)
+
+
+def test_items_of_no_size_are_refused() -> None:
+    """Any number of such items needs no memory in the file."""
+    with pytest.raises(MapError, match="an array of dtype 'S0'"):
+        unpickle(pickle.dumps(Hostile(np.dtype, "S0")))
+
+
+def _shared(scene: dict[str, Any]) -> None:
+    rows: list[Any] = [[0.0, 0.0, 0.0]]
+    for _ in range(12):
+        rows = [rows] * 8  # 8 ** 12 numbers in 100 bytes
+    scene["map_features"]["inE"]["polyline"] = rows
+
+
+def _crowd(scene: dict[str, Any]) -> None:
+    scene["tracks"] |= {str(k): scene["tracks"]["parked"] for k in range(5000)}
+
+
+def _many_samples(scene: dict[str, Any]) -> None:
+    scene["length"] = 90_000
+    scene["metadata"]["ts"] = np.arange(90_000) * 0.1
+    scene["tracks"] |= {str(k): scene["tracks"]["parked"] for k in range(200)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_shared, "lane 'inE': must be an array of numbers"),
+        (_crowd, "5003 tracks of 91 samples: must be at most 4000 tracks"),
+        (_many_samples, "203 tracks of 90000 samples"),
+    ],
+)
+def test_shared_content_of_a_pickle_cannot_fill_the_memory(
+    change: Change, message: str, tmp_path: Path
+) -> None:
+    scene = scenario()
+    change(scene)
+    path = write_pickle(tmp_path, scene)
+    assert path.stat().st_size < 3_000_000
+    with pytest.raises(MapError, match=message):
+        read_scene(path)
 
 
 @pytest.mark.parametrize(
