@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
-from cavmarl.core.math.elementary_arrays import cos_all, sin_all
+from cavmarl.core.math.elementary_arrays import cos_all, hypot_all, sin_all
 from cavmarl.core.scene_names import is_scene_file
 from cavmarl.maps.scenes.logged_scene import (
     FARTHEST_M,
@@ -38,6 +38,7 @@ MOST_TRACKS = 4_000  # 900 in Waymo's scenes
 MOST_SAMPLES = 10_000_000  # of all tracks; in a pickle, tracks may share their arrays
 GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
+_ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; share of points that are further from the direction
 # Waymo states the first two, and nuPlan the last one.
 _MPS_PER_UNIT = (("kmh", 1.0 / 3.6), ("mph", 0.44704), ("mps", 1.0))
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
@@ -131,6 +132,10 @@ def _scenarionet(scene: Any) -> LoggedScene:
             counts.add("bicycle lanes ignored")
         else:
             lanes.append(_scenarionet_lane(str(name), entry, "FREEWAY" in kind))
+    if _have_headings(lanes):
+        flat = [np.concatenate([lane.points[:, :2], 0.0 * lane.points[:, 2:]], 1) for lane in lanes]
+        lanes = [lane._replace(points=points) for lane, points in zip(lanes, flat, strict=True)]
+        counts.add("lanes with headings in place of heights: height 0", len(lanes))
     if lights := len(_mapping(scene.get("dynamic_map_states") or {}, "dynamic_map_states")):
         counts.add("traffic lights ignored", lights)
     own = str(meta.get("sdc_id", ""))
@@ -184,6 +189,20 @@ def _scenarionet_lane(name: str, entry: Mapping[str, Any], is_freeway: bool) -> 
         None,
         tuple(map(str, exits)) if isinstance(exits, list | tuple | np.ndarray) else None,
     )
+
+
+def _have_headings(lanes: Sequence[SceneLane]) -> bool:
+    """Return whether the third column of the lanes is their direction, as in scenes of nuScenes."""
+    apart = []
+    for lane in lanes:
+        moves = np.diff(lane.points, axis=0)
+        length = hypot_all(moves[:, 0], moves[:, 1])
+        moves, headings = moves[length > 0.0], lane.points[:-1, 2][length > 0.0]
+        along = moves[:, 0] * cos_all(headings) + moves[:, 1] * sin_all(headings)
+        apart.append(along < _ALONG_COS * length[length > 0.0])
+    far = np.concatenate([np.zeros(0, dtype=np.bool_), *apart])
+    is_flat = all((lane.points[:, 2] == lane.points[0, 2]).all() for lane in lanes)
+    return not is_flat and float(np.mean(far)) < _MOST_MISFITS
 
 
 def _number(value: Any) -> float | None:

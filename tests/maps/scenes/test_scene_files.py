@@ -298,6 +298,24 @@ def test_speed_limits_are_read_in_all_units(
     assert found == (None if mps is None else pytest.approx(mps))
 
 
+def test_headings_in_place_of_heights_are_recognized(tmp_path: Path) -> None:
+    """nuScenes gives the poses of lanes: x, y and the heading."""
+    scene, slope = scenario(), scenario()
+    for number, changed in enumerate((scene, slope)):
+        for feature in changed["map_features"].values():
+            if feature["type"].startswith("LANE"):
+                line = feature["polyline"]
+                moves = np.diff(line, axis=0, append=2.0 * line[-1:] - line[-2:-1])
+                heading = np.arctan2(moves[:, 1], moves[:, 0])
+                line[:, 2] = 0.05 * line[:, 0] if number else heading
+    found = read_scene(write_pickle(tmp_path, scene))
+    assert all((lane.points[:, 2] == 0.0).all() for lane in found.lanes)
+    assert "20 lanes with headings in place of heights: height 0" in found.notes
+    found = read_scene(write_pickle(tmp_path, slope))
+    assert np.ptp(found.lanes[0].points[:, 2]) > 3.0
+    assert not any("headings" in note for note in found.notes)
+
+
 def test_sidewalks_are_ignored_and_counted(tmp_path: Path) -> None:
     """nuPlan and nuScenes state sidewalks as areas, with a type of road edges."""
     scene = scenario()
