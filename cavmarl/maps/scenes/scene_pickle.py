@@ -25,6 +25,9 @@ _FORBIDDEN = frozenset(
 _KINDS = "biufSU"  # kinds of numbers and text; objects and records could contain anything
 
 
+_NONE = object()  # an argument that was not given
+
+
 class _ForbiddenError(pickle.UnpicklingError):
     """The pickle names something that is not on the list, or changes it."""
 
@@ -37,8 +40,11 @@ class _Function:
     def __init__(self, function: Callable[..., Any]) -> None:
         self._function = function
 
-    def __call__(self, *arguments: Any) -> Any:
-        return self._function(*arguments)
+    def __call__(
+        self, first: Any, second: Any = _NONE, third: Any = _NONE, fourth: Any = _NONE
+    ) -> Any:
+        given = (first, second, third, fourth)
+        return self._function(*(one for one in given if one is not _NONE))
 
     def __setstate__(self, state: object) -> None:
         raise _ForbiddenError("a changed function")
