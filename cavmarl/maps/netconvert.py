@@ -85,7 +85,7 @@ _TOLERANT = "--ignore-errors"
 _LEFT_HAND = "--lefthand"
 # Increase the number if a source is converted in another way, so that the cache converts it anew.
 _CONVERSION = "conversion 2"
-_SCENE_CONVERSION = "scene 1"  # the same for logged scenes
+_SCENE_CONVERSION = "scene 2"  # the same for logged scenes
 
 _COMMENT = re.compile(rb"<!-- generated on .*?-->\s*", re.DOTALL)
 _FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths

@@ -11,9 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from cavmarl.config.env import EnvConfig
+from cavmarl.config.env import EnvConfig, MapConfig
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError, RecordingError
+from cavmarl.core.scene_names import is_scene_file
 from cavmarl.env.parallel import CavEnv, parallel_env
 from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_of, inputs_dtype
 from cavmarl.recordings.recording import Recording
@@ -131,6 +132,13 @@ def _check_world(recording: Recording, made: CavEnv) -> None:
             f"the environment of the recording, {recording.head.environment}"
         )
     recorded, present = _keys_of(world.get("config", {})), _keys_of(_plain(made.config))
+    defaults = _keys_of(_plain(EnvConfig(name="", map=MapConfig(source="map"))))
+    for name in present.keys() - recorded.keys():  # keys that are newer than the recording
+        if name in defaults:
+            recorded[name] = defaults[name]
+    for keys in (recorded, present):  # like maps, logged scenes may have moved
+        if is_scene_file(str(keys.get("scenario.name"))):
+            keys["scenario.name"] = Path(str(keys["scenario.name"])).name
     names = sorted(recorded.keys() | present.keys())
     differing = [
         f"{name} = {present.get(name)}, recorded with {recorded.get(name)}"

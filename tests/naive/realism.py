@@ -94,6 +94,16 @@ def body_distance(one: list[Point], other: list[Point]) -> float:
     return -nearest if all(_cross(a, b, (0.0, 0.0)) > 0.0 for a, b in sides) else nearest
 
 
+def object_distance(one: tuple[Pose, float, float], other: tuple[Pose, float, float]) -> float:
+    """Return the signed distance of two objects (pose, length, width) with round corners."""
+    cores, radii = [], 0.0
+    for pose, length, width in (one, other):
+        radius = 0.7 * min(length, width) / 2
+        cores.append(corners(pose, length - 2 * radius, width - 2 * radius))
+        radii += radius
+    return body_distance(cores[0], cores[1]) - radii
+
+
 def edge_distance(point: Point, lines: Sequence[Sequence[Point]]) -> float:
     """Return the signed distance to the nearest line, positive on its right."""
     best = NONE_M
@@ -187,7 +197,10 @@ def series(
             if n != k and (there := body.poses[t]) is not None
         ]
         nearest = min(
-            (body_distance(box, corners(there, body.length, body.width)) for body, there in others),
+            (
+                object_distance((pose, own.length, own.width), (there, body.length, body.width))
+                for body, there in others
+            ),
             default=NONE_M,
         )
         edge = max(edge_distance(corner, lines) for corner in box)

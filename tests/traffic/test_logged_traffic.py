@@ -27,13 +27,17 @@ from cavmarl import (
 )
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_EXTERNAL
+from cavmarl.engine.world_setup import load_world
 from cavmarl.env.recorded_inputs import INPUTS
 from cavmarl.recordings.extra_tables import RecordOptions
 from cavmarl.recordings.recording import Recording
+from cavmarl.traffic.scenarios.lane_matching import LaneMatcher
+from cavmarl.traffic.scenarios.library import plan_scene
 from cavmarl.verify.recorded_runs import repeat_recording
 from tests.support.logged_scenes import (
     ASIDE_M,
     TIMES,
+    lane_lines,
     scenario,
     track,
     write_json_scene,
@@ -279,6 +283,25 @@ def test_a_recorded_run_is_repeated(scene: Path, tmp_path: Path) -> None:
         assert (found.first_difference, found.state_hash) == (None, wanted)
 
 
+def test_a_recorded_run_is_repeated_with_a_moved_scene_only_if_it_is_the_same(
+    scene: Path, tmp_path: Path
+) -> None:
+    record = RecordOptions(tmp_path / "run", include=(INPUTS,))
+    with closing(parallel_env(scene, record=record)) as env:
+        env.reset(seed=0)
+        advance(env, 10)
+        wanted = env.state_hash()
+    moved = tmp_path / "moved"
+    moved.mkdir()
+    (moved / scene.name).write_bytes(scene.read_bytes())
+    found = repeat_recording(tmp_path / "run", WorldSpec.of(moved / scene.name))
+    assert (found.first_difference, found.state_hash) == (None, wanted)
+    changed = scenario()
+    changed["tracks"]["8"]["state"]["position"][:, 0] += 1.0
+    with pytest.raises(ConfigError, match="was recorded on another map"):
+        repeat_recording(tmp_path / "run", WorldSpec.of(write_pickle(moved, changed)))
+
+
 def test_the_caller_can_pose_vehicles_beside_the_replayed_ones(scene: Path) -> None:
     with closing(made(scene, overrides={"population.external": 2})) as env:
         slot = env.external.spawn(-30.0, 40.0, 0.0)
@@ -353,6 +376,29 @@ def test_an_agent_s_vehicle_must_not_overlap_another_one(tmp_path: Path) -> None
         parallel_env(path, overrides={"scenario.seats": ["7"]})
     with closing(made(path)) as env:  # chosen automatically, another vehicle is the agent's
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([80.0], abs=1e-4)
+
+
+def test_where_lanes_diverge_the_log_decides_on_which_an_agent_is(tmp_path: Path) -> None:
+    lines = lane_lines()
+    line = np.concatenate([lines["tWN"], lines["outN"][1:]])[:, :2]
+    steps = np.diff(line, axis=0)
+    along = np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
+    at = 1.0 + 0.5 * np.arange(TIMES)
+    heading = np.interp(at, along[:-1], np.arctan2(steps[:, 1], steps[:, 0]))
+    turner = track(0.0, 0.0, 1.0, 0.0)
+    for axis, aside in enumerate((np.sin(heading), -np.cos(heading))):  # 0.5 m on the right
+        turner["state"]["position"][:, axis] = np.interp(at, along, line[:, axis]) + 0.5 * aside
+    turner["state"]["heading"][:] = heading
+    scene = scenario()
+    scene["tracks"] = {"turner": turner}
+    world = load_world(write_pickle(tmp_path, scene), overrides={"scenario.seats": ["turner"]})
+    found = plan_scene(world.config.scenario, world.network, 1)
+    assert found is not None
+    matcher = LaneMatcher(world.network)
+    x, y = turner["state"]["position"][-1, :2].tolist()
+    end = matcher.place(x, y, float(heading[-1]))
+    assert end is not None
+    assert found.seats[0].goal_edge == matcher.edge(end.lane, is_start=False)
 
 
 def test_a_missing_or_hostile_file_is_a_typed_error(tmp_path: Path) -> None:

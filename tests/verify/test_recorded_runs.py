@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import threading
 from contextlib import closing
 from dataclasses import replace
@@ -121,6 +122,22 @@ def test_another_world_is_refused_by_its_keys(recorded: tuple[Path, list[str]]) 
         repeat_recording(recorded[0], other)
     with pytest.raises(ConfigError, match="on another map"):
         repeat_recording(recorded[0], replace(SPEC, env="ring"))
+
+
+def test_keys_that_are_newer_than_a_recording_have_their_defaults(
+    recorded: tuple[Path, list[str]], tmp_path: Path
+) -> None:
+    path, found = recorded
+    older = tmp_path / "older"
+    shutil.copytree(path, older)
+    manifest = json.loads((older / "recording.json").read_text(encoding="utf-8"))
+    del manifest["manifest"]["world"]["config"]["scenario"]["seats"]
+    del manifest["manifest"]["world"]["config"]["map"]["changed_lanes"]
+    (older / "recording.json").write_text(json.dumps(manifest), encoding="utf-8")
+    assert repeat_recording(older, SPEC).state_hash == found[-1]
+    other = replace(SPEC, overrides={**SETTINGS, "map.changed_lanes": 2})
+    with pytest.raises(ConfigError, match=r"map\.changed_lanes = 2, recorded with 0"):
+        repeat_recording(older, other)
 
 
 def test_a_recording_without_commands_cannot_be_repeated(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from cavmarl.maps.scenes.logged_scene import wrapped
 Numbers = NDArray[np.float64]
 
 NEVER_M = 1e10  # distance without another object
+CORNER_SHARE = 0.7  # radius of the corners of an object, as a share of half its shorter side
 MOST_TTC_S = 5.0
 _ASKEW_RAD = math.radians(75.0)  # a vehicle is followed up to this difference in heading,
 _SLIGHTLY_RAD = math.radians(10.0)  # or this one, if less than `_OVERLAP_M` is ahead
@@ -124,11 +125,16 @@ def corners_of(poses: Numbers, sizes_m: Numbers) -> Numbers:
 
 
 def _distances(objects: Trajectories, evaluated: int) -> Numbers:
-    """Return (E, T) the signed distance to the nearest other object; negative: overlap."""
-    corners = corners_of(objects.poses, objects.sizes_m)
+    """Return (E, T) the signed distance to the nearest other object; negative: overlap.
+
+    Objects are boxes with round corners: all points within a radius of a smaller box, the core.
+    """
+    radius = 0.5 * CORNER_SHARE * objects.sizes_m.min(axis=1)
+    cores = replace(objects, sizes_m=objects.sizes_m - 2.0 * radius[:, None])
+    corners = corners_of(cores.poses, cores.sizes_m)
     found = np.full(objects.valid[:evaluated].shape, NEVER_M)
     for k in range(evaluated):
-        apart = signed_distances(objects, corners, k)
+        apart = signed_distances(cores, corners, k) - (radius + radius[k])[:, None]
         both = objects.valid & objects.valid[k]
         both[k] = False
         found[k] = np.where(both, apart, NEVER_M).min(axis=0)

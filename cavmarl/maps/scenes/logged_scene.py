@@ -152,6 +152,7 @@ def checked_track(
 def without_jumps(tracks: Sequence[Track], step_s: float) -> tuple[list[Track], int]:
     """Cut tracks where they jump. Return the tracks and the number of jumps."""
     found: list[Track] = []
+    names = {track.name for track in tracks}
     jumps = 0
     for track in tracks:
         cuts = [0]
@@ -164,7 +165,11 @@ def without_jumps(tracks: Sequence[Track], step_s: float) -> tuple[list[Track], 
         for number, (start, end) in enumerate(pairwise([*cuts, len(track.valid)])):
             valid = track.valid.copy()
             valid[:start] = valid[end:] = False
-            name = track.name if number == 0 else f"{track.name}#{number + 1}"
+            name = track.name
+            while number and (name == track.name or name in names):
+                number += 1
+                name = f"{track.name}#{number}"
+            names.add(name)
             found.append(replace(track, name=name, valid=valid))
     return found, jumps
 

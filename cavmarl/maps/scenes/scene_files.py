@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import MapError
-from cavmarl.core.math.elementary_arrays import cos_all, sin_all
+from cavmarl.core.math.elementary_arrays import cos_all, hypot_all, sin_all
 from cavmarl.core.scene_names import is_scene_file
 from cavmarl.maps.scenes.logged_scene import (
     FARTHEST_M,
@@ -32,11 +32,15 @@ from cavmarl.maps.scenes.logged_scene import (
 )
 from cavmarl.maps.scenes.scene_pickle import unpickle
 
-MOST_BYTES = 1 << 30
+MOST_BYTES = 1 << 26
 MOST_TIMES = 100_000
+MOST_TRACKS = 4_000  # 900 in Waymo's scenes
+MOST_SAMPLES = 10_000_000  # of all tracks; in a pickle, tracks may share their arrays
 GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
-_KMH_PER_MPH = 1.609344
+_ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; share of points that are further from the direction
+# Waymo states the first two, and nuPlan the last one.
+_MPS_PER_UNIT = (("kmh", 1.0 / 3.6), ("mph", 0.44704), ("mps", 1.0))
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
 _GPUDRIVE_FREEWAY, _GPUDRIVE_BIKE_LANE = 1, 3  # map_element_id
 
@@ -108,6 +112,7 @@ def _scenarionet(scene: Any) -> LoggedScene:
         raise MapError(f"length = {length!r}: must be a whole number from 1 to {MOST_TIMES}")
     length = int(length)
     step_s = _step_of(meta.get("ts"), length)
+    _check_size(len(_mapping(scene.get("tracks"), "tracks")), length)
     tracks = []
     for name, entry in _mapping(scene.get("tracks"), "tracks").items():
         track = _scenarionet_track(str(name), _mapping(entry, f"track '{name}'"), length, counts)
@@ -117,7 +122,9 @@ def _scenarionet(scene: Any) -> LoggedScene:
     for name, entry in _mapping(scene.get("map_features"), "map_features").items():
         entry = _mapping(entry, f"map feature '{name}'")
         kind = str(entry.get("type", ""))
-        if kind.startswith("ROAD_EDGE"):
+        if kind == "ROAD_EDGE_SIDEWALK" and "polyline" not in entry:
+            counts.add("sidewalks ignored")  # areas, with a polygon instead of a line
+        elif kind.startswith("ROAD_EDGE"):
             edges.append(_points(entry.get("polyline"), f"road edge '{name}'", 2))
         elif not kind.startswith("LANE"):
             counts.add(_ignored(kind.startswith("ROAD_LINE"), kind))
@@ -125,6 +132,10 @@ def _scenarionet(scene: Any) -> LoggedScene:
             counts.add("bicycle lanes ignored")
         else:
             lanes.append(_scenarionet_lane(str(name), entry, "FREEWAY" in kind))
+    if _have_headings(lanes):
+        flat = [np.concatenate([lane.points[:, :2], 0.0 * lane.points[:, 2:]], 1) for lane in lanes]
+        lanes = [lane._replace(points=points) for lane, points in zip(lanes, flat, strict=True)]
+        counts.add("lanes with headings in place of heights: height 0", len(lanes))
     if lights := len(_mapping(scene.get("dynamic_map_states") or {}, "dynamic_map_states")):
         counts.add("traffic lights ignored", lights)
     own = str(meta.get("sdc_id", ""))
@@ -167,17 +178,31 @@ def _scenarionet_track(
 
 
 def _scenarionet_lane(name: str, entry: Mapping[str, Any], is_freeway: bool) -> SceneLane:
-    kmh, mph = (_number(entry.get(f"speed_limit_{unit}")) for unit in ("kmh", "mph"))
-    speed = mph * _KMH_PER_MPH if kmh is None and mph is not None else kmh
+    limits = ((_number(entry.get(f"speed_limit_{unit}")), factor) for unit, factor in _MPS_PER_UNIT)
+    speed = next((value * factor for value, factor in limits if value is not None), None)
     exits = entry.get("exit_lanes")
     return SceneLane(
         name,
         _points(entry.get("polyline"), f"lane '{name}'", 3),
         is_freeway,
-        None if speed is None else speed / 3.6,
+        speed,
         None,
         tuple(map(str, exits)) if isinstance(exits, list | tuple | np.ndarray) else None,
     )
+
+
+def _have_headings(lanes: Sequence[SceneLane]) -> bool:
+    """Return whether the third column of the lanes is their direction, as in scenes of nuScenes."""
+    apart = []
+    for lane in lanes:
+        moves = np.diff(lane.points, axis=0)
+        length = hypot_all(moves[:, 0], moves[:, 1])
+        moves, headings = moves[length > 0.0], lane.points[:-1, 2][length > 0.0]
+        along = moves[:, 0] * cos_all(headings) + moves[:, 1] * sin_all(headings)
+        apart.append(along < _ALONG_COS * length[length > 0.0])
+    far = np.concatenate([np.zeros(0, dtype=np.bool_), *apart])
+    is_flat = all((lane.points[:, 2] == lane.points[0, 2]).all() for lane in lanes)
+    return not is_flat and float(np.mean(far)) < _MOST_MISFITS
 
 
 def _number(value: Any) -> float | None:
@@ -219,6 +244,7 @@ def _gpudrive(scene: Any) -> LoggedScene:
             f"objects have {sorted(lengths)[:5]} samples: must all have the same number; pad them "
             "with samples that are not valid"
         )
+    _check_size(len(parts), max(lengths, default=0))
     factor = _heading_unit([part for part in parts if part is not None])
     if factor != 1.0:
         counts.add("scene with headings in degrees, as their directions of motion show")
@@ -333,6 +359,14 @@ def _scene(
     return LoggedScene(name, step_s, lanes, edges, tracks, own, present, counts.notes())
 
 
+def _check_size(tracks: int, length: int) -> None:
+    if tracks > MOST_TRACKS or tracks * length > MOST_SAMPLES:
+        raise MapError(
+            f"{tracks} tracks of {length} samples: must be at most {MOST_TRACKS} tracks, and "
+            f"{MOST_SAMPLES} samples of all together; cut the scene into parts"
+        )
+
+
 def _mapping(value: Any, what: str) -> Mapping[str, Any]:
     if not isinstance(value, Mapping):
         raise MapError(f"{what}: must be a mapping, is {type(value).__name__}: give {_KNOWN}")
@@ -345,12 +379,31 @@ def _list(value: Any, what: str) -> list[Any]:
     return value
 
 
-def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numbers:
-    """Return numbers (length, one of `columns`)."""
+def _numbers(value: Any, what: str) -> Numbers:
+    """Return an array; rows of lists have at most 3 numbers.
+
+    In a pickle, lists of shared lists could stand for any amount of memory.
+    """
     try:
-        found = np.asarray(value, dtype=np.float64)
+        if isinstance(value, list | tuple) and not all(map(_is_row, value)):
+            raise ValueError("long rows")
+        return np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError, RecursionError) as error:
         raise MapError(f"{what}: must be an array of numbers; export the scene again") from error
+
+
+def _is_row(value: object) -> bool:
+    """Return whether a value is a number or has at most 3 numbers."""
+    if isinstance(value, list | tuple):
+        return len(value) <= 3 and not any(
+            isinstance(one, list | tuple | np.ndarray) for one in value
+        )
+    return not isinstance(value, np.ndarray) or value.size <= 3
+
+
+def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numbers:
+    """Return numbers (length, one of `columns`)."""
+    found = _numbers(value, what)
     if found.ndim == 1 and columns == (1,):
         found = found[:, None]
     if found.ndim != 2 or found.shape[0] != length or found.shape[1] not in columns:
@@ -363,10 +416,7 @@ def _array(value: Any, what: str, length: int, columns: tuple[int, ...]) -> Numb
 
 def _points(value: Any, what: str, columns: int) -> Numbers:
     """Return the points (n, columns) of a polyline; missing heights are 0."""
-    try:
-        found = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError, OverflowError, RecursionError) as error:
-        raise MapError(f"{what}: must have points x, y (z); export the scene again") from error
+    found = _numbers(value, what)
     if found.ndim != 2 or found.shape[1] not in (2, 3) or not len(found):
         raise MapError(f"{what}: has the shape {found.shape}: must have points x, y (z)")
     if not (np.abs(found) <= FARTHEST_M).all():

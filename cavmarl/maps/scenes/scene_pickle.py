@@ -1,9 +1,9 @@
 """Reads pickles of strangers: only builtins and NumPy's arrays of numbers and text.
 
-A pickle can call any function that it names. This reader knows a fixed list of names, and replaces
-NumPy's functions by versions that check their arguments. Before that, it checks the operations: a
-place in the memo beyond their number, or a length beyond the content, could reserve any amount of
-memory.
+A pickle can call any function that it names, and set the state and the attributes of any object
+that it has. This reader knows a fixed list of names, and replaces NumPy's functions and types by
+versions that check arguments and states. Before that, it checks the operations: a place in the memo
+beyond their number, or a length beyond the content, could reserve any amount of memory.
 """
 
 from __future__ import annotations
@@ -25,30 +25,83 @@ _FORBIDDEN = frozenset(
 _KINDS = "biufSU"  # kinds of numbers and text; objects and records could contain anything
 
 
+_NONE = object()  # an argument that was not given
+
+
 class _ForbiddenError(pickle.UnpicklingError):
-    """The pickle names something that is not on the list."""
+    """The pickle names something that is not on the list, or changes it."""
 
 
-def _array(subtype: type[Any], shape: object, code: object) -> Any:
-    """Return an empty array; its content follows in the pickle, and memory only with it."""
+class _Function:
+    """A function that a pickle may call. The pickle can set no attribute of it."""
+
+    __slots__ = ("_function",)
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self._function = function
+
+    def __call__(
+        self, first: Any, second: Any = _NONE, third: Any = _NONE, fourth: Any = _NONE
+    ) -> Any:
+        given = (first, second, third, fourth)
+        return self._function(*(one for one in given if one is not _NONE))
+
+    def __setstate__(self, state: object) -> None:
+        raise _ForbiddenError("a changed function")
+
+
+class _Type:
+    """A dtype of numbers or text. Its state is only the byte order.
+
+    NumPy would also take flags from the state, which say that an array contains objects.
+    """
+
+    __slots__ = ("dtype",)
+
+    def __init__(self, code: str, align: bool = False, copy: bool = True) -> None:
+        del align, copy
+        self.dtype = np.dtype(code)
+        if self.dtype.kind not in _KINDS or not self.dtype.itemsize:
+            raise _ForbiddenError(f"an array of dtype {str(code)[:40]!r}")
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, order, subtype, names, fields = state[:5]
+        if (subtype, names, fields) != (None, None, None) or order not in ("<", ">", "|", "="):
+            raise _ForbiddenError("an array of records")
+        self.dtype = self.dtype.newbyteorder(order)
+
+
+class _Array(np.ndarray[Any, Any]):
+    """An array whose content follows in the pickle, and whose memory is reserved only with it."""
+
+    def __setstate__(self, state: tuple[Any, ...]) -> None:
+        _, shape, kind, is_fortran, data = state
+        super().__setstate__((1, shape, _dtype_of(kind), is_fortran, _bytes_of(data)))
+
+
+def _dtype_of(kind: object) -> np.dtype[Any]:
+    if not isinstance(kind, _Type):
+        raise _ForbiddenError("an array without a dtype")
+    return kind.dtype
+
+
+def _bytes_of(data: object) -> bytes:
+    if not isinstance(data, bytes | bytearray):
+        raise _ForbiddenError("an array of objects")
+    return bytes(data)
+
+
+def _array(subtype: object, shape: object, code: object) -> Any:
     del subtype, shape, code
-    return np.ndarray.__new__(np.ndarray, (0,), "b")
+    return np.ndarray.__new__(_Array, (0,), "b")
 
 
-def _dtype(code: str, align: bool = False, copy: bool = True) -> np.dtype[Any]:
-    del align, copy
-    found = np.dtype(code)
-    if found.kind not in _KINDS or found.names is not None:
-        raise _ForbiddenError(f"an array of dtype {str(code)[:40]!r}")
-    return found
+def _scalar(kind: object, data: object) -> Any:
+    return np.frombuffer(_bytes_of(data), _dtype_of(kind), 1)[0]
 
 
-def _scalar(dtype: np.dtype[Any], data: bytes) -> Any:
-    return np.frombuffer(data, _dtype(dtype.str), 1)[0]
-
-
-def _from_buffer(data: bytes, dtype: np.dtype[Any], shape: tuple[int, ...], order: str) -> Any:
-    found = np.frombuffer(data, _dtype(dtype.str))
+def _from_buffer(data: object, kind: object, shape: tuple[int, ...], order: str) -> Any:
+    found = np.frombuffer(_bytes_of(data), _dtype_of(kind))
     return found.reshape(shape, order="F" if order == "F" else "C")
 
 
@@ -58,15 +111,15 @@ def _encoded(text: str, encoding: str = "latin1") -> bytes:
     return text.encode("latin1")
 
 
-_NUMPY: dict[str, Callable[..., Any]] = {
-    "_reconstruct": _array,
-    "scalar": _scalar,
-    "_frombuffer": _from_buffer,
+_NUMPY: dict[str, _Function] = {
+    "_reconstruct": _Function(_array),
+    "scalar": _Function(_scalar),
+    "_frombuffer": _Function(_from_buffer),
 }
 _NAMES: dict[tuple[str, str], Any] = {
     ("numpy", "ndarray"): "ndarray",  # only the first argument of `_reconstruct`: not callable
-    ("numpy", "dtype"): _dtype,
-    ("_codecs", "encode"): _encoded,
+    ("numpy", "dtype"): _Function(_Type),
+    ("_codecs", "encode"): _Function(_encoded),
     ("collections", "OrderedDict"): OrderedDict,
     ("collections", "defaultdict"): defaultdict,
     **{

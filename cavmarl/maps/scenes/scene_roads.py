@@ -33,6 +33,8 @@ _LEVEL_M = 3.0  # along, between the ends of neighbours
 _INNER_M = 200.0  # the longest path over a junction
 _NEAR_M = 2.0  # closer paths are in conflict
 _SAMPLE_M = 1.0
+_BLOCK = 256  # samples that are compared at once
+_MOST_M = 1e6  # length of all lanes together
 _STRAIGHT_RAD, _BACK_RAD = 0.52, 2.62  # 30° and 150°
 _HEIGHT_M = 3.0  # a larger difference in height is a bridge
 
@@ -74,7 +76,7 @@ class _Movement(NamedTuple):
 def scene_network(scene: LoggedScene) -> SceneNetwork:
     """Return the SUMO network of a scene.
 
-    Raises MapError: no lane is long enough to drive on.
+    Raises MapError: no lane is long enough to drive on, or the lanes are too long.
     """
     lanes, short = _lanes_of(scene)
     if not lanes:
@@ -95,13 +97,19 @@ def scene_network(scene: LoggedScene) -> SceneNetwork:
 
 
 def _lanes_of(scene: LoggedScene) -> tuple[list[_Lane], int]:
-    lanes, short = [], 0
+    lanes, short, total = [], 0, 0.0
     for lane in scene.lanes:
         points = _without_repeats(lane.points)
         along = _arc_lengths(points)
         if along[-1] < _SHORTEST_M:
             short += 1
             continue
+        total += float(along[-1])
+        if total > _MOST_M:
+            raise MapError(
+                f"the lanes are longer than {_MOST_M:g} m together: a lane has wrong points, or "
+                "the scene has to be cut into parts"
+            )
         count = int(along[-1] / _SAMPLE_M) + 2
         at = np.arange(count) * (along[-1] / (count - 1))
         samples = np.stack([np.interp(at, along, points[:, k]) for k in range(3)], axis=1)
@@ -176,10 +184,16 @@ def _near_pairs(lanes: Sequence[_Lane]) -> dict[int, set[int]]:
 
 
 def _is_near(one: Numbers, other: Numbers) -> bool:
-    east = one[:, None, 0] - other[None, :, 0]
-    north = one[:, None, 1] - other[None, :, 1]
-    level = np.abs(one[:, None, 2] - other[None, :, 2]) < _HEIGHT_M
-    return bool((level & (east * east + north * north < _NEAR_M * _NEAR_M)).any())
+    for start in range(0, len(one), _BLOCK):
+        part = one[start : start + _BLOCK]
+        low, high = part.min(axis=0) - _HEIGHT_M, part.max(axis=0) + _HEIGHT_M
+        near = other[((other >= low) & (other <= high)).all(axis=1)]
+        east = part[:, None, 0] - near[None, :, 0]
+        north = part[:, None, 1] - near[None, :, 1]
+        level = np.abs(part[:, None, 2] - near[None, :, 2]) < _HEIGHT_M
+        if (level & (east * east + north * north < _NEAR_M * _NEAR_M)).any():
+            return True
+    return False
 
 
 def _inner_lanes(lanes: Sequence[_Lane], near: dict[int, set[int]]) -> set[int]:

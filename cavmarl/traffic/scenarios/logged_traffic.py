@@ -173,12 +173,15 @@ class _Casting:
             return f"is a {track.kind}, not a vehicle"
         if not track.valid[self._first]:
             return f"was not seen at {self._first * self._log.step_s:g} s"
-        place = self._place(track, self._first)
-        if place is None:
+        places = self._matcher.lanes(*track.poses[self._first].tolist())
+        if not places:
             return "is not on a lane in its direction"
         if self._overlaps(track):
             return f"overlaps another road user at {self._first * self._log.step_s:g} s"
-        return self._seat_at(track, place, self._first, self._goal(track, place))
+        # Where lanes diverge, the lane that leads farthest along the log is that of the vehicle.
+        goals = [self._goal(track, place) for place in places]
+        best = max(range(len(places)), key=lambda k: (goals[k][0], -k))
+        return self._seat_at(track, places[best], self._first, goals[best][1])
 
     def _seat_at(self, track: Track, place: LanePlace, time: int, goal: int) -> Seat:
         x, y, heading = track.poses[time].tolist()
@@ -197,8 +200,8 @@ class _Casting:
         number = next(k for k, one in enumerate(present) if one.name == track.name)
         return bool(boxes_meet(poses, half)[number].any())
 
-    def _goal(self, track: Track, start: LanePlace) -> int:
-        """Return the last logged edge to which a way leads."""
+    def _goal(self, track: Track, start: LanePlace) -> tuple[int, int]:
+        """Return the last time whose logged edge a way leads to, and that edge."""
         times = track.times[track.times >= self._first][::-1]
         tried: set[int] = set()
         for time in times[::GOAL_STEPS].tolist():
@@ -211,8 +214,8 @@ class _Casting:
             tried.add(edge)
             plan = make_plans(self._network, [edge])[0]
             if np.isfinite(plan["to_go"][start.lane]) and plan["to_go"][start.lane] > start.s:
-                return edge
-        return self._matcher.edge(start.lane, is_start=False)
+                return time, edge
+        return self._first, self._matcher.edge(start.lane, is_start=False)
 
     def _reaction(self, track: Track) -> ReactingVehicle | None:
         """Return the way of a vehicle that drives by itself; None: it has to be replayed."""

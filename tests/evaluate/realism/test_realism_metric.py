@@ -12,7 +12,14 @@ from numpy.typing import NDArray
 from cavmarl import ScenarioError
 from cavmarl.evaluate.realism.realism_metric import COMPONENTS, realism_of
 from cavmarl.evaluate.realism.rollout_features import Trajectories, features_of
-from tests.naive.realism import WEIGHTS, Body, body_distance, corners, edge_distance, likelihoods
+from tests.naive.realism import (
+    WEIGHTS,
+    Body,
+    corners,
+    edge_distance,
+    likelihoods,
+    object_distance,
+)
 from tests.support.logged_scenes import edge_lines
 
 STEP_S = 0.1
@@ -121,10 +128,21 @@ def test_distances_of_bodies_equal_those_of_minkowski_differences() -> None:
         poses, sizes = random_boxes(random, 2)
         objects = Trajectories(poses, np.ones((2, 1), np.bool_), sizes)
         found = features_of(objects, 1, EDGES, STEP_S).distance_to_nearest_object[0, 0]
-        boxes = [corners(tuple(poses[k, 0]), *sizes[k]) for k in (0, 1)]
-        assert found == pytest.approx(body_distance(*boxes), abs=1e-9)
+        boxes = [(tuple(poses[k, 0]), *sizes[k]) for k in (0, 1)]
+        assert found == pytest.approx(object_distance(*boxes), abs=1e-9)
         negative += found < 0.0
     assert 30 < negative < 270
+
+
+def test_objects_have_round_corners() -> None:
+    """Two squares touch with their corners only: the round objects are apart."""
+    apart = 0.7 * 2.0 * (math.sqrt(2.0) - 1.0)  # radius 0.7 m, of both
+    for shift, expected in ((2.0, apart), (1.9, apart - 0.1 * math.sqrt(2.0))):
+        poses = np.array([[[0.0, 0.0, 0.0]], [[shift, shift, 0.0]]])
+        objects = Trajectories(poses, np.ones((2, 1), np.bool_), np.full((2, 2), 2.0))
+        found = features_of(objects, 2, EDGES, STEP_S)
+        assert found.distance_to_nearest_object == pytest.approx(expected)
+        assert not found.collided.any()
 
 
 def test_distances_to_road_edges_have_the_sign_of_the_side() -> None:

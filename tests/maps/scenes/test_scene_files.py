@@ -96,6 +96,9 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "content",
     [
+        # a function of the reader with other defaults, which later scenes would get
+        b"\x80\x02c_codecs\nencode\nN}X\x0c\x00\x00\x00__defaults__)s\x86b.",
+        b"\x80\x02c_codecs\nencode\n}X\x01\x00\x00\x00aNsb.",
         b"\x80\x02Nr\xff\xff\xff\x7f.",  # a place in the memo that needs 32 GB
         b"\x80\x05\x96\x00\x00\x00\x00\x01\x00\x00\x00.",  # a bytearray of 4 GB
         b"\x80\x05\x97.",  # a buffer outside of the pickle
@@ -105,6 +108,68 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
 def test_pickles_that_reserve_memory_or_call_back_are_refused(content: bytes) -> None:
     with pytest.raises(MapError, match=r"only builtins|broken pickle"):
         unpickle(content)
+
+
+@pytest.mark.parametrize("code", [">f8", ">f4", ">i4", ">U3", "<f8"])
+def test_arrays_of_any_byte_order_are_read(code: str) -> None:
+    numbers = np.arange(3).astype(code)
+    for protocol in (2, 5):
+        assert unpickle(pickle.dumps(numbers, protocol)).tolist() == numbers.tolist()
+        assert unpickle(pickle.dumps(numbers[1], protocol)) == numbers[1]
+
+
+def test_a_state_cannot_make_objects_of_the_bytes_of_an_array() -> None:
+    content = pickle.dumps(np.array([b"abcdefgh"]), 2)
+    state = b"NNNK\x08K\x01K\x00t"  # subtype, names, fields, size, alignment and flags
+    assert content.count(state) == 1
+    found = unpickle(content.replace(state, b"NNNK\x08K\x01K\x3ft"))  # flags: contains objects
+    assert not found.dtype.hasobject
+    assert found.tolist() == [b"abcdefgh"]
+    named = content.replace(state, b"N)}K\x08K\x01K\x00t")
+    with pytest.raises(MapError, match="an array of records"):
+        unpickle(named)
+
+
+def test_items_of_no_size_are_refused() -> None:
+    """Any number of such items needs no memory in the file."""
+    with pytest.raises(MapError, match="an array of dtype 'S0'"):
+        unpickle(pickle.dumps(Hostile(np.dtype, "S0")))
+
+
+def _shared(scene: dict[str, Any]) -> None:
+    rows: list[Any] = [[0.0, 0.0, 0.0]]
+    for _ in range(12):
+        rows = [rows] * 8  # 8 ** 12 numbers in 100 bytes
+    scene["map_features"]["inE"]["polyline"] = rows
+
+
+def _crowd(scene: dict[str, Any]) -> None:
+    scene["tracks"] |= {str(k): scene["tracks"]["parked"] for k in range(5000)}
+
+
+def _many_samples(scene: dict[str, Any]) -> None:
+    scene["length"] = 90_000
+    scene["metadata"]["ts"] = np.arange(90_000) * 0.1
+    scene["tracks"] |= {str(k): scene["tracks"]["parked"] for k in range(200)}
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (_shared, "lane 'inE': must be an array of numbers"),
+        (_crowd, "5003 tracks of 91 samples: must be at most 4000 tracks"),
+        (_many_samples, "203 tracks of 90000 samples"),
+    ],
+)
+def test_shared_content_of_a_pickle_cannot_fill_the_memory(
+    change: Change, message: str, tmp_path: Path
+) -> None:
+    scene = scenario()
+    change(scene)
+    path = write_pickle(tmp_path, scene)
+    assert path.stat().st_size < 3_000_000
+    with pytest.raises(MapError, match=message):
+        read_scene(path)
 
 
 @pytest.mark.parametrize(
@@ -201,6 +266,63 @@ def test_jumps_cut_a_track_and_overlaps_are_counted(tmp_path: Path) -> None:
     assert (first.name, second.name) == ("8", "8#2")
     assert first.times.tolist() == list(range(50))
     assert second.times.tolist() == list(range(50, TIMES))
+
+
+def test_parts_of_tracks_get_names_of_their_own(tmp_path: Path) -> None:
+    scene = scenario()
+    scene["tracks"]["8"]["state"]["position"][50:, 0] -= 60.0
+    scene["tracks"]["8#2"] = scene["tracks"]["parked"]
+    names = [track.name for track in read_scene(write_pickle(tmp_path, scene)).tracks]
+    assert names == ["7", "8", "8#3", "9", "walker", "rider", "parked", "8#2"]
+
+
+@pytest.mark.parametrize(
+    ("stated", "mps"),
+    [
+        ({"speed_limit_kmh": 72.0, "speed_limit_mph": 45.0}, 20.0),
+        ({"speed_limit_kmh": 0.0, "speed_limit_mph": 45.0}, 20.1168),
+        ({"speed_limit_mps": 11.2}, 11.2),  # nuPlan
+        ({"speed_limit_mps": None}, None),
+        ({"speed_limit_kmh": 1000.0}, None),  # MetaDrive's default
+        ({}, None),
+    ],
+)
+def test_speed_limits_are_read_in_all_units(
+    stated: dict[str, Any], mps: float | None, tmp_path: Path
+) -> None:
+    scene = scenario()
+    lane = scene["map_features"]["inE"]
+    del lane["speed_limit_kmh"]
+    lane.update(stated)
+    found = read_scene(write_pickle(tmp_path, scene)).lanes[0].speed_mps
+    assert found == (None if mps is None else pytest.approx(mps))
+
+
+def test_headings_in_place_of_heights_are_recognized(tmp_path: Path) -> None:
+    """nuScenes gives the poses of lanes: x, y and the heading."""
+    scene, slope = scenario(), scenario()
+    for number, changed in enumerate((scene, slope)):
+        for feature in changed["map_features"].values():
+            if feature["type"].startswith("LANE"):
+                line = feature["polyline"]
+                moves = np.diff(line, axis=0, append=2.0 * line[-1:] - line[-2:-1])
+                heading = np.arctan2(moves[:, 1], moves[:, 0])
+                line[:, 2] = 0.05 * line[:, 0] if number else heading
+    found = read_scene(write_pickle(tmp_path, scene))
+    assert all((lane.points[:, 2] == 0.0).all() for lane in found.lanes)
+    assert "20 lanes with headings in place of heights: height 0" in found.notes
+    found = read_scene(write_pickle(tmp_path, slope))
+    assert np.ptp(found.lanes[0].points[:, 2]) > 3.0
+    assert not any("headings" in note for note in found.notes)
+
+
+def test_sidewalks_are_ignored_and_counted(tmp_path: Path) -> None:
+    """nuPlan and nuScenes state sidewalks as areas, with a type of road edges."""
+    scene = scenario()
+    scene["map_features"]["walk"] = {"type": "ROAD_EDGE_SIDEWALK", "polygon": np.zeros((4, 2))}
+    found = read_scene(write_pickle(tmp_path, scene))
+    assert "1 sidewalks ignored" in found.notes
+    assert len(found.road_edges) == 4
 
 
 def test_what_is_ignored_is_counted(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from cavmarl import ConfigError
+from cavmarl import ConfigError, MapError
 from cavmarl.maps.netconvert import build_network, map_file
 from cavmarl.maps.scenes.logged_scene import LoggedScene, SceneLane
 from cavmarl.maps.scenes.scene_files import read_scene
@@ -122,3 +122,11 @@ def test_a_scene_is_built_and_kept_like_any_map(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match="leave out all options"):
         build_network(source, tmp_path / "cut.net.xml", bbox=(0.0, 0.0, 1.0, 1.0))
     assert not (tmp_path / "cut.net.xml").exists()
+
+
+def test_lanes_of_absurd_length_are_refused_before_they_need_memory(tmp_path: Path) -> None:
+    long = [(-1e7, 0.0), (1e7, 0.0)]
+    with pytest.raises(MapError, match="longer than 1e"):
+        drawn(long, [(0.0, -1e7), (0.0, 1e7)], folder=tmp_path)
+    network = drawn([(-1e5, 0.0), (1e5, 0.0)], [(0.0, -1e5), (0.0, 1e5)], folder=tmp_path)
+    assert len(network.lanes) == 2
