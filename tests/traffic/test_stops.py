@@ -128,7 +128,8 @@ def test_vehicles_pass_a_vehicle_that_stands_on_another_lane(world: World) -> No
 def test_a_vehicle_that_cannot_change_lanes_takes_another_route(world: World) -> None:
     simulation = world(
         '<vType id="c" sigma="0" speedDev="0"/>'
-        '<trip id="v" type="c" depart="0" from="A1B1" to="D3right3"/>',
+        '<vehicle id="v" type="c" depart="0">'
+        '<route edges="A1B1 B1C1 C1D1 D1D2 D2D3 D3right3"/></vehicle>',
         "grid4x4",
     )
     network, travel = simulation.network, simulation.travel
