@@ -153,7 +153,7 @@ def evacuate(
         found.append(run)
         if run.contacts:
             places = escape(", ".join(run.contact_places) or "roads where no sample shows any")
-            console.print(f"contacts: {run.contacts} vehicles began to touch another; on {places}")
+            console.print(f"contacts: {run.contacts}, on {places}")
         for road in (road for road, count in run.contraflow.items() if not count):
             console.print(f"contraflow: no vehicle used the lanes on {escape(road)}")
         names, *columns = zip(*table_of(run), strict=True)

@@ -81,7 +81,7 @@ class ReversedRoads:
     def _kept(self, world: int, road: int) -> NDArray[np.bool_]:
         """Return which lanes of a road stay closed when it returns."""
         index = np.arange(len(self._own[road]))
-        return (self.states[world, road, _KEPT] >> index) & 1 == 1
+        return np.asarray((self.states[world, road, _KEPT] >> index) & 1, dtype=np.bool_)
 
     def lanes(self, edge: str) -> NDArray[np.intp]:
         """Return the LANE rows of the contraflow lanes of a road."""

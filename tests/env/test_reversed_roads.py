@@ -101,7 +101,9 @@ EVACUEES = (
 def chain(folder: Path) -> Path:
     """Write a world in which one road after another is reversed, with vehicles both ways."""
     words = ["-n", str(folder / "chain.nod.xml"), "-e", str(folder / "chain.edg.xml")]
-    ends = [(a, b) for one in ("WA", "AM", "MN", "NB", "BX") for a, b in (one, one[::-1])]
+    ends = [
+        (a, b) for one in ("WA", "AM", "MN", "NB", "BX") for a, b in (tuple(one), tuple(one[::-1]))
+    ]
     edges = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}"/>' for a, b in ends)
     (folder / "chain.nod.xml").write_text(NODES, encoding="utf-8")
     (folder / "chain.edg.xml").write_text(f"<edges>{edges}</edges>", encoding="utf-8")
