@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from shutil import rmtree
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -25,7 +26,7 @@ from cavmarl.cli.output import (
     make_folder,
     write_json,
 )
-from cavmarl.core.errors import ConfigError, require_all
+from cavmarl.core.errors import CavmarlError, ConfigError, require_all
 from cavmarl.core.progress import counting
 
 if TYPE_CHECKING:
@@ -123,13 +124,19 @@ def evacuate(
     folder = out or Path("runs/evacuate") / f"{Path(where).name.split('.')[0]}-{stamp}"
     if folder.exists() and any(folder.iterdir()):
         raise ConfigError(f"--out {folder}: the folder is not empty; name a new folder")
+    was_there = folder.exists()
     make_folder(folder)
     console = Console()
     found = []
     for number in range(seed, seed + repeats):
         place = folder / f"seed-{number}"
         make_folder(place)
-        prepared = prepare(plan, base, place, number)
+        try:
+            prepared = prepare(plan, base, place, number)
+        except CavmarlError:
+            if number == seed:  # nothing has been written
+                rmtree(place if was_there else folder)
+            raise
         if number == seed:
             if not plan.exits:
                 console.print(f"exits, chosen: {escape(', '.join(prepared.exits))}")
@@ -144,6 +151,11 @@ def evacuate(
                 told=told,
             )
         found.append(run)
+        if run.contacts:
+            places = escape(", ".join(run.contact_places) or "roads where no sample shows any")
+            console.print(f"contacts: {run.contacts}, on {places}")
+        for road in (road for road, count in run.contraflow.items() if not count):
+            console.print(f"contraflow: no vehicle used the lanes on {escape(road)}")
         names, *columns = zip(*table_of(run), strict=True)
         rows = [(title, *cells) for title, cells in zip(FIGURES.values(), columns, strict=True)]
         console.print(grid((f"seed {number}", *map(escape, names)), rows))

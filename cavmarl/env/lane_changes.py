@@ -19,10 +19,10 @@ from cavmarl.engine.world_views import WorldViews
 from cavmarl.env.reversed_roads import (
     AS_ON_MAP,
     CLEARING,
+    QUEUED,
     RETURNING,
     REVERSED_NOW,
     ReversedRoads,
-    wrong_reversals,
 )
 from cavmarl.roads.contraflow_ids import contraflow_of, is_contraflow
 from cavmarl.roads.network import RoadNetwork
@@ -82,7 +82,7 @@ class LaneChanges:
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
         """Return what is wrong with a `memory` from outside; empty if nothing."""
         told, states = memory
-        return wrong_changes(told, self._network.lanes) or wrong_reversals(states)
+        return wrong_changes(told, self._network.lanes) or self._reversed.wrong(states, told)
 
     def close(
         self,
@@ -112,6 +112,9 @@ class LaneChanges:
         if not shuts_in:
             self._refuse_last_way(world, edge, closed)
         self._tell(world, limit_mps, closed, (CLOSED, _detail(edge, lanes)))
+        if self._reversed.state(world, edge) == RETURNING:
+            first = int(self._network.edges["first_lane"][self._edges[edge]])
+            self._reversed.keep_closed(world, edge, rows - first)
 
     def open(self, world: int, edge: str, lanes: Sequence[int] | None = None) -> None:
         """Give lanes of a road the limits and permissions of the map; raises as `close`.
@@ -120,9 +123,14 @@ class LaneChanges:
         """
         rows = self._rows(world, edge, lanes)
         state = self._reversed.state(world, edge)
+        if state == QUEUED:
+            self._reversed.begin(world, edge, AS_ON_MAP)
+            return
+        if state == RETURNING:
+            self._reversed.open_all(world, edge)
+            return
         if state != AS_ON_MAP:
-            if state != RETURNING:
-                self._turn_back(world, edge)
+            self._turn_back(world, edge)
             return
         limit_mps, closed = self._now(world)
         own = self._network.lanes["speed_mps"]
@@ -139,6 +147,8 @@ class LaneChanges:
     ) -> None:
         """Close a road, and open its contraflow lanes once no vehicle is on it.
 
+        If other roads that are being reversed lead to it, the road closes once they are empty.
+
         Raises:
             ActionError: there is no such world or road, it is the last way out of others, it is
                 not one of `map.contraflow`, or `lanes` does not name all of its lanes.
@@ -150,6 +160,8 @@ class LaneChanges:
                 "leave lanes out"
             )
         self._reversed.check(edge)
+        if self._reversed.state(world, edge) in (CLEARING, REVERSED_NOW, QUEUED):
+            return
         before = self._reversed.states[world].copy()
         self._reversed.begin(world, edge, CLEARING)
         try:
@@ -157,6 +169,19 @@ class LaneChanges:
         except (ActionError, CapacityError):
             self._reversed.states[world] = before
             raise
+        for road in self._reversed.to_queue(world):
+            self._queue(world, road)
+
+    def _queue(self, world: int, edge: str) -> None:
+        """Open a road that is to be reversed, until the reversed roads before it are empty."""
+        limit_mps, classes = self._now(world)
+        classes[self._rows(world, edge, None)] = 0
+        closing = (CLOSED, edge)
+        waiting = self._waiting[world]
+        self._reversed.begin(world, edge, QUEUED)
+        self._tell(world, limit_mps, classes, (OPENED, edge))
+        if closing in waiting:  # it has not closed yet
+            self._waiting[world] = tuple(event for event in waiting if event != closing)
 
     def _turn_back(self, world: int, edge: str) -> None:
         """Close the contraflow lanes of a road; it opens once no vehicle is on them."""
@@ -171,17 +196,27 @@ class LaneChanges:
         `ticks`: (W,) of the worlds, before the step.
         """
         for world, tick in enumerate(ticks.tolist() if self._events else ()):
-            for event in self._events:
+            for k, event in enumerate(self._events):
                 due = math.ceil(event.at_s / self._clock.sim_dt_s - 1e-9)
-                if tick - self._clock.ticks_per_step < due <= tick:
+                if not tick - self._clock.ticks_per_step < due <= tick:
+                    continue
+                try:
                     self._happen(world, event)
-        for world, edge, is_reversed in self._reversed.cleared(ticks, self._present):
+                except (ActionError, CapacityError) as error:
+                    raise type(error)(f"map.events.{k}, now: {error}") from error
+        for world, edge in self._reversed.due(ticks):
+            self._reversed.begin(world, edge, CLEARING)
+            self.close(world, edge, shuts_in=True)
+        for world, edge, is_reversed, kept in self._reversed.cleared(ticks, self._present):
             limit_mps, classes = self._now(world)
             road, back = self._rows(world, edge, None), self._reversed.lanes(edge)
             classes[back] = ALL_PERMISSIONS if is_reversed else 0
-            classes[road] = ALL_PERMISSIONS if is_reversed else 0
-            kind = REVERSED if is_reversed else OPENED
-            self._tell(world, limit_mps, classes, (kind, edge))
+            classes[road] = np.where(is_reversed | kept, ALL_PERMISSIONS, 0)
+            if is_reversed:
+                self._tell(world, limit_mps, classes, (REVERSED, edge))
+            elif not kept.all():
+                opened = np.flatnonzero(~kept).tolist() if kept.any() else None
+                self._tell(world, limit_mps, classes, (OPENED, _detail(edge, opened)))
 
     def _happen(self, world: int, event: RoadEvent) -> None:
         """Let an event happen in one world; what has happened already is left out."""
@@ -193,8 +228,7 @@ class LaneChanges:
             elif event.action == "damage":
                 self.limit(world, edge, event.speed_mps or 0.0, event.lanes)
             elif event.action == "reverse":
-                if self._reversed.state(world, edge) not in (CLEARING, REVERSED_NOW):
-                    self.reverse(world, edge, shuts_in=event.shuts_in)
+                self.reverse(world, edge, shuts_in=event.shuts_in)
             elif self._differs(world, edge, event.lanes):
                 self.open(world, edge, event.lanes)
             if np.array_equal(before, self._told[world]):
@@ -203,6 +237,8 @@ class LaneChanges:
     def _differs(self, world: int, edge: str, lanes: Sequence[int] | None) -> bool:
         """Return whether lanes of a road differ from the map."""
         rows = self._rows(world, edge, lanes)
+        if self._reversed.state(world, edge) != AS_ON_MAP:
+            return True
         limit_mps, classes = self._now(world)
         is_slower = limit_mps[rows] != self._network.lanes["speed_mps"][rows]
         return bool((is_slower | (classes[rows] != 0)).any())
@@ -332,7 +368,7 @@ class LaneChanges:
     ) -> None:
         """Let the changes hold from the next step on."""
         differs = np.flatnonzero((limit_mps != self._network.lanes["speed_mps"]) | (closed != 0))
-        number = len(differs) + self._reversed.reserved(world)
+        number = len(np.union1d(differs, self._reversed.reserved(world)))
         if number > self._most:
             raise CapacityError(
                 f"world {world}: {number} lanes would differ from the map, but "

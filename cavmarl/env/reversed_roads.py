@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ActionError
+from cavmarl.core.records.changed_lanes import CHANGED, CLASSES
+from cavmarl.driving.vehicle_types import ALL_PERMISSIONS
 from cavmarl.engine.world_views import WorldViews
 from cavmarl.roads.contraflow_ids import contraflow_of
 from cavmarl.roads.network import RoadNetwork
 
 # States of a road: as on the map; closed, to be reversed once it is empty; reversed; its
-# contraflow lanes are closed, and it opens once they are empty.
-AS_ON_MAP, CLEARING, REVERSED_NOW, RETURNING = range(4)
-_STATE, _SINCE = 0, 1  # columns of `ReversedRoads.states`
+# contraflow lanes are closed, and it opens once they are empty; still open, to be closed once the
+# reversed roads that lead to it are empty, so that their vehicles can leave.
+AS_ON_MAP, CLEARING, REVERSED_NOW, RETURNING, QUEUED = range(5)
+# Columns of `ReversedRoads.states`. KEPT: bits of the lanes that stay closed when a road returns;
+# of a road that is being cleared: whether vehicles may be on its contraflow lanes.
+_STATE, _SINCE, _KEPT = range(3)
 _NOT_YET = -1  # the order belongs to the next step
 
 # Least time between closing lanes and opening those in the other direction. Vehicles that cannot
@@ -28,18 +33,21 @@ class ReversedRoads:
     """The states of the C roads of `map.contraflow` in W worlds.
 
     Attributes:
-        states: (W, C, 2) state of each road, and the tick in which it began.
+        states: (W, C, 3) state of each road, the tick in which it began, and the bits of the lanes
+            that were closed while the road returns.
     """
 
     def __init__(self, config: EnvConfig, network: RoadNetwork, num_worlds: int) -> None:
         self._roads = tuple(sorted(set(config.map.contraflow)))
         self._clock = config.clock
-        self.states = np.zeros((num_worlds, len(self._roads), 2), dtype=np.int64)
+        self.states = np.zeros((num_worlds, len(self._roads), 3), dtype=np.int64)
         edges = {name: row for row, name in enumerate(network.edge_ids)} if self._roads else {}
         self._ground = [_ground(network, edges[road]) for road in self._roads]
         back = [edges[contraflow_of(road)] for road in self._roads]
         self._lanes = [_lanes(network, edge) for edge in back]
         self._above = [_ground(network, edge) for edge in back]
+        self._own = [_lanes(network, edges[road]) for road in self._roads]
+        self._before = _roads_before(network, [edges[road] for road in self._roads])
 
     def check(self, edge: str) -> None:
         """Raise ActionError if a road cannot be reversed."""
@@ -57,23 +65,86 @@ class ReversedRoads:
 
     def begin(self, world: int, edge: str, state: int) -> None:
         """Let a road have another state from the next step on."""
-        self.states[world, self._roads.index(edge)] = state, _NOT_YET
+        road = self._roads.index(edge)
+        is_used = state == CLEARING and self.states[world, road, _STATE] == RETURNING
+        self.states[world, road] = state, _NOT_YET, int(is_used)
+
+    def keep_closed(self, world: int, edge: str, lanes: NDArray[np.intp]) -> None:
+        """Let lanes of a road that returns stay closed; `lanes`: their indices."""
+        bits = np.bitwise_or.reduce(np.int64(1) << lanes.astype(np.int64))
+        self.states[world, self._roads.index(edge), _KEPT] |= bits
+
+    def open_all(self, world: int, edge: str) -> None:
+        """Let all lanes of a road that returns open."""
+        self.states[world, self._roads.index(edge), _KEPT] = 0
+
+    def _kept(self, world: int, road: int) -> NDArray[np.bool_]:
+        """Return which lanes of a road stay closed when it returns."""
+        index = np.arange(len(self._own[road]))
+        return np.asarray((self.states[world, road, _KEPT] >> index) & 1, dtype=np.bool_)
 
     def lanes(self, edge: str) -> NDArray[np.intp]:
         """Return the LANE rows of the contraflow lanes of a road."""
         return self._lanes[self._roads.index(edge)]
 
-    def reserved(self, world: int) -> int:
-        """Return the number of contraflow lanes that will open."""
-        waiting = np.flatnonzero(self.states[world, :, _STATE] == CLEARING)
-        return sum(len(self._lanes[road]) for road in waiting.tolist())
+    def reserved(self, world: int) -> NDArray[np.intp]:
+        """Return the LANE rows of lanes that will close or open to reverse roads."""
+        state = self.states[world, :, _STATE]
+        found = [self._lanes[road] for road in np.flatnonzero(state == CLEARING).tolist()]
+        for road in np.flatnonzero(state == QUEUED).tolist():
+            found += [self._own[road], self._lanes[road]]
+        return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
+
+    def to_queue(self, world: int) -> list[str]:
+        """Return the roads that are closed before the reversed roads that lead to them are empty.
+
+        They have to open again, so that vehicles on the other roads can leave.
+        """
+        state = self.states[world, :, _STATE]
+        waits = self._before @ ((state == QUEUED) | (state == CLEARING))
+        waits &= (state == CLEARING) & (self.states[world, :, _KEPT] == 0)
+        return [self._roads[road] for road in np.flatnonzero(waits).tolist()]
+
+    def due(self, ticks: NDArray[np.int64]) -> list[tuple[int, str]]:
+        """Return each world and road that closes in the next step; `ticks` as for `cleared`."""
+        state = self.states[..., _STATE]
+        waits = ((state == QUEUED) | (state == CLEARING)) @ self._before.T
+        runs = np.broadcast_to(ticks, len(state))[:, np.newaxis] >= 0
+        return [
+            (world, self._roads[road])
+            for world, road in np.argwhere((state == QUEUED) & ~waits & runs).tolist()
+        ]
+
+    def wrong(self, states: NDArray[np.int64], told: NDArray[np.float64]) -> str:
+        """Return what is wrong with `states` from outside; empty if nothing.
+
+        `told`: (W, N, 3) changed lanes that were saved beside them; see `changed_lanes`.
+        """
+        state, since, kept = np.moveaxis(states, -1, 0)
+        if ((state < AS_ON_MAP) | (state > QUEUED)).any() or (since < _NOT_YET).any():
+            return "a reversed road has an unknown state"
+        most = np.where(state == RETURNING, np.iinfo(np.int64).max, state == CLEARING)
+        if ((kept < 0) | (kept > most)).any():
+            return "a road that does not return has lanes that stay closed"
+        changed, classes = told[..., CHANGED] - 1.0, told[..., CLASSES]
+        for road, (own, back) in enumerate(zip(self._own, self._lanes, strict=True)):
+            opened = (np.isin(changed, back) & (classes > 0.0)).sum(axis=1)
+            is_reversed = state[:, road] == REVERSED_NOW
+            if (opened != np.where(is_reversed, len(back), 0)).any():
+                return "contraflow lanes of a road that is not reversed are open, or the reverse"
+            closed = (np.isin(changed, own) & (classes == ALL_PERMISSIONS)).sum(axis=1)
+            is_shut = np.isin(state[:, road], (CLEARING, REVERSED_NOW, RETURNING))
+            if (is_shut & (closed != len(own))).any():
+                return "a reversed road is open"
+        return ""
 
     def cleared(
         self, ticks: NDArray[np.int64], present: Callable[[], WorldViews]
-    ) -> Iterator[tuple[int, str, bool]]:
-        """Yield each road whose lanes are empty: its world, its id, and whether it is reversed.
+    ) -> Iterator[tuple[int, str, bool, NDArray[np.bool_]]]:
+        """Yield each road whose lanes are empty.
 
-        Their states change. Lanes are examined once a second.
+        The tuple has its world, its id, whether it is reversed, and which of its lanes stay closed
+        otherwise. The states of the roads change. Lanes are examined once a second.
 
         `ticks`: (W,) of the worlds; -1: the world's episode is over.
         """
@@ -81,7 +152,7 @@ class ReversedRoads:
         ticks_per_s = max(1, round(1.0 / self._clock.sim_dt_s))
         per_step = self._clock.ticks_per_step
         for world, road in np.argwhere(under_way).tolist():
-            tick, (state, since) = int(ticks[world]), self.states[world, road].tolist()
+            tick, (state, since, _) = int(ticks[world]), self.states[world, road].tolist()
             if tick < 0:
                 continue
             if since == _NOT_YET:
@@ -94,8 +165,9 @@ class ReversedRoads:
             if np.isin(present().vehicles(world)["lane"], taken[road]).any():
                 continue
             now = REVERSED_NOW if state == CLEARING else AS_ON_MAP
-            self.states[world, road] = now, tick
-            yield world, self._roads[road], now == REVERSED_NOW
+            kept = self._kept(world, road)
+            self.states[world, road] = now, tick, 0
+            yield world, self._roads[road], now == REVERSED_NOW, kept
 
 
 def _lanes(network: RoadNetwork, edge: int) -> NDArray[np.intp]:
@@ -111,9 +183,18 @@ def _ground(network: RoadNetwork, edge: int) -> NDArray[np.intp]:
     return np.concatenate([lanes, over])
 
 
-def wrong_reversals(states: NDArray[np.int64]) -> str:
-    """Return what is wrong with `ReversedRoads.states` from outside; empty if nothing."""
-    state, since = states[..., _STATE], states[..., _SINCE]
-    if ((state < AS_ON_MAP) | (state > RETURNING)).any() or (since < _NOT_YET).any():
-        return "a reversed road has an unknown state"
-    return ""
+def _roads_before(network: RoadNetwork, edges: Sequence[int]) -> NDArray[np.bool_]:
+    """Return (C, C) whether the second road leads to the first one, but not back to itself.
+
+    On a cycle of roads, no road waits for another.
+    """
+    edge, links = network.lanes["edge"], network.links
+    ahead = ~np.isin(links["direction"], (ord("t"), ord("T")))
+    leads = np.zeros((len(edges), len(edges)), dtype=np.bool_)
+    for column, road in enumerate(edges):
+        reached = edge[links["to_lane"][ahead & (edge[links["from_lane"]] == road)]]
+        leads[:, column] = np.isin(edges, reached)
+    reaches = leads
+    for _ in range(len(edges).bit_length()):
+        reaches = reaches | reaches @ reaches
+    return leads & ~reaches.T

@@ -12,6 +12,8 @@ import pytest
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
 from cavmarl import ActionError, CapacityError, ConfigError, make_vec, parallel_env
+from cavmarl.env.lane_changes import LaneChanges
+from cavmarl.maps.netconvert_process import run_netconvert
 from cavmarl.recordings.recording import Recording
 from tests.support.saved_midway import check_resumed
 
@@ -84,6 +86,146 @@ def test_a_reversed_road_opens_when_it_is_empty_and_turns_back() -> None:
         assert env.closed_roads() == ()
         assert below[env.present.vehicles(0)["lane"]].any()
         assert env.traffic_stats()["contacts"] == 0
+
+
+NODES = """<nodes><node id="W" x="-200" y="0"/><node id="A" x="0" y="0"/>
+<node id="M" x="150" y="0"/>
+<node id="N" x="300" y="0"/><node id="B" x="450" y="0"/><node id="X" x="650" y="0"/></nodes>"""
+BRIDGE = ("MA", "NM", "BN")
+EVACUEES = (
+    '<vType id="evacuee"><param key="has.rerouting.device" value="true"/>'
+    '<param key="device.rerouting.period" value="20"/></vType>'
+)
+
+
+def chain(folder: Path) -> Path:
+    """Write a world in which one road after another is reversed, with vehicles both ways."""
+    words = ["-n", str(folder / "chain.nod.xml"), "-e", str(folder / "chain.edg.xml")]
+    ends = [
+        (a, b) for one in ("WA", "AM", "MN", "NB", "BX") for a, b in (tuple(one), tuple(one[::-1]))
+    ]
+    edges = "".join(f'<edge id="{a}{b}" from="{a}" to="{b}"/>' for a, b in ends)
+    (folder / "chain.nod.xml").write_text(NODES, encoding="utf-8")
+    (folder / "chain.edg.xml").write_text(f"<edges>{edges}</edges>", encoding="utf-8")
+    run_netconvert([*words, "-o", str(folder / "chain.net.xml")], folder, None)
+    trips = "".join(
+        f'<trip id="{k}" type="evacuee" depart="{k}" from="{a}" to="{b}"/>'
+        for k in range(120)
+        for a, b in [("WA", "BX") if k % 2 else ("XB", "AW")]
+    )
+    demand = f"<routes>{EVACUEES}{trips}</routes>"
+    (folder / "trips.rou.xml").write_text(demand, encoding="utf-8")
+    (folder / "env.yaml").write_text(
+        "name: chain\nversion: 1\n"
+        "map: {source: chain.net.xml, contraflow: [MA, NM, BN], changed_lanes: 6}\n"
+        "clock: {sim_dt_s: 0.1, ctrl_dt_s: 1.0}\n"
+        "population: {mode: respawn, agents: 0, background: 0, reroute: blocked}\n"
+        "traffic: {demand: [trips.rou.xml]}\nhorizon_s: 900\n",
+        encoding="utf-8",
+    )
+    return folder
+
+
+@pytest.mark.parametrize("order", [BRIDGE, BRIDGE[::-1]])
+def test_vehicles_leave_roads_that_are_reversed_one_after_another(
+    tmp_path: Path, order: tuple[str, ...]
+) -> None:
+    with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
+        vec.reset(seed=1)
+        names, edges = vec.network.edge_ids, vec.network.lanes["edge"]
+        rows = {road: (names.index(road), names.index(f"contraflow:{road}")) for road in BRIDGE}
+        used, closed = set(), []
+        for step in range(400):
+            if step == 60:
+                for road in order:
+                    vec.close_road(road, shuts_in=True, contraflow=True)
+                # Vehicles on the other roads can still leave over these two.
+                assert vec.closed_roads() == ("BN",)
+            if step == 250:
+                for road in order:
+                    vec.open_road(road)
+            vec.step(vec.suggest_actions())
+            closed.append(vec.closed_roads())
+            there = edges[vec.present.vehicles(0)["lane"]]
+            for road, (below, above) in rows.items():
+                assert not ((there == below).any() and (there == above).any())
+                used |= {road} if (there == above).any() else set()
+        assert used == set(BRIDGE)
+        assert [("BN",), ("BN", "NM"), ("BN", "MA", "NM")] == sorted(set(closed[60:250]), key=len)
+        assert closed[-1] == ()
+        stats = vec.traffic_stats()
+        assert (stats["arrived"], stats["contacts"]) == (120, 0)
+
+
+def test_a_divided_world_equals_the_undivided_one_while_roads_wait(tmp_path: Path) -> None:
+    keys = {"map.events": [{"at_s": 40, "action": "reverse", "edges": [*BRIDGE], "shuts_in": True}]}
+
+    def found(**more: Any) -> list[str]:
+        with closing(make_vec(tmp_path, num_envs=1, overrides=keys, **more)) as vec:
+            vec.reset(seed=1)
+            hashes = []
+            for step in range(160):
+                vec.step(vec.suggest_actions())
+                if step % 40 == 39:
+                    hashes.append(vec.state_hash())
+            return hashes
+
+    chain(tmp_path)
+    undivided = found()
+    assert found(zones=3) == undivided
+    assert found(zones=2, workers=2) == undivided
+
+
+def test_a_road_that_is_closed_while_it_returns_stays_closed(tmp_path: Path) -> None:
+    with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
+
+        def drive(steps: int) -> tuple[str, ...]:
+            for _ in range(steps):
+                vec.step(vec.suggest_actions())
+            return vec.closed_roads()
+
+        vec.reset(seed=1)
+        vec.close_road("MA", shuts_in=True, contraflow=True)
+        assert drive(90) == ("MA",)
+        vec.close_road("MA", shuts_in=True, contraflow=True)  # it is reversed already
+        vec.open_road("MA")
+        assert drive(2) == ("MA",)
+        vec.close_road("MA", shuts_in=True)
+        assert drive(120) == ("MA",)
+        vec.open_road("MA")
+        assert drive(1) == ()
+
+
+def test_reversals_in_damaged_states_are_refused(tmp_path: Path) -> None:
+    with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
+        vec.reset(seed=1)
+        vec.close_road("BN", shuts_in=True, contraflow=True)
+        for _ in range(60):
+            vec.step(vec.suggest_actions())
+        changes = LaneChanges(
+            vec.config, vec.network, 1, lambda: pytest.fail("no world is examined")
+        )
+        changes.reverse(0, "MA", shuts_in=True)
+        told, states = changes.memory
+        assert changes.wrong((told, states)) == ""
+        for place, value, message in (
+            ((0, 1, 0), 5, "unknown state"),
+            ((0, 1, 0), 2, "is not reversed are open, or the reverse"),
+            ((0, 0, 0), 1, "a reversed road is open"),
+            ((0, 0, 0), 3, "a reversed road is open"),
+            ((0, 1, 1), -2, "unknown state"),
+            ((0, 1, 2), 2, "lanes that stay closed"),
+        ):
+            forged = states.copy()
+            forged[place] = value
+            assert message in changes.wrong((told, forged))
+        opened = told.copy()
+        opened[0, 5] = (
+            1 + vec.network.lane_ids.index("contraflow:MA_0"),
+            1.0,
+            1.0,
+        )
+        assert "is not reversed are open" in changes.wrong((opened, states))
 
 
 def test_impossible_reversals_are_refused_with_a_fix() -> None:

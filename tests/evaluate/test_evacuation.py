@@ -33,6 +33,7 @@ from cavmarl.evaluate.evacuation.evacuation_runs import (
 from cavmarl.maps.netconvert_process import run_netconvert
 from cavmarl.roads.network import RoadNetwork
 
+LATE = RoadEvent(at_s=5000.0, action="close", edges=("B1B2",))
 MIDDLE = ("B1B2", "B2B1", "C1B1", "B1C1", "C2B2", "B2C2")
 PLAN = EvacuationPlan(
     map="grid4x4",
@@ -140,6 +141,9 @@ def test_contraflow_lanes_shorten_an_evacuation_over_a_bridge(tmp_path: Path) ->
     assert helped.contacts == plain.contacts == 0
     assert (helped.all.clearance_s or 0.0) < (plain.all.clearance_s or 0.0)
     assert helped.rerouted > 20
+    assert plain.contraflow == {}
+    assert 0 < helped.contraflow["BA"] < 200
+    assert helped.contact_places == {}
 
 
 def test_traffic_recovers_after_roads_open_again(tmp_path: Path) -> None:
@@ -247,6 +251,41 @@ def test_wrong_plan_files_are_refused(text: str, message: str, tmp_path: Path) -
         load_plan(path)
 
 
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"horizon_s": 700.5}, "must be a whole number of seconds"),
+        ({"events": (LATE,)}, "must be above 5000, the time of the last event"),
+        (
+            {
+                "areas": {
+                    "a": Area(polygon=((0.0, float("nan")), (1.0, 0.0), (0.0, 1.0)), vehicles=1)
+                }
+            },
+            "must consist of finite numbers",
+        ),
+    ],
+)
+def test_values_that_would_be_ignored_are_refused(change: dict[str, Any], message: str) -> None:
+    with pytest.raises(ConfigError, match=message):
+        replace(PLAN, **change)
+
+
+def test_an_area_with_the_name_of_the_sum_has_a_row_of_its_own(
+    undivided: EvacuationResult,
+) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra 'report'")
+    from cavmarl.evaluate.evacuation.evacuation_page import table_of
+
+    middle, corner = undivided.areas.values()
+    rows = table_of(replace(undivided, areas={"all areas": middle, "corner": corner}))
+    assert [row[:2] for row in rows] == [
+        ("all areas", str(middle.vehicles)),
+        ("corner", str(corner.vehicles)),
+        ("all areas", str(undivided.all.vehicles)),
+    ]
+
+
 def code(*words: str) -> int:
     with pytest.raises(SystemExit) as end:
         main(words)
@@ -273,6 +312,17 @@ def test_the_command_writes_a_page_and_an_environment(
     assert load_world(out / "seed-0").config.map.events[0].edges == ("B1B2",)
     assert code(*words, "--out", str(out)) == 2
     assert "the folder is not empty" in capsys.readouterr().err
+
+
+def test_a_refused_evacuation_leaves_no_folder(tmp_path: Path) -> None:
+    pytest.importorskip("matplotlib", reason="needs the extra 'report'")
+    out = tmp_path / "out"
+    for words in (("--exit", "Z9"), ("--contraflow", "Z9"), ("--close", "Z9")):
+        assert code("evacuate", "grid4x4", *words, "--out", str(out)) == 2
+        assert not out.exists()
+    out.mkdir()
+    assert code("evacuate", "grid4x4", "--exit", "Z9", "--out", str(out)) == 2
+    assert not any(out.iterdir())
 
 
 def test_the_command_runs_a_plan_and_refuses_options_of_maps(

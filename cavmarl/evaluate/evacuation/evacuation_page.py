@@ -81,10 +81,10 @@ def write_results(
 
 def table_of(run: EvacuationResult) -> list[tuple[str, ...]]:
     """Return a row of cells for each area, and for all of them if there are several."""
-    rows = dict(run.areas)
+    rows = list(run.areas.items())
     if len(rows) > 1:
-        rows["all areas"] = run.all
-    return [(name, *_cells(result)) for name, result in rows.items()]
+        rows.append(("all areas", run.all))
+    return [(name, *_cells(result)) for name, result in rows]
 
 
 def _cells(result: AreaResult) -> tuple[str, ...]:

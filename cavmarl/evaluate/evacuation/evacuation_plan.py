@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -80,9 +81,18 @@ class EvacuationPlan(Section, key=""):
             check(is_one, key, area, "must have either a polygon or edges")
             is_closed = not area.polygon or len(area.polygon) >= 3
             check(is_closed, f"{key}.polygon", area.polygon, "must have three corners or more")
+            is_finite = all(math.isfinite(value) for corner in area.polygon for value in corner)
+            check(is_finite, f"{key}.polygon", area.polygon, "must consist of finite numbers")
             is_one = (area.vehicles is None) != (area.per_km is None)
             check(is_one, key, area, "must have either vehicles or per_km")
         check_events(self.events, self.contraflow)
+        self.need("horizon_s", self.horizon_s % 1.0 == 0.0, "must be a whole number of seconds")
+        late = [event.at_s for event in self.events if event.at_s >= self.horizon_s]
+        self.need(
+            "horizon_s",
+            not late,
+            f"must be above {max(late, default=0.0):g}, the time of the last event",
+        )
         self.need(
             "horizon_s",
             self.start_s + self.within_s < self.horizon_s,

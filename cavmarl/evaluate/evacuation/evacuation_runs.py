@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.evaluate.evacuation.evacuation_demand import Evacuees, find_evacuees
 from cavmarl.evaluate.evacuation.evacuation_plan import EvacuationPlan, default_exits, edge_rows
 from cavmarl.maps.netconvert import map_file
+from cavmarl.roads.contraflow_ids import contraflow_of
 from cavmarl.roads.network import RoadNetwork
 
 STEP_S = 1.0
@@ -73,7 +74,10 @@ class EvacuationResult:
     recovery_s: float | None
     deadlocks: tuple[tuple[int, ...], ...]  # at the end
     rerouted: int
-    contacts: int
+    contacts: int  # number of vehicles that began to touch another vehicle
+    # of the roads and junctions with most contacts: vehicles in contact, summed over the samples
+    contact_places: dict[str, int]
+    contraflow: dict[str, int]  # vehicles of the areas that used the contraflow lanes of each road
     state_hash: str
     series: dict[str, list[float]]  # by second: time_s, departed, arrived, standing
 
@@ -219,6 +223,9 @@ class _Meter:
             np.array([names[self._ids[edge]] for edge in np.unique(self._of_area(k)).tolist()])
             for k in range(len(self._plan.areas))
         ]
+        self._back = {road: names[contraflow_of(road)] for road in self._plan.contraflow}
+        self._used = {road: np.zeros(count, dtype=np.bool_) for road in self._back}
+        self._touching = np.zeros(len(vec.network.edges), dtype=np.int64)
         self._most_queued = np.zeros(len(vec.network.edges), dtype=np.int64)
         self._time_s: list[float] = []
         self._standing: list[int] = []
@@ -260,11 +267,15 @@ class _Meter:
         for number, home in enumerate(self._home):
             if np.isin(edges, home).any():
                 self._seen_s[number] = time_s
+        for road, back in self._back.items():
+            self._used[road][evacuees["order"][edges == back]] = True
         stands = np.abs(rows["speed"]) < STANDING_MPS
         queued = np.bincount(
             self._network.lanes["edge"][rows["lane"][stands]], minlength=len(self._most_queued)
         )
         np.maximum(self._most_queued, queued, out=self._most_queued)
+        touches = self._network.lanes["edge"][rows["lane"][rows["hit"] >= 0]]
+        self._touching += np.bincount(touches, minlength=len(self._touching))
         self._time_s.append(time_s)
         self._standing.append(int(stands.sum()))
         self._counts.append((self.departed, self.arrived))
@@ -328,7 +339,6 @@ class _Meter:
         everyone = np.ones(len(evacuees.area), dtype=np.bool_)
         last_seen_s = float(np.nanmax(self._seen_s)) if np.isfinite(self._seen_s).any() else np.nan
         stats = vec.traffic_stats()
-        worst = np.argsort(-self._most_queued, kind="stable")[:10].tolist()
         departed, arrived = zip(*self._counts, strict=True)
         return EvacuationResult(
             seed=seed,
@@ -340,15 +350,13 @@ class _Meter:
             exits=self._arrivals(),
             longest_queue=max(self._standing),
             mean_queue=float(np.mean(self._standing)),
-            queues={
-                ids[edge]: int(self._most_queued[edge])
-                for edge in worst
-                if self._most_queued[edge] > 0
-            },
+            queues=_largest(self._most_queued, ids),
             recovery_s=self._recovery_s(),
             deadlocks=vec.deadlocks(),
             rerouted=int(stats["rerouted"]),
             contacts=int(stats["contacts"]),
+            contact_places=_largest(self._touching, ids),
+            contraflow={road: int(used.sum()) for road, used in self._used.items()},
             state_hash=vec.state_hash(),
             series={
                 "time_s": self._time_s,
@@ -357,3 +365,9 @@ class _Meter:
                 "standing": [float(number) for number in self._standing],
             },
         )
+
+
+def _largest(numbers: NDArray[np.int64], ids: Sequence[str]) -> dict[str, int]:
+    """Return the ten largest numbers (num_edges,) above 0 by the ids of edges."""
+    rows = np.argsort(-numbers, kind="stable")[:10].tolist()
+    return {ids[row]: int(numbers[row]) for row in rows if numbers[row] > 0}
