@@ -47,7 +47,11 @@ def evacuate(
     ],
     vehicles: Annotated[
         int | None,
-        about(f"Number of vehicles on a map without a plan [default: {VEHICLES}].", min=1),
+        about(
+            f"Number of vehicles on a map without a plan [default: {VEHICLES}].",
+            metavar="N",
+            min=1,
+        ),
     ] = None,
     around: Annotated[
         str | None,
@@ -78,7 +82,7 @@ def evacuate(
     ] = None,
     seconds: Annotated[float | None, about("Longest simulated time.", metavar="S", min=1.0)] = None,
     repeats: Annotated[
-        int, about("Number of runs, with consecutive seeds.", "--repeats", "-r", min=1)
+        int, about("Number of runs, with consecutive seeds.", "--repeats", "-r", metavar="N", min=1)
     ] = 1,
     seed: Seed = 0,
     zones: Zones = None,
