@@ -78,12 +78,15 @@ class TrainingJob:
 
         def end(number: int, _: object) -> None:
             told.append(number)
-            os.kill(child.pid, signal.SIGTERM)
+            if child.returncode is None:
+                os.kill(child.pid, signal.SIGTERM)
 
-        if threading.current_thread() is threading.main_thread():
-            signal.signal(signal.SIGTERM, end)
+        is_main = threading.current_thread() is threading.main_thread()
+        before = signal.signal(signal.SIGTERM, end) if is_main else None
         while (code := child.poll()) is None:
             time.sleep(0.2)
+        if is_main:
+            signal.signal(signal.SIGTERM, before)
         if told and not is_trained(Path(self.folder)):
             time.sleep(END_S)  # the batch system ends this process, and starts the job again
         if code:

@@ -119,7 +119,8 @@ class Ranks:
         with torch.no_grad(), _connected():
             flat = torch.cat([each.detach().flatten().cpu() for each in tensors])
             act(flat)
-            for each, values in zip(tensors, flat.split([*map(torch.numel, tensors)]), strict=True):
+            parts = torch.split(flat, [*map(torch.numel, tensors)])
+            for each, values in zip(tensors, parts, strict=True):
                 each.copy_(values.view_as(each))
 
 
