@@ -26,39 +26,25 @@ TINY = [
     "--num-steps", "8", "--epochs", "2", "--minibatches", "2", "--checkpoint-updates", "2",
 ]  # fmt: skip
 
-# In each process: an uninterrupted run, a run in which process 1 is told to end, and its rest.
-THREE_RUNS = """\
+# `ppo.py`, which writes the weights of its process. In update STOP, process 1 is told to end.
+WATCHED = """\
 import importlib.util, os, signal, sys
-from pathlib import Path
 import torch
 spec = importlib.util.spec_from_file_location("ppo", sys.argv[1])
 ppo = sys.modules["ppo"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(ppo)
-rank, words = os.environ["RANK"], sys.argv[2:]
-assert ppo.main([*words, "--name", "whole"]) == 0
+rank, stop = os.environ["RANK"], int(sys.argv[2])
 save, update = ppo.Run.save, ppo.Run.update
 def update_and_stop(self):
     row = update(self)
-    if rank == "1" and row["updates"] == 3:
+    if rank == "1" and row["updates"] == stop:
         os.kill(os.getpid(), signal.SIGTERM)
     return row
-ppo.Run.update = update_and_stop
-os.environ["TORCHELASTIC_RESTART_COUNT"] = "1"  # the addresses of each group are apart
-try:
-    ppo.main([*words, "--name", "cut"])
-except SystemExit as end:
-    assert end.code == 143
-else:
-    sys.exit("the run has not been stopped")
-torch.distributed.is_initialized() and sys.exit("the processes are still connected")
-Path(f"stopped_{rank}").touch()
-ppo.Run.update = update
 def save_and_watch(self):
     torch.save(self.network.state_dict(), f"rank_{rank}.pt")
     save(self)
-ppo.Run.save = save_and_watch
-os.environ["TORCHELASTIC_RESTART_COUNT"] = "2"
-assert ppo.main(["--resume", "runs/cut"]) == 0
+ppo.Run.update, ppo.Run.save = update_and_stop, save_and_watch
+sys.exit(ppo.main(sys.argv[3:]))
 """
 
 
@@ -74,29 +60,37 @@ def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
     return (folder / "model.safetensors").read_bytes(), rows
 
 
+def torchrun(*words: str, stop: int = 0) -> subprocess.CompletedProcess[str]:
+    """Run `ppo.py` in two processes."""
+    Path("watched.py").write_text(WATCHED)
+    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
+    return subprocess.run(
+        [*launch, "watched.py", str(TRAIN / "ppo.py"), str(stop), *words],
+        env={**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(TRAIN.parent)},
+        capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
 def test_two_processes_learn_one_network_and_resume_bit_for_bit(here: Path) -> None:
     import torch
 
-    (here / "three_runs.py").write_text(THREE_RUNS)
-    launch = [sys.executable, "-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
-    words = [str(TRAIN / "ppo.py"), *TINY, "--total-agent-steps", "300"]
-    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(TRAIN.parent)}
-    done = subprocess.run(
-        [*launch, "three_runs.py", *words],
-        env=environment, capture_output=True, text=True, check=False,
-    )  # fmt: skip
+    words = [*TINY, "--total-agent-steps", "300"]
+    done = torchrun(*words, "--name", "whole")
     assert done.returncode == 0, done.stderr
     assert done.stdout.count("driver: runs/whole") == 1
-    assert learnt(here / "runs/cut") == learnt(here / "runs/whole")
+    one, other = (torch.load(f"rank_{rank}.pt", weights_only=True) for rank in (0, 1))
+    assert all(torch.equal(one[name], other[name]) for name in one)
     rows = learnt(here / "runs/whole")[1]
     # 4 worlds with 2 agents and 8 steps: the decisions of both processes are counted.
     assert 4 * 2 * 8 * 0.5 < int(rows[0]["agent_steps"]) <= 4 * 2 * 8
-    one, other = (torch.load(f"rank_{rank}.pt", weights_only=True) for rank in (0, 1))
-    assert all(torch.equal(one[name], other[name]) for name in one)
     state = read_checkpoint(here / "runs/whole")
     worlds = [parts["collector"]["worlds"] for parts in (state.parts, state.shares[0]["parts"])]
     assert not torch.equal(*worlds)
-    assert {path.name for path in here.iterdir()} >= {"stopped_0", "stopped_1"}
+    assert torchrun(*words, "--name", "cut", stop=3).returncode
+    assert read_checkpoint(here / "runs/cut").updates == 3
+    done = torchrun("--resume", "runs/cut")
+    assert done.returncode == 0, done.stderr
+    assert learnt(here / "runs/cut") == learnt(here / "runs/whole")
 
 
 def test_another_number_of_processes_is_refused(
