@@ -17,8 +17,8 @@ ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
 # The packages of these extras conflict with other libraries, do not run on each machine, or bring
-# clients of services that few users have (`trackers`).
-APART = {"benchmarl", "rllib", "lanelet2", "trackers"}
+# clients of services that few users have (`trackers`, `cluster`).
+APART = {"benchmarl", "rllib", "lanelet2", "trackers", "cluster"}
 TOOLS = {"all", "bench", "dev", "fuzz"}
 
 

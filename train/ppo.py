@@ -3,6 +3,7 @@
     python train/ppo.py --env merge --minutes 2
     python train/ppo.py --env town --start cities_ippo --workers 2
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
+    torchrun --nproc-per-node 2 train/ppo.py --env merge
 
 From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
 the update; `Run`, which alternates both (Schulman et al. 2017; de Witt et al. 2020;
@@ -11,6 +12,7 @@ docs/guides/train.md).
 
 from __future__ import annotations
 
+import signal
 import sys
 import time
 from collections.abc import Iterator, Sequence
@@ -33,7 +35,8 @@ from cavmarl.env.vector import CavVectorEnv, make_vec
 from cavmarl.learning import options
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts, bytes_of, tensor_of
-from cavmarl.learning.log import Trips, describe, progress_bar
+from cavmarl.learning.data_parallel import ALONE, Ranks
+from cavmarl.learning.log import Trips, describe, mean_of_ranks, progress_bar
 from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.observation_norm import Scales
 from cavmarl.learning.opponents import Opponents
@@ -57,7 +60,7 @@ class Args:
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
     agents: Annotated[int, "agents per world; 0: the environment's"] = 0
     background: Annotated[int, "background vehicles per world; -1: the environment's"] = -1
-    num_envs: Annotated[int, "number of parallel worlds"] = 16
+    num_envs: Annotated[int, "number of parallel worlds, of all processes together"] = 16
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
     plugins: Annotated[str, "modules with terms, sensors, … of your own, comma-separated"] = ""
     zones: Annotated[int, "zones per world; 0: the environment's"] = 0
@@ -160,13 +163,18 @@ class Collector:
         opponents: drivers of some vehicles, whose data are not used for training.
     """
 
-    def __init__(self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int) -> None:
+    def __init__(
+        self, vec: CavVectorEnv, network: ActorCritic, args: Args, seed: int, rank: int = 0
+    ) -> None:
         self.vec, self.network, self._args, self._device = vec, network, args, args.device
         self.trips = Trips(vec.num_envs, vec.num_agents)
         self.times = PhaseTimes(PHASES)
-        self._mask = vec.reset(seed=seed)[1]["mask"]
+        first_world = rank * vec.num_envs
+        self._mask = vec.reset(seed=seed, options={"first_world": first_world})[1]["mask"]
         self._observations = torch.from_numpy(vec.worlds.arrays.observations)  # shared
-        self.opponents = Opponents(args.opponents, vec, args.opponent_share, args.seed)
+        self.opponents = Opponents(
+            args.opponents, vec, args.opponent_share, args.seed + first_world
+        )
         self._suggest = self.opponents.example(args.imitate)
 
     @torch.inference_mode()
@@ -271,10 +279,10 @@ class Collector:
 class Learner:
     """The network, its optimiser, and PPO's update (Schulman et al. 2017)."""
 
-    def __init__(self, network: ActorCritic, args: Args) -> None:
-        self.network, self._args = network.to(args.device), args
+    def __init__(self, network: ActorCritic, args: Args, ranks: Ranks = ALONE) -> None:
+        self.network, self._args, self._ranks = network.to(args.device), args, ranks
         self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
-        self.scales = Scales(network)
+        self.scales = Scales(network, ranks)
 
     def imitation_weight(self, left: float) -> float:
         """Return the imitation weight with a share `left` of the run remaining."""
@@ -287,48 +295,59 @@ class Learner:
         share = left if args.anneal else 1.0
         for group in self.optimizer.param_groups:
             group["lr"] = args.learning_rate * share
-        advantages = batch.advantages(args.gamma, args.gae_lambda)
+        advantages = batch.advantages(args.gamma, args.gae_lambda).flatten()
         acted = batch.acted.flatten().nonzero().squeeze(1)
-        chosen = self._filtered(advantages.flatten(), acted, batch.suggested is not None)
-
-        def of(values: Tensor, rows: Tensor) -> Tensor:
-            return values.flatten(0, 2)[rows]
-
+        chosen = self._filtered(advantages, acted, batch.suggested is not None)
         found: list[Tensor] = []
         for _ in range(args.epochs):
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]
             for rows in order.tensor_split(args.minibatches):
-                if rows.numel() < 2:  # the advantage of a single decision is undefined
-                    continue
-                states = batch.states.flatten(0, 1)
-                seen = network.normal(of(batch.observations, rows))
-                output, values = network.heads(seen, states[rows // batch.acted.shape[2]])
-                log_prob, entropy = network.judge(output, of(batch.actions, rows))
-                change = log_prob - of(batch.log_probs, rows)
-                ratio = change.exp()
-                gains = of(advantages, rows)
-                returns = gains + of(batch.values, rows)
-                gains = (gains - gains.mean()) / (gains.std() + 1e-8)
-                bounded = ratio.clamp(1.0 - args.clip, 1.0 + args.clip)
-                policy_loss = -torch.min(gains * ratio, gains * bounded).mean()
-                value_loss = (values - returns).square().mean()
-                loss = policy_loss + 0.5 * args.value_weight * value_loss
-                loss = loss - args.entropy_weight * share * entropy.mean()
-                if batch.suggested is not None:
-                    distance = network.distance(output, of(batch.suggested, rows))
-                    loss = loss + self.imitation_weight(left) * distance.mean()
                 self.optimizer.zero_grad()
-                loss.backward()  # type: ignore[no-untyped-call]
-                for part in network.parts:
-                    nn.utils.clip_grad_norm_(part, args.max_gradient_norm)
-                self.optimizer.step()
-                with torch.no_grad():
-                    kl = (ratio - 1.0 - change).mean()
-                    clipped = ((ratio - 1.0).abs() > args.clip).float().mean()
-                found.append(torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]))
-        self.scales.add(of(batch.observations, acted))
-        means = torch.stack(found or [torch.zeros(len(NUMBERS))]).detach().mean(0)
-        return dict(zip(NUMBERS, means.tolist(), strict=True))
+                count = rows.numel() if rows.numel() > 1 else 0  # the advantage of one is undefined
+                if count:
+                    found.append(self._differentiate(batch, advantages, rows, share, left))
+                if self._ranks.average_gradients(network, count):
+                    for part in network.parts:
+                        nn.utils.clip_grad_norm_(part, args.max_gradient_norm)
+                    self.optimizer.step()
+        self.scales.add(batch.observations.flatten(0, 2)[acted])
+        means = torch.stack(found or [torch.zeros(len(NUMBERS))]).mean(0)
+        of_ranks = self._ranks.gather(means.tolist())
+        return {
+            name: sum(each) / len(of_ranks) for name, *each in zip(NUMBERS, *of_ranks, strict=True)
+        }
+
+    def _differentiate(
+        self, batch: Batch, advantages: Tensor, rows: Tensor, share: float, left: float
+    ) -> Tensor:
+        """Compute the gradients of a minibatch; return the values of `NUMBERS`."""
+        args, network = self._args, self.network
+
+        def of(values: Tensor) -> Tensor:
+            return values.flatten(0, 2)[rows]
+
+        states = batch.states.flatten(0, 1)
+        seen = network.normal(of(batch.observations))
+        output, values = network.heads(seen, states[rows // batch.acted.shape[2]])
+        log_prob, entropy = network.judge(output, of(batch.actions))
+        change = log_prob - of(batch.log_probs)
+        ratio = change.exp()
+        gains = advantages[rows]
+        returns = gains + of(batch.values)
+        gains = (gains - gains.mean()) / (gains.std() + 1e-8)
+        bounded = ratio.clamp(1.0 - args.clip, 1.0 + args.clip)
+        policy_loss = -torch.min(gains * ratio, gains * bounded).mean()
+        value_loss = (values - returns).square().mean()
+        loss = policy_loss + 0.5 * args.value_weight * value_loss
+        loss = loss - args.entropy_weight * share * entropy.mean()
+        if batch.suggested is not None:
+            distance = network.distance(output, of(batch.suggested))
+            loss = loss + self.imitation_weight(left) * distance.mean()
+        loss.backward()  # type: ignore[no-untyped-call]
+        with torch.no_grad():
+            kl = (ratio - 1.0 - change).mean()
+            clipped = ((ratio - 1.0).abs() > args.clip).float().mean()
+            return torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]).detach()
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
         """Return the rows to learn from, by large advantages (Cusumano-Towner et al. 2025)."""
@@ -351,8 +370,8 @@ class Learner:
 class Run:
     """A run of PPO: its state and its main loop."""
 
-    def __init__(self, args: Args, vec: CavVectorEnv, folder: RunFolder) -> None:
-        self.args, self.vec, self.folder = args, vec, folder
+    def __init__(self, args: Args, vec: CavVectorEnv, folder: RunFolder, ranks: Ranks) -> None:
+        self.args, self.vec, self.folder, self.ranks = args, vec, folder, ranks
         self.agent_steps, self.updates = folder.began.agent_steps, folder.began.updates
         torch.set_num_threads(args.threads)
         torch.manual_seed(args.seed + self.updates)
@@ -368,10 +387,14 @@ class Run:
             residual=args.residual,
         )
         self.network = ActorCritic(self.config, (args.throttle_std, args.steering_std))
-        self.learner = Learner(self.network, args)
+        self.learner = Learner(self.network, args, ranks)
         if args.start and not folder.began.parts:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
-        self.collector = Collector(vec, self.network, args, args.seed + self.updates)
+        ranks.copy_weights(self.network)
+        if ranks.rank:  # each process samples other actions
+            torch.manual_seed(args.seed + self.updates + ranks.rank * 1_000_003)
+        seed = args.seed + self.updates
+        self.collector = Collector(vec, self.network, args, seed, ranks.rank)
         if not folder.began.parts:
             self.save()  # a run that is killed before its first checkpoint restarts from here
         if parts := folder.resume():
@@ -383,7 +406,7 @@ class Run:
         done = self.agent_steps / self.args.total_agent_steps
         if self.args.minutes:
             done = max(done, self.folder.seconds / (60.0 * self.args.minutes))
-        return min(done, 1.0)
+        return self.ranks.of_first(min(done, 1.0))
 
     def update(self) -> dict[str, float]:
         """Collect, learn and log; return the logged numbers."""
@@ -392,30 +415,34 @@ class Run:
         batch = collector.collect(self.learner.imitation_weight(left) > 0.0)
         with collector.times.of("learning"):
             numbers = self.learner.update(batch, left)
-        new = int(batch.acted.sum())
+        new = sum(self.ranks.gather(int(batch.acted.sum())))
         self.agent_steps, self.updates = self.agent_steps + new, self.updates + 1
         row = {
             "updates": self.updates,
             "agent_steps": self.agent_steps,
             "seconds": self.folder.seconds,
             "agent_steps_per_s": new / (time.perf_counter() - started),
-            **collector.trips.means(),
+            **mean_of_ranks(self.ranks.gather(collector.trips.means())),
             **numbers,
             **{f"{phase}_s": seconds for phase, seconds in collector.times.spent_s.items()},
         }
-        self.folder.log.write(row)
+        if self.ranks.rank == 0:
+            self.folder.log.write(row)
         return row
 
     def save(self) -> None:
         """Write a checkpoint and the driver."""
-        parts = {"learner": self.learner.save(), "collector": self.collector.save()}
+        parts = {"collector": self.collector.save()}
+        if self.ranks.rank == 0:
+            parts["learner"] = self.learner.save()
         self.folder.save(self.agent_steps, self.updates, parts)
         self.folder.save_driver(self.network, replace(self.config, agent_steps=self.agent_steps))
 
 
 @contextmanager
-def opened(args: Args) -> Iterator[Run]:
+def opened(args: Args, ranks: Ranks) -> Iterator[Run]:
     """Open a run with its worlds and its folder, and close them at the end."""
+    num_envs = ranks.share("--num-envs", args.num_envs)
     plugins = [word for word in args.plugins.split(",") if word]
     import_plugins(plugins)
     args = options.with_form_of(args, args.start)
@@ -423,7 +450,7 @@ def opened(args: Args) -> Iterator[Run]:
     given = parse_settings([word for word in args.settings.split(",") if word], plugins)
     vec = make_vec(
         args.env,
-        num_envs=args.num_envs,
+        num_envs=num_envs,
         zones=args.zones or None,
         backend=args.backend or None,
         workers=args.workers or None,
@@ -435,30 +462,43 @@ def opened(args: Args) -> Iterator[Run]:
     )
     try:
         refuse_signal_agents(vec.config, "this program")
-        with RunFolder(args, vec.worlds.world, vec.plans) as folder:
-            yield Run(args, vec, folder)
+        with ranks, RunFolder(args, vec.worlds.world, vec.plans, ranks) as folder:
+            yield Run(args, vec, folder, ranks)
     finally:
         vec.close()
 
 
 def train(args: Args, console: Console) -> Path:
-    """Run PPO until the decisions or minutes are used up; return the folder of the run."""
-    with opened(args) as run, progress_bar(console) as bar:
+    """Run PPO until the decisions or minutes are used up; return the folder of the run.
+
+    On SIGTERM, write a checkpoint after the present update, and raise SystemExit.
+    """
+    ranks = Ranks.of_torchrun()
+    console.quiet |= ranks.rank > 0
+    with (
+        options.noting_sigterm() as was_told,
+        opened(args, ranks) as run,
+        progress_bar(console) as bar,
+    ):
         if run.vec.plans:
             console.print(run.vec.plan_text(), highlight=False)
         task, done = bar.add_task("", total=1.0), run.done() if run.updates else 0.0
         while done < 1.0:
             row = run.update()
             done = run.done()
-            if done == 1.0 or run.folder.is_due(run.updates):
+            ends = done < 1.0 and any(ranks.gather(was_told()))
+            if ends or done == 1.0 or run.folder.is_due(run.updates):
                 run.save()
+            if ends:
+                raise SystemExit(128 + signal.SIGTERM)
             bar.update(task, completed=done, description=describe(row))
         return run.folder.end(plans=run.vec.plans)
 
 
 def main(words: Sequence[str] | None = None) -> int:
     """Train; return 0: trained, 2: wrong usage."""
-    return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()))
+    message = "" if Ranks.of_torchrun().rank else options.DRIVER
+    return options.run_program(lambda: train(parse_run(Args, words, __doc__), Console()), message)
 
 
 if __name__ == "__main__":

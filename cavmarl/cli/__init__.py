@@ -34,6 +34,7 @@ from cavmarl.cli import (
     ros2,
     scenario,
     service,
+    submit_train,
     suite,
     train,
     verify,
@@ -58,6 +59,8 @@ START, TRAIN, MAPS = "Start here", "Train and evaluate", "Maps and demand"
 DIVIDE, COSIM = "Divide worlds", "Co-simulation"
 
 
+SUBMIT_TRAIN = "submit train"
+
 REMOVED = {"verify-determinism": "verify determinism"}  # command → its replacement
 
 
@@ -80,6 +83,12 @@ class _Group(CliGroup):
         names = super().list_commands(ctx)
         names.insert(names.index("demand"), "map")
         return names
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """Return a command and the words after it; the name of one command has two words."""
+        if args[:2] == SUBMIT_TRAIN.split():
+            args = [SUBMIT_TRAIN, *args[2:]]
+        return super().resolve_command(ctx, args)
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         if cmd_name in REMOVED:
@@ -125,6 +134,13 @@ _train(
     "cavmarl train ppo --config merge",
     ignore_unknown_options=True,
     allow_interspersed_args=False,
+)
+_train(
+    SUBMIT_TRAIN,
+    submit_train.submit_train,
+    "cavmarl submit train ppo --config merge --to slurm --sbatch partition=long",
+    "cavmarl submit train ppo --env town --to local --processes 2",
+    ignore_unknown_options=True,
 )
 _train(
     "evaluate",

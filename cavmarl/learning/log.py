@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import os
 from collections import deque
-from collections.abc import Collection, Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -82,6 +82,20 @@ class Trips:
         names = ("trip_return", "success", *ENDS[1:])
         columns = np.array(self._ended).mean(axis=0) if self._ended else np.full(5, np.nan)
         return {"trips": self._count, **dict(zip(names, columns.tolist(), strict=True))}
+
+
+def mean_of_ranks(found: Sequence[dict[str, float]]) -> dict[str, float]:
+    """Return `Trips.means` over all processes, weighted by the numbers of averaged trips."""
+    if len(found) == 1:
+        return found[0]
+    weights = [min(row["trips"], WINDOW) for row in found]
+    counted = [row for row, weight in zip(found, weights, strict=True) if weight]
+    columns = np.array([list(row.values()) for row in counted or found])
+    means = np.average(columns, axis=0, weights=[each for each in weights if each] or None)
+    return {
+        **dict(zip(found[0], means.tolist(), strict=True)),
+        "trips": sum(row["trips"] for row in found),
+    }
 
 
 class Log:

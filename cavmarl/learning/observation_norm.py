@@ -9,6 +9,7 @@ from torch import Tensor
 
 from cavmarl.learning.actor_critic import ActorCritic
 from cavmarl.learning.checkpoint import Parts
+from cavmarl.learning.data_parallel import ALONE, Ranks
 from cavmarl.learning.warm_start import begin_with
 from cavmarl.networks.network_files import NetworkConfig
 
@@ -18,8 +19,8 @@ LEAST_DEVIATION = 0.02  # minimum, so that nearly constant observations are not 
 class Scales:
     """Updates the network's mean and deviation of observations over all decisions of a run."""
 
-    def __init__(self, network: ActorCritic) -> None:
-        self._network = network
+    def __init__(self, network: ActorCritic, ranks: Ranks = ALONE) -> None:
+        self._network, self._ranks = network, ranks
         self._count = 0
         self._squares = torch.zeros_like(network.deviation)
 
@@ -29,11 +30,18 @@ class Scales:
         self._squares = self._network.deviation.square() * self._count
 
     def add(self, observations: Tensor) -> None:
-        """Add the observations (N, D) of new decisions (Chan et al. 1979)."""
-        network, new = self._network, len(observations)
-        if new == 0:
-            return
-        squares, mean = torch.var_mean(observations, 0, correction=0)
+        """Add the observations (N, D) of new decisions, of all processes (Chan et al. 1979)."""
+        mine = None
+        if len(observations):
+            mine = (len(observations), *torch.var_mean(observations, 0, correction=0))
+        for found in self._ranks.gather(mine):
+            if found is not None:
+                self._merge(*found)
+
+    def _merge(self, new: int, squares: Tensor, mean: Tensor) -> None:
+        """Add observations of which the number, the variances and the means are given."""
+        network = self._network
+        squares, mean = squares.to(network.mean.device), mean.to(network.mean.device)
         apart, total = mean - network.mean, self._count + new
         self._squares += squares * new + apart.square() * (self._count * new / total)
         network.mean += apart * (new / total)

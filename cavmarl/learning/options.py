@@ -7,8 +7,11 @@ from `Annotated[type, "text"]`.
 from __future__ import annotations
 
 import argparse
+import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+import threading
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar, get_args, get_type_hints
@@ -130,12 +133,13 @@ def run_folder(runs: str, name: str, env: str, program: str, seed: int, resume: 
 
 
 def run_program(train: Callable[[], Path], message: str = DRIVER) -> int:
-    """Train, print the folder that `train` returns, and return the exit code.
+    """Train, print a message with the folder that `train` returns, and return the exit code.
 
-    0: trained; 2: wrong usage or an error; 130: interrupted.
+    An empty message is not printed. 0: trained; 2: wrong usage or an error; 130: interrupted.
     """
+    end = "\n" if message else ""
     return run_to_end(
-        lambda: print(message.format(folder=train())),
+        lambda: print(message.format(folder=train()), end=end),
         "use --resume to continue from the last checkpoint",
     )
 
@@ -154,6 +158,28 @@ def run_to_end(act: Callable[[], None], goes_on: str) -> int:
         print(f"interrupted: {goes_on}", file=sys.stderr)
         return 130
     return 0
+
+
+@contextmanager
+def noting_sigterm() -> Iterator[Callable[[], bool]]:
+    """Let SIGTERM end no program inside; yield a function that returns whether it has come.
+
+    A second SIGTERM ends the program at once.
+    """
+    came: list[int] = []
+
+    def note(number: int, _: object) -> None:
+        came.append(number)
+        signal.signal(signal.SIGTERM, signal.SIG_DFL)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield lambda: False
+        return
+    before = signal.signal(signal.SIGTERM, note)
+    try:
+        yield lambda: bool(came)
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 def _option(name: str) -> str:

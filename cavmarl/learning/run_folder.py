@@ -38,6 +38,7 @@ from cavmarl.learning.checkpoint import (
     write_checkpoint,
     writing,
 )
+from cavmarl.learning.data_parallel import ALONE, Ranks
 from cavmarl.learning.log import CSV_FILE, Log, cut_logs
 from cavmarl.learning.loggers import logger_names
 from cavmarl.learning.options import given_options, settings_of
@@ -95,20 +96,31 @@ class RunFolder:
         settings: settings of the run; a non-empty `resume` continues the run.
         world: the environment of the training.
         plans: assignment of shards to workers.
+        ranks: the processes of the run, of which the first one writes the files.
 
     Raises:
+        ConfigError: the run that is resumed had another number of processes.
         TrainingError: another process uses the folder, it contains a run and `resume` is empty,
             the run cannot be resumed, or the folder cannot be written.
     """
 
     def __init__(
-        self, settings: RunSettings, world: World | Simulation, plans: Sequence[Plan] = ()
+        self,
+        settings: RunSettings,
+        world: World | Simulation,
+        plans: Sequence[Plan] = (),
+        ranks: Ranks = ALONE,
     ) -> None:
         self.path = path = settings.folder
-        self._settings = settings
+        self._settings, self._ranks = settings, ranks
         self._environment = _digest(world)
         self._maps = road_kinds(world.network)
+        self._lock: int | None = None
         resumes = bool(getattr(settings, "resume", ""))
+        if ranks.rank:
+            self.began = self._read() if resumes else RunState(settings.program, {}, "")
+            self._began_at = time.perf_counter()
+            return
         try:
             path.mkdir(parents=True, exist_ok=True)
             self._lock = _locked(path)
@@ -119,7 +131,7 @@ class RunFolder:
         try:
             self.began = self._read() if resumes else RunState(settings.program, {}, "")
             if not resumes:
-                self._refuse_begun()
+                refuse_begun(path, hasattr(settings, "resume"))
             remove_dead_drafts(path)
             with writing(path / MANIFEST_FILE):
                 if resumes:
@@ -137,6 +149,11 @@ class RunFolder:
                 f"--resume {self.path}: the environment has changed since that run; restore its "
                 "files, or train again under another --name"
             )
+        if (size := 1 + len(state.shares)) != self._ranks.size:
+            raise ConfigError(
+                f"--resume {self.path}: the run has {size} processes, not {self._ranks.size}; "
+                + ("start it without torchrun" if size == 1 else f"torchrun has to start {size}")
+            )
         if is_trained(self.path):
             total, minutes = (
                 getattr(settings, name, 0) for name in ("total_agent_steps", "minutes")
@@ -150,18 +167,6 @@ class RunFolder:
                     f"--minutes {minutes:g}: the run has {state.seconds / 60.0:.3g}; ask for more"
                 )
         return state
-
-    def _refuse_begun(self) -> None:
-        can_go_on = hasattr(self._settings, "resume")
-        left = [self.path / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE)]
-        left += [] if can_go_on else [self.path / MANIFEST_FILE]
-        table = self.path / CSV_FILE
-        if any(path.exists() for path in left) or (table.exists() and table.stat().st_size):
-            cure = f"continue it (--resume {self.path}), or " if can_go_on else ""
-            raise TrainingError(
-                f"{self.path}: contains a run, which is not overwritten; {cure}give this run "
-                "another --name"
-            )
 
     @cached_property
     def log(self) -> Log:
@@ -183,9 +188,14 @@ class RunFolder:
         Starts the clock of the run.
         """
         self._began_at = time.perf_counter()
-        if self.began.random:
-            set_random_states(self.began.random)
-        return self.began.parts
+        state = self.began
+        parts, random = state.parts, state.random
+        if self._ranks.rank and state.shares:
+            share = state.shares[self._ranks.rank - 1]
+            parts, random = {**parts, **share["parts"]}, share["random"]
+        if random:
+            set_random_states(random)
+        return parts
 
     def is_due(self, updates: int) -> bool:
         """Return whether a checkpoint is due after this number of updates."""
@@ -193,11 +203,16 @@ class RunFolder:
         return updates % every == 0
 
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
-        """Replace the checkpoint by a new one.
+        """Replace the checkpoint by a new one; all processes call this.
+
+        `parts` of other processes than the first one take precedence in these processes alone.
 
         Raises:
             TrainingError: it cannot be written; the previous one is intact.
         """
+        shares = self._ranks.gather_in_first({"random": random_states(), "parts": parts})
+        if self._ranks.rank:
+            return
         settings = {**asdict(self._settings), "resume": ""}
         state = RunState(
             self._settings.program,
@@ -207,8 +222,9 @@ class RunFolder:
             updates,
             self.seconds,
             self.log.sync(),
-            random_states(),
-            parts,
+            shares[0]["random"],
+            shares[0]["parts"],
+            shares[1:],
         )
         with writing(self.path / CHECKPOINT_FILE):
             write_checkpoint(self.path, state)
@@ -218,11 +234,15 @@ class RunFolder:
 
         Runs are not resumed from it.
         """
+        if self._ranks.rank:
+            return
         with writing(self.path / WEIGHTS_FILE):
             save_network(self.path, network, replace(config, maps=self._maps))
 
     def end(self, files: Sequence[str] = DRIVER_FILES, plans: Sequence[Plan] = ()) -> Path:
         """Complete the manifest with the files of the run."""
+        if self._ranks.rank:
+            return self.path
         with writing(self.path / MANIFEST_FILE):
             end_training(self.path, files, plans)
         return self.path
@@ -231,7 +251,8 @@ class RunFolder:
         """Close the log and release the folder."""
         if "log" in vars(self):
             self.log.close()
-        os.close(self._lock)
+        if self._lock is not None:
+            os.close(self._lock)
 
     def __enter__(self) -> Self:
         return self
@@ -243,6 +264,19 @@ class RunFolder:
         trace: TracebackType | None,
     ) -> None:
         self.close()
+
+
+def refuse_begun(folder: Path, can_resume: bool) -> None:
+    """Raise a TrainingError if the folder contains a run."""
+    left = [folder / name for name in (CHECKPOINT_FILE, WEIGHTS_FILE)]
+    left += [] if can_resume else [folder / MANIFEST_FILE]
+    table = folder / CSV_FILE
+    if any(path.exists() for path in left) or (table.exists() and table.stat().st_size):
+        cure = f"continue it (--resume {folder}), or " if can_resume else ""
+        raise TrainingError(
+            f"{folder}: contains a run, which is not overwritten; {cure}give this run another "
+            "--name"
+        )
 
 
 def _locked(folder: Path) -> int:

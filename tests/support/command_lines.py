@@ -20,10 +20,10 @@ def check_command(line: str) -> None:
     context = command.make_context("cavmarl", [], resilient_parsing=True)
     words = shlex.split(line.replace("…", ""), comments=True)[1:]
     while hasattr(command, "get_command") and words and not words[0].startswith("-"):
-        found = command.get_command(context, words[0])
+        _, found, words = command.resolve_command(context, words)
         assert found is not None, line
         context = type(context)(found, parent=context, **found.context_settings)
-        command, words = found, words[1:]
+        command = found
     check_options(command, words, context)
 
 
