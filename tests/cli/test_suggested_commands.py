@@ -17,7 +17,7 @@ from cavmarl.cli import app
 
 PACKAGE = Path(cavmarl.__file__).parent
 # Options of other programs: netconvert, Ray, gdal_calc.py.
-FOREIGN = {"--keep-edges", "--junctions", "--address", "--head", "--calc"}
+FOREIGN = {"--keep-edges", "--junctions", "--address", "--head", "--calc", "--nproc-per-node"}
 _OPTION = re.compile(r"(?<![\w-])--[a-z][a-z0-9-]*")
 _COMMAND = re.compile(r"`(?:python -m )?cavmarl ([a-z-]+)(?: ([a-z-]+))?([^`]*)`")
 

@@ -11,6 +11,7 @@ import pytest
 from cavmarl.cli import main
 from cavmarl.config.registry import agent_entries
 from cavmarl.core.machine import describe_hardware
+from cavmarl.evaluate.evaluation import run_seeds
 
 pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
@@ -32,6 +33,7 @@ def test_a_difference_names_both_hashes_and_both_processors(
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"] |= {"episodes": 1, "seed": 3}
+    document |= {"episodes": 1, "seeds": run_seeds(3, len(document["seeds"]))}
     document["hardware"] |= {"cpu": "Another Processor", "architecture": "a64"}
     path.write_text(json.dumps(document))
     with pytest.raises(SystemExit) as ended:
