@@ -23,7 +23,7 @@ def scratch_folder() -> Iterator[Path]:
     place, variable = tempfile.tempdir, os.environ.get("TMPDIR")
     base = Path(tempfile.gettempdir())
     remove_abandoned(base)
-    folder, lock = _locked(base)
+    folder, lock = _locked()
     tempfile.tempdir = os.environ["TMPDIR"] = str(folder)
     try:
         yield folder
@@ -50,10 +50,10 @@ def remove_abandoned(base: Path) -> None:
                 os.close(lock)
 
 
-def _locked(base: Path) -> tuple[Path, int]:
-    """Return a new folder and the descriptor that has its lock."""
+def _locked() -> tuple[Path, int]:
+    """Return a new temporary folder and the descriptor that has its lock."""
     while True:
-        folder = Path(tempfile.mkdtemp(prefix=PREFIX, dir=base))
+        folder = Path(tempfile.mkdtemp(prefix=PREFIX))
         with suppress(FileNotFoundError):  # another process has deleted the folder before the lock
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
             fcntl.flock(lock, fcntl.LOCK_EX)

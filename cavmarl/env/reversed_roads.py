@@ -101,14 +101,15 @@ class ReversedRoads:
         They have to open again, so that vehicles on the other roads can leave.
         """
         state = self.states[world, :, _STATE]
-        waits = self._before @ ((state == QUEUED) | (state == CLEARING))
+        waits = (self._before & ((state == QUEUED) | (state == CLEARING))).any(axis=1)
         waits &= (state == CLEARING) & (self.states[world, :, _KEPT] == 0)
         return [self._roads[road] for road in np.flatnonzero(waits).tolist()]
 
     def due(self, ticks: NDArray[np.int64]) -> list[tuple[int, str]]:
         """Return each world and road that closes in the next step; `ticks` as for `cleared`."""
         state = self.states[..., _STATE]
-        waits = ((state == QUEUED) | (state == CLEARING)) @ self._before.T
+        closing = (state == QUEUED) | (state == CLEARING)
+        waits = (closing[:, np.newaxis] & self._before).any(axis=2)
         runs = np.broadcast_to(ticks, len(state))[:, np.newaxis] >= 0
         return [
             (world, self._roads[road])
@@ -196,5 +197,5 @@ def _roads_before(network: RoadNetwork, edges: Sequence[int]) -> NDArray[np.bool
         leads[:, column] = np.isin(edges, reached)
     reaches = leads
     for _ in range(len(edges).bit_length()):
-        reaches = reaches | reaches @ reaches
+        reaches = reaches | (reaches[:, :, np.newaxis] & reaches).any(axis=1)
     return leads & ~reaches.T

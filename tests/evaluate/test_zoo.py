@@ -12,6 +12,7 @@ import pytest
 from cavmarl import make_vec
 from cavmarl.config.registry import agent_entries, load_config
 from cavmarl.core.errors import ConfigError, ManifestError, PolicyError
+from cavmarl.evaluate.evaluation import run_seeds
 from cavmarl.evaluate.zoo import TABLES, cross, verify_entry, zoo_entries
 from cavmarl.policies.loading import load_policy, policy_files
 from tests.golden.zoo import OTHER, SAME, record
@@ -70,6 +71,7 @@ def test_a_difference_is_reported_with_its_step(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"] |= {"episodes": 1, "seed": 3}
+    document |= {"episodes": 1, "seeds": run_seeds(3, len(document["seeds"]))}
     path.write_text(json.dumps(document))
     assert set(verify_entry(entry).differing) == set(TABLES)
 
@@ -78,6 +80,7 @@ def test_a_result_is_recorded_again(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"] |= {"episodes": 1, "seed": 3}
+    document |= {"episodes": 1, "seeds": run_seeds(3, len(document["seeds"]))}
     path.write_text(json.dumps(document))
     assert record(entry) == OTHER
     assert not verify_entry(entry).differing
