@@ -72,7 +72,7 @@ PASSED_ON = {
 }
 
 # A new capability raises these two bounds by the lines that it needs; the commit says why.
-PACKAGE_LINES = 153_800
+PACKAGE_LINES = 154_300
 REACHABLE_LINES = 92_400  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.

@@ -39,7 +39,7 @@ class Scales:
                 self._merge(*found)
 
     def _merge(self, new: int, squares: Tensor, mean: Tensor) -> None:
-        """Add observations of which the number, the variances and the means are given."""
+        """Add observations by their number, variances and means."""
         network = self._network
         squares, mean = squares.to(network.mean.device), mean.to(network.mean.device)
         apart, total = mean - network.mean, self._count + new

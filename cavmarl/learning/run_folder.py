@@ -96,7 +96,7 @@ class RunFolder:
         settings: settings of the run; a non-empty `resume` continues the run.
         world: the environment of the training.
         plans: assignment of shards to workers.
-        ranks: the processes of the run, of which the first one writes the files.
+        ranks: the processes of the run; the first one writes the files.
 
     Raises:
         ConfigError: the run that is resumed had another number of processes.
