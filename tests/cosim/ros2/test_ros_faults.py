@@ -85,11 +85,11 @@ def test_a_node_that_dies_is_counted_as_late(domain: int, run_bridge: Run) -> No
 
         killer = threading.Thread(target=kill)
         killer.start()
-        report, _ = run_bridge(RosOptions(domain=domain, ready_s=20.0, deadline_s=0.05), 60)
+        report, _ = run_bridge(RosOptions(domain=domain, ready_s=20.0, deadline_s=0.3), 30)
         killer.join(20.0)
     counts = report["controls"]["car_0"]
-    assert report["steps"] == 61
-    assert counts["used"] > 0  # on a busy machine, some answers of a living node are late, too
+    assert report["steps"] == 31
+    assert counts["used"] >= 10
     assert counts["late"] > 10
     # The last command is held.
     assert counts["held"] == counts["late"]
