@@ -28,7 +28,7 @@ TIMES = {"seconds", "agent_steps_per_s", "simulation_s", "transfer_s", "inferenc
 RUN = [
     "ppo", "--env", "ring", "--num-envs", "2", "--agents", "2", "--background", "2",
     "--hidden", "8", "--num-steps", "32", "--epochs", "2", "--minibatches", "2",
-    "--checkpoint-updates", "1000", "--total-agent-steps", "12000",
+    "--checkpoint-updates", "1000", "--total-agent-steps", "60000",
 ]  # fmt: skip
 
 
