@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
+import psutil
 import pytest
 from typer.testing import CliRunner
 
@@ -86,7 +87,8 @@ def test_a_preempted_job_is_queued_again_and_resumes(here: Path) -> None:
     assert folder == here / "runs/job"
     wait(lambda: rows(folder) > 2, log)
     assert read_checkpoint(folder).updates == 0
-    os.kill(int(told["job"]), signal.SIGUSR2)  # its number is that of its process
+    (trains,) = psutil.Process(int(told["job"])).children()  # the job's process watches this one
+    trains.send_signal(signal.SIGUSR2)
     wait(lambda: read_checkpoint(folder).updates, log)
     assert not is_trained(folder)
     wait(lambda: is_trained(folder), log)
