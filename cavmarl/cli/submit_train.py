@@ -19,12 +19,10 @@ from cavmarl.core.errors import ConfigError, TrainingError, require, require_all
 if TYPE_CHECKING:
     from cavmarl.learning.cluster_job import TrainingJob
 
-PLACES = ("slurm", "local")
-REFUSED = {
-    "service": "the service evaluates drivers, but trains none",
-    "ray": "jobs of Ray are not supported; `cavmarl train ppo --backend ray:N` runs worlds in Ray",
-}
+PLACES = ("slurm", "ray", "local")
+REFUSED = {"service": "the service evaluates drivers, but trains none"}
 CLUSTER = "Cluster"
+DAY_MIN = 24 * 60
 
 
 def submit_train(
@@ -40,7 +38,7 @@ def submit_train(
     ] = None,
     to: Annotated[
         str,
-        about("Where the job runs: slurm, or local for this machine.", metavar="PLACE"),
+        about("Where the job runs: slurm, ray, or local for this machine.", metavar="PLACE"),
     ] = "slurm",
     processes: Annotated[
         int, about("Processes that train one network together; ppo.", metavar="N", min=1)
@@ -48,9 +46,14 @@ def submit_train(
     cpus: Annotated[int, about("CPUs of each process.", metavar="N", min=1, panel=CLUSTER)] = 1,
     gpus: Annotated[int, about("GPUs of the job.", metavar="N", min=0, panel=CLUSTER)] = 0,
     job_minutes: Annotated[
-        int,
-        about("Time limit of a job; then it is queued again.", metavar="MIN", min=1, panel=CLUSTER),
-    ] = 24 * 60,
+        int | None,
+        about(
+            "Time limit of a job; then it is queued again. The default is a day; Ray has none.",
+            metavar="MIN",
+            min=1,
+            panel=CLUSTER,
+        ),
+    ] = None,
     sbatch: Annotated[
         list[str] | None,
         about(
@@ -67,11 +70,19 @@ def submit_train(
     """
     if to not in PLACES:
         why = REFUSED.get(to, "unknown")
-        raise ConfigError(f"--to {to}: {why}; give {' or '.join(PLACES)}")
-    if sbatch and to != "slurm":
-        raise ConfigError(f"--sbatch: has no effect with --to {to}; leave it out")
+        raise ConfigError(f"--to {to}: {why}; give {', '.join(PLACES[:-1])} or {PLACES[-1]}")
+    useless = ["--sbatch"] if sbatch and to != "slurm" else []
+    useless += ["--job-minutes"] if job_minutes and to == "ray" else []
+    if useless:
+        raise ConfigError(f"{useless[0]}: has no effect with --to {to}; leave it out")
     parameters = _pairs(sbatch or [])
     job = make_job(name, with_config(options or []), processes)
+    if to == "ray":
+        from cavmarl.learning import ray_job
+
+        number = ray_job.submit(job, cpus * processes, gpus)
+        typer.echo(f"job: {number}\nrun: {job.folder}\nlog: ray job logs {number}")
+        return
     submitit = require("submitit", "cluster")
     logs = Path(job.folder) / "jobs"
     try:
@@ -83,7 +94,7 @@ def submit_train(
         ) from error
     executor.update_parameters(
         name=Path(job.folder).name,
-        timeout_min=job_minutes,
+        timeout_min=job_minutes or DAY_MIN,
         cpus_per_task=cpus * processes,
         gpus_per_node=gpus,
         slurm_additional_parameters=parameters,

@@ -72,9 +72,9 @@ def rows(folder: Path) -> int:
     return path.read_text().count("\n") - 1 if path.exists() else 0
 
 
-def check_resumed(folder: Path) -> None:
+def check_resumed(folder: Path, *options: str) -> None:
     """Compare the run of a job with a run that was not interrupted."""
-    assert load_program("ppo").main([*RUN[1:], "--name", "whole"]) == 0
+    assert load_program("ppo").main([*RUN[1:], *options, "--name", "whole"]) == 0
     assert learnt(folder) == learnt(Path("runs/whole"))
 
 
@@ -121,9 +121,9 @@ def test_a_job_continues_its_own_run_and_no_other(here: Path) -> None:
     ("words", "said"),
     [
         (["ppo", "--to", "service"], "--to service: the service evaluates drivers, but trains no"),
-        (["ppo", "--to", "pbs"], "--to pbs: unknown; give slurm or local"),
+        (["ppo", "--to", "pbs"], "--to pbs: unknown; give slurm, ray or local"),
         (["ppo", "--sbatch", "a=b", "--to", "local"], "--sbatch: has no effect with --to local"),
-        (["ppo", "--to", "ray"], "--to ray: jobs of Ray are not supported; `cavmarl train ppo -"),
+        (["ppo", "--to", "ray", "--job-minutes", "9"], "--job-minutes: has no effect with --to ray"),
         (["ppo", "--sbatch", "gpu"], "--sbatch gpu: must be KEY=VALUE"),
         (["pppo"], "pppo: is no training program that can resume; choose one of ippo_torchrl, "),
         (["ppo_rllib"], "ppo_rllib: is no training program that can resume; choose one of ippo_"),

@@ -36,6 +36,7 @@ _MAP_FIXTURES = {"shared_maps", "built_map", "town", "town_file"}
 _DEAR_FOLDERS = ("tests/cosim/", "tests/train/")
 
 RAY_FILES = (
+    "tests/learning/test_ray_job.py",
     "tests/parallel/test_ray_combinations.py",
     "tests/parallel/test_ray_start.py",
     "tests/parallel/test_ray_worlds.py",
