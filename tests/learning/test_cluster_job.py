@@ -123,7 +123,7 @@ def test_a_job_continues_its_own_run_and_no_other(here: Path) -> None:
         (["ppo", "--to", "service"], "--to service: the service evaluates drivers, but trains no"),
         (["ppo", "--to", "pbs"], "--to pbs: unknown; give slurm, ray or local"),
         (["ppo", "--sbatch", "a=b", "--to", "local"], "--sbatch: has no effect with --to local"),
-        (["ppo", "--to", "ray", "--job-minutes", "9"], "--job-minutes: has no effect with --to ray"),
+        (["ppo", "--to", "ray", "--job-minutes", "9"], "--job-minutes: has no effect with"),
         (["ppo", "--sbatch", "gpu"], "--sbatch gpu: must be KEY=VALUE"),
         (["pppo"], "pppo: is no training program that can resume; choose one of ippo_torchrl, "),
         (["ppo_rllib"], "ppo_rllib: is no training program that can resume; choose one of ippo_"),
