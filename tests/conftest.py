@@ -84,8 +84,9 @@ def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object], context:
     from cavmarl.evaluate.traffic import sumo_side
     from cavmarl.parallel.nodes import node_starters
     from cavmarl.parallel.processes import fork_server
+    from cavmarl.traffic.sumo import sumo_process
 
-    for module in (fork_server, node_starters, subprocess_calls):
+    for module in (fork_server, node_starters, subprocess_calls, sumo_process):
         patch.setattr(module, "start_python", start)
     patch.setattr(sumo_side, "get_context", lambda how: context)
 

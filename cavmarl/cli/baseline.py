@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from datetime import datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -11,7 +10,6 @@ from rich.markup import escape
 
 from cavmarl.cli.evaluate import driver_cell
 from cavmarl.cli.output import (
-    OUTPUT,
     PAGE_EXTRAS,
     Agents,
     Backend,
@@ -19,6 +17,7 @@ from cavmarl.cli.output import (
     Imports,
     JsonPath,
     MapName,
+    NewFolder,
     Seed,
     Workers,
     Zones,
@@ -27,9 +26,10 @@ from cavmarl.cli.output import (
     grid,
     make_folder,
     parse_settings,
+    results_folder,
     write_json,
 )
-from cavmarl.core.errors import ConfigError, require_all
+from cavmarl.core.errors import require_all
 from cavmarl.core.progress import progress_bar
 
 
@@ -48,12 +48,7 @@ def baseline(
     backend: Backend = None,
     workers: Workers = None,
     imports: Imports = None,
-    out: Annotated[
-        Path | None,
-        about(
-            "New folder for the results [default: a folder in runs/].", metavar="DIR", panel=OUTPUT
-        ),
-    ] = None,
+    out: NewFolder = None,
     json_path: JsonPath = None,
 ) -> None:
     """Compare drivers on a map, and write a page.
@@ -64,10 +59,7 @@ def baseline(
     require_all(PAGE_EXTRAS)
     from cavmarl.evaluate.baseline import baseline_drivers, figures, run_baseline, write_baseline
 
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
-    folder = out or Path("runs/baseline") / f"{Path(where).name.split('.')[0]}-{stamp}"
-    if folder.exists() and any(folder.iterdir()):
-        raise ConfigError(f"--out {folder}: the folder is not empty; name a new folder")
+    folder = results_folder(out, "baseline", where)
     make_folder(folder)
     console = Console()
     with progress_bar(console) as bar:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from datetime import datetime
 from pathlib import Path
 from shutil import rmtree
 from typing import TYPE_CHECKING, Annotated
@@ -13,10 +12,10 @@ from rich.console import Console
 from rich.markup import escape
 
 from cavmarl.cli.output import (
-    OUTPUT,
     PAGE_EXTRAS,
     Backend,
     JsonPath,
+    NewFolder,
     Seed,
     Workers,
     Zones,
@@ -24,6 +23,7 @@ from cavmarl.cli.output import (
     backend_text,
     grid,
     make_folder,
+    results_folder,
     write_json,
 )
 from cavmarl.core.errors import CavmarlError, ConfigError, require_all
@@ -88,12 +88,7 @@ def evacuate(
     zones: Zones = None,
     backend: Backend = None,
     workers: Workers = None,
-    out: Annotated[
-        Path | None,
-        about(
-            "New folder for the results [default: a folder in runs/].", metavar="DIR", panel=OUTPUT
-        ),
-    ] = None,
+    out: NewFolder = None,
     json_path: JsonPath = None,
 ) -> None:
     """Let vehicles leave areas of a map over exits, and write a page with clearance times.
@@ -124,10 +119,7 @@ def evacuate(
         network = load_world(where, agents=0, background=0).network  # kept, so it is read once
         plan = _plan_of_map(where, network, count, around, radius)
     plan = _changed(plan, exits, contraflow, close, within_s, seconds)
-    stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
-    folder = out or Path("runs/evacuate") / f"{Path(where).name.split('.')[0]}-{stamp}"
-    if folder.exists() and any(folder.iterdir()):
-        raise ConfigError(f"--out {folder}: the folder is not empty; name a new folder")
+    folder = results_folder(out, "evacuate", where)
     was_there = folder.exists()
     make_folder(folder)
     console = Console()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextvars import ContextVar
+from datetime import datetime
 from functools import partial, wraps
 from inspect import Parameter, Signature, signature
 from pathlib import Path
@@ -271,6 +272,10 @@ Repeats = Annotated[
     int,
     about("Number of independent runs, each in a new process.", "--repeats", "-r", metavar="N"),
 ]
+NewFolder = Annotated[
+    Path | None,
+    about("New folder for the results [default: a folder in runs/].", metavar="DIR", panel=OUTPUT),
+]
 JsonPath = Annotated[
     Path | None,
     about(
@@ -443,6 +448,19 @@ def make_folder(path: Path) -> None:
             pass
     except OSError as error:
         raise _unwritable(path, error) from error
+
+
+def results_folder(out: Path | None, command: str, where: str) -> Path:
+    """Return the folder given by `--out`, or the name of a new folder in runs/ for this command.
+
+    Raises:
+        ConfigError: the folder has files.
+    """
+    stamp = datetime.now().strftime("%Y%m%d-%H%M%S-%f")
+    folder = out or Path("runs") / command / f"{Path(where).name.split('.')[0]}-{stamp}"
+    if folder.exists() and any(folder.iterdir()):
+        raise ConfigError(f"--out {folder}: the folder is not empty; name a new folder")
+    return folder
 
 
 def write_json(path: Path | None, document: dict[str, Any]) -> None:

@@ -7,7 +7,6 @@ import json
 import time
 from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
 from typing import Any, Self, TypeVar
 
 import httpx
@@ -45,10 +44,6 @@ def _write(files: dict[str, bytes], folder: str | Path) -> Path:
     for name, content in files.items():
         (path / name).write_bytes(content)
     return path
-
-
-def _listed(lanes: Sequence[int] | None) -> list[int] | None:
-    return None if lanes is None else [int(lane) for lane in lanes]
 
 
 def _request(
@@ -287,9 +282,7 @@ class RemoteWorld:
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world, as `insert_vehicle` of `make_vec` does."""
-        asked = self.flows.change(
-            "insert_vehicle", lane=lane, position_m=float(position_m), world=world
-        )
+        asked = self.flows.change("insert_vehicle", lane=lane, position_m=position_m, world=world)
         self._client.run(asked)
 
     def close_road(
@@ -300,20 +293,19 @@ class RemoteWorld:
         shuts_in: bool = False,
     ) -> None:
         """Close lanes of a road, as `close_road` of `make_vec` does."""
-        given = {"edge": edge, "lanes": _listed(lanes), "world": world, "shuts_in": shuts_in}
+        given = {"edge": edge, "lanes": lanes, "world": world, "shuts_in": shuts_in}
         self._client.run(self.flows.change("close_road", **given))
 
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
         """Open lanes of a road, as `open_road` of `make_vec` does."""
-        asked = self.flows.change("open_road", edge=edge, lanes=_listed(lanes), world=world)
-        self._client.run(asked)
+        self._client.run(self.flows.change("open_road", edge=edge, lanes=lanes, world=world))
 
     def damage_road(
         self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
     ) -> None:
         """Lower the speed limit of lanes of a road, as `damage_road` of `make_vec` does."""
-        given = {"edge": edge, "speed_mps": float(speed_mps), "lanes": _listed(lanes)}
-        self._client.run(self.flows.change("damage_road", **given, world=world))
+        given = {"edge": edge, "speed_mps": speed_mps, "lanes": lanes, "world": world}
+        self._client.run(self.flows.change("damage_road", **given))
 
     def declare_event(self, world: int, agent: int | str, cause: str) -> None:
         """Let the vehicle of an agent, given by index or id, announce an event."""
@@ -330,7 +322,7 @@ class RemoteWorld:
 
         The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
         """
-        given = {"name": name, "place": place, "seed": seed, "params": dict(params or {})}
+        given = {"name": name, "place": place, "seed": seed, "params": params or {}}
         self._client.run(self.flows.change("scenario", **given))
 
     def save_state(self) -> bytes:
@@ -342,7 +334,7 @@ class RemoteWorld:
 
     def record(self, include: Sequence[str] = ()) -> None:
         """Record the worlds on the node from the next command on; see `RecordOptions.include`."""
-        self._client.run(self.flows.change("record", include=list(include)))
+        self._client.run(self.flows.change("record", include=include))
 
     def recording(self, folder: str | Path) -> list[Path]:
         """Write what has been recorded so far to a new folder, and return its recordings.
@@ -472,9 +464,7 @@ class AsyncClient:
     async def __aenter__(self) -> Self:
         return self
 
-    async def __aexit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, _: TracebackType | None
-    ) -> None:
+    async def __aexit__(self, *_: object) -> None:
         await self.close()
 
 
@@ -518,9 +508,7 @@ class AsyncWorld:
 
     async def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Like `RemoteWorld.insert_vehicle`."""
-        asked = self.flows.change(
-            "insert_vehicle", lane=lane, position_m=float(position_m), world=world
-        )
+        asked = self.flows.change("insert_vehicle", lane=lane, position_m=position_m, world=world)
         await self._client.run(asked)
 
     async def close_road(
@@ -531,22 +519,21 @@ class AsyncWorld:
         shuts_in: bool = False,
     ) -> None:
         """Like `RemoteWorld.close_road`."""
-        given = {"edge": edge, "lanes": _listed(lanes), "world": world, "shuts_in": shuts_in}
+        given = {"edge": edge, "lanes": lanes, "world": world, "shuts_in": shuts_in}
         await self._client.run(self.flows.change("close_road", **given))
 
     async def open_road(
         self, edge: str, lanes: Sequence[int] | None = None, world: int = 0
     ) -> None:
         """Like `RemoteWorld.open_road`."""
-        asked = self.flows.change("open_road", edge=edge, lanes=_listed(lanes), world=world)
-        await self._client.run(asked)
+        await self._client.run(self.flows.change("open_road", edge=edge, lanes=lanes, world=world))
 
     async def damage_road(
         self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
     ) -> None:
         """Like `RemoteWorld.damage_road`."""
-        given = {"edge": edge, "speed_mps": float(speed_mps), "lanes": _listed(lanes)}
-        await self._client.run(self.flows.change("damage_road", **given, world=world))
+        given = {"edge": edge, "speed_mps": speed_mps, "lanes": lanes, "world": world}
+        await self._client.run(self.flows.change("damage_road", **given))
 
     async def declare_event(self, world: int, agent: int | str, cause: str) -> None:
         """Like `RemoteWorld.declare_event`."""
@@ -560,7 +547,7 @@ class AsyncWorld:
         params: Mapping[str, bool | float] | None = None,
     ) -> None:
         """Like `RemoteWorld.scenario`."""
-        given = {"name": name, "place": place, "seed": seed, "params": dict(params or {})}
+        given = {"name": name, "place": place, "seed": seed, "params": params or {}}
         await self._client.run(self.flows.change("scenario", **given))
 
     async def save_state(self) -> bytes:
@@ -569,7 +556,7 @@ class AsyncWorld:
 
     async def record(self, include: Sequence[str] = ()) -> None:
         """Like `RemoteWorld.record`."""
-        await self._client.run(self.flows.change("record", include=list(include)))
+        await self._client.run(self.flows.change("record", include=include))
 
     async def recording(self, folder: str | Path) -> list[Path]:
         """Like `RemoteWorld.recording`."""

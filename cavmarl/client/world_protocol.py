@@ -12,7 +12,7 @@ from __future__ import annotations
 import io
 import math
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -109,10 +109,11 @@ class WorldFlows:
 
     def change(self, kind: str, **given: Any) -> Flow[None]:
         """Change the worlds between two steps; see `cavmarl.service.change_bodies`."""
-        for name, value in given.items():
+        json = {"kind": kind, **{name: _plain(value) for name, value in given.items()}}
+        for name, value in json.items():
             if isinstance(value, float) and not math.isfinite(value):
                 raise ActionError(f"{name} = {value}: must be a finite number")
-        yield from self._command(SentCommand("change", {}, json={"kind": kind, **given}))
+        yield from self._command(SentCommand("change", {}, json=json))
 
     def declare_event(self, agent: int | str, cause: str, world: int) -> Flow[None]:
         """Let the vehicle of an agent, given by its index or id, announce an event."""
@@ -295,6 +296,17 @@ def _may_pass(error: Exception, names: Sequence[str], until_s: float) -> bool:
     if isinstance(error, ServiceError) and error.problem not in names:
         return False
     return time.monotonic() < until_s
+
+
+def _plain(value: Any) -> Any:
+    """Return a value as JSON has it: numbers of NumPy as numbers, sequences as lists."""
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, Mapping):
+        return {key: _plain(one) for key, one in value.items()}
+    if isinstance(value, Iterable) and not isinstance(value, str):
+        return [_plain(one) for one in value]
+    return value
 
 
 def pack(arrays: Mapping[str, NDArray[Any]]) -> bytes:

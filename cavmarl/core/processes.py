@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import os
-import resource
 import signal
 import subprocess
 import sys
@@ -64,20 +63,6 @@ def die_with_parent() -> None:
     """Let the system kill this process when the thread that started it ends; Linux only."""
     if _LIBC is not None:
         _LIBC.prctl(_PR_SET_PDEATHSIG, int(signal.SIGKILL), 0, 0, 0)
-
-
-def limit_memory(most_bytes: int) -> None:
-    """Limit the memory that this process may allocate from now on; Linux only.
-
-    Its children get the same limit.
-    """
-    if _LIBC is not None:
-        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-        pages_now = int(Path("/proc/self/statm").read_text().split()[5])
-        most = most_bytes + pages_now * resource.getpagesize()
-        if hard != resource.RLIM_INFINITY:
-            most = min(most, hard)
-        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
 
 
 def occupy_standard_descriptors() -> None:
@@ -145,8 +130,8 @@ def start_python(
 
     It finds modules in the working directory only if this process does.
 
-    `words`: `-m` and a module, or `-c` and a program, and arguments. `env`: environment variables
-    in addition to those of this process.
+    `words`: `-m` and a module, `-c` and a program, or a file; then arguments. `env`: environment
+    variables in addition to those of this process.
     """
     here = str(Path(__file__).resolve().parents[2])
     path = os.pathsep.join([here, *(place for place in sys.path if place)])

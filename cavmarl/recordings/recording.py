@@ -294,11 +294,6 @@ class Recording:
         return self._kept[1]
 
 
-def _is_in_order(index: NDArray[np.void]) -> bool:
-    episodes, ticks = np.diff(index["episode"]), np.diff(index["tick"])
-    return bool(((episodes > 0) | (episodes == 0) & (ticks > 0)).all())
-
-
 def _number(text: str) -> int | None:
     is_number = text.isascii() and text.isdecimal() and len(text) <= MOST_DIGITS
     return int(text) if is_number else None

@@ -158,32 +158,43 @@ def test_features_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones")
 
 
+def hosted(*elsewhere: str) -> pytest.MarkDecorator:
+    """Return the features as variants; those that other tests compare, too, are slow tests."""
+    slow = (*elsewhere, *(feature for feature in FEATURES if feature.startswith("SUMO")))
+    return pytest.mark.parametrize(
+        "feature",
+        [
+            pytest.param(feature, marks=pytest.mark.slow) if feature in slow else feature
+            for feature in FEATURES
+        ],
+    )
+
+
 # SUMO over workers: `tests/traffic/test_sumo_processes.py`; over nodes: `test_node_parts.py`.
-hosted = pytest.mark.parametrize(
-    "feature",
-    [
-        pytest.param(feature, marks=pytest.mark.slow) if feature.startswith("SUMO") else feature
-        for feature in FEATURES
-    ],
-)
-
-
-@hosted
+@hosted()
 def test_features_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "workers")
 
 
-@hosted
+@hosted()
 def test_features_of_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "zones over workers")
 
 
-@hosted
+# While a node dies: `test_node_parts.py`, `test_node_network.py` and `test_node_cuts.py`.
+@hosted(
+    "mounted sensors",
+    "messages",
+    "a network simulator",
+    "a scenario",
+    "rerouting",
+    "repartitions",
+)
 def test_features_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "nodes")
 
 
-@hosted
+@hosted()
 def test_features_of_whole_worlds_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
     check(make, tmp_path, feature, "worlds over nodes")
 

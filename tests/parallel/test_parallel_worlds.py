@@ -57,6 +57,7 @@ def test_worlds_over_workers_equal_those_of_one_process(mode: str, kind: str, wo
     env.close()
 
 
+@pytest.mark.slow  # `test_workers.py` and `test_split.py` kill workers of the same pool
 def test_dead_workers_change_no_result() -> None:
     whole = drive(parallel_env("grid4x4", **settings("open")))
     env = parallel_env("grid4x4", workers=2, **settings("open"))

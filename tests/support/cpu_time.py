@@ -34,7 +34,7 @@ __all__ = [
 LISTED_AT_END_S = 2.0  # tests above this time are listed at the end of a run
 ARGUED_S = 2.0  # tests above this time are slow, except tests in argued.txt
 LISTED_S = 0.5  # tests below this time are not in costs.txt
-OFTEN_S = 1.5  # total time of a test's variants in every run; at least one variant runs
+OFTEN_S = 0.5  # total time of a test's variants in every run; at least the cheapest runs
 TURNS = 30  # runs of `make rotation` after which each slow test that is not long has run
 CHEAP_S = 0.05  # assumed time of a test that is not in costs.txt
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
@@ -72,13 +72,13 @@ def rare_tests(
     """Return the tests that are too expensive for every run.
 
     Args:
-        names: of all tests in order; variants of a test differ after the bracket.
+        names: of all tests; variants of a test differ after the bracket.
         costs: known processor times in s by name.
         kept: expensive tests that are in every run; `[*]` after a test: all its variants.
     """
     spent: dict[str, float] = {}
     rare = set()
-    for name in names:
+    for name in sorted(names, key=lambda name: costs.get(name, 0.0)):
         test, cost_s = name.split("[", 1)[0], costs.get(name, 0.0)
         another = test in spent and spent[test] + cost_s > OFTEN_S and cost_s > 0.0
         another = another and f"{test}[*]" not in kept

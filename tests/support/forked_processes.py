@@ -19,15 +19,21 @@ from typing import IO, Any
 
 from cavmarl.core.processes import start_python
 from cavmarl.evaluate.subprocess_calls import PROGRAM
+from cavmarl.traffic.sumo import sumo_child
 from tests.support.local_actors import FORKS
 
 __all__ = ["FORKS", "ForkedProcess", "start_forked"]
 
 
+# Environment variables that libsumo sets when it is imported.
+_SET_BY_LIBSUMO = ("SUMO_HOME", "PROJ_LIB", "PROJ_DATA")
+
+
 class ForkedProcess:
     """The part of `subprocess.Popen` that pools and tests use.
 
-    `words`: arguments of an interpreter: `-m` and a module, or `-c` and a program, and others.
+    `words`: arguments of an interpreter: `-m` and a module, `-c` and a program, or a file, and
+    others.
     `env`: environment variables; None: those of this process.
     """
 
@@ -37,15 +43,21 @@ class ForkedProcess:
         *,
         env: Mapping[str, str] | None = None,
         stdin: int | None = None,
-        stdout: int | None = None,
+        stdout: int | IO[bytes] | None = None,
+        stderr: IO[bytes] | None = None,
         pass_fds: Sequence[int] = (),
         text: bool = False,
     ) -> None:
+        self.stdin: IO[Any] | None
+        self.stdout: IO[Any] | None
         self.stdin, read = _pipe_to(text) if stdin == subprocess.PIPE else (None, _nothing())
         self.stdout, write = _pipe_from(text) if stdout == subprocess.PIPE else (None, os.dup(1))
         if stdout == subprocess.DEVNULL:
             os.dup2(_nothing(), write)
-        given = {0: read, 1: write, 2: 2} | {number: number for number in pass_fds}
+        elif stdout is not None and not isinstance(stdout, int):
+            os.dup2(stdout.fileno(), write)
+        errors = 2 if stderr is None else stderr.fileno()
+        given = {0: read, 1: write, 2: errors} | {number: number for number in pass_fds}
         passed = {number: DupFd(there) for number, there in given.items()}
         variables = dict(os.environ if env is None else env)
         self._process = FORKS.Process(
@@ -93,7 +105,7 @@ class ForkedProcess:
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
     """Replace `start_python`; programs that do not use cavmarl are passed on to it."""
     ours = words[0] == "-m" and words[1].startswith(("cavmarl.", "tests."))
-    if ours or words == ["-c", PROGRAM]:
+    if ours or words == ["-c", PROGRAM] or words[0] == sumo_child.__file__:
         return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)
     return start_python(words, env=env, **options)
 
@@ -122,13 +134,18 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     for number, there in moved.items():
         os.dup2(there, number)
         os.close(there)
+    of_libsumo = {name: os.environ[name] for name in _SET_BY_LIBSUMO if name in os.environ}
     os.environ.clear()
-    os.environ.update(variables)
+    os.environ.update(of_libsumo | variables)
     own, asked = os.getpid(), os.getppid
     # The parent of this process is the process that forks; report the caller as the parent.
     os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.stdin = open(0, closefd=False)
     sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # type: ignore[misc]
+    if words[0].endswith(".py"):
+        sys.argv = words
+        runpy.run_path(words[0], run_name="__main__")
+        return
     how, what, *arguments = words
     if how == "-c":
         sys.argv = [how, *arguments]

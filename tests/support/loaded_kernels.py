@@ -1,8 +1,13 @@
-"""Loads the kernels of worlds when it is imported, for processes that are forked later."""
+"""Loads the kernels of worlds and libsumo when it is imported, for forks of the process."""
 
 from __future__ import annotations
+
+import contextlib
 
 from cavmarl.engine.world_setup import load_world
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 
 LocalWorlds(load_world("grid4x4", zones=4), 1, warm=True)
+
+with contextlib.suppress(ImportError):  # the extra 'sumo'
+    import libsumo  # noqa: F401

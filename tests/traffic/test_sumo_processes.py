@@ -370,6 +370,7 @@ def test_a_node_resumes_the_log_of_another_node(tmp_path: Path, source: str) -> 
 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks Linux for a process's settings")
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
+@pytest.mark.usefixtures("fresh_processes")
 def test_settings_of_the_c_library_by_the_user_take_precedence(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:

@@ -22,13 +22,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.errors import ConfigError, require
-from cavmarl.core.processes import limit_memory
 from cavmarl.core.records.codes import SIGNAL_NONE
 from cavmarl.driving.vehicles import VEHICLE, blank_vehicle
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficCounts, TrafficMeter, TrafficRun
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import limit
+from cavmarl.traffic.sumo.sumo_child import limit_memory
 from cavmarl.traffic.sumo.sumo_input import SumoInput, command_words, free_libsumo
 from cavmarl.traffic.sumo.sumo_process import MAX_SUMO_BYTES, MEMORY_LIMIT
 

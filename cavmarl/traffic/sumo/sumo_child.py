@@ -13,17 +13,17 @@ from __future__ import annotations
 import importlib
 import json
 import os
+import resource
 import signal
 import socket
 import sys
 from collections.abc import Callable, Sequence
 from itertools import chain, compress, repeat
+from pathlib import Path
 from typing import Any, NoReturn
 
 import numpy as np
 from numpy.typing import NDArray
-
-from cavmarl.core.processes import die_with_parent, limit_memory
 
 HEAD = np.dtype([("kind", "<i4"), ("records", "<i4"), ("letters", "<i4"), ("line", "<i4")])
 START, STEP, LOOK_UP = 0, 1, 2  # kinds of requests
@@ -304,6 +304,20 @@ def _answer(
     wire.sendall(head.tobytes() + records + letters + text)
 
 
+def limit_memory(most_bytes: int) -> None:
+    """Limit the memory that this process may allocate from now on; Linux only.
+
+    Its children get the same limit.
+    """
+    if sys.platform == "linux":
+        hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+        pages_now = int(Path("/proc/self/statm").read_text().split()[5])
+        most = most_bytes + pages_now * resource.getpagesize()
+        if hard != resource.RLIM_INFINITY:
+            most = min(most, hard)
+        resource.setrlimit(resource.RLIMIT_DATA, (most, most))
+
+
 def _serve(wire: socket.socket, most_bytes: int) -> NoReturn:
     _, _, setup = _request(wire)
     simulation = SumoSimulation(setup)
@@ -331,12 +345,9 @@ def _serve(wire: socket.socket, most_bytes: int) -> NoReturn:
 
 def main() -> None:
     """Serve requests until the process that started this one ends."""
-    number, parent, dies_with_thread, most_bytes = map(int, sys.argv[1:])
+    number, most_bytes = map(int, sys.argv[1:])
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the other side handles Ctrl-C and closes
-    if dies_with_thread:
-        die_with_parent()
-    if os.getppid() == parent:
-        _serve(socket.socket(fileno=number), most_bytes)
+    _serve(socket.socket(fileno=number), most_bytes)
 
 
 if __name__ == "__main__":

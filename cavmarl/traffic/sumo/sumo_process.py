@@ -6,13 +6,10 @@ import json
 import os
 import socket
 import subprocess
-import sys
 import tempfile
-import threading
 import weakref
 from collections.abc import Mapping
 from importlib.util import find_spec
-from pathlib import Path
 from typing import IO, Any, NamedTuple
 
 import numpy as np
@@ -26,6 +23,7 @@ from cavmarl.core.processes import (
     last_words,
     occupy_standard_descriptors,
     refuse_fork,
+    start_python,
 )
 from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo import sumo_child as child
@@ -73,25 +71,16 @@ class SumoProcess:
         occupy_standard_descriptors()
         ours, theirs = socket.socketpair()
         output = tempfile.TemporaryFile()
-        with_thread = threading.current_thread() is threading.main_thread()
         self._most_bytes = limit(MEMORY_LIMIT, MAX_SUMO_BYTES)
-        numbers = (theirs.fileno(), os.getpid(), int(with_thread), self._most_bytes)
-        words = list(map(str, numbers))
-        path = os.pathsep.join(part for part in sys.path if part)
         with theirs:
-            process = subprocess.Popen(
-                [sys.executable, "-P", str(Path(child.__file__)), *words],
+            process = start_python(
+                [child.__file__, str(theirs.fileno()), str(self._most_bytes)],
+                # SUMO's memory access is scattered; huge pages save up to a sixth of a step.
+                {"OMP_NUM_THREADS": "1", **huge_heap()},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
                 stderr=output,
                 pass_fds=(theirs.fileno(),),
-                env={
-                    **os.environ,
-                    "PYTHONPATH": path,
-                    "OMP_NUM_THREADS": "1",
-                    # SUMO's memory access is scattered; huge pages save up to a sixth of a step.
-                    **huge_heap(),
-                },
             )
         ours.settimeout(ANSWER_S)
         self.pid = process.pid
