@@ -396,6 +396,10 @@ def hold_for_foe(
     # passes that line and the shared area is further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     comes_last = not (gives_way and conflict["must_yield"])
+    if foe_link["from_lane"] == target["from_lane"]:
+        if foe["dist"] >= distance:
+            return HOLD_NONE  # of vehicles on one lane, the vehicle ahead goes first
+        front = min(front, 0.0)
     if comes_last and front > 0.0 and not _is_committed(foe, front):
         return HOLD_NONE  # early exit for most foes, which does not read the VEHICLE row
     wait_m = foe_link["wait_m"]
