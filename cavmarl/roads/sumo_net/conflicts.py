@@ -301,8 +301,9 @@ def conflict_rows(
     Two links are foes if the map sets the bit of either, as some maps set one of the two bits. A
     link over a bridge and a link below it are never foes. Links from different lanes that are no
     foes in the map, but so close that cars would touch, are foes, too; the turn across the road
-    yields. Links from one lane are foes where their paths meet again beyond the fork; the vehicle
-    ahead goes first. An unruled link ends in the same lane as another link, and the map has no rule for both.
+    yields. Links from one lane are foes where their paths meet again beyond the fork; neither has
+    the right of way. An unruled link ends in the same lane as another link, and the map has no rule
+    for both.
 
     Args:
         movements: one per LINK row.

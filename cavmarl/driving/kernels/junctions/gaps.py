@@ -392,14 +392,12 @@ def hold_for_foe(
         return HOLD_NONE
     target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
+    if foe_link["from_lane"] == target["from_lane"]:
+        return HOLD_NONE  # the vehicle ahead goes first, see `behind_fork`
     # Distance of the foe's front to the line at which it can still stop: its stop line or, if it
     # passes that line and the shared area is further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     comes_last = not (gives_way and conflict["must_yield"])
-    if foe_link["from_lane"] == target["from_lane"]:
-        if foe["dist"] >= distance:
-            return HOLD_NONE  # of vehicles on one lane, the vehicle ahead goes first
-        front = min(front, 0.0)
     if comes_last and front > 0.0 and not _is_committed(foe, front):
         return HOLD_NONE  # early exit for most foes, which does not read the VEHICLE row
     wait_m = foe_link["wait_m"]

@@ -496,7 +496,7 @@ def constraint_inside(
             continue
         for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
-            if foe["row"] == i:
+            if foe["row"] == i or roads.links[foe["link"]]["from_lane"] == target["from_lane"]:
                 continue
             found = _constraint_of(roads, rows, kind, row, conflict, foe, place, dt)
             if found > no_constraint(kind):
