@@ -34,7 +34,7 @@ from cavmarl.roads.network import (
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
 # Increase this if the reader returns other rows for a file. Record types are hashed, too.
-FORMAT = 51
+FORMAT = 52
 
 _DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
 _ALIGNED = 64  # arrays begin at multiples of this number of bytes

@@ -15,9 +15,11 @@ from cavmarl.core.records.codes import DRIVER_AGENT
 from cavmarl.driving.kernels.junctions.junctions import exit_blocked
 from cavmarl.driving.kernels.junctions.stop_line_registration import STANDING_MPS
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
+from cavmarl.evaluate.traffic.native_side import idle_commands, make_world
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.junction_scenes import Scene, build_crossing
+from tests.support.narrow_places import looping_turn
 from tests.support.traffic import network as network_of
 from tests.support.traffic import on_lane, scratch, travel
 
@@ -358,6 +360,23 @@ def test_links_from_one_lane_share_their_path_up_to_the_fork(
             assert (apart[s < fork - 0.6] < 2.7).all(), "closer than two cars side by side"
             beyond = apart[s > fork + 0.6]
             assert beyond[0] > 2.5
+
+
+def test_vehicles_from_one_lane_do_not_touch_where_their_paths_meet_again(tmp_path: Path) -> None:
+    net, routes = looping_turn(tmp_path)
+    world = make_world(net, [routes], 320, 1, 0.1)
+    network, commands = world.network, idle_commands(world)
+    (first, second), (one, other) = network.links["fork_m"], network.conflicts
+    assert not one["must_yield"]
+    assert not other["must_yield"]
+    assert one["enter_m"] > first + 10.0, "the fork is no shared area"
+    assert other["enter_m"] > second + 5.0
+    for _ in range(3200):
+        world.step(commands)
+        rows = world.vehicles()
+        assert (rows["hit"] < 0).all()
+        assert (rows["wait_s"] < 10.0).all()
+    assert world.traffic_stats().arrived > 95
 
 
 def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:

@@ -18,6 +18,7 @@ from cavmarl.core.records.codes import (
     SIGNAL_GREEN_MINOR,
     SIGNAL_NONE,
     SIGNAL_RED,
+    SIGNAL_YELLOW_MINOR,
 )
 from cavmarl.driving.kernels.junctions.junctions import exit_blocked
 from cavmarl.driving.kernels.lanes.lane_index import index_lanes
@@ -125,6 +126,7 @@ def test_a_free_waiting_position_in_the_next_junction_is_room(tmp_path: Path) ->
     for light, taken, blocked in (
         (SIGNAL_GREEN_MINOR, False, False),
         (SIGNAL_GREEN_MINOR, True, True),
+        (SIGNAL_YELLOW_MINOR, False, True),
         (SIGNAL_RED, False, True),
     ):
         scene = ahead(tmp_path, light, apart_m=22.0)
@@ -153,8 +155,11 @@ def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_p
     assert world.traffic_stats().arrived == 60
 
 
-@pytest.mark.parametrize(("light", "blocked"), [(SIGNAL_RED, True), (SIGNAL_GREEN_MINOR, False)])
-def test_on_a_road_shorter_than_a_vehicle_red_blocks(
+@pytest.mark.parametrize(
+    ("light", "blocked"),
+    [(SIGNAL_RED, True), (SIGNAL_YELLOW_MINOR, True), (SIGNAL_GREEN_MINOR, False)],
+)
+def test_on_a_road_shorter_than_a_vehicle_red_and_yellow_block(
     tmp_path: Path, light: int, blocked: bool
 ) -> None:
     # At green, a vehicle that is too long to wait on that road need not wait before it either.

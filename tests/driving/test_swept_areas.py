@@ -405,7 +405,8 @@ def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
     room.approach[0] = entry[0]
     room.link_start[link], room.link_end[link] = 0, 1
     kind = generated_types()[0]
-    constraint = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room)
+    constraint = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, 0.1, room)
     assert constraint == behind(kind, 5.0, 20.0 + 1.0 - 2.5 - 6.0, 0.0, kind["decel"])
     room.approach[0]["dist"] = -0.5 * BUS_M - 40.0  # the rear of the bus has left the lane
-    assert behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, room) == no_constraint(kind)
+    constraint = behind_fork(network.arrays, kind, rows[0], lane, -1, 20.0, 0.1, room)
+    assert constraint == no_constraint(kind)

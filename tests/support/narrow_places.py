@@ -1,4 +1,4 @@
-"""Maps with little room for vehicles: a lane drop, close signals, and close U-turns."""
+"""Maps with little room: a lane drop, close signals, close U-turns, and paths that meet again."""
 
 from __future__ import annotations
 
@@ -67,6 +67,18 @@ TURNS_DEMAND = """<routes>
 <flow id="west" begin="0" end="900" period="30"><route edges="wa ab ba aw"/></flow>
 <flow id="east" begin="1" end="900" period="30.5"><route edges="eb ba ab be"/></flow></routes>"""
 
+LOOP_NODES = """<nodes><node id="w" x="-150" y="0"/><node id="j" x="0" y="0" type="priority"/>
+<node id="e" x="150" y="0"/><node id="s" x="14" y="-150"/></nodes>"""
+LOOP_EDGES = """<edges><edge id="wj" from="w" to="j" shape="-150,0 -8,0"/>
+<edge id="je" from="j" to="e" shape="14,0 150,0"/>
+<edge id="js" from="j" to="s" shape="14,-8 14,-150"/></edges>"""
+LOOP_CONNECTIONS = """<connections><connection from="wj" to="je" fromLane="0" toLane="0"/>
+<connection from="wj" to="js" fromLane="0" toLane="0"
+  shape="-8,-1.6 -3.4,2.3 -0.3,13.9 4,16.4 8.7,14.6 11.3,9.2 12.4,-8"/></connections>"""
+LOOP_DEMAND = """<routes>
+<flow id="turn" from="wj" to="js" begin="0" end="300" period="6" departSpeed="max"/>
+<flow id="on" from="wj" to="je" begin="0" end="300" period="6.2" departSpeed="max"/></routes>"""
+
 
 def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[Path, Path]:
     """Make a road on which two lanes become one, with `per_h` vehicles/h on each lane."""
@@ -88,6 +100,11 @@ def signal_pair(
 def turning_pair(folder: Path) -> tuple[Path, Path]:
     """Make a road of 11 m with room for one car, at both ends of which vehicles turn round."""
     return _made(folder, TURNS_NODES, TURNS_EDGES, TURNS_CONNECTIONS, TURNS_DEMAND)
+
+
+def looping_turn(folder: Path) -> tuple[Path, Path]:
+    """Make a right turn that begins to the left, and crosses the way straight on from its lane."""
+    return _made(folder, LOOP_NODES, LOOP_EDGES, LOOP_CONNECTIONS, LOOP_DEMAND)
 
 
 def _made(folder: Path, nodes: str, edges: str, connections: str, demand: str) -> tuple[Path, Path]:

@@ -248,7 +248,7 @@ def _road_ahead(
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
         before = roads.links[here["link"]]["from_lane"]
-        fork = behind_fork(roads, kind, row, before, here["link"], -place, scratch)
+        fork = behind_fork(roads, kind, row, before, here["link"], -place, dt, scratch)
         constraint, hold, waits = constraint_inside(
             roads, travel, rows, i, here["link"], place, row["way"], phase, dt, scratch
         )
@@ -286,7 +286,7 @@ def _road_ahead(
             break
         stops = False
         if link >= 0 and distance < see:
-            fork = behind_fork(roads, kind, row, before, link, distance, scratch)
+            fork = behind_fork(roads, kind, row, before, link, distance, dt, scratch)
             at_line, found, to_stop = decide_at_line(
                 roads, travel, rows, i, kind, link, distance, way, phase, dt, scratch
             )

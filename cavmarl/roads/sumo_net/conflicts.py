@@ -105,11 +105,14 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     return found
 
 
-def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> Overlap | None:
+def grazing(
+    path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath, *, forked: bool = False
+) -> Overlap | None:
     """Return where cars on two paths would touch because cars are oblique in bends, or None.
 
-    The ways are the paths with some metres of the lanes at their ends. The result has the positions
-    of an arriving front bumper and of a leaving rear bumper, like that of `overlap`.
+    The ways are the paths with some metres of the lanes at their ends. If the paths are `forked`,
+    they leave the same lane: only the area where they meet again counts. The result has the
+    positions of an arriving front bumper and of a leaving rear bumper, like that of `overlap`.
     """
     mine, theirs = poses(path, way), poses(foe, foe_way)
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
@@ -120,10 +123,16 @@ def grazing(path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath) -> 
     if not rows.size:
         return None
     meet = touching(apart[rows, columns, :2], mine.heading[rows], theirs.heading[columns])
+    if forked:
+        meet &= (rows > _first_absent(rows[meet])) & (columns > _first_absent(columns[meet]))
     if not meet.any():
         return None
     here, there = path.s[rows[meet]], foe.s[columns[meet]]
     return Overlap(*_from_centres(path, here), *_from_centres(foe, there))
+
+
+def _first_absent(numbers: NDArray[np.intp]) -> int:
+    return int(np.setdiff1d(np.arange(len(numbers) + 1), numbers)[0])
 
 
 def poses(path: LinkPath, way: LinkPath) -> Poses:
@@ -292,7 +301,9 @@ def conflict_rows(
     Two links are foes if the map sets the bit of either, as some maps set one of the two bits. A
     link over a bridge and a link below it are never foes. Links from different lanes that are no
     foes in the map, but so close that cars would touch, are foes, too; the turn across the road
-    yields. An unruled link ends in the same lane as another link, and the map has no rule for both.
+    yields. Links from one lane are foes where their paths meet again beyond the fork; neither has
+    the right of way. An unruled link ends in the same lane as another link, and the map has no rule
+    for both.
 
     Args:
         movements: one per LINK row.
@@ -326,7 +337,8 @@ def conflict_rows(
                 if merging and not any(yields):
                     yields = not _is_straight(a) and _is_straight(b), _is_straight(a)
             else:
-                continue
+                shared = _grazing(paths, ways, one, other, forked=True)
+                yields = False, False
             if shared is None:
                 continue
             mine, theirs = shared[:2], shared[2:4]
@@ -407,12 +419,17 @@ def _turns_across(movement: Movement, left_hand: bool) -> bool:
 
 
 def _grazing(
-    paths: Sequence[LinkPath | None], ways: Sequence[LinkPath | None], one: int, other: int
+    paths: Sequence[LinkPath | None],
+    ways: Sequence[LinkPath | None],
+    one: int,
+    other: int,
+    *,
+    forked: bool = False,
 ) -> Overlap | None:
     path, foe, way, foe_way = paths[one], paths[other], ways[one], ways[other]
     if path is None or foe is None or way is None or foe_way is None:
         return None
-    return grazing(path, foe, way, foe_way)
+    return grazing(path, foe, way, foe_way, forked=forked)
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:

@@ -392,6 +392,8 @@ def hold_for_foe(
         return HOLD_NONE
     target = roads.links[link]
     foe_link = roads.links[conflict["foe"]]
+    if foe_link["from_lane"] == target["from_lane"]:
+        return HOLD_NONE  # the vehicle ahead goes first, see `behind_fork`
     # Distance of the foe's front to the line at which it can still stop: its stop line or, if it
     # passes that line and the shared area is further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]

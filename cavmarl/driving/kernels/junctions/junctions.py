@@ -141,22 +141,28 @@ def _hold_for_foes(
     return hold
 
 
+@inlined_kernel
+def _stops_all(signal: int) -> bool:
+    """Return whether no vehicle that is still before the previous junction passes this signal."""
+    red = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
+    return red or signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR
+
+
 @kernel
 def _waits_at(
     roads: RoadArrays, link: int, road_m: float, needed: float, phase: NDArray[np.int32]
 ) -> bool:
     """Return whether a vehicle has to expect to wait before `link`, beyond the next junction.
 
-    It does so at red, and where it yields during green: it may not go before red. But if the road
-    before `link`, `road_m` m long, has no room for the vehicle, it cannot wait there until others
-    let it go. At links without a signal it expects to go, as in SUMO.
+    It does so at red and yellow, and where it yields during green: it may not go before red. But if
+    the road before `link`, `road_m` m long, has no room for the vehicle, it cannot wait there until
+    others let it go. At links without a signal it expects to go, as in SUMO.
     """
     signal = link_signal(roads, link, phase)
-    stops = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
     yields = signal != SIGNAL_NONE and (
         must_stop(roads, link, signal) or is_minor(roads, link, phase)
     )
-    waits: bool = stops or (yields and road_m >= needed)
+    waits: bool = _stops_all(signal) or (yields and road_m >= needed)
     return waits
 
 
@@ -164,13 +170,12 @@ def _waits_at(
 def _room_inside(roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch: Scratch) -> float:
     """Return how far beyond its line a vehicle that yields on `link` can wait, in m.
 
-    It is 0 if the vehicle has to wait at the line: at red, without a waiting position inside, and
-    if another vehicle is on the way there.
+    It is 0 if the vehicle has to wait at the line: at red and yellow, without a waiting position
+    inside, and if another vehicle is on the way there.
     """
-    signal = link_signal(roads, link, phase)
     lane, wait_m = roads.links[link]["next_lane"], roads.links[link]["wait_m"]
     taken = scratch.lane_start[lane] < scratch.lane_end[lane]
-    if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW or wait_m == np.inf or taken:
+    if _stops_all(link_signal(roads, link, phase)) or wait_m == np.inf or taken:
         return 0.0
     room: float = wait_m
     return room
@@ -491,7 +496,7 @@ def constraint_inside(
             continue
         for k in range(scratch.link_start[conflict["foe"]], scratch.link_end[conflict["foe"]]):
             foe = scratch.approach[k]
-            if foe["row"] == i:
+            if foe["row"] == i or roads.links[foe["link"]]["from_lane"] == target["from_lane"]:
                 continue
             found = _constraint_of(roads, rows, kind, row, conflict, foe, place, dt)
             if found > no_constraint(kind):

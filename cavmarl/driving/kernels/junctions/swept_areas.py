@@ -344,8 +344,9 @@ def behind_fork(
     kind: np.void,
     row: np.void,
     lane: int,
-    chosen: int,
-    distance: float,
+    chosen: int,  # LINK that the row takes, -1: none
+    distance: float,  # from its centre to the end of the lane, m; negative beyond it
+    dt: float,
     scratch: Scratch,
 ) -> float:
     """Return the constraint of vehicles that have just left the same lane by another link."""
@@ -364,4 +365,35 @@ def behind_fork(
                 constraint = max(
                     constraint, behind(kind, row["speed"], gap, other["speed"], kind["decel"])
                 )
+            if chosen >= 0 and place + other["half"] > 0.0:
+                meeting = _before_meeting_again(roads, kind, row, chosen, distance, other, dt)
+                constraint = max(constraint, meeting)
     return constraint
+
+
+@kernel
+def _before_meeting_again(
+    roads: RoadArrays,
+    kind: np.void,
+    row: np.void,
+    link: int,
+    distance: float,
+    other: np.void,
+    dt: float,
+) -> float:
+    """Return the constraint of an APPROACH whose path meets that of `link` again after the fork.
+
+    A vehicle in the shared area goes first, or else the vehicle that is further from the fork.
+    """
+    front, foe_front = 0.5 * row["length"] - distance, other["half"] - other["dist"]
+    first = roads.links[link]["first_conflict"]
+    for c in range(first, first + roads.links[link]["num_conflicts"]):
+        area = roads.conflicts[c]
+        if area["foe"] != other["link"]:
+            continue
+        if front > area["enter_m"] or foe_front - 2.0 * other["half"] > area["foe_leave_m"]:
+            break
+        ahead = other["dist"] < distance or (other["dist"] == distance and other["id"] < row["id"])
+        if ahead or foe_front > area["foe_enter_m"]:
+            return before_line(kind, row["speed"], area["enter_m"] - front, dt)
+    return no_constraint(kind)

@@ -142,7 +142,7 @@ def constraint_over_lane_end(
     over it.
     """
     row = rows[i]
-    constraint = behind_fork(roads, kind, row, lane, -1, distance, scratch)
+    constraint = behind_fork(roads, kind, row, lane, -1, distance, dt, scratch)
     if not is_near or is_steered(row):
         return constraint
     if roads.lanes[lane]["num_links"] == 0:
