@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,11 +19,14 @@ from cavmarl.driving.vehicle_types import (
     NEAREST_CLASS,
     NO_ROAD_CLASSES,
     VTYPE,
+    agent_types,
     generated_types,
+    names_beside_car,
     set_model,
 )
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
+from cavmarl.traffic.scenarios.movement_scripts import actor_types
 from cavmarl.traffic.sumo.sumo_input import SumoInput, begun, command_words, read_input
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
@@ -45,6 +48,9 @@ class SumoDemand:
     interface: str  # `libsumo` or `traci`
     version: str  # version of SUMO
     types: NDArray[np.void]  # VTYPE (num_types,) of the road vehicles
+    # VTYPE (n,) of this package's vehicles besides the car; they follow `types` in a world's table
+    puppets: NDArray[np.void]
+    reroutes: str  # which vehicles take another way if lanes change; empty: lanes do not change
     type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
     content_hash: str  # hash of all files
 
@@ -57,6 +63,7 @@ class SumoDemand:
         """Return the setup that a process receives once, with VTYPE rows of the world's table."""
         return _names(self.network, self.interface) | {
             "drives": self.drives,
+            "reroutes": self.reroutes,
             "types": {
                 name: row + len(generated_types()) if row < len(self.types) else -1
                 for row, name in enumerate(self.type_ids)
@@ -65,7 +72,16 @@ class SumoDemand:
 
     def words(self, folder: Path, seed: int) -> list[str]:
         """Return SUMO's command line; `folder` is for files that it reads."""
-        return _words(self.map_file, self.given, folder, self.dt_s, self.max_vehicles, seed)
+        words = _words(
+            self.map_file, self.given, folder, self.dt_s, self.max_vehicles, seed, self._puppets()
+        )
+        # Otherwise SUMO ends if a vehicle enters whose route leads over a closed road.
+        return [*words, "--ignore-route-errors=true"] if self.reroutes else words
+
+    def _puppets(self) -> dict[int, np.void]:
+        """Return the types of vehicles that SUMO does not move, by VTYPE row."""
+        first = len(generated_types()) + len(self.types)
+        return {first + row: kind for row, kind in enumerate(self.puppets)}
 
 
 def read_sumo_demand(
@@ -81,10 +97,12 @@ def read_sumo_demand(
     """
     given = begun(read_input(files), config.horizon_s)
     interface = choose_interface(config.sumo.interface)
-    process = SumoProcess(_names(network, interface) | {"types": {}, "drives": False})
+    process = SumoProcess(
+        _names(network, interface) | {"types": {}, "drives": False, "reroutes": ""}
+    )
     try:
         with tempfile.TemporaryDirectory() as folder:
-            words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0)
+            words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0, {})
             # Read all of the demand, not only its first minutes.
             found = process.look_up([*words, "--route-steps=0"])
     except ConfigError as error:
@@ -113,6 +131,8 @@ def read_sumo_demand(
         interface=interface,
         version=found["version"],
         types=_types(list(on_road.values())),
+        puppets=_puppet_types(config),
+        reroutes=config.population.reroute if config.may_change_lanes else "",
         type_ids=(*on_road, *others),
         content_hash=_hash(given),
     )
@@ -124,14 +144,24 @@ def _names(network: RoadNetwork, interface: str) -> dict[str, Any]:
         "lanes": list(network.lane_ids),
         "edges": list(network.edge_ids),
         "signals": list(network.signal_ids),
+        "classes": [
+            [name for name, nearest in NEAREST_CLASS.items() if nearest == one]
+            for one in VEHICLE_CLASSES
+        ],
     }
 
 
 def _words(
-    map_file: Path, given: SumoInput, folder: Path, dt_s: float, most: int, seed: int
+    map_file: Path,
+    given: SumoInput,
+    folder: Path,
+    dt_s: float,
+    most: int,
+    seed: int,
+    others: Mapping[int, np.void],
 ) -> list[str]:
     puppets = folder / "puppets.add.xml"
-    puppets.write_text(_puppets(), encoding="utf-8")
+    puppets.write_text(_puppets(others), encoding="utf-8")
     own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
         # This package detects contacts; SUMO removes no vehicle for one.
@@ -142,15 +172,36 @@ def _words(
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 
 
-def _puppets() -> str:
-    """Return types for vehicles that SUMO does not move; they are never teleported."""
+def _puppets(others: Mapping[int, np.void]) -> str:
+    """Return types for vehicles that SUMO does not move; they are never teleported.
+
+    `others`: VTYPE of all such vehicles besides the car, by VTYPE row.
+    """
+    car = {row: (kind, "") for row, kind in enumerate(generated_types())}
+    # SUMO's drivers take the car to brake like a car of SUMO.
+    rest = {
+        row: (
+            kind,
+            f'accel="{kind["accel"]}" decel="{kind["decel"]}" '
+            f'emergencyDecel="{kind["emergency_decel"]}" minGap="{kind["min_gap"]}" ',
+        )
+        for row, kind in others.items()
+    }
     kinds = "".join(
         f'<vType id="cavmarl.{row}" vClass="ignoring" length="{kind["length"]}" '
         f'width="{kind["width"]}" height="{kind["height"]}" maxSpeed="{kind["max_speed"]}" '
-        'timeToTeleport="1000000"/>'
-        for row, kind in enumerate(generated_types())
+        f'{limits}timeToTeleport="1000000"/>'
+        for row, (kind, limits) in (car | rest).items()
     )
     return f"<additional>{kinds}</additional>"
+
+
+def _puppet_types(config: EnvConfig) -> NDArray[np.void]:
+    """Return VTYPE (n,) of vehicles of agents, the caller and a scenario besides the car."""
+    population = config.population
+    names = names_beside_car(population, population.external > 0)
+    types = agent_types(names, own=population.own_types)
+    return np.concatenate([actor_types(), types]) if config.scenario.name else types
 
 
 def _types(described: list[dict[str, Any]]) -> NDArray[np.void]:

@@ -39,6 +39,7 @@ class SumoTick(NamedTuple):
     stops: NDArray[np.int64]
     teleported: tuple[int, ...]  # numbers of vehicles taken off the road
     rerouted: NDArray[np.int64]  # (r,) numbers of vehicles with a changed route, ascending
+    ways: NDArray[np.int64]  # (k, 2) numbers of vehicles that have asked for a way, and paths
 
 
 class SumoWorlds:
@@ -51,6 +52,7 @@ class SumoWorlds:
         stops: their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has teleported since each reset.
+        dropped: (W,) vehicles that SUMO has not let in since each reset: their roads were closed.
         logs: by world, what SUMO has received since its reset; empty: not kept.
     """
 
@@ -61,6 +63,7 @@ class SumoWorlds:
         self.stops = stops
         self.names: list[list[str]] = [[] for _ in range(num_worlds)]
         self.teleports = np.zeros(num_worlds, dtype=np.int64)
+        self.dropped = np.zeros(num_worlds, dtype=np.int64)
         self.logs: tuple[ToldLog, ...] = ()
         self._demand = demand
         self._tick_ms = round(1000.0 * demand.dt_s)
@@ -87,7 +90,7 @@ class SumoWorlds:
         self.book.begin(w)
         self.stops.begin(w)
         self.names[w] = []
-        self.teleports[w] = 0
+        self.teleports[w] = self.dropped[w] = 0
         if self.logs:
             self.logs[w].begin()
         self._path_of[w] = np.zeros(0, dtype=np.int32)
@@ -180,6 +183,14 @@ class SumoWorlds:
         for number, name in lifted:
             log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
         self.teleports[w] += len(lifted)
+        if dropped := line.get("dropped", []):
+            self.dropped[w] += len(dropped)
+            log.warning(
+                "world %d, tick %d: SUMO drops %s, whose first road is closed (%d in this episode)",
+                w, tick, ", ".join(dropped), self.dropped[w],
+            )  # fmt: skip
+        ways = np.array(line.get("ways", []), dtype=np.int32).reshape(-1, 3)
+        ways[:, 1] = self.book.look_up(w, ways[:, 1], ways[:, 2])
         return SumoTick(
             tick,
             seen,
@@ -189,6 +200,7 @@ class SumoWorlds:
             np.array(stops, dtype=np.int64).reshape(-1, 2),
             tuple(number for number, _ in lifted),
             self._changed(w, seen),
+            ways[:, :2].astype(np.int64),
         )
 
     def _changed(self, w: int, seen: NDArray[np.void]) -> NDArray[np.int64]:
