@@ -25,6 +25,7 @@ from cavmarl.config.traffic import TrafficConfig
 from cavmarl.config.v2x import V2xConfig
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.zones import ZonesConfig
+from cavmarl.core.scene_names import is_scene_file
 
 BY_MAP = 0.0  # horizon in s that is derived from the map
 
@@ -323,8 +324,9 @@ class EnvConfig(Section, key=""):
         )
         self.need(
             "scenario.name",
-            not self.scenario.name,
-            f"traffic.source = {source}: scenarios need native traffic; leave the key out",
+            not is_scene_file(self.scenario.name),
+            f"traffic.source = {source}: a logged scene has traffic of its own; name a scripted "
+            "scenario, or use traffic.source = native",
         )
 
     @property

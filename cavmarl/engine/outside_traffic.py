@@ -46,6 +46,9 @@ class OutsideTraffic:
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of the other simulator, after cavmarl's own vehicles."""
 
+    def mirror_people(self, tick: Tick, people: Sequence[NDArray[np.void]]) -> None:
+        """Move the persons of the other simulator; `people`: SEEN of each world."""
+
     def let_in(self, tick: Tick) -> None:
         """Add the vehicles that have entered in the other simulator."""
 
@@ -98,6 +101,7 @@ class SumoPhases(OutsideTraffic):
                 sumo.send_on(departures, worlds, side)
                 return
         tick.note_phase(MIRROR)
+        self.callers.mirror_people(tick, sumo.people)
         if sumo.mirror(worlds, side):
             tick.executor.dismiss(departures)
             tick.coordination.left(departures)

@@ -250,8 +250,13 @@ class NativeTraffic:
 
     @property
     def num_external(self) -> int:
-        """Slots of vehicles that are posed: those of the caller, then the replayed ones."""
-        return self.population.external + self.num_replayed
+        """Slots of vehicles that are posed: of the caller, replayed ones, then SUMO's persons."""
+        return self.population.external + self.num_replayed + self.num_persons
+
+    @property
+    def num_persons(self) -> int:
+        """Number of SUMO's persons that are mirrored."""
+        return 0 if self.sumo is None else self.sumo.num_persons
 
     @property
     def _other_types(self) -> list[str]:
@@ -661,7 +666,7 @@ def capacity_of(
 
 
 def _capacity_of_sumo(population: PopulationConfig, sumo: SumoDemand) -> int:
-    return _own_vehicles(population) + sumo.max_vehicles
+    return _own_vehicles(population) + sumo.max_vehicles + sumo.num_persons
 
 
 def _own_vehicles(population: PopulationConfig) -> int:

@@ -292,8 +292,12 @@ class LoadedWorlds:
         ticks = max(1, -int(-tick_s // _LONGEST_TICK_S))
         config, _ = load_config(spec.env, overrides=spec.overrides)
         _refuse_signal_agents(config)
+        if config.traffic.source == "sumo-traffic":
+            served = {**SERVED_WORLD, "population.external": 0}  # SUMO would not see such vehicles
+        else:
+            served = SERVED_WORLD
         overrides = {
-            **SERVED_WORLD,
+            **served,
             "horizon_s": tick_s * round(_HORIZON_S / tick_s),
             **spec.overrides,
             "clock.sim_dt_s": tick_s / ticks,

@@ -70,6 +70,8 @@ class SumoSimulation:
         self._lane_names: list[str] = setup["lanes"]
         self._classes: list[list[str]] = setup["classes"]  # SUMO's classes by bit of a class
         self._reroutes: str = setup["reroutes"]  # see `population.reroute`
+        self._outages_ms: dict[str, int] = setup["outages_ms"]  # time of failure by signal
+        self._num_slots: int = setup["persons"]  # maximum number of persons that are reported
         self._forget()
 
     def _forget(self) -> None:
@@ -83,6 +85,9 @@ class SumoSimulation:
         self._waiting: set[str] = set()  # loaded vehicles that have not entered
         self._goals: dict[int, str] = {}  # last edge of each route, by its number
         self._goal_of: dict[int, str] = {}  # last edge of each vehicle's route
+        self._slot_of: dict[str, int] = {}  # by person
+        self._to_fail = dict(self._outages_ms)
+        self._free_slots = list(reversed(range(self._num_slots)))
 
     def start(self, words: list[str]) -> dict[str, Any]:
         self._stop()
@@ -122,12 +127,20 @@ class SumoSimulation:
             self._change_lanes(moved[is_lane])
         if self._is_seen:
             self._place(moved[~is_lane])
+        self._fail_signals()
         self._sumo.simulationStep()
         line = self._after_closures() if self._allowed else {}
         seen, letters, news = self.read_state()
         if not self._is_seen and not is_lane.all():
             line["ways"] = self._find_ways(moved[~is_lane], news)
         return seen, letters, news | line
+
+    def _fail_signals(self) -> None:
+        """Switch off the signals that are off after the next step."""
+        after_ms = self._time_ms() + round(1000.0 * self._sumo.simulation.getDeltaT())
+        for name in [name for name, at_ms in self._to_fail.items() if at_ms <= after_ms]:
+            del self._to_fail[name]
+            self._sumo.trafficlight.setProgram(name, "off")
 
     def _change_lanes(self, changes: NDArray[np.void]) -> None:
         """Set the classes and the limits of lanes, and let vehicles find other routes."""
@@ -137,9 +150,7 @@ class SumoSimulation:
         ):
             name = self._lane_names[row]
             on_map = self._allowed.setdefault(name, tuple(lanes.getAllowed(name)))
-            shut = {
-                one for k, of in enumerate(self._classes) if bits >> k & 1 for one in of
-            }
+            shut = {one for k, of in enumerate(self._classes) if bits >> k & 1 for one in of}
             allowed = [one for one in on_map if one not in shut]
             self._shut[name] = shut
             lanes.setMaxSpeed(name, limit_mps)
@@ -245,7 +256,40 @@ class SumoSimulation:
         for field, get in self._getters.items():
             seen[field] = np.fromiter(map(get, names), self._seen[field], len(names))
         letters = "".join(map(self._state_of, self._signals)).encode()
-        return seen[np.argsort(numbers)], letters, line
+        seen = seen[np.argsort(numbers)]
+        return (
+            np.concatenate([self._people(line), seen]) if self._num_slots else seen,
+            letters,
+            line,
+        )
+
+    def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
+        """Return the records of the persons who are on foot; `line` receives how many find no slot.
+
+        A slot is free for one step before another person gets it.
+        """
+        person = self._sumo.person
+        names = [name for name in person.getIDList() if not person.getVehicle(name)]
+        left = sorted(self._slot_of.keys() - set(names))
+        fresh = [name for name in names if name not in self._slot_of]
+        for name in fresh[: len(self._free_slots)]:
+            self._slot_of[name] = self._free_slots.pop()
+        if fresh[len(self._free_slots) :] and (unseen := len(names) - len(self._slot_of)) > 0:
+            line["unseen"] = unseen
+        self._free_slots += [self._slot_of.pop(name) for name in left]
+        names = [name for name in names if name in self._slot_of]
+        seen = np.zeros(len(names), dtype=self._seen)
+        seen["number"] = [-1 - self._slot_of[name] for name in names]
+        places = chain.from_iterable(map(person.getPosition3D, names))
+        seen["x"], seen["y"], seen["z"] = np.fromiter(places, np.float64).reshape(-1, 3).T
+        for field, get in (
+            ("angle", person.getAngle),
+            ("speed", person.getSpeed),
+            ("pos", person.getLength),
+            ("lat", person.getWidth),
+        ):
+            seen[field] = np.fromiter(map(get, names), np.float64, len(names))
+        return seen
 
     def _on_road(
         self,

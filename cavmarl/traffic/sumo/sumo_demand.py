@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +27,13 @@ from cavmarl.driving.vehicle_types import (
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.roads.sumo_net.xml_source import read_bytes
 from cavmarl.traffic.scenarios.movement_scripts import actor_types
-from cavmarl.traffic.sumo.sumo_input import SumoInput, begun, command_words, read_input
+from cavmarl.traffic.sumo.sumo_input import (
+    SumoInput,
+    begun,
+    command_words,
+    read_input,
+    read_unmirrored,
+)
 from cavmarl.traffic.sumo.sumo_process import SumoProcess, choose_interface
 
 _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergency_decel", "tau",
@@ -50,6 +56,9 @@ class SumoDemand:
     types: NDArray[np.void]  # VTYPE (num_types,) of the road vehicles
     # VTYPE (n,) of this package's vehicles besides the car; they follow `types` in a world's table
     puppets: NDArray[np.void]
+    num_persons: int  # persons that a world mirrors at the same time
+    num_callers: int  # vehicles that the caller may pose or drive; persons follow them
+    outages: Mapping[str, float]  # time of failure by signal, in s since the reset
     reroutes: str  # which vehicles take another way if lanes change; empty: lanes do not change
     type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
     content_hash: str  # hash of all files
@@ -64,6 +73,11 @@ class SumoDemand:
         return _names(self.network, self.interface) | {
             "drives": self.drives,
             "reroutes": self.reroutes,
+            "persons": self.num_persons,
+            "outages_ms": {
+                name: round(1000.0 * (self.given.begin_s + at_s))
+                for name, at_s in self.outages.items()
+            },
             "types": {
                 name: row + len(generated_types()) if row < len(self.types) else -1
                 for row, name in enumerate(self.type_ids)
@@ -85,12 +99,17 @@ class SumoDemand:
 
 
 def read_sumo_demand(
-    config: EnvConfig, network: RoadNetwork, map_file: Path, files: Sequence[Path]
+    config: EnvConfig,
+    network: RoadNetwork,
+    map_file: Path,
+    files: Sequence[Path],
+    outages: Mapping[str, float],
 ) -> SumoDemand:
     """Let SUMO read all files of an environment, and return the checked demand.
 
     `config`: the environment; its `traffic.source` is one of SUMO's. `map_file`: the network, as
-    SUMO reads it. `files`: one `.sumocfg`, or files of routes and additional files.
+    SUMO reads it. `files`: one `.sumocfg`, or files of routes and additional files. `outages`: time
+    of failure by signal, in s since the beginning of the episode.
 
     Raises DemandError: SUMO refuses the files on this map (the error quotes SUMO), or its signals
     differ from the map's; MissingExtraError: SUMO is not installed.
@@ -98,7 +117,8 @@ def read_sumo_demand(
     given = begun(read_input(files), config.horizon_s)
     interface = choose_interface(config.sumo.interface)
     process = SumoProcess(
-        _names(network, interface) | {"types": {}, "drives": False, "reroutes": ""}
+        _names(network, interface)
+        | {"types": {}, "drives": False, "reroutes": "", "persons": 0, "outages_ms": {}}
     )
     try:
         with tempfile.TemporaryDirectory() as folder:
@@ -120,18 +140,26 @@ def read_sumo_demand(
         if kind["vclass"] not in NO_ROAD_CLASSES and not name.startswith("cavmarl.")
     }
     others = [name for name in found["types"] if name not in on_road]
+    drives = config.traffic.source == "sumo-traffic"
+    most_persons = config.sumo.max_persons if drives else 0
+    off_road = {name: found["types"][name]["vclass"] for name in others}
+    unmirrored, has_persons = read_unmirrored(given, off_road, most_persons)
+    num_persons = most_persons if has_persons else 0
     return SumoDemand(
         network,
         map_file,
-        given,
-        drives=config.traffic.source == "sumo-traffic",
+        replace(given, tolerated=(*given.tolerated, *unmirrored)),
+        drives=drives,
         max_vehicles=config.sumo.max_vehicles,
         replay_bytes=config.sumo.replay_mib << 20,
         dt_s=config.clock.sim_dt_s,
         interface=interface,
         version=found["version"],
         types=_types(list(on_road.values())),
-        puppets=_puppet_types(config),
+        puppets=_puppet_types(config, num_persons),
+        num_persons=num_persons,
+        num_callers=config.population.external,
+        outages=outages,
         reroutes=config.population.reroute if config.may_change_lanes else "",
         type_ids=(*on_road, *others),
         content_hash=_hash(given),
@@ -196,10 +224,10 @@ def _puppets(others: Mapping[int, np.void]) -> str:
     return f"<additional>{kinds}</additional>"
 
 
-def _puppet_types(config: EnvConfig) -> NDArray[np.void]:
+def _puppet_types(config: EnvConfig, num_persons: int) -> NDArray[np.void]:
     """Return VTYPE (n,) of vehicles of agents, the caller and a scenario besides the car."""
     population = config.population
-    names = names_beside_car(population, population.external > 0)
+    names = names_beside_car(population, population.external + num_persons > 0)
     types = agent_types(names, own=population.own_types)
     return np.concatenate([actor_types(), types]) if config.scenario.name else types
 

@@ -25,7 +25,13 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds, ZoneState
-from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
+from cavmarl.core.records.codes import (
+    COUNT_REROUTED,
+    DRIVER_EXTERNAL,
+    LANE_GIVEN,
+    POS_GIVEN,
+    SPEED_MAX,
+)
 from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import find_blocked, greet, list_others, mirror, send_on
@@ -34,7 +40,6 @@ from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import LANE_CHANGE, MOVED, ToldLog
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
-
 
 _EVERY_CLASS = (1 << len(VEHICLE_CLASSES)) - 1  # bits of LANE["permissions"]
 
@@ -120,6 +125,7 @@ class SumoTraffic:
         lanes: NDArray[np.void],
     ) -> None:
         self.drives = demand.drives
+        self._num_callers = demand.num_callers
         num_worlds, capacity = zoned.rows.shape[2:]
         book = RouteBook(network, travel.steps, first_step, num_worlds, travel.types["permissions"])
         stops = StopBook(network, travel.stops, num_worlds)
@@ -202,7 +208,11 @@ class SumoTraffic:
         """Return MOVED (n,): all that the SUMO of a world receives before its step."""
         lanes = self._changes(w)
         if self.drives:
-            return np.concatenate([lanes, self._moved(w, side)]) if len(lanes) else self._moved(w, side)
+            return (
+                np.concatenate([lanes, self._moved(w, side)])
+                if len(lanes)
+                else self._moved(w, side)
+            )
         asks = self._reroutes and tick % self._ticks_per_s == 0
         return np.concatenate([lanes, self._asking(w, side)]) if asks else lanes
 
@@ -260,6 +270,11 @@ class SumoTraffic:
             )
             for w in range(len(worlds.ticks))
         )
+
+    @property
+    def people(self) -> list[NDArray[np.void]]:
+        """SEEN (p,) of each world: the persons on foot."""
+        return [self.worlds.at(w).people for w in range(self._zoned.rows.shape[2])]
 
     def forgive(self, departures: DepartureQueue) -> None:
         """Clear the events of leaving vehicles that SUMO has teleported: they have not arrived."""
@@ -376,8 +391,10 @@ class SumoTraffic:
             return np.zeros(0, dtype=MOVED)
         num = self._list_others(self._zoned, side, w, self._others)
         ours = self._others[:num]
+        is_person = (ours["driver"] == DRIVER_EXTERNAL) & (ours["order"] >= self._num_callers)
+        ours = ours[~is_person]
         ours = ours[np.argsort(ours["id"])]
-        moved = np.zeros(num, dtype=MOVED)
+        moved = np.zeros(len(ours), dtype=MOVED)
         half = 0.5 * ours["length"]
         moved["id"] = ours["id"]
         moved["x"] = ours["x"] + half * cos_all(ours["heading"])

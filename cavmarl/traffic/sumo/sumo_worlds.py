@@ -39,6 +39,7 @@ class SumoTick(NamedTuple):
     stops: NDArray[np.int64]
     teleported: tuple[int, ...]  # numbers of vehicles taken off the road
     rerouted: NDArray[np.int64]  # (r,) numbers of vehicles with a changed route, ascending
+    people: NDArray[np.void]  # SEEN (p,) persons on foot, by slot
     ways: NDArray[np.int64]  # (k, 2) numbers of vehicles that have asked for a way, and paths
 
 
@@ -70,6 +71,7 @@ class SumoWorlds:
         self._begin_ms = round(1000.0 * demand.given.begin_s)
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[SumoTick | None] = [None] * num_worlds
+        self._has_warned = [False] * num_worlds  # of persons without room, in this episode
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
 
     @property
@@ -90,6 +92,7 @@ class SumoWorlds:
         self.book.begin(w)
         self.stops.begin(w)
         self.names[w] = []
+        self._has_warned[w] = False
         self.teleports[w] = self.dropped[w] = 0
         if self.logs:
             self.logs[w].begin()
@@ -174,6 +177,13 @@ class SumoWorlds:
             raise SumoError(
                 f"world {w}: SUMO's clock shows {line['time_ms']} ms instead of {should_be} ms"
             )
+        people, seen = seen[seen["number"] < 0], seen[seen["number"] >= 0]
+        if "unseen" in line and not self._has_warned[w]:
+            self._has_warned[w] = True
+            log.warning(
+                "world %d, tick %d: %d persons of SUMO are not mirrored; raise sumo.max_persons",
+                w, tick, line["unseen"],
+            )  # fmt: skip
         self.book.enter(w, line.get("routes", []))
         seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])
         departed = line.get("departed", [])
@@ -200,6 +210,7 @@ class SumoWorlds:
             np.array(stops, dtype=np.int64).reshape(-1, 2),
             tuple(number for number, _ in lifted),
             self._changed(w, seen),
+            people,
             ways[:, :2].astype(np.int64),
         )
 
