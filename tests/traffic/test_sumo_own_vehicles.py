@@ -23,7 +23,6 @@ FLOW = (
     '<vType id="car" sigma="0" speedDev="0"/>'
     '<flow id="f" type="car" from="in" to="out" begin="0" end="900" period="4"/>'
 )
-LANE_Y = -1.6  # m, centre of the lane of the road `in`, which leads east from x = 0
 MIN_GAP_M = 2.5  # of SUMO's car
 
 
@@ -86,8 +85,9 @@ def test_sumos_cars_stop_behind_a_posed_vehicle_until_it_leaves(tmp_path: Path) 
     net = make_map(tmp_path)
     with closing(parallel_env(net, agents=1, background=0, overrides=wanted)) as env:
         env.reset(seed=1)
-        truck = env.external.spawn(200.0, LANE_Y, 0.0, vtype="truck", size_m=(10.0, 2.4, 3.0))
-        env.external.spawn(100.0, LANE_Y - 4.0, 1.5, vtype="pedestrian")
+        x, y = env.network.lane_polyline(env.network.lane_ids.index("in_0"))[0][:2].tolist()
+        truck = env.external.spawn(x + 200.0, y, 0.0, vtype="truck", size_m=(10.0, 2.4, 3.0))
+        env.external.spawn(x + 100.0, y - 4.0, 1.5, vtype="pedestrian")
         for _ in range(200):
             env.step(env.suggest_actions())
         rows = env.simulation.vehicles(0)

@@ -64,7 +64,9 @@ def test_persons_are_at_their_places_in_sumo_until_they_arrive(tmp_path: Path) -
             rows = np.sort(people(simulation), order=["x", "y"])
             persons = libsumo.person
             there = sorted(persons.getPosition(name) for name in persons.getIDList())
-            assert [(row["x"], row["y"]) for row in rows] == pytest.approx(there)
+            assert len(rows) == len(there)
+            for row, place in zip(rows, there, strict=True):
+                assert (row["x"], row["y"]) == pytest.approx(place)
             assert (rows["vtype"] == pedestrian).all()
             assert np.isin(
                 np.round(rows["speed"], 6),

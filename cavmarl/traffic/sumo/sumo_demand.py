@@ -6,6 +6,7 @@ import hashlib
 import tempfile
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from numpy.typing import NDArray
 
 from cavmarl.config.env import EnvConfig
 from cavmarl.core.errors import ConfigError, DemandError
-from cavmarl.core.records.codes import MODEL_KRAUSS
+from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_KRAUSS
 from cavmarl.driving.vehicle_types import (
     NEAREST_CLASS,
     NO_ROAD_CLASSES,
@@ -93,7 +94,7 @@ class SumoDemand:
         return [*words, "--ignore-route-errors=true"] if self.reroutes else words
 
     def _puppets(self) -> dict[int, np.void]:
-        """Return the types of vehicles that SUMO does not move, by VTYPE row."""
+        """Return the types of vehicles besides the car that SUMO does not move, by VTYPE row."""
         first = len(generated_types()) + len(self.types)
         return {first + row: kind for row, kind in enumerate(self.puppets)}
 
@@ -189,7 +190,8 @@ def _words(
     others: Mapping[int, np.void],
 ) -> list[str]:
     puppets = folder / "puppets.add.xml"
-    puppets.write_text(_puppets(others), encoding="utf-8")
+    has_walking_areas = _has_walking_areas(map_file, map_file.stat().st_mtime_ns)
+    puppets.write_text(_puppets(others, has_walking_areas), encoding="utf-8")
     own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
         # This package detects contacts; SUMO removes no vehicle for one.
@@ -200,10 +202,16 @@ def _words(
     return command_words(map_file, given, folder, dt_s, seed, more, (puppets,))
 
 
-def _puppets(others: Mapping[int, np.void]) -> str:
+@lru_cache(maxsize=64)  # SUMO is started for each episode
+def _has_walking_areas(map_file: Path, changed_ns: int) -> bool:
+    return b'function="walkingarea"' in read_bytes(map_file)
+
+
+def _puppets(others: Mapping[int, np.void], has_walking_areas: bool) -> str:
     """Return types for vehicles that SUMO does not move; they are never teleported.
 
-    `others`: VTYPE of all such vehicles besides the car, by VTYPE row.
+    `others`: VTYPE of all such vehicles besides the car, by VTYPE row. `has_walking_areas`: whether
+    the map has areas for pedestrians: SUMO would crash if it put a vehicle there.
     """
     car = {row: (kind, "") for row, kind in enumerate(generated_types())}
     # SUMO's drivers take the car to brake like a car of SUMO.
@@ -215,13 +223,24 @@ def _puppets(others: Mapping[int, np.void]) -> str:
         )
         for row, kind in others.items()
     }
+    every = car | rest
+    classes = {
+        row: _puppet_class(kind) if has_walking_areas else "ignoring"
+        for row, (kind, _) in every.items()
+    }
     kinds = "".join(
-        f'<vType id="cavmarl.{row}" vClass="ignoring" length="{kind["length"]}" '
+        f'<vType id="cavmarl.{row}" vClass="{classes[row]}" length="{kind["length"]}" '
         f'width="{kind["width"]}" height="{kind["height"]}" maxSpeed="{kind["max_speed"]}" '
         f'{limits}timeToTeleport="1000000"/>'
-        for row, (kind, limits) in (car | rest).items()
+        for row, (kind, limits) in every.items()
     )
     return f"<additional>{kinds}</additional>"
+
+
+def _puppet_class(kind: np.void) -> str:
+    """Return the class of SUMO whose lanes a VTYPE may use."""
+    is_person = kind["vclass"] == CLASS_PEDESTRIAN
+    return "passenger" if is_person else VEHICLE_CLASSES[kind["vclass"]]
 
 
 def _puppet_types(config: EnvConfig, num_persons: int) -> NDArray[np.void]:
