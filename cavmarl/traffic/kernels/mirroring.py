@@ -166,6 +166,8 @@ def send_on(
             n = np.searchsorted(numbers, row["order"])
             if row["order"] < 0 or n == numbers.size or numbers[n] != row["order"]:
                 continue
+            if row["driver"] != DRIVER_BACKGROUND:  # `order` is the slot of the caller's vehicles
+                continue
             edge = _edge_to_be(roads, row["lane"])
             for k in range(paths.first[chosen[n]], paths.first[chosen[n] + 1]):
                 if paths.edges[k] == edge:

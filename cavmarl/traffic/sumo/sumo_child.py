@@ -169,8 +169,9 @@ class SumoSimulation:
         SUMO drops a vehicle whose first edge is closed to it when the vehicle departs.
         """
         simulation = self._sumo.simulation
-        entered = set(simulation.getDepartedIDList()) - set(self._puppets.values())
-        self._waiting |= set(simulation.getLoadedIDList())
+        puppets = set(self._puppets.values())
+        entered = set(simulation.getDepartedIDList()) - puppets
+        self._waiting |= set(simulation.getLoadedIDList()) - puppets
         self._waiting -= entered
         present = set(self._vehicle.getIDList())
         is_second = self._time_ms() % 1000 < round(1000.0 * simulation.getDeltaT())
@@ -207,15 +208,14 @@ class SumoSimulation:
 
     def _find_ways(self, asking: NDArray[np.void], line: dict[str, Any]) -> list[list[int]]:
         """Return number, route and type of each vehicle that has a way to its goal."""
-        found: dict[tuple[int, int, int], int] = {}
+        found: dict[tuple[int, str, int], int] = {}
         ways = []
         for number, edge, kind in zip(
             asking["id"].tolist(), asking["edge"].tolist(), asking["kind"].tolist(), strict=True
         ):
-            goal = self._goal_of[number]
-            key = edge, self._edge_row[goal], kind
+            key = edge, self._goal_of[number], kind
             if key not in found:
-                found[key] = self._find_way(self._edges[edge], goal, kind, line)
+                found[key] = self._find_way(self._edges[edge], key[1], kind, line)
             if found[key] >= 0:
                 ways.append([number, found[key], kind])
         return ways
@@ -257,11 +257,9 @@ class SumoSimulation:
             seen[field] = np.fromiter(map(get, names), self._seen[field], len(names))
         letters = "".join(map(self._state_of, self._signals)).encode()
         seen = seen[np.argsort(numbers)]
-        return (
-            np.concatenate([self._people(line), seen]) if self._num_slots else seen,
-            letters,
-            line,
-        )
+        if self._num_slots:
+            seen = np.concatenate([self._people(line), seen])
+        return seen, letters, line
 
     def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
         """Return the records of the persons who are on foot; `line` receives how many find no slot.
@@ -274,9 +272,9 @@ class SumoSimulation:
         fresh = [name for name in names if name not in self._slot_of]
         for name in fresh[: len(self._free_slots)]:
             self._slot_of[name] = self._free_slots.pop()
-        if fresh[len(self._free_slots) :] and (unseen := len(names) - len(self._slot_of)) > 0:
-            line["unseen"] = unseen
         self._free_slots += [self._slot_of.pop(name) for name in left]
+        if unseen := len(names) - len(self._slot_of):
+            line["unseen"] = unseen
         names = [name for name in names if name in self._slot_of]
         seen = np.zeros(len(names), dtype=self._seen)
         seen["number"] = [-1 - self._slot_of[name] for name in names]

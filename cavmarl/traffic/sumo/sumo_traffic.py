@@ -27,6 +27,7 @@ from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds, ZoneState
 from cavmarl.core.records.codes import (
     COUNT_REROUTED,
+    DRIVER_BACKGROUND,
     DRIVER_EXTERNAL,
     LANE_GIVEN,
     POS_GIVEN,
@@ -208,11 +209,7 @@ class SumoTraffic:
         """Return MOVED (n,): all that the SUMO of a world receives before its step."""
         lanes = self._changes(w)
         if self.drives:
-            return (
-                np.concatenate([lanes, self._moved(w, side)])
-                if len(lanes)
-                else self._moved(w, side)
-            )
+            return np.concatenate([lanes, self._moved(w, side)])
         asks = self._reroutes and tick % self._ticks_per_s == 0
         return np.concatenate([lanes, self._asking(w, side)]) if asks else lanes
 
@@ -360,7 +357,8 @@ class SumoTraffic:
         chosen = dict(ways.tolist())
         for zone, num in enumerate(self._zoned.num_owned[:, w].tolist()):
             rows = self._zoned.rows[side, zone, w, :num]
-            for i in np.flatnonzero(np.isin(rows["order"], ways[:, 0])).tolist():
+            asked = np.isin(rows["order"], ways[:, 0]) & (rows["driver"] == DRIVER_BACKGROUND)
+            for i in np.flatnonzero(asked).tolist():
                 row = rows[i]
                 way = self._way(w, chosen[int(row["order"])], 0, int(row["lane"]))
                 stands = row["speed"] < STANDING_MPS
