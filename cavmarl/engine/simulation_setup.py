@@ -28,9 +28,18 @@ def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
     """Attach SUMO to the worlds, if it simulates the demand."""
     if isinstance(demand, SumoDemand):
         travel, zoned = tick.traffic.travel, tick.division.zoned
-        first_route = tick.traffic.own_plan_steps.stop
+        plans = tick.traffic.own_plan_steps
         lanes = tick.shards[0].own_lanes
-        traffic = SumoTraffic(demand, network, travel, first_route, zoned, blank_vehicle(), lanes)
+        traffic = SumoTraffic(
+            demand,
+            network,
+            travel,
+            plans.stop,
+            zoned,
+            blank_vehicle(),
+            lanes,
+            tick.traffic.plans.size if plans else 0,
+        )
         tick.outside = SumoPhases(traffic)
 
 

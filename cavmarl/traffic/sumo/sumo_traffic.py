@@ -34,15 +34,14 @@ from cavmarl.core.records.codes import (
     SPEED_MAX,
 )
 from cavmarl.driving.kernels.motion.motion import STANDING_MPS
-from cavmarl.roads.network import SIGNAL_STATES, VEHICLE_CLASSES, RoadNetwork
+from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
 from cavmarl.traffic.kernels.mirroring import find_blocked, greet, list_others, mirror, send_on
 from cavmarl.traffic.kernels.way_requests import has_room, put_on_way
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
-from cavmarl.traffic.sumo.sumo_history import LANE_CHANGE, MOVED, ToldLog
+from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
+from cavmarl.traffic.sumo.sumo_lanes import SumoLanes
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
-
-_EVERY_CLASS = (1 << len(VEHICLE_CLASSES)) - 1  # bits of LANE["permissions"]
 
 
 class _Shown(NamedTuple):
@@ -109,6 +108,7 @@ class SumoTraffic:
     `travel`: types and ways, with room for SUMO's routes at the end. `first_step`: start of that
     room. `zoned`: the rows of all zones. `blank`: VEHICLE (1,), template of every vehicle's
     record. `lanes`: LANE (W, L) of each world; (0, L): lanes do not change.
+    `plan_steps`: see `RouteBook`.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
@@ -124,11 +124,13 @@ class SumoTraffic:
         zoned: ZoneState,
         blank: NDArray[np.void],
         lanes: NDArray[np.void],
+        plan_steps: int = 0,
     ) -> None:
         self.drives = demand.drives
         self._num_callers = demand.num_callers
         num_worlds, capacity = zoned.rows.shape[2:]
-        book = RouteBook(network, travel.steps, first_step, num_worlds, travel.types["permissions"])
+        permissions = travel.types["permissions"]
+        book = RouteBook(network, travel.steps, first_step, num_worlds, permissions, plan_steps)
         stops = StopBook(network, travel.stops, num_worlds)
         self.worlds = SumoWorlds(demand, book, stops, num_worlds)
         self._roads: RoadArrays = network.arrays
@@ -149,12 +151,9 @@ class SumoTraffic:
         self._edge_of_lane = np.where(
             on_map["internal"], on_map["edge"][leads_to], on_map["edge"]
         ).astype(np.int32)
-        self._lanes = lanes
+        self._lanes = SumoLanes(on_map, lanes)
         self._reroutes = demand.reroutes not in ("", "never")
         self._ticks_per_s = max(1, round(1.0 / demand.dt_s))
-        # what the SUMO of each world knows of its lanes: closed classes, and limits
-        self._known_bits = np.zeros(lanes.shape, dtype=np.int64)
-        self._known_mps = np.tile(on_map["speed_mps"], (len(lanes), 1))
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Restart SUMO in the chosen worlds (W,); errors as in `SumoWorlds.begin`."""
@@ -163,9 +162,7 @@ class SumoTraffic:
 
     def _begin(self, w: int, key: int) -> None:
         self.worlds.begin(w, key)
-        if len(self._lanes):
-            self._known_bits[w] = 0
-            self._known_mps[w] = self._roads.lanes["speed_mps"]
+        self._lanes.begin(w)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
         """Log what SUMO receives from the next reset on, one log per world, for `catch_up`.
@@ -180,7 +177,7 @@ class SumoTraffic:
     @property
     def _tells(self) -> bool:
         """Whether SUMO receives anything during an episode; see `EnvConfig.tells_sumo`."""
-        return self.drives or len(self._lanes) > 0
+        return self.drives or len(self._lanes.now) > 0
 
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
@@ -194,7 +191,7 @@ class SumoTraffic:
                 logged = log.ticks(tick)
             self._begin(w, int(key))
             for passed, moved in enumerate(logged):
-                self._know(w, moved[moved["kind"] == LANE_CHANGE])
+                self._lanes.learn(w, moved)
                 self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
@@ -207,41 +204,21 @@ class SumoTraffic:
 
     def _told(self, w: int, side: int, tick: int) -> NDArray[np.void]:
         """Return MOVED (n,): all that the SUMO of a world receives before its step."""
-        lanes = self._changes(w)
+        lanes = self._lanes.news(w)
         if self.drives:
             return np.concatenate([lanes, self._moved(w, side)])
         asks = self._reroutes and tick % self._ticks_per_s == 0
         return np.concatenate([lanes, self._asking(w, side)]) if asks else lanes
-
-    def _changes(self, w: int) -> NDArray[np.void]:
-        """Return MOVED (n,): the lanes that differ from what the SUMO of a world knows."""
-        if not len(self._lanes):
-            return np.zeros(0, dtype=MOVED)
-        now, on_map = self._lanes[w], self._roads.lanes
-        bits = on_map["permissions"] & ~now["permissions"] & _EVERY_CLASS
-        limits = now["speed_mps"]
-        changed = np.flatnonzero((bits != self._known_bits[w]) | (limits != self._known_mps[w]))
-        found = np.zeros(len(changed), dtype=MOVED)
-        found["kind"], found["edge"] = LANE_CHANGE, changed
-        found["id"], found["x"] = bits[changed], limits[changed]
-        self._know(w, found)
-        return found
-
-    def _know(self, w: int, changes: NDArray[np.void]) -> None:
-        """Note that the SUMO of a world knows changes of lanes, MOVED (n,)."""
-        if len(changes):
-            self._known_bits[w, changes["edge"]] = changes["id"]
-            self._known_mps[w, changes["edge"]] = changes["x"]
 
     def _asking(self, w: int, side: int) -> NDArray[np.void]:
         """Return MOVED (n,) by ascending id: vehicles whose ways lead over closed roads.
 
         SUMO's own copies of these vehicles may have passed the road before it was closed.
         """
-        if not self._known_bits[w].any():
+        if not self._lanes.has_closed(w):
             return np.zeros(0, dtype=MOVED)
         num = self._find_blocked(
-            self._roads, self._travel, self._lanes[w], self._zoned, side, w, self._others
+            self._roads, self._travel, self._lanes.now[w], self._zoned, side, w, self._others
         )
         ours = np.sort(self._others[:num], order="id")
         asking = np.zeros(num, dtype=MOVED)
@@ -372,13 +349,18 @@ class SumoTraffic:
         for w, phase in enumerate(worlds.signal_phase):
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
-    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert rows of world w, VEHICLE or departures, to those of world w + `worlds`.
+    def single(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert rows of a world, VEHICLE or departures, to those of a single world.
 
         Ways and stops are written, because each world has its own part of their tables.
         """
-        self.worlds.book.shift(rows, worlds)
-        self.worlds.stops.shift(rows, worlds)
+        self.worlds.book.single(rows, w)
+        self.worlds.stops.shift(rows, -w)
+
+    def placed(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert rows of a single world to those of world w; see `single`."""
+        self.worlds.book.placed(rows, w)
+        self.worlds.stops.shift(rows, w)
 
     def close(self) -> None:
         self.worlds.close()
