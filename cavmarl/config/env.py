@@ -25,6 +25,7 @@ from cavmarl.config.traffic import TrafficConfig
 from cavmarl.config.v2x import V2xConfig
 from cavmarl.config.workers import WorkersConfig
 from cavmarl.config.zones import ZonesConfig
+from cavmarl.core.scene_names import is_scene_file
 
 BY_MAP = 0.0  # horizon in s that is derived from the map
 
@@ -285,7 +286,7 @@ class EnvConfig(Section, key=""):
         )
         self.need(
             "workers.balance_steps",
-            source == "sumo-demand" or self.workers.balance_steps == 0,
+            not self.tells_sumo or self.workers.balance_steps == 0,
             f"must be 0 with traffic.source = {source}: to move a world, SUMO would have to run "
             "again from the start of the episode",
         )
@@ -301,24 +302,10 @@ class EnvConfig(Section, key=""):
                 f"traffic.source = {source}: SUMO's signal changes are not known; set it to false",
             )
         self.need(
-            "population.types",
-            set(self.population.agent_types) == {"car"},
-            f"traffic.source = {source}: SUMO only knows cavmarl's car; leave the key out",
-        )
-        self.need(
-            "population.insertions",
-            self.population.insertions == 0,
-            f"traffic.source = {source}: SUMO only runs vehicles of its demand; leave the key out",
-        )
-        self.need(
-            "population.external",
-            self.population.external == 0,
-            f"traffic.source = {source}: SUMO would not see such vehicles; leave the key out",
-        )
-        self.need(
-            "map.changed_lanes",
-            self.map.changed_lanes == 0,
-            f"traffic.source = {source}: SUMO would not see these changes; leave the key out",
+            "map.contraflow",
+            not self.map.contraflow,
+            f"traffic.source = {source}: SUMO has no contraflow lanes; leave the key out, or use "
+            "traffic.source = native",
         )
         self.need(
             "signals.overrides",
@@ -337,8 +324,9 @@ class EnvConfig(Section, key=""):
         )
         self.need(
             "scenario.name",
-            not self.scenario.name,
-            f"traffic.source = {source}: scenarios need native traffic; leave the key out",
+            not is_scene_file(self.scenario.name),
+            f"traffic.source = {source}: a logged scene has traffic of its own; name a scripted "
+            "scenario, or use traffic.source = native",
         )
 
     @property
@@ -351,6 +339,15 @@ class EnvConfig(Section, key=""):
     def may_change_lanes(self) -> bool:
         """Whether lanes of a world may differ from the map: closed, or with a lower limit."""
         return self.map.changed_lanes > 0 or self.limits.are_controlled
+
+    @property
+    def tells_sumo(self) -> bool:
+        """Whether SUMO receives anything during an episode, so that its state is not its demand's.
+
+        It receives vehicles if it moves its own ones, and changes of lanes.
+        """
+        source = self.traffic.source
+        return source == "sumo-traffic" or (source != "native" and self.may_change_lanes)
 
     @property
     def drives_alone(self) -> bool:

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.config.fleet import OwnType
+from cavmarl.config.population import PopulationConfig
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN, MODEL_IDM
 from cavmarl.driving.kernels.models.following import MODELS
 from cavmarl.driving.kernels.models.idm import (
@@ -234,6 +235,15 @@ def agent_types(
         record["most_accel"], record["most_decel"] = kind.accel, kind.emergency_decel
     types.setflags(write=False)
     return types
+
+
+def names_beside_car(population: PopulationConfig, has_external: bool) -> list[str]:
+    """Return the names of the types of agents' and of the caller's vehicles, without the car.
+
+    `has_external`: whether the caller poses or drives vehicles.
+    """
+    names = [*population.agent_types, *(EXTERNAL_TYPES if has_external else ())]
+    return [name for name in dict.fromkeys(names) if name != "car"]
 
 
 def _write_own(record: np.void, own: OwnType, model: int) -> None:

@@ -38,6 +38,7 @@ class ComponentContext(NamedTuple):
     lane_plans: LanePlans | None = None  # of worlds whose lanes may differ from the map
     # (W,) the tick in which lanes last changed, -1: never; see `NativeTraffic`
     changed_at: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
+    num_persons: int = 0  # slots of SUMO's persons
     # EXTERNAL (K, L) of the replayed road users of a logged scene, see `logged_commands`
     replayed: NDArray[np.void] | None = None
 

@@ -1,7 +1,8 @@
 """Vehicles that the caller poses or drives: their commands and ids, and their part of a tick.
 
 The replayed road users of a logged scene are such vehicles, too. Their slots follow those of the
-caller, and their commands come from a table.
+caller, and their commands come from a table. The slots of SUMO's persons come last, and SUMO's step
+determines their poses.
 """
 
 from __future__ import annotations
@@ -53,13 +54,15 @@ class ExternalComponent(Component):
         leaving: (W, E) slots whose vehicles leave in this tick.
         coming: (W, E) slots whose vehicles enter in this tick.
         has_news: whether this is the first tick of a step with new commands.
+        first_person: the first slot of SUMO's persons.
     """
 
     def __init__(self, host: ComponentContext) -> None:
         self._num_told = host.config.population.external
         none = np.zeros((1, 0), dtype=EXTERNAL)
         self._replayed = none if host.replayed is None else host.replayed
-        shape = (host.num_worlds, self._num_told + self._replayed.shape[1])
+        self.first_person = self._num_told + self._replayed.shape[1]
+        shape = (host.num_worlds, self.first_person + host.num_persons)
         self._held = host.zeros((*shape, EXTERNAL_FIELDS))
         self.ids: NDArray[np.int64] = host.zeros(shape, dtype=np.int64)
         self.ids[:] = -1
@@ -123,8 +126,31 @@ class ExternalComponent(Component):
         told = records_of(self._told)
         if self._replayed.shape[1]:
             steps = np.minimum(self._ticks // self._ticks_per_step + 1, len(self._replayed) - 1)
-            told[:, self._num_told :] = self._replayed[steps]
+            told[:, self._num_told : self.first_person] = self._replayed[steps]
         return told
+
+    def see_people(self, w: int, people: NDArray[np.void], vtype: int) -> None:
+        """Take the poses of SUMO's persons in a world, SEEN (p,), after SUMO's step.
+
+        `vtype`: VTYPE row of persons.
+        """
+        persons = slice(self.first_person, None)
+        held = self.held[w, persons]
+        is_here = np.zeros(len(held), dtype=np.bool_)
+        slots = -1 - people["number"]
+        is_here[slots] = True
+        was_here = held["kind"] == EXTERNAL_POSED
+        self.coming[w, persons], self.leaving[w, persons] = is_here & ~was_here, was_here & ~is_here
+        poses = np.zeros(len(people), dtype=EXTERNAL)
+        poses["kind"], poses["vtype"] = EXTERNAL_POSED, vtype
+        for name in ("x", "y", "z", "speed"):
+            poses[name] = people[name]
+        poses["heading"] = np.radians(90.0 - people["angle"])
+        poses["pitch"] = np.nan
+        poses["length"], poses["width"] = people["pos"], people["lat"]
+        poses["height"] = self._types["height"][vtype]
+        held[...] = np.zeros((), dtype=EXTERNAL)
+        held[slots] = poses
 
     def arrays(self) -> Iterator[NDArray[Any]]:
         """Return the commands and the ids of all slots."""
@@ -172,25 +198,45 @@ class ExternalPhases(OutsideTraffic):
 
     def follow(self, tick: Tick) -> None:
         """Move the vehicles. A vehicle leaves if it is removed, or to enter again at a far pose."""
-        part, departures = self._part, tick.departures
+        part = self._part
         # A pose that is farther than any vehicle drives in a step is a jump.
         reach_m = MAX_SPEED_MPS * self._dt * self._ticks_per_step if part.has_news else math.inf
-        gone = self._move_external(
+        gone = self._move(tick, (0, part.first_person), self._ticks_per_step, reach_m)
+        if part.has_news:
+            self._dismiss(tick, gone)
+
+    def mirror_people(self, tick: Tick, people: Sequence[NDArray[np.void]]) -> None:
+        """Move SUMO's persons to their places after SUMO's step; `people`: SEEN of each world."""
+        part, end = self._part, self._part.ids.shape[1]
+        if part.first_person == end:
+            return
+        vtype = tick.traffic.type_rows["pedestrian"]
+        for w, seen in enumerate(people):
+            part.see_people(w, seen, vtype)
+        self._dismiss(tick, self._move(tick, (part.first_person, end), 1, math.inf))
+
+    def _move(self, tick: Tick, slots: tuple[int, int], ticks_per_step: int, reach_m: float) -> int:
+        """Move the vehicles of the slots [first, end); return how many leave."""
+        gone: int = self._move_external(
             self._roads,
             tick.traffic.travel,
             self._grid,
-            part.held,
-            part.leaving,
+            self._part.held,
+            self._part.leaving,
+            *slots,
             tick.division.zoned,
             tick.division.next_side,
             tick.worlds.ticks,
-            self._ticks_per_step,
+            ticks_per_step,
             reach_m,
             *self._limits,
             self._dt,
         )
-        if not part.has_news:
-            return
+        return gone
+
+    def _dismiss(self, tick: Tick, gone: int) -> None:
+        """Remove the vehicles that leave. `gone`: their number in this process."""
+        part, departures = self._part, tick.departures
         if gone:
             tick.executor.dismiss(departures)
             tick.coordination.left(departures)

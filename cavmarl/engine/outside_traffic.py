@@ -46,6 +46,9 @@ class OutsideTraffic:
     def follow(self, tick: Tick) -> None:
         """Move the vehicles of the other simulator, after cavmarl's own vehicles."""
 
+    def mirror_people(self, tick: Tick, people: Sequence[NDArray[np.void]]) -> None:
+        """Move the persons of the other simulator; `people`: SEEN of each world."""
+
     def let_in(self, tick: Tick) -> None:
         """Add the vehicles that have entered in the other simulator."""
 
@@ -64,10 +67,15 @@ class OutsideTraffic:
 
 
 class SumoPhases(OutsideTraffic):
-    """The phases of a tick in worlds with SUMO."""
+    """The phases of a tick in worlds with SUMO.
 
-    def __init__(self, traffic: SumoTraffic) -> None:
+    Attributes:
+        callers: the phases of vehicles that the caller poses or drives.
+    """
+
+    def __init__(self, traffic: SumoTraffic, callers: OutsideTraffic | None = None) -> None:
         self.sumo = self._sumo = traffic
+        self.callers = OutsideTraffic() if callers is None else callers
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Restart SUMO in the chosen worlds (W,)."""
@@ -79,6 +87,7 @@ class SumoPhases(OutsideTraffic):
 
     def follow(self, tick: Tick) -> None:
         """Step SUMO, then move its vehicles to their new places or remove them."""
+        self.callers.follow(tick)  # SUMO receives the new places of these vehicles
         sumo, departures, worlds, side = (
             self._sumo,
             tick.departures,
@@ -92,6 +101,7 @@ class SumoPhases(OutsideTraffic):
                 sumo.send_on(departures, worlds, side)
                 return
         tick.note_phase(MIRROR)
+        self.callers.mirror_people(tick, sumo.people)
         if sumo.mirror(worlds, side):
             tick.executor.dismiss(departures)
             tick.coordination.left(departures)
@@ -108,6 +118,11 @@ class SumoPhases(OutsideTraffic):
             sumo.order(departures, worlds)
         elif sumo.let_in(departures, worlds, tick.peers.running()):
             tick.admit()
+        self.callers.let_in(tick)
+
+    def running(self, peers: Peers) -> NDArray[np.int64]:
+        """Return how many places (W,) of each world are taken, or reserved for the caller."""
+        return self.callers.running(peers)
 
     def switch_signals(self, tick: Tick) -> None:
         """Copy the states of SUMO's signals."""

@@ -28,7 +28,18 @@ def add_sumo(tick: Tick, demand: object, network: RoadNetwork) -> None:
     """Attach SUMO to the worlds, if it simulates the demand."""
     if isinstance(demand, SumoDemand):
         travel, zoned = tick.traffic.travel, tick.division.zoned
-        traffic = SumoTraffic(demand, network, travel, travel.num_fixed, zoned, blank_vehicle())
+        plans = tick.traffic.own_plan_steps
+        lanes = tick.shards[0].own_lanes
+        traffic = SumoTraffic(
+            demand,
+            network,
+            travel,
+            plans.stop,
+            zoned,
+            blank_vehicle(),
+            lanes,
+            tick.traffic.plans.size if plans else 0,
+        )
         tick.outside = SumoPhases(traffic)
 
 
@@ -36,7 +47,9 @@ def add_external(tick: Tick) -> None:
     """Let the caller pose and drive vehicles, if there is room for such vehicles."""
     for part in tick.attached:
         if isinstance(part, ExternalComponent):
-            tick.outside = ExternalPhases(part, tick)
+            callers = ExternalPhases(part, tick)
+            sumo = tick.outside.sumo
+            tick.outside = callers if sumo is None else SumoPhases(sumo, callers)
 
 
 def add_simulators(

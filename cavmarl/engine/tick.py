@@ -208,8 +208,8 @@ class Tick:
         self.traffic = wrap(self.traffic)
         self.shared = wrap(self.shared)
         self.coordination = wrap(self.coordination)
-        if self.outside.sumo is not None:
-            self.outside = SumoPhases(wrap(self.outside.sumo))
+        if isinstance(self.outside, SumoPhases):
+            self.outside = SumoPhases(wrap(self.outside.sumo), self.outside.callers)
 
     def trace(self, wrap: Callable[[Executor], Executor], note: Callable[[str], None]) -> None:
         """Report phases: shards' phases to `wrap(executor)`, components' phases to `note`.

@@ -76,6 +76,7 @@ def make_tick(
             frames=frames,
             lane_plans=traffic.lane_plans,
             changed_at=traffic.changed_at,
+            num_persons=traffic.num_persons,
             replayed=None
             if traffic.num_replayed == 0 or traffic.scene is None
             else logged_commands(traffic.scene.log, traffic.type_rows, config.clock.ctrl_dt_s),
@@ -94,7 +95,7 @@ def attach(host: ComponentContext) -> tuple[Component, ...]:
         parts.append(lanes)
     if host.config.scenario.name:
         parts.append(Cues(host.travel.scripts.cues, host.shards, host.division))
-    if host.config.population.external or host.replayed is not None:
+    if host.config.population.external or host.replayed is not None or host.num_persons:
         parts.append(ExternalComponent(host))
     if host.config.signals.overrides:
         parts.append(OverrideComponent(host))

@@ -158,7 +158,8 @@ def make_world(config: EnvConfig, base_dir: Path) -> World:
     if config.traffic.source != "native":
         network = with_programs(network, read_input(files).additional_files)
         path = map_file(resolve_map(config, base_dir)).resolve()
-        demand = read_sumo_demand(config, network, path, files)
+        outages = {} if scene is None else dict(scene.outages)
+        demand = read_sumo_demand(config, network, path, files, outages)
     elif files:
         demand = read_demand(
             files,

@@ -173,14 +173,14 @@ def share_of(parts: Parts, w: int) -> list[Array]:
     owns_ways = parts.traffic.owns_ways
     waiting = departures.queue[w : w + 1, : departures.num_queue.item(w)]
     owned = [parts.division.owned(w, zone) for zone in range(parts.division.count)]
-    if parts.sumo is not None:
-        waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
-        for rows in (waiting, *owned):
-            parts.sumo.shift(rows, -w)
     if owns_ways:
         owned = [rows.copy() for rows in owned]
         for rows in owned:
             rows["way"] = parts.traffic.moved_ways(rows["way"], -w)
+    if parts.sumo is not None:
+        waiting, owned = waiting.copy(), [rows.copy() for rows in owned]
+        for rows in (waiting, *owned):
+            parts.sumo.single(rows, w)
     return [
         *(array[w : w + 1] for array in _fixed(parts)),
         waiting,
@@ -215,7 +215,7 @@ def _shifted(
     queue = sum(1 for _ in _fixed(parts))
     for n in (queue, *range(len(found) - parts.division.count, len(found))):
         found[n] = found[n].copy()
-        sumo.shift(found[n], worlds)
+        sumo.placed(found[n], worlds)
     return found
 
 
@@ -261,7 +261,7 @@ def digest_world(parts: Parts, world: int) -> str:
     if parts.traffic.owns_ways:
         rows["way"] = parts.traffic.moved_ways(rows["way"], -world)
     if sumo is not None:
-        sumo.shift(rows, -world)
+        sumo.single(rows, world)
     digest = hashlib.blake2b(digest_size=16)
     remembers = (rows["driver"] == DRIVER_LEARNED).any()
     for name in STATE_FIELDS:
@@ -273,7 +273,7 @@ def digest_world(parts: Parts, world: int) -> str:
     queue = departures.queue[world, : departures.num_queue[world]]
     if sumo is not None:
         queue = queue.copy()
-        sumo.shift(queue, -world)
+        sumo.single(queue, world)
     for name in queue.dtype.names or ():
         digest.update(np.ascontiguousarray(queue[name]).tobytes())
     common = arrays_of(worlds, SharedState, Use.DIGESTED)

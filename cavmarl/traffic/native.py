@@ -18,12 +18,19 @@ from cavmarl.config.traffic import ZOO, TrafficConfig
 from cavmarl.core.compiled.bound_call import bound, keep_last
 from cavmarl.core.errors import CapacityError
 from cavmarl.core.memory import Zeros
-from cavmarl.core.records.arrays import Demand, DepartureQueue, RoadArrays, TripTables, Worlds
+from cavmarl.core.records.arrays import (
+    Demand,
+    DepartureQueue,
+    RoadArrays,
+    Scripts,
+    TripTables,
+    Worlds,
+)
 from cavmarl.core.records.codes import MODEL_IDM
 from cavmarl.driving.driver_models import model_code
 from cavmarl.driving.kernels.drivers import look_ahead_m, see_line_m
 from cavmarl.driving.kernels.lanes.lane_index import VIEW_M
-from cavmarl.driving.vehicle_types import EXTERNAL_TYPES, agent_types, generated_types
+from cavmarl.driving.vehicle_types import agent_types, generated_types, names_beside_car
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN, make_plans
 from cavmarl.traffic.demand import STOP, DemandFile
@@ -185,7 +192,8 @@ class NativeTraffic:
     def cast(self) -> Cast | None:
         if self.scene is None:
             return None
-        first_type = len(self.own_types) + (0 if self.file is None else len(self.file.types))
+        files = self.file if self.sumo is None else self.sumo
+        first_type = len(self.own_types) + (0 if files is None else len(files.types))
         goals = {edge: goal for goal, edge in enumerate(self.goal_edges[0].tolist())}
         agents = self.population.agents
         return Cast.of(self.scene, self.network, goals, first_type, self.dt, agents)
@@ -242,14 +250,18 @@ class NativeTraffic:
 
     @property
     def num_external(self) -> int:
-        """Slots of vehicles that are posed: those of the caller, then the replayed ones."""
-        return self.population.external + self.num_replayed
+        """Slots of vehicles that are posed: of the caller, replayed ones, then SUMO's persons."""
+        return self.population.external + self.num_replayed + self.num_persons
+
+    @property
+    def num_persons(self) -> int:
+        """Number of SUMO's persons that are mirrored."""
+        return 0 if self.sumo is None else self.sumo.num_persons
 
     @property
     def _other_types(self) -> list[str]:
         """Names of the types of agents' and of the caller's vehicles, without the car."""
-        names = [*self.population.agent_types, *(EXTERNAL_TYPES if self.num_external else ())]
-        return [name for name in dict.fromkeys(names) if name != "car"]
+        return names_beside_car(self.population, self.num_external > 0)
 
     @cached_property
     def type_rows(self) -> dict[str, int]:
@@ -268,10 +280,11 @@ class NativeTraffic:
         types = self.own_types
         steps = self.plans.reshape(-1)
         nowhere = self._nowhere_steps
-        if self.sumo is not None:
-            return self._travel_of_sumo(self.sumo, types, steps)
         scripts = NO_SCRIPTS if self.cast is None else self.cast.scripts
         actors = types[:0] if self.cast is None else self.cast.types
+        if self.sumo is not None:
+            types = np.concatenate([types, self.sumo.types, actors])
+            return self._travel_of_sumo(self.sumo, types, np.concatenate([steps, nowhere]), scripts)
         if self.file is None or self.schedule is None:
             types = np.concatenate([types, actors])
             steps = np.concatenate([steps, nowhere]) if len(nowhere) else steps
@@ -329,7 +342,7 @@ class NativeTraffic:
 
     @property
     def own_plan_steps(self) -> range:
-        """The steps of the plans of single worlds."""
+        """The steps of the plans of single worlds; SUMO's routes follow."""
         return range(self._first_own, self._first_own + self._own_steps)
 
     def _with_room(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
@@ -380,16 +393,19 @@ class NativeTraffic:
         return self.plans[np.newaxis] if self.lane_plans is None else self.lane_plans.tables
 
     def _travel_of_sumo(
-        self, sumo: SumoDemand, types: NDArray[np.void], fixed: NDArray[np.void]
+        self,
+        sumo: SumoDemand,
+        types: NDArray[np.void],
+        fixed: NDArray[np.void],
+        scripts: Scripts,
     ) -> TripTables:
-        """Return the tables with SUMO's types, and room for its routes and stops."""
-        steps = self.zeros(
-            len(fixed) + RouteBook.room(self.network, self.num_worlds), dtype=fixed.dtype
-        )
+        """Return the tables, with room for the plans of each world and SUMO's routes and stops."""
+        room = self._own_steps + RouteBook.room(self.network, self.num_worlds)
+        steps = self.zeros(len(fixed) + room, dtype=fixed.dtype)
         steps[: len(fixed)] = fixed
         stops = self.zeros(0 if sumo.drives else StopBook.room(self.num_worlds), dtype=STOP)
         return TripTables(
-            np.concatenate([types, sumo.types]),
+            types,
             steps,
             stops,
             0,
@@ -397,7 +413,7 @@ class NativeTraffic:
             VIEW_M,
             VIEW_M,
             num_fixed=len(fixed),
-            scripts=NO_SCRIPTS,
+            scripts=scripts,
             shifts=self._shifts,
         )
 
@@ -408,7 +424,7 @@ class NativeTraffic:
         `VIEW_M`: IDM reacts to any leader, and agents may drive at any speed.
         """
         own = self.population
-        if self.file is None or own.agents + own.background + own.insertions + own.external > 0:
+        if self.file is None or _own_vehicles(own) > 0:
             return VIEW_M
         fast_mps = FAST_FACTOR * float(self.network.lanes["speed_mps"].max())
         looks_m = [
@@ -466,9 +482,9 @@ class NativeTraffic:
     @cached_property
     def capacity(self) -> int:
         """Number of vehicle rows that one world needs."""
-        if self.sumo is not None:
-            return _capacity_of_sumo(self.population, self.sumo)
         actors = 0 if self.scene is None else self.scene.num_rows
+        if self.sumo is not None:
+            return _capacity_of_sumo(self.population, self.sumo) + actors
         args = (self.network, self.population, self.schedule, self.dt, self.horizon_s)
         return _capacity(*args) + actors
 
@@ -650,7 +666,13 @@ def capacity_of(
 
 
 def _capacity_of_sumo(population: PopulationConfig, sumo: SumoDemand) -> int:
-    return population.agents + population.background + sumo.max_vehicles
+    return _own_vehicles(population) + sumo.max_vehicles + sumo.num_persons
+
+
+def _own_vehicles(population: PopulationConfig) -> int:
+    """Return how many vehicles a population has at most besides those of a demand."""
+    placed = population.agents + population.background
+    return placed + population.insertions + population.external
 
 
 def _capacity(
@@ -661,7 +683,7 @@ def _capacity(
     horizon_s: float,
 ) -> int:
     """Return the smaller of the number of ordered vehicles and the number that fit on the map."""
-    own = population.agents + population.background + population.insertions + population.external
+    own = _own_vehicles(population)
     if schedule is None or not len(schedule.demand.types):
         return own
     shortest = float(schedule.demand.types["length"].min())

@@ -289,10 +289,3 @@ def test_sensors_messages_and_moving_borders_change_nothing() -> None:
     undivided = hashes(overrides=more)
     moving = {**more, "zones.repartition_steps": 6, "zones.check_invariants": True}
     assert hashes(overrides=moving, zones=3) == undivided
-
-
-def test_worlds_with_sumos_traffic_refuse_external_vehicles() -> None:
-    sumo = {"traffic.source": "sumo-traffic", "traffic.demand": ["any.sumocfg"]}
-    overrides = {**ROOM, **sumo, "sensors.signal.timing": False}
-    with pytest.raises(ConfigError, match=r"population\.external = 4: .*SUMO would not see"):
-        parallel_env("grid4x4", overrides=overrides)

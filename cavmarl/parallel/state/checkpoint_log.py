@@ -32,7 +32,7 @@ def make_segments(config: EnvConfig, num_worlds: int, num_signals: int) -> list[
     """
     images = [Segment.make(_FIRST_IMAGE_BYTES) for _ in range(2)]
     steps = Segment.make(size_of(_layout(config, num_worlds, num_signals)))
-    num_logs = num_worlds if config.traffic.source == "sumo-traffic" else 0
+    num_logs = num_worlds if config.tells_sumo else 0
     return [*images, steps, *(Segment.make(FIRST_LOG_BYTES) for _ in range(2 * num_logs))]
 
 

@@ -432,7 +432,7 @@ def missing_in_states(config: EnvConfig) -> str:
     Simulators of zones are filled from a loaded state.
     """
     kept = {
-        "traffic.source = sumo…": config.traffic.source == "sumo-traffic",
+        "traffic.source = sumo…": config.tells_sumo,
         "workers.sensors": config.workers.sensors,
     }
     return next((key for key, is_so in kept.items() if is_so), "")

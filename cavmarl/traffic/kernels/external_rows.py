@@ -174,6 +174,8 @@ def move_external(
     grid: LaneGrid,
     held: NDArray[np.void],  # EXTERNAL (W, E), the present commands
     leaving: NDArray[np.bool_],  # (W, E) slots whose vehicles leave in this tick
+    first: int,  # the rows of the slots [first, end) move
+    end: int,
     zoned: ZoneState,  # the owned rows of `side` are written
     side: int,
     ticks: NDArray[np.int64],  # (W,)
@@ -183,7 +185,7 @@ def move_external(
     steering_limit: float,  # rad, of the front wheels
     dt: float,
 ) -> int:
-    """Move the external rows of all zones for one tick, and mark those that leave as arrived.
+    """Move external rows of all zones for one tick, and mark those that leave as arrived.
 
     Returns the number of rows that leave.
     """
@@ -194,7 +196,7 @@ def move_external(
             found = False
             for i in range(zoned.num_owned[zone, w]):
                 row = zoned.rows[side, zone, w, i]
-                if row["driver"] != DRIVER_EXTERNAL:
+                if row["driver"] != DRIVER_EXTERNAL or not first <= row["order"] < end:
                     continue
                 found = True
                 told = held[w, row["order"]]

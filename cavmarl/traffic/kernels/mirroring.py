@@ -16,7 +16,12 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.math.elementary import atan, cosine, sine
 from cavmarl.core.math.geometry import lane_pose, wrap_angle
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, ZoneState
-from cavmarl.core.records.codes import COUNT_DEPARTED, DRIVER_SUMO, EVENT_ARRIVED
+from cavmarl.core.records.codes import (
+    COUNT_DEPARTED,
+    DRIVER_BACKGROUND,
+    DRIVER_SUMO,
+    EVENT_ARRIVED,
+)
 from cavmarl.driving.kernels.lanes.route_following import distance_left, free_speed, own_step
 from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_before
 from cavmarl.driving.kernels.motion.tracking import side_lane
@@ -161,6 +166,8 @@ def send_on(
             n = np.searchsorted(numbers, row["order"])
             if row["order"] < 0 or n == numbers.size or numbers[n] != row["order"]:
                 continue
+            if row["driver"] != DRIVER_BACKGROUND:  # `order` is the slot of the caller's vehicles
+                continue
             edge = _edge_to_be(roads, row["lane"])
             for k in range(paths.first[chosen[n]], paths.first[chosen[n] + 1]):
                 if paths.edges[k] == edge:
@@ -169,6 +176,80 @@ def send_on(
                     taken += 1
                     break
     return taken
+
+
+@kernel
+def find_blocked(
+    roads: RoadArrays,
+    travel: TripTables,
+    lanes: NDArray[np.void],
+    zoned: ZoneState,
+    side: int,
+    w: int,
+    out: NDArray[np.void],
+) -> int:
+    """Copy the owned rows of a demand whose way leads over a closed road into `out`.
+
+    Rows in a junction or with a stop ahead are left out. `lanes`: LANE (L,) of the world.
+
+    Returns the number of rows.
+    """
+    found = 0
+    for zone in range(zoned.num_owned.shape[0]):
+        for i in range(zoned.num_owned[zone, w]):
+            row = zoned.rows[side, zone, w, i]
+            if row["driver"] != DRIVER_BACKGROUND or row["order"] < 0:
+                continue
+            if row["stop"] >= 0 and row["stop"] < row["stops_end"]:
+                continue
+            if not roads.lanes[row["lane"]]["internal"] and _is_blocked(roads, travel, lanes, row):
+                out[found] = row
+                found += 1
+    return found
+
+
+@inlined_kernel
+def _is_blocked(
+    roads: RoadArrays, travel: TripTables, lanes: NDArray[np.void], row: np.void
+) -> bool:
+    """Return whether a road ahead on the way of a row outside junctions is closed to it."""
+    permissions = travel.types[row["vtype"]]["permissions"]
+    lane = row["lane"]
+    edge = roads.lanes[lane]["edge"]
+    way = row["way"]
+    while True:
+        here = roads.lanes[lane]
+        if here["internal"]:
+            lane = here["successor"]
+            continue
+        if here["edge"] != edge:
+            edge = here["edge"]
+            if _is_closed(roads, lanes, edge, permissions):
+                return True
+        step = travel.steps[way + lane]
+        if step["to_go"] == math.inf:
+            return False
+        if step["change"] != 0:
+            lane = here["left"] if step["change"] > 0 else here["right"]
+            continue
+        if step["next"] < 0:
+            return False
+        way += step["shift"]
+        lane = step["next"]
+
+
+@inlined_kernel
+def _is_closed(
+    roads: RoadArrays, lanes: NDArray[np.void], edge: int, permissions: np.uint32
+) -> bool:
+    """Return whether a vehicle may use lanes of an edge on the map, but none of them now."""
+    first = roads.edges[edge]["first_lane"]
+    is_open = False
+    was_open = False
+    for lane in range(first, first + roads.edges[edge]["num_lanes"]):
+        is_open = is_open or lanes[lane]["permissions"] & permissions != 0
+        was_open = was_open or roads.lanes[lane]["permissions"] & permissions != 0
+    return was_open and not is_open
 
 
 @inlined_kernel

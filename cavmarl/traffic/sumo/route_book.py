@@ -24,7 +24,8 @@ class RouteBook:
     """The paths of W worlds; a path is a route for vehicles that may use certain lanes.
 
     `steps`: PLAN, the table of all ways. `first`: start of the room for these worlds, which ends
-    the table. `permissions`: (num_types,) of VTYPE rows.
+    the table. `permissions`: (num_types,) of VTYPE rows. `plan_steps`: steps of each world's own
+    plans, which precede the room.
     """
 
     def __init__(
@@ -34,6 +35,7 @@ class RouteBook:
         first: int,
         num_worlds: int,
         permissions: NDArray[np.uint32],
+        plan_steps: int = 0,
     ) -> None:
         self._network = network
         self._steps = steps
@@ -48,6 +50,8 @@ class RouteBook:
         self._of_world = (len(steps) - self._first) // num_worlds
         self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)
         self._worlds = [_Pages(self._first + w * self._of_world) for w in range(num_worlds)]
+        # The room of a single world would begin this many steps earlier.
+        self._later = (num_worlds - 1) * plan_steps
 
     @staticmethod
     def room(network: RoadNetwork, num_worlds: int) -> int:
@@ -60,10 +64,17 @@ class RouteBook:
     def paths(self, w: int) -> Paths:
         return self._worlds[w].arrays(self._nowhere)
 
-    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the ways of rows, VEHICLE or departures, to those of world w + `worlds`."""
+    def single(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert ways of rows of a world, VEHICLE or departures, to those of a single world."""
         own = rows["way"] >= self._first - len(self._network.lanes)
-        rows["way"] += own * (worlds * self._of_world)
+        of_book = rows["way"] >= self._nowhere
+        rows["way"] -= own * (w * self._of_world) + of_book * self._later
+
+    def placed(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert the ways of rows of a single world to those of world w."""
+        own = rows["way"] >= self._first - self._later - len(self._network.lanes)
+        of_book = rows["way"] >= self._nowhere - self._later
+        rows["way"] += own * (w * self._of_world) + of_book * self._later
 
     def enter(self, w: int, routes: list[list[int]]) -> None:
         """Add routes that SUMO has reported, each as EDGE rows, numbered in this order."""

@@ -34,6 +34,8 @@ PUPPET = "cavmarl."  # prefix of the names of vehicles that are moved from outsi
 FREE = 2  # moveToXY: anywhere, on a road or not
 PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
 BY_ITSELF = 0  # speed and lane change modes in which SUMO decides nothing
+LANE_CHANGE = -1  # `kind` of the record of a lane that changes
+SIZE_M = 1e-4  # sizes that differ by less are equal
 
 # Getters read for each vehicle, by field of its record; _FIELDS_SEEN only if SUMO drives.
 _FIELDS = {"at": "getRouteIndex", "pos": "getLanePosition"}
@@ -65,6 +67,11 @@ class SumoSimulation:
         self._signals: list[str] = setup["signals"]
         self._type_row: dict[str, int] = setup["types"]
         self._is_seen: bool = setup["drives"]  # whether places of its vehicles are read
+        self._lane_names: list[str] = setup["lanes"]
+        self._classes: list[list[str]] = setup["classes"]  # SUMO's classes by bit of a class
+        self._reroutes: str = setup["reroutes"]  # see `population.reroute`
+        self._outages_ms: dict[str, int] = setup["outages_ms"]  # time of failure by signal
+        self._num_slots: int = setup["persons"]  # maximum number of persons that are reported
         self._forget()
 
     def _forget(self) -> None:
@@ -72,6 +79,15 @@ class SumoSimulation:
         self._types: list[int] = []  # by number
         self._route_row: dict[str, int] = {}
         self._puppets: dict[int, str] = {}
+        self._allowed: dict[str, tuple[str, ...]] = {}  # classes of changed lanes, as on the map
+        self._shut: dict[str, set[str]] = {}  # closed classes by lane
+        self._unsure: set[str] = set()  # vehicles whose routes are examined again each second
+        self._waiting: set[str] = set()  # loaded vehicles that have not entered
+        self._goals: dict[int, str] = {}  # last edge of each route, by its number
+        self._goal_of: dict[int, str] = {}  # last edge of each vehicle's route
+        self._slot_of: dict[str, int] = {}  # by person
+        self._to_fail = dict(self._outages_ms)
+        self._free_slots = list(reversed(range(self._num_slots)))
 
     def start(self, words: list[str]) -> dict[str, Any]:
         self._stop()
@@ -102,10 +118,116 @@ class SumoSimulation:
         }
 
     def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """Run one step: puppets are placed, SUMO moves all other vehicles."""
-        self._place(moved)
+        """Run one step: lanes change, puppets are placed, SUMO moves all other vehicles.
+
+        If no puppets are placed, the records that are no lanes are vehicles that ask for a way.
+        """
+        is_lane = moved["kind"] == LANE_CHANGE
+        if is_lane.any():
+            self._change_lanes(moved[is_lane])
+        if self._is_seen:
+            self._place(moved[~is_lane])
+        self._fail_signals()
         self._sumo.simulationStep()
-        return self.read_state()
+        line = self._after_closures() if self._allowed else {}
+        seen, letters, news = self.read_state()
+        if not self._is_seen and not is_lane.all():
+            line["ways"] = self._find_ways(moved[~is_lane], news)
+        return seen, letters, news | line
+
+    def _fail_signals(self) -> None:
+        """Switch off the signals that are off after the next step."""
+        after_ms = self._time_ms() + round(1000.0 * self._sumo.simulation.getDeltaT())
+        for name in [name for name, at_ms in self._to_fail.items() if at_ms <= after_ms]:
+            del self._to_fail[name]
+            self._sumo.trafficlight.setProgram(name, "off")
+
+    def _change_lanes(self, changes: NDArray[np.void]) -> None:
+        """Set the classes and the limits of lanes, and let vehicles find other routes."""
+        lanes = self._sumo.lane
+        for bits, limit_mps, row in zip(
+            changes["id"].tolist(), changes["x"].tolist(), changes["edge"].tolist(), strict=True
+        ):
+            name = self._lane_names[row]
+            on_map = self._allowed.setdefault(name, tuple(lanes.getAllowed(name)))
+            shut = {one for k, of in enumerate(self._classes) if bits >> k & 1 for one in of}
+            allowed = [one for one in on_map if one not in shut]
+            self._shut[name] = shut
+            lanes.setMaxSpeed(name, limit_mps)
+            if allowed:
+                lanes.setAllowed(name, allowed)
+            else:
+                lanes.setDisallowed(name, ["all"])
+        present = set(self._vehicle.getIDList())
+        puppets = set(self._puppets.values())
+        self._waiting |= set(self._vehicle.getLoadedIDList()) - present - puppets
+        self._renew_routes(present - puppets)
+
+    def _after_closures(self) -> dict[str, Any]:
+        """Renew routes after a step; return the vehicles that SUMO has dropped, by name.
+
+        SUMO drops a vehicle whose first edge is closed to it when the vehicle departs.
+        """
+        simulation = self._sumo.simulation
+        puppets = set(self._puppets.values())
+        entered = set(simulation.getDepartedIDList()) - puppets
+        self._waiting |= set(simulation.getLoadedIDList()) - puppets
+        self._waiting -= entered
+        present = set(self._vehicle.getIDList())
+        is_second = self._time_ms() % 1000 < round(1000.0 * simulation.getDeltaT())
+        self._renew_routes((entered | self._unsure if is_second else entered) & present)
+        self._unsure &= present
+        if not self._waiting:
+            return {}
+        dropped = self._waiting - set(self._vehicle.getLoadedIDList())
+        self._waiting -= dropped
+        return {"dropped": sorted(dropped)} if dropped else {}
+
+    def _renew_routes(self, names: set[str]) -> None:
+        """Let SUMO find another route for each vehicle whose route leads over a closed lane.
+
+        `_unsure` receives the vehicles that cannot turn off now, or are in a junction or on a
+        closed lane.
+        """
+        if self._reroutes == "never":
+            return
+        vehicle = self._vehicle
+        for name in sorted(names):
+            lane = vehicle.getLaneID(name)
+            kind = vehicle.getVehicleClass(name)
+            is_bound = lane.startswith(":") or kind in self._shut.get(lane, ())
+            if lane == NOWHERE or is_bound:
+                self._unsure.add(name)
+                continue
+            if self._reroutes == "always" or not vehicle.isRouteValid(name):
+                vehicle.rerouteTraveltime(name)
+            if vehicle.isRouteValid(name):
+                self._unsure.discard(name)
+            else:
+                self._unsure.add(name)
+
+    def _find_ways(self, asking: NDArray[np.void], line: dict[str, Any]) -> list[list[int]]:
+        """Return number, route and type of each vehicle that has a way to its goal."""
+        found: dict[tuple[int, str, int], int] = {}
+        ways = []
+        for number, edge, kind in zip(
+            asking["id"].tolist(), asking["edge"].tolist(), asking["kind"].tolist(), strict=True
+        ):
+            key = edge, self._goal_of[number], kind
+            if key not in found:
+                found[key] = self._find_way(self._edges[edge], key[1], kind, line)
+            if found[key] >= 0:
+                ways.append([number, found[key], kind])
+        return ways
+
+    def _find_way(self, start: str, goal: str, kind: int, line: dict[str, Any]) -> int:
+        """Return the number of the fastest route that is open to a type; -1: there is none."""
+        name = next(name for name, row in self._type_row.items() if row == kind)
+        try:
+            edges = self._sumo.simulation.findRoute(start, goal, name).edges
+        except self._sumo.TraCIException:  # the first edge is closed
+            return -1
+        return self._number_route("|".join(edges), edges, line) if edges else -1
 
     def read_state(self) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
         """Return the records of vehicles, the letters of signals, and rare events."""
@@ -124,6 +246,9 @@ class SumoSimulation:
         seen["vtype"] = np.array(self._types, dtype=np.int32)[numbers]
         seen["lane"] = lanes
         seen["route"] = self._routes(names, line)
+        if self._reroutes and not self._is_seen:
+            goals = map(self._goals.__getitem__, seen["route"].tolist())
+            self._goal_of.update(zip(numbers.tolist(), goals, strict=True))
         if self._is_seen:
             places = chain.from_iterable(map(self._place_of, names))
             xyz = np.fromiter(places, np.float64, 3 * len(names)).reshape(-1, 3)
@@ -131,7 +256,38 @@ class SumoSimulation:
         for field, get in self._getters.items():
             seen[field] = np.fromiter(map(get, names), self._seen[field], len(names))
         letters = "".join(map(self._state_of, self._signals)).encode()
-        return seen[np.argsort(numbers)], letters, line
+        seen = seen[np.argsort(numbers)]
+        if self._num_slots:
+            seen = np.concatenate([self._people(line), seen])
+        return seen, letters, line
+
+    def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
+        """Return the records of the persons who are on foot; `line` receives how many find no slot.
+
+        A slot is free for one step before another person gets it.
+        """
+        person = self._sumo.person
+        names = [name for name in person.getIDList() if not person.getVehicle(name)]
+        left = sorted(self._slot_of.keys() - set(names))
+        fresh = [name for name in names if name not in self._slot_of]
+        for name in fresh[: len(self._free_slots)]:
+            self._slot_of[name] = self._free_slots.pop()
+        self._free_slots += [self._slot_of.pop(name) for name in left]
+        if unseen := len(names) - len(self._slot_of):
+            line["unseen"] = unseen
+        names = [name for name in names if name in self._slot_of]
+        seen = np.zeros(len(names), dtype=self._seen)
+        seen["number"] = [-1 - self._slot_of[name] for name in names]
+        places = chain.from_iterable(map(person.getPosition3D, names))
+        seen["x"], seen["y"], seen["z"] = np.fromiter(places, np.float64).reshape(-1, 3).T
+        for field, get in (
+            ("angle", person.getAngle),
+            ("speed", person.getSpeed),
+            ("pos", person.getLength),
+            ("lat", person.getWidth),
+        ):
+            seen[field] = np.fromiter(map(get, names), np.float64, len(names))
+        return seen
 
     def _on_road(
         self,
@@ -203,11 +359,17 @@ class SumoSimulation:
         for place in np.flatnonzero(rows < 0).tolist():
             route = ids[place]
             if route not in known:
-                known[route] = len(known)
-                edges = self._vehicle.getRoute(names[place])
-                line.setdefault("routes", []).append([self._edge_row.get(e, -1) for e in edges])
+                self._number_route(route, self._vehicle.getRoute(names[place]), line)
             rows[place] = known[route]
         return rows
+
+    def _number_route(self, route: str, edges: Sequence[str], line: dict[str, Any]) -> int:
+        """Return the number of a route; the edges of a new route are added to `line`."""
+        number = self._route_row.setdefault(route, len(self._goals))
+        if number == len(self._goals):
+            self._goals[number] = edges[-1]
+            line.setdefault("routes", []).append([self._edge_row.get(e, -1) for e in edges])
+        return number
 
     def _place(self, moved: NDArray[np.void]) -> None:
         """Place the puppets. Add new puppets, and remove puppets that are not listed."""
@@ -219,20 +381,25 @@ class SumoSimulation:
             if name in present:
                 vehicle.remove(name)
         for row in moved.tolist():
-            number, x, y, angle, edge, kind = row
+            number, x, y, angle, length, width, edge, kind = row
             name = f"{PUPPET}{number}"
             if name not in present:
-                self._add(name, self._edges[edge], kind)
+                self._add(name, self._edges[edge], kind, length, width)
                 self._puppets[number] = name
             vehicle.moveToXY(name, "", -1, x, y, angle, FREE)
 
-    def _add(self, name: str, edge: str, kind: int) -> None:
+    def _add(self, name: str, edge: str, kind: int, length: float, width: float) -> None:
         route = f"{PUPPET}{edge}"
         if route not in self._sumo.route.getIDList():
             self._sumo.route.add(route, [edge])
         self._vehicle.add(name, route, typeID=f"{PUPPET}{kind}")
         self._vehicle.setSpeedMode(name, BY_ITSELF)
         self._vehicle.setLaneChangeMode(name, BY_ITSELF)
+        # A vehicle with a size of its own gets a type of its own.
+        if abs(self._vehicle.getLength(name) - length) > SIZE_M:
+            self._vehicle.setLength(name, length)
+        if abs(self._vehicle.getWidth(name) - width) > SIZE_M:
+            self._vehicle.setWidth(name, width)
 
     def _time_ms(self) -> int:
         time_s: float = self._sumo.simulation.getTime()

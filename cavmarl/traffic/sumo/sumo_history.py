@@ -18,7 +18,8 @@ from cavmarl.core.errors import SumoError
 
 # A vehicle of SUMO in SUMO's conventions: the middle of the front bumper, degrees clockwise from
 # north, the place on the lane by the lane's length attribute. If SUMO only orders departures, all
-# fields from `x` on are 0, except `pos`.
+# fields from `x` on are 0, except `pos`. A person has `number` -1 - slot; `pos` is its length and
+# `lat` its width.
 SEEN = np.dtype(
     [
         ("number", np.int32),  # in the order of entering
@@ -37,17 +38,22 @@ SEEN = np.dtype(
     ]
 )
 
-# A vehicle of this package in SUMO's conventions.
+# A vehicle of this package in SUMO's conventions. Or a lane that changes: `kind` is `LANE_CHANGE`,
+# `edge` the LANE row, `id` the bits of the classes that it is closed to, `x` its limit in m/s. Or,
+# if SUMO only orders departures, a vehicle that asks for a way: `id` is its VEHICLE["order"].
 MOVED = np.dtype(
     [
         ("id", np.int64),  # VEHICLE["id"]
         ("x", np.float64),  # m, of the front bumper
         ("y", np.float64),
         ("angle", np.float64),  # degrees
+        ("length", np.float32),  # m
+        ("width", np.float32),
         ("edge", np.int32),  # EDGE row outside junctions, near the vehicle
         ("kind", np.int32),  # VTYPE row
     ]
 )
+LANE_CHANGE = -1
 
 
 _TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether recording stopped

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import gzip
 import re
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
@@ -27,6 +27,10 @@ from cavmarl.traffic.demand.element import Element as DemandElement
 from cavmarl.traffic.demand.sumo_config import tell_ignored
 from cavmarl.traffic.demand.xml_files import read_elements
 
+_PERSONS = ("person", "personFlow")
+_OFF_ROAD = (*_PERSONS, "container", "containerFlow")
+_ONLY = "moves in SUMO only"
+_PERSONS_CURE = "; traffic.source = sumo-traffic mirrors persons, with sumo.max_persons above 0"
 _BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attribute of the begin
 # Kinds of options that are passed to SUMO.
 _PASSED = ("read", "traffic", "beyond")
@@ -104,6 +108,33 @@ def begun(given: SumoInput, horizon_s: float) -> SumoInput:
     report.tolerate(late_begin(given.begin_s, horizon_s, first_ms, given.has_begin), place)
     begin_s = given.begin_s if given.has_begin else float(first_ms // 1000)
     return replace(given, begin_s=begin_s, tolerated=(*given.tolerated, *report.lines()))
+
+
+def read_unmirrored(
+    given: SumoInput, off_road: Mapping[str, str], most_persons: int
+) -> tuple[list[str], bool]:
+    """Return a line with a count for all that moves in SUMO only, and whether there are persons.
+
+    `off_road`: vehicle classes of types that use no road, by name. `most_persons`: number of
+    persons that a world mirrors. Files that cannot be read are left to SUMO.
+    """
+    skipped, found = DemandReport(), DemandReport()
+
+    def take(element: DemandElement) -> None:
+        vclass = off_road.get(element.attrs.get("type", ""), "")
+        if element.name in _BEGINS and vclass:
+            found.tolerate(f"<{element.name}> of class {vclass} {_ONLY}", element.place)
+
+    with suppress(DemandError):
+        for path in (*given.route_files, *given.additional_files):
+            read_elements(path, skipped, take)
+    tallies = {name: skipped.tolerated.get(f"<{name}> is not read") for name in _OFF_ROAD}
+    for name, tally in tallies.items():
+        is_person = name in _PERSONS
+        if tally is not None and not (is_person and most_persons):
+            cure = _PERSONS_CURE if is_person else ""
+            found.tolerate(f"<{name}> {_ONLY}{cure}", tally.first, tally.count)
+    return found.lines(), any(tallies[name] is not None for name in _PERSONS)
 
 
 def without_outputs(path: Path, folder: Path) -> Path:

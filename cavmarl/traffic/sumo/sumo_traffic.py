@@ -7,6 +7,8 @@ vehicles first; then SUMO receives their new places and takes its step.
 `sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
 same tick, with its type, route, stops, lane and speed factor. A vehicle that is rerouted there is
 rerouted here. Signals show SUMO's phases.
+
+If lanes change, SUMO receives the changes before its step, in which this package obeys them, too.
 """
 
 from __future__ import annotations
@@ -23,12 +25,22 @@ from cavmarl.core.compiled import specialized
 from cavmarl.core.errors import CapacityError, SumoError
 from cavmarl.core.math.elementary_arrays import cos_all, sin_all
 from cavmarl.core.records.arrays import DepartureQueue, RoadArrays, TripTables, Worlds, ZoneState
-from cavmarl.core.records.codes import COUNT_REROUTED, LANE_GIVEN, POS_GIVEN, SPEED_MAX
+from cavmarl.core.records.codes import (
+    COUNT_REROUTED,
+    DRIVER_BACKGROUND,
+    DRIVER_EXTERNAL,
+    LANE_GIVEN,
+    POS_GIVEN,
+    SPEED_MAX,
+)
+from cavmarl.driving.kernels.motion.motion import STANDING_MPS
 from cavmarl.roads.network import SIGNAL_STATES, RoadNetwork
-from cavmarl.traffic.kernels.mirroring import greet, list_others, mirror, send_on
+from cavmarl.traffic.kernels.mirroring import find_blocked, greet, list_others, mirror, send_on
+from cavmarl.traffic.kernels.way_requests import has_room, put_on_way
 from cavmarl.traffic.sumo.route_book import RouteBook, StopBook
 from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
+from cavmarl.traffic.sumo.sumo_lanes import SumoLanes
 from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 
 
@@ -95,7 +107,8 @@ class SumoTraffic:
 
     `travel`: types and ways, with room for SUMO's routes at the end. `first_step`: start of that
     room. `zoned`: the rows of all zones. `blank`: VEHICLE (1,), template of every vehicle's
-    record.
+    record. `lanes`: LANE (W, L) of each world; (0, L): lanes do not change.
+    `plan_steps`: see `RouteBook`.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
@@ -110,10 +123,14 @@ class SumoTraffic:
         first_step: int,
         zoned: ZoneState,
         blank: NDArray[np.void],
+        lanes: NDArray[np.void],
+        plan_steps: int = 0,
     ) -> None:
         self.drives = demand.drives
+        self._num_callers = demand.num_callers
         num_worlds, capacity = zoned.rows.shape[2:]
-        book = RouteBook(network, travel.steps, first_step, num_worlds, travel.types["permissions"])
+        permissions = travel.types["permissions"]
+        book = RouteBook(network, travel.steps, first_step, num_worlds, permissions, plan_steps)
         stops = StopBook(network, travel.stops, num_worlds)
         self.worlds = SumoWorlds(demand, book, stops, num_worlds)
         self._roads: RoadArrays = network.arrays
@@ -127,40 +144,54 @@ class SumoTraffic:
         self._greet = specialized(greet)
         self._list_others = specialized(list_others)
         self._send_on = specialized(send_on)
+        self._find_blocked = specialized(find_blocked)
         self._others = np.zeros(capacity, dtype=zoned.rows.dtype)
-        lanes, links = network.lanes, network.links
-        leads_to = np.where(lanes["internal"], links["to_lane"][lanes["link"]], -1)
+        on_map, links = network.lanes, network.links
+        leads_to = np.where(on_map["internal"], links["to_lane"][on_map["link"]], -1)
         self._edge_of_lane = np.where(
-            lanes["internal"], lanes["edge"][leads_to], lanes["edge"]
+            on_map["internal"], on_map["edge"][leads_to], on_map["edge"]
         ).astype(np.int32)
+        self._lanes = SumoLanes(on_map, lanes)
+        self._reroutes = demand.reroutes not in ("", "never")
+        self._ticks_per_s = max(1, round(1.0 / demand.dt_s))
 
     def reset(self, chosen: NDArray[np.bool_], worlds: Worlds) -> None:
         """Restart SUMO in the chosen worlds (W,); errors as in `SumoWorlds.begin`."""
         for w in np.flatnonzero(chosen).tolist():
-            self.worlds.begin(w, int(worlds.keys[w]))
+            self._begin(w, int(worlds.keys[w]))
+
+    def _begin(self, w: int, key: int) -> None:
+        self.worlds.begin(w, key)
+        self._lanes.begin(w)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
         """Log what SUMO receives from the next reset on, one log per world, for `catch_up`.
 
-        Returns the logs; empty if SUMO moves no vehicles, since then it receives nothing.
+        Returns the logs; empty if SUMO receives nothing: it moves no vehicles, and no lanes change.
         """
-        if self.drives and not self.worlds.logs:
+        if self._tells and not self.worlds.logs:
             num_worlds = self._zoned.rows.shape[2]
             self.worlds.logs = tuple(ToldLog(self._replay_bytes) for _ in range(num_worlds))
         return self.worlds.logs
 
+    @property
+    def _tells(self) -> bool:
+        """Whether SUMO receives anything during an episode; see `EnvConfig.tells_sumo`."""
+        return self.drives or len(self._lanes.now) > 0
+
     def catch_up(self, worlds: Worlds) -> None:
         """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
 
-        Raises SumoError: SUMO had received the places of vehicles, and they are not recorded.
+        Raises SumoError: SUMO had received vehicles or lanes, and they are not recorded.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
             logged: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
-            if self.drives:
+            if self._tells:
                 log = self.worlds.logs[w] if self.worlds.logs else ToldLog(0)
                 logged = log.ticks(tick)
-            self.worlds.begin(w, int(key))
+            self._begin(w, int(key))
             for passed, moved in enumerate(logged):
+                self._lanes.learn(w, moved)
                 self.worlds.step_one(w, passed, moved)
 
     def step(self, worlds: Worlds, side: int) -> None:
@@ -168,7 +199,32 @@ class SumoTraffic:
 
         `worlds`: the worlds of any shard. `side`: side that holds the next rows.
         """
-        self.worlds.step(worlds.ticks.tolist(), lambda w: self._moved(w, side))
+        ticks = worlds.ticks.tolist()
+        self.worlds.step(ticks, lambda w: self._told(w, side, ticks[w]))
+
+    def _told(self, w: int, side: int, tick: int) -> NDArray[np.void]:
+        """Return MOVED (n,): all that the SUMO of a world receives before its step."""
+        lanes = self._lanes.news(w)
+        if self.drives:
+            return np.concatenate([lanes, self._moved(w, side)])
+        asks = self._reroutes and tick % self._ticks_per_s == 0
+        return np.concatenate([lanes, self._asking(w, side)]) if asks else lanes
+
+    def _asking(self, w: int, side: int) -> NDArray[np.void]:
+        """Return MOVED (n,) by ascending id: vehicles whose ways lead over closed roads.
+
+        SUMO's own copies of these vehicles may have passed the road before it was closed.
+        """
+        if not self._lanes.has_closed(w):
+            return np.zeros(0, dtype=MOVED)
+        num = self._find_blocked(
+            self._roads, self._travel, self._lanes.now[w], self._zoned, side, w, self._others
+        )
+        ours = np.sort(self._others[:num], order="id")
+        asking = np.zeros(num, dtype=MOVED)
+        asking["id"], asking["kind"] = ours["order"], ours["vtype"]
+        asking["edge"] = self._edge_of_lane[ours["lane"]]
+        return asking
 
     def mirror(self, worlds: Worlds, side: int) -> int:
         """Move SUMO's vehicles to their places after its step; arguments as in `step`.
@@ -188,6 +244,11 @@ class SumoTraffic:
             )
             for w in range(len(worlds.ticks))
         )
+
+    @property
+    def people(self) -> list[NDArray[np.void]]:
+        """SEEN (p,) of each world: the persons on foot."""
+        return [self.worlds.at(w).people for w in range(self._zoned.rows.shape[2])]
 
     def forgive(self, departures: DepartureQueue) -> None:
         """Clear the events of leaving vehicles that SUMO has teleported: they have not arrived."""
@@ -249,6 +310,8 @@ class SumoTraffic:
         """Put this package's vehicles, driving and waiting, on the routes that SUMO has changed."""
         for w in range(len(worlds.ticks)):
             now, paths = self.worlds.at(w), self.worlds.paths(w)
+            if len(now.ways):
+                departures.counts[w, COUNT_REROUTED] += self._take_ways(w, side, now.ways)
             if not len(now.rerouted):
                 continue
             places = np.searchsorted(now.seen["number"], now.rerouted)
@@ -262,18 +325,42 @@ class SumoTraffic:
                 path = int(chosen[np.searchsorted(now.rerouted, row["order"])])
                 row["way"] = self._way(w, path, 0, int(row["lane"]))
 
+    def _take_ways(self, w: int, side: int, ways: NDArray[np.int64]) -> int:
+        """Put vehicles on the ways that they have asked for, if they have room to turn off.
+
+        `ways`: (k, 2) VEHICLE["order"] and path. Returns the number of vehicles on a new way.
+        """
+        taken = 0
+        chosen = dict(ways.tolist())
+        for zone, num in enumerate(self._zoned.num_owned[:, w].tolist()):
+            rows = self._zoned.rows[side, zone, w, :num]
+            asked = np.isin(rows["order"], ways[:, 0]) & (rows["driver"] == DRIVER_BACKGROUND)
+            for i in np.flatnonzero(asked).tolist():
+                row = rows[i]
+                way = self._way(w, chosen[int(row["order"])], 0, int(row["lane"]))
+                stands = row["speed"] < STANDING_MPS
+                if stands or has_room(self._roads, self._travel, row, self._travel.steps, way):
+                    put_on_way(self._travel, row, way)
+                    taken += 1
+        return taken
+
     def show(self, worlds: Worlds) -> None:
         """Show the signal phases of SUMO in all worlds."""
         for w, phase in enumerate(worlds.signal_phase):
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
-    def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert rows of world w, VEHICLE or departures, to those of world w + `worlds`.
+    def single(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert rows of a world, VEHICLE or departures, to those of a single world.
 
         Ways and stops are written, because each world has its own part of their tables.
         """
-        self.worlds.book.shift(rows, worlds)
-        self.worlds.stops.shift(rows, worlds)
+        self.worlds.book.single(rows, w)
+        self.worlds.stops.shift(rows, -w)
+
+    def placed(self, rows: NDArray[np.void], w: int) -> None:
+        """Convert rows of a single world to those of world w; see `single`."""
+        self.worlds.book.placed(rows, w)
+        self.worlds.stops.shift(rows, w)
 
     def close(self) -> None:
         self.worlds.close()
@@ -284,8 +371,10 @@ class SumoTraffic:
             return np.zeros(0, dtype=MOVED)
         num = self._list_others(self._zoned, side, w, self._others)
         ours = self._others[:num]
+        is_person = (ours["driver"] == DRIVER_EXTERNAL) & (ours["order"] >= self._num_callers)
+        ours = ours[~is_person]
         ours = ours[np.argsort(ours["id"])]
-        moved = np.zeros(num, dtype=MOVED)
+        moved = np.zeros(len(ours), dtype=MOVED)
         half = 0.5 * ours["length"]
         moved["id"] = ours["id"]
         moved["x"] = ours["x"] + half * cos_all(ours["heading"])
@@ -293,6 +382,7 @@ class SumoTraffic:
         moved["angle"] = np.degrees(0.5 * math.pi - ours["heading"]) % 360.0
         moved["edge"] = self._edge_of_lane[ours["lane"]]
         moved["kind"] = ours["vtype"]
+        moved["length"], moved["width"] = ours["length"], ours["width"]
         return moved
 
     def _fill(self, row: np.void, seen: np.void, w: int) -> None:

@@ -39,6 +39,8 @@ class SumoTick(NamedTuple):
     stops: NDArray[np.int64]
     teleported: tuple[int, ...]  # numbers of vehicles taken off the road
     rerouted: NDArray[np.int64]  # (r,) numbers of vehicles with a changed route, ascending
+    people: NDArray[np.void]  # SEEN (p,) persons on foot, by slot
+    ways: NDArray[np.int64]  # (k, 2) numbers of vehicles that have asked for a way, and paths
 
 
 class SumoWorlds:
@@ -51,6 +53,7 @@ class SumoWorlds:
         stops: their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has teleported since each reset.
+        dropped: (W,) vehicles that SUMO has not let in since each reset: their roads were closed.
         logs: by world, what SUMO has received since its reset; empty: not kept.
     """
 
@@ -61,12 +64,14 @@ class SumoWorlds:
         self.stops = stops
         self.names: list[list[str]] = [[] for _ in range(num_worlds)]
         self.teleports = np.zeros(num_worlds, dtype=np.int64)
+        self.dropped = np.zeros(num_worlds, dtype=np.int64)
         self.logs: tuple[ToldLog, ...] = ()
         self._demand = demand
         self._tick_ms = round(1000.0 * demand.dt_s)
         self._begin_ms = round(1000.0 * demand.given.begin_s)
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[SumoTick | None] = [None] * num_worlds
+        self._has_warned = [False] * num_worlds  # of persons without room, in this episode
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
 
     @property
@@ -87,7 +92,8 @@ class SumoWorlds:
         self.book.begin(w)
         self.stops.begin(w)
         self.names[w] = []
-        self.teleports[w] = 0
+        self._has_warned[w] = False
+        self.teleports[w] = self.dropped[w] = 0
         if self.logs:
             self.logs[w].begin()
         self._path_of[w] = np.zeros(0, dtype=np.int32)
@@ -171,6 +177,13 @@ class SumoWorlds:
             raise SumoError(
                 f"world {w}: SUMO's clock shows {line['time_ms']} ms instead of {should_be} ms"
             )
+        people, seen = seen[seen["number"] < 0], seen[seen["number"] >= 0]
+        if "unseen" in line and not self._has_warned[w]:
+            self._has_warned[w] = True
+            log.warning(
+                "world %d, tick %d: %d persons of SUMO are not mirrored; raise sumo.max_persons",
+                w, tick, line["unseen"],
+            )  # fmt: skip
         self.book.enter(w, line.get("routes", []))
         seen["route"] = self.book.look_up(w, seen["route"], seen["vtype"])
         departed = line.get("departed", [])
@@ -180,6 +193,14 @@ class SumoWorlds:
         for number, name in lifted:
             log.warning("world %d, tick %d: SUMO teleports %s (%d)", w, tick, name, number)
         self.teleports[w] += len(lifted)
+        if dropped := line.get("dropped", []):
+            self.dropped[w] += len(dropped)
+            log.warning(
+                "world %d, tick %d: SUMO drops %s, whose first road is closed (%d in this episode)",
+                w, tick, ", ".join(dropped), self.dropped[w],
+            )  # fmt: skip
+        ways = np.array(line.get("ways", []), dtype=np.int32).reshape(-1, 3)
+        ways[:, 1] = self.book.look_up(w, ways[:, 1], ways[:, 2])
         return SumoTick(
             tick,
             seen,
@@ -189,6 +210,8 @@ class SumoWorlds:
             np.array(stops, dtype=np.int64).reshape(-1, 2),
             tuple(number for number, _ in lifted),
             self._changed(w, seen),
+            people,
+            ways[:, :2].astype(np.int64),
         )
 
     def _changed(self, w: int, seen: NDArray[np.void]) -> NDArray[np.int64]:
