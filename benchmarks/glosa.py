@@ -1,6 +1,6 @@
 """Effect of speed advice before signals: stops, standing and speed of agents that follow `glosa`.
 
-Source of the CO₂: `evaluate.signals.emissions`.
+Source of the CO₂: `driving.kernels.emissions`.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from benchmarks.program import run
 from cavmarl import load_policy, make_vec
 from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import OptionalEnvironment, Seed, about
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.driving.vehicles import VEHICLE
-from cavmarl.evaluate.signals.emissions import co2_mg_per_s
 from cavmarl.signals.controllers import SignalController
 
 STANDING_MPS = 0.1
@@ -102,14 +102,14 @@ class _Meter:
         stood = np.zeros(len(rows), dtype=np.bool_)
         stood[now] = np.abs(self._last["speed"][before]) < STANDING_MPS
         free_s = rows["free_s"].sum() - self._last["free_s"][before].sum()
-        co2_g = 1e-3 * co2_mg_per_s(speed, rows["accel"]).sum()
+        co2_g = emissions_of(rows, np.zeros(len(rows), np.int64), step_s)[:, 1].sum()
         self.sums += [
             (stands & ~stood).sum(),
             stands.sum() * step_s,
             len(rows) * step_s,
             len(rows) * step_s - free_s,
             speed.sum() * step_s,
-            co2_g * step_s,
+            co2_g,
         ]
         self._last = rows.copy()
 

@@ -22,11 +22,13 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
+TOWN = "benchmarks/maps/Town10HD.net.xml"  # the benchmark map of the papers, from CARLA (MIT)
+
 
 @with_world()
 def measure(
     world: WorldSpec,
-    env: OptionalEnvironment = "town",
+    env: OptionalEnvironment = TOWN,
     workers: Annotated[
         str, about("Comma-separated numbers of sensor workers.", metavar="N,…")
     ] = "1,2,3,4",

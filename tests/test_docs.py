@@ -18,6 +18,7 @@ from cavmarl.config.io import dotted_keys
 from cavmarl.config.rig import CollisionConfig, SampledConfig
 from cavmarl.config.terms import TERMS
 from cavmarl.core.errors import missing
+from cavmarl.engine import step_trace
 from cavmarl.sensors.registry import TYPES
 from tests.support.command_lines import check_command
 from tests.support.generated import check_block, table
@@ -63,6 +64,30 @@ def test_the_page_of_sensors_lists_every_type_and_key() -> None:
     header = ("key", "type", "unit", "default", "meaning")
     check_block(page, "common keys", table(header, common))
     check_block(page, "keys", table(("of", *header), own))
+
+
+def test_the_page_of_co_simulation_draws_the_cycle() -> None:
+    source = inspect.getsource(step_trace)
+    meanings = dict(re.findall(r'^[A-Z]+ = "(\w+)"  # (.+)$', source, re.MULTILINE))
+    nodes = [f'    {phase}["{phase}: {meanings[phase]}"]' for phase in step_trace.PHASES]
+    lines = ["```mermaid", "flowchart TB", *nodes, f"    {' --> '.join(step_trace.PHASES)}"]
+    lines += [f"    {step_trace.PHASES[-1]} -. next cycle .-> {step_trace.PHASES[0]}", "```"]
+    check_block(ROOT / "docs/guides/cosimulation.md", "cycle", "\n".join(lines))
+
+
+def test_the_comparison_with_papers_draws_the_five_layers() -> None:
+    page = ROOT / "docs/explanation/papers.md"
+    text = page.read_text(encoding="utf-8").split("## Five layers")[1].split("\n## ")[0]
+    rows = re.findall(r"^\| ([^|`]+) \| ([^|]*`[^|]*) \|", text, re.MULTILINE)
+    nodes = []
+    for k, (layer, content) in enumerate(rows):
+        places = re.findall(r"`([\w/.]+)`", content)
+        assert all((ROOT / "cavmarl" / place).exists() for place in places), layer
+        nodes.append(f'    L{k}["{layer}<br/>{", ".join(places)}"]')
+    assert len(nodes) == 5
+    order = " --> ".join(f"L{k}" for k in range(len(nodes)))
+    lines = ["```mermaid", "flowchart TB", *nodes, f"    {order}", "```"]
+    check_block(page, "layers", "\n".join(lines))
 
 
 def test_the_page_of_environments_explains_every_term() -> None:

@@ -55,6 +55,9 @@ def replay(
         int | None, about("Outline the ghosts of this zone.", metavar="ZONE")
     ] = None,
     fcd: Annotated[Path | None, about_file("Write floating car data as SUMO does.")] = None,
+    emissions: Annotated[
+        Path | None, about_file("Write energy, CO₂ and fuel of each vehicle as SUMO does.")
+    ] = None,
     csv: Annotated[Path | None, about_file("Write one line per vehicle and frame.")] = None,
     mcap: Annotated[Path | None, about_file("Write an MCAP file for Foxglove.")] = None,
     rosbag2: Annotated[
@@ -86,7 +89,14 @@ def replay(
     """
     from cavmarl.core.errors import ConfigError, RecordingError, require_all
 
-    given = {"fcd": fcd, "csv": csv, "mcap": mcap, "rosbag2": rosbag2, "minari": minari}
+    given = {
+        "fcd": fcd,
+        "emissions": emissions,
+        "csv": csv,
+        "mcap": mcap,
+        "rosbag2": rosbag2,
+        "minari": minari,
+    }
     wanted = {name: file for name, file in given.items() if file}
     shows = video is not None or not (web or wanted)
     require_all(

@@ -22,6 +22,8 @@ TERMS = (
     "red_light",
     "arrival",
     "delay",
+    "energy",
+    "co2",
 )
 
 

@@ -14,7 +14,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 NEAR_M = 25.0  # distance to another zone below which a vehicle is near a border
 PLACES = ("inside", "near border")
 PER_HOUR = ("collision", "off_road", "red_light", "wrong_way", "arrival")  # per hour of driving
-PER_STEP = ("jerk", "ttc_risk", "speeding", "delay")  # averaged over steps
+PER_STEP = ("jerk", "ttc_risk", "speeding", "delay", "energy", "co2")  # averaged over steps
 
 
 class BorderTerms:

@@ -1,4 +1,4 @@
-"""Recording of places and near misses of agents, and of message counts, after each step."""
+"""Recording of places and near misses of agents, message counts, and energy of other vehicles."""
 
 from __future__ import annotations
 
@@ -6,10 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.arrays import Worlds
+from cavmarl.driving.kernels.emissions import FUEL_PER_CO2
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.engine.simulation import Simulation
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.kernels.near_misses import locate_agents, watch_encroachments
-from cavmarl.evaluate.recorder import MESSAGE_COLUMNS, Recorder
+from cavmarl.evaluate.recorder import BACKGROUND_COLUMNS, MESSAGE_COLUMNS, Recorder
 from cavmarl.roads.network import RoadNetwork
 
 
@@ -100,3 +102,32 @@ class MessageRecord:
         """Fill the message columns of the first n worlds in EPISODE (n,); NaN: no messages."""
         for column, name in enumerate(MESSAGE_COLUMNS):
             episodes[name] = self._values[: len(episodes), column]
+
+
+class BackgroundUse:
+    """Adds up energy and CO₂ of background vehicles, in one step of each simulated second."""
+
+    def __init__(self, vec: CavVectorEnv) -> None:
+        self._step_s = vec.step_s
+        self._every = max(1, round(1.0 / vec.step_s))
+        self._has_engine = np.array(FUEL_PER_CO2) > 0.0
+        self._sums = np.zeros((vec.num_envs, len(BACKGROUND_COLUMNS)))
+        self._km = np.zeros(vec.num_envs)
+
+    def add(self, simulation: Simulation, step: int, running: NDArray[np.bool_]) -> None:
+        """Sample the running worlds (W,) before a step with this number."""
+        if step % self._every:
+            return
+        for world in np.flatnonzero(running).tolist():
+            rows = simulation.vehicles(world)
+            vclass = simulation.types["vclass"][rows["vtype"]]
+            counts = (rows["agent"] < 0) & self._has_engine[vclass]
+            rows, vclass = rows[counts], vclass[counts]
+            self._sums[world] += emissions_of(rows, vclass, self._step_s).sum(axis=0)
+            self._km[world] += 1e-3 * self._step_s * np.abs(rows["speed"]).sum()
+
+    def write(self, episodes: NDArray[np.void]) -> None:
+        """Fill the background columns of the first n worlds in EPISODE (n,)."""
+        km = np.where(self._km > 0.0, self._km, np.nan)
+        for column, name in enumerate(BACKGROUND_COLUMNS):
+            episodes[name] = (self._sums[:, column] / km)[: len(episodes)]

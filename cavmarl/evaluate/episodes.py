@@ -22,7 +22,7 @@ from cavmarl.engine.world_setup import make_world
 from cavmarl.env.drawn_worlds import WorldCopy
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.border_terms import BorderTerms
-from cavmarl.evaluate.encounters import EncounterWatch, MessageRecord
+from cavmarl.evaluate.encounters import BackgroundUse, EncounterWatch, MessageRecord
 from cavmarl.evaluate.failure_clips import Failure
 from cavmarl.evaluate.recorder import SLOWEST, Recorder
 from cavmarl.evaluate.resources import ResourceWatch
@@ -241,7 +241,7 @@ class _Part:
         keys, maps = present.worlds.keys, len(vec.network.maps)
         self._recorder.maps[:] = [map_of(key, maps) for key in keys]
         handed_over = TransferRecorder(transfer_logs(vec))
-        imbalance, messages = _Imbalance(vec), MessageRecord(vec)
+        imbalance, messages, others = _Imbalance(vec), MessageRecord(vec), BackgroundUse(vec)
         running = np.arange(vec.num_envs) < self._count
         every = max(1, round(TRACK_S / vec.step_s))
         self._seen.begin(first, running)
@@ -251,6 +251,7 @@ class _Part:
             self._standing.look(steps, infos["mask"])
             imbalance.add(present, running)
             messages.add(present, running)
+            others.add(present, steps, running)
             if self._tracked and running[0] and steps % every == 0:
                 self._note_track(steps, infos["mask"][0])
             before = time.perf_counter()
@@ -282,6 +283,7 @@ class _Part:
         self.episodes["episode"] += first
         self.episodes["zone_imbalance"] = imbalance.means()[: self._count]
         messages.write(self.episodes)
+        others.write(self.episodes)
         self.transfers, self.transfer_counts = handed_over.records(), handed_over.counts
         self.transfers["episode"] += first
 

@@ -80,6 +80,14 @@ METRICS = (
              "speed", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
+    Metric("energy_wh_per_km", "energy", "Wh/km", "run",
+           "energy of the agents per kilometre, as if they were electric cars", "less"),
+    Metric("co2_g_per_km", "CO₂", "g/km", "run",
+           "CO₂ of the agents per kilometre, with combustion engines", "less"),
+    Metric("background_energy_wh_per_km", "energy of others", "Wh/km", "episode",
+           "the same of background vehicles", "less"),
+    Metric("background_co2_g_per_km", "CO₂ of others", "g/km", "episode",
+           "the same of background vehicles", "less"),
     Metric("mean_speeding", "speeding", "%", "trip",
            "mean speed above the limit, as a share of it", "less", scale=100.0),
     Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", "less"),
@@ -119,17 +127,20 @@ def metric_values(
         return np.asarray(episodes[metric.name], dtype=np.float64)
     rows = trips[trips["counted"]]
     if metric.per == "run":
-        return _km_per_infraction(rows)
+        return _of_run(metric, rows)
     if metric.arrived:
         rows = rows[rows["arrived"]]
     return np.asarray(rows[metric.name], dtype=np.float64)
 
 
-def _km_per_infraction(trips: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return one value; none without trips."""
-    infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)
+def _of_run(metric: Metric, trips: NDArray[np.void]) -> NDArray[np.float64]:
+    """Return one value; none without trips, and none per kilometre without a kilometre."""
     km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
-    return np.asarray(km / max(infractions, 1), dtype=np.float64)[: len(trips)]
+    if metric.name == KM_PER_INFRACTION:
+        infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)
+        return np.asarray(km / max(infractions, 1), dtype=np.float64)[: len(trips)]
+    sums = trips[metric.name.removesuffix("_per_km")].sum(keepdims=True)
+    return np.asarray(sums[km > 0.0] / km[km > 0.0], dtype=np.float64)
 
 
 def least_value(metric: Metric, trips: NDArray[np.void]) -> float:

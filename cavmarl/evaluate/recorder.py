@@ -16,6 +16,7 @@ SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel
 STILL_S = 10.0  # a vehicle that has stood this long when its trip is cut counts as standing
 MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # unit of the term `comfort`
+BACKGROUND_COLUMNS = ("background_energy_wh_per_km", "background_co2_g_per_km")
 MESSAGE_COLUMNS = ("v2x_reception_ratio", "v2x_latency_s", "v2x_busy_ratio")
 
 _TERM = {name: k for k, name in enumerate(TERMS)}
@@ -136,6 +137,7 @@ class Recorder:
         in_time = rows["duration_s"] <= self._slowest * free_s
         rows["success"] = rows["arrived"] & ~at_fault & in_time
         rows["mean_jerk_mps3"] = JERK_UNIT_MPS3 * sums[:, _TERM["jerk"]] / steps
+        rows["energy_wh"], rows["co2_g"] = sums[:, _TERM["energy"]], sums[:, _TERM["co2"]]
         rows["mean_speeding"] = sums[:, _TERM["speeding"]] / steps
         rows["least_ttc_s"] = TTC_HORIZON_S * (1.0 - self._worst_ttc[ended])
         rows["short_ttc_share"] = self._short_ttc[ended] / steps
@@ -154,10 +156,10 @@ class Recorder:
     def episodes(self) -> NDArray[np.void]:
         """Return EPISODE (W,) of all worlds; an unfinished episode has a duration of 0.
 
-        Values about zones and messages are filled in elsewhere.
+        Values about zones, messages and the energy of other vehicles are filled in elsewhere.
         """
         rows = np.zeros(self._world_steps.size, dtype=EPISODE)
-        for name in ("zone_imbalance", *MESSAGE_COLUMNS):
+        for name in ("zone_imbalance", *MESSAGE_COLUMNS, *BACKGROUND_COLUMNS):
             rows[name] = np.nan
         num_agents = self._steps.shape[1]
         trips = self.trips()

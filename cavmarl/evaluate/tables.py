@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import csv
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Final
 
@@ -52,6 +52,8 @@ TRIP = np.dtype(
         ("mean_speed_mps", np.float64),  # distance over duration
         ("delay_s", np.float64),  # time lost compared with driving at `free_speed`
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
+        ("energy_wh", np.float64),  # of an electric car, less what it recuperated
+        ("co2_g", np.float64),  # of a combustion engine
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
         ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
@@ -70,6 +72,8 @@ EPISODE = np.dtype(
         ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
         ("agent_arrivals_per_h", np.float64),  # of simulated time
         ("background_arrivals_per_h", np.float64),
+        ("background_energy_wh_per_km", np.float64),  # as of trips; NaN: no background vehicle
+        ("background_co2_g_per_km", np.float64),
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
         ("gini_delay", np.float64),  # of the delays per kilometre of these trips
         ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
@@ -138,14 +142,15 @@ def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -
 
 
 def read_table(path: Path, dtype: np.dtype[np.void]) -> dict[str, Rows]:
-    """Return the records of a CSV file by policy, in the order of their first rows."""
+    """Return the records of a CSV file by policy, in the order of their first rows.
+
+    Numbers of a column that the file does not have, because it is older, are NaN.
+    """
     with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.reader(file)
-        next(reader)
-        by_policy: dict[str, list[list[str]]] = {}
-        for policy, *texts in reader:
-            by_policy.setdefault(policy, []).append(texts)
-    return {policy: _records(texts, dtype) for policy, texts in by_policy.items()}
+        by_policy: dict[str, list[dict[str, str]]] = {}
+        for line in csv.DictReader(file):
+            by_policy.setdefault(line["policy"], []).append(line)
+    return {policy: _records(lines, dtype) for policy, lines in by_policy.items()}
 
 
 def _names(dtype: np.dtype[np.void]) -> tuple[str, ...]:
@@ -159,13 +164,13 @@ def _texts(column: NDArray[np.generic]) -> list[str]:
     return ["" if value != value else repr(value) for value in column.tolist()]
 
 
-def _records(lines: Sequence[Sequence[str]], dtype: np.dtype[np.void]) -> Rows:
+def _records(lines: Sequence[Mapping[str, str]], dtype: np.dtype[np.void]) -> Rows:
     rows = np.zeros(len(lines), dtype=dtype)
-    for name, texts in zip(_names(dtype), zip(*lines, strict=True), strict=True):
+    for name in _names(dtype):
         if dtype[name] == np.float64:
-            rows[name] = [float(text) if text else np.nan for text in texts]
+            rows[name] = [float(line.get(name) or np.nan) for line in lines]
         else:
-            rows[name] = [int(text) for text in texts]
+            rows[name] = [int(line[name]) for line in lines]
     return rows
 
 

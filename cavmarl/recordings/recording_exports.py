@@ -1,4 +1,4 @@
-"""Export of recordings: SUMO's floating car data, CSV, and MCAP for Foxglove."""
+"""Export of recordings: SUMO's floating car data and emissions, CSV, and MCAP for Foxglove."""
 
 from __future__ import annotations
 
@@ -15,6 +15,8 @@ import numpy as np
 
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.core.records.codes import CLASS_PEDESTRIAN
+from cavmarl.driving.kernels.emissions import FUEL_PER_CO2
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.engine.world_frame import SEEN, FrameEvent, WorldFrame
 from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import VEHICLE_CLASSES
@@ -95,6 +97,39 @@ def write_csv(
     return count
 
 
+def write_emissions(
+    recording: Recording, path: Path, world: int, episode: int, track: Track = iter
+) -> int:
+    """Write SUMO's emission output, with the emissions of a step in each frame; see `write_fcd`.
+
+    `electricity` (Wh) is that of an electric car, `CO2` and `fuel` (mg) are those of a combustion
+    engine, so each vehicle has all three. The step before a frame has its speed and acceleration.
+    """
+    step_s, lane_ids, count = recording.head.step_s, recording.network.lane_ids, 0
+    per_co2 = np.array(FUEL_PER_CO2)
+    with _writing(path) as file:
+        file.write('<?xml version="1.0" encoding="UTF-8"?>\n<emission-export>\n')
+        for frame in track(recording.frames(world, episode)):
+            file.write(f'    <timestep time="{frame.time_s:.2f}">\n')
+            rows = frame.vehicles
+            vclass = np.minimum(rows["vclass"], CLASS_PEDESTRIAN)
+            used = emissions_of(rows, vclass, step_s)
+            fuel_mg = 1e3 * used[:, 1] * per_co2[vclass]
+            for row, (energy_wh, co2_g), fuel in zip(rows, used, fuel_mg, strict=True):
+                lane = int(row["lane"])
+                name = lane_ids[lane] if 0 <= lane < len(lane_ids) else ""
+                file.write(
+                    f'        <vehicle id="{row["id"]}" CO2="{1e3 * co2_g:.2f}" fuel="{fuel:.2f}" '
+                    f'electricity="{energy_wh:.5f}" type="{_class_name(int(row["vclass"]))}" '
+                    f'speed="{float(row["speed"]):.3f}" lane={quoteattr(name)} '
+                    f'x="{float(row["x"]):.3f}" y="{float(row["y"]):.3f}"/>\n'
+                )
+            file.write("    </timestep>\n")
+            count += 1
+        file.write("</emission-export>\n")
+    return count
+
+
 def write_mcap(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
@@ -131,7 +166,12 @@ def write_mcap(
     return count
 
 
-EXPORTS: dict[str, Export] = {"fcd": write_fcd, "csv": write_csv, "mcap": write_mcap}
+EXPORTS: dict[str, Export] = {
+    "fcd": write_fcd,
+    "emissions": write_emissions,
+    "csv": write_csv,
+    "mcap": write_mcap,
+}
 
 
 def _class_name(vclass: int) -> str:

@@ -16,6 +16,7 @@ from benchmarks.sensor_run import PARTS, describe_rig, load_rig
 from cavmarl.config.registry import find_settings, load_config
 from cavmarl.core.errors import ConfigError
 from cavmarl.parallel.processes.process_barrier import usable_cores
+from cavmarl.roads.cache import load_network
 from tests.support.sumo_worlds import MODES, tiny_file
 
 RIG: dict[str, dict[str, Any]] = {
@@ -112,6 +113,13 @@ def test_the_description_of_the_rig_lists_ten_sensors() -> None:
     assert all(
         {"type", "resolution", "lines", "rate_hz", "placement"} <= sensor.keys() for sensor in told
     )
+
+
+def test_the_default_map_is_that_of_the_papers() -> None:
+    network = load_network(Path(sensors.TOWN))
+    roads = network.edges[~network.edges["internal"]]
+    assert len(roads) == 46
+    assert 1500.0 < roads["length_m"].sum() < 1700.0
 
 
 def test_the_program_writes_every_step_and_a_figure(

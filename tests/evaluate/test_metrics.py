@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from cavmarl.evaluate.metrics import METRICS, metric_values
-from cavmarl.evaluate.tables import EPISODE, TRIP
+from cavmarl.evaluate.tables import EPISODE, TRIP, read_table, write_table
 
 BY_NAME = {metric.name: metric for metric in METRICS}
 
@@ -37,6 +39,25 @@ def test_each_infraction_reduces_the_kilometres_per_infraction(infraction: str) 
 def test_distance_that_was_driven_back_does_not_count() -> None:
     assert values("km_per_infraction", trips(3000.0, -1000.0)) == [3.0]
     assert values("km_per_infraction", trips()) == []
+
+
+def test_energy_and_co2_are_per_kilometre_of_all_trips() -> None:
+    rows = trips(3000.0, -1000.0, 1000.0)
+    rows["energy_wh"], rows["co2_g"] = (500.0, 50.0, -30.0), (400.0, 100.0, 100.0)
+    assert values("energy_wh_per_km", rows) == [130.0]
+    assert values("co2_g_per_km", rows) == [150.0]
+    assert values("co2_g_per_km", trips()) == values("co2_g_per_km", trips(-5.0)) == []
+
+
+def test_a_file_of_an_older_version_has_no_energy(tmp_path: Path) -> None:
+    rows = trips(3000.0)
+    write_table(tmp_path / "new.csv", {"idm": rows}, TRIP)
+    assert read_table(tmp_path / "new.csv", TRIP)["idm"].tobytes() == rows.tobytes()
+    older = np.dtype([(name, TRIP[name]) for name in TRIP.names or () if name != "energy_wh"])
+    write_table(tmp_path / "old.csv", {"idm": rows[list(older.names or ())]}, older)
+    found = read_table(tmp_path / "old.csv", TRIP)["idm"]
+    assert np.isnan(found["energy_wh"]).all()
+    assert found["distance_m"].tolist() == [3000.0]
 
 
 def test_only_trips_that_count_have_values() -> None:

@@ -51,11 +51,13 @@ class Worlds:
 
 def test_a_trip_is_the_sum_of_its_steps() -> None:
     worlds = Worlds()
-    worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.5, 0.0))
+    worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.5, 0.0), energy=(-0.5, 0.0))
     worlds.add(
         progress=(4.0, 1.0),
         jerk=(0.3, 0.0),
         delay=(0.2, 0.0),
+        energy=(2.0, -0.5),
+        co2=(3.0, 0.0),
         red_light=(1.0, 0.0),
         speeding=(0.3, 0.0),
         ttc_risk=(0.7, 0.0),
@@ -70,6 +72,8 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     assert trips["mean_speed_mps"].tolist() == [8.0, 2.0]
     assert trips["reward"].tolist() == [24.0, 6.0]
     assert trips["delay_s"] == pytest.approx([0.2, 0.0])
+    assert trips["energy_wh"] == pytest.approx([1.5, -0.5])
+    assert trips["co2_g"] == pytest.approx([3.0, 0.0])
     assert trips["mean_speeding"] == pytest.approx([0.1, 0.0])
     assert trips["mean_jerk_mps3"] == pytest.approx([4.0 / 3.0, 0.0])
     assert trips["least_ttc_s"] == pytest.approx([1.2, 4.0])

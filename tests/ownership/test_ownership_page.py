@@ -4,17 +4,29 @@ from __future__ import annotations
 
 import inspect
 import re
+from collections.abc import Sequence
 from dataclasses import fields
 from pathlib import Path
 
 from cavmarl.ownership.codec import KINDS as MESSAGES
 from cavmarl.ownership.log_records import KINDS as RECORDS
-from cavmarl.ownership.messages import Message, Record
+from cavmarl.ownership.messages import (
+    COORDINATOR,
+    Begin,
+    Commit,
+    Message,
+    Output,
+    Prepare,
+    Record,
+    Step,
+)
 from cavmarl.ownership.transitions import Party, mermaid
 from tests.ownership import test_border_rules, test_rules
+from tests.ownership.bench import Bench
 from tests.ownership.scenarios import SCENARIOS
 from tests.support.generated import check_block, table
 
+NAMES = {0: "Source", COORDINATOR: "Coordinator", 1: "Target"}  # of zones and the coordinator
 PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
@@ -40,6 +52,46 @@ def test_the_page_lists_every_record() -> None:
 def test_the_page_shows_every_transition() -> None:
     parts = [f"{party.value.capitalize()}:\n\n```mermaid\n{mermaid(party)}\n```" for party in Party]
     check_block(PAGE, "diagrams", "\n\n".join(parts))
+
+
+class Drawn(Bench):
+    """A run that draws its messages and records."""
+
+    def __init__(self) -> None:
+        self.lines = ["sequenceDiagram", *(f"    participant {name}" for name in NAMES.values())]
+        super().__init__()
+
+    def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
+        sender = getattr(message, "source" if isinstance(message, Prepare) else "zone", COORDINATOR)
+        sender = COORDINATOR if isinstance(message, Step) else sender
+        label = type(message).__name__.upper()
+        if isinstance(message, Step):
+            label += "".join(f", {word}" for word in ("OUT", "IN") if word in _lists(message))
+        for place in message.destinations():
+            self.lines.append(f"    {NAMES[sender]}->>{NAMES[place]}: {label}")
+        return super().give(message, removed)
+
+    def note(self, output: Output) -> Output:
+        for record in output.records:
+            if isinstance(record, Begin | Commit):
+                name = type(record).__name__.upper()
+                self.lines.append(f"    Note over {NAMES[COORDINATOR]}: {name} {record.tick}")
+        return super().note(output)
+
+
+def _lists(step: Step) -> set[str]:
+    return {word for word, moves in (("IN", step.enter), ("OUT", step.leave)) if moves}
+
+
+def test_the_page_draws_a_hand_off() -> None:
+    drawn = Drawn()
+    drawn.tick(births=[(7, 0)])
+    first = len(drawn.lines)
+    drawn.tick(offers=[(7, 1)])
+    drawn.tick(movers=[(7, 1)])
+    assert drawn.owner(7) == 1
+    lines = [*drawn.lines[: 1 + len(NAMES)], *drawn.lines[first:]]
+    check_block(PAGE, "handoff", "\n".join(["```mermaid", *lines, "```"]))
 
 
 def test_the_page_lists_every_remedy() -> None:

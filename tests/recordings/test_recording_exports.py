@@ -15,9 +15,15 @@ from mcap.reader import make_reader
 
 from cavmarl import ConfigError, load_policy, parallel_env
 from cavmarl.cli import main
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.engine.world_frame import SEEN, WorldFrame
 from cavmarl.recordings.recording import Recording
-from cavmarl.recordings.recording_exports import write_csv, write_fcd, write_mcap
+from cavmarl.recordings.recording_exports import (
+    write_csv,
+    write_emissions,
+    write_fcd,
+    write_mcap,
+)
 from cavmarl.recordings.replay_pictures import ReplayPictures
 
 pytestmark = pytest.mark.integration  # the manifest asks git; videos are made by ffmpeg
@@ -62,6 +68,25 @@ def test_fcd_has_each_vehicle_as_sumo_would(
             )
             assert line.get("lane") == recording.network.lane_ids[row["lane"]]
             assert line.get("type") == "passenger"
+
+
+def test_emissions_have_energy_co2_and_fuel_of_each_vehicle(
+    path: Path, frames: list[WorldFrame], tmp_path: Path
+) -> None:
+    recording = Recording.open(path)
+    assert write_emissions(recording, tmp_path / "emissions.xml", 0, 0) == STEPS + 1
+    root = ElementTree.parse(tmp_path / "emissions.xml").getroot()
+    assert root.tag == "emission-export"
+    total_mg = 0.0
+    for step, frame in zip(root, frames, strict=True):
+        used = emissions_of(frame.vehicles, frame.vehicles["vclass"], recording.head.step_s)
+        for line, row, (energy_wh, co2_g) in zip(step, frame.vehicles, used, strict=True):
+            assert int(line.get("id")) == row["id"]
+            assert float(line.get("electricity")) == pytest.approx(energy_wh, abs=1e-5)
+            assert float(line.get("CO2")) == pytest.approx(1e3 * co2_g, abs=0.01)
+            assert float(line.get("fuel")) == pytest.approx(324.18 * co2_g, abs=0.01)
+            total_mg += float(line.get("CO2"))
+    assert total_mg > 0.0
 
 
 def test_csv_has_all_numbers_in_full(path: Path, frames: list[WorldFrame], tmp_path: Path) -> None:

@@ -18,6 +18,7 @@ from cavmarl.core.records.codes import (
     EVENT_WRONG_WAY,
 )
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.driving.vehicle_types import generated_types
 from cavmarl.rewards.kernels.terms import TTC_HORIZON_S, write_terms
 from tests.naive.terms import ttc_risk
@@ -93,6 +94,17 @@ def test_a_slow_type_is_not_late_at_its_maximum_speed() -> None:
 def test_comfort_is_the_mean_jerk() -> None:
     # 2 m/s² of acceleration gained and lost within the step: 4 m/s² of |jerk| in 0.1 s.
     assert terms(one(step_jerk=4.0))["jerk"] == pytest.approx(4.0 / STEP_S / 10.0)
+
+
+def test_energy_and_co2_are_those_of_the_step() -> None:
+    row = one(speed=12.0, accel=1.0, pitch=0.02)
+    energy_wh, co2_g = emissions_of(row, np.zeros(1, np.int64), STEP_S)[0].tolist()
+    found = terms(row)
+    assert found["energy"] == pytest.approx(energy_wh)
+    assert found["co2"] == pytest.approx(co2_g)
+    assert min(energy_wh, co2_g) > 0.0
+    braking = terms(one(speed=12.0, accel=-2.0))
+    assert braking["energy"] < 0.0 == braking["co2"]
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from cavmarl.core.records.codes import SIGNAL_GREEN_MAJOR, SIGNAL_GREEN_MINOR
-from cavmarl.evaluate.signals.emissions import co2_mg_per_s
+from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.roads.network import RoadNetwork
 
 STANDING_MPS = 0.1
@@ -44,7 +44,7 @@ class SignalFigures:
     stops: float  # mean over departed vehicles
     queue: float | None  # vehicles below 0.1 m/s on lanes that end at a signal, mean of the samples
     most_queued: int | None  # the same, most at a time
-    co2_g_per_km: float | None  # of a petrol car, see `co2_mg_per_s`
+    co2_g_per_km: float | None  # of a petrol car, see `emissions_of`
     switches_per_h: float | None  # changes of the green of a signal, mean over signals
     longest_red_s: float | None  # longest time for which a lane was red while a vehicle stood on it
     jams: bool | None  # see `is_jammed`
@@ -86,7 +86,7 @@ class SignalMeter:
         self._red_s = np.zeros(len(self._lanes))
         self._longest_red_s = 0.0
         self._samples = self._queued = self._most_queued = 0
-        self._co2_mg = self._metres = 0.0
+        self._co2_g = self._metres = 0.0
 
     def sample(
         self,
@@ -118,7 +118,8 @@ class SignalMeter:
         self._trips["waited_s"][ids] += stands
         self._trips["stops"][ids] += stands & ~self._trips["stands"][ids]
         self._trips["stands"][ids] = stands
-        self._co2_mg += float(co2_mg_per_s(speed, rows["accel"]).sum())
+        cars = np.zeros(len(rows), np.int64)
+        self._co2_g += float(emissions_of(rows, cars, 1.0)[:, 1].sum())
         self._metres += float(speed.sum())
         self._sample_lanes(self._lane_of[rows["lane"][stands]], codes)
         self._samples += 1
@@ -176,7 +177,7 @@ class SignalMeter:
             stops=float(trips["stops"].mean()) if len(trips) else 0.0,
             queue=self._queued / max(self._samples, 1),
             most_queued=self._most_queued,
-            co2_g_per_km=self._co2_mg / self._metres if self._metres else None,
+            co2_g_per_km=1e3 * self._co2_g / self._metres if self._metres else None,
             switches_per_h=switches_per_h,
             longest_red_s=self._longest_red_s,
             jams=jams,

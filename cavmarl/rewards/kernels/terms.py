@@ -24,6 +24,7 @@ from cavmarl.core.records.codes import (
     EVENT_RED_LIGHT,
     EVENT_WRONG_WAY,
 )
+from cavmarl.driving.kernels.emissions import battery_wh, co2_mg_per_s
 from cavmarl.driving.kernels.lanes.route_following import free_speed
 
 TTC_HORIZON_S = 4.0  # longer times to collision do not count
@@ -126,6 +127,19 @@ def _delay(roads: RoadArrays, kind: np.void, row: np.void, step_s: float) -> flo
 
 
 @kernel
+def _energy(kind: np.void, row: np.void, step_s: float) -> float:
+    """Return the energy in Wh that an electric car draws in the step; negative: it recuperates."""
+    return float(battery_wh(kind["vclass"], row["speed"], row["accel"], row["pitch"], step_s))
+
+
+@kernel
+def _co2(kind: np.void, row: np.void, step_s: float) -> float:
+    """Return the CO₂ of a combustion engine in the step in g."""
+    rate = co2_mg_per_s(kind["vclass"], row["speed"], row["accel"], row["pitch"])
+    return float(1e-3 * step_s * rate)
+
+
+@kernel
 def write_terms(
     roads: RoadArrays,
     rows: NDArray[np.void],  # VEHICLE (C,) at the end of the step
@@ -146,3 +160,5 @@ def write_terms(
     out[7] = _event(row, EVENT_RED_LIGHT)
     out[8] = _event(row, EVENT_ARRIVED)
     out[9] = _delay(roads, kind, row, step_s)
+    out[10] = _energy(kind, row, step_s)
+    out[11] = _co2(kind, row, step_s)
