@@ -124,6 +124,19 @@ def test_plans_of_others_and_times_of_signals_are_labelled_as_state_of_the_world
     assert not any(one.source == "world's state" for one in readings_of(OFF))
 
 
+@pytest.mark.parametrize("name", ["cities_sensed", "cities_test", "cities_test_left"])
+def test_drivers_by_sensors_alone_are_trained_and_judged_without_the_state_of_the_world(
+    name: str,
+) -> None:
+    sensors = load_config(name)[0].sensors
+    readings = readings_of(sensors)
+    assert {one.source for one in readings} == {"own vehicle", "ideal sensors", "map"}
+    assert sensors == load_config("cities_sensed")[0].sensors
+    features = [feature.name for sensor in SENSORS for feature in sensor.features(sensors)]
+    assert {"line_stop_0", "turn_0"} < set(features)
+    assert not any("change_" in name and name.startswith("line") for name in features)
+
+
 def test_an_indicator_that_is_visible_near_a_junction_is_not_state_of_the_world() -> None:
     conflicts = ConflictsConfig(count=1, indicators=True, indicators_m=40.0)
     readings = readings_of(replace(OFF, conflicts=conflicts))

@@ -17,6 +17,7 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from copy import deepcopy
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, ClassVar
@@ -87,6 +88,7 @@ class Args:
     end_at_red: Annotated[bool, "end returns at a red light, as at a crash"] = False
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
+    average: Annotated[float, "share of the driver's averaged weights that an update keeps"] = 0.0
     max_gradient_norm: Annotated[float, "largest norm of a gradient; longer ones are clipped"] = 0.5
     throttle_std: Annotated[float, "initial standard deviation of throttle; without --start"] = 0.3
     steering_std: Annotated[float, "initial standard deviation of steering; without --start"] = 0.1
@@ -109,7 +111,7 @@ class Args:
         least = dict.fromkeys(f"{ones} checkpoint_updates".split(), 1)
         options.check_at_least(self, least | dict.fromkeys(zeros.split(), 0) | {"background": -1})
         options.check_above_zero(self, [*above.split(), "imitation_share"])
-        options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share"))
+        options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share", "average"))
         options.check_device(self.device)
         logger_names(self.loggers)
         if self.residual and self.imitation_weight:
@@ -277,12 +279,18 @@ class Collector:
 
 
 class Learner:
-    """The network, its optimiser, and PPO's update (Schulman et al. 2017)."""
+    """The network, its optimiser, and PPO's update (Schulman et al. 2017).
+
+    Attributes:
+        averaged: the network of the driver: an exponential average of the weights after each
+            update (Polyak and Juditsky 1992).
+    """
 
     def __init__(self, network: ActorCritic, args: Args, ranks: Ranks = ALONE) -> None:
         self.network, self._args, self._ranks = network.to(args.device), args, ranks
         self.optimizer = torch.optim.Adam(network.parameters(), lr=args.learning_rate, eps=1e-5)
         self.scales = Scales(network, ranks)
+        self.averaged = deepcopy(network)
 
     def imitation_weight(self, left: float) -> float:
         """Return the imitation weight with a share `left` of the run remaining."""
@@ -311,6 +319,7 @@ class Learner:
                         nn.utils.clip_grad_norm_(part, args.max_gradient_norm)
                     self.optimizer.step()
         self.scales.add(batch.observations.flatten(0, 2)[acted])
+        self._average()
         means = torch.stack(found or [torch.zeros(len(NUMBERS))]).mean(0)
         of_ranks = self._ranks.gather(means.tolist())
         return {
@@ -357,13 +366,23 @@ class Learner:
         kept = size.topk(max(int(self._args.keep * len(size)), 1), sorted=False).indices
         return acted[kept.sort().values]
 
+    @torch.no_grad()
+    def _average(self) -> None:
+        """Move the averaged weights towards the new ones; the scales are the new ones."""
+        latest, kept = self.network.state_dict(), self._args.average
+        for name, tensor in self.averaged.state_dict().items():
+            tensor.lerp_(latest[name], 1.0 if name in ("mean", "deviation") else 1.0 - kept)
+
     def save(self) -> Parts:
         network, optimizer = self.network.state_dict(), self.optimizer.state_dict()
-        return {"network": network, "optimizer": optimizer, "scales": self.scales.save()}
+        averaged = self.averaged.state_dict()
+        scales = self.scales.save()
+        return {"network": network, "optimizer": optimizer, "scales": scales, "averaged": averaged}
 
     def load(self, saved: Parts) -> None:
         self.network.load_state_dict(saved["network"])
         self.optimizer.load_state_dict(saved["optimizer"])
+        self.averaged.load_state_dict(saved["averaged"])
         self.scales.load(saved["scales"])
 
 
@@ -391,6 +410,7 @@ class Run:
         if args.start and not folder.began.parts:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         ranks.copy_weights(self.network)
+        self.learner.averaged.load_state_dict(self.network.state_dict())
         if ranks.rank:  # each process samples other actions
             torch.manual_seed(args.seed + self.updates + ranks.rank * 1_000_003)
         seed = args.seed + self.updates
@@ -436,7 +456,9 @@ class Run:
         if self.ranks.rank == 0:
             parts["learner"] = self.learner.save()
         self.folder.save(self.agent_steps, self.updates, parts)
-        self.folder.save_driver(self.network, replace(self.config, agent_steps=self.agent_steps))
+        self.folder.save_driver(
+            self.learner.averaged, replace(self.config, agent_steps=self.agent_steps)
+        )
 
 
 @contextmanager

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from pathlib import Path
 
 import torch
@@ -12,6 +13,8 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.learning.actor_critic import ActorCritic, load_network
 from cavmarl.networks.network_files import CONTINUOUS_ACTIONS, NetworkConfig
 from cavmarl.sensors.observed import feature_names
+
+log = logging.getLogger(__name__)
 
 OF_OBSERVATIONS = (
     "mean",
@@ -26,7 +29,8 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
     """Copy the weights of a driver into a network; return how many decisions they come from.
 
     Observations that the driver does not have get the weight 0, so that the network first decides
-    as the driver does.
+    as the driver does. Observations that the run does not have are left out and logged: the network
+    first decides as the driver does where they equal their mean.
 
     Args:
         network: the initialised network.
@@ -34,12 +38,12 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
         folder: folder of the driver.
 
     Raises:
-        PolicyError: the driver has another form, or needs observations that the run does not have.
+        PolicyError: the driver has another form.
     """
     driver, its_config = load_network(folder)
     held = driver.state_dict()
     if its_config.sensors != config.sensors:
-        held = _widened(held, network.state_dict(), _columns(its_config, config, folder))
+        held = _fitted(held, network.state_dict(), *_columns(its_config, config, folder))
     try:
         network.load_state_dict(held)
     except RuntimeError as error:
@@ -54,32 +58,37 @@ def _names(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
     return [(stack - 1 - frame, *name) for frame in range(stack) for name in names]
 
 
-def _columns(driver: NetworkConfig, run: NetworkConfig, folder: Path) -> Tensor:
-    """Return the index in a run's observation of each element of a driver's observation."""
+def _columns(driver: NetworkConfig, run: NetworkConfig, folder: Path) -> tuple[Tensor, Tensor]:
+    """Return two indices of each number that both observe: in the driver's and the run's array."""
     known = {name: k for k, name in enumerate(_names(run.sensors))}
     names = _names(driver.sensors)
+    kept = [k for k, name in enumerate(names) if name in known]
     if missing := [name for name in names if name not in known]:
         _, sensor, feature = missing[0]
-        raise PolicyError(
-            f"--start {folder}: observes {len(missing)} numbers that this run does not, first "
-            f"'{feature}' of the sensor '{sensor}'; leave its sensors on"
-        )
-    columns = [known[name] for name in names]
+        log.warning(
+            "--start %s: the driver observes %d numbers that this run does not, first '%s' of the "
+            "sensor '%s'; the run starts without them",
+            folder, len(missing), feature, sensor,
+        )  # fmt: skip
+    columns = [known[names[k]] for k in kept]
     if driver.residual:
+        kept += range(len(names), len(names) + CONTINUOUS_ACTIONS)
         columns += range(run.observation_size - CONTINUOUS_ACTIONS, run.observation_size)
-    return torch.tensor(columns)
+    return torch.tensor(kept), torch.tensor(columns)
 
 
-def _widened(
-    held: dict[str, Tensor], wanted: dict[str, Tensor], columns: Tensor
+def _fitted(
+    held: dict[str, Tensor], wanted: dict[str, Tensor], kept: Tensor, columns: Tensor
 ) -> dict[str, Tensor]:
-    """Widen a driver's tensors to longer observations; a critic's state stays at the end."""
+    """Fit a driver's tensors to other observations; a critic's state stays at the end."""
     found = dict(held)
+    observed = held["mean"].shape[-1]
     for name in held.keys() & wanted.keys() & set(OF_OBSERVATIONS):
         old, size = held[name], wanted[name].shape[-1]
-        state = torch.arange(size - (old.shape[-1] - len(columns)), size)
+        num_states = old.shape[-1] - observed
         found[name] = torch.full(
             (*old.shape[:-1], size), 1.0 if name == "deviation" else 0.0, dtype=old.dtype
         )
-        found[name][..., torch.cat([columns, state])] = old
+        found[name][..., columns] = old[..., kept]
+        found[name][..., size - num_states :] = old[..., observed:]
     return found

@@ -70,3 +70,22 @@ def test_learning_uses_decisions_with_large_positive_or_negative_advantages(
     monkeypatch.setattr(found.network, "heads", noting)
     found.update(batch([3.0, -4.0, 1.0, -2.0]), 1.0)
     assert learned == [[0.0, 1.0]]
+
+
+@pytest.mark.parametrize("kept", [0.0, 0.75])
+def test_the_driver_has_averaged_weights_and_the_latest_scales(kept: float) -> None:
+    found = learner(average=kept, learning_rate=0.1, epochs=1, minibatches=1)
+    due = {name: tensor.clone() for name, tensor in found.network.state_dict().items()}
+    for rewards in ([1.0, 2.0, 3.0], [3.0, -1.0, 2.0]):
+        found.update(batch(rewards), 1.0)
+        for name, tensor in found.network.state_dict().items():
+            share = 0.0 if name in ("mean", "deviation") else kept
+            due[name] = share * due[name] + (1.0 - share) * tensor
+    for name, tensor in found.averaged.state_dict().items():
+        torch.testing.assert_close(tensor, due[name])
+    moved = not torch.equal(found.averaged.log_std, found.network.log_std)
+    assert moved == (kept > 0.0)
+    other = learner(average=kept)
+    other.load(found.save())
+    for name, tensor in found.averaged.state_dict().items():
+        assert other.averaged.state_dict()[name].equal(tensor), name

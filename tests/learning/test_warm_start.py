@@ -73,11 +73,25 @@ def test_with_the_same_sensors_the_weights_are_the_same(tmp_path: Path) -> None:
         assert run.state_dict()[name].equal(tensor), name
 
 
-def test_a_driver_with_other_sensors_is_refused(tmp_path: Path) -> None:
-    its, ours = made(MORE, {}, 1), made(FEWER, {}, 2)
-    save_network(tmp_path, network(its), its)
-    with pytest.raises(PolicyError, match=r"observes \d+ numbers that this run does not, first"):
-        begin_with(network(ours), ours, tmp_path)
+@pytest.mark.parametrize("form", FORMS, ids=str)
+def test_observations_that_the_run_does_not_have_are_left_out_and_counted(
+    form: dict[str, int], tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    its, ours = made(MORE, form, 1), made(FEWER, form, 2)
+    driver, run = network(its), network(ours)
+    save_network(tmp_path, driver, its)
+    begin_with(run, ours, tmp_path)
+    fewer = torch.randn(16, ours.observation_size)
+    seen = driver.mean.repeat(16, 1)  # numbers that the run does not observe equal their mean
+    places = {name: k for k, name in enumerate(named(MORE))}
+    columns = [places[name] for name in named(FEWER)]
+    if "residual" in form:
+        columns += [its.observation_size - 2, its.observation_size - 1]
+    seen[:, columns] = fewer
+    states = torch.randn(16, its.state_size) if its.state_size else None
+    torch.testing.assert_close(run(fewer), driver(seen))
+    torch.testing.assert_close(run.value(fewer, states), driver.value(seen, states))
+    assert f"observes {len(named(MORE)) - len(named(FEWER))} numbers that this" in caplog.text
 
 
 def test_a_driver_with_another_network_is_refused(tmp_path: Path) -> None:

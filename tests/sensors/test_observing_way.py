@@ -139,6 +139,27 @@ def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
             assert seen == pytest.approx(twin, abs=2e-5)
 
 
+def test_a_route_is_unknown_until_it_is_indicated() -> None:
+    roads, ways = network("grid4x4"), plans("grid4x4")
+    phase = np.zeros(len(roads.arrays.signals), np.int32)
+    links = roads.links
+    lane = next(k for k in np.unique(links["from_lane"]) if np.sum(links["from_lane"] == k) > 1)
+    goals = {int(ways[goal][lane]["link"]): goal for goal in range(len(ways))}
+    goals.pop(-1, None)
+    assert len(goals) > 1
+
+    def numbers(from_line_m: float, goal: int) -> list[float]:
+        s = float(roads.lanes[lane]["length_m"]) - from_line_m
+        rows = np.concatenate([on_lane(roads, lane, s - 20.0), on_lane(roads, lane, s, speed=10.0)])
+        rows["goal"], rows["id"] = [min(goals.values()), goal], [0, 1]
+        rows["way"] = rows["goal"] * len(roads.lanes)
+        return observed_conflicts("grid4x4", rows, 0, phase, INDICATED_NEAR)
+
+    for from_line_m, is_known in ((NEAR_M + 1.0, False), (NEAR_M - 1.0, True)):
+        seen = {tuple(numbers(from_line_m, goal)) for goal in goals.values()}
+        assert (len(seen) > 1) == is_known
+
+
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
     """Return cars at (s, d, speed) on the road behind the merge, whose goal is its end."""
     roads = network("merge")
@@ -161,13 +182,15 @@ def test_vehicles_are_ordered_by_time_to_contact_and_not_by_distance() -> None:
     assert not numbers[2:].any()
 
 
-def test_the_plan_of_another_changes_nothing() -> None:
+@pytest.mark.parametrize("config", [CONFIG, INDICATED_NEAR])
+def test_the_plan_of_another_changes_nothing(config: SensorsConfig) -> None:
+    """Vehicles that indicate near junctions are too far from one."""
     rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
     phase = np.zeros(0, np.int32)
-    before = observed_conflicts("merge", rows, 0, phase)
+    before = observed_conflicts("merge", rows, 0, phase, config)
     for name in ("goal", "way", "target_lane", "link", "throttle", "steering", "to_go"):
         rows[name][1:] = 0
-    assert observed_conflicts("merge", rows, 0, phase) == before
+    assert observed_conflicts("merge", rows, 0, phase, config) == before
 
 
 def test_an_indicated_route_is_observed_over_one_junction_only() -> None:
