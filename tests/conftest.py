@@ -53,6 +53,16 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
 
 
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect tests without the garbage collector, which would look at ever more objects."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
+
+
 def pytest_collection_finish() -> None:
     """Freeze the objects that all tests share, so that the garbage collector skips them."""
     gc.collect()
