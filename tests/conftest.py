@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Iterator
 from multiprocessing import get_context
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import pytest
 from hypothesis import settings
@@ -22,6 +23,10 @@ from tests.support.cpu_time import (
     rare_tests,
 )
 from tests.support.tiers import ProcessWatch, TimeLimit, is_needed, mark
+
+if TYPE_CHECKING:
+    from cavmarl import CavVectorEnv
+    from tests.support.vec_runs import Make
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -46,6 +51,16 @@ def pytest_configure(config: pytest.Config) -> None:
     settings.register_profile("compiled", deadline=None)
     settings.register_profile("python", deadline=None, max_examples=25)
     settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collection() -> Iterator[None]:
+    """Collect tests without the garbage collector, which would look at ever more objects."""
+    gc.disable()
+    try:
+        return (yield)
+    finally:
+        gc.enable()
 
 
 def pytest_collection_finish() -> None:
@@ -107,6 +122,22 @@ def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
     from cavmarl.core.processes import start_python
 
     _let_start(monkeypatch, start_python, get_context("spawn"))
+
+
+@pytest.fixture
+def make() -> Iterator[Make]:
+    """Yield `make_vec`, and close its environments at the end."""
+    from cavmarl import make_vec
+
+    made: list[CavVectorEnv] = []
+
+    def call(env: str, **arguments: Any) -> CavVectorEnv:
+        made.append(make_vec(env, **arguments))
+        return made[-1]
+
+    yield call
+    for vec in made:
+        vec.close()
 
 
 @pytest.fixture(scope="session")

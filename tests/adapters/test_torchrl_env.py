@@ -15,13 +15,19 @@ from cavmarl.env.vector import make_vec
 from cavmarl.signals.kernels.green_choices import GREEN
 
 torch = pytest.importorskip("torch", reason="needs the extra: torchrl")
-torchrl = pytest.importorskip("torchrl", reason="needs the extra: torchrl")
 
 # TorchRL warns about its own code when it is imported.
 pytestmark = [
     pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl"),
     pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase"),
 ]
+
+
+@pytest.fixture(autouse=True)
+def torchrl() -> Any:
+    """Return the library; importing it takes seconds, so this file does it only for its tests."""
+    return pytest.importorskip("torchrl", reason="needs the extra: torchrl")
+
 
 MODES = ("closed", "open", "respawn")
 WORLDS, AGENTS, BUDGET, HORIZON = 2, 3, 5, 12
@@ -123,7 +129,7 @@ def test_the_seed_determines_the_results() -> None:
     )
 
 
-def test_a_world_can_be_reset_before_it_is_over() -> None:
+def test_a_world_can_be_reset_before_it_is_over(torchrl: Any) -> None:
     from torchrl.envs import StepCounter, TransformedEnv
 
     env = make()

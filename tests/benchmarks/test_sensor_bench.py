@@ -29,11 +29,13 @@ RIG: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def found() -> SensorBench:
+    """Return a result of new processes, which cost 8 s of processor time: its tests are slow."""
     return measure_sensor_workers(
         "grid4x4", RIG, workers=(1, 2), warmup=2, steps=6, repeats=1, background=3
     )
 
 
+@pytest.mark.slow
 def test_the_result_contains_every_run(found: SensorBench) -> None:
     assert sorted((turn.repeat, turn.workers) for turn in found.turns) == [(1, 1), (1, 2)]
     assert [turn.place for turn in found.turns] == [1, 2]
@@ -42,6 +44,7 @@ def test_the_result_contains_every_run(found: SensorBench) -> None:
     assert all(len(turn.run.digests) == 3 for turn in found.turns)
 
 
+@pytest.mark.slow
 def test_the_ceiling_of_the_machine_is_measured_with_the_workers(found: SensorBench) -> None:
     if len(usable_cores()) < 2:
         assert found.ceiling is None
@@ -51,6 +54,7 @@ def test_the_ceiling_of_the_machine_is_measured_with_the_workers(found: SensorBe
     assert 0.0 < found.ceiling.ratio == found.facts()["ceiling"]["ratio"]
 
 
+@pytest.mark.slow
 def test_the_parts_of_a_step_sum_to_at_most_the_step(found: SensorBench) -> None:
     # Their share is not tested here, because other programs disturb the measurement.
     for row in found.rows:
@@ -61,6 +65,7 @@ def test_the_parts_of_a_step_sum_to_at_most_the_step(found: SensorBench) -> None
         assert row.wait_ms < row.step_ms
 
 
+@pytest.mark.slow
 def test_the_time_of_sumo_is_listed_separately(found: SensorBench, tmp_path: Path) -> None:
     """SUMO's step and the wait for it are listed for both kinds of coupling, and only there."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
@@ -80,6 +85,7 @@ def test_the_time_of_sumo_is_listed_separately(found: SensorBench, tmp_path: Pat
         assert "SUMO" in coupled.facts()["parts_ms"][1]
 
 
+@pytest.mark.slow
 def test_resources_of_all_processes_are_reported(found: SensorBench) -> None:
     ticks = 6 * found.turns[0].run.ticks_per_step
     for number in (1, 2):
@@ -90,12 +96,14 @@ def test_resources_of_all_processes_are_reported(found: SensorBench) -> None:
         assert window.got_bytes > 6 * 32 * 18 * 3
 
 
+@pytest.mark.slow
 def test_both_placements_are_reported(found: SensorBench) -> None:
     shares = found.shares(2)
     assert shares["in_turn"].homes == (0, 1, 0, 1)
     assert max(shares["cost"].loads_s) <= max(shares["in_turn"].loads_s)
 
 
+@pytest.mark.slow
 def test_the_result_is_json_with_every_sensor(found: SensorBench) -> None:
     told = json.loads(json.dumps(found.facts()))
     sensors = told["turns"][0]["run"]["sensors"]

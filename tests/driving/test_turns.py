@@ -121,6 +121,7 @@ def test_a_corner_between_two_lanes_is_a_bend(tmp_path: Path) -> None:
     assert bend_speed(roads.arrays, first, first, -20.0) == math.inf
 
 
+@pytest.mark.slow  # 900 steps
 def test_a_single_agent_on_two_lanes_keeps_its_lane(tmp_path: Path) -> None:
     """Bends, lines and limits ahead are the same on both lanes."""
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM, "-L", "2", "-j", "traffic_light")

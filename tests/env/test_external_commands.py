@@ -6,9 +6,8 @@ Such vehicles are the same, bit for bit, in a divided and in an undivided world.
 from __future__ import annotations
 
 import math
-import os
-import signal
 from contextlib import closing
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, parallel_en
 from cavmarl.core.errors import EpisodeError
 from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_EXTERNAL
 from cavmarl.core.records.rows import LOST_M
+from tests.support.acted_on import hashes_of
 from tests.support.saved_midway import check_resumed
 
 ROOM = {"population.external": 4}
@@ -74,24 +74,7 @@ def act(env: Any, step: int) -> None:
         env.external.pose(0, middle_x, middle_y, 0.3, z=0.2, pitch=0.1)
 
 
-def hashes(
-    kill_at: tuple[int, ...] = (), overrides: dict[str, Any] | None = None, **more: Any
-) -> list[str]:
-    overrides = ROOM | (overrides or {})
-    with closing(
-        parallel_env("grid4x4", agents=3, background=20, overrides=overrides, **more)
-    ) as env:
-        env.reset(seed=2)
-        found = []
-        for step in range(45):
-            act(env, step)
-            actions = env.suggest_actions()
-            if step in kill_at:
-                os.kill(env.worlds.worker_pids[1], signal.SIGKILL)
-            env.step(actions)
-            if step % 4 == 3:
-                found.append(env.state_hash())
-        return found
+hashes = partial(hashes_of, act=act, overrides=ROOM, agents=3, background=20, steps=45, every=4)
 
 
 def test_a_divided_world_equals_the_undivided_one() -> None:
@@ -286,6 +269,6 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
 
 def test_sensors_messages_and_moving_borders_change_nothing() -> None:
     more = {"v2x.enabled": True, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
-    undivided = hashes(overrides=more)
+    undivided = hashes(overrides=ROOM | more)
     moving = {**more, "zones.repartition_steps": 6, "zones.check_invariants": True}
-    assert hashes(overrides=moving, zones=3) == undivided
+    assert hashes(overrides=ROOM | moving, zones=3) == undivided

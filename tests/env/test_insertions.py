@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ import pytest
 
 from cavmarl import ActionError, CapacityError, CavEnv, ConfigError, make_vec, parallel_env
 from cavmarl.recordings.recording import Recording
+from tests.support.acted_on import hashes_of
 
 ROOM = {"population.insertions": 12}
 
@@ -31,16 +33,7 @@ def act(env: Any, step: int) -> None:
         env.insert_vehicle(network.lane_ids[int(roads[step])], 20.0 + step)
 
 
-def hashes(**more: Any) -> list[str]:
-    with closing(parallel_env("grid4x4", agents=3, background=40, overrides=ROOM, **more)) as env:
-        env.reset(seed=2)
-        found = []
-        for step in range(60):
-            act(env, step)
-            env.step(env.suggest_actions())
-            if step % 10 == 9:
-                found.append(env.state_hash())
-        return found
+hashes = partial(hashes_of, act=act, overrides=ROOM, agents=3, background=40, steps=60, every=10)
 
 
 def test_a_divided_world_with_insertions_equals_the_undivided_one() -> None:

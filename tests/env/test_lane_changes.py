@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import pytest
 from cavmarl import ActionError, CapacityError, ConfigError, make_vec, parallel_env
 from cavmarl.recordings.recording import Recording
 from cavmarl.sensors.observed import feature_names
+from tests.support.acted_on import hashes_of
 from tests.support.saved_midway import check_resumed
 
 ROOM = {"map.changed_lanes": 40}
@@ -28,25 +30,14 @@ def damage(env: Any, step: int) -> None:
         env.damage_road("B1B2", 13.89)
 
 
-def hashes(act: Any = damage, overrides: dict[str, Any] = ROOM, **more: Any) -> list[str]:
-    with closing(
-        parallel_env("grid4x4", agents=3, background=40, overrides=overrides, **more)
-    ) as env:
-        env.reset(seed=2)
-        found = []
-        for step in range(40):
-            act(env, step)
-            env.step(env.suggest_actions())
-            if step % 5 == 4:
-                found.append(env.state_hash())
-        return found
+hashes = partial(hashes_of, act=damage, overrides=ROOM, agents=3, background=40, steps=40, every=5)
 
 
 def test_a_divided_world_with_limits_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=4) == undivided
     assert hashes(zones=4, workers=2) == undivided
-    assert hashes(act=lambda env, step: None) != undivided
+    assert hashes(act=lambda env, step: None, steps=5) != undivided[:1]
 
 
 @pytest.mark.slow
@@ -124,15 +115,15 @@ def close(env: Any, step: int) -> None:
 @pytest.mark.parametrize("reroute", ["never", "blocked", "always"])
 def test_a_divided_world_with_closed_roads_equals_the_undivided_one(reroute: str) -> None:
     overrides = {**ROOM, "population.reroute": reroute}
-    undivided = hashes(close, overrides)
-    assert hashes(close, overrides, zones=4) == undivided
+    undivided = hashes(act=close, overrides=overrides)
+    assert hashes(act=close, overrides=overrides, zones=4) == undivided
     if reroute == "blocked":
-        assert hashes(close, overrides, zones=4, workers=2) == undivided
+        assert hashes(act=close, overrides=overrides, zones=4, workers=2) == undivided
 
 
 @pytest.mark.slow
 def test_worlds_with_closed_roads_over_nodes_are_equal() -> None:
-    assert hashes(close, zones=2, nodes=2) == hashes(close)
+    assert hashes(act=close, zones=2, nodes=2) == hashes(act=close)
 
 
 def test_saved_states_include_closed_roads() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from cavmarl import ActionError, CapacityError, ConfigError, make_vec, parallel_
 from cavmarl.env.lane_changes import LaneChanges
 from cavmarl.maps.netconvert_process import run_netconvert
 from cavmarl.recordings.recording import Recording
+from tests.support.acted_on import hashes_of
 from tests.support.saved_midway import check_resumed
 
 ROOM: dict[str, Any] = {
@@ -33,25 +35,16 @@ def reverse(env: Any, step: int) -> None:
         env.open_road("B1B2")
 
 
-def hashes(act: Any = reverse, overrides: dict[str, Any] = ROOM, **more: Any) -> list[str]:
-    with closing(
-        parallel_env("grid4x4", agents=2, background=50, overrides=overrides, **more)
-    ) as env:
-        env.reset(seed=2)
-        found = []
-        for step in range(140):
-            act(env, step)
-            env.step(env.suggest_actions())
-            if step % 20 == 19:
-                found.append(env.state_hash())
-        return found
+hashes = partial(
+    hashes_of, act=reverse, overrides=ROOM, agents=2, background=50, steps=100, every=20
+)
 
 
 def test_a_divided_world_with_reversed_roads_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=4) == undivided
     assert hashes(zones=4, workers=2) == undivided
-    assert hashes(act=lambda env, step: None) != undivided
+    assert hashes(act=lambda env, step: None, steps=20) != undivided[:1]
 
 
 @pytest.mark.slow
@@ -282,9 +275,9 @@ def test_events_are_what_a_caller_would_do() -> None:
     def nothing(env: Any, step: int) -> None:
         pass
 
-    wanted = hashes(by_hand, {**EVENTS, "map.events": []})
-    assert hashes(nothing, EVENTS) == wanted
-    assert hashes(nothing, EVENTS, zones=2) == wanted
+    wanted = hashes(act=by_hand, overrides={**EVENTS, "map.events": []})
+    assert hashes(act=nothing, overrides=EVENTS) == wanted
+    assert hashes(act=nothing, overrides=EVENTS, zones=2) == wanted
 
 
 def test_events_happen_in_each_episode_of_each_world() -> None:

@@ -5,9 +5,7 @@ Such signals are the same, bit for bit, in a divided and in an undivided world.
 
 from __future__ import annotations
 
-import os
-import signal
-from contextlib import closing
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +24,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.roads.shown_signals import signal_codes
 from cavmarl.sensors.observed import feature_names
+from tests.support.acted_on import hashes_of
 from tests.support.saved_midway import check_resumed
 
 ROOM = {"signals.overrides": 40}
@@ -52,34 +51,19 @@ def act(env: Any, step: int) -> None:
         env.signal_overrides.show("A0", 1, "u")
 
 
-def hashes(kill_at: tuple[int, ...] = (), **more: Any) -> list[str]:
-    overrides = ROOM | more.pop("overrides", {})
-    with closing(
-        parallel_env("grid4x4", agents=3, background=30, overrides=overrides, **more)
-    ) as env:
-        env.reset(seed=2)
-        found = []
-        for step in range(32):
-            act(env, step)
-            actions = env.suggest_actions()
-            if step in kill_at:
-                os.kill(env.worlds.worker_pids[1], signal.SIGKILL)
-            env.step(actions)
-            if step % 4 == 3:
-                found.append(env.state_hash())
-        return found
+hashes = partial(hashes_of, act=act, overrides=ROOM, agents=3, background=30, steps=32, every=4)
 
 
 def test_a_divided_world_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=2) == undivided
     assert hashes(zones=4, workers=2) == undivided
-    assert hashes(overrides={"signals.overrides": 41}) == undivided
+    assert hashes(overrides=ROOM | {"signals.overrides": 41}) == undivided
 
 
 def test_messages_and_sensors_change_nothing() -> None:
     more = {**TALKATIVE, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
-    assert hashes(overrides=more, zones=3) == hashes(overrides=more)
+    assert hashes(overrides=ROOM | more, zones=3) == hashes(overrides=ROOM | more)
 
 
 @pytest.mark.filterwarnings("ignore:workers = ")

@@ -57,6 +57,7 @@ def test_repartitioning_changes_no_result(
     assert worlds.pool.recoveries == 0
 
 
+@pytest.mark.slow  # `test_node_parts.py` lets vehicles reroute over nodes in each run
 def test_rerouting_vehicles_keep_their_places(make: Make, tmp_path: Path) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     named = {

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -11,12 +10,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from cavmarl import ConfigError, PolicyError, make_vec
+from cavmarl import ConfigError, PolicyError
 from cavmarl.core.records.codes import DRIVER_AGENT, DRIVER_BACKGROUND, DRIVER_LEARNED
 from cavmarl.driving.vehicles import MEMORY_FIELDS
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
-from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.traffic.native_side import idle_commands
 from cavmarl.networks.driver_network import load_driver_network
 from cavmarl.policies.loading import policy_files
@@ -33,20 +31,6 @@ MIXED = {"zoo:cities_ippo": 0.5, "zoo:intersection_ippo": 0.3, "idm": 0.2}
 TWO_KINDS = {"zoo:cities_ippo": 1.0, "zoo:ring22_ippo": 1.0}
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 SHOWN = ("x", "y", "heading", "speed", "throttle", "steering", "lane", "s", "d", "to_go")
-
-
-@pytest.fixture
-def make() -> Iterator[Make]:
-    """Yield `make_vec`, and close its environments at the end."""
-    made: list[CavVectorEnv] = []
-
-    def call(env: str, **arguments: Any) -> CavVectorEnv:
-        made.append(make_vec(env, **arguments))
-        return made[-1]
-
-    yield call
-    for vec in made:
-        vec.close()
 
 
 def simulation(env: str, model: Any, background: int, agents: int = 0, **more: Any) -> Simulation:
