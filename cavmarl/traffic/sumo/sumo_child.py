@@ -262,7 +262,7 @@ class SumoSimulation:
         return seen, letters, line
 
     def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
-        """Return the records of the persons who are on foot; `line` receives how many find no slot.
+        """Return the records of persons on foot; `line` receives how many find no slot.
 
         A slot is free for one step before another person gets it.
         """
