@@ -19,6 +19,8 @@ def emissions_of(
         dt_s: time for which their speed and acceleration stand.
     """
     out = np.zeros((len(rows), 2))
-    columns = [np.ascontiguousarray(rows[name], np.float64) for name in ("speed", "accel", "pitch")]
-    write_emissions(np.ascontiguousarray(vclass, np.int64), *columns, dt_s, out)
+    speed, accel, pitch = (
+        np.ascontiguousarray(rows[name], np.float64) for name in ("speed", "accel", "pitch")
+    )
+    write_emissions(np.ascontiguousarray(vclass, np.int64), speed, accel, pitch, dt_s, out)
     return out

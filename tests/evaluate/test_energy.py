@@ -13,7 +13,7 @@ from cavmarl import TERMS, make_vec
 from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.evaluate.evaluation import evaluate
 
-SMALL: dict[str, Any] = {"episodes": 2, "agents": 4, "background": 30, "max_cycles": 300}
+SMALL: dict[str, Any] = {"episodes": 2, "agents": 4, "background": 30, "max_cycles": 200}
 NAMES = ("energy_wh_per_km", "co2_g_per_km")
 WEIGHTS = {"terms.weights": {"energy": -0.1, "co2": -0.05}}
 
