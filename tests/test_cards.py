@@ -7,6 +7,8 @@ from typing import Any
 import pytest
 
 import cavmarl
+from cavmarl.cli.output import parse_settings
+from cavmarl.config.io import read_yaml
 from cavmarl.config.registry import agent_entries, entries, load_config
 from cavmarl.config.sensors import (
     ConflictsConfig,
@@ -26,6 +28,7 @@ from cavmarl.config.sensors import (
 )
 from cavmarl.engine.spaces import flat_observation_space, observation_table
 from cavmarl.networks.network_files import read_network_config
+from cavmarl.policies.loading import driver_keys
 from cavmarl.roads.road_kinds import road_kinds
 from cavmarl.sensors.observed import SENSORS, layout
 from cavmarl.sensors.observed.readings import readings_of, readings_table
@@ -135,6 +138,14 @@ def test_drivers_by_sensors_alone_are_trained_and_judged_without_the_state_of_th
     features = [feature.name for sensor in SENSORS for feature in sensor.features(sensors)]
     assert {"line_stop_0", "turn_0"} < set(features)
     assert not any("change_" in name and name.startswith("line") for name in features)
+
+
+def test_the_training_by_sensors_alone_has_the_sensors_of_its_environment() -> None:
+    """A run that starts from a driver has the driver's sensors, except for its settings."""
+    given = read_yaml(ROOT / "configs/train/cities_sensed.yaml")
+    overrides = driver_keys(given["start"]) | parse_settings(given["settings"].split(","))
+    sensors = load_config(given["env"], overrides=overrides)[0].sensors
+    assert sensors == load_config(given["env"])[0].sensors
 
 
 def test_an_indicator_that_is_visible_near_a_junction_is_not_state_of_the_world() -> None:

@@ -175,7 +175,7 @@ CITIES_CARD = (
     "--seed 1000"
 )
 CITIES_ALONE = f"cavmarl evaluate cities_validation -p idm {ALONE} -n 96 --seed 500"
-SENSED = "cavmarl evaluate cities_validation -p cities_sensed_ippo -p idm -n 96 --seed 1000"
+SENSED = "cavmarl evaluate cities_validation -p cities_sensed_ippo -p idm -n 96 --seed 5000"
 RESIDUAL = "cavmarl evaluate cities_validation -p cities_residual -p idm -n 96 --seed SEED"
 SEEDS = ("5000", "6000")
 CAREFUL = "cavmarl evaluate merge -p merge_careful_ippo -p cities_ippo -p idm -n 64 --seed 2000"
