@@ -131,12 +131,13 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, source: str) -> None
     overrides = settings(source, [tiny_file(tmp_path)])
     made: dict[str, Any] = {"num_envs": 2, "agents": 2, "background": 2, "overrides": overrides}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
+    workers: Any = vec.worlds
     with closing(plain), closing(vec):
         for one in (plain, vec):
             one.reset(seed=9)
         for step in range(40):
             if step == 20:
-                os.kill(vec.worlds.pool.pids[1], signal.SIGKILL)
+                os.kill(workers.pool.pids[1], signal.SIGKILL)
             for one in (plain, vec):
                 if step == 5:
                     one.close_road("A0B0", world=1)
@@ -145,6 +146,6 @@ def test_a_worker_that_dies_changes_nothing(tmp_path: Path, source: str) -> None
                 one.step(one.suggest_actions())
             hashes = [[one.state_hash(w) for w in range(2)] for one in (plain, vec)]
             assert hashes[0] == hashes[1], step
-        assert len(vec.worlds.pool.deaths) == 1
+        assert len(workers.pool.deaths) == 1
         with pytest.raises(ConfigError, match="cannot be saved"):
             plain.save_state()

@@ -45,7 +45,8 @@ def make_map(folder: Path) -> Path:
 
 def people(simulation: Simulation) -> np.ndarray:
     rows = simulation.vehicles()
-    return rows[rows["driver"] == DRIVER_EXTERNAL]
+    found: np.ndarray = rows[rows["driver"] == DRIVER_EXTERNAL]
+    return found
 
 
 def test_persons_are_at_their_places_in_sumo_until_they_arrive(tmp_path: Path) -> None:
@@ -109,14 +110,20 @@ def settings(source: str, folder: Path, **more: Any) -> dict[str, Any]:
     }
 
 
+def tolerated(net: Path, overrides: dict[str, Any]) -> str:
+    demand = load_world(net, overrides=overrides).demand
+    assert demand is not None
+    return "\n".join(demand.tolerated)
+
+
 @pytest.mark.parametrize("source", MODES)
 def test_what_is_not_mirrored_is_told_with_counts(tmp_path: Path, source: str) -> None:
     net = make_map(tmp_path)
-    told = "\n".join(load_world(net, overrides=settings(source, tmp_path)).demand.tolerated)
+    told = tolerated(net, settings(source, tmp_path))
     assert "1 <container> moves in SUMO only" in told
     assert ("3 <person> moves in SUMO only" in told) is (source == "sumo-demand")
     off = settings(source, tmp_path, **{"sumo.max_persons": 0})
-    told = "\n".join(load_world(net, overrides=off).demand.tolerated)
+    told = tolerated(net, off)
     assert "3 <person> moves in SUMO only; traffic.source = sumo-traffic mirrors" in told
 
 

@@ -14,6 +14,7 @@ from cavmarl.core.records.codes import DRIVER_SCRIPTED, DRIVER_SUMO
 from cavmarl.engine.world_setup import load_world
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.traffic.scenarios.library import plan_scene
+from cavmarl.traffic.scenarios.motions import Move
 from cavmarl.verify.equivalence import verify_zones
 from tests.support.driving import drive, idle
 from tests.support.rerouting import write_demand
@@ -65,7 +66,9 @@ def test_sumos_cars_stop_before_actors(tmp_path: Path) -> None:
     world = load_world("grid4x4", agents=1, overrides=own)
     scene = plan_scene(world.config.scenario, world.network, 1)
     assert scene is not None
-    road = scene.actors[0].acts[0].beside
+    stand = scene.actors[0].acts[0]
+    assert isinstance(stand, Move)
+    road = stand.beside
     edge = world.network.edge_ids[world.network.lanes["edge"][road]]
     flow = f'<flow id="f" from="{edge}" to="{edge}" begin="0" end="60" period="4"/>'
     with coupled("grid4x4", write_demand(tmp_path, flow), agents=1, overrides=own) as simulation:
