@@ -142,7 +142,7 @@ def test_drivers_by_sensors_alone_are_trained_and_judged_without_the_state_of_th
 
 def test_the_training_by_sensors_alone_has_the_sensors_of_its_environment() -> None:
     """A run that starts from a driver has the driver's sensors, except for its settings."""
-    given = read_yaml(ROOT / "configs/train/cities_sensed.yaml")
+    given: Any = read_yaml(ROOT / "configs/train/cities_sensed.yaml")
     overrides = driver_keys(given["start"]) | parse_settings(given["settings"].split(","))
     sensors = load_config(given["env"], overrides=overrides)[0].sensors
     assert sensors == load_config(given["env"])[0].sensors

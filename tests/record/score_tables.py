@@ -175,7 +175,6 @@ CITIES_CARD = (
     "--seed 1000"
 )
 CITIES_ALONE = f"cavmarl evaluate cities_validation -p idm {ALONE} -n 96 --seed 500"
-SENSED = "cavmarl evaluate cities_validation -p cities_sensed_ippo -p idm -n 96 --seed 5000"
 RESIDUAL = "cavmarl evaluate cities_validation -p cities_residual -p idm -n 96 --seed SEED"
 SEEDS = ("5000", "6000")
 CAREFUL = "cavmarl evaluate merge -p merge_careful_ippo -p cities_ippo -p idm -n 64 --seed 2000"
@@ -313,13 +312,6 @@ def _cards() -> Iterator[ScoreTable]:
     idms = [(f"idm's {name}", "idm", name) for name in ("success", "collision")]
     yield ScoreTable(
         page, "scores by map", (CITIES_CARD,), partial(maps_table, CITIES_CARD, [*ours, *idms])
-    )
-    page = "agents/cities_sensed_ippo/README.md"
-    table_of = partial(drivers_table, columns_of(SENSED), rows)
-    yield ScoreTable(page, "scores", (SENSED,), table_of)
-    ours = [(title, "cities_sensed_ippo", name) for title, _, name in ours]
-    yield ScoreTable(
-        page, "scores by map", (SENSED,), partial(maps_table, SENSED, [*ours, *idms])
     )
     page, command = "agents/cities_residual/README.md", filled(RESIDUAL, SEEDS[0])
     speeding = ("mean speed above the limit", figure("mean_speeding", " %"))
