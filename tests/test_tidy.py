@@ -72,8 +72,8 @@ PASSED_ON = {
 }
 
 # A new capability raises these two bounds by the lines that it needs; the commit says why.
-PACKAGE_LINES = 154_300
-REACHABLE_LINES = 92_400  # lines that `make_vec` and `parallel_env` can reach
+PACKAGE_LINES = 155_400
+REACHABLE_LINES = 93_000  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.
 SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name
