@@ -22,7 +22,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.parallel.processes.process_barrier import usable_cores
 from cavmarl.parallel.sensor_workers.sensor_shares import Shares
 
-TOWN = "benchmarks/maps/Town10HD.net.xml"  # the benchmark map of the papers, from CARLA (MIT)
+TOWN = "envs/cities_sensed/map/town10hd.net.xml.gz"  # the benchmark map of the papers, by CARLA
 
 
 @with_world()
