@@ -86,7 +86,7 @@ def test_vehicles_take_another_way_until_a_road_opens(
         drive(vec, 40)
         assert len(on_roads(vec)["short"]) >= 1
         assert vec.traffic_stats()["removed"] == 0
-    assert "SUMO drops g, whose first road is closed (1 in this episode)" in caplog.text
+    assert "SUMO drops g (1 in this episode) before departure" in caplog.text
 
 
 @pytest.mark.parametrize("source", MODES)
