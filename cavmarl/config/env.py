@@ -284,11 +284,12 @@ class EnvConfig(Section, key=""):
             self.map.programs or self.map.program,
             f"traffic.source = {source}: SUMO runs the signals; name such files in its .sumocfg",
         )
+        also = " and map.changed_lanes" if source == "sumo-demand" else ""
         self.need(
             "workers.balance_steps",
             not self.tells_sumo or self.workers.balance_steps == 0,
-            f"must be 0 with traffic.source = {source}: to move a world, SUMO would have to run "
-            "again from the start of the episode",
+            f"must be 0 with traffic.source = {source}{also}: to move a world, SUMO would have to "
+            "run again from the start of the episode",
         )
         way = self.sensors.way
         for key, timed in (

@@ -211,8 +211,11 @@ class Simulation(WorldViews):
         roots = np.array([self._seed, self._first_world], dtype=np.int64)
         return [roots, self._episodes, *snapshot.save(self._parts())]
 
-    def load(self, saved: Sequence[NDArray[Any]]) -> None:
+    def load(self, saved: Sequence[NDArray[Any]], with_sumo: bool = True) -> None:
         """Resume from a state that `save` returned in worlds of the same environment.
+
+        `with_sumo`: whether the worlds will be stepped. If not, SUMO does not repeat the episode,
+        and routes that SUMO has chosen are missing.
 
         Raises:
             ConfigError: the state is damaged or belongs to different worlds. These worlds are
@@ -223,7 +226,8 @@ class Simulation(WorldViews):
         """
         self._put_back(saved)
         tick = self._tick
-        tick.outside.catch_up(self._shard.worlds)
+        if with_sumo or self.sumo is None:
+            tick.outside.catch_up(self._shard.worlds)
         tick.peers.drop_foreign_rows(self.everywhere)
         tick.peers.resume_from(tick.departures, tick.division.side)
 

@@ -58,6 +58,15 @@ def check_rendering(
         )
 
 
+def check_external_agents(config: EnvConfig, backend: BackendName) -> None:
+    """Raise a ConfigError if external agents cannot sense, as their worlds cannot be copied."""
+    if config.population.external_agents and (obstacle := why_not_copied(config, backend)):
+        raise ConfigError(
+            f"population.external_agents with {obstacle}: such vehicles can only sense in the "
+            "caller's process; use backend='local', or set population.external_agents = false"
+        )
+
+
 def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
     """Return the settings that keep this process from copying the worlds; else ""."""
     if backend.is_local:
@@ -90,14 +99,17 @@ class WorldCopy:
             self._copied = LocalWorlds(without_journals(worlds.world), len(worlds.arrays.mask))
         return self._copied.simulation
 
-    def present(self, worlds: SteppedWorlds) -> Simulation:
-        """Return the local worlds, or an up-to-date copy of remote worlds."""
+    def present(self, worlds: SteppedWorlds, with_sumo: bool = True) -> Simulation:
+        """Return the local worlds, or an up-to-date copy of remote worlds.
+
+        `with_sumo`: see `Simulation.load`.
+        """
         worlds = unguarded(worlds)
         simulation = self.standing(worlds)
         if self._copied is not None:
             if isinstance(worlds, NodeWorlds):
                 simulation.zones.set_zones(worlds.partition)
-            self._copied.load_worlds(worlds.save_worlds())
+            self._copied.load(self._copied.read_worlds(worlds.save_worlds()), with_sumo)
         return simulation
 
     def close(self) -> None:

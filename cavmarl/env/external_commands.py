@@ -50,7 +50,7 @@ class ExternalCommands:
         config: configuration of the worlds.
         network: map of the worlds.
         num_worlds: number of worlds, W.
-        present: returns the worlds as they are now.
+        present: returns the worlds as they are now; routes of SUMO may be missing.
     """
 
     def __init__(

@@ -75,10 +75,11 @@ class StepSession:
         commands = Commands(arrays.controls, arrays.meta_actions) if in_place else None
         self.decoder = ActionDecoder(config.action, num_worlds, self.agents, commands)
         self.events = DeclaredEvents(config, num_worlds)
-        self.insertions = Insertions(config, worlds.world.network, num_worlds)
-        self.external = ExternalCommands(config, worlds.world.network, num_worlds, self.present)
-        self.overrides = SignalOverrides(config, worlds.world.network, num_worlds, self.present)
-        self.lane_changes = LaneChanges(config, worlds.world.network, num_worlds, self.present)
+        network = worlds.world.network
+        self.insertions = Insertions(config, network, num_worlds)
+        self.external = ExternalCommands(config, network, num_worlds, self.without_sumo)
+        self.overrides = SignalOverrides(config, network, num_worlds, self.present)
+        self.lane_changes = LaneChanges(config, network, num_worlds, self.present)
         self.controlled = _controlled(config, worlds)
         self.roadside = None if config.roadside is None else self.controlled
         self._choose = _choices_of_controller(self.controlled, config)
@@ -212,6 +213,10 @@ class StepSession:
     def present(self) -> Simulation:
         """Return the worlds as they are now, or a copy if other processes run them."""
         return self._copy.present(self.worlds)
+
+    def without_sumo(self) -> Simulation:
+        """Return the worlds as `present` does, but a copy may lack the routes of SUMO."""
+        return self._copy.present(self.worlds, with_sumo=False)
 
     def picture(
         self, world: int, ghosts_of: int | None, mode: str, name: str, fps: int

@@ -13,7 +13,7 @@ from cavmarl.config.removed_keys import removed_argument
 from cavmarl.core.errors import ConfigError, UnknownArgumentError
 from cavmarl.core.seeds import check_seed
 from cavmarl.engine.world_setup import check_agents, make_world
-from cavmarl.env.drawn_worlds import check_rendering
+from cavmarl.env.drawn_worlds import check_external_agents, check_rendering
 from cavmarl.env.recorded_worlds import Record, check_recording
 from cavmarl.parallel.backends import find_backend, make_worlds
 from cavmarl.parallel.worlds.step_arrays import SteppedWorlds
@@ -114,6 +114,7 @@ def start_worlds(
     check_agents(config, may_be_alone=may_be_alone)
     check_rendering(config, given.get("render_mode"), backend, render_modes)
     check_recording(config, given.get("record"), backend)
+    check_external_agents(config, backend)
     world = make_world(config, base_dir)
     world.tell_tolerated()
     return make_worlds(world, base_dir, num_worlds, backend, in_next_step)

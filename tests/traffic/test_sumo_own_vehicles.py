@@ -143,19 +143,23 @@ def hashes(source: str, folder: Path, **more: Any) -> list[str]:
 def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
     undivided = hashes(source, tmp_path)
     assert hashes(source, tmp_path, zones=4) == undivided
-    if source == "sumo-demand":  # else `external.spawn` cannot copy the worlds of workers
-        assert hashes(source, tmp_path, zones=2, workers=2) == undivided
+    assert hashes(source, tmp_path, zones=2, workers=2) == undivided
 
 
-@pytest.mark.parametrize(
-    ("wanted", "words"),
-    [
-        ({"map.contraflow": ["A0B0"], "map.changed_lanes": 8}, r"map\.contraflow.*native"),
-    ],
-)
 @pytest.mark.parametrize("source", MODES)
-def test_what_sumo_cannot_do_is_refused(
-    tmp_path: Path, source: str, wanted: dict[str, Any], words: str
+def test_contraflow_is_refused(tmp_path: Path, source: str) -> None:
+    wanted = settings(source, [tiny_file(tmp_path)])
+    wanted |= {"map.contraflow": ["A0B0"], "map.changed_lanes": 8}
+    with pytest.raises(ConfigError, match=r"map\.contraflow.*native"):
+        load_config("grid4x4", overrides=wanted)
+
+
+@pytest.mark.parametrize("source", MODES)
+def test_sensors_of_external_agents_need_the_worlds_in_this_process(
+    tmp_path: Path, source: str
 ) -> None:
-    with pytest.raises(ConfigError, match=words):
-        load_config("grid4x4", overrides=settings(source, [tiny_file(tmp_path)]) | wanted)
+    wanted = settings(source, [tiny_file(tmp_path)], population__external=1)
+    wanted |= {"population.external_agents": True, "clock.ctrl_dt_s": 0.1}
+    wanted["rig"] = {"gnss": {"type": "gnss", "rate_hz": 10}}
+    with pytest.raises(ConfigError, match=r"external_agents.*backend='local'"):
+        parallel_env("grid4x4", agents=1, overrides=wanted, workers=2)

@@ -4,13 +4,17 @@ from __future__ import annotations
 
 import logging
 import math
+import os
+import signal
 import subprocess
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from cavmarl import parallel_env
 from cavmarl.core.records.codes import DRIVER_EXTERNAL
 from cavmarl.engine.simulation import Simulation
 from cavmarl.engine.world_setup import load_world
@@ -80,11 +84,10 @@ def test_persons_are_at_their_places_in_sumo_until_they_arrive(tmp_path: Path) -
         assert np.abs(np.cos(people(simulation)["heading"] - heading)).max() > 0.99
 
 
-@pytest.mark.parametrize("zones", [(1, 4)])
-def test_divisions_change_nothing(tmp_path: Path, zones: tuple[int, ...]) -> None:
+def test_zones_change_nothing(tmp_path: Path) -> None:
     found = verify_zones(
         make_map(tmp_path),
-        zones,
+        (1, 4),
         steps=80,
         seed=2,
         agents=2,
@@ -95,6 +98,26 @@ def test_divisions_change_nothing(tmp_path: Path, zones: tuple[int, ...]) -> Non
     for result in found.results:
         assert result.difference is None, result
         assert result.steps == 80
+
+
+def test_workers_change_nothing_even_if_one_dies(tmp_path: Path) -> None:
+    net = make_map(tmp_path)
+    made: dict[str, Any] = {"agents": 2, "overrides": settings("sumo-traffic", tmp_path)}
+    plain, divided = parallel_env(net, **made), parallel_env(net, zones=2, workers=2, **made)
+    workers: Any = divided.worlds
+    with closing(plain), closing(divided):
+        for env in (plain, divided):
+            env.reset(seed=4)
+        for step in range(70):
+            if step == 20:
+                os.kill(workers.pool.pids[1], signal.SIGKILL)
+            for env in (plain, divided):
+                env.step(env.suggest_actions())
+            assert plain.state_hash() == divided.state_hash(), step
+            if step == 20:
+                assert len(people(plain.simulation)) == 3
+        assert len(people(plain.simulation)) < 3, "nobody has arrived"
+        assert len(workers.pool.deaths) == 1
 
 
 def settings(source: str, folder: Path, **more: Any) -> dict[str, Any]:

@@ -259,10 +259,10 @@ class LocalWorlds:
         """Return all that the next step depends on, as views."""
         return [self._steps, self._waiting, *self.simulation.save()]
 
-    def load(self, saved: Sequence[NDArray[Any]]) -> None:
-        """Resume from the result of `save`. Raises the errors of `Simulation.load`."""
+    def load(self, saved: Sequence[NDArray[Any]], with_sumo: bool = True) -> None:
+        """Resume from the result of `save`; parameters and errors as of `Simulation.load`."""
         self._check_own(saved)
-        self.simulation.load(saved[2:])
+        self.simulation.load(saved[2:], with_sumo)
         self._steps[:], self._waiting[:] = saved[:2]
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
@@ -432,7 +432,8 @@ def missing_in_states(config: EnvConfig) -> str:
     Simulators of zones are filled from a loaded state.
     """
     kept = {
-        "traffic.source = sumo…": config.tells_sumo,
+        "traffic.source = sumo-traffic": config.traffic.source == "sumo-traffic",
+        "map.changed_lanes with traffic.source = sumo-demand": config.tells_sumo,
         "workers.sensors": config.workers.sensors,
     }
     return next((key for key, is_so in kept.items() if is_so), "")

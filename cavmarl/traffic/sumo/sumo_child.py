@@ -160,7 +160,9 @@ class SumoSimulation:
                 lanes.setDisallowed(name, ["all"])
         present = set(self._vehicle.getIDList())
         puppets = set(self._puppets.values())
-        self._waiting |= set(self._vehicle.getLoadedIDList()) - present - puppets
+        absent = set(self._vehicle.getLoadedIDList()) - present - puppets
+        # The time of departure is negative before the departure.
+        self._waiting |= {name for name in absent if self._vehicle.getDeparture(name) < 0.0}
         self._renew_routes(present - puppets)
 
     def _after_closures(self) -> dict[str, Any]:

@@ -116,9 +116,9 @@ def read_unmirrored(
     """Return a line with a count for all that moves in SUMO only, and whether there are persons.
 
     `off_road`: vehicle classes of types that use no road, by name. `most_persons`: number of
-    persons that a world mirrors. Files that cannot be read are left to SUMO.
+    persons that a world mirrors. Files that cannot be read are left to SUMO, and may have persons.
     """
-    skipped, found = DemandReport(), DemandReport()
+    skipped, found, is_read = DemandReport(), DemandReport(), False
 
     def take(element: DemandElement) -> None:
         vclass = off_road.get(element.attrs.get("type", ""), "")
@@ -128,13 +128,14 @@ def read_unmirrored(
     with suppress(DemandError):
         for path in (*given.route_files, *given.additional_files):
             read_elements(path, skipped, take)
+        is_read = True
     tallies = {name: skipped.tolerated.get(f"<{name}> is not read") for name in _OFF_ROAD}
     for name, tally in tallies.items():
         is_person = name in _PERSONS
         if tally is not None and not (is_person and most_persons):
             cure = _PERSONS_CURE if is_person else ""
             found.tolerate(f"<{name}> {_ONLY}{cure}", tally.first, tally.count)
-    return found.lines(), any(tallies[name] is not None for name in _PERSONS)
+    return found.lines(), not is_read or any(tallies[name] is not None for name in _PERSONS)
 
 
 def without_outputs(path: Path, folder: Path) -> Path:

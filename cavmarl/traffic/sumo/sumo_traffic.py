@@ -367,8 +367,6 @@ class SumoTraffic:
 
     def _moved(self, w: int, side: int) -> NDArray[np.void]:
         """Return MOVED (n,) by ascending id: the vehicles that SUMO does not move."""
-        if not self.drives:
-            return np.zeros(0, dtype=MOVED)
         num = self._list_others(self._zoned, side, w, self._others)
         ours = self._others[:num]
         is_person = (ours["driver"] == DRIVER_EXTERNAL) & (ours["order"] >= self._num_callers)

@@ -53,7 +53,7 @@ class SumoWorlds:
         stops: their stops.
         names: by world, SUMO's names of the vehicles by number.
         teleports: (W,) vehicles that SUMO has teleported since each reset.
-        dropped: (W,) vehicles that SUMO has not let in since each reset: their roads were closed.
+        dropped: (W,) vehicles that SUMO has dropped before departure since each reset.
         logs: by world, what SUMO has received since its reset; empty: not kept.
     """
 
@@ -196,7 +196,8 @@ class SumoWorlds:
         if dropped := line.get("dropped", []):
             self.dropped[w] += len(dropped)
             log.warning(
-                "world %d, tick %d: SUMO drops %s, whose first road is closed (%d in this episode)",
+                "world %d, tick %d: SUMO drops %s (%d in this episode) before departure: the first "
+                "road is closed, or max-depart-delay has passed",
                 w, tick, ", ".join(dropped), self.dropped[w],
             )  # fmt: skip
         ways = np.array(line.get("ways", []), dtype=np.int32).reshape(-1, 3)
