@@ -181,7 +181,7 @@ class StepSession:
         """Return the deadlocks of a world; see `WorldsEnvironment.deadlocks`."""
         self.refuse_unready("deadlocks()")
         self._check_world(world)
-        simulation = self.present()
+        simulation = self.without_sumo()
         return find_deadlocks(
             simulation.network, simulation.travel.steps, simulation.vehicles(world)
         )

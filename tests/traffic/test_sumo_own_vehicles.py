@@ -135,6 +135,7 @@ def hashes(source: str, folder: Path, **more: Any) -> list[str]:
             env.step(env.suggest_actions())
             if step % 10 == 9:
                 found.append(env.state_hash())
+        assert env.deadlocks() == ()
         assert env.traffic_stats()["departed"] > 3 + 4 + 3, "no vehicle comes from SUMO"
     return found
 
