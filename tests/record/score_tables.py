@@ -318,9 +318,7 @@ def _cards() -> Iterator[ScoreTable]:
     table_of = partial(drivers_table, columns_of(SENSED), rows)
     yield ScoreTable(page, "scores", (SENSED,), table_of)
     ours = [(title, "cities_sensed_ippo", name) for title, _, name in ours]
-    yield ScoreTable(
-        page, "scores by map", (SENSED,), partial(maps_table, SENSED, [*ours, *idms])
-    )
+    yield ScoreTable(page, "scores by map", (SENSED,), partial(maps_table, SENSED, [*ours, *idms]))
     page, command = "agents/cities_residual/README.md", filled(RESIDUAL, SEEDS[0])
     speeding = ("mean speed above the limit", figure("mean_speeding", " %"))
     rows = [*CITIES_ROWS, speeding, JERK]
