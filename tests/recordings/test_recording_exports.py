@@ -95,7 +95,7 @@ def test_emissions_have_energy_co2_and_fuel_of_each_vehicle(
 def test_emissions_are_those_since_the_frame_before(
     path: Path, frames: list[WorldFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames need not be one step apart, for example in recordings of the server for CARLA's clients."""
+    """Frames need not be one step apart, as in recordings of the server for CARLA's clients."""
     late = [frames[0], *(frame._replace(time_s=frame.time_s + 0.7) for frame in frames[1:])]
     monkeypatch.setattr(Recording, "frames", lambda *_: iter(late))
     write_emissions(Recording.open(path), tmp_path / "emissions.xml", 0, 0)
