@@ -48,7 +48,7 @@ def submit_train(
     job_minutes: Annotated[
         int | None,
         about(
-            "Time limit of a job; then it is queued again. The default is a day; Ray has none.",
+            "Time after which a job is stopped and queued again; not with ray [default: a day].",
             metavar="MIN",
             min=1,
             panel=CLUSTER,
@@ -71,10 +71,10 @@ def submit_train(
     if to not in PLACES:
         why = REFUSED.get(to, "unknown")
         raise ConfigError(f"--to {to}: {why}; give {', '.join(PLACES[:-1])} or {PLACES[-1]}")
-    useless = ["--sbatch"] if sbatch and to != "slurm" else []
-    useless += ["--job-minutes"] if job_minutes and to == "ray" else []
-    if useless:
-        raise ConfigError(f"{useless[0]}: has no effect with --to {to}; leave it out")
+    if sbatch and to != "slurm":
+        raise ConfigError(f"--sbatch: has no effect with --to {to}; leave it out")
+    if job_minutes and to == "ray":
+        raise ConfigError("--job-minutes: has no effect with --to ray; leave it out")
     parameters = _pairs(sbatch or [])
     job = make_job(name, with_config(options or []), processes)
     if to == "ray":

@@ -5,45 +5,62 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import AsyncIterator, Iterator, Mapping, Sequence
+from collections.abc import AsyncIterator, Callable, Coroutine, Iterator, Sequence
+from functools import wraps
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import Any, Concatenate, ParamSpec, Protocol, Self, TypeVar
 
 import httpx
 
-from cavmarl.client.recording_parts import unpack_recordings
-from cavmarl.client.service_protocol import Ask, Flow, Rest, ServiceFlows, Told, check
+from cavmarl.client.service_protocol import Ask, Flow, Rest, ServiceFlows, check
 from cavmarl.client.world_protocol import RECOVERY_S, WorldFlows
 from cavmarl.core.errors import ServiceError
 from cavmarl.core.server_address import is_loopback
-from cavmarl.sensors.mounted.frames import SensorFrames
 
+P = ParamSpec("P")
 T = TypeVar("T")
+Flows = TypeVar("Flows")
 TIMEOUT = httpx.Timeout(300.0, connect=5.0)  # the first world may compile kernels
+
+
+class _Blocking(Protocol[Flows]):
+    flows: Flows
+
+    def run(self, flow: Flow[T]) -> T: ...
+
+
+class _Awaitable(Protocol[Flows]):
+    flows: Flows
+
+    async def run(self, flow: Flow[T]) -> T: ...
+
+
+def _method(flow: Callable[..., Flow[Any]]) -> Any:
+    """Return a method that calls `flow` of the object's `flows`, and executes the result."""
+
+    @wraps(flow)
+    def method(self: Any, *arguments: Any, **named: Any) -> Any:
+        return self.run(flow(self.flows, *arguments, **named))
+
+    return method
+
+
+def blocking(
+    flow: Callable[Concatenate[Flows, P], Flow[T]],
+) -> Callable[Concatenate[_Blocking[Flows], P], T]:
+    """Return a flow as a method that returns its result."""
+    return _method(flow)  # type: ignore[no-any-return]
+
+
+def awaitable(
+    flow: Callable[Concatenate[Flows, P], Flow[T]],
+) -> Callable[Concatenate[_Awaitable[Flows], P], Coroutine[Any, Any, T]]:
+    """Return a flow as a method that returns a coroutine."""
+    return _method(flow)  # type: ignore[no-any-return]
 
 
 def _wanted(node: str | None, needs: Sequence[str], wait_s: float) -> dict[str, Any]:
     return {"node": node, "needs": list(needs), "wait_s": wait_s}
-
-
-def _job(
-    policies: Sequence[str], episodes: int, repeats: int, node: str | None, wait_s: float | None
-) -> dict[str, Any]:
-    return {
-        "policies": list(policies),
-        "episodes": episodes,
-        "repeats": repeats,
-        "node": node,
-        "wait_s": wait_s,
-    }
-
-
-def _write(files: dict[str, bytes], folder: str | Path) -> Path:
-    path = Path(folder)
-    path.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        (path / name).write_bytes(content)
-    return path
 
 
 def _request(
@@ -133,55 +150,12 @@ class Client:
         self.run(flows.take_up(session))
         return RemoteWorld(self, flows)
 
-    def submit(
-        self,
-        environment: str | Path,
-        *,
-        policies: Sequence[str] = ("idm",),
-        episodes: int = 32,
-        repeats: int = 1,
-        node: str | None = None,
-        wait_s: float | None = None,
-        **keys: Any,
-    ) -> str:
-        """Submit an evaluation as by `cavmarl.evaluate.evaluate`, and return the id of the job.
-
-        If no node is free, the job waits at most `wait_s` and then fails.
-        """
-        job = _job(policies, episodes, repeats, node, wait_s)
-        return self.run(self.flows.submit(environment, keys, job))
-
-    def wait(
-        self,
-        job: str,
-        folder: str | Path | None = None,
-        timeout_s: float = 3600.0,
-        told: Told = lambda _: None,
-    ) -> dict[str, Any]:
-        """Wait for a job, and write its files to `folder`.
-
-        Meanwhile `told` is called with the state of the job.
-        """
-        found = self.run(self.flows.wait(job, timeout_s, told))
-        if folder is not None:
-            _write(self.run(self.flows.results(job)), folder)
-        return found
-
-    def events(self, subject: str) -> list[dict[str, Any]]:
-        """Return the events of a session, a job or a node."""
-        return self.run(self.flows.events(subject))
-
-    def get(self, path: str, **params: Any) -> Any:
-        """Return a document of the service: `/nodes`, `/sessions` or `/events`."""
-        return self.run(self.flows.get(path, **params))
-
-    def post(self, path: str, document: Any = None) -> Any:
-        """Send a document to the service and return the answer."""
-        return self.run(self.flows.post(path, document))
-
-    def delete(self, path: str) -> None:
-        """Delete a resource of the service."""
-        self.run(self.flows.delete(path))
+    submit = blocking(ServiceFlows.submit)
+    wait = blocking(ServiceFlows.wait)
+    events = blocking(ServiceFlows.events)
+    get = blocking(ServiceFlows.get)
+    post = blocking(ServiceFlows.post)
+    delete = blocking(ServiceFlows.delete)
 
     def follow(self, after: int = 0) -> Iterator[dict[str, Any]]:
         """Yield events as they happen, until the service ends."""
@@ -244,109 +218,27 @@ class RemoteWorld:
         self._client = client
         self.flows = flows
 
-    def reset(self, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in every world."""
-        return self._client.run(self.flows.reset(seed))
+    def run(self, flow: Flow[T]) -> T:
+        """Execute a flow."""
+        return self._client.run(flow)
 
-    def step(self, actions: Any) -> tuple[Any, ...]:
-        """Step all worlds; return observations, rewards, terminations, truncations and infos."""
-        return self._client.run(self.flows.step(actions))
-
-    def suggest_actions(self) -> Any:
-        """Return the built-in driver's actions."""
-        return self._client.run(self.flows.look("suggestion"))["actions"]
-
-    def state_hash(self, world: int = 0) -> str:
-        """Return the state hash of one world."""
-        return str(self._client.run(self.flows.look("hash"))["hashes"][world])
-
-    def page(self) -> dict[str, str]:
-        """Open a page of the worlds on the node's machine; return its `address` and tokens.
-
-        `token` allows control, `watch_token` only watching.
-        """
-        found: dict[str, str] = self._client.run(self.flows.look("page"))
-        return found
-
-    def transfers(self) -> list[dict[str, Any]]:
-        """Return the most recent ownership transfers of a divided world."""
-        found: list[dict[str, Any]] = self._client.run(self.flows.look("transfers"))["transfers"]
-        return found
-
-    def frames(self, final: bool = False) -> dict[str, SensorFrames]:
-        """Return the samples of the mounted sensors, as `frames` of `make_vec` does.
-
-        With `final`, return those before the reset, as `final_frames` does.
-        """
-        return self._client.run(self.flows.frames(final))
-
-    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
-        """Let a car enter a world, as `insert_vehicle` of `make_vec` does."""
-        asked = self.flows.change("insert_vehicle", lane=lane, position_m=position_m, world=world)
-        self._client.run(asked)
-
-    def close_road(
-        self,
-        edge: str,
-        lanes: Sequence[int] | None = None,
-        world: int = 0,
-        shuts_in: bool = False,
-    ) -> None:
-        """Close lanes of a road, as `close_road` of `make_vec` does."""
-        given = {"edge": edge, "lanes": lanes, "world": world, "shuts_in": shuts_in}
-        self._client.run(self.flows.change("close_road", **given))
-
-    def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
-        """Open lanes of a road, as `open_road` of `make_vec` does."""
-        self._client.run(self.flows.change("open_road", edge=edge, lanes=lanes, world=world))
-
-    def damage_road(
-        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
-    ) -> None:
-        """Lower the speed limit of lanes of a road, as `damage_road` of `make_vec` does."""
-        given = {"edge": edge, "speed_mps": speed_mps, "lanes": lanes, "world": world}
-        self._client.run(self.flows.change("damage_road", **given))
-
-    def declare_event(self, world: int, agent: int | str, cause: str) -> None:
-        """Let the vehicle of an agent, given by index or id, announce an event."""
-        self._client.run(self.flows.declare_event(agent, cause, world))
-
-    def scenario(
-        self,
-        name: str,
-        place: str = "",
-        seed: int = 0,
-        params: Mapping[str, bool | float] | None = None,
-    ) -> None:
-        """Make the worlds again with a scenario; an empty name: without one. Reset them next.
-
-        The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
-        """
-        given = {"name": name, "place": place, "seed": seed, "params": params or {}}
-        self._client.run(self.flows.change("scenario", **given))
-
-    def save_state(self) -> bytes:
-        """Store the state with the service now, and return it.
-
-        `load_state` of the same environment from `make_vec` takes it.
-        """
-        return self._client.run(self.flows.save())
-
-    def record(self, include: Sequence[str] = ()) -> None:
-        """Record the worlds on the node from the next command on; see `RecordOptions.include`."""
-        self._client.run(self.flows.change("record", include=include))
-
-    def recording(self, folder: str | Path) -> list[Path]:
-        """Write what has been recorded so far to a new folder, and return its recordings.
-
-        A recording ends and the next one begins whenever the state is saved, so there are several.
-        Call this before `close`.
-        """
-        return unpack_recordings(self._client.run(self.flows.recording()), folder)
-
-    def close(self) -> None:
-        """End the session."""
-        self._client.run(self.flows.close())
+    reset = blocking(WorldFlows.reset)
+    step = blocking(WorldFlows.step)
+    suggest_actions = blocking(WorldFlows.suggest_actions)
+    state_hash = blocking(WorldFlows.state_hash)
+    page = blocking(WorldFlows.page)
+    transfers = blocking(WorldFlows.transfers)
+    frames = blocking(WorldFlows.frames)
+    insert_vehicle = blocking(WorldFlows.insert_vehicle)
+    close_road = blocking(WorldFlows.close_road)
+    open_road = blocking(WorldFlows.open_road)
+    damage_road = blocking(WorldFlows.damage_road)
+    declare_event = blocking(WorldFlows.declare_event)
+    scenario = blocking(WorldFlows.scenario)
+    save_state = blocking(WorldFlows.save_state)
+    record = blocking(WorldFlows.record)
+    recording = blocking(WorldFlows.recording)
+    close = blocking(WorldFlows.close)
 
     def __enter__(self) -> Self:
         return self
@@ -380,41 +272,10 @@ class AsyncClient:
         await self.run(flows.open(environment, keys, _wanted(node, needs, wait_s)))
         return AsyncWorld(self, flows)
 
-    async def submit(
-        self,
-        environment: str | Path,
-        *,
-        policies: Sequence[str] = ("idm",),
-        episodes: int = 32,
-        repeats: int = 1,
-        node: str | None = None,
-        wait_s: float | None = None,
-        **keys: Any,
-    ) -> str:
-        """Like `Client.submit`."""
-        job = _job(policies, episodes, repeats, node, wait_s)
-        return await self.run(self.flows.submit(environment, keys, job))
-
-    async def wait(
-        self,
-        job: str,
-        folder: str | Path | None = None,
-        timeout_s: float = 3600.0,
-        told: Told = lambda _: None,
-    ) -> dict[str, Any]:
-        """Like `Client.wait`."""
-        found = await self.run(self.flows.wait(job, timeout_s, told))
-        if folder is not None:
-            _write(await self.run(self.flows.results(job)), folder)
-        return found
-
-    async def events(self, subject: str) -> list[dict[str, Any]]:
-        """Like `Client.events`."""
-        return await self.run(self.flows.events(subject))
-
-    async def get(self, path: str, **params: Any) -> Any:
-        """Like `Client.get`."""
-        return await self.run(self.flows.get(path, **params))
+    submit = awaitable(ServiceFlows.submit)
+    wait = awaitable(ServiceFlows.wait)
+    events = awaitable(ServiceFlows.events)
+    get = awaitable(ServiceFlows.get)
 
     async def follow(self, after: int = 0) -> AsyncIterator[dict[str, Any]]:
         """Like `Client.follow`."""
@@ -475,96 +336,27 @@ class AsyncWorld:
         self._client = client
         self.flows = flows
 
-    async def reset(self, seed: int | None = None) -> tuple[Any, dict[str, Any]]:
-        """Start an episode in every world."""
-        return await self._client.run(self.flows.reset(seed))
+    async def run(self, flow: Flow[T]) -> T:
+        """Execute a flow."""
+        return await self._client.run(flow)
 
-    async def step(self, actions: Any) -> tuple[Any, ...]:
-        """Step all worlds."""
-        return await self._client.run(self.flows.step(actions))
-
-    async def suggest_actions(self) -> Any:
-        """Return the built-in driver's actions."""
-        return (await self._client.run(self.flows.look("suggestion")))["actions"]
-
-    async def state_hash(self, world: int = 0) -> str:
-        """Return the state hash of one world."""
-        return str((await self._client.run(self.flows.look("hash")))["hashes"][world])
-
-    async def page(self) -> dict[str, str]:
-        """Like `RemoteWorld.page`."""
-        found: dict[str, str] = await self._client.run(self.flows.look("page"))
-        return found
-
-    async def transfers(self) -> list[dict[str, Any]]:
-        """Like `RemoteWorld.transfers`."""
-        told = await self._client.run(self.flows.look("transfers"))
-        found: list[dict[str, Any]] = told["transfers"]
-        return found
-
-    async def frames(self, final: bool = False) -> dict[str, SensorFrames]:
-        """Like `RemoteWorld.frames`."""
-        return await self._client.run(self.flows.frames(final))
-
-    async def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
-        """Like `RemoteWorld.insert_vehicle`."""
-        asked = self.flows.change("insert_vehicle", lane=lane, position_m=position_m, world=world)
-        await self._client.run(asked)
-
-    async def close_road(
-        self,
-        edge: str,
-        lanes: Sequence[int] | None = None,
-        world: int = 0,
-        shuts_in: bool = False,
-    ) -> None:
-        """Like `RemoteWorld.close_road`."""
-        given = {"edge": edge, "lanes": lanes, "world": world, "shuts_in": shuts_in}
-        await self._client.run(self.flows.change("close_road", **given))
-
-    async def open_road(
-        self, edge: str, lanes: Sequence[int] | None = None, world: int = 0
-    ) -> None:
-        """Like `RemoteWorld.open_road`."""
-        await self._client.run(self.flows.change("open_road", edge=edge, lanes=lanes, world=world))
-
-    async def damage_road(
-        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
-    ) -> None:
-        """Like `RemoteWorld.damage_road`."""
-        given = {"edge": edge, "speed_mps": speed_mps, "lanes": lanes, "world": world}
-        await self._client.run(self.flows.change("damage_road", **given))
-
-    async def declare_event(self, world: int, agent: int | str, cause: str) -> None:
-        """Like `RemoteWorld.declare_event`."""
-        await self._client.run(self.flows.declare_event(agent, cause, world))
-
-    async def scenario(
-        self,
-        name: str,
-        place: str = "",
-        seed: int = 0,
-        params: Mapping[str, bool | float] | None = None,
-    ) -> None:
-        """Like `RemoteWorld.scenario`."""
-        given = {"name": name, "place": place, "seed": seed, "params": params or {}}
-        await self._client.run(self.flows.change("scenario", **given))
-
-    async def save_state(self) -> bytes:
-        """Like `RemoteWorld.save_state`."""
-        return await self._client.run(self.flows.save())
-
-    async def record(self, include: Sequence[str] = ()) -> None:
-        """Like `RemoteWorld.record`."""
-        await self._client.run(self.flows.change("record", include=include))
-
-    async def recording(self, folder: str | Path) -> list[Path]:
-        """Like `RemoteWorld.recording`."""
-        return unpack_recordings(await self._client.run(self.flows.recording()), folder)
-
-    async def close(self) -> None:
-        """End the session."""
-        await self._client.run(self.flows.close())
+    reset = awaitable(WorldFlows.reset)
+    step = awaitable(WorldFlows.step)
+    suggest_actions = awaitable(WorldFlows.suggest_actions)
+    state_hash = awaitable(WorldFlows.state_hash)
+    page = awaitable(WorldFlows.page)
+    transfers = awaitable(WorldFlows.transfers)
+    frames = awaitable(WorldFlows.frames)
+    insert_vehicle = awaitable(WorldFlows.insert_vehicle)
+    close_road = awaitable(WorldFlows.close_road)
+    open_road = awaitable(WorldFlows.open_road)
+    damage_road = awaitable(WorldFlows.damage_road)
+    declare_event = awaitable(WorldFlows.declare_event)
+    scenario = awaitable(WorldFlows.scenario)
+    save_state = awaitable(WorldFlows.save_state)
+    record = awaitable(WorldFlows.record)
+    recording = awaitable(WorldFlows.recording)
+    close = awaitable(WorldFlows.close)
 
     async def __aenter__(self) -> Self:
         return self

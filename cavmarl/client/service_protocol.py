@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 import secrets
 import time
-from collections.abc import Callable, Generator, Iterable, Mapping
+from collections.abc import Callable, Generator, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple, TypeVar
 
@@ -21,6 +21,7 @@ from cavmarl.core.errors import ServiceError
 T = TypeVar("T")
 RENEW_BEFORE_S = 60.0  # time before its expiry at which a token is renewed
 AGAIN_S = 0.2  # time between two attempts
+POLL_S = 0.25  # time between two questions about a job
 PAGE = 1000  # maximum number of events in one answer
 TAKEOVER_S = 10.0  # how long the services are asked in turn until one answers
 RETRIED_S = 10.0  # how long a request is repeated after a lost answer
@@ -123,12 +124,12 @@ class ServiceFlows:
             yield from self._renew()
         return self._token
 
-    def get(self, path: str, **params: Any) -> Flow[Any]:
-        """Return a document of the service."""
+    def get(self, /, path: str, **params: Any) -> Flow[Any]:
+        """Return a document of the service: `/nodes`, `/sessions` or `/events`."""
         return (yield from self.ask("GET", path, params=params)).json()
 
     def post(self, path: str, json: Any = None) -> Flow[Any]:
-        """Send a document and return the answer."""
+        """Send a document to the service and return the answer."""
         return (yield from self.ask("POST", path, json=json)).json()
 
     def post_once(self, path: str, json: Any, within_s: float) -> Flow[Any]:
@@ -143,7 +144,7 @@ class ServiceFlows:
                 yield Rest(AGAIN_S)
 
     def delete(self, path: str) -> Flow[None]:
-        """Delete a resource."""
+        """Delete a resource of the service."""
         yield from self.ask("DELETE", path)
 
     def upload(self, files: Iterable[Upload], licence: str = "") -> Flow[None]:
@@ -174,32 +175,63 @@ class ServiceFlows:
 
     def submit(
         self,
+        /,
         environment: str | Path,
-        keys: Mapping[str, Any],
-        job: Mapping[str, Any],
+        *,
+        policies: Sequence[str] = ("idm",),
+        episodes: int = 32,
+        repeats: int = 1,
+        node: str | None = None,
+        wait_s: float | None = None,
+        **keys: Any,
     ) -> Flow[str]:
-        """Submit a job and return its id."""
-        found = yield from self.add_configuration(environment, keys)
-        body = {"configuration": found, **job}
+        """Submit an evaluation as by `cavmarl.evaluate.evaluate`, and return the id of the job.
+
+        If no node is free, the job waits at most `wait_s` and then fails.
+        """
+        body = {
+            "configuration": (yield from self.add_configuration(environment, keys)),
+            "policies": list(policies),
+            "episodes": episodes,
+            "repeats": repeats,
+            "node": node,
+            "wait_s": wait_s,
+        }
         return plain_name((yield from self.post_once("/jobs", body, RETRIED_S))["id"])
 
     def wait(
-        self, job: str, timeout_s: float, told: Told = lambda _: None, poll_s: float = 0.25
+        self,
+        job: str,
+        folder: str | Path | None = None,
+        timeout_s: float = 3600.0,
+        told: Told = lambda _: None,
     ) -> Flow[dict[str, Any]]:
-        """Return a job when it is done; raise ServiceError if it fails or takes too long."""
+        """Wait for a job, write its files to `folder`, and return the job.
+
+        Meanwhile `told` is called with the state of the job.
+
+        Raises:
+            ServiceError: the job has failed or takes too long.
+        """
         until_s = time.monotonic() + timeout_s
         while True:
             found: dict[str, Any] = yield from self.get(f"/sessions/{job}")
             told(found)
             if found["state"] == "done":
-                return found
+                break
             if found["state"] in ("failed", "closed"):
                 raise ServiceError(f"job {job} is {found['state']}: {found['message']}")
             if time.monotonic() > until_s:
                 raise ServiceError(
                     f"job {job} is {found['state']} after {timeout_s:g} s; ask again later"
                 )
-            yield Rest(poll_s)
+            yield Rest(POLL_S)
+        if folder is not None:
+            files = yield from self.results(job)
+            Path(folder).mkdir(parents=True, exist_ok=True)
+            for name, content in files.items():
+                (Path(folder) / name).write_bytes(content)
+        return found
 
     def results(self, job: str) -> Flow[dict[str, bytes]]:
         """Return the files of a job by name."""

@@ -20,6 +20,7 @@ import httpx
 import numpy as np
 from numpy.typing import NDArray
 
+from cavmarl.client.recording_parts import unpack_recordings
 from cavmarl.client.service_protocol import AGAIN_S, RETRIED_S, Ask, Flow, Rest, ServiceFlows, check
 from cavmarl.core.errors import ActionError, ServiceError
 from cavmarl.sensors.mounted.frames import SensorFrames
@@ -90,14 +91,14 @@ class WorldFlows:
         self.assignment = {"session": session, "assigned": ""}
         yield from self._recover(is_known=False, is_foreign=True)
 
-    def reset(self, seed: int | None) -> Flow[tuple[Any, Arrays]]:
+    def reset(self, seed: int | None = None) -> Flow[tuple[Any, Arrays]]:
         """Start an episode in every world."""
         params = {} if seed is None else {"seed": seed}
         arrays = yield from self._command(SentCommand("reset", params))
         return _join(arrays, "observations"), _infos(arrays)
 
     def step(self, actions: Any) -> Flow[tuple[Any, ...]]:
-        """Step all worlds."""
+        """Step all worlds; return observations, rewards, terminations, truncations and infos."""
         form = self.description["action"]
         given = np.asarray(actions)
         if list(given.shape) != form["shape"]:
@@ -107,7 +108,51 @@ class WorldFlows:
         parts = [arrays[name] for name in ("rewards", "terminations", "truncations")]
         return _join(arrays, "observations"), *parts, _infos(arrays)
 
-    def change(self, kind: str, **given: Any) -> Flow[None]:
+    def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> Flow[None]:
+        """Let a car enter a world, as `insert_vehicle` of `make_vec` does."""
+        return self._change("insert_vehicle", lane=lane, position_m=position_m, world=world)
+
+    def close_road(
+        self,
+        edge: str,
+        lanes: Sequence[int] | None = None,
+        world: int = 0,
+        shuts_in: bool = False,
+    ) -> Flow[None]:
+        """Close lanes of a road, as `close_road` of `make_vec` does."""
+        return self._change("close_road", edge=edge, lanes=lanes, world=world, shuts_in=shuts_in)
+
+    def open_road(
+        self, edge: str, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> Flow[None]:
+        """Open lanes of a road, as `open_road` of `make_vec` does."""
+        return self._change("open_road", edge=edge, lanes=lanes, world=world)
+
+    def damage_road(
+        self, edge: str, speed_mps: float, lanes: Sequence[int] | None = None, world: int = 0
+    ) -> Flow[None]:
+        """Lower the speed limit of lanes of a road, as `damage_road` of `make_vec` does."""
+        given = {"edge": edge, "speed_mps": speed_mps, "lanes": lanes, "world": world}
+        return self._change("damage_road", **given)
+
+    def scenario(
+        self,
+        name: str,
+        place: str = "",
+        seed: int = 0,
+        params: Mapping[str, bool | float] | None = None,
+    ) -> Flow[None]:
+        """Make the worlds again with a scenario; an empty name: without one. Reset them next.
+
+        The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
+        """
+        return self._change("scenario", name=name, place=place, seed=seed, params=params or {})
+
+    def record(self, include: Sequence[str] = ()) -> Flow[None]:
+        """Record the worlds on the node from the next command on; see `RecordOptions.include`."""
+        return self._change("record", include=include)
+
+    def _change(self, kind: str, **given: Any) -> Flow[None]:
         """Change the worlds between two steps; see `cavmarl.service.change_bodies`."""
         json = {"kind": kind, **{name: _plain(value) for name, value in given.items()}}
         for name, value in json.items():
@@ -115,24 +160,30 @@ class WorldFlows:
                 raise ActionError(f"{name} = {value}: must be a finite number")
         yield from self._command(SentCommand("change", {}, json=json))
 
-    def declare_event(self, agent: int | str, cause: str, world: int) -> Flow[None]:
+    def declare_event(self, world: int, agent: int | str, cause: str) -> Flow[None]:
         """Let the vehicle of an agent, given by its index or id, announce an event."""
         names = self.description["agents"]
         if isinstance(agent, str):
             if agent not in names:
                 raise ActionError(f"no agent {agent!r}: choose one of {', '.join(names)}")
             agent = names.index(agent)
-        yield from self.change("declare_event", agent=agent, cause=cause, world=world)
+        yield from self._change("declare_event", agent=agent, cause=cause, world=world)
 
-    def save(self) -> Flow[bytes]:
-        """Store state and recording with the service now, and return the state of the worlds."""
+    def save_state(self) -> Flow[bytes]:
+        """Store state and recording with the service now, and return the state.
+
+        `load_state` of the same environment from `make_vec` takes it.
+        """
         answer = yield from self._asked("POST", SentCommand("save", {}))
         self._trim(answer)
         return answer.content
 
-    def frames(self, is_final: bool) -> Flow[dict[str, SensorFrames]]:
-        """Return the samples of the mounted sensors by name."""
-        params = {"final": 1} if is_final else {}
+    def frames(self, final: bool = False) -> Flow[dict[str, SensorFrames]]:
+        """Return the samples of the mounted sensors, as `frames` of `make_vec` does.
+
+        With `final`, return those before the reset, as `final_frames` does.
+        """
+        params = {"final": 1} if final else {}
         answer = yield from self._asked("GET", SentCommand("frames", params))
         parts: dict[str, dict[str, Any]] = {}
         for name, array in unpack(answer.content).items():
@@ -140,14 +191,39 @@ class WorldFlows:
             parts.setdefault(sensor, {})[field] = array
         return {name: SensorFrames(**fields) for name, fields in parts.items()}
 
-    def recording(self) -> Flow[dict[str, bytes]]:
-        """Return all parts of the recording so far, each a ZIP file, by name."""
-        yield from self.save()
-        files = yield from self._service.results(self.session)
-        return {name: content for name, content in files.items() if name.startswith("recording-")}
+    def recording(self, folder: str | Path) -> Flow[list[Path]]:
+        """Write what has been recorded so far to a new folder, and return its recordings.
 
-    def look(self, word: str) -> Flow[Any]:
-        """Send a query that changes nothing: `hash`, `suggestion` or `transfers`."""
+        A recording ends and the next one begins whenever the state is saved, so there are several.
+        Call this before `close`.
+        """
+        yield from self.save_state()
+        files = yield from self._service.results(self.session)
+        parts = {name: content for name, content in files.items() if name.startswith("recording-")}
+        return unpack_recordings(parts, folder)
+
+    def suggest_actions(self) -> Flow[Any]:
+        """Return the built-in driver's actions."""
+        return (yield from self._look("suggestion"))["actions"]
+
+    def state_hash(self, world: int = 0) -> Flow[str]:
+        """Return the state hash of one world."""
+        return str((yield from self._look("hash"))["hashes"][world])
+
+    def page(self) -> Flow[dict[str, str]]:
+        """Open a page of the worlds on the node's machine; return its `address` and tokens.
+
+        `token` allows control, `watch_token` only watching.
+        """
+        return self._look("page")
+
+    def transfers(self) -> Flow[list[dict[str, Any]]]:
+        """Return the most recent ownership transfers of a divided world."""
+        found: list[dict[str, Any]] = (yield from self._look("transfers"))["transfers"]
+        return found
+
+    def _look(self, word: str) -> Flow[Any]:
+        """Send a query that changes nothing."""
         answer = yield from self._asked("GET", SentCommand(word, {}))
         if answer.headers["content-type"] == "application/json":
             return answer.json()

@@ -144,11 +144,15 @@ def write_table(path: Path, tables: dict[str, Rows], dtype: np.dtype[np.void]) -
 def read_table(path: Path, dtype: np.dtype[np.void]) -> dict[str, Rows]:
     """Return the records of a CSV file by policy, in the order of their first rows.
 
-    Numbers of a column that the file does not have, because it is older, are NaN.
+    A file of an older version may lack a column of numbers; its values are then NaN. A line that
+    is too short or too long raises ValueError.
     """
     with path.open(newline="", encoding="utf-8") as file:
+        reader = csv.reader(file)
+        names = next(reader)
         by_policy: dict[str, list[dict[str, str]]] = {}
-        for line in csv.DictReader(file):
+        for texts in reader:
+            line = dict(zip(names, texts, strict=True))
             by_policy.setdefault(line["policy"], []).append(line)
     return {policy: _records(lines, dtype) for policy, lines in by_policy.items()}
 

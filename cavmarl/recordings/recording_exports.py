@@ -63,22 +63,31 @@ def write_fcd(
 
 
 def _fcd_line(row: np.void, lane_ids: tuple[str, ...]) -> str:
-    half = 0.5 * float(row["length"])
-    heading, vclass = float(row["heading"]), int(row["vclass"])
-    x = float(row["x"]) + half * math.cos(heading)
-    y = float(row["y"]) + half * math.sin(heading)
-    angle = (90.0 - math.degrees(heading)) % 360.0
+    vclass = int(row["vclass"])
+    angle = (90.0 - math.degrees(float(row["heading"]))) % 360.0
     kind = "person" if vclass == CLASS_PEDESTRIAN else "vehicle"
-    lane = int(row["lane"])
-    name = lane_ids[lane] if 0 <= lane < len(lane_ids) else ""
     key = "edge" if kind == "person" else "lane"
+    name = _lane_name(row, lane_ids)
     return (
-        f'        <{kind} id="{row["id"]}" x="{x:.3f}" y="{y:.3f}" z="{float(row["z"]):.3f}" '
+        f'        <{kind} id="{row["id"]}" {_front(row)} z="{float(row["z"]):.3f}" '
         f'angle="{angle:.3f}" type="{_class_name(vclass)}" speed="{float(row["speed"]):.3f}" '
         f'slope="{math.degrees(float(row["pitch"])):.3f}" '
         f'acceleration="{float(row["accel"]):.3f}" odometer="{float(row["distance_m"]):.3f}" '
         f"{key}={quoteattr(name)}/>\n"
     )
+
+
+def _front(row: np.void) -> str:
+    """Return the attributes x and y: the place of the front bumper, as in SUMO."""
+    half, heading = 0.5 * float(row["length"]), float(row["heading"])
+    x = float(row["x"]) + half * math.cos(heading)
+    y = float(row["y"]) + half * math.sin(heading)
+    return f'x="{x:.3f}" y="{y:.3f}"'
+
+
+def _lane_name(row: np.void, lane_ids: tuple[str, ...]) -> str:
+    lane = int(row["lane"])
+    return lane_ids[lane] if 0 <= lane < len(lane_ids) else ""
 
 
 def write_csv(
@@ -100,30 +109,30 @@ def write_csv(
 def write_emissions(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write SUMO's emission output, with the emissions of a step in each frame; see `write_fcd`.
+    """Write SUMO's emission output: in each frame, what was emitted since the frame before it.
 
     `electricity` (Wh) is that of an electric car, `CO2` and `fuel` (mg) are those of a combustion
-    engine, so each vehicle has all three. The step before a frame has its speed and acceleration.
+    engine, so each vehicle has all three. The speed and acceleration in a frame stand for the time
+    since the frame before it. Arguments, result and errors are those of `write_fcd`.
     """
-    step_s, lane_ids, count = recording.head.step_s, recording.network.lane_ids, 0
-    per_co2 = np.array(FUEL_PER_CO2)
+    lane_ids, count = recording.network.lane_ids, 0
+    per_co2, before_s = np.array(FUEL_PER_CO2), math.nan
     with _writing(path) as file:
         file.write('<?xml version="1.0" encoding="UTF-8"?>\n<emission-export>\n')
         for frame in track(recording.frames(world, episode)):
             file.write(f'    <timestep time="{frame.time_s:.2f}">\n')
-            rows = frame.vehicles
-            vclass = np.minimum(rows["vclass"], CLASS_PEDESTRIAN)
-            used = emissions_of(rows, vclass, step_s)
+            rows, vclass = frame.vehicles, frame.vehicles["vclass"]
+            elapsed_s = frame.time_s - before_s if count else recording.head.step_s
+            used = emissions_of(rows, vclass, elapsed_s)
             fuel_mg = 1e3 * used[:, 1] * per_co2[vclass]
             for row, (energy_wh, co2_g), fuel in zip(rows, used, fuel_mg, strict=True):
-                lane = int(row["lane"])
-                name = lane_ids[lane] if 0 <= lane < len(lane_ids) else ""
                 file.write(
                     f'        <vehicle id="{row["id"]}" CO2="{1e3 * co2_g:.2f}" fuel="{fuel:.2f}" '
                     f'electricity="{energy_wh:.5f}" type="{_class_name(int(row["vclass"]))}" '
-                    f'speed="{float(row["speed"]):.3f}" lane={quoteattr(name)} '
-                    f'x="{float(row["x"]):.3f}" y="{float(row["y"]):.3f}"/>\n'
+                    f'speed="{float(row["speed"]):.3f}" '
+                    f"lane={quoteattr(_lane_name(row, lane_ids))} {_front(row)}/>\n"
                 )
+            before_s = frame.time_s
             file.write("    </timestep>\n")
             count += 1
         file.write("</emission-export>\n")

@@ -58,6 +58,16 @@ def test_a_file_of_an_older_version_has_no_energy(tmp_path: Path) -> None:
     found = read_table(tmp_path / "old.csv", TRIP)["idm"]
     assert np.isnan(found["energy_wh"]).all()
     assert found["distance_m"].tolist() == [3000.0]
+    assert all(np.isnan(values("energy_wh_per_km", found)))
+    assert values("co2_g_per_km", found) == [0.0]
+
+
+def test_a_table_with_a_cut_line_is_refused(tmp_path: Path) -> None:
+    write_table(tmp_path / "cut.csv", {"idm": trips(3000.0, 2000.0)}, TRIP)
+    text = (tmp_path / "cut.csv").read_text(encoding="utf-8")
+    (tmp_path / "cut.csv").write_text(text.rstrip().rpartition(",")[0], encoding="utf-8")
+    with pytest.raises(ValueError, match="shorter"):
+        read_table(tmp_path / "cut.csv", TRIP)
 
 
 def test_only_trips_that_count_have_values() -> None:

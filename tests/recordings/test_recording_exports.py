@@ -85,8 +85,27 @@ def test_emissions_have_energy_co2_and_fuel_of_each_vehicle(
             assert float(line.get("electricity")) == pytest.approx(energy_wh, abs=1e-5)
             assert float(line.get("CO2")) == pytest.approx(1e3 * co2_g, abs=0.01)
             assert float(line.get("fuel")) == pytest.approx(324.18 * co2_g, abs=0.01)
+            ahead = 0.5 * row["length"] * np.array([np.cos(row["heading"]), np.sin(row["heading"])])
+            front = np.array([row["x"], row["y"]]) + ahead
+            assert [float(line.get("x")), float(line.get("y"))] == pytest.approx(front, abs=0.001)
             total_mg += float(line.get("CO2"))
     assert total_mg > 0.0
+
+
+def test_emissions_are_those_since_the_frame_before(
+    path: Path, frames: list[WorldFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Frames need not be one step apart, as in recordings of the server for CARLA's clients."""
+    late = [frames[0], *(frame._replace(time_s=frame.time_s + 0.7) for frame in frames[1:])]
+    monkeypatch.setattr(Recording, "frames", lambda *_: iter(late))
+    write_emissions(Recording.open(path), tmp_path / "emissions.xml", 0, 0)
+    steps = ElementTree.parse(tmp_path / "emissions.xml").getroot()
+    for k, dt_s in ((1, late[1].time_s), (2, late[2].time_s - late[1].time_s)):
+        rows = late[k].vehicles
+        co2_g = emissions_of(rows, rows["vclass"], dt_s)[:, 1].sum()
+        total_mg = sum(float(line.get("CO2")) for line in steps[k])
+        assert total_mg == pytest.approx(1e3 * co2_g, abs=0.01 * len(rows))
+        assert co2_g > 0.0
 
 
 def test_csv_has_all_numbers_in_full(path: Path, frames: list[WorldFrame], tmp_path: Path) -> None:
