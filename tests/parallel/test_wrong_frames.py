@@ -27,7 +27,7 @@ BUSY: dict[str, Any] = {
 }  # fmt: skip
 # A row of a frame about agents
 AGENT = np.dtype([
-    ("terms", "<f4", 10), ("terminated", "?"), ("present", "?"), ("acted", "?"), ("events", "<i4"),
+    ("terms", "<f4", 12), ("terminated", "?"), ("present", "?"), ("acted", "?"), ("events", "<i4"),
     ("vehicle_id", "<i8"), ("place", "<f8", 2),
 ])  # fmt: skip
 NEW = -1  # number of a node that has not begun
