@@ -72,7 +72,7 @@ EPISODE = np.dtype(
         ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
         ("agent_arrivals_per_h", np.float64),  # of simulated time
         ("background_arrivals_per_h", np.float64),
-        ("background_energy_wh_per_km", np.float64),  # as of trips; NaN: no background vehicle
+        ("background_energy_wh_per_km", np.float64),  # as in TRIP; NaN: no background vehicle
         ("background_co2_g_per_km", np.float64),
         ("jain_speed", np.float64),  # of the mean speeds of its trips that count
         ("gini_delay", np.float64),  # of the delays per kilometre of these trips

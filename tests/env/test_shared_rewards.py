@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 
 from cavmarl import make_vec
+from cavmarl.config.terms import TERMS
 
 SHARE, RANGE_M = 0.3, 40.0
-DELAY = 9  # the column of the term
 
 
 def test_a_share_of_the_reward_comes_from_nearby_agents() -> None:
@@ -19,7 +19,7 @@ def test_a_share_of_the_reward_comes_from_nearby_agents() -> None:
         _, rewards, _, _, infos = vec.step(vec.suggest_actions())
         for world in range(2):
             acted = infos["acted"][world]
-            own = infos["terms"][world, acted, DELAY].astype(np.float64)
+            own = infos["terms"][world, acted, TERMS.index("delay")].astype(np.float64)
             places = vec.simulation.outputs.places[world, acted]
             apart = np.linalg.norm(places[:, None] - places[None], axis=2) <= RANGE_M
             neighbours |= set(apart.sum(1).tolist())

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from cavmarl.config.terms import TERMS
 from cavmarl.driving.vehicles import VEHICLE
 from cavmarl.ownership.messages import COORDINATOR, Ack, Done, Message, Prepare
 from cavmarl.parallel.nodes import node_pool
@@ -27,8 +28,8 @@ BUSY: dict[str, Any] = {
 }  # fmt: skip
 # A row of a frame about agents
 AGENT = np.dtype([
-    ("terms", "<f4", 12), ("terminated", "?"), ("present", "?"), ("acted", "?"), ("events", "<i4"),
-    ("vehicle_id", "<i8"), ("place", "<f8", 2),
+    ("terms", "<f4", len(TERMS)), ("terminated", "?"), ("present", "?"), ("acted", "?"),
+    ("events", "<i4"), ("vehicle_id", "<i8"), ("place", "<f8", 2),
 ])  # fmt: skip
 NEW = -1  # number of a node that has not begun
 REFUSED = "the state is damaged or belongs to different worlds"

@@ -260,7 +260,7 @@ class LocalWorlds:
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]], with_sumo: bool = True) -> None:
-        """Resume from the result of `save`; parameters and errors as of `Simulation.load`."""
+        """Resume from the result of `save`, as `Simulation.load` does, with the same errors."""
         self._check_own(saved)
         self.simulation.load(saved[2:], with_sumo)
         self._steps[:], self._waiting[:] = saved[:2]
