@@ -114,6 +114,8 @@ class Args:
         options.check_shares(self, ("gamma", "gae_lambda", "keep", "opponent_share", "average"))
         options.check_device(self.device)
         logger_names(self.loggers)
+        if self.average == 1.0:
+            raise ConfigError("--average 1.0: must be below 1; at 1 the driver would not change")
         if self.residual and self.imitation_weight:
             raise ConfigError("--residual: leave out --imitation-weight; it starts as that driver")
         if self.shared and self.mappo:

@@ -204,6 +204,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--loggers", "tensorbord"], "--loggers tensorbord: no such logger; give some of"),
         (["--keep", "0"], "--keep 0.0: must be above 0"),
         (["--gamma", "1.5"], "--gamma 1.5: must be from 0 to 1"),
+        (["--average", "1"], "--average 1.0: must be below 1"),
         (["--agents", "-1"], "--agents -1: must be at least 0"),
         (["--resume", "nowhere"], "--resume nowhere: has no checkpoint"),
     ],
