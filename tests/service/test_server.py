@@ -55,11 +55,14 @@ def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
             client.get("/health")
 
 
-def test_the_service_starts_within_two_seconds(tmp_path: Path) -> None:
-    """The limit is for processor time, since other programs use this machine."""
+def test_the_service_starts_without_kernels(tmp_path: Path) -> None:
+    """Compilers and learning libraries would take most of the time of its start."""
     with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
-        assert sum(psutil.Process(service.process.pid).cpu_times()[:2]) < 2.0
+        mapped = {Path(found.path).name for found in psutil.Process(service.process.pid).memory_maps()}
+    assert any("pydantic" in name for name in mapped)
+    heavy = ("llvmlite", "_dispatcher", "torch", "pyarrow", "sumo")
+    assert {name for name in mapped if any(word in name for word in heavy)} == set()
 
 
 def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
