@@ -47,12 +47,12 @@ def test_neighbors_are_mutual(partition: ZonePartition) -> None:
             assert Neighbor(zone, other.corner) in partition.neighbors[other.zone]
 
 
-def test_the_hash_depends_on_the_division_only() -> None:
+def test_the_hash_depends_only_on_the_cuts() -> None:
     plain = four()
     assert plain.content_hash == four().content_hash
     assert plain.content_hash != four(np.nextafter(10.0, 11.0)).content_hash
     assert plain.content_hash != ZonePartition(BOUNDS, plain.rects[::-1]).content_hash
-    # Points have the same owners for any box that was cut.
+    # The bounds that were cut do not change which zone owns a point.
     wider = np.where(plain.rects == -40.0, -45.0, plain.rects)
     assert plain.content_hash == ZonePartition((-45.0, *BOUNDS[1:]), wider).content_hash
     assert four(0.0).content_hash == four(-0.0).content_hash
