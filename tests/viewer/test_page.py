@@ -29,7 +29,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
 
 
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
-    """Open a page and wait for its first frame; return the page, its errors and the hosts it used."""
+    """Open a page and wait for its first frame; return the page, its errors and the used hosts."""
     page = browser.new_page(viewport={"width": 1280, "height": 760})
     problems: list[str] = []
     hosts: set[str] = set()
