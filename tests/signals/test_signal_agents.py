@@ -152,7 +152,12 @@ def test_signals_without_an_agent_keep_their_programs() -> None:
 def expected_counts(
     env: CavEnv, standing_times: dict[int, tuple[int, int]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return the expected counts of each lane; `standing_times` has (lane, standing ticks) of each vehicle."""
+    """Return the expected counts of each lane.
+
+    Args:
+        env: the world.
+        standing_times: (lane, standing ticks) of each vehicle.
+    """
     found: dict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(4))
     speed_mps = env.network.lanes["speed_mps"]
     for row in env.simulation.vehicles(0):

@@ -257,7 +257,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             np.testing.assert_array_equal(counts[:, LENGTH_MM], 5000 * counts[:, VEHICLES])
             moving = counts[:, VEHICLES] - counts[:, STANDING]
             np.testing.assert_array_equal(counts[:, SPEED_PPM], 1_000_000 * moving)
-            # The estimate is at least 1 if a vehicle covers the loop at the line, and at most 7 fit.
+            # The estimate is at least 1 if a vehicle covers the loop at the line, and at most 7.
             covered = vec.signals.view.loops[0, :, EXIT, FREE_TICKS] == 0
             assert (counts[covered, VEHICLES] > 0).all()
             np.testing.assert_array_equal(counts[:, NEAR_LINE], covered)
