@@ -24,7 +24,7 @@ PRESENT, OTHER = 0, 7  # indices of observed features
 
 
 def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
-    """Run a world in which an agent declares an obstacle in the third step; return event features."""
+    """Return observed events of a world in which agent 1 declares an obstacle in the third step."""
     env = make_vec("grid4x4", agents=4, workers=workers, zones=zones, overrides=TOLD)
     part = observation_parts(env.config.sensors)["messages"].place
     env.reset(seed=3)
