@@ -41,7 +41,7 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 
 
 def view_of(vec: CavVectorEnv) -> SignalView:
-    """Return a view of the signals at 100 s, when the first green has with_green_s for 20 s."""
+    """Return a view of the signals at 100 s, when the first green has lasted for 20 s."""
     vec.reset(seed=0)
     given = vec.signals.view
     states, history = np.zeros_like(given.states), np.zeros_like(given.history)
@@ -71,7 +71,7 @@ def lanes_of(view: SignalView, green: int) -> list[int]:
 
 
 def with_green_s(view: SignalView, green_s: float) -> SignalView:
-    """Return a copy of the view in which the present green has with_green_s for `green_s`."""
+    """Return a copy of the view in which the present green has lasted for `green_s`."""
     states = view.states.copy()
     states[..., SINCE] = 500 - round((2.0 + green_s) / view.dt)
     return view._replace(states=states)
