@@ -12,7 +12,7 @@ from cavmarl.learning.log import Trips
 def step(
     trips: Trips, reward: tuple[float, float], ends: str = "", *, red: bool = False
 ) -> dict[str, float]:
-    """Add a step of two agents; a letter of `ends` means a: arrives, c: is truncated, -: goes on."""
+    """Add a step of two agents; in `ends`, a means arrival, c truncation and - no end."""
     terms = np.zeros((1, 2, len(TERMS)), np.float32)
     done, cut = np.zeros((2, 1, 2), np.bool_)
     for agent, letter in enumerate(ends):

@@ -179,7 +179,7 @@ def test_writing_a_block_keeps_the_rest_of_the_page(tmp_path: Path) -> None:
 
 def test_the_tests_that_write_blocks_are_found() -> None:
     found = block_tests()
-    assert "tests/test_cards.py::test_a_card_has_the_observation_index_by_index" in found
+    assert "tests/test_cards.py::test_a_card_has_the_table_of_observations" in found
     assert all("::test_" in name for name in found)
 
 
