@@ -1,8 +1,8 @@
 """Jobs: evaluations of one driver in one world, for the commands beside tables of scores.
 
-Several tables show the same driver in the same world, so each such job runs once.
-Results stay in runs/record, under the hash of the sources that made them. An interrupted recording
-continues with the jobs that it has not finished.
+Several tables show the same driver in the same world, so each such job runs once. Results stay in
+runs/record, under the hash of the sources that made them. An interrupted recording continues with
+the jobs that it has not finished.
 """
 
 from __future__ import annotations
