@@ -1,4 +1,4 @@
-"""Zones that other simulators run: an exact simulator changes no bit, a faulty one raises."""
+"""Zones that other simulators run: an exact one changes no bit, a faulty one causes an error."""
 
 from __future__ import annotations
 
@@ -183,7 +183,7 @@ def test_cavmarl_takes_over_a_zone_whose_simulator_refuses_vehicles_for_too_long
 
 
 class Mortal(OwnKinematics):
-    """A simulator whose method `call` fails at call number `at`, for the first one of a zone."""
+    """The first simulator of a zone fails in call number `at` of its method `call`."""
 
     call = "read"
     at = 60

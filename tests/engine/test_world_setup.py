@@ -71,7 +71,7 @@ def test_worlds_of_the_same_files_share_their_map(tmp_path: Path) -> None:
 
 
 def test_the_horizon_of_a_bare_map_depends_on_its_size(grid: Path) -> None:
-    # The map is 800 m wide and high. 1600 m at SUMO's 13.89 m/s take 115.2 s; three times that.
+    # The map is 800 m wide and high: 1600 m take 115.2 s at SUMO's 13.89 m/s. Use three times this.
     worlds = [load_world(grid, agents=2, background=3, zones=zones) for zones in (1, 4)]
     assert [world.config.horizon_s for world in worlds] == [350.0, 350.0]
     assert check_map(grid).horizon_s == 350.0

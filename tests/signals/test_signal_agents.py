@@ -168,7 +168,7 @@ def expected_counts(
     return found
 
 
-def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
+def test_observations_and_rewards_equal_a_computation_from_all_vehicles() -> None:
     weights = {"diff_wait": 1.0, "average_speed": 0.5, "queue": 0.25, "pressure": 0.125}
     weights |= {"delay": 0.1, "wait": 0.2}
     ticks = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2}
@@ -641,7 +641,7 @@ def test_a_world_for_clients_of_carla_refuses_signal_agents() -> None:
         source.load("grid4x4", 0.05)
 
 
-def test_calls_for_vehicles_refuse_signal_agents_by_name() -> None:
+def test_calls_for_vehicles_refuse_the_names_of_signal_agents() -> None:
     with closing(world()) as env:
         env.reset()
         name = env.signals.agents[0]
@@ -656,7 +656,7 @@ def test_calls_for_vehicles_refuse_signal_agents_by_name() -> None:
 
 
 @pytest.mark.parametrize("change", [(2.0, 1.0), (0.0, 0.0), (3.0, 0.0)])
-def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float, float]) -> None:
+def test_the_reported_time_to_a_change_is_a_lower_bound(change: tuple[float, float]) -> None:
     yellow_s, all_red_s = change
     times: dict[str, Any] = {"yellow_s": yellow_s, "all_red_s": all_red_s, "min_green_s": 4.0}
     with closing(world(decide_s=1.0, **times)) as env:

@@ -22,7 +22,7 @@ EXTERNAL = {"channel__external": True, "channel__latency_ticks": 3}
 class Federate:
     """A fake network simulator with its own thread and clock.
 
-    Each packet reaches all receivers except its sender, after the ticks in `delays[sender]`.
+    Each packet reaches all receivers except its sender after `delays[sender]` ticks.
     """
 
     def __init__(self, delays: dict[int, int]) -> None:

@@ -1,4 +1,4 @@
-"""`cavmarl.show`: pages show an environment that a program steps, a notebook or an evaluation."""
+"""`cavmarl.show`: web pages show the environment of a running program, notebook or evaluation."""
 
 from __future__ import annotations
 

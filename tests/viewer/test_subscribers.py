@@ -29,7 +29,7 @@ def audience() -> Audience:
     return found
 
 
-def test_a_newer_frame_replaces_one_that_was_not_sent() -> None:
+def test_a_newer_frame_replaces_an_unsent_frame() -> None:
     watcher = PageWatcher(1)
     for number in range(3):
         watcher.offer(Publication(b"frame %d" % number, FIRST))

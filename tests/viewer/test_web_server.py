@@ -264,7 +264,7 @@ def test_a_first_message_with_half_a_surrogate_pair_is_refused(serve: Serve, hel
         assert first_of(client, "hello")
 
 
-def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
+def test_a_page_without_control_changes_nothing(serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, control=False))
     with welcome(served.server) as client:
         assert first_of(client, "hello")["control"] is False
@@ -274,7 +274,7 @@ def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
             assert first_of(client, 3)[1] == 0
 
 
-def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_continues(serve: Serve) -> None:
+def test_a_watcher_that_reads_nothing_is_dropped(serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, send_s=0.5), drives=False)
     served.run.clock.pace = 0.0
     large = Publication(b"\x03" + bytes(2**20), (Change(1, b""),))

@@ -70,7 +70,7 @@ def test_crossed_and_approaching_vehicles_are_found(
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # the kernel's square is 0
+        if depth_m * depth_m == 0.0:  # too small for the kernel's square
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)

@@ -63,7 +63,7 @@ def test_a_border_through_a_deadlock_changes_no_result(
 def test_a_driver_does_not_wait_for_a_vehicle_that_cannot_reach_its_path(
     tmp_path: Path,
 ) -> None:
-    # No lane of the other zone leads to the side road, so its vehicles have no followers to see.
+    # No road leads into the zone of the side road, so that zone needs no ghost of "held".
     path = build_crossing(tmp_path, "priority", only_in="S")
     here = DividedScene(path, tmp_path, (-1.0, -24.0), ("car",))
     here.put("stays", "E_in_0 W_out_0", 23.0, speed_factor=CRAWLS)

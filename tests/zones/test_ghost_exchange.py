@@ -182,7 +182,7 @@ def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int
         noted[name][: len(places)] = rows[name][places]
 
 
-def test_ghosts_carry_the_route_step_of_their_owner() -> None:
+def test_ghosts_have_the_route_steps_of_the_owned_vehicles() -> None:
     """The exchange moves rows: ghosts that can touch owned vehicles precede the other ghosts."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(-10.0, 50.0, (40, 2))

@@ -106,7 +106,7 @@ def test_the_longest_move_includes_jumps_over_junctions_without_lanes(tmp_path: 
     )
     assert longest_move_m(roads, travel("merge"), 1.0) == pytest.approx(
         10.0 * way_m + 2.0 * 20.0 + LENGTH_M / 2
-    ), "a tick of 1 s has two jumps"
+    ), "the second jump in a tick of 1 s is missing"
 
 
 def test_the_longest_move_includes_kinks_of_lanes() -> None:

@@ -97,7 +97,7 @@ def test_the_kernel_equals_its_twin(
 def test_merging_drivers_see_vehicles_before_the_previous_junction(
     tmp_path: Path, side_m: float, part: tuple[float, float, float, float]
 ) -> None:
-    """A part that `merge` names can continue on the lane before the previous junction."""
+    """A merge point can be beyond the end of a lane if no vehicle has to stop at that end."""
     options = ("--grid.number", "7", "--grid.length", str(side_m), "-L", "2")
     net = netgenerate(tmp_path / "net.net.xml", "-g", "-j", "priority_stop", *options)
     roads = read_network(net)
@@ -116,7 +116,7 @@ def test_merging_drivers_see_vehicles_before_the_previous_junction(
 def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
     tmp_path: Path, junctions: str, seen: int
 ) -> None:
-    """A driver that checks for a deadlock looks at the foe, and at the vehicles it yields to."""
+    """To find a deadlock, a driver looks at the foe and at the vehicles to which the foe yields."""
     roads = read_network(netgenerate(tmp_path / "net.net.xml", "-g", "-j", junctions))
     links, conflicts = roads.links.copy(), roads.conflicts.copy()
     middle = np.bincount(links["junction"]).argmax()

@@ -1,4 +1,4 @@
-"""Watchers: zones that get the ghosts on a lane; the result equals a check of each vehicle."""
+"""The watchers of a lane are the zones that get ghosts of the vehicles on the lane."""
 
 from __future__ import annotations
 
@@ -129,7 +129,7 @@ def test_zones_get_exactly_the_ghosts_that_they_need(seed: int, zones: int) -> N
     assert 0.05 * VEHICLES < seen < (zones - 1) * VEHICLES
 
 
-def test_zones_watch_the_lanes_of_their_looks_and_the_lanes_near_them() -> None:
+def test_zones_watch_the_lanes_that_their_drivers_look_at_and_nearby_lanes() -> None:
     roads = network("grid4x4")
     partition = cut_map(roads, "grid", 4)
     looks = blank_looks((4, len(roads.lanes)))

@@ -94,7 +94,7 @@ def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
     car = cars(np.array([[7.0, 16.0]]))
     assert ghosts(four(), 5.0, car, 0) == [[], [0], [0], [0]]
     assert ghosts(four(), 4.9, car, 0) == [[], [0], [0], []]
-    # The vehicle is not in its owner's zone, because a transfer is late.
+    # The vehicle is outside of the zone that owns it, because a transfer is late.
     assert ghosts(PINWHEEL, 1.0, cars(np.array([[15.0, 15.0]])), 0) == [[], [], [], [], [0]]
 
 
