@@ -320,7 +320,7 @@ FROM_DEAD_ENDS = (
     [
         # Departures at the start of a lane behind a junction depend on vehicles on the junction.
         ("--grid.number=3 -j=allway_stop", TURNS, (*TURNS, *BETWEEN)),
-        # At dead ends, departures have lanes without links to them. Turns wait on junctions.
+        # At dead ends, vehicles depart on lanes to which no link leads. Left turns wait.
         ("--grid.number=2 --grid.attach-length=90 -j=priority", AT_DEAD_ENDS, FROM_DEAD_ENDS),
     ],
 )

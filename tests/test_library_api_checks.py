@@ -116,7 +116,7 @@ def test_state(make: Make, make_aec: Make) -> None:
     state_test(make_aec(), make(), num_cycles=STEPS)
 
 
-@worlds(bare=())  # independent of bare maps
+@worlds(bare=())  # without bare maps
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")

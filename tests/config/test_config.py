@@ -111,7 +111,9 @@ def test_the_error_for_a_wrong_unit_names_the_right_unit(tmp_path: Path, key: st
         ("population: {mode: ajar}", r"population\.mode = 'ajar': must be 'closed', 'open' or"),
     ],
 )
-def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None:
+def test_the_error_for_a_wrong_type_names_the_right_type(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
 
 
@@ -216,7 +218,7 @@ def test_the_error_for_an_invalid_sensor_gives_the_reason(
     assert re.search(expected, refusal(tmp_path, f"{MINIMAL}sensors: {text}"))
 
 
-def test_a_missing_key_is_named(tmp_path: Path) -> None:
+def test_the_error_for_a_missing_key_names_the_key(tmp_path: Path) -> None:
     assert "map: missing; this key has no default" in refusal(tmp_path, "name: mine\n")
     assert "map.source = '': must name a map" in refusal(tmp_path, "name: a\nmap: {source: ''}")
 
@@ -314,7 +316,7 @@ def test_invalid_settings_of_zones_are_refused(key: str, value: object) -> None:
         load_config("ring", overrides={f"zones.{key}": value})
 
 
-def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:
+def test_signal_programs_can_be_set_and_missing_files_are_refused(tmp_path: Path) -> None:
     config = load(
         tmp_path, "name: a\nmap: {source: m.net.xml, programs: [p.add.xml], program: {j: night}}"
     )

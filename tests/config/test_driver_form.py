@@ -1,4 +1,4 @@
-"""The form of a trained driver, which is its keys of sensors and actions."""
+"""The form of a trained driver: its settings of sensors and actions."""
 
 from __future__ import annotations
 
@@ -86,7 +86,7 @@ def test_a_form_has_the_keys_of_its_kind_of_action() -> None:
     assert kinds["grid"] == {"kind", *scales, "grid_throttle", "grid_steering"}
 
 
-def test_shared_and_shielded_policies_contain_drivers_with_forms() -> None:
+def test_the_form_of_a_shared_or_shielded_policy_is_that_of_its_driver() -> None:
     assert drivers_in("merge_ippo+shielded:idm+blind") == ["merge_ippo", "idm", "blind"]
     assert list(forms_in(["idm+merge_ippo", "shielded:merge_ippo"])) == ["merge_ippo"]
     assert form_of_driver("shielded:merge_ippo+idm") == form_of_driver("merge_ippo")

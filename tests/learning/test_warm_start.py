@@ -54,7 +54,7 @@ def test_a_warm_start_with_more_sensors_acts_like_the_driver(
     save_network(tmp_path, driver, its)
     assert begin_with(run, ours, tmp_path) == 7
     more = torch.randn(16, ours.observation_size)
-    more[0] = 0.0  # a mean of the additional numbers
+    more[0] = 0.0  # the mean of numbers that the driver does not observe
     places = {name: k for k, name in enumerate(feature_places(MORE))}
     columns = [places[name] for name in feature_places(FEWER)]
     if "residual" in form:

@@ -1,4 +1,4 @@
-"""The benchmark `ring22`: one agent among 21 simulated human drivers, compared with 22 of them."""
+"""`ring22`: one agent among 21 simulated human drivers, compared with 22 such drivers."""
 
 from __future__ import annotations
 

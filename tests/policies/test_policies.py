@@ -314,7 +314,7 @@ def test_a_shield_refuses_discrete_actions() -> None:
         load_policy("shielded:idm", vec).act_batch(observations, infos["mask"])
 
 
-def test_opponents_drive_badly_on_purpose() -> None:
+def test_the_opponents_blind_and_phantom_braking_drive_worse_than_idm() -> None:
     vec = make_vec("merge", num_envs=4, agents=8)
     rows = {}
     for name in ("blind", "phantom_braking", "idm"):

@@ -90,7 +90,7 @@ def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text; one decimal becomes two if the text would be 0.0 otherwise."""
+    """Return a number as text; a positive number has two decimals if one would show 0.0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 

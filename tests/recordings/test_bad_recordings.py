@@ -1,4 +1,4 @@
-"""Truncated, damaged or incomplete recordings, and those of another version: typed errors."""
+"""The errors for damaged or incomplete recordings, and for recordings of another version."""
 
 from __future__ import annotations
 

@@ -144,7 +144,7 @@ def test_time_to_collision_of_a_faster_follower() -> None:
     assert terms(rows)["ttc_risk"] == 0.0, "a vehicle on the next lane counts"
 
 
-def test_adjacent_cars_collide_only_if_they_approach_sideways() -> None:
+def test_adjacent_cars_have_a_collision_risk_only_if_they_approach_sideways() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (1.0, 3.2, 0.0)], speed=[15.0, 10.0])
     assert terms(rows)["ttc_risk"] == 0.0, "passing on the next lane counts"
     # The sides are 1.2 m apart; one vehicle approaches the other sideways at 1 m/s.
@@ -161,7 +161,7 @@ def test_time_to_collision_equals_twin(rows: NDArray[np.void], i: int) -> None:
     i %= len(rows)
     found = terms(rows, i)["ttc_risk"]
     assert 0.0 <= found <= 1.0
-    # Rounding decides whether bodies that nearly touch do so. Compare with bodies that are 1 µm
+    # Rounding decides whether nearly touching bodies touch. So compare with bodies that are 1 µm
     # smaller and larger.
     assert ttc_risk(rows, i, -1e-6) - 1e-4 <= found <= ttc_risk(rows, i, 1e-6) + 1e-4
 

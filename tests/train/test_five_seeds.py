@@ -17,7 +17,7 @@ from tests.support.training import TRAIN, load_program
 
 pytest.importorskip("torch", reason="needs the extra: train")
 
-WAIT_MS = 20_000  # time limit for an end
+WAIT_MS = 20_000  # time in which a process must end
 
 
 @pytest.mark.parametrize("ended_by", [signal.SIGKILL, signal.SIGINT])
@@ -75,7 +75,7 @@ def test_an_interrupted_seed_continues(tmp_path: Path) -> None:
     program = load_program("five_seeds")
     commands: list[list[str]] = []
 
-    class Noted:
+    class FakeChildren:
         def run(self, command: list[str], said: str) -> int:
             commands.append(command)
             return 0
@@ -85,6 +85,6 @@ def test_an_interrupted_seed_continues(tmp_path: Path) -> None:
     (tmp_path / "seed_1").mkdir()
     (tmp_path / "seed_1" / "checkpoint.pt").touch()
     for seed in (0, 1):
-        program.train_seed(args, seed, Noted())
+        program.train_seed(args, seed, FakeChildren())
     assert commands[0][-4:] == ["--name", "seed_0", "--env", "ring"]
     assert commands[1][-2:] == ["--resume", str(tmp_path / "seed_1")]

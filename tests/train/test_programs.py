@@ -1,4 +1,4 @@
-"""The training programs that use other libraries, called like by a user with small settings."""
+"""The training programs that use other libraries, called as a user calls them, but small."""
 
 from __future__ import annotations
 

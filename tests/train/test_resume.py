@@ -143,7 +143,7 @@ def test_a_killed_run_resumes_bit_for_bit(ippo: ModuleType, here: Path, whole: L
     ],
 )
 @pytest.mark.filterwarnings("ignore:workers = 2")
-def test_a_run_resumes_bit_for_bit_with_each_way_to_collect(
+def test_a_run_with_other_settings_resumes_bit_for_bit(
     here: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], others: list[str]
 ) -> None:
     program = load_program("ppo")

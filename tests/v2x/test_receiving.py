@@ -142,7 +142,7 @@ def test_packets_of_the_largest_ids_are_dropped_beyond_the_capacity() -> None:
 
 
 def test_packets_beyond_the_capacity_of_the_channel_are_dropped() -> None:
-    # 60 packets of 300 bytes at 0.5 Mbit/s take 4.84 ms each. Of these 290 ms, 100 ms are available.
+    # 60 packets of 300 bytes at 0.5 Mbit/s take 4.84 ms each: 290 ms, but only 100 ms are there.
     world = StationWorld(1, channel__data_rate_mbps=0.5)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
     world.tick()
