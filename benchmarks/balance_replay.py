@@ -38,7 +38,7 @@ Verdict = Literal[
 
 @dataclass(frozen=True)
 class StrategyResult:
-    """One placement strategy; all values are means over traces."""
+    """The results of one placement strategy; all values are means over traces."""
 
     name: str  # of `STRATEGIES`, or `perfect` for arbitrarily divisible shards
     ratio: float  # time / time of the static placement
@@ -47,9 +47,9 @@ class StrategyResult:
     beside_balanced95: Interval | None  # between traces; None: a single trace
     imbalance: float  # maximum / mean of the workers' ticks, mean over rounds
     moves: float  # moved shards per round
-    handoffs: float  # vehicles per round that changed their zone by a new cut
+    handoffs: float  # vehicles per round that changed their zone because of a new cut
     weights: tuple[float, float, float]  # weights of the last round's score, mean
-    verdict: Verdict  # from `ratio95`
+    verdict: Verdict  # derived from `ratio95`
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 __all__ = ["STRATEGIES", "LoadStrategy", "Placed", "StaticPlacement"]
 
 STRATEGIES = ("static", "balanced", "calibrated", "predicted", "repartitioned")
-RECUT_EVERY = 10  # rounds
+RECUT_EVERY = 10  # least number of rounds between two cuts
 
 
 @dataclass(frozen=True)
@@ -27,7 +27,7 @@ class Placed:
 
     partition: ZonePartition  # the zones
     homes: tuple[int, ...]  # worker of each zone
-    moved_shards: int = 0  # since the previous round
+    moved_shards: int = 0  # shards moved since the previous round
     moved_vehicles: int = 0  # vehicles that changed their zone because the map was cut again
 
 

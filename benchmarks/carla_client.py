@@ -6,7 +6,7 @@ The program needs CARLA's client and nothing of cavmarl. SENSORS and OUTPUT are 
 has a list of blueprints with attributes, which are mounted on the first agent. OUTPUT has the wall
 time of all ticks in s, the largest number of vehicles, and for each sensor the delays of its frames
 in ms. A delay is the time from the call of `tick` to the arrival of the frame of this tick. Frames
-that come out of order have none.
+that come out of order have no delay.
 """
 
 from __future__ import annotations

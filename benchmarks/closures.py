@@ -123,7 +123,7 @@ def sumo_trip_times(job: SumoJob) -> list[float]:
 
 
 def rerouter(edges: Sequence[str], closed: Sequence[str], close_s: int) -> str:
-    """Return SUMO's file of a rerouter on all edges, which closes roads at a time."""
+    """Return SUMO's file of a rerouter on all edges, which closes roads from a time on."""
     closings = "".join(f'<closingReroute id="{edge}"/>' for edge in closed)
     interval = f'<interval begin="{close_s}" end="1000000">{closings}</interval>'
     rule = f'<rerouter id="closures" edges="{" ".join(edges)}">{interval}</rerouter>'

@@ -50,7 +50,7 @@ def measure(
     settings = {"agents": agents, "background": 0, "overrides": KEYS}
     rows: list[dict[str, Any]] = []
     with one_core(), _one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the libraries
+        warnings.simplefilter("ignore")  # warnings of the libraries
         for view, make in VIEWS.items():
             say(f"measuring {view}")
             row: dict[str, Any] = {"view": view, "step_ms": None, "added_ms": None, "missing": ""}

@@ -45,7 +45,7 @@ class LoadTrace:
     network: RoadNetwork  # the map
     partition: ZonePartition  # its initial zones
     ticks: int  # per round
-    # additional cost of a vehicle that changed its zone in this round, s per tick
+    # additional cost of a vehicle that changed its zone in a round, s per tick
     migration_s: float
     rounds: tuple[LoadRound, ...]  # in temporal order
 

@@ -160,7 +160,7 @@ class _Least:
 
 
 def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> None:
-    """Run one of the nodes."""
+    """Run a node."""
     config, base_dir = load_config(env, agents=1, background=0, max_cycles=1_000_000)
     worlds = LocalWorlds(make_world(config, base_dir), 1, warm=True)
     worlds.arrays.chosen[:] = True

@@ -158,7 +158,7 @@ def _row(
 
 
 def _predictions(costs: NodeCosts, cores: int) -> list[str]:
-    """Return from which sizes dividing a city pays by the model, if each node has a core."""
+    """Return the sizes from which dividing a city pays, by the model with a core for each node."""
     lines = []
     for vehicles in PREDICTED:
         found = {n: costs.tick(vehicles, n, 0.0, cores) for n in (0, *OVER)}

@@ -76,7 +76,7 @@ def measure(
 
 @dataclass(frozen=True)
 class _Turn:
-    ns: float  # in steps only
+    ns: float  # time of steps
     vehicle_steps: int
     agent_steps: int
 

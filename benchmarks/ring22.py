@@ -1,7 +1,7 @@
 """Effect of one driver among 21 human drivers: the mean speed on `ring22`.
 
-Flow (Wu et al. 2017) judges a driver that stabilises a ring in this way. The mean speed of all 22
-cars, after stop-and-go waves have formed, is compared with the mean speed of 22 human drivers.
+The measure is that of Flow (Wu et al. 2017): the mean speed of all 22 cars after stop-and-go waves
+have formed, compared with the mean speed of 22 human drivers.
 """
 
 from __future__ import annotations

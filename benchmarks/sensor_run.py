@@ -25,7 +25,7 @@ from cavmarl.sensors.registry import type_of
 
 Rig = dict[str, dict[str, Any]]
 
-WINDOW = 25  # steps
+WINDOW = 25  # number of steps
 
 PARTS = (
     "physics", "SUMO", "ghosts", "transfers", "sensor compute", "sensor transport", "barrier",
@@ -87,7 +87,7 @@ class Window:
     leader_cpu_s: float  # processor time of the process with the state
     worker_cpu_s: tuple[float, ...]  # processor time of each sensor worker
     leader_rss_mb: float  # resident memory at the end, including shared memory
-    worker_rss_mb: tuple[float, ...]  # of each sensor worker
+    worker_rss_mb: tuple[float, ...]  # resident memory of each sensor worker
     sent_bytes: int  # input of the workers
     got_bytes: int  # frames written by the workers
     messages: int  # orders and answers
@@ -100,7 +100,7 @@ class SensorRun:
     step_ms: tuple[float, ...]  # time of each `step`
     wait_ms: tuple[float, ...]  # part of this time that waits for sensor workers
     parts_ms: dict[str, tuple[float, ...]]  # per step, by the names of `PARTS`
-    windows: tuple[Window, ...]  # resources
+    windows: tuple[Window, ...]  # used resources, by windows of steps
     costs_ms: tuple[float, ...]  # processor time of one agent's frame of each sensor
     sensors: list[dict[str, Any]]  # type, resolution, rate and placement of each
     digests: tuple[str, ...]  # hashes of state and frames, after warm-up steps and the last

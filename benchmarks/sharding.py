@@ -81,7 +81,7 @@ def measure_sharding(
     make_checked: Callable[[int], Simulation] | None = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure in turn on one core."""
+    """Measure the worlds in turn on one core."""
     check_numbers(zones, after_s, repeats)
     with one_core():
         say("creating the worlds")

@@ -81,7 +81,7 @@ def measure(
 
 
 def split_line(found: Sequence[tuple[int, float]]) -> int | None:
-    """Return from which number of vehicles every divided world was faster."""
+    """Return the number of vehicles from which on every divided world was faster, if any."""
     line = None
     for vehicles, ratio in sorted(found, reverse=True):
         if ratio <= 1.0:

@@ -35,7 +35,7 @@ from cavmarl.shards.shard import Commands
 
 PROGRAM = "benchmarks.trivial_worker"
 SETTINGS = {"population.mode": "respawn", "observation.kind": "flat", "action.kind": "continuous"}
-STEPS = 300  # per turn
+STEPS = 300  # steps per turn
 WARM_STEPS = 50
 ORDER = "our workers alone"
 LIBRARIES = {
@@ -127,7 +127,7 @@ def _gymnasium(agents: int, size: int, workers: int) -> Iterator[Step]:
 @contextmanager
 def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # of the library
+        warnings.simplefilter("ignore")  # warnings of the library
         supersuit = require("supersuit", "bench")
         rows = supersuit.pettingzoo_env_to_vec_env_v1(_TrivialAgents(agents, size))
         vec = supersuit.concat_vec_envs_v1(rows, workers, workers, base_class="gymnasium")

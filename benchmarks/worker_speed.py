@@ -31,7 +31,7 @@ from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 
 WARM_STEPS = 20
-PINGS = 2000  # per turn
+PINGS = 2000  # empty commands per turn
 IDLE_S = 1.0
 START_S = 300.0  # time limit for a program to start
 
@@ -42,7 +42,7 @@ class Row:
 
     workers: int  # number of workers; 0: all worlds in the caller's process
     made_s: float  # time until the worlds could be reset
-    step_ms: tuple[float, ...]  # per turn, ms per step
+    step_ms: tuple[float, ...]  # ms per step in each turn
     busiest_ms: float | None  # processor time per step of the busiest worker, ms
 
 
@@ -52,7 +52,7 @@ class WorkerSpeed:
 
     env: str  # name of the environment
     worlds: int  # number of worlds
-    steps: int  # per turn
+    steps: int  # steps per turn
     rows: tuple[Row, ...]  # without workers, with one, and with the requested number
     barrier_us: tuple[
         float, ...
@@ -172,8 +172,10 @@ class CoreCeiling:
     """Independent programs that step worlds, one at a time and all at once."""
 
     programs: int  # number of programs
-    alone_ms: tuple[float, ...]  # per turn, ms per step of all worlds, one program after another
-    together_ms: tuple[float, ...]  # per turn, ms per step of the slowest program while all run
+    alone_ms: tuple[float, ...]  # ms per step of all worlds in each turn, one program after another
+    together_ms: tuple[
+        float, ...
+    ]  # ms per step of the slowest program in each turn, while all programs run
 
     @property
     def ratio(self) -> float:

@@ -36,7 +36,7 @@ SHARES = {  # and additional features of a net
     "perturbed": 0.2,
     "random_lanes": 0.2,
     "random_priority": 0.35,
-    "one_way": 0.3,  # of random nets
+    "one_way": 0.3,  # share of random nets
     "shared_track": 0.05,  # lanes of both directions overlap
     "turnarounds": 0.5,
     "lefthand": 0.12,
@@ -64,7 +64,7 @@ _LANES = (1, 1, 2, 2, 3, 4)
 class NetDraw:
     """The properties of a net."""
 
-    kind: str  # of `KINDS` or `NARROW`
+    kind: str  # one of `KINDS` or `NARROW`
     options: tuple[str, ...]  # options of netgenerate, or of netconvert for a cut or a zipper
     length_m: float  # length of a typical edge, or half the side of a cut
     num_lanes: int  # upper bound on netgenerate's edges

@@ -27,7 +27,7 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.faulty_network import FaultyNetwork
 
-PER_JUNCTION = 25  # vehicles
+PER_JUNCTION = 25  # vehicles per junction
 EDGE_M = 200
 FIRST_STEPS = 3  # steps after creation
 WARM_STEPS = 2  # unmeasured steps of a turn, which fill the cache

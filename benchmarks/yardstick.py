@@ -53,7 +53,7 @@ TOGETHER = 100  # approximate number of vehicles in all parallel worlds
 RECORDED = ("off_road", "collision", "wrong_way", "red_light")
 OF_TRIPS = (*RECORDED, "shared_ground")  # the last name is of collisions on shared ground
 FAULTS = (*OF_TRIPS, "stands")
-HEADS = {"collision": "colli-\nsion"}  # to fit 80 characters
+HEADS = {"collision": "colli-\nsion"}  # broken, so that the table fits 80 characters
 SHOWN = 12  # number of faults below the table
 GREEN = [SIGNAL_STATES.index(letter) for letter in "gGoOs"] + [SIGNAL_NONE]
 
@@ -65,7 +65,7 @@ class Drive:
     trips: int = 0
     arrived: int = 0
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FAULTS, 0))
-    faults: list[dict[str, Any]] = field(default_factory=list)  # position and time
+    faults: list[dict[str, Any]] = field(default_factory=list)  # faults with position and time
 
     def add(self, other: Drive) -> None:
         self.trips += other.trips
