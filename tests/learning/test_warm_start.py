@@ -39,6 +39,12 @@ def network(config: NetworkConfig) -> ActorCritic:
     return made
 
 
+def in_double_precision(*networks: ActorCritic) -> None:
+    """Convert networks to float64, in which sums in another order differ little."""
+    for network in networks:
+        network.double()
+
+
 def feature_places(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
     """Return the name of each observed number, with its frame (-1 is the newest)."""
     frames = range(-sensors.stack, 0)
@@ -53,13 +59,14 @@ def test_a_warm_start_with_more_sensors_acts_like_the_driver(
     driver, run = network(its), network(ours)
     save_network(tmp_path, driver, its)
     assert begin_with(run, ours, tmp_path) == 7
-    more = torch.randn(16, ours.observation_size)
+    in_double_precision(driver, run)
+    more = torch.randn(16, ours.observation_size, dtype=torch.float64)
     more[0] = 0.0  # the mean of numbers that the driver does not observe
     places = {name: k for k, name in enumerate(feature_places(MORE))}
     columns = [places[name] for name in feature_places(FEWER)]
     if "residual" in form:
         columns += [ours.observation_size - 2, ours.observation_size - 1]
-    states = torch.randn(16, its.state_size) if its.state_size else None
+    states = torch.randn(16, its.state_size, dtype=torch.float64) if its.state_size else None
     torch.testing.assert_close(run(more), driver(more[:, columns]))
     torch.testing.assert_close(run.value(more, states), driver.value(more[:, columns], states))
 
@@ -81,14 +88,15 @@ def test_a_warm_start_with_fewer_sensors_logs_the_missing_numbers(
     driver, run = network(its), network(ours)
     save_network(tmp_path, driver, its)
     begin_with(run, ours, tmp_path)
-    fewer = torch.randn(16, ours.observation_size)
+    in_double_precision(driver, run)
+    fewer = torch.randn(16, ours.observation_size, dtype=torch.float64)
     seen = driver.mean.repeat(16, 1)  # numbers that only the driver observes
     places = {name: k for k, name in enumerate(feature_places(MORE))}
     columns = [places[name] for name in feature_places(FEWER)]
     if "residual" in form:
         columns += [its.observation_size - 2, its.observation_size - 1]
     seen[:, columns] = fewer
-    states = torch.randn(16, its.state_size) if its.state_size else None
+    states = torch.randn(16, its.state_size, dtype=torch.float64) if its.state_size else None
     torch.testing.assert_close(run(fewer), driver(seen))
     torch.testing.assert_close(run.value(fewer, states), driver.value(seen, states))
     assert (
