@@ -37,10 +37,11 @@ Step = Callable[[], object]
 
 def measure(
     env: Annotated[str, about("Name, folder or map file of an environment.")] = "town",
-    agents: Annotated[int, about("Agents in the one world.")] = 1000,
+    agents: Annotated[int, about("Number of agents in the world.")] = 1000,
     steps: Annotated[int, about("Steps of each adapter.")] = 30,
     at_most: Annotated[
-        float | None, about("Exit with 1 if TorchRL's adapter adds more ms per step.")
+        float | None,
+        about("Most ms per step that TorchRL's adapter may add; exit with 1 above it."),
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
@@ -62,7 +63,7 @@ def measure(
     added = next(row["added_ms"] for row in rows if row["view"] == "torchrl")
     return BenchmarkReport(
         f"a step of one world with {agents:,} agents, in ms of one core: medians of {steps} steps",
-        {"view": "view", "a step": "step_ms:.2f", "of it the view's": "added_ms:.2f"},
+        {"adapter": "view", "step": "step_ms:.2f", "added by the adapter": "added_ms:.2f"},
         rows,
         notes=[f"{row['view']}: {row['missing']}" for row in rows if row["missing"]],
         facts={"agents": agents, "steps": steps},

@@ -80,7 +80,7 @@ def measure(
     own_ratio = paired_ratio(own["recorded"], own["not recorded"])
     return BenchmarkReport(
         f"A step of {env}, {vehicles} vehicles",
-        {"": "side", "ms per step": "ms:.3f", "least": "least:.3f", "processor": "own:.3f"},
+        {"": "side", "ms per step": "ms:.3f", "lowest": "least:.3f", "processor": "own:.3f"},
         rows,
         [
             f"recorded: {ratio:.3f} times as long, {own_ratio:.3f} times the processor time of "

@@ -32,7 +32,9 @@ def measure(
         list[str] | None, typer.Option("--policy", "-p", help="Policy of the agent; repeatable.")
     ] = None,
     episodes: Annotated[int, about("Episodes per policy.")] = 8,
-    after_s: Annotated[int, about("Seconds of each episode to leave out.")] = 75,
+    after_s: Annotated[
+        int, about("Seconds at the start of each episode that are not measured.")
+    ] = 75,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
@@ -51,9 +53,9 @@ def measure(
         {
             "driver": "driver",
             "m/s": "mean:.2f",
-            "least": "least:.2f",
-            "most": "most:.2f",
-            "over human, %": "gain:+.0f",
+            "lowest": "least:.2f",
+            "highest": "most:.2f",
+            "gain over human, %": "gain:+.0f",
             "crashed": "crashed",
         },
         rows,
@@ -110,7 +112,7 @@ def driver_mps(name: str, episodes: int, after_s: float, seed: int) -> NDArray[n
 
 
 def _steps(simulation: Simulation, after_s: float) -> tuple[int, int]:
-    """Return the steps of an episode, and the number of steps before this time."""
+    """Return the number of steps of an episode, and the number of steps before `after_s`."""
     step_s = simulation.config.clock.ctrl_dt_s
     return round(simulation.config.horizon_s / step_s), round(after_s / step_s)
 

@@ -100,7 +100,7 @@ def measure(
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Count trips of the built-in driver that end off the road, collide, or stand forever."""
+    """Count trips of the built-in driver that end off the road, collide, or get stuck."""
     check_range(worlds=(worlds, 0, 10_000), seconds=(seconds, 1, 100_000))
     check_range(first_seed=(first_seed, 0, 10**9))
     crowds = numbers_of("--agents", agents)

@@ -59,12 +59,12 @@ class Args:
     program: ClassVar[str] = "ppo.py"
 
     env: Annotated[str, "environment: a name, a folder or a map file"] = "merge"
-    agents: Annotated[int, "agents per world; 0: the environment's"] = 0
-    background: Annotated[int, "background vehicles per world; -1: the environment's"] = -1
+    agents: Annotated[int, "agents per world; 0: as in the environment"] = 0
+    background: Annotated[int, "background vehicles per world; -1: as in the environment"] = -1
     num_envs: Annotated[int, "number of parallel worlds, of all processes together"] = 16
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
     plugins: Annotated[str, "modules with terms, sensors, … of your own, comma-separated"] = ""
-    zones: Annotated[int, "zones per world; 0: the environment's"] = 0
+    zones: Annotated[int, "zones per world; 0: as in the environment"] = 0
     backend: Annotated[str, "place of the worlds: local, processes:N, nodes:N, ray:N, …"] = ""
     workers: Annotated[int, "short form: N for --backend processes:N; 0: see --backend"] = 0
     seed: Annotated[int, "root of all random numbers"] = 0

@@ -2,10 +2,11 @@
 
     python train/signals_sb3.py --env grid4x4.sumocfg
 
-The network scores each green of a signal with the same weights, so signals may have any number of
-greens and lanes. Afterwards, the network and the scripted controllers run in worlds of other seeds,
-and a table shows their figures. The run's folder has stable-baselines3's `model.zip`, the figures
-as `evaluation.json`, and `manifest.json` with the conditions of the training.
+The network scores each green phase of a signal with the same weights, so signals may have any
+number of green phases and lanes. Afterwards, the network and the scripted controllers run in worlds
+of other seeds, and a table shows their figures. The run's folder has stable-baselines3's
+`model.zip`, the figures as `evaluation.json`, and `manifest.json` with the conditions of the
+training.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ class Args:
 
     env: Annotated[str, "environment: a name, a folder, a map file or a .sumocfg"] = "grid4x4"
     num_worlds: Annotated[int, "number of parallel worlds"] = 4
-    background: Annotated[int, "vehicles of the generator; -1: the environment's"] = -1
+    background: Annotated[int, "generated background vehicles; -1: as in the environment"] = -1
     agents: Annotated[int, "vehicles that are agents in the training"] = 0
     drivers: Annotated[str, "policy of these vehicles; empty: the built-in driver"] = ""
     settings: Annotated[str, "other keys of the environment: KEY=VALUE, comma-separated"] = ""
@@ -63,7 +64,7 @@ class Args:
     delay_weight: Annotated[float, "weight of the reward's term delay"] = 0.1
     wait_weight: Annotated[float, "weight of the reward's term wait"] = 0.1
     decide_s: Annotated[float, "seconds between two decisions of a signal"] = 5.0
-    range_m: Annotated[float, "signals observe lanes at least this far before them"] = 50.0
+    range_m: Annotated[float, "signals observe lanes up to at least this distance, in m"] = 50.0
     hidden: Annotated[int, "width of the hidden layers"] = 64
     compare: Annotated[bool, "run the scripted controllers, too"] = True
     evaluations: Annotated[int, "worlds of the evaluation"] = 5
@@ -81,7 +82,7 @@ class Args:
 
     @property
     def overrides(self) -> dict[str, Any]:
-        """Keys of the worlds of training and evaluation."""
+        """The changed keys of the environment, for training and evaluation."""
         background = {"population.background": self.background} if self.background >= 0 else {}
         return {
             "clock.sim_dt_s": TICK_S,
@@ -96,7 +97,7 @@ class Args:
 
 
 def make_model(args: Args) -> tuple[PPO, CavSb3SignalEnv]:
-    """Create the library's PPO on the signals of all worlds."""
+    """Create stable-baselines3's PPO on the signals of all worlds."""
     step_s = TICK_S if args.agents else args.decide_s
     clock = {"clock.ctrl_dt_s": step_s, "horizon_s": float(args.horizon_s)}
     rows = CavSb3SignalEnv(
@@ -131,9 +132,9 @@ def evaluate(args: Args, model: PPO) -> dict[str, list[SignalFigures]]:
     if args.compare:
         controllers |= {name: name for name in (OWN_PROGRAM, *CONTROLLERS)}
     found = {}
-    with counting(Console(), "controllers") as told:
+    with counting(Console(), "controllers") as report:
         for done, (name, controller) in enumerate(controllers.items()):
-            told(done, len(controllers))
+            report(done, len(controllers))
             found[name] = run_controller(
                 args.env,
                 controller,

@@ -1,7 +1,7 @@
 """Checks of configuration values.
 
-The type of a field contains its range: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges` reads
-it there. A class checks conditions on several fields itself, in `__post_init__`.
+The type of a field contains its range: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges`
+reads it from the type. A class checks conditions on several fields in its own `__post_init__`.
 """
 
 from __future__ import annotations

@@ -173,7 +173,7 @@ class LidarConfig(SensorSection, key="sensors.lidar", switches=("rays",), sight=
 class KinematicsConfig(
     SensorSection, key="sensors.kinematics", switches=("vehicles_count",), sight=("vehicles_count",)
 ):
-    """highway-env's `Kinematics`: a table with a row per vehicle, starting with the own vehicle.
+    """highway-env's `Kinematics`: a table with a row per vehicle, starting with the ego vehicle.
 
     Attributes:
         vehicles_count: rows, own vehicle included (highway-env: 5); 0 switches the sensor off.
@@ -182,7 +182,7 @@ class KinematicsConfig(
         features_range: feature to [min, max], mapped to [-1, 1]; other features stay unmapped.
             Empty: x ±200 m, y ±4 m for each lane of the map's widest road, vx and vy ±80 m/s.
         absolute: whether x, y, vx and vy of other vehicles are in the world's frame; otherwise
-            relative to the own vehicle. The own row is always in the world's frame.
+            relative to the ego vehicle. The ego row is always in the world's frame.
         order: `sorted`: nearest along the lane first. `shuffled`: those with the smallest ids, in
             random order.
         normalize: whether ranges are mapped to [-1, 1].
@@ -352,7 +352,7 @@ class WayConfig(
 class ConflictsConfig(
     SensorSection, key="sensors.conflicts", switches=("count",), sight=("count",)
 ):
-    """The vehicles that come closest to the own path, the soonest and closest ones first.
+    """The vehicles that come closest to the ego path, the soonest and closest ones first.
 
     Their plans are unknown except for `indicators`: a vehicle is assumed to keep its motion, along
     its heading.

@@ -80,7 +80,7 @@ class TrafficConfig(Section, key="traffic"):
             "model",
             all(math.isfinite(share) and share >= 0.0 for share in shares)
             and 0.0 < sum(shares) < math.inf,
-            "shares must be finite numbers from 0 on, and at least one must be above 0",
+            "shares must be finite numbers of at least 0, and at least one must be above 0",
         )
         self.need(
             "model",

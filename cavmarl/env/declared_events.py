@@ -19,7 +19,7 @@ class DeclaredEvents:
     def __init__(self, config: EnvConfig, num_worlds: int) -> None:
         self._enabled = config.v2x.enabled
         self._causes = np.zeros((num_worlds, config.population.num_ids), dtype=np.int32)
-        self._are_any = False
+        self._has_any = False
 
     @property
     def memory(self) -> NDArray[np.int32]:
@@ -29,10 +29,10 @@ class DeclaredEvents:
     @memory.setter
     def memory(self, causes: NDArray[np.int32]) -> None:
         self._causes[:] = causes
-        self._are_any = bool(causes.any())
+        self._has_any = bool(causes.any())
 
     def wrong(self, causes: NDArray[np.int32]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with the `memory` of a saved state; an empty text if it is valid."""
         if not self._enabled and causes.any():
             return "events are declared in worlds without messages"
         return wrong_causes(causes)
@@ -47,20 +47,20 @@ class DeclaredEvents:
                 f"{num_worlds} worlds"
             )
         self._causes[world, agent] = cause_code(cause)
-        self._are_any = True
+        self._has_any = True
 
     def add_to(self, commands: Commands) -> Commands:
         """Return the commands with the declared events, which are held until `clear`."""
-        return replace(commands, declared=self._causes.copy()) if self._are_any else commands
+        return replace(commands, declared=self._causes.copy()) if self._has_any else commands
 
     def clear(self) -> None:
         """Drop the declared events after the step that sent them."""
-        if self._are_any:
+        if self._has_any:
             self._causes[:] = 0
-            self._are_any = False
+            self._has_any = False
 
 
 def wrong_causes(causes: NDArray[np.int32]) -> str:
-    """Return what is wrong with CAUSE_* codes, 0: none; empty if nothing."""
+    """Return an error if a code is neither 0 nor a CAUSE_* code; otherwise an empty text."""
     is_known = np.isin(causes, (0, *CAUSES.values())).all()
     return "" if is_known else "an event has an unknown code"

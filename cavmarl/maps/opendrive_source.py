@@ -248,8 +248,8 @@ class OpenDriveSource:
         if not self.tolerant:
             raise MapError(
                 f"{self.path}: road '{road.get('id')}': <speed max='{text}' unit='{unit}'/>: must "
-                f"be a number from 0 on, 'no limit' or 'undefined', in {', '.join(_UNITS)}: repair "
-                f"it, or ignore such limits: cavmarl map build {self.path} --tolerant"
+                f"be a number of at least 0, 'no limit' or 'undefined', in {', '.join(_UNITS)}: "
+                f"repair it, or ignore such limits: cavmarl map build {self.path} --tolerant"
             )
         self.counts[_INVALID] += 1
         return None

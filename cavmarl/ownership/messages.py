@@ -137,7 +137,7 @@ class Step(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Done(Message):
-    """Z → C: `tick` is in the store. `owned` is after `removed`; `rows` is the rows' digest."""
+    """Z → C: `tick` is in the store. `owned`: after removals; `rows`: digest of the rows."""
 
     zone: int
     incarnation: int

@@ -54,7 +54,7 @@ class ModelPolicy(Policy):
 
     Raises:
         PolicyError: the model does not accept the observations of the environment, or its results
-            are no actions of the environment.
+            are not actions of the environment.
     """
 
     def __init__(

@@ -69,7 +69,7 @@ def draw_ground(shapes: RoadShapes, camera: Viewport, detail: int) -> Surface:
 def draw_stop_lines(
     surface: Surface, shapes: RoadShapes, codes: NDArray[np.uint8], camera: Viewport
 ) -> None:
-    """Draw the part of the stop line of each link with a signal.
+    """Draw the stop line of each link with a signal.
 
     `shapes`: shapes of the network. `codes`: (num_links,) from `signal_codes`.
     """

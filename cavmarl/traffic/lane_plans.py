@@ -1,7 +1,7 @@
 """`LanePlans`: the plans of each world whose lanes differ from the map.
 
 The plans of a world follow from its lanes alone. They are renewed when lanes change, and after a
-state is loaded, so that they are no part of the state.
+state is loaded, so that they are not part of the state.
 """
 
 from __future__ import annotations

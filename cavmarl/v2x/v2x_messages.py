@@ -200,7 +200,7 @@ def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
     Raises MessageError: another version, an unknown kind, or a wrong length.
     """
     if len(data) < HEADER.itemsize:
-        raise MessageError(f"{len(data)} bytes are no message: a header needs {HEADER.itemsize}")
+        raise MessageError(f"{len(data)} bytes are not a message: a header needs {HEADER.itemsize}")
     header = np.frombuffer(data, HEADER, 1)[0]
     if header["version"] != SCHEMA_VERSION:
         raise MessageError(

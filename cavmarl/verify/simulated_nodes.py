@@ -175,7 +175,7 @@ def verify_simulated_nodes(
     check_count("steps", steps, MAX_STEPS)
     check_count("seeds", seeds, MAX_SEEDS)
     if first_seed < 0:
-        raise ConfigError(f"first_seed = {first_seed}: must be a whole number from 0 on")
+        raise ConfigError(f"first_seed = {first_seed}: must be a whole number of at least 0")
     check_nodes(nodes)
     if steps < 2 * FIRST_STEPS:
         raise ConfigError(f"steps = {steps}: must be at least {2 * FIRST_STEPS}")

@@ -25,7 +25,7 @@ class Visibility:
     travel: TripTables  # the types of vehicles, and how far drivers look
     halo_m: float  # zones see no vehicles farther away
     sure_m: float  # zones see all nearer vehicles; if it is `halo_m`, roads have no influence
-    outside_m: float  # distance outside of its zone of a vehicle whose transfer is late
+    outside_m: float  # how far a vehicle can be outside of its zone while its transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:
         halo = zone_halo(partition, self.halo_m)
@@ -35,7 +35,7 @@ class Visibility:
         scratch = make_scratch(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
         aside_m = off_lane_m(self.network, self.travel)
-        wide_m = self.outside_m + aside_m  # of a vehicle's position along its lane
+        wide_m = self.outside_m + aside_m  # how far a zone's vehicle can be on a lane outside of it
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m

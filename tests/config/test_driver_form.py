@@ -193,7 +193,7 @@ def test_the_form_is_added_to_an_overridden_section() -> None:
 
 
 @pytest.mark.parametrize("overrides", [3, "sensors.lidar.rays=3"])
-def test_overrides_that_are_no_mapping_are_refused(overrides: Any) -> None:
+def test_overrides_that_are_not_a_mapping_are_refused(overrides: Any) -> None:
     with pytest.raises(ConfigError, match="must map dotted keys to values"):
         with_sensors_of(overrides, "merge_ippo")
 

@@ -82,7 +82,7 @@ def test_the_error_for_an_unknown_name_lists_the_nearest_name_and_all_names(here
     assert str(told.value).split("Environments: ")[1].split(", ") == sorted(entries())
 
 
-def test_the_error_for_a_file_that_is_no_map_names_map_files(here: Path) -> None:
+def test_the_error_for_a_file_that_is_not_a_map_names_map_files(here: Path) -> None:
     (here / "city.png").touch()
     with pytest.raises(UnknownEnvironmentError, match=r"city\.png: not a map file.*\.net\.xml"):
         load_config("city.png")
@@ -119,7 +119,7 @@ def test_an_episode_has_exactly_max_cycles_steps(ctrl_dt_s: float, max_cycles: i
 
 
 @pytest.mark.parametrize("max_cycles", [0, -1, True, 2.0, "3"])
-def test_max_cycles_that_is_no_positive_integer_is_refused(max_cycles: object) -> None:
+def test_max_cycles_that_is_not_a_positive_integer_is_refused(max_cycles: object) -> None:
     with pytest.raises(ConfigError, match=r"max_cycles = .*whole number, at least 1"):
         load_config("ring", max_cycles=max_cycles)  # type: ignore[arg-type]
 

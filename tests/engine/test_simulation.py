@@ -1,4 +1,4 @@
-"""Traffic of built-in drivers: no vehicle is lost, collides, breaks a rule or stands forever."""
+"""Traffic of built-in drivers: no vehicle is lost, collides, breaks a rule or gets stuck."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import drive, make_simulation, make_traffic, start
 
-# Environments, and a number of background vehicles that does not cause a jam.
+# Numbers of background vehicles that do not cause a jam.
 FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 40}
-PER_TICK = {"clock.ctrl_dt_s": 0.05}
+STEP_PER_TICK = {"clock.ctrl_dt_s": 0.05}  # each step is one tick
 
 
-def minutes(simulation: Simulation, many: float) -> Iterator[int]:
-    """Step the worlds for this number of minutes; yield the number of each step."""
-    for step in range(round(many * 60.0 / simulation.config.clock.ctrl_dt_s)):
+def step_for_minutes(simulation: Simulation, minutes: float) -> Iterator[int]:
+    """Step the worlds for this simulated time; yield the index of each step."""
+    for step in range(round(minutes * 60.0 / simulation.config.clock.ctrl_dt_s)):
         drive(simulation)
         yield step
 
@@ -33,7 +33,7 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
     background = FREE_FLOW[env]
     simulation = make_simulation(env, mode=mode, agents=4, background=background, num_worlds=2)
     start(simulation, seed=3)
-    for _ in minutes(simulation, 0.75):
+    for _ in step_for_minutes(simulation, 0.75):
         for world in range(2):
             stats = simulation.traffic_stats(world)
             assert stats.departed == stats.running + stats.arrived + stats.removed
@@ -53,7 +53,7 @@ def test_departures_without_room_enter_later() -> None:
     start(simulation, seed=0)
     first = set(simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"].tolist())
     assert len(first) > 20
-    for _ in minutes(simulation, 1.0):
+    for _ in step_for_minutes(simulation, 1.0):
         queue = simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"]
         assert (np.diff(queue) > 0).all(), "the queue is not in the order of ids"
     assert len(first & set(queue.tolist())) < 0.75 * len(first)
@@ -85,7 +85,7 @@ def test_the_error_for_a_full_map_names_the_keys_to_change(
     ("env", "agents", "background"),
     [("ring22", 100, 20), ("ring22", 1, 60), ("ring22", 12, 0), ("ring", 90, 20), ("ring", 90, 0)],
 )
-def test_a_population_with_the_numbers_of_the_error_has_room(
+def test_a_map_has_room_for_the_numbers_that_the_error_states(
     env: str, agents: int, background: int
 ) -> None:
     with pytest.raises(CapacityError) as caught:
@@ -102,16 +102,16 @@ def test_a_population_with_the_numbers_of_the_error_has_room(
 
 @pytest.mark.parametrize("env", FREE_FLOW)
 @pytest.mark.parametrize(
-    ("seed", "worlds", "length"),
+    ("seed", "worlds", "minutes"),
     [(0, 3, 3.0), (1, 3, 3.0), pytest.param(2, 12, 12.0, marks=pytest.mark.slow)],
 )
-def test_drivers_do_not_collide_or_stand_forever(
-    env: str, seed: int, worlds: int, length: float
+def test_drivers_neither_collide_nor_get_stuck(
+    env: str, seed: int, worlds: int, minutes: float
 ) -> None:
     simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=worlds)
     start(simulation, seed)
     longest = 0.0
-    for _ in minutes(simulation, length):
+    for _ in step_for_minutes(simulation, minutes):
         for world in range(worlds):
             vehicles = simulation.vehicles(world)
             touching = vehicles["id"][vehicles["hit"] >= 0].tolist()
@@ -128,7 +128,7 @@ def test_drivers_drive_at_most_the_speed_limit_times_their_speed_factor(env: str
     start(simulation, seed=7)
     lanes = simulation.network.lanes
     ratios, roads = [], []
-    for _ in minutes(simulation, 1.0):
+    for _ in step_for_minutes(simulation, 1.0):
         for world in range(2):
             vehicles = simulation.vehicles(world)
             lane = lanes[vehicles["lane"]]
@@ -136,7 +136,7 @@ def test_drivers_drive_at_most_the_speed_limit_times_their_speed_factor(env: str
             ratios.append(ratio)
             roads.append(~lane["internal"])
     ratio = np.concatenate(ratios)
-    # After a lower limit begins, the speed decays towards it and stays a few per cent above it.
+    # Behind the start of a lower limit, the speed is still a few per cent above it for some time.
     assert ratio.max() < 1.05
     assert np.mean(ratio[np.concatenate(roads)] > 1.001) < 0.02
     assert ratio.max() > 0.9, "no vehicle drives at the limit on a free road"
@@ -144,12 +144,12 @@ def test_drivers_drive_at_most_the_speed_limit_times_their_speed_factor(env: str
 
 @pytest.mark.parametrize("env", ["grid4x4", "town"])
 def test_no_driver_passes_a_red_signal(env: str) -> None:
-    simulation = make_traffic(env, background=60, num_worlds=2, overrides=PER_TICK)
+    simulation = make_traffic(env, background=60, num_worlds=2, overrides=STEP_PER_TICK)
     start(simulation, seed=2)
     roads, steps = simulation.network.arrays, simulation.travel.steps
     crossed = 0
     before: list[dict[int, tuple[int, float]]] = [{}, {}]
-    for _ in minutes(simulation, 2.0):
+    for _ in step_for_minutes(simulation, 2.0):
         for world in range(2):
             phases = simulation.signal_phases(world)
             now = {}
@@ -193,7 +193,7 @@ def test_vehicles_on_a_bridge_and_below_do_not_interact(
     roads.write_text(OVERPASS.format(z=z), encoding="utf-8")
     simulation = make_traffic(roads, background=24)
     start(simulation, seed=0)
-    for _ in minutes(simulation, 2.0):
+    for _ in step_for_minutes(simulation, 2.0):
         pass
     stats = simulation.traffic_stats()
     assert stats.arrived > 20

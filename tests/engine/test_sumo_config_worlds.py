@@ -67,7 +67,7 @@ def test_a_sumo_configuration_needs_no_demand(config: Path) -> None:
     assert world.demand is None
 
 
-def test_files_that_are_no_maps_are_refused(config: Path) -> None:
+def test_files_that_are_not_maps_are_refused(config: Path) -> None:
     with pytest.raises(UnknownEnvironmentError, match="root element must be the <configuration>"):
         load_world(config.parent / "a b.xml")
     config.write_text('<configuration><r value="a b.xml"/></configuration>', encoding="utf-8")

@@ -61,7 +61,7 @@ def test_a_full_block_is_a_deadlock_of_all_its_vehicles() -> None:
     assert find_deadlocks(roads, steps, shuffled) == (cycle,)
 
 
-def test_a_queue_that_will_move_is_no_deadlock() -> None:
+def test_a_queue_that_will_move_is_not_a_deadlock() -> None:
     roads = network("grid4x4")
     lanes, steps = block(roads)
     rows = queues(roads, lanes)

@@ -12,8 +12,8 @@ from cavmarl.core.errors import ConfigError, EpisodeError
 from cavmarl.core.records.codes import EVENT_ARRIVED, EVENT_COLLIDED
 from cavmarl.engine.world_frame import ENDED, SEEN, WorldFrame, events_between
 
-_PLACED = ("zone", "target_zone", "transfer")
-_WHAT = [name for name in SEEN.names or () if name not in _PLACED]
+_ZONE_FIELDS = ("zone", "target_zone", "transfer")
+_OTHER_FIELDS = [name for name in SEEN.names or () if name not in _ZONE_FIELDS]
 
 
 def _frames(zones: int, workers: int, steps: int = 25) -> list[WorldFrame]:
@@ -33,7 +33,9 @@ def test_frames_of_divided_worlds_equal_those_of_the_undivided_world(
 ) -> None:
     for whole, divided in zip(_frames(1, 0), _frames(zones, workers), strict=True):
         assert (whole.tick, whole.time_s) == (divided.tick, divided.time_s)
-        np.testing.assert_array_equal(whole.vehicles[_WHAT], divided.vehicles[_WHAT])
+        np.testing.assert_array_equal(
+            whole.vehicles[_OTHER_FIELDS], divided.vehicles[_OTHER_FIELDS]
+        )
         np.testing.assert_array_equal(whole.signals, divided.signals)
         np.testing.assert_array_equal(whole.ended, divided.ended)
         if zones > 1:
@@ -49,9 +51,9 @@ def test_a_frame_is_a_copy_of_the_state_of_the_world() -> None:
     simulation = world.worlds.simulation
     rows = np.sort(simulation.vehicles(), order="id")
     for name in SEEN.names or ():
-        held = {"zone": rows["owner"], "vclass": simulation.types["vclass"][rows["vtype"]]}
-        there = held[name] if name in held else rows[name]
-        np.testing.assert_array_equal(frame.vehicles[name], there.astype(SEEN[name]))
+        derived = {"zone": rows["owner"], "vclass": simulation.types["vclass"][rows["vtype"]]}
+        expected = derived[name] if name in derived else rows[name]
+        np.testing.assert_array_equal(frame.vehicles[name], expected.astype(SEEN[name]))
     assert len(frame.ghosts) == 4
     assert any(len(ids) for ids in frame.ghosts)
     kept = frame.vehicles.copy()
@@ -59,11 +61,11 @@ def test_a_frame_is_a_copy_of_the_state_of_the_world() -> None:
     np.testing.assert_array_equal(frame.vehicles, kept)
 
 
-def test_events_have_the_causes_of_ended_trips() -> None:
+def test_events_agree_with_the_infos_of_ended_trips() -> None:
     world = parallel_env("ring")
     world.reset(seed=1)
     (before,) = world.world_frames()
-    told: list[tuple[str, int]] = []
+    reported: list[tuple[str, int]] = []
     ended: list[tuple[str, int]] = []
     rng = np.random.default_rng(0)
     for _ in range(150):
@@ -73,7 +75,7 @@ def test_events_have_the_causes_of_ended_trips() -> None:
         actions = {agent: rng.uniform(low, high, 2).astype("f4") for agent in world.agents}
         _, _, terminations, _, infos = world.step(actions)
         (after,) = world.world_frames()
-        told += [
+        reported += [
             (event.kind, event.agent)
             for event in events_between(before, after)
             if event.agent >= 0 and event.kind in ("collision", "off_road", "arrived")
@@ -90,8 +92,8 @@ def test_events_have_the_causes_of_ended_trips() -> None:
                 if terms[term]
             ]
         before = after
-    assert sorted(told) == sorted(ended)
-    assert told
+    assert sorted(reported) == sorted(ended)
+    assert reported
 
 
 def _frame(

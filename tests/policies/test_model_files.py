@@ -109,7 +109,7 @@ def save_script(path: Path, module: torch.nn.Module) -> None:
         torch.jit.trace(module, torch.zeros(1, SIZE)).save(str(path))  # type: ignore[no-untyped-call]
 
 
-def test_a_torch_script_gives_its_outputs_as_actions(tmp_path: Path) -> None:
+def test_the_outputs_of_a_torchscript_model_are_its_actions(tmp_path: Path) -> None:
     module = torch.nn.Linear(SIZE, 2)
     save_script(tmp_path / "model.pt", module)
     vec = small_vec()
@@ -119,7 +119,7 @@ def test_a_torch_script_gives_its_outputs_as_actions(tmp_path: Path) -> None:
     assert mask.any()
 
 
-def test_a_torch_script_with_logits_chooses_the_largest(tmp_path: Path) -> None:
+def test_the_action_of_a_torchscript_model_is_its_largest_logit(tmp_path: Path) -> None:
     module = torch.nn.Linear(SIZE, 5)
     save_script(tmp_path / "model.ts", module)
     vec = small_vec(action__kind="discrete")
@@ -144,14 +144,14 @@ def test_a_model_for_other_sensors_is_refused(tmp_path: Path) -> None:
         ("model.txt", r"not a policy; .*\.onnx"),
     ],
 )
-def test_files_that_are_no_models_are_refused(tmp_path: Path, name: str, message: str) -> None:
+def test_files_that_are_not_models_are_refused(tmp_path: Path, name: str, message: str) -> None:
     path = tmp_path / name
     path.write_bytes(b"nothing")
     with pytest.raises(PolicyError, match=message):
         load_policy(path, small_vec())
 
 
-def test_a_state_dict_is_refused_as_torch_script(tmp_path: Path) -> None:
+def test_a_state_dict_is_refused_as_a_torchscript_model(tmp_path: Path) -> None:
     torch.save(torch.nn.Linear(SIZE, 2).state_dict(), tmp_path / "model.pt")
     with pytest.raises(PolicyError, match=r"save the module with torch\.jit\.trace"):
         load_policy(tmp_path / "model.pt", small_vec())
@@ -195,8 +195,8 @@ def test_an_onnx_model_gets_observations_under_the_name_of_its_input(
         load_policy(path, vec)
 
 
-@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the exporter warns about itself
-def test_a_real_onnx_model_gives_its_outputs_as_actions(tmp_path: Path) -> None:
+@pytest.mark.filterwarnings("ignore::DeprecationWarning")  # the exporter is deprecated
+def test_the_outputs_of_a_real_onnx_model_are_its_actions(tmp_path: Path) -> None:
     pytest.importorskip("onnxruntime")
     pytest.importorskip("onnx")
     module = torch.nn.Linear(SIZE, 2)

@@ -182,7 +182,7 @@ def test_a_policy_that_is_neither_a_name_nor_a_path_is_refused(policy: Any) -> N
         load_policy(policy, small_vec())
 
 
-def test_a_file_that_is_no_policy_is_refused(tmp_path: Path) -> None:
+def test_a_file_that_is_not_a_policy_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "model.pkl"
     path.touch()
     with pytest.raises(PolicyError, match=r"model\.pkl: not a policy"):

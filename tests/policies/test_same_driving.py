@@ -51,15 +51,15 @@ def test_dicts_and_batches_give_the_same_actions(driver: str) -> None:
     vec.close()
 
 
-def test_each_driver_of_a_shared_policy_acts_as_if_it_were_alone() -> None:
+def test_each_driver_of_a_mixed_policy_acts_as_if_it_were_alone() -> None:
     vec = make_vec("merge", num_envs=3, agents=5, background=4)
     observations, infos = vec.reset(seed=5)
     names = ("merge_ippo+idm", "merge_ippo", "idm")
-    shared, trained, idm = (load_policy(name, vec) for name in names)
+    mixed, trained, idm = (load_policy(name, vec) for name in names)
     is_even = np.arange(5) % 2 == 0
     for _ in range(STEPS):
         mask = infos["mask"]
-        found = shared.act_batch(observations, mask)
+        found = mixed.act_batch(observations, mask)
         own, other = trained.act_batch(observations, mask), idm.act_batch(observations, mask)
         np.testing.assert_array_equal(found[mask & is_even], own[mask & is_even])
         np.testing.assert_array_equal(found[mask & ~is_even], other[mask & ~is_even])
@@ -68,7 +68,7 @@ def test_each_driver_of_a_shared_policy_acts_as_if_it_were_alone() -> None:
 
 
 def test_a_trained_driver_is_evaluated_without_torch() -> None:
-    """Loading a scripted driver does not import safetensors."""
+    """Torch is not imported at all, and safetensors only for a trained driver."""
     code = (
         "import sys\n"
         "class NoTorch:\n"

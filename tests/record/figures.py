@@ -1,6 +1,6 @@
-"""Figures: functions that write the cells of tables of scores.
+"""Functions that write the cells of score tables.
 
-A figure takes the report on the evaluation of one driver and returns the text of a cell.
+A `Figure` takes the evaluation report of one driver and returns the text of a cell.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ def trips(report: EvaluationReport) -> str:
 def figure(
     name: str, unit: str = "", *, decimals: int = 1, interval: str = "", interval_decimals: int = 1
 ) -> Figure:
-    """Return the figure of a metric, which writes its mean and its 95 % interval.
+    """Return a function that writes the mean and the 95 % confidence interval of a metric.
 
     Args:
         name: the metric.
-        unit: unit behind the mean, with a leading space; empty if the title has the unit.
+        unit: unit after the mean, with a leading space; empty if the column title has the unit.
         decimals: number of decimals of the mean.
-        interval: "[]" writes the ends, "±" half of the width, "" no interval.
+        interval: "[]" writes both ends, "±" half of the width, "" no interval.
         interval_decimals: number of decimals of the interval.
     """
     scale = _METRICS[name].scale
@@ -54,24 +54,24 @@ def figure(
 
 
 def share(name: str, *, decimals: int = 1) -> Figure:
-    """Return the figure of a share, which writes per cent with the interval in brackets."""
+    """Return a function that writes a share in per cent, and its interval in brackets."""
     return figure(name, " %", decimals=decimals, interval="[]")
 
 
-def way_per_infraction(report: EvaluationReport) -> str:
-    """Return the kilometres per infraction, with one decimal below 100 km."""
+def distance_per_infraction(report: EvaluationReport) -> str:
+    """Return the distance driven per infraction in km, with one decimal below 100 km."""
     km = driver_report(report)["km_per_infraction"].mean
     return NONE if km is None else f"{km:,.1f} km" if km < 100.0 else f"{km:,.0f} km"
 
 
 def worst_map(report: EvaluationReport) -> str:
-    """Return the success on the map with the least success, and the name of that map."""
+    """Return the lowest success rate of a map, and the name of that map."""
     ((row, *_),) = report.by_map.values()
     return f"{100.0 * row['success']:.1f} % (`{row['map']}`)"
 
 
 def by_map(report: EvaluationReport) -> dict[str, dict[str, str]]:
-    """Return the shares of each map in per cent; the map with the least success is first."""
+    """Return the shares of each map in per cent, starting with the lowest success rate."""
     (rows,) = report.by_map.values()
     shares = ("success", "collision", "red_light")
     return {
@@ -79,8 +79,8 @@ def by_map(report: EvaluationReport) -> dict[str, dict[str, str]]:
     }
 
 
-def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
-    """Return the difference first - second of a metric, with the interval over paired runs."""
+def difference(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
+    """Return the mean difference first - second of a metric, and its interval over paired runs."""
     scale = _METRICS[name].scale
     runs = zip(*map(_run_means, (first, second), (name, name)), strict=True)
     differences = np.array([scale * (a - b) for a, b in runs])
@@ -90,13 +90,13 @@ def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text; a positive number has two decimals if one would show 0.0."""
+    """Return a number as text; a positive number has two decimals where one would show 0.0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 
 
 def driver_report(report: EvaluationReport) -> PolicyReport:
-    """Return the part of a report on its only driver."""
+    """Return the results of the only driver in a report."""
     (found,) = report.policies.values()
     return found
 

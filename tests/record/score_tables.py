@@ -15,11 +15,11 @@ from tests.record.figures import (
     NONE,
     Figure,
     by_map,
+    difference,
+    distance_per_infraction,
     figure,
-    minus,
     share,
     trips,
-    way_per_infraction,
     worst_map,
 )
 from tests.record.jobs import AnyJob, drivers_of, jobs_of
@@ -139,7 +139,7 @@ def names_table(
 DELAY = ("delay of an arrival", figure("delay_s", " s", interval="±"))
 JERK = ("jerk", figure("mean_jerk_mps3", " m/s³", interval="±", interval_decimals=2))
 TRIPS = ("trips", trips)
-WAY = ("way per infraction", way_per_infraction)
+WAY = ("way per infraction", distance_per_infraction)
 
 
 def shares(*names: str, decimals: int = 1, **titles: str) -> Rows:
@@ -254,7 +254,7 @@ def messages_table(results: Results) -> str:
         (title, *(figure(name, interval="[]")(report) for name in names))
         for title, report in reports.items()
     ]
-    paired = (minus(name, reports["none"], reports["all"]) for name in names)
+    paired = (difference(name, reports["none"], reports["all"]) for name in names)
     lines.append(("none lost minus all lost", *paired))
     return table(("messages lost", *names.values()), lines, is_right=True)
 

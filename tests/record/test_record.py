@@ -15,7 +15,15 @@ from cavmarl.evaluate import EvaluationReport
 from cavmarl.evaluate.report import make_report
 from cavmarl.evaluate.tables import EPISODE, TRIP
 from tests.record.__main__ import block_tests, tables_named
-from tests.record.figures import by_map, minus, number, share, trips, way_per_infraction, worst_map
+from tests.record.figures import (
+    by_map,
+    difference,
+    distance_per_infraction,
+    number,
+    share,
+    trips,
+    worst_map,
+)
 from tests.record.jobs import (
     EVALUATE,
     ROOT,
@@ -97,7 +105,7 @@ def test_a_table_of_a_small_result() -> None:
     results = Results({idm: fake_report(collisions=0), blind: fake_report()})
     columns = [("idm", COMMAND, "idm"), ("other", COMMAND, "blind")]
     rows = [("trips", trips), *shares("arrived", "off_road"), *shares("collision", decimals=2)]
-    rows += [("way per infraction", way_per_infraction), DELAY]
+    rows += [("way per infraction", distance_per_infraction), DELAY]
     assert drivers_table(columns, rows, results) == "\n".join(
         [
             "|  | idm | other |",
@@ -116,7 +124,7 @@ def test_figures_of_several_runs_have_intervals_between_runs() -> None:
     report = fake_report(runs=3)
     assert DELAY[1](report) == "4.0 s ± 2.5"
     assert share("collision")(report) == "5.0 % [1.5, 15.2]"
-    assert minus("collision", report, fake_report(runs=3, collisions=0)) == "2.5"
+    assert difference("collision", report, fake_report(runs=3, collisions=0)) == "2.5"
 
 
 def test_maps_are_sorted_by_success() -> None:

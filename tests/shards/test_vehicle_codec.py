@@ -415,5 +415,5 @@ def test_the_page_describes_the_content_of_a_state() -> None:
         (group, ", ".join(f"`{name}`" for name in names), apart.get(group, ""))
         for group, names in GROUPS.items()
     ]
-    header = ("group", "fields of the record", "beside it")
+    header = ("group", "fields of the record", "other data")
     check_block(ROOT / "docs/explanation/ownership.md", "state", table(header, rows))

@@ -1,4 +1,4 @@
-"""SUMO's persons are mirrored, and what is not mirrored is told with a count."""
+"""SUMO's persons are mirrored, and persons that are not mirrored are counted in a warning."""
 
 from __future__ import annotations
 

@@ -49,7 +49,7 @@ def test_decoded_messages_equal_encoded_ones(kind: int) -> None:
 
 def test_invalid_bytes_are_refused() -> None:
     data = example(KIND_CAM)
-    with pytest.raises(MessageError, match="3 bytes are no message"):
+    with pytest.raises(MessageError, match="3 bytes are not a message"):
         decode(data[:3])
     with pytest.raises(MessageError, match="version 9: only version 1"):
         decode(b"\x09\x00" + data[2:])

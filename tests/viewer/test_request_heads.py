@@ -61,7 +61,7 @@ def test_an_endless_head_ends_the_connection(server: WebServer) -> None:
 
 
 @pytest.mark.parametrize("rest", [b"\r\n", b"GET / HTTP/1.1\r\nX-Slow: "])
-def test_a_connection_is_closed_after_its_answer(server: WebServer, rest: bytes) -> None:
+def test_a_connection_is_closed_after_the_response(server: WebServer, rest: bytes) -> None:
     with connection(server) as peer:
         peer.sendall(head(server) + b"\r\n")
         assert b" 200 " in peer.recv(65536)

@@ -1,4 +1,4 @@
-"""Reach: how far drivers look, how far vehicles move in a tick and how far off their lanes."""
+"""Reach: how far drivers look, and how far vehicles move in a tick or are off their lanes."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_reach_includes_view_junctions_and_approaching_vehicles(name: str) -> No
     assert rest_m <= 40.0, "the halo covers the whole map"
 
 
-def test_reach_shrinks_with_the_sight_distance_of_stop_lines() -> None:
+def test_reach_shrinks_if_drivers_check_stop_lines_from_nearer() -> None:
     near = travel("merge")._replace(see_m=100.0)
     shrunk = driving_reach_m(network("merge"), travel("merge")) - driving_reach_m(
         network("merge"), near
@@ -99,19 +99,19 @@ def test_the_longest_move_includes_jumps_over_junctions_without_lanes(tmp_path: 
     path = tmp_path / "gap.net.xml"
     path.write_text(GAP, encoding="utf-8")
     tick_s = 0.1
-    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
+    driven_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
     roads = load_network(find_map(path))
     assert longest_move_m(roads, travel("merge"), tick_s) == pytest.approx(
-        way_m + 20.0 + LENGTH_M / 2
+        driven_m + 20.0 + LENGTH_M / 2
     )
     assert longest_move_m(roads, travel("merge"), 1.0) == pytest.approx(
-        10.0 * way_m + 2.0 * 20.0 + LENGTH_M / 2
+        10.0 * driven_m + 2.0 * 20.0 + LENGTH_M / 2
     ), "the second jump in a tick of 1 s is missing"
 
 
 def test_the_longest_move_includes_kinks_of_lanes() -> None:
     roads, tick_s = network("merge"), 0.1
-    way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
+    driven_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
     lines = zip(roads.lanes["first_point"], roads.lanes["num_points"], strict=True)
     turns = [
         abs(math.remainder(b - a, math.tau))
@@ -120,8 +120,8 @@ def test_the_longest_move_includes_kinks_of_lanes() -> None:
     ]
     aside_m = float(roads.lanes["width_m"].max())
     kink_m = 2.0 * aside_m * math.sin(0.5 * max(turns))
-    assert longest_move_m(roads, travel("merge"), tick_s) >= way_m + kink_m + LENGTH_M / 2 - 1e-9
-    assert longest_move_m(roads, travel("merge"), tick_s) < way_m + aside_m + LENGTH_M / 2
+    assert longest_move_m(roads, travel("merge"), tick_s) >= driven_m + kink_m + LENGTH_M / 2 - 1e-9
+    assert longest_move_m(roads, travel("merge"), tick_s) < driven_m + aside_m + LENGTH_M / 2
 
 
 @pytest.mark.parametrize("internal", [(), ("--no-internal-links",)])
@@ -182,19 +182,19 @@ def test_the_sight_of_a_zone_includes_vehicles_beside_seen_lanes(tmp_path: Path)
     partition = cut_map(roads, "grid", 4)
     sight = Visibility(roads, kinds, halo_m=1000.0, sure_m=5.0, outside_m=8.0)
     halo = sight.halo(partition)
-    asked = [looks_of(halo, zone) for zone in range(4)]
-    asked_m = max(
+    seen = [looks_of(halo, zone) for zone in range(4)]
+    look_m = max(
         farthest_m(roads.arrays, partition.arrays.rects, zone, looks)
-        for zone, looks in enumerate(asked)
+        for zone, looks in enumerate(seen)
     )
     aside_m = off_lane_m(roads, kinds)
     assert aside_m > LOST_M
-    assert halo.seen_m == asked_m + aside_m < halo.halo_m
+    assert halo.seen_m == look_m + aside_m < halo.halo_m
     inner = np.isfinite(partition.reaching[:, 2])
     margins = partition.reaching[inner, 2] - halo.inner[inner, 2]
     assert len(margins) == 2
     assert margins == pytest.approx(halo.seen_m, abs=1e-4)
-    # Own drivers may be up to `outside_m` outside of the zone, because a transfer may be late.
+    # A zone's drivers may be up to `outside_m` outside of it, because a transfer may be late.
     wide_m = 8.0 + aside_m
     half_m = 0.5 * float(kinds.types["length"].max())
     scratch = make_scratch(len(roads.lanes), len(roads.links))
@@ -202,8 +202,8 @@ def test_the_sight_of_a_zone_includes_vehicles_beside_seen_lanes(tmp_path: Path)
         looks = np.zeros(len(roads.lanes), dtype=LOOK)
         wide = rect + np.array([-wide_m, -wide_m, wide_m, wide_m])
         find_looks(roads.arrays, wide, kinds.view_m, kinds.see_m, half_m, scratch, looks)
-        assert asked[zone].tolist() == looks.tolist()
+        assert seen[zone].tolist() == looks.tolist()
 
 
-def test_without_jumps_the_distance_off_a_lane_is_that_of_agents() -> None:
+def test_without_jumps_the_distance_off_a_lane_is_at_most_lost_m() -> None:
     assert off_lane_m(network("grid4x4"), travel("grid4x4")) == LOST_M

@@ -181,7 +181,7 @@ class ClientActors:
             controls: throttle and steering in [-1, 1], scaled as those of agents.
 
         Raises:
-            ActionError: the actor is not moved by controls, or these are no two such numbers.
+            ActionError: the actor is not moved by controls, or the controls are not two numbers.
         """
         if actor.order.moved_by != CONTROLS:
             raise ActionError(

@@ -26,7 +26,7 @@ _FARTHEST_M = 60.0  # a longer corner is left out
 _LEAST_AREA_M2 = 0.05
 _MOST_VERTICES = 60_000  # of a tile, whose indices have 16 bits
 
-# Detour's numbers of areas and flags in the client.
+# Area types and polygon flags of Detour, with the numbers that the client gives them.
 _SIDEWALK, _CROSSWALK = (1, 0x02), (2, 0x04)
 
 _FILE_HEAD = struct.Struct("<iii3fffii")
@@ -57,12 +57,12 @@ _DETAIL = np.dtype(
         ("padding", "u1", 2),
     ]
 )
-# Two triangles of a quadrangle: indices of its corners, and which of their edges are on its border.
+# Two triangles of a quadrangle: three of its corners each, then flags of edges on its border.
 _TRIANGLES = bytes((0, 1, 2, 1 | 4, 0, 2, 3, 4 | 16))
 
 
 class NavigationMesh(NamedTuple):
-    """A mesh as a file. `name`: changes with the content, because clients keep files by name."""
+    """A mesh as a file. `name` changes with the content, because clients cache files by name."""
 
     name: str
     content: bytes
@@ -179,7 +179,7 @@ def _connections(
 def _oriented(
     vertices: NDArray[np.float32], quadrangles: NDArray[np.intp]
 ) -> tuple[NDArray[np.intp], NDArray[np.bool_]]:
-    """Return quadrangles (m, 4) in Detour's direction, and whether each is convex."""
+    """Return quadrangles (m, 4) in Detour's winding order, and whether each is convex."""
     corners = vertices[quadrangles][:, :, [0, 2]].astype(np.float64)
     before = corners - np.roll(corners, 1, axis=1)
     after = np.roll(before, -1, axis=1)

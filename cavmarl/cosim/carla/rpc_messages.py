@@ -45,7 +45,7 @@ class RequestReader:
     def read(self, data: bytes) -> Iterator[Request]:
         """Yield the requests that are complete after `data` has arrived.
 
-        Raises MessageError: the bytes are no requests, or a message is too large. The connection
+        Raises MessageError: the bytes are not requests, or a message is too large. The connection
         cannot be used any more.
         """
         try:

@@ -29,7 +29,7 @@ class RequestCounts:
 
     accepted: int = 0
     refused: int = 0  # what the vehicle cannot do
-    invalid: int = 0  # bytes that are no message, and unknown values
+    invalid: int = 0  # bytes that are not a message, and unknown values
 
 
 class AutowareRequests:

@@ -35,11 +35,11 @@ Wait = Literal["stamp", "newest"]
 
 _NODE_NAME = "cavmarl"
 _LOOK_S = 0.1  # how often matched subscribers are counted, wall time
-_SETTLED_S = 0.5  # a node's subscriptions are found one by one; then all are, wall time
+_SETTLED_S = 0.5  # all subscriptions are found if their number is constant for this long, wall time
 _REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
 
 BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
-BUFFER_BYTES = 4 << 20  # that `fast_dds.xml` asks for: a large message arrives in one burst
+BUFFER_BYTES = 4 << 20  # as in `fast_dds.xml`, because a large message arrives in one burst
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ class RosOptions:
     def __post_init__(self) -> None:
         for name in ("deadline_s", "ready_s"):
             if not 0.0 <= getattr(self, name) < float("inf"):
-                raise ConfigError(f"{name} = {getattr(self, name)}: must be a number from 0 on")
+                raise ConfigError(f"{name} = {getattr(self, name)}: must be finite and at least 0")
         if self.lag_steps < 0:
             raise ConfigError(f"lag_steps = {self.lag_steps}: must be at least 0")
 
@@ -93,7 +93,7 @@ class RosBridge:
         wait_wall_s: wall time that was spent waiting for commands.
 
     Raises:
-        ConfigError: a vehicle has actions of another kind or no speed, or names of topics clash.
+        ConfigError: actions are not continuous, no sensor measures speed, or topic names clash.
         RosError: DDS cannot be started.
         MissingExtraError: the extra `ros2` is not installed.
     """
@@ -108,13 +108,13 @@ class RosBridge:
         has_speed = any(view.settings.get("type") == "odometry" for view in welcome.sensors)
         if welcome.vehicles and not (has_speed or options.truth):
             raise ConfigError(
-                "the vehicles do not measure their speed, which commands of a speed need; add a "
+                "the vehicles do not measure their speed, which speed commands need; add a "
                 "sensor of type odometry to the rig, or publish the truth (--truth)"
             )
         if options.profile == "autoware" and len(welcome.vehicles) > 1:
             raise ConfigError(
-                f"{len(welcome.vehicles)} vehicles: the names of Autoware's topics are those of "
-                "one vehicle; start one bridge for each, with another --domain"
+                f"{len(welcome.vehicles)} vehicles: Autoware's topic names allow one vehicle per "
+                "domain; start one bridge per vehicle, each with its own --domain"
             )
         self._follower, self._options = follower, options
         self._types = RosTypes(options.distro)
@@ -222,7 +222,7 @@ class RosBridge:
             self._until(ready_s, _Settled(self._subscribers), bases)
         if silent := [name for name in bases if not self._has_publisher(name)]:
             log.warning(
-                "no node publishes commands of %s on domain %d: the vehicles brake until a node "
+                "no node publishes commands for %s on domain %d: the vehicles brake until a node "
                 "publishes commands; topics: %s",
                 ", ".join(silent),
                 self._options.domain,
@@ -278,8 +278,8 @@ class RosBridge:
         others = self._node.publishers_of(CLOCK) - 1
         if others > 0:
             raise RosError(
-                f"{others} other nodes publish {CLOCK} on domain {self._options.domain}: only the "
-                "world has the time; stop them (use_sim_time, no clock of their own), or choose "
+                f"{others} other nodes publish {CLOCK} on domain {self._options.domain}: only "
+                "the bridge may publish it; stop their clocks and set use_sim_time, or choose "
                 "another domain"
             )
 
@@ -310,7 +310,7 @@ class RosBridge:
         def late() -> list[str]:
             return [name for name in bases if self._controls[name].stamp_ns < due_ns]
 
-        # If no node publishes commands of a vehicle, the step does not wait for them.
+        # If no node publishes commands for a vehicle, the step does not wait for them.
         if self._is_commanded:
             began_s = time.monotonic()
             self._until(
@@ -359,7 +359,7 @@ class RosBridge:
 
 
 def _warn_of_small_buffers() -> None:
-    """Log that nodes of this machine cannot receive large messages as a whole, if so."""
+    """Warn if receive buffers on this machine are too small for large messages."""
     try:
         limit = int(BUFFER_LIMIT.read_text())
     except (OSError, ValueError):  # another system, whose limit is unknown
@@ -375,7 +375,7 @@ def _warn_of_small_buffers() -> None:
 
 
 class _Settled:
-    """Whether numbers have been the same for `_SETTLED_S`."""
+    """A condition that is true when counts have not changed for `_SETTLED_S`."""
 
     def __init__(self, count: Callable[[], tuple[int, ...]]) -> None:
         self._count = count

@@ -79,7 +79,7 @@ class ControlCounts:
     held: int = 0  # steps with an older command, or without any (the vehicle brakes)
     late: int = 0  # steps in which no command came before the deadline
     old: int = 0  # messages older than a used message
-    invalid: int = 0  # messages with NaN, infinity, or bytes that are no message
+    invalid: int = 0  # messages with NaN, infinity, or bytes that are not a message
     limited: int = 0  # steps in which a command was beyond the limits of the vehicle
 
 

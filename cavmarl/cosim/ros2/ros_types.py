@@ -172,12 +172,12 @@ class RosTypes:
     def decode(self, kind: str, data: bytes) -> Any:
         """Return the message in CDR bytes as an object of `rosbags`.
 
-        Raises ValueError: the bytes are no message of this type.
+        Raises ValueError: the bytes are not a message of this type.
         """
         try:
             return self.store.deserialize_cdr(data, kind)
         except Exception as error:  # invalid bytes raise errors of any class
-            raise ValueError(f"{len(data)} bytes are no {kind}: {error}") from error
+            raise ValueError(f"{len(data)} bytes are not a {kind}: {error}") from error
 
     def _message(self, kind: str, fields: dict[str, Any]) -> Any:
         nodes = dict(self.fields_of(kind))

@@ -60,7 +60,7 @@ def _size(tables: Sequence[Array]) -> int:
 def _read(data: memoryview) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """Return the whole words of a frame, and its bytes. Raises MessageError: it is too short."""
     if len(data) < 8:
-        raise MessageError(f"{len(data)} bytes are no frame about agents")
+        raise MessageError(f"{len(data)} bytes are not a frame about agents")
     return np.frombuffer(data, np.int64, len(data) // 8), np.frombuffer(data, np.uint8)
 
 
@@ -100,13 +100,13 @@ class AgentStream:
             these agents.
 
         Raises:
-            MessageError: the bytes are no such frame, or name unknown agents, or those of another
-                node.
+            MessageError: the bytes are not such a frame, or name agents that are unknown or of
+                another node.
         """
         words, content = _read(data)
         unowned = np.count_nonzero(owner == UNOWNED)
         if self._unpack(self._tables, words, content, number, owner) != len(data):
-            raise MessageError(f"{len(data)} bytes are no frame about agents")
+            raise MessageError(f"{len(data)} bytes are not a frame about agents")
         if np.count_nonzero(owner == UNOWNED) != unowned - words.item(0):
             raise MessageError("a frame names agents of other nodes, or an agent twice")
         agents = words[1 : 1 + words.item(0)]
@@ -160,7 +160,7 @@ class ResultStream:
         """Write the results of a node to the arrays.
 
         Raises:
-            MessageError: the bytes are no results, or name unknown agents.
+            MessageError: the bytes are not results, or name unknown agents.
         """
         arguments = self._outcome, chosen, of_step, with_common, number, owner, self._unread
         if not self._unpack(*arguments, *_read(data)):

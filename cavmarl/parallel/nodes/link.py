@@ -167,7 +167,7 @@ class Link:
 
         Raises:
             EOFError, OSError: the other end has gone.
-            MessageError: the bytes are no frame.
+            MessageError: the bytes are not a frame.
             NeededNoMoreError, NodeRefusedError: the coordinator has dismissed this node.
         """
         while True:

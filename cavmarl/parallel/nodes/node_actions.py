@@ -105,7 +105,7 @@ class ReceivedActions:
             agents of other nodes, and where the actions end.
 
         Raises:
-            MessageError: the bytes are no actions.
+            MessageError: the bytes are not actions.
         """
         words = np.frombuffer(data, np.int64, (len(data) - at) // 8, at)
         size, wrong, missing = self._unpack(
@@ -113,7 +113,7 @@ class ReceivedActions:
             self._missing, owner, self._number, self._wrong,
         )  # fmt: skip
         if size < 0:
-            raise MessageError(f"{len(data)} bytes are no actions of agents")
+            raise MessageError(f"{len(data)} bytes are not actions of agents")
         self.are_due = missing > 0
         return self._wrong[:wrong], at + 8 * size
 
@@ -127,10 +127,10 @@ def read_refusal(data: memoryview, num_agents: int, nodes: set[int]) -> NDArray[
     """Read a refusal: (2, n) agents, and the owner of each.
 
     Raises:
-        MessageError: the bytes are no refusal, or name unknown agents or nodes.
+        MessageError: the bytes are not a refusal, or name unknown agents or nodes.
     """
     if len(data) % 16:
-        raise MessageError(f"{len(data)} bytes are no refusal")
+        raise MessageError(f"{len(data)} bytes are not a refusal")
     found = np.frombuffer(data, np.int64).reshape(2, -1)
     agents, owners = found
     if ((agents < 0) | (agents >= num_agents)).any() or not set(owners.tolist()) <= nodes:

@@ -99,7 +99,7 @@ def request_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:
 
 
 def read_request(data: memoryview, num_worlds: int, latency_ticks: int) -> ExchangeRequest:
-    """Read a request. Raises MessageError: the bytes are no request."""
+    """Read a request. Raises MessageError: the bytes are not a request."""
     slots, at = latency_ticks + 1, _HEAD.size + 8 * (latency_ticks + 1)
     if len(data) < at:
         raise MessageError(f"{len(data)} bytes are too short for an exchange")

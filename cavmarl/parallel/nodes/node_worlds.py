@@ -312,7 +312,7 @@ class NodeWorlds(CommandedWorlds):
         where = np.frombuffer(data, np.int64, num)
         check_indices("agent", where, suggested.size // 2)
         if rest:
-            raise MessageError(f"{len(data)} bytes are no suggestions")
+            raise MessageError(f"{len(data)} bytes are not suggestions")
         return where, np.frombuffer(data, suggested.dtype, 2 * num, 8 * num).reshape(-1, 2)
 
     def _read_states(self, data: memoryview) -> None:

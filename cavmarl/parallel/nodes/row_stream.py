@@ -147,7 +147,7 @@ class RowStream:
         """Read a frame of the other node.
 
         Raises:
-            MessageError: the bytes are no frame, or there is no room for its content.
+            MessageError: the bytes are not a frame, or there is no room for its content.
         """
         received, num = self._received, NO_FRAME
         if data and not len(data) % 8:
@@ -159,7 +159,7 @@ class RowStream:
                 received.make(-1 - num)
                 num = self._unpack(*args, received.now, frame)
         if num < 0:
-            raise MessageError(f"{len(data)} bytes are no frame of ghosts")
+            raise MessageError(f"{len(data)} bytes are not a frame of ghosts")
         if num or len(received.before.words):
             received.turn(num)
 

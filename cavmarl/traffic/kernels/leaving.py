@@ -1,6 +1,6 @@
 """Removal of vehicles from their shard when their trip has ended.
 
-`demand_generator.settle` counts them and orders their successors.
+`demand_generator.settle` counts these vehicles and orders their successors.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.zones.kernels.zone_lookup import note_outer
 
 
 @kernel
-def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
+def _has_ended(row: np.void, driver: int, ticks_per_step: int) -> bool:
     ending = EVENT_ARRIVED
     if driver == DRIVER_AGENT or driver == DRIVER_LEARNED:
         ending = EVENTS_THAT_END
@@ -32,7 +32,7 @@ def _is_through(row: np.void, driver: int, ticks_per_step: int) -> bool:
 
 
 @kernel
-def _strike(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
+def _remove_outer(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
     """Remove row i from the rows that other zones may see, and renumber row `last` to i."""
     outer = worlds.outer[w]
     num = worlds.num_outer[w]
@@ -73,7 +73,7 @@ def leave(
             continue
         i = 0
         while i < worlds.num_owned[w]:
-            if not _is_through(rows[w, i], driver, ticks_per_step):
+            if not _has_ended(rows[w, i], driver, ticks_per_step):
                 i += 1
                 continue
             departures.passing[w, departures.num_passing[w]] = rows[w, i]
@@ -85,7 +85,7 @@ def leave(
             worlds.num_owned[w] = last_owned
             worlds.num_rows[w] = last
             if worlds.num_outer[w] >= 0:
-                _strike(worlds, w, rows[w], i, last_owned)
+                _remove_outer(worlds, w, rows[w], i, last_owned)
 
 
 @kernel

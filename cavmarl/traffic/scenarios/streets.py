@@ -137,7 +137,7 @@ class Streets:
                 yield crossing
 
     def apart_m(self, crossing: Crossing) -> float:
-        """Return the distance from the shared area's centre on the foe's way to the own way."""
+        """Return the distance from the shared area's centre on the foe's path to the ego path."""
         rest, lane = crossing.foe_middle_m, int(self.network.links["first_internal"][crossing.foe])
         while rest > self.length_m(lane) and self.network.lanes["internal"][lane]:
             rest -= self.length_m(lane)

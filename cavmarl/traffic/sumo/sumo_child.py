@@ -120,7 +120,7 @@ class SumoSimulation:
     def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
         """Run one step: lanes change, puppets are placed, SUMO moves all other vehicles.
 
-        If no puppets are placed, the records that are no lanes are vehicles that ask for a way.
+        If no puppets are placed, the records that are not lanes are vehicles that ask for a way.
         """
         is_lane = moved["kind"] == LANE_CHANGE
         if is_lane.any():

@@ -1,4 +1,4 @@
-"""`SumoProcess`: the process of one SUMO, used by the world that it belongs to."""
+"""`SumoProcess`: a process that runs the SUMO of one world."""
 
 from __future__ import annotations
 
@@ -90,7 +90,7 @@ class SumoProcess:
         self._send(child.START, {**setup, "seen": SEEN.descr, "moved": MOVED.descr})
 
     @property
-    def lives(self) -> bool:
+    def is_alive(self) -> bool:
         return self._finalizer.alive
 
     def look_up(self, words: list[str]) -> dict[str, Any]:

@@ -76,7 +76,7 @@ class SumoWorlds:
 
     @property
     def pids(self) -> tuple[int, ...]:
-        return tuple(p.pid for p in self._processes if p is not None and p.lives)
+        return tuple(p.pid for p in self._processes if p is not None and p.is_alive)
 
     def begin(self, w: int, key: int) -> None:
         """Restart a world's SUMO for an episode.
@@ -86,7 +86,7 @@ class SumoWorlds:
         Raises ConfigError: SUMO refuses its files; SumoError: the process ended.
         """
         process = self._processes[w]
-        if process is None or not process.lives:
+        if process is None or not process.is_alive:
             process = self._processes[w] = SumoProcess(self._demand.setup())
         self._ticks[w] = None
         self.book.begin(w)

@@ -1,7 +1,7 @@
 """Records of messages, and the working memory of a message bus.
 
-A packet is one transmission of a station. It carries reports: in a CAM one of the sender, in a CPM
-one of each perceived vehicle. `v2x/v2x_messages.py` is the external schema. Records that outlive a
+A packet is one transmission of a station. It carries reports: a CAM one on its sender, a CPM one
+on each perceived vehicle. `v2x/v2x_messages.py` is the external schema. Records that outlive a
 tick have no padding, because the hash of the state covers all their bytes.
 """
 
@@ -76,7 +76,7 @@ PACKET = record(
     ("tick", np.int64),  # tick of sending
     ("x", np.float64),  # m, position of the sender
     ("y", np.float64),
-    ("word", np.uint64),  # the packet's half of random numbers, see `packet_word`
+    ("word", np.uint64),  # part of the random number of a reception, see `packet_word`
     ("kind", np.int32),
     ("first", np.int32),  # index of its first report
     ("count", np.int64),
@@ -111,7 +111,7 @@ RECEIVER = record(
     ("id", np.int64),  # -1: none
     ("x", np.float64),
     ("y", np.float64),
-    ("word", np.uint64),  # the receiver's half of random numbers, see `receiver_word`
+    ("word", np.uint64),  # part of the random number of a reception, see `receiver_word`
 )
 
 
@@ -134,7 +134,7 @@ class Sending(NamedTuple):
     unit_range_m: float
     memory_ticks: int  # lifetime of all other reports
     latency: int  # ticks between sending and receiving
-    decide: int  # ticks between decisions about chosen greens
+    decide: int  # ticks between decisions about the green phases of signals
 
 
 class Mail(NamedTuple):
@@ -197,7 +197,7 @@ class V2xScratch(NamedTuple):
     seen: NDArray[np.int32]  # (MAX_NEAR,) vehicles that the station sees, as rows of `vehicles`
     cams: Air  # CAMs
     others: Air  # all other packets
-    kinds: NDArray[np.int64]  # (NUM_KINDS,) number of packets received now
+    kinds: NDArray[np.int64]  # (NUM_KINDS,) number of packets received in this tick
     access: NDArray[np.bool_]  # (P,) whether a packet has channel access
     cam_of: NDArray[np.int32]  # (a power of 2,) hash table of the CAM of a sender, or -1
     heard: HeardCams

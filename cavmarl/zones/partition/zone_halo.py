@@ -23,7 +23,7 @@ _ROUNDING_M = 1e-6
 def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
     """Return a halo for `ghost_exchange.exchange` in which zones see all vehicles."""
     if not (math.isfinite(halo_m) and halo_m >= 0.0):
-        raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number from 0 on")
+        raise ConfigError(f"halo_m = {halo_m!r}: must be a finite number of at least 0")
     near = partition.within(halo_m)
     start = np.concatenate([[0], np.cumsum(near.sum(axis=1))]).astype(np.int32)
     return Halo(

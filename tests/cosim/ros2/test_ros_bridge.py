@@ -280,7 +280,7 @@ def test_two_vehicles_are_refused_by_a_profile_for_one(domain: int, run_bridge: 
 
 @pytest.mark.parametrize("key", ["deadline_s", "ready_s"])
 def test_options_that_are_not_numbers_or_negative_are_refused(key: str) -> None:
-    with pytest.raises(ConfigError, match=f"{key} = nan: must be a number from 0 on"):
+    with pytest.raises(ConfigError, match=f"{key} = nan: must be finite and at least 0"):
         RosOptions(**{key: math.nan})
     with pytest.raises(ConfigError, match="lag_steps = -1: must be at least 0"):
         RosOptions(lag_steps=-1)

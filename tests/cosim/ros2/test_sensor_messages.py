@@ -232,7 +232,7 @@ def test_message_types_equal_the_distributions(distro: str) -> None:
         assert types.store.serialize_cdr(again, kind) == types.encode(kind, fields)
     with pytest.raises(ValueError, match="has no field 'heigth'"):
         types.encode("sensor_msgs/msg/Image", {"heigth": 3})
-    with pytest.raises(ValueError, match="7 bytes are no sensor_msgs/msg/Image"):
+    with pytest.raises(ValueError, match="7 bytes are not a sensor_msgs/msg/Image"):
         types.decode("sensor_msgs/msg/Image", b"\0\1\0\0abc")
 
 

@@ -41,8 +41,8 @@ BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared ar
 GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
 GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # relative to the acceleration of any vehicle
 HARD_STOP = 5.0  # m/s²: a vehicle that needs more to stop before the line will not stop
-AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the own line)
-STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the own driver has waited long
+AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the ego line)
+STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the ego driver has waited long
 STEERED_AHEAD_S = 3.0  # time gap if one of both vehicles is steered, which may take longer
 STEERED_MERGE_AHEAD_S = 1.5  # time gap if both then drive into one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # from this acceleration on, a foe is assumed to keep accelerating
@@ -214,7 +214,7 @@ def _is_harmless(
         before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
         if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
             return True
-        # The own vehicle can follow a faster foe that drives into the same lane.
+        # The ego vehicle can follow a faster foe that drives into the same lane.
         follows: bool = conflict["merging"] and apart > ROOM_M and row["speed"] <= foe["speed"]
         return follows
     if 0.0 < rows[foe["row"]]["to_go"] < foe["dist"] + ARRIVES_M:

@@ -94,7 +94,7 @@ def wish_on_lane(
 ) -> float:
     """Return the desired acceleration in m/s² of a steered vehicle on its lane.
 
-    Only the leader counts: bends, lines and limits ahead affect both lanes and are no reason to
+    Only the leader counts: bends, lines and limits ahead affect both lanes and are not a reason to
     change lanes.
     """
     lane = row["lane"]
@@ -115,7 +115,7 @@ def wish_on_lane(
 def _has_rear_close_beyond(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
     """Return whether the rear of a vehicle that leaves a lane is less than `gap_m` m ahead.
 
-    `front` is the distance in m from the own front to the end of the lane.
+    `front` is the distance in m from the ego front to the end of the lane.
     """
     for link in range(lane["first_link"], lane["first_link"] + lane["num_links"]):
         for k in range(scratch.link_start[link], scratch.link_end[link]):

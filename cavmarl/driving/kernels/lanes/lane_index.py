@@ -223,7 +223,7 @@ def num_ahead(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float)
 def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: float) -> int:
     """Return the index of the rearmost other vehicle on `lane`, or -1.
 
-    The own vehicle is `distance` m before the start of the lane. Vehicles further from it than
+    The ego vehicle is `distance` m before the start of the lane. Vehicles further from it than
     `view_m` are not found.
     """
     k = int(scratch.lane_start[lane])

@@ -14,7 +14,7 @@ from cavmarl.driving.kernels.lanes.lane_index import beside_s
 
 LONGEST_HALF_M = 10.0  # half the length of the longest vehicle
 STAYS_ASIDE = 2  # value of `lane_change`: wait between two lanes
-MARGIN_M = 0.1  # on each side of the own body
+MARGIN_M = 0.1  # on each side of the ego body
 ASIDE_MPS = 5.0  # up to this speed, a vehicle between two lanes checks its side clearance
 
 
