@@ -31,7 +31,7 @@ def network() -> RoadNetwork:
 def constant_trace(
     network: RoadNetwork, counts: list[int], snapshot: LoadSnapshot, rounds: int = 8
 ) -> LoadTrace:
-    """Return a trace of constant loads: vehicles per zone of a grid, at 1 µs per vehicle."""
+    """Return a trace in which zone k always has counts[k] vehicles, which cost 1 µs each."""
     partition = cut_map(network, "grid", len(counts))
     middles = 0.5 * (partition.rects[:, :2] + partition.rects[:, 2:])
     places = np.repeat(middles, counts, axis=0)

@@ -1,4 +1,4 @@
-"""Folders of drafts: removed at the end of their block, or by the next draft after a kill."""
+"""Folders of drafts are removed at the end of their block, or after a kill by the next draft."""
 
 from __future__ import annotations
 

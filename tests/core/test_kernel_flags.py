@@ -43,7 +43,7 @@ print(kernel(last)(np.arange(3.0)))
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-def test_only_negative_indices_in_the_source_text_count_from_the_end(
+def test_only_constant_negative_indices_count_from_the_end(
     tmp_path: Path,
 ) -> None:
     script = tmp_path / "program.py"

@@ -21,7 +21,7 @@ OTHER = (
     "handoff/simulators/carla_zone_client.py",
     "handoff/simulators/carla_frames.py",
 )
-# Files outside of these folders that compute tables of results, or are drivers.
+# These files are in other folders. They compute tables of results, or are drivers.
 FILES = ("evaluate/*.py", "evaluate/scenarios/criticality.py", "../agents/*.py")
 
 # Functions of the C library or NumPy whose rounding depends on the processor.

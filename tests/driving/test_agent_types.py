@@ -106,7 +106,7 @@ def test_a_krauss_driver_keeps_the_speed_limit_if_it_decides_every_few_ticks() -
     assert np.median(accels) < 0.5
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     def drive(**keywords: Any) -> list[bytes]:
         vec = make("grid4x4", **keywords)
         vec.reset(seed=3)

@@ -49,7 +49,7 @@ def network(crossing: Callable[..., Path]) -> RoadNetwork:
 
 @pytest.fixture
 def blocks(network: RoadNetwork) -> Blocks:
-    """Return a function: does a foe from the west block a yielding car from the south (HOLD_*)?"""
+    """Return a function that tells how a foe from the west blocks a yielding car from the south."""
     link = network.links[FROM_SOUTH]
     first = int(link["first_conflict"])
     conflicts = network.conflicts[first : first + int(link["num_conflicts"])]
@@ -136,7 +136,7 @@ def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
 def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # The vehicle is over one second away from the area. A vehicle that moves goes on.
+    # The vehicle is over one second away from the area. A vehicle that moves does not stop.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 

@@ -102,7 +102,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
 
 
-def test_unused_slots_for_external_vehicles_change_nothing() -> None:
+def test_unused_slots_for_external_vehicles_change_no_result() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("ring", agents=1, background=8, overrides=overrides)) as env:
@@ -273,7 +273,7 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
     check_resumed(act, ROOM, at=24, steps=40)
 
 
-def test_sensors_messages_and_moving_borders_change_nothing() -> None:
+def test_sensors_messages_and_moving_borders_change_no_result() -> None:
     more = {"v2x.enabled": True, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
     undivided = hashes(overrides=ROOM | more)
     moving = {**more, "zones.repartition_steps": 6, "zones.check_invariants": True}

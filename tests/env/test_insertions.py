@@ -47,7 +47,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_unused_slots_for_insertions_change_nothing() -> None:
+def test_unused_slots_for_insertions_change_no_result() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:

@@ -108,7 +108,7 @@ def test_an_undivided_world_writes_no_table_of_transfers(tmp_path: Path) -> None
     assert report.to_dict()["policies"]["idm"]["transfers"] is None
 
 
-def test_transfers_without_a_duration_have_none() -> None:
+def test_the_duration_of_a_transfer_is_none_if_it_is_unknown() -> None:
     rows = np.zeros(2, TRANSFER)
     rows["ms"] = [1.5, np.nan]
     first, second = transfers_of(rows)

@@ -33,7 +33,7 @@ def test_separate_paths_are_not_near_even_if_the_map_lists_them_as_foes(
 def waiting_place(
     wait_m: float, enter_m: float, yields: tuple[bool, bool] = (True, False)
 ) -> float:
-    """Return the waiting position of a turn: netconvert's, or before the start of an area."""
+    """Return a turn's waiting position, for netconvert's position and the area's start, in m."""
     links, lanes = np.zeros(2, LINK), np.zeros(2, LANE)
     links["wait_m"] = wait_m, np.inf
     links["from_lane"] = links["to_lane"] = 0, 1
@@ -53,7 +53,7 @@ def waiting_place(
         (9.5, 10.0),  # a front stops 1 m before the position, so 0.5 m before the area
         (8.9, 9.9),
         (6.1, 7.1),
-        (5.9, 10.0),  # too near: vehicles wait for this area at the stop line
+        (5.9, 10.0),  # over 3 m before the position, so vehicles wait at the stop line
     ],
 )
 def test_a_turn_waits_inside_the_junction_before_the_shared_area(

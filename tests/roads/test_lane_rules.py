@@ -54,9 +54,8 @@ def test_lanes_forbid_lane_changes_to_vehicle_classes(grid: Path) -> None:
         == 0
     )
     mirrored = read_network(mirror_net(rules, rules.with_name("left.net.xml")))
-    assert (
-        classes_without_change(mirrored, f"{ROAD}_0", -1) == 0x1FF & ~BUS
-    )  # in left-hand traffic, SUMO's "left" is to the right
+    # In left-hand traffic, SUMO's "left" is to the right.
+    assert classes_without_change(mirrored, f"{ROAD}_0", -1) == 0x1FF & ~BUS
 
 
 @pytest.mark.parametrize("rules", ["", 'changeLeft="all" changeRight=""'])

@@ -146,7 +146,7 @@ def test_the_true_state_of_a_hidden_vehicle_has_no_effect() -> None:
 
 
 @pytest.mark.parametrize("split", [{"zones": 2}, {"zones": 4}, {"zones": 2, "workers": 2}])
-def test_zones_and_workers_change_nothing(split: dict[str, int]) -> None:
+def test_zones_and_workers_change_no_result(split: dict[str, int]) -> None:
     lossy = {"v2x.channel.loss": 0.3}
     whole, divided = made(lossy), made(lossy, **split)
     for one, other in zip(driven(whole, 40), driven(divided, 40), strict=True):

@@ -76,7 +76,7 @@ def test_vehicles_behind_a_house_are_hidden() -> None:
     assert hidden > 0
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     whole = [seen.tobytes() for seen, _ in seen_from(False, 40)]
     assert whole == [seen.tobytes() for seen, _ in seen_from(False, 40, zones=2)]
 

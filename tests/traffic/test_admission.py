@@ -75,7 +75,9 @@ def test_if_two_departures_would_touch_over_a_border_the_first_in_the_queue_ente
 
 
 @pytest.mark.parametrize(("present", "enter"), [(8, 2), (9, 1), (10, 0)])
-def test_a_full_world_accepts_only_as_many_as_fit(present: int, enter: int) -> None:
+def test_a_nearly_full_world_accepts_only_as_many_departures_as_fit(
+    present: int, enter: int
+) -> None:
     departures = queue_of(4)
     offer(departures, [(3, 300.0), (1, 100.0), (2, 200.0)])
     accept(departures, running(present), 10)

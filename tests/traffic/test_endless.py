@@ -30,7 +30,7 @@ def test_an_endless_trip_does_not_end() -> None:
     assert drive(endless=False)[1]
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     def seen(zones: int) -> list[bytes]:
         overrides = {"traffic.endless": True}
         vec = cavmarl.make_vec("ring", agents=3, background=6, zones=zones, overrides=overrides)

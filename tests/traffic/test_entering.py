@@ -237,7 +237,7 @@ def test_each_departure_speed_has_its_value_on_an_empty_lane(factor: float) -> N
     assert drawn.mean() == pytest.approx(0.5 * factor * LIMIT, rel=0.1)
 
 
-def test_speed_last_is_that_of_the_last_vehicle_and_speed_average_the_mean() -> None:
+def test_speed_last_is_the_speed_of_the_last_vehicle_and_speed_average_is_the_mean() -> None:
     _, room = traffic((MAIN[0], 120.0, 6.0), (MAIN[0], 150.0, 10.0))
     assert speed(room, speed_code=codes.SPEED_LAST) == 6.0
     assert speed(room, speed_code=codes.SPEED_AVERAGE) == 8.0

@@ -1,6 +1,6 @@
-"""Worlds of logged scenes: replayed road users, agents in logged seats, drivers that react.
+"""Worlds of logged scenes: replayed road users, agents in logged vehicles, reactive drivers.
 
-A divided world is the undivided one, bit for bit, over zones, workers and nodes.
+A divided world equals the undivided one, bit for bit, over zones, workers and nodes.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def rows_of(env: CavEnv, driver: int) -> NDArray[np.void]:
     return found
 
 
-def test_a_file_is_a_world_with_an_agent_in_the_vehicle_that_logged_it(scene: Path) -> None:
+def test_without_settings_the_agent_drives_the_vehicle_that_logged_the_scene(scene: Path) -> None:
     with closing(made(scene)) as env:
         assert env.config.max_steps == TIMES - 1
         (agent,) = rows_of(env, DRIVER_AGENT)
@@ -110,7 +110,7 @@ def test_poses_between_samples_are_interpolated(scene: Path) -> None:
         assert first["speed"] == pytest.approx(8.0, abs=1e-3)
 
 
-def test_seats_are_chosen_by_name_or_in_the_order_of_the_file(scene: Path) -> None:
+def test_vehicles_of_agents_are_chosen_by_name_or_in_the_order_of_the_file(scene: Path) -> None:
     with closing(made(scene, agents=2)) as env:
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([-60.0, 80.0], abs=1e-4)
     seats = {"scenario.seats": ["8", "7"]}
@@ -182,7 +182,7 @@ def hashes(scene: Path, kill_at: tuple[int, ...] = (), **more: Any) -> list[str]
 
 @pytest.mark.parametrize("params", [{}, {"reactive": True}, {"start_s": 1.0}])
 @pytest.mark.parametrize("seats", [["8"], ["7", "8"]])
-def test_zones_and_workers_change_nothing(
+def test_zones_and_workers_change_no_result(
     scene: Path, seats: list[str], params: dict[str, Any]
 ) -> None:
     overrides = {
@@ -228,7 +228,7 @@ def test_a_successor_of_a_dead_worker_continues(scene: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nodes_change_nothing(scene: Path) -> None:
+def test_nodes_change_no_result(scene: Path) -> None:
     for overrides in ({}, REACTIVE):
         whole = hashes(scene, overrides=overrides)
         assert hashes(scene, overrides=overrides, zones=2, nodes=2) == whole

@@ -68,7 +68,7 @@ def test_a_border_through_the_scene_changes_nothing(name: str, tmp_path: Path) -
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
-def test_workers_change_nothing_in_scenarios(
+def test_workers_change_no_result_in_scenarios(
     name: str, count: int, agents: int, tmp_path: Path
 ) -> None:
     place = ROOMY.get(name, "")

@@ -101,7 +101,7 @@ def test_without_rerouting_vehicles_wait_before_a_closed_road(tmp_path: Path, so
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
+def test_divisions_change_no_result(tmp_path: Path, source: str) -> None:
     """The world has agents, generated cars and SUMO's cars; the check compares rows every tick."""
     events = [
         {"at_s": 8, "action": "close", "edges": ["A0B0", "B1C1"]},

@@ -141,7 +141,7 @@ def hashes(source: str, folder: Path, **more: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
+def test_divisions_change_no_result(tmp_path: Path, source: str) -> None:
     undivided = hashes(source, tmp_path)
     assert hashes(source, tmp_path, zones=4) == undivided
     assert hashes(source, tmp_path, zones=2, workers=2) == undivided

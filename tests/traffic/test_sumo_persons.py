@@ -1,4 +1,4 @@
-"""SUMO's persons are mirrored as rows; containers and persons that are not are counted."""
+"""SUMO's persons are mirrored as rows; other persons, and containers, are counted."""
 
 from __future__ import annotations
 
@@ -84,7 +84,7 @@ def test_persons_are_at_their_places_in_sumo_until_they_arrive(tmp_path: Path) -
         assert np.abs(np.cos(people(simulation)["heading"] - heading)).max() > 0.99
 
 
-def test_zones_change_nothing(tmp_path: Path) -> None:
+def test_zones_change_no_result(tmp_path: Path) -> None:
     found = verify_zones(
         make_map(tmp_path),
         (1, 4),
@@ -100,7 +100,7 @@ def test_zones_change_nothing(tmp_path: Path) -> None:
         assert result.steps == 80
 
 
-def test_workers_change_nothing_even_if_one_dies(tmp_path: Path) -> None:
+def test_workers_change_no_result_even_if_one_dies(tmp_path: Path) -> None:
     net = make_map(tmp_path)
     made: dict[str, Any] = {"agents": 2, "overrides": settings("sumo-traffic", tmp_path)}
     plain, divided = parallel_env(net, **made), parallel_env(net, zones=2, workers=2, **made)

@@ -87,7 +87,7 @@ def test_sumos_cars_stop_before_actors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("name", ["pedestrian_crossing", "signal_outage"])
-def test_divisions_change_nothing(tmp_path: Path, source: str, name: str) -> None:
+def test_divisions_change_no_result(tmp_path: Path, source: str, name: str) -> None:
     found = verify_zones(
         "grid4x4",
         (1, 4),

@@ -100,7 +100,7 @@ def test_vehicles_stop_at_their_stops_for_the_given_time(tmp_path: Path) -> None
     assert second > first
 
 
-def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
+def test_zones_and_workers_change_no_result(tmp_path: Path) -> None:
     paths = [str(path) for path in write_stops(tmp_path)]
     both = {**MODE, "traffic.demand": paths, "clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
     verified = verify_zones(

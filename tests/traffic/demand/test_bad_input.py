@@ -120,7 +120,9 @@ def test_bad_routes_can_be_skipped_and_are_counted(demand: Reader) -> None:
     assert tally.first.endswith("line 2")
 
 
-def test_allowed_classes_and_the_class_ignoring_may_use_a_restricted_edge(demand: Reader) -> None:
+def test_allowed_classes_and_vehicles_that_ignore_permissions_may_use_a_restricted_edge(
+    demand: Reader,
+) -> None:
     types = '<vType id="i" vClass="ignoring"/><vType id="b" vClass="bus"/>'
     cars = "".join(
         f'<vehicle id="{t}" type="{t}" depart="0"><route edges="AB BX"/></vehicle>' for t in "ib"

@@ -56,7 +56,7 @@ def test_the_hash_covers_fields_and_not_padding(demand: Reader) -> None:
     assert replace(file, routes=other).content_hash != file.content_hash
 
 
-def test_a_later_element_changes_no_draw(demand: Reader) -> None:
+def test_an_added_flow_does_not_change_the_draws_of_other_flows(demand: Reader) -> None:
     flow = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
     alone = demand(flow).draw(KEY)
     beside = demand(flow + flow.replace('"f"', '"g"')).draw(KEY)
