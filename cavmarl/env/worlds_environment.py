@@ -175,8 +175,8 @@ class WorldsEnvironment(OwnWorlds):
 
         From the next step on, no vehicle enters the lanes, except those that cannot stop before
         them any more. Vehicles on the lanes leave them. The vehicles of `population.reroute` take
-        another way within a second. Vehicles without another way wait before the closed lanes, and
-        departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
+        another route within a second. Vehicles without another route wait before the closed lanes,
+        and departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
 
         Args:
             edge: id of a road.

@@ -80,7 +80,7 @@ def replay_file(
     )
 
 
-@call("stop_replayer", flag, returns=Returns.NOTHING, note="the world goes on where it stood")
+@call("stop_replayer", flag, returns=Returns.NOTHING, note="the world continues where it stopped")
 def stop_replayer(caller: Caller, session: CarlaSession, keep_actors: bool) -> None:
     session.recordings.end_replay()
 

@@ -60,7 +60,7 @@ class SumoDemand:
     num_persons: int  # persons that a world mirrors at the same time
     num_callers: int  # vehicles that the caller may pose or drive; persons follow them
     outages: Mapping[str, float]  # time of failure by signal, in s since the reset
-    reroutes: str  # which vehicles take another way if lanes change; empty: lanes do not change
+    reroutes: str  # which vehicles take another route if lanes change; empty: lanes do not change
     type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
     content_hash: str  # hash of all files
 
