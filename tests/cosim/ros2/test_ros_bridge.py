@@ -138,7 +138,7 @@ def test_without_commands_the_vehicle_brakes_and_a_warning_is_logged(
     report, _ = run_bridge(RosOptions(domain=domain, ready_s=0.2, deadline_s=0.0), 5)
     counts = report["controls"]["car_0"]
     assert (counts["held"], counts["used"], counts["received"]) == (6, 0, 0)
-    assert "no node publishes commands of car_0" in caplog.text
+    assert "no node publishes commands for car_0" in caplog.text
     # No node listens. Only messages for late subscribers and their time are sent.
     assert report["sent"] == {"/tf_static": 1, "/car_0/goal": 1, "/clock": 1}
 
@@ -274,7 +274,7 @@ def test_unsupported_options_and_worlds_are_refused(
 
 def test_two_vehicles_are_refused_by_a_profile_for_one(domain: int, run_bridge: Run) -> None:
     options = RosOptions(domain=domain, profile="autoware")
-    with pytest.raises(ConfigError, match="2 vehicles: the names of Autoware's topics are those"):
+    with pytest.raises(ConfigError, match="2 vehicles: Autoware's topic names allow one vehicle"):
         run_bridge(options, 1, ("car_0", "car_1"))
 
 

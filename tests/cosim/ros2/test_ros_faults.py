@@ -71,7 +71,7 @@ def test_a_node_of_another_domain_is_not_heard(
     with Driver(types, domain + 1):
         report, _ = run_bridge(RosOptions(domain=domain, ready_s=1.0, deadline_s=0.1), 5)
     assert report["controls"]["car_0"]["received"] == 0
-    assert f"no node publishes commands of car_0 on domain {domain}" in caplog.text
+    assert f"no node publishes commands for car_0 on domain {domain}" in caplog.text
 
 
 def test_a_node_that_dies_is_counted_as_late(domain: int, run_bridge: Run) -> None:
