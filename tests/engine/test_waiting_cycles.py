@@ -40,7 +40,7 @@ def block(roads: RoadNetwork) -> tuple[list[int], NDArray[np.void]]:
 
 
 def queues(roads: RoadNetwork, lanes: list[int]) -> NDArray[np.void]:
-    """Return queues of standing vehicles that fill these lanes; ids rise along the lanes."""
+    """Return queues of stopped vehicles that fill these lanes; ids rise along the lanes."""
     rows = []
     for lane in lanes:
         for s in np.arange(3.0, roads.lanes["length_m"][lane] - 3.0, 7.0).tolist():

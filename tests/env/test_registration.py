@@ -94,7 +94,7 @@ def test_invalid_names_are_refused(env: object) -> None:
 
 
 @pytest.mark.parametrize("overrides", [[1, 2], "sensors", 3])
-def test_overrides_that_are_no_mapping_are_refused(overrides: object) -> None:
+def test_overrides_that_are_not_a_mapping_are_refused(overrides: object) -> None:
     with pytest.raises(cavmarl.ConfigError, match="must map dotted keys"):
         cavmarl.parallel_env("ring", overrides=overrides)
 

@@ -540,7 +540,7 @@ def test_a_saved_state_continues_with_other_zones(sensing: str) -> None:
 
 
 def arrived(name: str) -> tuple[int, float]:
-    """Return the number of arrivals in 350 s, and a measure of the number of standing vehicles."""
+    """Return the number of arrivals in 350 s, and a measure of the number of stopped vehicles."""
     overrides = ALL | {
         "clock.ctrl_dt_s": 5.0,
         "horizon_s": 900.0,

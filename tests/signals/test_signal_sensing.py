@@ -92,7 +92,7 @@ def near_line(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.bool_]:
 
 
 def sums(rows: NDArray[np.void], lanes: NDArray[np.int64], num: int) -> NDArray[np.int64]:
-    """Return for each lane the numbers of vehicles and of standing vehicles."""
+    """Return for each lane the numbers of vehicles and of stopped vehicles."""
     standing = lanes[np.abs(rows["speed"]) < 0.1]
     return np.stack([np.bincount(each, minlength=num) for each in (lanes, standing)], axis=1)
 

@@ -1,4 +1,4 @@
-"""Worlds whose vehicles stand at positions that a test chooses, with their message bus."""
+"""Worlds whose vehicles are stopped at positions that a test chooses, with their message bus."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class StationWorld:
         self.bus.reset(np.ones(1, dtype=np.bool_))
 
     def put(self, places: NDArray[np.float64], **fields: Any) -> NDArray[np.void]:
-        """Replace all vehicles by standing vehicles at (n, 2) positions; vehicle k has the id k."""
+        """Replace all vehicles by stopped vehicles at (n, 2) positions; vehicle k has the id k."""
         rows = np.zeros(len(places), VEHICLE)
         rows[:] = blank_vehicle()
         rows["id"] = np.arange(len(places))

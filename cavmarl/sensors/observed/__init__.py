@@ -117,9 +117,9 @@ def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     """Return the largest distance at which an agent can sense a vehicle, centre to centre, in m.
 
     A vehicle that is further away changes no number of an observation and no reward term of the
-    package. Sensors that measure to vehicle centres, including `lanes`, reach as far as their
-    range. Rays end at bodies, whose centres can be half a diagonal behind the hit. Reward terms,
-    which are always computed, reach `TERMS_REACH_M`.
+    package. Sensors that measure to vehicle centres reach as far as their range; `lanes` also
+    ignores vehicles that are further away in the plane. Rays end at bodies, whose centres can be
+    half a diagonal behind the hit. Reward terms, always computed, reach `TERMS_REACH_M`.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
