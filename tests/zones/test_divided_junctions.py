@@ -80,7 +80,7 @@ def test_a_driver_does_not_wait_for_a_vehicle_that_cannot_reach_its_path(
 def test_a_bus_leaves_room_for_a_queued_bus_beyond_a_border(
     priority: Path, tmp_path: Path, is_second: bool
 ) -> None:
-    """The queued bus is stopped, but its path covers the position where the other bus would stop."""
+    """The queued bus is stopped, but its path covers the place where the other bus would stop."""
     here = DividedScene(priority, tmp_path, (6.0, -22.0), ("car", "bus"))
     here.put("waits", "S_in_0 N_out_0", -11.0, "bus", speed=8.0)
     here.put("queued", "E_in_0 S_out_0", -22.5, "bus", wait_s=10.0)
