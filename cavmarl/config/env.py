@@ -36,13 +36,14 @@ class MapConfig(Section, key="map"):
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. A `.sumocfg` stands for its network and signal programs. Or a
+            the eclipse-sumo wheel. A `.sumocfg` gives its network and signal programs. Or a
             list of map files, or a folder of them; the seed then draws a map for each episode of
             each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
-        program: the program of each signal named here, whatever was loaded; may be `off`.
-        buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
+        program: the program of each signal named here, instead of the last one loaded; may be
+        `off`. buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of
+        buildings
             (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,

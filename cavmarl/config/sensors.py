@@ -176,7 +176,7 @@ class KinematicsConfig(
     """highway-env's `Kinematics`: a table with a row per vehicle, starting with the ego vehicle.
 
     Attributes:
-        vehicles_count: rows, own vehicle included (highway-env: 5); 0 switches the sensor off.
+        vehicles_count: rows, including the ego vehicle (highway-env: 5); 0 switches the sensor off.
         features: columns, from `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
             `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`.
         features_range: feature to [min, max], mapped to [-1, 1]; other features stay unmapped.

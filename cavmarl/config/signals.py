@@ -43,7 +43,7 @@ class SignalsConfig(Section, key="signals"):
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
         longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
-            been red this long before a standing vehicle; 0: they do not.
+            been red this long before a stopped vehicle; 0: they do not.
         saturation_per_h: `webster`: vehicles per hour of green that leave a lane.
         flow_interval_s: `webster` plans from the vehicles counted in the last interval of this
             length.
@@ -66,7 +66,7 @@ class SignalsConfig(Section, key="signals"):
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
-            has received. Rewards are those of the truth in any case.
+            has received. Rewards always use the truth.
         loop_upstream_m: distance from the stop line to the loop before it.
         camera_range_m: how far from the signal a camera sees, along a lane.
         camera_height_m: height of a camera above the road.

@@ -36,7 +36,7 @@ class DenmConfig(Section, key="v2x.denm"):
     Attributes:
         rate_hz: repetition rate while an event lasts; 0: only events that agents declare are sent.
         hard_braking_mps2: deceleration from which braking is an event.
-        stationary_s: standing time from which a vehicle is an event.
+        stationary_s: time for which a vehicle must be stopped to be an event.
         validity_s: time for which a receiver keeps an event.
     """
 

@@ -28,12 +28,12 @@ class ZonesConfig(Section, key="zones"):
         backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
         halo_m: how far zones see over their borders; default: as far as exact results need. Less is
             an error.
-        approach_ticks: how many ticks before a vehicle reaches a zone, at its present speed, the
-            zone is told about it.
+        approach_ticks: a vehicle is offered to a zone this many ticks before it reaches the zone at
+            its present speed.
         journal: file for the coordinator's log; empty: none. It must not exist.
         check_invariants: check the invariants of ownership at run time.
         repartition_steps: steps between two checks whether a bisection by the positions of vehicles
-            would distribute them better. Results do not depend on it. 0: zones stay.
+            would distribute them better. Results do not depend on it. 0: zones never change.
         repartition_tolerance: share of the mean by which the fullest zone must shrink.
         simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
             a registered simulator (docs/guides/zone_simulators.md).

@@ -1,8 +1,8 @@
 """Baselines for a map: random actions, the built-in driver and a trained driver, and no traffic.
 
 Three drivers drive the same trips in traffic, under the rules of one environment on another map.
-The built-in driver also drives alone on the road, on other trips of the map. The difference to that
-row estimates the cost of traffic. It is no bound: another driver can be better.
+The built-in driver also drives alone on the road, on other trips of the map. The difference from
+that row estimates the cost of traffic. It is not a bound: another driver can be better.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def run_baseline(
         background: number of background vehicles; None: as configured by the environment.
         episodes: episodes of each driver in traffic. `idm` alone drives eight times as many, up to
             64.
-        seed: of the episodes.
+        seed: seed of the episodes.
         progress: as in `evaluate`.
         overrides: values of further keys of the environment.
         zones: as in `evaluate`.
@@ -134,7 +134,7 @@ def write_baseline(folder: Path, found: Mapping[str, EvaluationReport], path: Pa
 
 
 def _texts(driver: PolicyReport) -> list[tuple[str, str]]:
-    """Return mean and interval of each figure as texts."""
+    """Return mean and interval of each figure as text."""
     texts = []
     for metric in figures():
         one = driver[metric.name]

@@ -1,4 +1,4 @@
-"""The board: entries of drivers whose results are driven again, shown on one page.
+"""The board: a page of drivers whose results were reproduced by driving again.
 
 An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
 and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
@@ -69,17 +69,17 @@ class BoardEntry:
     """An entry as the page shows it.
 
     Attributes:
-        name: of the folder.
+        name: name of the folder.
         about: first sentence of the card.
-        kind: `trained`, `scripted` or `model`, which is of another library; empty if unknown.
-        environment: with its version; empty if the result cannot be read.
-        conditions: what differs from the environment as it is, for example other agents.
+        kind: `trained`, `scripted`, or `model` (a model of another library); empty if unknown.
+        environment: environment with its version; empty if the result cannot be read.
+        conditions: settings that differ from the environment's, for example other agents.
         episodes: number of episodes of all runs.
         trips: number of counted trips.
-        shares: by the names of `SHARES`.
+        shares: shares of trips, by the names of `SHARES`.
         digest: SHA-256 of the driver's first file.
-        version: of cavmarl that made the result.
-        failure: why the entry failed, with the remedy; empty if it is verified or cannot be.
+        version: version of cavmarl that made the result.
+        failure: why the entry failed, with the remedy; empty if it did not fail.
     """
 
     name: str
@@ -122,7 +122,7 @@ def entry_driver(folder: Path) -> Path:
 
 
 def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
-    """Check that an entry is complete and has the bytes of its result when it is driven again.
+    """Check that an entry is complete and that driving again reproduces the bytes of its result.
 
     The driver's script, if there is one, is run. A model file of another library is neither read
     nor run: the files of the verification are then empty.

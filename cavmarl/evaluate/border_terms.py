@@ -1,4 +1,4 @@
-"""Reward terms of agents near zone borders and inside zones, to reveal effects of borders."""
+"""Comparison of reward terms near zone borders and inside zones, to reveal effects of borders."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class BorderTerms:
         """Add a step.
 
         Args:
-            places_m: (W, A, 2) places of the agents before the step.
+            places_m: (W, A, 2) positions of the agents before the step.
             acted: (W, A) which agents count.
             terms: (W, A, T) terms of the step, registered ones last.
         """

@@ -16,10 +16,10 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def mirrored_conflicts(network: RoadNetwork) -> NDArray[np.int32]:
-    """Return (num_conflicts,) the row of the same area on the foe's path, -1 where paths merge.
+    """Return (num_conflicts,) the CONFLICT row of the same area on the foe's path; -1: paths merge.
 
-    After a merge both vehicles share a lane. That is following, which time to collision measures,
-    and not an encroachment.
+    After a merge both vehicles share a lane. This is car following, which time to collision
+    measures, not an encroachment.
     """
     links, conflicts = network.links, network.conflicts
     link = np.repeat(np.arange(len(links)), links["num_conflicts"])
@@ -60,7 +60,7 @@ class EncounterWatch:
         """Record a step.
 
         Args:
-            worlds: their state after the step.
+            worlds: the worlds after the step.
             now_s: time of the step.
             running: (W,) the worlds to watch.
             mask: (W, A) agents that drive.

@@ -50,7 +50,7 @@ TIMED_TICKS = 16  # one of this many ticks is timed zone by zone
 
 Progress = Callable[
     [str, int, int], None
-]  # called with policy, steps done, maximum number of steps
+]  # called with the policy, the steps done, and the maximum number of steps
 Watcher = Callable[[CavVectorEnv], Callable[[], None]]
 """Called with the worlds of a run; returns a function to call after each reset and step."""
 

@@ -87,7 +87,7 @@ TRANSFERS_FILE = "transfers.csv"
 TRANSFER_COUNTS_FILE = "transfer_counts.json"
 RESULT_FILES = [TRIPS_FILE, EPISODES_FILE, TRACKS_FILE, MAP_FILE, SPEED_FILE]
 PLACES_FILE = "places.json"  # only for divided worlds
-TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # the same, if the backend logs transfers
+TRANSFER_FILES = [TRANSFERS_FILE, TRANSFER_COUNTS_FILE]  # if the backend logs transfers
 RESOURCES_FILE = "resources.csv"  # only for worlds in other processes
 
 
@@ -131,7 +131,7 @@ def evaluate(
             run, and the maximum number of steps.
         watcher: called with the worlds that are stepped together; it returns a function that is
             called after each reset and step, outside of the measured time. With one run only.
-        keys: of the world; the seed is that of the first run and determines the others.
+        keys: keys of the world; the seed is that of the first run and determines the others.
 
     Raises:
         ConfigError: a wrong number or key, an override that contradicts a trained driver, `out`

@@ -33,7 +33,7 @@ class Failure:
 
     cause: str  # one of `CAUSES`
     severity: float  # higher is worse within a cause: m/s, or s of delay
-    trip: Mapping[str, Any]  # policy, run, seed, episode, agent, when and where it ended
+    trip: Mapping[str, Any]  # policy, run, seed, episode, agent, when and where the trip ended
     clip: Mapping[str, Any]  # `vehicles` and `frames` from `clip_of`
 
 
@@ -42,7 +42,7 @@ class FailureClips:
 
     Args:
         most: number of failures to keep.
-        config: of the worlds.
+        config: configuration of the worlds.
         about: values for each trip: policy, run, seed.
         observations: (W, A, D) observations of the agents, as the last step wrote them.
     """
@@ -136,13 +136,13 @@ class FailureClips:
 
 
 def _rounded(shape: Shape) -> Shape:
-    """Round places to decimetres, as a page has thousands of them."""
+    """Round positions to decimetres, because a page has thousands of them."""
     names = {"rays": ("from", "ends"), "links": ("points",)}[shape["kind"]]
     return shape | {name: [round(value, 1) for value in shape[name]] for name in names}
 
 
 def cause_of(trip: np.void) -> str:
-    """Return why a trip failed, one of `CAUSES`."""
+    """Return the cause of a failed trip, one of `CAUSES`."""
     return next((cause for cause in FATES if trip[cause]), "slow")
 
 
@@ -161,7 +161,7 @@ def worst(failures: Iterable[Failure], most: int) -> list[Failure]:
 
 
 def clip_of(frames: Sequence[WorldFrame], center: tuple[float, float]) -> dict[str, Any]:
-    """Return what frames show near a place, as numbers for a page.
+    """Return the vehicles near a place in some frames, as numbers for a page.
 
     Returns:
         `vehicles`: by id [length, width, agent]; `frames`: of each the tick and [id, x, y, heading,

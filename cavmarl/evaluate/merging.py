@@ -30,7 +30,7 @@ def merge_runs(parts: Sequence[Path], out: Path) -> None:
     """Write the results of several evaluations of one run each as runs 0, 1, … of one evaluation.
 
     Tables equal those of `evaluate(…, repeats=len(parts))` with the same seeds. The manifest keeps
-    those of the parts under `parts`.
+    the manifests of the parts under `parts`.
 
     Args:
         parts: results folders of the runs, in their order.

@@ -62,16 +62,16 @@ METRICS = (
     _share("off_road", "off road", "trips that ended off the road", "less"),
     _share("unfinished", "unfinished", "trips that a horizon cut: the episode's, or their own",
            "less"),
-    _share("blocked", "blocked", "trips that were cut where the built-in driver would stand, too",
-           "less"),
-    _share("stood", "stood", "trips that were cut where they stood, and the built-in driver would "
+    _share("blocked", "blocked", "trips that were cut while stopped where the built-in driver "
+           "would stop, too", "less"),
+    _share("stood", "stood", "trips that were cut while stopped where the built-in driver would "
            "drive", "less"),
-    _share("out_of_time", "out of time", "trips that were cut under way", "less"),
+    _share("out_of_time", "out of time", "trips that were cut while moving", "less"),
     _share("red_light", "red light", "trips that passed a red light", "less"),
     _share("wrong_way", "wrong way", "trips that drove against a lane", "less"),
     Metric(KM_PER_INFRACTION, "way per infraction", "km", "run",
            "kilometres driven for each collision, way off the road, red light and wrong way; with "
-           "none, all kilometres, which it is above", "more"),
+           "none, all kilometres (a lower bound)", "more"),
     Metric("agent_arrivals_per_h", "agents arriving", "1/h", "episode",
            "agents that arrived in an hour of simulated time", "more"),
     Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
@@ -79,7 +79,7 @@ METRICS = (
     _arrived("delay_s", "delay", "time lost against driving at the limit, or at the type's maximum "
              "speed", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
-    Metric("mean_speed_mps", "speed", "m/s", "trip", "way made towards the goal over time"),
+    Metric("mean_speed_mps", "speed", "m/s", "trip", "progress towards the goal over time"),
     Metric("energy_wh_per_km", "energy", "Wh/km", "run",
            "energy of the agents per kilometre of progress, as if they were electric cars", "less"),
     Metric("co2_g_per_km", "CO₂", "g/km", "run",
@@ -101,10 +101,11 @@ METRICS = (
     Metric("jain_speed", "speeds, Jain", "", "episode",
            "Jain's index of the agents' mean speeds: 1 is even", "more", bounded=True),
     Metric("gini_delay", "delays, Gini", "", "episode",
-           "Gini's coefficient of the agents' delays a kilometre: 0 is even", "less", bounded=True),
+           "Gini's coefficient of the agents' delays per kilometre: 0 is even", "less",
+           bounded=True),
     Metric("zone_imbalance", "zone imbalance", "", "episode",
-           "vehicles of the fullest zone over those of a mean one, mean over the steps: 1 is even",
-           "less"),
+           "vehicles of the fullest zone over the mean of all zones, mean over the steps: 1 is "
+           "even", "less"),
     _percent("v2x_reception_ratio", "packets received",
              "share of the packets within reach of a receiver that it received", "more"),
     Metric("v2x_latency_s", "latency of packets", "s", "episode",

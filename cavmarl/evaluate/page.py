@@ -57,7 +57,7 @@ def write_page(folder: Path, path: Path, story: Story | None = None) -> None:
 
 
 def _told(story: Story, report: EvaluationReport) -> dict[str, Any]:
-    """Return the parts of a story as the template shows them."""
+    """Return the parts of a story for the template."""
     from cavmarl.evaluate import plots
 
     with story.curve.open(encoding="utf-8", newline="") as file:

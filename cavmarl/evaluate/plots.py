@@ -197,7 +197,7 @@ def plot_map(outline: Mapping[str, Any], tracks: Rows, trips: Rows, color: str) 
 
 
 def _ways(tracks: Rows) -> list[NDArray[np.float64]]:
-    """Return polylines (n, 2) of the agents, split where an agent got a new vehicle."""
+    """Return the tracks (n, 2) of the agents, split where an agent got a new vehicle."""
     rows = tracks[np.lexsort((tracks["time_s"], tracks["agent"]))]
     places = np.stack([rows["x_m"], rows["y_m"]], axis=1)
     jumps = np.hypot(*np.diff(places, axis=0).T) > MAX_JUMP_M
@@ -237,7 +237,7 @@ def plot_series(series: Mapping[str, Sequence[float]], shown: Sequence[str], lab
 def plot_roads(
     lines: Sequence[NDArray[np.float64]], marked: Mapping[str, Sequence[NDArray[np.float64]]]
 ) -> str:
-    """Plot roads to scale, and some of them in colours with a legend.
+    """Plot roads to scale; draw some roads in colours with a legend.
 
     `lines`: (n, 2) each, in m. `marked`: label → lines.
     """

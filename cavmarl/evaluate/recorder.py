@@ -13,7 +13,7 @@ from cavmarl.rewards.kernels.terms import TTC_HORIZON_S
 SHORT_TTC_S = 1.5  # below this, a driver has no time to react (Hayward 1972; SSAM)
 PET_HORIZON_S = 10.0  # a pass after a longer time is no encounter
 SLOWEST = 3.0  # longest duration of a success, as a multiple of the free travel time
-STILL_S = 10.0  # a vehicle that has stood this long when its trip is cut counts as standing
+STILL_S = 10.0  # a vehicle that has been stopped this long when its trip is cut counts as stopped
 MIN_DISTANCE_M = 1.0  # shortest trip whose delay per kilometre is compared
 JERK_UNIT_MPS3 = 10.0  # unit of the term `comfort`
 BACKGROUND_COLUMNS = ("background_energy_wh_per_km", "background_co2_g_per_km")

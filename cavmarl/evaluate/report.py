@@ -43,7 +43,7 @@ class Found:
 
     mean: float | None  # mean of the run means; None without data
     # interval of that mean over independent runs; None with fewer than two runs that have the
-    # metric, or if all have one value and it is no share
+    # metric, or if all runs have the same value of a metric that is not a share
     between_run_ci95: Interval | None
     within_run: tuple[Within, ...]  # mean and spread of each run
 

@@ -86,7 +86,7 @@ class ResourceWatch:
         try:
             process = psutil.Process(pid)
             times, memory_bytes = process.cpu_times(), process.memory_info().rss
-        except psutil.NoSuchProcess:  # it is being replaced
+        except psutil.NoSuchProcess:  # the process is being replaced
             return (np.nan, np.nan, *unknown)
         used_s = times.user + times.system
         before_s, self._used_s[pid] = self._used_s.get(pid, 0.0), used_s

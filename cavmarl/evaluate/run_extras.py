@@ -22,10 +22,10 @@ class RunWatch:
 
     Args:
         vec: the worlds.
-        standing: the worlds, or a copy of remote ones.
+        standing: the worlds, or a copy of remote worlds.
         policy: name of the policy in the results.
         run: number of the run.
-        seed: of the run.
+        seed: seed of the run.
         record: options of the recording; None: no recording.
         failures: number of failed trips to keep.
         look: called at each moment of the worlds.

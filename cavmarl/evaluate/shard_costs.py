@@ -31,7 +31,7 @@ class MeasuredRound:
 class MeasuredWorlds:
     """Measured worlds of one environment."""
 
-    costs: tuple[ShardCost, ...]  # of their shards
+    costs: tuple[ShardCost, ...]  # costs of their shards
     # (n, 2) places of all vehicles after the last step, m
     places: NDArray[np.float64]
 

@@ -1,4 +1,4 @@
-"""Detection of agents that stand, with or without a reason, to explain unfinished trips."""
+"""Detection of agents that are stopped with or without a reason, to explain unfinished trips."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from cavmarl.env.vector import CavVectorEnv
 from cavmarl.evaluate.recorder import STILL_S, Recorder
 
 ASK_S = 5.0  # time between two queries of the built-in driver's action
-STILL_MPS = 0.1  # a slower vehicle stands
+STILL_MPS = 0.1  # a slower vehicle counts as stopped
 GO_MPS2 = 0.5  # acceleration with which the built-in driver would start
 
 
 class StandingWatch:
-    """Records how long agents have stood, and whether the built-in driver would stand."""
+    """Records how long agents have been stopped, and whether the built-in driver would stop."""
 
     def __init__(self, vec: CavVectorEnv, recorder: Recorder) -> None:
         self._vec = vec

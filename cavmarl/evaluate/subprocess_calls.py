@@ -33,7 +33,7 @@ def call_in_fresh_process(
     """Return `call(*given)` from a new interpreter, or raise the CavmarlError that it raised.
 
     If `hear` is given, `call` gets a further argument: a function that passes its own arguments to
-    `hear` in this process. If the new process dies, an `EvaluationError` names `what` it did.
+    `hear` in this process. If the new process dies, an `EvaluationError` names its task, `what`.
     `began` is called with the process, so that another thread can end it.
     """
     program = start_python(["-c", PROGRAM], stdin=subprocess.PIPE, stdout=subprocess.PIPE)

@@ -154,12 +154,12 @@ def run_signals(
     began: Callable[[SuiteWorld], None],
     overrides: Mapping[str, object] | None = None,
 ) -> dict[str, dict[str, list[SignalFigures]]]:
-    """Run each controller of signals in every world, and SUMO beside it if the map is a .sumocfg.
+    """Run each controller of signals in every world, and also SUMO if the map is a .sumocfg.
 
     Args:
         suite: has `controllers`.
         worlds: its worlds.
-        repeats: number of runs, with the seeds from `seed` on.
+        repeats: number of runs, with the seeds `seed`, `seed` + 1, ….
         seed: first seed.
         began: called before each world.
         overrides: values of further keys of every world.

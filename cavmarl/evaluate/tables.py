@@ -38,8 +38,8 @@ TRIP = np.dtype(
         ("collision", np.bool_),
         ("off_road", np.bool_),
         ("unfinished", np.bool_),  # cut by the horizon of the episode or of the trip
-        ("blocked", np.bool_),  # unfinished: stood where the built-in driver would stand, too
-        ("stood", np.bool_),  # unfinished: stood where the built-in driver would drive on
+        ("blocked", np.bool_),  # unfinished: stopped where the built-in driver would stop, too
+        ("stood", np.bool_),  # unfinished: stopped where the built-in driver would drive on
         ("out_of_time", np.bool_),  # unfinished: was moving
         # arrived in time, never entered a junction at red, never drove the wrong way. In time:
         # within the trip's horizon, or within SLOWEST times the free time if it has none
@@ -58,7 +58,7 @@ TRIP = np.dtype(
         ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
         ("least_pet_s", np.float64),  # least post-encroachment time; NaN: none up to PET_HORIZON_S
-        ("end_x_m", np.float64),  # its place before its last step
+        ("end_x_m", np.float64),  # position before the last step
         ("end_y_m", np.float64),
     ]
 )
@@ -68,7 +68,7 @@ EPISODE = np.dtype(
         ("run", np.int64),
         ("episode", np.int64),
         ("duration_s", np.float64),
-        ("trips", np.int64),  # number of trips that ended or were cut in it
+        ("trips", np.int64),  # number of trips that ended or were cut in the episode
         ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
         ("agent_arrivals_per_h", np.float64),  # of simulated time
         ("background_arrivals_per_h", np.float64),
@@ -93,7 +93,7 @@ TRANSFER = np.dtype(
     [
         ("run", np.int64),
         ("episode", np.int64),
-        ("tick", np.int64),  # counted over the whole run of the world, not reset with it
+        ("tick", np.int64),  # counted over the whole run of the world, not reset
         ("vehicle", np.int64),
         ("source", np.int64),
         ("target", np.int64),
@@ -125,7 +125,7 @@ RESOURCE = np.dtype(
         ("sent_frames", np.float64),
         ("vehicles", np.float64),  # owned at the end of the window, in all worlds
         ("ghosts", np.float64),  # copies of vehicles of other zones
-        ("slowest", np.float64),  # 1: the other nodes waited for this one
+        ("slowest", np.float64),  # 1: the other nodes waited for this node
         ("migrations", np.float64),  # changes of owner in the window, in the row of the caller
     ]
 )

@@ -54,8 +54,8 @@ class ZooEntry:
     name: str
     folder: Path
     weights_bytes: int
-    environment: str  # with its version, for example `merge-v6`; empty: no result
-    trips: int  # of the result
+    environment: str  # name and version, for example `merge-v6`; empty: no result
+    trips: int  # trips of the result
     shares: Mapping[str, float]  # shares of trips by the names of `SHARES`
     readings: tuple[Reading, ...] = ()  # what the driver reads, by source
     maps: tuple[RoadKind, ...] = ()  # kinds of the maps of its training
@@ -67,7 +67,7 @@ class Verification:
     """An entry's result compared with driving the same episodes again.
 
     Attributes:
-        name: of the driver.
+        name: name of the driver.
         expected: SHA-256 of each file of the result.
         found: SHA-256 of the files of this run.
         expected_on: processor on which the result was made.
@@ -108,7 +108,7 @@ class EntryJob:
 
 @dataclass(frozen=True)
 class Cross:
-    """Drivers among each other: `tables[a][b]` are the TRIP rows of a's vehicles among b's."""
+    """Results of drivers among others: `tables[a][b]` are TRIP rows of a's vehicles among b's."""
 
     drivers: tuple[str, ...]
     tables: Mapping[str, Mapping[str, NDArray[np.void]]]
@@ -144,7 +144,7 @@ def verify_result(folder: Path, driver: Path, progress: Progress | None = None) 
 
     Args:
         folder: contains the result.
-        driver: the trained driver's folder, or the script.
+        driver: folder of the trained driver, or the script.
         progress: as in `evaluate`.
 
     Raises:
@@ -265,7 +265,7 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
 
     Args:
         document: manifest of the result.
-        folder: of the driver.
+        folder: folder of the driver.
 
     Raises:
         ManifestError: the manifest does not contain it.
@@ -304,7 +304,7 @@ def check_weights(document: Mapping[str, Any], name: str, files: Sequence[Path])
 
 
 def _check_world(document: Mapping[str, Any], name: str, spec: WorldSpec) -> None:
-    """Raise an error if the world is not the result's; new and removed keys do not count."""
+    """Raise an error if the world is not that of the result; new and removed keys do not count."""
     here = json.loads(json.dumps(describe_world(*load_world(spec.env, **spec.keywords))))
     there = document["world"]
     try:

@@ -1,4 +1,4 @@
-"""`EvacuationPlan`: which areas are left, over which exits, and what happens to the roads."""
+"""`EvacuationPlan`: the areas that vehicles leave, the exits, and changes of roads."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ from cavmarl.roads.network import CARS, RoadNetwork
 SHORTEST_M = 15.0  # on a shorter lane, no vehicle begins its trip
 MOST_EXITS = 8  # number of exits that are chosen if the plan names none
 FAR_SHARE = 0.6  # chosen exits are at least this share of the largest distance away
-RADIUS_SHARE = 0.4  # of the radius that 90 % of the roads fill: the area if none is given
-AREA = "area"  # name of the area if none is given
+RADIUS_SHARE = 0.4  # default area: share of the radius that contains 90 % of the roads
+AREA = "area"  # name of the default area
 
 
 @dataclass(frozen=True, kw_only=True)
 class Area:
-    """An area that is left, as a polygon or as a list of roads.
+    """An area that vehicles leave, as a polygon or as a list of roads.
 
     Attributes:
         polygon: corners x, y in m of the map's frame; all roads whose middle is inside belong to
@@ -55,7 +55,7 @@ class EvacuationPlan(Section, key=""):
         within_s: vehicles depart evenly within this time after the order.
         horizon_s: simulated time.
         background: vehicles of the generator, which drive to goals of their own.
-        reroute_s: time between two searches of a vehicle for a faster way, which considers the
+        reroute_s: time between two searches of a vehicle for a faster route, which considers the
             speeds of the last minutes; 0: one search, after its departure.
         events: roads that close, open, or slow down; see `map.events`.
     """
@@ -160,7 +160,7 @@ def circle(x: float, y: float, radius_m: float, vehicles: int) -> Area:
 
 
 def default_exits(plan: EvacuationPlan, network: RoadNetwork) -> tuple[str, ...]:
-    """Return roads that end without a way on and are far from the areas, the widest ones first.
+    """Return dead ends that are far from the areas, the widest ones first.
 
     Raises ConfigError: the map has no such road.
     """

@@ -26,14 +26,14 @@ STEP_S = 1.0
 TICK_S = 0.1
 STANDING_MPS = 0.5
 SHARES = (0.5, 0.9, 1.0)
-RECOVERED_SHARE = 1.1  # traffic has recovered if at most this multiple stands as before the closure
+RECOVERED_SHARE = 1.1  # recovered: at most this multiple of the stopped vehicles before
 ENTRY, DEMAND = "env.yaml", "demand.rou.xml"
 Told = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
 class PreparedEvacuation:
-    """An evacuation whose environment is on disk."""
+    """An evacuation with its environment on disk."""
 
     plan: EvacuationPlan
     exits: tuple[str, ...]
@@ -65,12 +65,12 @@ class EvacuationResult:
     seed: int
     areas: dict[str, AreaResult]
     all: AreaResult
-    exits: dict[str, int]  # arrivals over each exit
-    longest_queue: int  # largest number of vehicles that stood at the same time
+    exits: dict[str, int]  # arrivals at each exit
+    longest_queue: int  # largest number of vehicles stopped at the same time
     mean_queue: float
-    queues: dict[str, int]  # of the roads with the longest queues: largest number that stood there
-    # time in s from the last opening of a road until as few vehicles stand as before the first
-    # closure; None: there is no closure that ends, or traffic did not recover
+    queues: dict[str, int]  # longest queues: largest number of stopped vehicles by road
+    # time in s from the last opening of a road until as few vehicles are stopped as before the
+    # first closure; None: there is no closure that ends, or traffic did not recover
     recovery_s: float | None
     deadlocks: tuple[tuple[int, ...], ...]  # at the end
     rerouted: int
@@ -92,7 +92,7 @@ def prepare(plan: EvacuationPlan, base: Path, folder: Path, seed: int) -> Prepar
         plan: the plan.
         base: folder that a relative path of the map refers to.
         folder: folder of the environment, which exists.
-        seed: of the order of departures.
+        seed: seed of the order of departures.
 
     Raises:
         ConfigError: the plan does not fit the map.
@@ -171,11 +171,11 @@ def run_evacuation(
 
     Args:
         prepared: the evacuation.
-        seed: of the world.
+        seed: seed of the world.
         zones: see `make_vec`; results do not depend on it.
         backend: see `make_vec`; results do not depend on it.
         overrides: values of further keys.
-        told: called in each second with the number of arrivals and of all vehicles.
+        told: called every second with the number of arrivals and the number of all vehicles.
 
     Raises the errors of `make_vec`.
     """
@@ -205,7 +205,7 @@ def _run(
 
 
 class _Meter:
-    """What is measured in each second of a run."""
+    """Measurements of a run, taken every second."""
 
     def __init__(self, prepared: PreparedEvacuation, vec: CavVectorEnv) -> None:
         self._plan, self._exits, self._ids = (
@@ -255,7 +255,7 @@ class _Meter:
         return not self._closures() or self._recovery_s() is not None
 
     def sample(self, time_s: float, rows: NDArray[np.void]) -> None:
-        """Note which vehicles drive, and where vehicles stand; `rows`: VEHICLE (n,)."""
+        """Record which vehicles drive and where vehicles are stopped; `rows`: VEHICLE (n,)."""
         there = np.zeros(len(self._departed_s), dtype=np.bool_)
         evacuees = rows[rows["order"] >= 0]
         there[evacuees["order"]] = True
@@ -291,7 +291,7 @@ class _Meter:
         ]
 
     def _recovery_s(self) -> float | None:
-        """Return the time from the last opening to as short queues as before; None: not yet."""
+        """Return the time from the last opening until queues are short again; None: not yet."""
         closures = self._closures()
         if not closures:
             return None
@@ -329,7 +329,7 @@ class _Meter:
         )
 
     def _arrivals(self) -> dict[str, int]:
-        """Return the number of arrivals over each exit."""
+        """Return the number of arrivals at each exit."""
         goals = self._evacuees.exit[np.isfinite(self._arrived_s)]
         return {name: int((goals == self._ids.index(name)).sum()) for name in self._exits}
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.records.arrays import RoadArrays
 
-MIN_SPEED_MPS = 1.0  # longest way that a front is followed back to its entry
+MIN_SPEED_MPS = 1.0  # least speed with which the entry of a front is extrapolated backwards
 
 
 @kernel
@@ -91,7 +91,7 @@ def watch_encroachments(
     seen_agent: NDArray[np.int32],
     least_s: NDArray[np.float64],
 ) -> None:
-    """Lower the least post-encroachment times of agents by the passes of one step.
+    """Update the least post-encroachment times of agents with the passes of one step.
 
     All vehicles first mark the areas that they cover. Then each vehicle reads the marks of the
     other
@@ -111,7 +111,7 @@ def watch_encroachments(
             never.
         seen_id: (W, num_conflicts) vehicle that covered it.
         seen_agent: (W, num_conflicts) agent that drove this vehicle, -1: none.
-        least_s: (W, A) lowered.
+        least_s: (W, A) updated: least time of each agent.
     """
     for w in range(rows.shape[0]):
         if not chosen[w]:

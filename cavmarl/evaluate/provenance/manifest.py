@@ -1,4 +1,4 @@
-"""The manifest of an evaluation: how results are made, written before the results.
+"""The manifest of an evaluation, which records how results are made before they exist.
 
 `open_manifest` writes the manifest before the first step. `close_manifest` completes it with the
 hashes of all results. If the process dies in between, the manifest stays open. Every report is read
@@ -102,7 +102,7 @@ def read_closed(folder: Path) -> Document:
     path = folder / MANIFEST_FILE
     if not path.is_file():
         raise ManifestError(
-            f"{folder}: no {MANIFEST_FILE}: the origin of these results is unknown; "
+            f"{folder}: has no {MANIFEST_FILE}: the origin of these results is unknown; "
             "make them with `cavmarl evaluate … --out FOLDER`"
         )
     document = _read(path)
@@ -113,7 +113,7 @@ def read_closed(folder: Path) -> Document:
         )
     for name, known in document["results_sha256"].items():
         file = folder / name
-        if not isfile(file):  # unlike methods of Path, it accepts impossible file names
+        if not isfile(file):  # unlike methods of Path, isfile accepts impossible file names
             raise ManifestError(f"{file}: is missing, though {path} lists it; run it again")
         if hash_of_file(file) != known:
             raise ManifestError(

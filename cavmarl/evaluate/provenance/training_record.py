@@ -33,7 +33,7 @@ def begin_training(
     world: World | Simulation,
     plans: Sequence[Plan] = (),
 ) -> None:
-    """Write the manifest of a training run, replacing that of an earlier run there.
+    """Write the manifest of a training run; an earlier manifest in the folder is replaced.
 
     `plans` say which worker hosts which shards; `cavmarl plan --again FOLDER/manifest.json`
     recomputes them. `seed` is one of the settings.
@@ -57,7 +57,7 @@ def end_training(folder: Path, files: Sequence[str], plans: Sequence[Plan] = ())
 
 
 def is_trained(folder: Path) -> bool:
-    """Return whether a run has ended there and its files are unchanged."""
+    """Return whether the folder has the unchanged files of a run that has ended."""
     try:
         read_closed(folder)
     except ManifestError:

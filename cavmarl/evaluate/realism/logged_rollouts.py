@@ -31,7 +31,7 @@ class RealismRun:
     driver: str
     rollouts: int
     seed: int
-    steps: int  # that were compared
+    steps: int  # number of compared steps
     evaluated: int  # vehicles that agents or built-in drivers drove
     replayed: int  # road users that followed the log
     # object steps of the log that are missing in rollouts because a vehicle had left, per cent
@@ -59,10 +59,10 @@ def measure_realism(
 
     Args:
         env: a scene file, or an environment with a logged scene.
-        driver: of the agents.
+        driver: driver of the agents.
         rollouts: number of episodes with different random numbers.
         agents: number of agents; None: as configured.
-        seed: of the first episode.
+        seed: seed of the first episode.
         overrides: values of further keys.
         told: called with the number of finished steps and the number of steps.
 
@@ -99,7 +99,7 @@ def measure_realism(
 
 @dataclass(frozen=True)
 class RealismSetup:
-    """What is compared: the first `evaluated` of the tracks, over some steps."""
+    """The compared tracks (the first `evaluated` ones) and steps."""
 
     log: LoggedTraffic
     tracks: list[Track]

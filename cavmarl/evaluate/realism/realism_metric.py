@@ -81,7 +81,7 @@ def realism_of(log: RolloutFeatures, rollouts: Sequence[RolloutFeatures], first:
     """Return the realism of rollouts.
 
     `first`: the first time that is compared; earlier times only serve derivatives. The values of a
-    rollout count where its object is there and, for derivatives, was there before and after.
+    rollout count where its object is present and, for derivatives, also present before and after.
 
     Raises ScenarioError: the log has no value of a component.
     """

@@ -35,7 +35,7 @@ class Trajectories:
 
     Attributes:
         poses: (N, T, 3) x and y of the centre in m, and heading in rad.
-        valid: (N, T) whether the object is there.
+        valid: (N, T) whether the object is present.
         sizes_m: (N, 2) length and width.
     """
 
@@ -46,7 +46,7 @@ class Trajectories:
 
 @dataclass(frozen=True)
 class RolloutFeatures:
-    """Features (E, T) of the first E objects. They have a value where `valid` holds.
+    """Features (E, T) of the first E objects. They have a value where `valid` is true.
 
     Derivatives are central differences: NaN at the first and the last time, accelerations also
     beside them.
@@ -170,7 +170,7 @@ def signed_distances(objects: Trajectories, corners: Numbers, k: int) -> Numbers
 def _times_to_collision(objects: Trajectories, evaluated: int, step_s: float) -> Numbers:
     """Return (E, T) the time until each object reaches the object that it follows, 5 s at most.
 
-    It is 5 s, too, where the speed of one of them is unknown.
+    It is also 5 s if the speed of either object is unknown.
     """
     moves = _half_steps(objects.poses[..., :2])
     speed = hypot_all(moves[..., 0], moves[..., 1]) / step_s
@@ -243,8 +243,8 @@ def _line_distance(points: Numbers, line: Numbers) -> Numbers:
     """Return (P,) the signed distance of points to a polyline, positive on its right.
 
     If the nearest point of the polyline is one of its vertices, the sides of both segments there
-    decide: a point is on the left of a bend to the right if it is on the left of either segment,
-    and of another bend if it is on the left of both.
+    decide: at a bend to the right, a point is on the left if it is on the left of either segment;
+    at another bend, if it is on the left of both segments.
     """
     start, step = line[:-1], np.diff(line, axis=0)
     away = points[:, None] - start[None]

@@ -57,8 +57,8 @@ def post_encroachment_s(one: NDArray[np.void], other: NDArray[np.void]) -> float
     (Allen, Shin, Cooper: "Analysis of traffic conflicts and collisions", Transportation Research
     Record 667, 1978). The arguments are TRACE (n,) and (m,), and the place is the ground that a
     body covers. The value is inf if no place was covered by both bodies, and 0 if both were there
-    at the same time. As bodies are known at discrete moments, it is too long by at most twice the
-    time between two of them.
+    at the same time. Because bodies are sampled at discrete moments, the value is too long by at
+    most twice the time between two samples.
     """
     reach = 0.5 * (hypot_all(one["length"], one["width"]).max(initial=0.0)
                    + hypot_all(other["length"], other["width"]).max(initial=0.0))  # fmt: skip

@@ -33,7 +33,7 @@ from cavmarl.evaluate.scenarios.criticality import (
 from cavmarl.policies.loading import load_policy
 
 DENSITIES = {"none": 0.0, "low": 2.0, "high": 8.0}
-"""Background vehicles a kilometre of lane."""
+"""Background vehicles per kilometre of lane."""
 
 HORIZON_S = 180.0
 
@@ -43,7 +43,7 @@ VERDICTS = {
     "stuck": 0,
     "passed": EVENT_ARRIVED,
 }
-"""From the worst on, with the event that says so."""
+"""Verdicts from the worst to the best, with the event that decides each."""
 
 
 @dataclass(frozen=True)
@@ -102,7 +102,7 @@ def make_scenario(
         place: place on the map; empty: drawn by the seed, which is also that of the first reset.
         density: density of the other traffic, one of `DENSITIES`.
         zones: number of zones; None: as configured by the environment.
-        keys: of the world; of the agents (default 1), the first is in the conflict and the others
+        keys: keys of the world; the first of the agents (default 1) is in the conflict, the others
             follow it.
 
     Raises:

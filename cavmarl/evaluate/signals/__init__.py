@@ -1,1 +1,1 @@
-"""Measures controllers of signals, beside SUMO with the map's own programs."""
+"""Compares controllers of signals with each other and with SUMO under the map's own programs."""

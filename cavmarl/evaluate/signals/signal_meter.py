@@ -12,14 +12,14 @@ from cavmarl.driving.vehicle_emissions import emissions_of
 from cavmarl.roads.network import RoadNetwork
 
 STANDING_MPS = 0.1
-LATE_S = 600  # arrivals in the last ten minutes tell whether a run jams
+LATE_S = 600  # length of the final period whose arrivals show whether a run jams
 
 # By vehicle id, of all vehicles that have departed.
 _TRIP = np.dtype(
     [
         ("departed_s", np.float64),  # NaN: not seen
-        ("late_s", np.float64),  # departure after it was due
-        ("lost_s", np.float64),  # time of the trip so far, minus that at the desired speed
+        ("late_s", np.float64),  # delay of the departure
+        ("lost_s", np.float64),  # time of the trip so far, minus the time at the desired speed
         ("waited_s", np.float64),  # below 0.1 m/s
         ("stops", np.int64),
         ("stands", np.bool_),  # at the last sample
@@ -43,10 +43,10 @@ class SignalFigures:
     waiting_s: float  # mean over departed vehicles: time below 0.1 m/s
     stops: float  # mean over departed vehicles
     queue: float | None  # vehicles below 0.1 m/s on lanes that end at a signal, mean of the samples
-    most_queued: int | None  # the same, most at a time
+    most_queued: int | None  # maximum of `queue` over the samples
     co2_g_per_km: float | None  # of a petrol car, see `emissions_of`
     switches_per_h: float | None  # changes of the green of a signal, mean over signals
-    longest_red_s: float | None  # longest time for which a lane was red while a vehicle stood on it
+    longest_red_s: float | None  # longest time for which a lane was red with a stopped vehicle
     jams: bool | None  # see `is_jammed`
 
 
@@ -125,7 +125,7 @@ class SignalMeter:
         self._samples += 1
 
     def _sample_lanes(self, standing: NDArray[np.int64], codes: NDArray[np.uint8]) -> None:
-        """Add the lanes of standing vehicles, -1 for lanes that do not end at a signal."""
+        """Add the lanes of stopped vehicles, -1 for lanes that do not end at a signal."""
         standing = standing[standing >= 0]
         self._queued += standing.size
         self._most_queued = max(self._most_queued, standing.size)

@@ -40,7 +40,7 @@ def run_controller(
         controller: one of `SIGNAL_CONTROLLERS`, or a controller of all signals; `map`: the map's
             own programs.
         seconds: simulated time.
-        seeds: of the worlds.
+        seeds: seeds of the worlds.
         overrides: values of further keys.
 
     Raises:

@@ -1,4 +1,4 @@
-"""Gridlocks of junctions: vehicles could move, but none does."""
+"""Gridlocks of junctions: vehicles wait although no red signal stops them, and none moves."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import SIGNAL_RED, SIGNAL_RED_YELLOW
 from cavmarl.roads.network import RoadNetwork
 
-STOP_LINE_M = 10.0  # a front this near to the end of its lane is at the stop line
+STOP_LINE_M = 10.0  # a front this close to the end of its lane is at the stop line
 
 
 class JunctionLocks:
     """The duration of locks of each junction, from samples once per second.
 
-    A vehicle *waits* at a junction if it stands inside it, or at the stop line of a lane with a
+    A vehicle *waits* at a junction if it is stopped inside it, or at the stop line of a lane with a
     link into the junction that has no red signal. A lock counts the seconds with a waiting vehicle
-    since a vehicle last entered or left the junction. It also ends when no vehicle stands there.
-    Seconds in which all vehicles that stand there have a red signal neither count nor end a lock.
+    since a vehicle last entered or left the junction. A lock also ends when no vehicle is stopped
+    there. Seconds in which all stopped vehicles have a red signal neither count nor end a lock.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -40,7 +40,7 @@ class JunctionLocks:
 
         Args:
             rows: VEHICLE (num_vehicles,), all on lanes of the map.
-            standing: (num_vehicles,) whether a vehicle stands.
+            standing: (num_vehicles,) whether a vehicle is stopped.
             codes: (num_links,) signal states of the links.
         """
         lanes = rows["lane"]

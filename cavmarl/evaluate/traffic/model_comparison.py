@@ -87,7 +87,7 @@ def compare_models(
         vehicles: number of vehicles at the beginning.
         seconds: duration.
         dt_s: step length of both simulators; a whole number of steps makes up `CTRL_DT_S`.
-        seed: of all sides.
+        seed: seed of all sides.
         teleports: whether SUMO may teleport vehicles that wait too long.
         progress: called with a text about the current work.
 
@@ -153,7 +153,7 @@ def _world(
 
 
 def _run(world: Simulation, seconds: int, trips: SumoTrips | None) -> TrafficRun:
-    """Run and measure a world; note its trips, if wanted."""
+    """Run and measure a world; record its trips if requested."""
     if trips is None:
         return run_native(world, seconds)
     trips.note(world)

@@ -42,8 +42,8 @@ class SumoJob:
     seconds: int  # duration from `demand.begin_s`
     dt_s: float  # step length
     seed: int  # seed of SUMO's random numbers
-    # whether SUMO may teleport vehicles that stand for too long (300 s, or as configured in the
-    # demand)
+    # whether SUMO may teleport vehicles that are stopped for too long (300 s, or as configured in
+    # the demand)
     teleports: bool = True
     # vehicles and flows that cavmarl drives, too; SUMO removes all others, and persons, when they
     # enter. None: nothing is removed
@@ -215,7 +215,7 @@ class VehicleReader:
         return codes
 
     def _blank(self, name: str) -> NDArray[np.void]:
-        """Return the initial VEHICLE (1,) of this vehicle, with a number for its name."""
+        """Return the initial VEHICLE (1,) of this vehicle, with a number instead of its name."""
         if name not in self._known:
             vehicle = self._libsumo.vehicle
             row = blank_vehicle()

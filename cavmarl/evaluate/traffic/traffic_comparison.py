@@ -26,17 +26,17 @@ class TrafficComparison:
 
     map_name: str  # the map's name
     seconds: int  # duration of both runs
-    dt_s: float  # step length of both
-    seed: int  # seed of both
-    ours: TrafficRun  # our run
-    sumo: TrafficRun  # SUMO's
+    dt_s: float  # step length of both runs
+    seed: int  # seed of both runs
+    ours: TrafficRun  # cavmarl's run
+    sumo: TrafficRun  # SUMO's run
     edge_ids: tuple[str, ...]  # ids of the map's edges, by EDGE row
     # parts of the demand that were left out or approximated, with counts
     tolerated: tuple[str, ...] = ()
     sumo_others: tuple[TrafficFigures, ...] = ()  # SUMO with further seeds, without contacts
 
     def ratio(self, figure: str) -> float | None:
-        """Return our value over SUMO's; None if SUMO's is zero or a value is missing."""
+        """Return cavmarl's value over SUMO's; None if SUMO's is zero or a value is missing."""
         ours, sumo = getattr(self.ours.figures, figure), getattr(self.sumo.figures, figure)
         return ours / sumo if figure in RATIOS and ours is not None and sumo else None
 
@@ -78,10 +78,10 @@ def compare_traffic(
         demand: route files and additional files, or one `.sumocfg`.
         seconds: duration from the beginning of the demand.
         dt_s: step length; a second is a whole number of steps.
-        seed: of both.
+        seed: seed of both simulators.
         teleports: whether SUMO may teleport vehicles that wait too long.
         sumo_seeds: number of seeds of SUMO, from `seed` on.
-        finished: called with our world at its end.
+        finished: called with cavmarl's world at its end.
         progress: called with a text about the current work.
 
     Raises:

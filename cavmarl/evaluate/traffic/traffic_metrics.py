@@ -16,7 +16,7 @@ from cavmarl.driving.kernels.motion.contacts import find_contacts
 from cavmarl.evaluate.traffic.junction_locks import JunctionLocks
 from cavmarl.roads.network import RoadNetwork
 
-STANDING_MPS = 0.1  # slower vehicles stand, as in SUMO's waiting time
+STANDING_MPS = 0.1  # slower vehicles count as stopped, as in SUMO's waiting time
 SAMPLES_PER_S = 1
 MINUTE_S = 60
 CELL_M = 10.0  # cell size of the grid for finding contacts
@@ -28,8 +28,8 @@ EDGE_MINUTE = np.dtype(
         ("edge", np.int32),  # EDGE row; never inside a junction
         ("minute", np.int32),  # since the beginning
         ("length_m", np.float64),  # of the edge
-        ("density_per_km", np.float64),  # vehicles on a kilometre of one lane
-        ("flow_per_h", np.float64),  # vehicles an hour on one lane
+        ("density_per_km", np.float64),  # vehicles per kilometre of one lane
+        ("flow_per_h", np.float64),  # vehicles per hour on one lane
         ("speed_mps", np.float64),  # flow over density
     ],
     align=True,
@@ -58,7 +58,7 @@ class TrafficFigures:
     arrived: int  # see `TrafficCounts`
     mean_speed_mps: float | None  # mean over all vehicles and samples; None without vehicles
     mean_delay_s: float | None  # see `TrafficCounts`
-    # standing vehicles (below 0.1 m/s) on lanes that end at a signal, mean of the samples
+    # stopped vehicles (below 0.1 m/s) on lanes that end at a signal, mean of the samples
     queue: float
     contacts: int  # pairs of vehicles whose rectangles began to overlap on the same level
     longest_lock_s: float  # the longest lock of any junction, see `JunctionLocks`
@@ -67,8 +67,8 @@ class TrafficFigures:
     # vehicles per hour on one lane, mean over all lanes outside junctions and the whole run, by
     # Edie's definition
     flow_per_h: float | None = None
-    # median time between the front bumpers of a vehicle that drives at least 1 m/s and the next
-    # vehicle on its lane, if this is at most 10 s
+    # median time between the front bumpers of two successive vehicles on a lane, if it is at most
+    # 10 s and the following vehicle drives at least 1 m/s
     median_headway_s: float | None = None
     distance_km: float = 0.0  # driven by all vehicles together
 
