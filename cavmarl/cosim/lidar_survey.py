@@ -39,7 +39,7 @@ SURVEY_RIG: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 _SETTLED_S = 5.0  # start of a drive whose frames are skipped while the filter finds its heading
-_STANDS_MPS = 0.3  # a vehicle slower than this sees nothing new
+_STANDS_MPS = 0.3  # frames of slower vehicles are skipped: they show nothing new
 _FRAMES_HELD = 200  # frames collected before the cloud is thinned
 
 
@@ -73,7 +73,7 @@ class _Drive:
 class Surveyor:
     """Drives the vehicles of some worlds and collects their lidar echoes.
 
-    `env`: with `SURVEY_RIG` and one vehicle per world. `range_m`: maximum range of used echoes.
+    `env`: worlds with `SURVEY_RIG` and one vehicle each. `range_m`: maximum range of used echoes.
     `voxel_m`: one point is kept in each cube with this side.
 
     Raises ConfigError: there is no lidar with several layers, or no GNSS.

@@ -18,7 +18,7 @@ from cavmarl.roads.network import RoadNetwork
 Points = NDArray[np.float64]
 
 _ON_LANE_M = 0.4  # maximum horizontal distance of a point on a lane from the lane's surface
-_HIGH_M = 0.5  # above the road; higher points are not ground
+_HIGH_M = 0.5  # height above the road; higher points are not ground
 _WALL_M = 2.0  # points farther from a wall belong to other objects
 _SEEN_M = 0.5  # a place on a lane is covered if a point is this near
 _MARGIN_M = 1.0
@@ -29,9 +29,9 @@ _SAMPLED_M = 0.5  # spacing of samples on the map's surface
 class SurveyFit:
     """The distance of a cloud from a map's surface; in m."""
 
-    height_rmse_m: float  # of points on lanes, vertical
+    height_rmse_m: float  # vertical error of points on lanes
     height_median_m: float
-    wall_rmse_m: float | None  # of points near walls, across the wall; None: there are none
+    wall_rmse_m: float | None  # error of points near walls, across the wall; None: no such points
     wall_median_m: float | None
     seen_share: float  # covered share of the lanes around the cloud
 

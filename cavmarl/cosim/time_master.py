@@ -163,7 +163,7 @@ class ClockEvent(NamedTuple):
     tick: int  # the master's tick at detection
     # `own_tick`: a follower tried to tick; `drift`: a world was advanced without its master
     kind: Literal["own_tick", "drift"]
-    follower: str  # its name; empty for a drift
+    follower: str  # name of the follower; empty for a drift
     ticks: int  # number of ticks by which the world was or would have been advanced
 
 
@@ -173,7 +173,7 @@ class TimeFollower:
 
     master: TimeMaster  # the master of the clock
     name: str
-    own_ticks: int = 0  # number of its own ticks
+    own_ticks: int = 0  # number of ticks that it has requested
 
     @property
     def time_s(self) -> float:

@@ -27,12 +27,12 @@ from cavmarl.roads.sumo_net.xml_source import read_xml
 
 Ring = NDArray[np.float64]
 
-DEFAULT_HEIGHT_M = 8.0  # height of a building if the file does not give it
+DEFAULT_HEIGHT_M = 8.0  # height of a building if the file does not state it
 LEVEL_M = 3.0  # height of a level, if only the number of levels is given
 
 PASSABLE_M = 3.0  # vehicles and rays pass under a building that begins at this height or higher
 
-# Values of building=* for buildings without walls, or that rays pass under.
+# Values of building=* for buildings without walls and for buildings under which rays pass.
 _NO_WALLS = frozenset(("no", "roof", "carport", "canopy", "demolished", "ruins"))
 _METRES = re.compile(r"\s*(-?[0-9]+(?:\.[0-9]+)?)\s*(?:m|metres?)?\s*")
 _MOST_HEIGHT_M = 1000.0
@@ -47,8 +47,8 @@ class Footprint:
     # (n, 2) corners in m in the map's frame, the first not repeated; the inside is given by the
     # even-odd rule
     rings: tuple[Ring, ...]
-    height_m: float  # above the ground
-    layer: float = 0.0  # OSM's order of things that cross; 0: on the ground
+    height_m: float  # height above the ground
+    layer: float = 0.0  # OSM's vertical order of crossing objects; 0: on the ground
 
 
 def read_footprints(path: Path, geo: GeoReference | None) -> list[Footprint]:
@@ -278,7 +278,7 @@ MOST_CORNERS = 4000
 def with_buildings(network: RoadNetwork, path: Path) -> RoadNetwork:
     """Return a network with the buildings of a file.
 
-    A building with a layer above 0 over a lane is a bridge of buildings, and is left out.
+    A building with a layer above 0 over a lane is taken to bridge the road, and is left out.
 
     Returns:
         A network whose `source_hash` covers both files.
@@ -322,7 +322,7 @@ def _is_near(network: RoadNetwork, footprint: Footprint) -> bool:
 
 
 def _check_size(path: Path, footprint: Footprint) -> None:
-    """Raise an error for an object that is too large to be a building, and to fit into memory."""
+    """Raise an error for an object that is too large for a building and for the memory."""
     corners = np.concatenate(footprint.rings)
     size_m = float(np.ptp(corners, axis=0).max())
     if size_m > LARGEST_M or len(corners) > MOST_CORNERS:

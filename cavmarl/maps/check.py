@@ -22,7 +22,7 @@ from cavmarl.roads.network import CARS, SIGNAL_STATES, RoadNetwork
 # A limit below walking speed or above the speed of any car probably has a wrong unit.
 _SPEED_RANGE_MPS = (1.0, 70.0)
 _STEEP = 0.15
-_ROUNDING = 0.005  # error of grades, because positions are rounded to the centimetre
+_ROUNDING = 0.005  # tolerance of grades, because positions are rounded to the centimetre
 _STUB_M = 1.0  # shorter lanes do not allow an estimate of the grade
 _WELL_CONNECTED = 0.9
 _GREEN = [SIGNAL_STATES.index(letter) for letter in "gGosOY"]
@@ -38,8 +38,8 @@ class MapReport:
     lane_km: float
     edges: int
     lanes: int
-    junctions: int  # where more than two edges meet
-    junctions_by_type: dict[str, int]  # all nodes of the map by SUMO's type
+    junctions: int  # number of places where more than two edges meet
+    junctions_by_type: dict[str, int]  # number of nodes of the map by SUMO's type
     signals: int  # traffic lights
     programs: int  # programs of all traffic lights
     actuated_signals: int  # traffic lights with an actuated program
@@ -51,7 +51,7 @@ class MapReport:
     horizon_s: float  # default duration of an episode, if only the map is given
     dead_ends: tuple[str, ...]  # edges that lead nowhere
     lanes_without_successor: tuple[str, ...]  # lanes that lead nowhere, except on dead ends
-    junctions_without_right_of_way: tuple[str, ...]  # where lanes meet without a rule
+    junctions_without_right_of_way: tuple[str, ...]  # junctions where lanes meet without a rule
     signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
     lanes_never_green: tuple[str, ...]  # lanes whose signal never opens any movement
     # signal programs (signal/program) that are simplified: programs with a choice between following

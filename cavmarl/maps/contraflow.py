@@ -1,8 +1,8 @@
 """Networks with contraflow lanes: lanes on a road that lead in the opposite direction.
 
-Each contraflow road is an edge of its own, on the ground of the road that it reverses. The reader
+Each contraflow road is a separate edge in the same place as the road that it reverses. The reader
 of networks gives its lanes no permissions, so that no route on the map uses it. A world opens it
-after the road below has been closed and is empty.
+after the reversed road has been closed and is empty.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cavmarl.roads.contraflow_ids import contraflow_of
 from cavmarl.roads.sumo_net.reader import map_name, source_hash
 from cavmarl.roads.sumo_net.xml_source import read_tree
 
-# Increase the number if the network is made in another way, so that the cache makes it anew.
+# Increase the number when networks are made differently, so that cached networks are made again.
 _CONVERSION = "contraflow 1"
 
 
@@ -90,7 +90,7 @@ _EXACT = ("--precision=6", "--no-turnarounds", "--offset.disable-normalization")
 
 
 class _Contraflow:
-    """The elements of plain XML that a network gets, in the order of the roads."""
+    """The elements that a network gets, as netconvert's plain XML, in the order of the roads."""
 
     def __init__(self, document: NetDocument, roads: Sequence[str]) -> None:
         self._roads = {
@@ -105,7 +105,7 @@ class _Contraflow:
         self.connections = [element for name in roads for element in self._connections(name)]
 
     def controlled(self, signals: Element) -> Iterable[Element]:
-        """Yield the movements that a signal controls, with the letters of movements beside them.
+        """Yield the movements that a signal controls, with the letters of the adjacent movements.
 
         `signals`: the root of a file of signals.
         """

@@ -36,7 +36,7 @@ class Defect:
     """A place that looks wrong."""
 
     kind: str
-    name: str  # of the lane, junction, signal or edge
+    name: str  # name of the lane, junction, signal or edge
     x_m: float
     y_m: float
     about: str
@@ -84,7 +84,7 @@ def find_defects(
 
 
 def cut_off_edges(network: RoadNetwork) -> list[int]:
-    """Return edges for cars (EDGE rows) that neither reach the largest part nor are reached."""
+    """Return edges for cars (EDGE rows) without a connection to and from the largest part."""
     from cavmarl.maps.components import strong_components
 
     open_lanes = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
@@ -123,7 +123,7 @@ def _middle(network: RoadNetwork, edge: int) -> tuple[float, float]:
 def _unruled_crossings(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
     """Find paths that cross in a junction without a rule or a signal.
 
-    The rules are read from the file, because the network has added rules where the file has none.
+    The rules are read from the file, because the reader adds missing rules to the network.
     """
     links = network.links
     rules = {
@@ -240,7 +240,7 @@ def _stop_lines_inside(network: RoadNetwork, document: NetDocument) -> Iterator[
 
 
 def _shared_strips(network: RoadNetwork, document: NetDocument) -> Iterator[Defect]:
-    """Find opposite lanes on the same strip, where the file draws them: the reader moves them."""
+    """Find opposite lanes that the file draws on the same strip; the reader moves them apart."""
     for strip in strips_of(network, document):
         for one, other in strip.lanes:
             x, y = network.lane_polyline(one)[0, :2].tolist()
@@ -267,7 +267,7 @@ def _with_height(points: Points) -> list[tuple[float, float, float]]:
 
 
 def _tight_corners(network: RoadNetwork) -> Iterator[Defect]:
-    """Find corners inside roads that the reader has no room to round."""
+    """Find corners inside roads that the reader cannot round for lack of room."""
     cars = (network.lanes["permissions"] & CARS != 0) & ~network.lanes["internal"]
     for lane in np.flatnonzero(cars).tolist():
         shape = network.lane_polyline(lane)
@@ -296,7 +296,7 @@ def _buildings_on_roads(
     network: RoadNetwork, document: NetDocument, buildings: Path
 ) -> Iterator[Defect]:
     """Find lanes inside buildings; tunnels, passages and covered roads lead through them."""
-    # SUMO's polygons have no ways.
+    # SUMO's polygons have no tags of ways.
     covered = {name for name, way in OsmRoads(buildings).ways.items() if way.is_covered}
     passages = {lane.id for lane in document.lanes if covered.intersection(lane.ways)}
     is_passage = np.array([id_ in passages for id_ in network.lane_ids], dtype=np.bool_)

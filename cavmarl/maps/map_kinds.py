@@ -1,4 +1,4 @@
-"""The kind of a map file, determined by its content and not by its name."""
+"""The kind of a map file, determined from its content instead of its name."""
 
 from __future__ import annotations
 

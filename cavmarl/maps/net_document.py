@@ -79,7 +79,7 @@ class NetDocument:
 
     @property
     def offset_m(self) -> tuple[float, float]:
-        """By how much netconvert has moved the source's coordinates to x and y of the network."""
+        """The offset that netconvert has added to the source's coordinates."""
         location = self.root.find("location")
         words = "0,0" if location is None else location.get("netOffset", "0,0")
         x, y = map(float, words.split(","))
@@ -107,7 +107,7 @@ def points_of(element: Element) -> Points:
 
 
 def shape_text(plane: list[str], heights_m: Points) -> str:
-    """Return a `shape` of positions in the plane, as they are in the file, with heights."""
+    """Return a `shape` from positions in the plane, with the digits of the file, and heights."""
     return " ".join(
         f"{place},{height:.{HEIGHT_DIGITS}f}"
         for place, height in zip(plane, heights_m.tolist(), strict=True)

@@ -70,7 +70,7 @@ OSM_OPTIONS = (
     "--keep-edges.by-vclass=passenger",
     "--remove-edges.isolated",
     *LANE_OPTIONS,
-    "--output.original-names",  # ids of the ways of each lane, for bridges, names, defaults
+    "--output.original-names",  # keeps OSM way ids of lanes, for bridges, names, defaults
 )
 OPENDRIVE_OPTIONS = ("--opendrive.import-all-lanes=false",)
 
@@ -83,7 +83,7 @@ _OPTIONS: dict[MapKind, tuple[str, ...]] = {
 _ISOLATED = "Removed a road without junctions"  # begins a warning
 _TOLERANT = "--ignore-errors"
 _LEFT_HAND = "--lefthand"
-# Increase the number if a source is converted in another way, so that the cache converts it anew.
+# Increase the number when sources are converted differently, so that cached maps are made again.
 _CONVERSION = "conversion 2"
 _SCENE_CONVERSION = "scene 2"  # the same for logged scenes
 
@@ -108,15 +108,15 @@ class BuildResult:
     source: Path  # the file from which it was built
     kind: MapKind  # kind of the source
     options: tuple[str, ...]  # netconvert's options; empty if a SUMO network was copied
-    # netconvert's warnings, counted by their text without names and numbers
+    # numbers of netconvert's warnings, by text without names and numbers
     warnings: dict[str, int]
     # changes that netconvert reports: joined junctions, guessed roundabouts …
     corrections: tuple[str, ...]
-    # with `tolerant`, ignored errors of netconvert; the objects named there were left out
+    # with `tolerant`, ignored errors of netconvert; the named objects were left out
     dropped: tuple[str, ...]
     provenance: dict[str, str]  # origin of the map, as written in its file
     defaults: tuple[RoadDefaults, ...] = ()  # missing values, from the type map
-    notes: tuple[str, ...] = ()  # what the source contains and the network does not, with counts
+    notes: tuple[str, ...] = ()  # elements of the source that are not in the network, with counts
     heights: HeightReport | None = None
     levels: int = 0  # number of lanes that cross on a bridge or in a tunnel; 0 with `heights`
 
@@ -149,8 +149,8 @@ def build_network(
         options: additional options for netconvert.
         bbox: keep the roads within (min, min, max, max): longitude and latitude in degrees for
             OSM, otherwise metres in the source's own frame.
-        side: side of the road on which vehicles drive; None: OSM: that of the country, OpenDRIVE:
-            the `rule` of the roads. A SUMO network has its own.
+        side: side of the road on which vehicles drive; None: the side of the country (OSM), or the
+            `rule` of the roads (OpenDRIVE). A SUMO network has its own side.
         origin: latitude and longitude of the map's x = y = 0, OSM only; by default the corner of
             the roads, in UTM.
         heights: terrain models for the roads; positions in the plane do not change. Without models,
@@ -216,7 +216,7 @@ def build_network(
 def map_file(path: str | Path) -> Path:
     """Return the SUMO network of a map file: the file itself, or the result of netconvert.
 
-    A configuration of SUMO stands for the network that it names.
+    For a configuration of SUMO, this is the network that it names.
 
     Raises MapError: see `build_network`.
     """
@@ -235,7 +235,7 @@ def map_file(path: str | Path) -> Path:
 
 
 def conversion_notes(path: Path) -> list[str]:
-    """Return what the conversion of a network from another format decided, guessed or ignored."""
+    """Return notes on the decisions, guesses and ignored elements of a map's conversion."""
     origin = read_provenance(path)
     if origin.get("traffic side", "").startswith("right"):
         del origin["traffic side"]  # the usual side
@@ -301,8 +301,8 @@ class _Build:
     log: BuildLog = field(default_factory=BuildLog)
     defaults: tuple[RoadDefaults, ...] = ()
     notes: tuple[str, ...] = ()
-    roads: OsmRoads | None = None  # of OSM
-    decided: str = ""  # the traffic side, and what has decided it
+    roads: OsmRoads | None = None  # roads of an OSM extract
+    decided: str = ""  # the traffic side, and the reason for it
     report: HeightReport | None = None
     levels: int = 0
 
@@ -339,7 +339,7 @@ class _Build:
         draft.write_text(drawn.text, encoding="utf-8")
 
     def _prepared(self, folder: Path) -> Path:
-        """Return the file for netconvert: the source, or a copy of it in a form that it reads."""
+        """Return the file for netconvert: the source, or a copy that netconvert can read."""
         if self.kind == "osm":
             self.roads = OsmRoads(self.source)
             self.roads.refuse_without_roads()
@@ -365,7 +365,7 @@ class _Build:
             self.options += (_LEFT_HAND,)
 
     def _side_of_place(self, roads: OsmRoads) -> Side:
-        """Return the traffic side of the country; raises MapError if there are both or neither."""
+        """Return the traffic side of the country; raises MapError if it is ambiguous."""
         west, south, east, north = self.bbox or (-180.0, -90.0, 180.0, 90.0)
         ways = (way for way in roads.ways.values() if way.for_cars)
         nodes = {node for way in ways for node in way.nodes}

@@ -18,7 +18,7 @@ from cavmarl.maps.provenance import RoadDefaults
 from cavmarl.maps.traffic_sides import Side
 from cavmarl.roads.sumo_net.xml_source import limit, read_tree, read_xml
 
-NO_LIMIT_MPS = 142.0 / 3.6  # as netconvert reads `maxspeed=none` of OSM
+NO_LIMIT_MPS = 142.0 / 3.6  # netconvert's value for `maxspeed=none` of OSM
 WALKING_MPS = 5.0 / 3.6  # lower limits are more likely a wrong unit
 MAX_GEOMETRY_M = 100_000
 LENGTH_LIMIT = "CAVMARL_MAX_GEOMETRY_M"  # environment variable that changes this limit
@@ -30,7 +30,7 @@ _TRAVELLED = {
     "driving": 13.89, "entry": 22.22, "exit": 22.22, "onRamp": 22.22, "offRamp": 22.22,
     "mwyEntry": 22.22, "mwyExit": 22.22, "bus": 13.89, "taxi": 13.89,
 }  # fmt: skip
-# Types that netconvert leaves out silently, and the type as which they are read.
+# Lane types that netconvert leaves out silently, with the type that replaces them.
 _READ_AS = {"slipLane": "driving", "shared": "driving", "connectingRamp": "offRamp"}
 # netconvert would open these lanes to through traffic, or close them silently.
 _NOT_TRAVELLED = frozenset(("parking", "stop", "HOV", "bidirectional"))
@@ -59,7 +59,7 @@ class OpenDriveSource:
         root: the changed document.
         changed: whether it differs from the file.
         defaults: roads without a speed limit, by type of road.
-        counts: what was ignored or looks wrong.
+        counts: numbers of ignored and suspicious elements.
     """
 
     path: Path
@@ -80,7 +80,7 @@ class OpenDriveSource:
         self._set_limits()
 
     def notes(self) -> tuple[str, ...]:
-        """Return what was ignored or looks wrong, with counts."""
+        """Return notes on ignored and suspicious elements, with counts."""
         return tuple(f"{count} {what}" for what, count in sorted(self.counts.items()))
 
     def content(self) -> bytes:
@@ -116,8 +116,8 @@ class OpenDriveSource:
     def _swap_sides(self) -> None:
         """Exchange the lanes on the left and on the right of all reference lines.
 
-        In left-hand traffic, lanes on the left of the line lead along it. netconvert takes those on
-        the right, and places them on the left if it has `--lefthand`.
+        In left-hand traffic, lanes on the left of the line lead along it. netconvert reads the
+        lanes on the right, and places them on the left if it has `--lefthand`.
         """
         for section in self.root.iter("laneSection"):
             for side in [*section.iterfind("left"), *section.iterfind("right")]:
@@ -138,7 +138,7 @@ class OpenDriveSource:
             _negate(validity, "toLane")
 
     def _refuse_endless(self) -> None:
-        """Raise MapError for a geometry so long that netconvert would fill the memory with it."""
+        """Raise MapError for a geometry that is so long that netconvert would run out of memory."""
         most_m = limit(LENGTH_LIMIT, MAX_GEOMETRY_M)
         number = 0
         for road in self.root.iter("road"):

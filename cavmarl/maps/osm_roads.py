@@ -11,7 +11,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-_MOST_KINDS = 5  # in an error message
+_MOST_KINDS = 5  # kinds listed in an error message
 _TAGS = frozenset(
     "highway bridge tunnel covered layer name ref lanes maxspeed width oneway busway motorcar "
     "motor_vehicle motor_vehicle:forward motor_vehicle:backward vehicle turn:lanes "

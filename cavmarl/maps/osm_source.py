@@ -1,4 +1,4 @@
-"""Prepares OSM extracts for netconvert, which reads some tags of lanes and of access otherwise.
+"""Prepares OSM extracts for netconvert, which misreads some tags of lanes and access.
 
 netconvert reads `turn:lanes` at the end of a way only, does not know `busway=lane`, and opens ways
 with `motor_vehicle=no` to cars.
@@ -26,11 +26,11 @@ _IGNORED = (
 
 
 def prepare_osm(path: Path, roads: OsmRoads, copy: Path, left_hand: bool) -> tuple[str, ...]:
-    """Write a changed copy of an extract if something has to be changed.
+    """Write a changed copy of an extract if a change is necessary.
 
     `roads`: the roads of the extract; new ways are added.
 
-    Returns notes on what was changed or ignored, with counts.
+    Return notes on changes and ignored tags, with counts.
     """
     counts: Counter[str] = Counter()
     for_cars = {name: way for name, way in roads.ways.items() if way.for_cars}
@@ -64,8 +64,8 @@ def prepare_osm(path: Path, roads: OsmRoads, copy: Path, left_hand: bool) -> tup
 def _cuts(ways: dict[str, RoadWay]) -> dict[str, tuple[int, int]]:
     """Return the nodes at which to cut ways with turn lanes: ahead and backward; 0: no cut.
 
-    Turn lanes lead to the junction at the end of their way. If the way ends nowhere, they lead to
-    the last junction before that.
+    Turn lanes lead to the junction at the end of their way. If the way is a dead end, they lead to
+    the last junction before its end.
     """
     ends: Counter[str] = Counter()
     for way in ways.values():
@@ -92,7 +92,7 @@ def _cut_ways(
     elements: dict[str, Element],
     cuts: dict[str, tuple[int, int]],
 ) -> None:
-    """Cut ways in up to three; the part with the turn lanes ahead keeps the name."""
+    """Cut ways into up to three parts; the part with the turn lanes ahead keeps the name."""
     free = max((int(name) for name in elements if name.lstrip("-").isdecimal()), default=0) + 1
     parts: dict[str, dict[str, list[str]]] = {}  # nodes of the parts of each way, by their names
     for name, (ahead, back) in cuts.items():
@@ -120,7 +120,7 @@ def _cut_ways(
             parts[name][own] = nodes[begin : end + 1]
         for own, refs in parts[name].items():
             roads.ways[own] = RoadWay(refs, roads.ways[name].tags)
-    # Relations follow the ways.
+    # In the file, relations come after the ways.
     relations = list(root.iter("relation"))
     for relation in relations:
         root.remove(relation)

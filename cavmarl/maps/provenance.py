@@ -31,8 +31,8 @@ class RoadDefaults:
     """Values from netconvert's type map for roads of one kind without the tag."""
 
     kind: str  # OSM's `highway`, as named by netconvert; the type of a road of OpenDRIVE
-    edges: int  # of OSM; roads of OpenDRIVE
-    guessed: str  # lanes, maxspeed or width
+    edges: int  # number of edges (OSM) or roads (OpenDRIVE)
+    guessed: str  # the guessed value: lanes, maxspeed or width
     value: str  # the most frequent value; speeds in m/s, widths in m
     used_for: int  # number of edges or roads without the value
 
@@ -82,7 +82,7 @@ def road_defaults(document: NetDocument, roads: OsmRoads) -> tuple[RoadDefaults,
 
 
 def defaults_text(defaults: Iterable[RoadDefaults], counted: str) -> str:
-    """Return the defaults for a comment; `counted` is what their numbers count: edges or roads."""
+    """Return the defaults for a comment; `counted`: the counted unit, edges or roads."""
     return "; ".join(
         f"{row.kind} {row.guessed}={row.value} ({row.used_for} of {row.edges} {counted})"
         for row in defaults

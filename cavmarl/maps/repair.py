@@ -21,14 +21,14 @@ _TIMEOUT_S = 600.0
 def mend(source: Path, target: Path, before: Sequence[Defect]) -> tuple[list[str], list[Defect]]:
     """Write a network again, without unconnected parts and with new right of way and signals.
 
-    Opposite edges on the same strip are drawn where the reader moves them.
+    Opposite edges on the same strip are drawn side by side, as the reader places them.
 
     Args:
         source: a SUMO network.
         target: file of the repaired network.
         before: defects of the source.
 
-    Returns the changes, and the defects of the repaired network.
+    Return the changes, and the defects of the repaired network.
 
     Raises MapError: netconvert fails, or the target is the source.
     """

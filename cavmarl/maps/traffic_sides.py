@@ -14,13 +14,13 @@ from cavmarl.core.math.elementary_arrays import cos_all
 
 Side = Literal["left", "right"]
 
-NEAR_M = 3_000.0  # from a border: the areas are not accurate enough to decide there
+NEAR_M = 3_000.0  # distance from a border within which the areas are too inaccurate
 _CELLS_PER_DEGREE = 200.0  # places are rounded to cells of about 500 m
 _M_PER_DEGREE = 111_195.0
 
 
 def sides_at(places: Iterable[tuple[float, float]]) -> set[Side]:
-    """Return the sides on which one drives at (longitude, latitude) places in degrees.
+    """Return the traffic sides at (longitude, latitude) places in degrees.
 
     Places within `NEAR_M` of a border between both sides do not count, so the result may be empty.
     """
@@ -29,7 +29,7 @@ def sides_at(places: Iterable[tuple[float, float]]) -> set[Side]:
     inside = np.zeros(len(cells), dtype=np.bool_)
     far = np.ones(len(cells), dtype=np.bool_)
     for ring in _rings():
-        # Most places are far from most rings.
+        # Skip far rings: most places are far from most rings.
         low, high = ring.min(axis=0) - 0.2, ring.max(axis=0) + 0.2
         rows = np.flatnonzero(((cells >= low) & (cells <= high)).all(axis=1))
         for row in rows.tolist():

@@ -1,4 +1,4 @@
 """Rendering of worlds: frames, windows, videos.
 
-The renderer reads rows of the engine; `env` and `evaluate` use it.
+The renderer reads the engine's vehicle rows; `env` and `evaluate` use the renderer.
 """

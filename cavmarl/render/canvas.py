@@ -1,4 +1,4 @@
-"""The colours of all pictures, and drawing of smooth polygons with pygame, which is loaded late.
+"""The colours of all pictures, and smooth polygons drawn with pygame, which is loaded at first use.
 
 Colours are (red, green, blue). The map has muted colours, so that agents stand out.
 """

@@ -82,7 +82,7 @@ def draw_walker(surface: Surface, row: np.void, center: list[float], scale: floa
 
 BRAKING_MPS2 = -1.0  # the brake lights are on below this acceleration
 
-# Smallest size of a drawn car.
+# Smallest size at which a car is drawn.
 MIN_LENGTH_PX = 8.0
 MIN_WIDTH_PX = 3.8
 AGENT_MIN_LENGTH_PX = 13.0

@@ -51,7 +51,7 @@ MOST = 2**24 - 1
 HEADINGS = 2048
 SPEEDS_PER_MPS = 4.0
 BRAKING_MPS2 = -0.8  # brake lights are on at or below this
-REBASE_ROWS = 1000  # changes beyond twice the vehicles after which the whole roster is sent
+REBASE_ROWS = 1000  # the whole roster is sent after twice the vehicles plus this many changes
 REBASE_CHANGES = 256
 
 
@@ -81,7 +81,7 @@ class Publication:
 class FrameEncoder:
     """Encodes successive frames of one world as publications.
 
-    `origin`: (2,) m, of the map's message.
+    `origin`: (2,) origin of the map's message, in m.
     """
 
     def __init__(self, origin: NDArray[np.float64]) -> None:
@@ -133,7 +133,7 @@ class FrameEncoder:
         return Publication(b"".join(parts), self._changes)
 
     def _rows(self, vehicles: NDArray[np.void]) -> bytes:
-        """Return ROW_BYTES per vehicle: three each for x and y, and three for the rest."""
+        """Return ROW_BYTES bytes per vehicle: three each for x and y, and three for the rest."""
         words = np.zeros((len(vehicles), 3), dtype="<u4")
         for k, name in enumerate(("x", "y")):
             place = (vehicles[name] - (self._origin[k] - MARGIN_M)) * 100.0

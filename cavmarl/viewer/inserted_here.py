@@ -21,7 +21,7 @@ FARTHEST_M = 30.0  # largest distance from a lane's centre
 def handle_insertion(
     env: ViewedEnv, world: int, audience: Audience, watcher: int, request: PageRequest, tick: int
 ) -> bool:
-    """Insert a vehicle, or close or open a road; return whether the request asked for that.
+    """Insert a vehicle, or close or open a road; return whether this was such a request.
 
     Args:
         env: environment of the world.
@@ -43,7 +43,7 @@ def handle_insertion(
 
 
 def _apply(env: ViewedEnv, world: int, request: PageRequest) -> tuple[str, str]:
-    """Carry out the request; return kind and detail of the resulting event."""
+    """Execute the request; return kind and detail of the resulting event."""
     network = env.network
     among = env.closed_roads(world) if request.kind == "open" else None
     lane, place_m = lane_at(network, request.x, request.y, among)

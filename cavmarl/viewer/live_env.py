@@ -22,7 +22,7 @@ from cavmarl.viewer.vehicle_details import ViewedEnv, hello_of, vehicle_details
 from cavmarl.viewer.viewed_world import first_stage
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
-FRAME_HEIGHT_PX = 560  # in a notebook
+FRAME_HEIGHT_PX = 560  # height of the page in a notebook
 
 
 # Pages of `show` by the id of their environment, which each page keeps alive.
@@ -40,7 +40,7 @@ class ShownEnv:
             worlds.
         title: description of what drives the worlds.
         looks_itself: whether to call `look` after each reset and step of `env`. If not, the caller
-            calls `look`, or, where it must not wait, `turn` and `moved`.
+            calls `look`, or `turn` and `moved` where it must not wait.
         tell: called with lines of text: the address, and a generated token.
         reset: restarts the episode of a world by index; None: pages may not restart episodes.
 

@@ -65,7 +65,7 @@ class ShownRecording:
         return wait_s
 
     def _go_on(self) -> float:
-        """Take the steps that are due; return the time until the next one."""
+        """Take the due steps; return the time until the next step."""
         now = time.monotonic()
         for _ in range(MOST_STEPS_AHEAD):
             wait_s = self.clock.wait_s(now)

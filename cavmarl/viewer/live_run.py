@@ -63,7 +63,7 @@ class ShownRun:
         return self._env.step_s
 
     def turn(self) -> float:
-        """Handle requests, step and publish as due; return how long to wait then, in s."""
+        """Handle requests, step and publish when due; return the time to wait afterwards, in s."""
         for number, request in self._audience.requests():
             self._handle(number, request)
         now = time.monotonic()

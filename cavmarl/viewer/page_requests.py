@@ -23,10 +23,10 @@ class PageRequest:
     """One request of a page.
 
     Attributes:
-        kind: `watch` (a vehicle), `ghosts` (mark those of a zone), or one of `CONTROLS`: `pause`,
-            `play`, `step`, `pace`, `reset`, `seat` (take the seat of an agent), `drive` (in that
-            seat), `seek` (a tick of a recording), `insert` (a vehicle at a position), `close` and
-            `open` (the road at a position).
+        kind: `watch` (a vehicle), `ghosts` (mark the ghosts of a zone), or one of `CONTROLS`:
+            `pause`, `play`, `step`, `pace`, `reset`, `seat` (take the seat of an agent), `drive`
+            (in that seat), `seek` (a tick of a recording), `insert` (a vehicle at a position),
+            `close` and `open` (the road at a position).
         number: the vehicle, zone, agent or tick, None for none; for `pace`, simulated seconds per
             second, 0 for as fast as possible.
         x: position, m from the map's origin.
@@ -48,7 +48,7 @@ class PageRequest:
 def read_object(text: str) -> dict[str, Any]:
     """Parse a JSON object sent by a page.
 
-    Raises MessageError: the text is no JSON object, or too long.
+    Raises MessageError: the text is not a JSON object, or is too long.
     """
     if len(text) > MAX_TEXT:
         raise MessageError(f"request of {len(text)} characters: at most {MAX_TEXT} are allowed")

@@ -6,8 +6,8 @@ import time
 
 from cavmarl.viewer.page_requests import PageRequest
 
-IDLE_S = 0.25  # longest wait before requests are checked again
-LATE_S = 0.5  # a clock that is later than this does not catch up
+IDLE_S = 0.25  # longest time between two checks for requests
+LATE_S = 0.5  # a longer delay is not caught up
 MOST_STEPS = 10  # largest number of requested steps that wait while paused
 
 
@@ -46,7 +46,7 @@ class RunClock:
         """Return the time until the next step is due, at most `IDLE_S`; 0: it is due now."""
         if self._steps_wanted:
             return 0.0
-        if self.is_paused:  # the request to play sets the next time
+        if self.is_paused:  # a request to play sets the time of the next step
             return IDLE_S
         return min(max(0.0, self._due_s - now_s), IDLE_S) if self.pace else 0.0
 

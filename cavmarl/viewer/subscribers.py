@@ -38,7 +38,7 @@ class PageWatcher:
     vehicle: int | None = None  # id of the watched vehicle
     sensors: bool = False  # whether to include its sensors
     ghosts_of: int | None = None
-    is_lost: bool = False  # whether it reads too slowly
+    is_lost: bool = False  # whether the page reads too slowly
 
     def offer(self, publication: Publication) -> None:
         self.newest = publication
@@ -182,7 +182,7 @@ class Audience:
             return
         try:
             loop.call_soon_threadsafe(partial(function, *given, **named))
-        except RuntimeError:  # the loop has been closed by now
+        except RuntimeError:  # the loop has been closed
             return
 
     def _spread(self, publication: Publication) -> None:

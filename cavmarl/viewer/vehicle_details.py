@@ -72,7 +72,7 @@ def hello_of(env: ViewedEnv, policy: str, *, is_driven_here: bool = True) -> dic
 
     Args:
         env: environment of the world.
-        policy: description of what drives it.
+        policy: description of the policy that drives the world.
         is_driven_here: whether pages may restart episodes and take seats.
     """
     config = env.config

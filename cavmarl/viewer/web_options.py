@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 DEFAULT_PORT = 8710
-PACKAGES = ("starlette", "uvicorn", "httptools", "websockets")  # of the extra `viewer`
+PACKAGES = ("starlette", "uvicorn", "httptools", "websockets")  # packages of the extra `viewer`
 
 
 @dataclass(frozen=True)

@@ -29,12 +29,12 @@ class ActorOrder:
         name: unique among the actors of its client.
         vtype: `car`, `truck`, `bus`, `pedestrian`, `cyclist`, `roadside_unit`, or a type of the
             world.
-        x, y: centre at the start, in m.
-        heading: in rad, counter-clockwise from east.
-        z: height of the ground below the centre, in m; None: of the lane.
-        size_m: length, width and height in m; None: of the type.
-        speed: at the start, in m/s.
-        moved_by: `poses`, `controls`, or `nothing`: it stands.
+        x, y: position of the centre at the start, in m.
+        heading: heading in rad, counter-clockwise from east.
+        z: height of the ground below the centre, in m; None: the lane's height.
+        size_m: length, width and height in m; None: the type's size.
+        speed: speed at the start, in m/s.
+        moved_by: `poses`, `controls`, or `nothing`: it does not move.
         rate_hz: rate of its poses; 0: unknown.
         extrapolation_s: largest time for which a pose is extrapolated.
         rig: names of the sensors of the world that it carries.
@@ -62,14 +62,14 @@ class ClientActor:
         client: name of the client or the trace.
         order: what the client has asked for.
         track: its poses.
-        slot: of the external vehicle; -1: not in the world.
+        slot: slot of the external vehicle; -1: not in the world.
     """
 
     client: str
     order: ActorOrder
     track: PoseTrack
     slot: int = -1
-    controls: tuple[float, float] | None = None  # for the next step, in [-1, 1]
+    controls: tuple[float, float] | None = None  # of the next step, in [-1, 1]
 
     @property
     def name(self) -> str:
@@ -94,7 +94,7 @@ class ClientActors:
         env: the environment.
 
     Attributes:
-        reports: of the actors that have left.
+        reports: reports of the actors that have left.
     """
 
     def __init__(self, env: CavEnv) -> None:
@@ -110,14 +110,14 @@ class ClientActors:
         return tuple(self._actors)
 
     def join(self, client: str, orders: Iterable[ActorOrder]) -> list[ClientActor]:
-        """Bring actors into the world, with the next step; before the first reset, with it.
+        """Bring actors into the world with the next step, or with the first reset.
 
         If the world refuses an actor, it takes none of them.
 
         Raises:
             ActionError: a name, type, place, size, rate or sensor is invalid, or the place is
                 occupied.
-            CapacityError: `population.external` such vehicles are already there.
+            CapacityError: all `population.external` places are taken.
             ConfigError: `population.external` is 0, or the world has no sensors for actors.
         """
         came: list[ClientActor] = []
@@ -147,7 +147,7 @@ class ClientActors:
     def begin_episode(self) -> dict[ClientActor, CavmarlError]:
         """Bring all actors into the new episode, at the places where they began.
 
-        Returns the actors that the world refuses, which have left, and the reasons.
+        Return the actors that the world refuses and therefore removes, with the reasons.
         """
         refused: dict[ClientActor, CavmarlError] = {}
         for actor in self.actors:
@@ -161,7 +161,7 @@ class ClientActors:
         return refused
 
     def add_pose(self, actor: ClientActor, sample: PoseSample, now_s: float) -> None:
-        """Take a pose of an actor.
+        """Add a pose of an actor.
 
         Raises:
             ActionError: the actor is not moved by poses, or the pose is invalid or in the future.
@@ -199,7 +199,7 @@ class ClientActors:
     def act(self, now_s: float) -> dict[ClientActor, ActionError]:
         """Give the commands for the next step to the environment.
 
-        Returns the actors whose poses lead out of the map, and the reasons.
+        Return the actors whose poses lead out of the map, with the reasons.
         """
         end_s = now_s + self._env.step_s
         refused: dict[ClientActor, ActionError] = {}
@@ -228,7 +228,7 @@ class ClientActors:
         return {int(row["order"]): row for row in self._env.external.vehicles()}
 
     def report(self) -> list[dict[str, Any]]:
-        """Return what has become of the poses of all actors, present and past."""
+        """Return the counts of poses of all actors, present and past."""
         return [*self.reports, *(actor.report() for actor in self._actors)]
 
     def _checked(self, order: ActorOrder) -> PoseTrack:

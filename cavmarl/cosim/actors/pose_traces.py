@@ -1,6 +1,6 @@
 """Recorded traces as actors: CSV files with poses, read once and played back in simulated time.
 
-A trace goes the same way as the poses of a client: through `ClientActors` and `PoseTrack`.
+Traces use the same classes as the poses of a client: `ClientActors` and `PoseTrack`.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ class PoseTrace:
     """The recorded poses of one body.
 
     Attributes:
-        name: of the body.
+        name: name of the body.
         vtype: its type; see `ActorOrder`.
-        size_m: length, width and height; None: of the type.
-        samples: by arrival; stamps begin at the first row of the file.
+        size_m: length, width and height; None: the type's size.
+        samples: samples in the order of arrival; stamps begin at the first row of the file.
         received_s: time at which each sample arrives; ascending.
     """
 
@@ -68,7 +68,7 @@ def read_traces(path: Path) -> list[PoseTrace]:
     other columns are ignored. So files of `cavmarl replay --csv` can be read.
 
     Raises:
-        ConfigError: the file cannot be read, a column is missing, or a value is no number.
+        ConfigError: the file cannot be read, a column is missing, or a value is not a number.
     """
     rows: dict[str, list[dict[str, str]]] = {}
     try:
@@ -117,7 +117,7 @@ def _trace(
     rows: Sequence[Mapping[str, float]],
     start_s: float,
 ) -> PoseTrace:
-    """Return the trace of one body. `first`: texts of its first row. `start_s`: of the file."""
+    """Return the trace of one body. `first`: its first row. `start_s`: start of the file."""
     listed = sorted(rows, key=lambda row: (row.get("received_s", row["time_s"]), row["time_s"]))
     samples = [
         PoseSample(
@@ -154,7 +154,7 @@ def _trace(
 
 
 def _type_of(path: Path, vclass: str | None) -> str:
-    """Return the type of a class. Raises ConfigError: it is no number of a class."""
+    """Return the type of a class. Raises ConfigError: it is not the number of a class."""
     if not vclass:
         return "car"
     if vclass not in map(str, range(CLASS_PEDESTRIAN + 1)):

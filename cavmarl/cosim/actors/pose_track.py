@@ -2,7 +2,7 @@
 
 Poses arrive at 10 to 100 Hz, and the world steps at another rate. For the end of a step, the track
 extrapolates the newest pose with the motion of the last two poses: the velocity turns with the
-heading, at a constant rate. It extrapolates for a limited time; then the body stands.
+heading, at a constant rate. It extrapolates for a limited time; then the body stops.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ class PoseSample(NamedTuple):
     x: float  # of its centre, m
     y: float
     heading: float  # rad, counter-clockwise from east
-    z: float | None = None  # height of the ground below its centre, m; None: of the lane
+    z: float | None = None  # height of the ground below its centre, m; None: the lane's
     pitch: float | None = None  # rad, positive uphill; None: the slope of the lane
-    speed: float | None = None  # m/s along the heading; None: of the move
+    speed: float | None = None  # m/s along the heading; None: follows from the move
 
 
 @dataclass
 class PoseCounts:
-    """What has become of the poses of a track."""
+    """Counts of the poses of a track."""
 
     received: int = 0
-    # older than a newer pose, and dropped; or older than one period and one step, and used
+    # older than a newer pose, so dropped; or older than one period and one step, but used
     late: int = 0
-    lost: int = 0  # missing between two poses, by the rate
-    extrapolated: int = 0  # steps without a pose for their end
+    lost: int = 0  # poses missing between two poses at the given rate
+    extrapolated: int = 0  # steps without a pose for the end of the step
     stopped: int = 0  # steps in which the newest pose was older than the bound
     worst_age_s: float = 0.0  # largest age of the newest pose at the end of a step
 
@@ -89,7 +89,7 @@ class PoseTrack:
         self._newest = self._before = None
 
     def add(self, sample: PoseSample, now_s: float, step_s: float) -> None:
-        """Take a pose that has arrived.
+        """Add a pose that has arrived.
 
         Args:
             sample: the pose.

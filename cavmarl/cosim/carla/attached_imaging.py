@@ -282,7 +282,7 @@ class RadarSensor:
 
 
 class AttachedCamera:
-    """Base class of the cameras. `picture`: what the kernel writes."""
+    """Base class of the cameras. `picture`: the array that the kernel writes."""
 
     kind: ClassVar[int]
     picture: ClassVar[str]

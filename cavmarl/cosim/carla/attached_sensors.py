@@ -34,7 +34,7 @@ if TYPE_CHECKING:
     from cavmarl.cosim.carla.carla_session import CarlaSession
 
 GRAVITY_MPS2 = 9.81
-_SOON_S = 1e-6  # a sample that is due within this time is taken
+_SOON_S = 1e-6  # a sample that is due within this time is taken now
 _FIRST_STREAM = 2
 _LISTENERS_DUE_S = 1.0  # clients listen to a new sensor within this time
 _IMPULSE_PER_MPS = 1500.0  # kg: impulse of a collision per m/s of difference in speed
@@ -205,14 +205,14 @@ class _Mounted:
 
 
 class SensorSuite:
-    """All sensors of a session. `streams`: where clients listen."""
+    """All sensors of a session. `streams`: the streams to which clients listen."""
 
     def __init__(self, session: CarlaSession, streams: StreamHub) -> None:
         self._context = SensorContext(session)
         self._streams = streams
         self._mounted: dict[int, _Mounted] = {}
         self._next_stream = _FIRST_STREAM
-        self._added = 0  # in this episode
+        self._added = 0  # number of sensors added in this episode
 
     def begin_episode(self) -> None:
         """Let the next sensors draw the random numbers of a first episode."""
@@ -237,7 +237,7 @@ class SensorSuite:
             self._streams.end(mounted.stream)
 
     def await_listeners(self) -> None:
-        """Wait again for clients that listen soon, after a restart of the world, which takes long.
+        """Wait again for clients that listen soon, after a slow restart of the world.
 
         See `are_listeners_due`.
         """

@@ -65,7 +65,7 @@ def apply_batch(
     if do_tick and session.settings.synchronous:
         try:
             session.tick_for(caller)
-        except CallRefused as problem:  # the answers of the commands are those of the call
+        except CallRefused as problem:  # a command gets the answer that the call would get
             session.tell(f"{caller.name}: apply_batch: {problem}")
     return answers
 
@@ -97,7 +97,7 @@ def _carry_out(
     name = _CALL_OF_COMMAND.get(index)
     if name is None:
         raise CallRefused(f"there is no command {index}")
-    # A command has a bare number of lamps where the call has a record.
+    # A command has a plain number for the lamps; the call has a record.
     rest = [[body[1]]] if index == _LIGHTS and len(body) == 2 else body[1:]
     CALLS[name].carry_out(caller, session, [number, *rest])
     return number

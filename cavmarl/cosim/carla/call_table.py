@@ -50,7 +50,7 @@ class ClientCall:
         required: number of arguments that must be there; other versions add or omit some.
         act: called with the caller, the session and the checked arguments; None: the call
             returns `constant`.
-        note: what is special, for the reference page; of a refused call, the reason.
+        note: remark for the reference page; for a refused call, the reason.
     """
 
     name: str
@@ -164,7 +164,7 @@ def answer(
     except (CallRefused, CavmarlError) as problem:
         message = str(problem)
         session.tell(f"{caller.name}: {name}: {message.removeprefix(f'{name}: ')}")
-    except Exception as problem:  # a fault of the server must not end the other clients' world
+    except Exception as problem:  # a fault of the server must not end the world of other clients
         log.exception("%s: %s", caller.name, name)
         message = f"internal error in {name}: {problem!r}"
     else:

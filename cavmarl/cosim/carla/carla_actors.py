@@ -75,12 +75,13 @@ class CarlaActor:
 
     Attributes:
         attributes: values by name; kinds are those of the blueprint.
-        pose: the present pose, except of vehicles and walkers; see `ActorTable.pose_of`.
+        pose: the present pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.
         centre, half_m: the bounding box in the actor's frame.
         vehicle: id of the row of a vehicle or walker; -1: none.
         agent: index of the agent that the vehicle belongs to; -1: none.
-        slot: number of a vehicle that a client has spawned, see `ExternalVehicles`; -1: no such.
+        slot: number of a vehicle that a client has spawned, see `ExternalVehicles`; -1: another
+    actor.
     """
 
     number: int
@@ -124,7 +125,7 @@ class ActorTable:
     """The actors of one episode, and their states as records of a snapshot.
 
     `first_number`: number of the first actor, larger than all numbers of earlier episodes, because
-    clients keep what they know of a number. `next_number`: least number of the first vehicle.
+    clients remember actors by their numbers. `next_number`: least number of the first vehicle.
     `known`: actors of vehicles that may appear, by the ids of the vehicles.
     """
 
@@ -156,7 +157,7 @@ class ActorTable:
         return self._next
 
     def skip_to(self, number: int) -> None:
-        """Give no number below this one to the next actors."""
+        """Give the next actors this number or higher ones."""
         self._next = max(self._next, number)
 
     @property
@@ -207,7 +208,7 @@ class ActorTable:
         return self._by_vehicle.get(vehicle)
 
     def state_of(self, actor: CarlaActor) -> np.void | None:
-        """Return the VEHICLE_STATE of a vehicle or walker; None of other actors."""
+        """Return the VEHICLE_STATE of a vehicle or walker; None for other actors."""
         row = self._row_of.get(actor.number)
         return None if row is None else self.vehicle_states[row]
 
@@ -218,11 +219,11 @@ class ActorTable:
         return CarlaPose(*state["place"].tolist(), *state["turn"].tolist())
 
     def of_agent(self, agent: int) -> CarlaActor | None:
-        """Return the actor of an agent's vehicle, as of the last `take`."""
+        """Return the actor of an agent's vehicle at the last call of `take`."""
         return next((actor for actor in self._listed if actor.agent == agent), None)
 
     def spawned(self) -> Iterator[CarlaActor]:
-        """Yield what clients have spawned."""
+        """Yield the actors that clients have spawned."""
         yield from self.attached()
         yield from (actor for actor in self.actors.values() if actor.slot >= 0)
 
@@ -248,7 +249,7 @@ class ActorTable:
         )
 
     def keep_spawned(self, world: HostedWorld, before: ActorTable) -> list[CarlaActor]:
-        """Take over what clients have spawned into an earlier world of the same map.
+        """Take over the actors that clients have spawned into an earlier world of the same map.
 
         Return the actors that could not be kept: their places are occupied, or their parents gone.
         """
@@ -455,4 +456,4 @@ class ActorTable:
 
 
 _LIGHT = bytes([LIGHT_TAG])
-_FIRST_OWN_BYTE = 65  # of a record: what follows depends on the type of the actor
+_FIRST_OWN_BYTE = 65  # byte of a record from which the content depends on the actor's type

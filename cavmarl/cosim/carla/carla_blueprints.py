@@ -1,7 +1,7 @@
 """The blueprints that clients can choose from, with CARLA's ids, attributes and default values.
 
-Client programs draw from the recommended values of each attribute that can be changed, so each of
-these has at least one.
+Client programs draw from the recommended values of each attribute that can be changed, so each such
+attribute has at least one value.
 """
 
 from __future__ import annotations
@@ -371,7 +371,7 @@ BLUEPRINTS = {
     )
 }
 
-# The blueprint that stands for vehicles of the world, by the class that cameras see.
+# The blueprint of vehicles of the world, by the class that cameras see.
 BLUEPRINT_OF_CLASS = {
     CAR: "vehicle.tesla.model3",
     TRUCK: "vehicle.carlamotors.carlacola",

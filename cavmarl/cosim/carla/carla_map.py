@@ -1,4 +1,4 @@
-"""`CarlaMap`: a road network as clients see it: OpenDRIVE, spawn points, and traffic lights.
+"""`CarlaMap`: the road network for clients: OpenDRIVE, spawn points, and traffic lights.
 
 There is one traffic light on each approach to a junction: the lanes of one edge with one signal.
 Its state is green only if all movements from these lanes are green.
@@ -45,11 +45,11 @@ _STATE_OF_CODE[[SIGNAL_OFF_BLINKING, SIGNAL_OFF]] = OFF
 
 SPAWN_HEIGHT_M = 0.3  # spawn points are this far above the road
 _SPAWN_EVERY_M = 40.0
-_FIRST_SPAWN_M = 15.0  # from the start of a longer lane
+_FIRST_SPAWN_M = 15.0  # distance of a spawn point from the start of a longer lane
 _SHORTEST_M = 12.0  # a shorter lane has no spawn point
 _SIGNAL = re.compile(r"<signal\s([^>]*)>")
 _ATTRIBUTE = re.compile(r'(\w+)="([^"]*)"')
-_BOX_BEFORE_LINE_M = 2.0  # centre of the trigger volume, before the stop line
+_BOX_BEFORE_LINE_M = 2.0  # distance from the centre of the trigger volume to the stop line
 
 
 class LightApproach(NamedTuple):

@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 log = logging.getLogger("cavmarl.carla")
 
 ACTORS_FILE = "carla_actors.jsonl"
-_MOST_BYTES = 1 << 26  # of the list of actors
+_MOST_BYTES = 1 << 26  # limit of the list of actors
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,99}")
 _NOWHERE = CarlaPose(0.0, 0.0, 0.0)
 
@@ -75,7 +75,7 @@ class RecordedActor:
             or not (isinstance(number, int) and 0 <= number < 1 << 32)
             or not all(len(one) == 3 and all(map(_is_small, one)) for one in vectors)
         ):
-            raise ValueError("it is no actor")
+            raise ValueError("it is not an actor")
         (cx, cy, cz), (hx, hy, hz) = vectors
         bytes.fromhex(given["tags"])
         boxes = (cx, cy, cz), (hx, hy, hz)
@@ -123,11 +123,11 @@ def read_session(path: Path) -> RecordedSession:
         actors = [RecordedActor.read(json.loads(line)) for line in lines]
         name, key, number = first["map"], first["session"], first["episode"]
         if not (isinstance(name, str) and isinstance(key, str) and isinstance(number, int)):
-            raise ValueError("its first line is no session")
+            raise ValueError("its first line is not a session")
         return RecordedSession(name, key, number, {one.vehicle: one for one in actors})
     except OSError as error:
         raise RecordingError(
-            f"{path.name}: is no recording of a CARLA server ({error.strerror}); start_recorder "
+            f"{path.name}: is not a recording of a CARLA server ({error.strerror}); start_recorder "
             "makes one"
         ) from error
     except (ValueError, KeyError, TypeError, AttributeError, RecursionError) as error:
@@ -139,8 +139,8 @@ def read_session(path: Path) -> RecordedSession:
 class CarlaRecorder:
     """Records the world of a session after each tick.
 
-    `folder`: where recordings are; None: recordings are refused. `most_rows`: a recording ends with
-    this number of vehicles, summed over its ticks.
+    `folder`: folder of the recordings; None: recordings are refused. `most_rows`: a recording ends
+    with this number of vehicles, summed over its ticks.
     """
 
     def __init__(self, folder: Path | None, most_rows: int) -> None:
@@ -181,11 +181,11 @@ class CarlaRecorder:
     def start(self, session: CarlaSession, key: str, name: str) -> Path:
         """Begin a recording; a recording of this name is replaced.
 
-        `key`: text that no other session has.
+        `key`: text that is unique to the session.
 
         Raises:
             CallRefused: the name is not allowed.
-            RecordingError: the folder cannot be written, or is no recording.
+            RecordingError: the folder cannot be written, or is not a recording.
             MissingExtraError: pyarrow is not installed.
         """
         path = self.path_of(name)

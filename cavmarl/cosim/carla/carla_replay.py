@@ -22,7 +22,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 log = logging.getLogger("cavmarl.carla")
 
 _SOON_S = 1e-6
-_BEFORE_LANE_M = -1e6  # recordings have no place along the lane: no vehicle is at its light
+_BEFORE_LANE_M = -1e6  # recordings have no position along the lane, so no vehicle is at its light
 
 
 class RecordedMoment(NamedTuple):
@@ -35,7 +35,7 @@ class RecordedMoment(NamedTuple):
 class CarlaRecording:
     """A recording of a CARLA server, read part by part.
 
-    `path`: its folder.
+    `path`: folder of the recording.
 
     Attributes:
         session: the session that was recorded, and its actors.
@@ -113,7 +113,7 @@ class CarlaRecording:
             yield RecordedMoment(time_s, found.frame), found.episode
 
     def frame_at(self, time_s: float) -> tuple[int, WorldFrame]:
-        """Return number and content of the last frame up to a time.
+        """Return the number and the content of the last frame up to a time.
 
         Raises RecordingError: a part has been damaged or removed.
         """
@@ -156,7 +156,7 @@ class CarlaReplay:
         self.end_s = min(last_s, self.begin_s + duration_s) if duration_s > 0.0 else last_s
         if self.begin_s > last_s:
             raise RecordingError(
-                f"{recording.name}: starts at {begin_s:g} s, but has {last_s:g} s; start earlier"
+                f"{recording.name}: starts at {begin_s:g} s, but lasts {last_s:g} s; start earlier"
             )
         if recording.most_rows > capacity:
             raise RecordingError(
@@ -173,7 +173,7 @@ class CarlaReplay:
         self.signals: NDArray[np.int32] = frame.signals
 
     def advance(self, step_s: float) -> None:
-        """Go on by some simulated time; after the end, the last state stays."""
+        """Advance by some simulated time; after the end, the last state remains."""
         self.time_s += step_s * self.factor
         self.is_over = self.time_s > self.end_s + _SOON_S
         try:

@@ -1,6 +1,6 @@
 """`CarlaServer`: the ports to which CARLA's clients connect, and the loop that runs the world.
 
-One thread answers all calls and advances the world, so the time master has one owner. In
+One thread answers all calls and advances the world, so only one thread uses the time master. In
 synchronous mode a client's cue advances the world; otherwise the wall clock does. The protocol has
 no login: by default, only programs of this machine can connect.
 """
@@ -50,8 +50,8 @@ CALL_MODULES = (
     episode_calls,
     light_calls,
     recorder_calls,
-)  # they fill the table of calls
-_LATE_S = 0.5  # a free-running world that is later than this does not catch up
+)  # importing them fills the table of calls
+_LATE_S = 0.5  # a free-running world does not catch up on longer delays
 _PATIENCE_S = 0.05  # how long a tick waits for listeners of new sensors
 _LOOK_S = 0.0005
 _MAX_PORT = 65534  # the streams have the next port

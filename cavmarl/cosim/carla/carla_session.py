@@ -38,7 +38,7 @@ _WEATHER = [0.0] * 12 + [0.0331, 0.0]
 
 @dataclass(frozen=True)
 class EpisodeSettings:
-    """CARLA's `WorldSettings`; `others`: the fields without effect, as they were sent."""
+    """CARLA's `WorldSettings`; `others`: values of the fields that have no effect, as sent."""
 
     synchronous: bool = False
     no_rendering: bool = False
@@ -91,8 +91,8 @@ class CarlaSession:
         step_s: length of a step of the first world.
         other_ticks: what happens in a synchronous world if a client ticks that is not the time
             master: the client that has ticked first, until it disconnects. `obey`: the world
-            advances, as CARLA's does. `refuse`: the client gets an error. `follow`: the client
-            waits for the next tick of the master.
+            advances, as in CARLA. `refuse`: the client gets an error. `follow`: the client waits
+            for the next tick of the master.
         recordings: folder of the recordings that clients make; None: they can make none.
 
     Attributes:
@@ -100,7 +100,7 @@ class CarlaSession:
         episode: number of the episode; it grows when a client loads a map.
         managers: ports and hosts of the clients' traffic managers.
         weather, gravity: values that clients have set; they have no effect.
-        recordings: what clients record and replay.
+        recordings: recordings and replays of clients.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class CarlaSession:
     def tick(self, actions: Mapping[str, Any] | None = None) -> int:
         """Advance the world by one tick and send its frames; return the number of the frame.
 
-        `actions`: actions of agents that no client drives; None: the built-in driver's.
+        `actions`: actions of agents that no client drives; None: actions of the built-in driver.
         """
         self.frame += 1
         self.time_s += self.delta_s
@@ -220,7 +220,7 @@ class CarlaSession:
     def change_settings(self, settings: EpisodeSettings) -> None:
         """Apply settings; a step length that does not fit the world restarts the world.
 
-        What clients have spawned is kept; the other vehicles are new ones.
+        Actors that clients have spawned are kept; all other vehicles are new.
 
         Raises CavmarlError: the world cannot have steps of this length. Nothing has changed.
         """

@@ -1,8 +1,8 @@
 """The stream port: a client names a stream, and then receives the frames of that stream.
 
-A frame is sent only if a client listens to its stream. If a client does not read, frames wait in
-this process. While the world runs freely, a client with waiting frames gets no more of them. If the
-world is synchronous, no frame is left out, and a client with too many waiting bytes is dropped.
+A frame is sent only if a client listens to its stream. Unread frames wait in this process. While
+the world runs freely, a client with waiting frames gets no more of them. If the world is
+synchronous, no frame is left out, and a client with too many waiting bytes is dropped.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Compares a road network with what CARLA's own library reads from its OpenDRIVE file.
 
 CARLA's client programs spawn vehicles on lanes, follow lanes over junctions, and look ahead for
-traffic lights. The comparison asks the library for the same.
+traffic lights. The comparison makes the library do the same.
 """
 
 from __future__ import annotations
@@ -30,16 +30,17 @@ from cavmarl.roads.network import CARS, RoadNetwork
 
 Poses = NDArray[np.float64]  # (n, 4): x, y, z in m and yaw in degrees, in CARLA's frame
 
-OFF_LIMIT_M = 0.3  # of 95 % of the points on lanes
+OFF_LIMIT_M = 0.3  # largest distance for 95 % of the points on lanes
 TURN_LIMIT_DEG = 5.0
-SHARE_LIMIT = 0.95  # of each kind of thing that is found
-SPAWN_LIMIT_M = 1.0  # of each spawn point: the vehicle is on its lane, in its direction
+SHARE_LIMIT = 0.95  # share of each kind of element that must be found
+SPAWN_LIMIT_M = 1.0  # largest distance of a spawn point from a lane of the same direction
 SPAWN_LIMIT_DEG = 15.0
 
 _EVERY_M = 2.0  # distance between points on a lane
 _MOST_POINTS = 100_000
-_MARGIN_M = 2.0  # from the ends of lanes to the ends of paths over junctions
-# Paths of the library over a junction can be shorter than ours or longer: its U-turns are wider.
+_MARGIN_M = 2.0  # distance from the ends of lanes to the ends of paths over junctions
+# The library's paths over a junction can be shorter or longer than cavmarl's: its U-turns are
+# wider.
 _PATH_LONGER_M = (-8.0, 0.0, 8.0, 16.0)
 _PATH_ALONG_M = 5.0
 _PATH_ASIDE_M = 1.5
@@ -182,7 +183,7 @@ class _Questions:
         self.before_lights = _poses(network, zip(with_light, at_light, strict=True))
 
     def packed(self, shift: Poses) -> dict[str, Any]:
-        """Return what `client_map_reader` asks; `shift`: from the file's places to ours."""
+        """Return the questions of `client_map_reader`; `shift`: from the file to cavmarl's map."""
         places = np.concatenate([self.lanes, self.spawns, self.insides]) - shift
         starts = (self.starts - shift)[:, :3].tolist()
         far_m = np.maximum(_MARGIN_M, np.add.outer(self.distances_m, _PATH_LONGER_M)).tolist()

@@ -31,10 +31,10 @@ from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS
 from cavmarl.env.parallel import CavEnv
 
-MASS_KG = 1845.0  # that clients read in the physics of each vehicle
+MASS_KG = 1845.0  # mass that clients read in the physics of each vehicle
 _OCCUPIED = "Spawn failed because of collision at spawn position"  # CARLA's text
 _VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all others are cars
-_FASTEST_MPS = MAX_SPEED_MPS - 0.5  # a pose that is farther in a step is a jump
+_FASTEST_MPS = MAX_SPEED_MPS - 0.5  # a faster move to a pose is a jump
 _FASTEST_BACKWARD_MPS = 10.0
 
 
@@ -42,7 +42,7 @@ class ExternalBody(NamedTuple):
     """A vehicle, walker or static prop to spawn."""
 
     type_id: str  # of its blueprint
-    base_type: str  # see `Blueprint.base_type`; a prop is a vehicle that stands
+    base_type: str  # see `Blueprint.base_type`; a prop is a stopped vehicle
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height
     speed_mps: float = 0.0
@@ -54,8 +54,8 @@ class _Spawned:
 
     Attributes:
         lift_m: height of the origin of CARLA's actor above the ground.
-        velocity, spin: in m/s and rad/s, for the next step only.
-        constant: velocity in the vehicle's frame, in each step.
+        velocity, spin: velocity in m/s and turn rate in rad/s, for the next step only.
+        constant: velocity in the vehicle's frame for every step.
         walk: direction and speed of a walker.
     """
 
@@ -79,7 +79,7 @@ class ExternalVehicles:
         self._env = env
         self._spawned: dict[int, _Spawned] = {}
         self.controls: dict[int, Control] = {}
-        self._posed: set[int] = set()  # in the next step, instead of driving
+        self._posed: set[int] = set()  # slots that get a pose in the next step
         self._bicycle_step = specialized(bicycle_step)
 
     def spawn(self, body: ExternalBody) -> tuple[int, tuple[float, float, float]]:
@@ -146,7 +146,7 @@ class ExternalVehicles:
         self._spawned[slot].walk = direction, speed_mps
 
     def set_velocity(self, slot: int, velocity: Vector) -> None:
-        """Give a vehicle a velocity in the next step; then it rolls on, or follows its control."""
+        """Give a vehicle a velocity in the next step; then it rolls, or follows its control."""
         self._spawned[slot].velocity = velocity
 
     def push(self, slot: int, change: Vector) -> None:
@@ -160,7 +160,7 @@ class ExternalVehicles:
         self._spawned[slot].spin = spin_radps
 
     def set_constant(self, slot: int, velocity: Vector | None) -> None:
-        """Keep a velocity in the vehicle's frame, until the next call; None: no longer."""
+        """Keep a velocity in the vehicle's frame until the next call; None: stop keeping it."""
         self._spawned[slot].constant = velocity
 
     def ids(self) -> dict[int, int]:
@@ -243,7 +243,7 @@ class ExternalVehicles:
             east, north = (one.velocity or self._velocity_of(slot))[:2]
             ahead, aside = east * cos - north * sin, -east * sin - north * cos
             if control is None and one.vtype != WALKER:
-                self.controls[slot] = CarlaControl()  # it rolls on
+                self.controls[slot] = CarlaControl()  # it keeps rolling
         if one.spin is not None:
             turn = -one.spin * step_s
         one.velocity = one.spin = None
@@ -266,7 +266,7 @@ class ExternalVehicles:
         self._pose(slot, x, y, math.atan2(north, east), speed)
 
     def _pose(self, slot: int, x: float, y: float, heading: float, speed: float) -> None:
-        """Let a vehicle reach a pose in the next step; at the edge of the map, it stands."""
+        """Let a vehicle reach a pose in the next step; at the edge of the map, it stops."""
         try:
             self._env.external.pose(slot, x, y, heading, speed=speed)
         except ActionError:

@@ -39,15 +39,15 @@ GENERATED_MAP = "OpenDriveMap"  # name of the map that a client has sent
 STEP_S = 0.05
 _HORIZON_S = 100_000.0
 _LONGEST_TICK_S = 0.1
-_DIGITS = 6  # clients send step lengths as float32
+_DIGITS = 6  # digits of a step length, which clients send as float32
 
-# Values of a world that the command loads; those that the user gives come first.
+# Values of a world that the command loads, unless the user gives other values.
 SERVED_WORLD: dict[str, Any] = {
     "population.mode": "respawn",
     "action.kind": "continuous",
-    "action.steering_rad": 1.2,  # the most that is allowed; full steer is a little more
+    "action.steering_rad": 1.2,  # the allowed maximum; full steer is a little more
     "action.acceleration_mps2": 8.0,
-    "traffic.endless": True,  # a vehicle that a client drives does not vanish at a goal
+    "traffic.endless": True,  # a client's vehicle does not vanish at a goal
     "traffic.trip_horizon": 0.0,
     "population.external": 64,
     "signals.overrides": 10_000,
@@ -86,7 +86,7 @@ class HostedWorld:
         controls: the clients' controls, by the index of the agent that they drive.
         external: the vehicles that clients have spawned.
         lights: the traffic lights.
-        replay: a recording that is shown instead of the world; the world then stands still.
+        replay: a recording that is shown instead of the world, which is then paused.
 
     Raises:
         ConfigError: the actions are not continuous, or other processes run the world.
@@ -115,7 +115,7 @@ class HostedWorld:
 
     @property
     def rows(self) -> NDArray[np.void]:
-        """VEHICLE (n,) of the present; the next step overwrites them."""
+        """VEHICLE (n,) of all vehicles now; the next step overwrites them."""
         return self.simulation.vehicles(0) if self.replay is None else self.replay.rows
 
     def light_states(self) -> NDArray[np.uint8]:
@@ -127,16 +127,16 @@ class HostedWorld:
     @property
     def present_lanes(self) -> NDArray[np.void]:
         """LANE (L,) as they are now, with limits that roadside units and callers have set."""
-        # The last table is that of the only world, or of the map if lanes never change.
+        # The last table belongs to the only world, or to the map if lanes never change.
         lanes: NDArray[np.void] = self.simulation.shards[0].worlds.lanes[-1]
         return lanes
 
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
         """Advance the world by one step, or begin the next episode if this one is over.
 
-        `actions`: actions of agents that no client drives; None: the built-in driver's.
+        `actions`: actions of agents that no client drives; None: actions of the built-in driver.
 
-        Returns the agents' vehicles that have left the world.
+        Return the agents' vehicles that have left the world.
         """
         env = self.env
         if self.replay is not None:

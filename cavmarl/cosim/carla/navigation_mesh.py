@@ -18,13 +18,13 @@ from numpy.typing import NDArray
 
 from cavmarl.roads.network import CARS, RoadNetwork
 
-GAP_M = 0.3  # between a road and its strip
-WIDTH_M = 2.0  # of a strip
+GAP_M = 0.3  # gap between a road and its strip
+WIDTH_M = 2.0  # width of a strip
 CROSSWALK_M = 3.0
 _STEP_M = 5.0  # length of a piece of a strip
 _FARTHEST_M = 60.0  # a longer corner is left out
 _LEAST_AREA_M2 = 0.05
-_MOST_VERTICES = 60_000  # of a tile, whose indices have 16 bits
+_MOST_VERTICES = 60_000  # limit of a tile, because indices have 16 bits
 
 # Area types and polygon flags of Detour, with the numbers that the client gives them.
 _SIDEWALK, _CROSSWALK = (1, 0x02), (2, 0x04)

@@ -1,4 +1,4 @@
-"""`OpticalFlowCamera`: how the point that each pixel shows has moved since the last picture."""
+"""`OpticalFlowCamera`: the motion of the point that each pixel shows, since the last picture."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.cosim.carla.carla_geometry import CarlaPose, axes_of
 from cavmarl.cosim.carla.sensor_settings import SensorContext
 
 _SKY_M = 1e6  # depth of pixels without an object, which move only if the camera turns
-_LARGEST = 2.0  # flow is between this and its negative, as CARLA's
+_LARGEST = 2.0  # largest absolute flow, as in CARLA
 _NEAR_M = 0.01  # points that were closer to the plane of the last picture have the largest flow
 
 Floats = NDArray[np.float64]
@@ -35,7 +35,7 @@ class _Bodies(NamedTuple):
         return cls(rows["id"].copy(), place, -rows["heading"])
 
     def find(self, ids: NDArray[np.int64]) -> tuple[NDArray[np.bool_], NDArray[np.int64]]:
-        """Return which ids (n,) there are, and the rows of these."""
+        """Return which ids (n,) are present, and their rows."""
         rows = np.searchsorted(self.ids, ids)
         known = rows < len(self.ids)
         known[known] = self.ids[rows[known]] == ids[known]

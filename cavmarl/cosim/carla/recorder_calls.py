@@ -22,12 +22,12 @@ from cavmarl.cosim.carla.carla_recorder import RecordedActor
 from cavmarl.cosim.carla.carla_replay import CarlaRecording, nearest_to
 from cavmarl.cosim.carla.carla_session import CarlaSession
 
-_MOST_CHARACTERS = 1 << 22  # of a report
+_MOST_CHARACTERS = 1 << 22  # limit of a report
 _MOST_FACTOR = 1000.0
 _KINDS = {"vehicle": 1, "walker": 2}  # CARLA's numbers; all others are 0
 _LETTERS = {"h": "hero", "v": "vehicle", "w": "walker", "t": "light", "o": "other", "a": "any"}
 _NO_OFFSET = CarlaPose(0.0, 0.0, 0.0)
-_BEHIND = CarlaPose(-10.0, 0.0, 5.0, -25.0)  # of the spectator that follows a vehicle
+_BEHIND = CarlaPose(-10.0, 0.0, 5.0, -25.0)  # spectator behind a vehicle
 
 
 @call(
@@ -57,7 +57,7 @@ def stop_recorder(caller: Caller, session: CarlaSession) -> None:
     flag,
     pose,
     required=4,  # client 0.9.15 has no offset
-    note="shows the recorded vehicles instead of the world, which stands still until the end",
+    note="shows the recorded vehicles instead of the world, which is paused until the end",
 )
 def replay_file(
     caller: Caller,
@@ -136,7 +136,7 @@ def _tail(recording: CarlaRecording) -> str:
 
 
 def _cut(head: str, lines: Iterator[str]) -> str:
-    """Return a report, which a line ends if it becomes too long for a message."""
+    """Return a report; if it is too long for a message, cut it and say so in a last line."""
     parts, size = [head], len(head)
     for line in lines:
         size += len(line) + 1
@@ -148,7 +148,7 @@ def _cut(head: str, lines: Iterator[str]) -> str:
 
 
 def _frame_lines(recording: CarlaRecording, show_all: bool) -> Iterator[str]:
-    """Yield when actors come and go; with `show_all`, also their places in each frame, in cm."""
+    """Yield when actors appear and leave; with `show_all`, also their places by frame, in cm."""
     actors = recording.session.actors
     present: set[int] = set()
     for frame_number, (time_s, frame) in enumerate(recording.moments(), start=1):

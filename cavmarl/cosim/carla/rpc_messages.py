@@ -46,7 +46,7 @@ class RequestReader:
         """Yield the requests that are complete after `data` has arrived.
 
         Raises MessageError: the bytes are not requests, or a message is too large. The connection
-        cannot be used any more.
+        is then unusable.
         """
         try:
             self._unpacker.feed(data)

@@ -29,7 +29,7 @@ from cavmarl.sensors.kernels.rig_rays import measure_lidar
 from cavmarl.sensors.mounted.backdrop import make_backdrop
 
 _CELL_M = 32.0
-_NO_ID = -2  # of the row of a sensor without a carrier; -1 is the id of no hit
+_NO_ID = -2  # id of the row of a sensor without a carrier; -1 means no hit
 
 
 class RayHits(NamedTuple):

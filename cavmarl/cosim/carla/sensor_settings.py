@@ -1,4 +1,4 @@
-"""The attributes of an attached sensor, and what it can ask about the world."""
+"""The attributes of an attached sensor, and its view of the world."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""`SessionRecordings`: what the clients of a session record and replay."""
+"""`SessionRecordings`: recordings and replays of the clients of a session."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class SessionRecordings:
     """The recording that a session makes, or the recording that it shows instead of its world.
 
-    `session`: the session. `folder`: where recordings are; None: clients can make none.
+    `session`: the session. `folder`: folder of the recordings; None: clients cannot record.
     """
 
     def __init__(self, session: CarlaSession, folder: Path | None) -> None:
@@ -63,7 +63,7 @@ class SessionRecordings:
         """Raise CallRefused if a recording is being replayed."""
         if self._live is not None:
             raise CallRefused(
-                "a recording is being replayed, and the world stands still; call stop_replayer, or "
+                "a recording is being replayed, and the world is paused; call stop_replayer, or "
                 "wait for its end"
             )
 
@@ -75,7 +75,7 @@ class SessionRecordings:
         follow: int,
         offset: CarlaPose,
     ) -> CarlaReplay:
-        """Show a recording instead of the world, which stands still until the end.
+        """Show a recording instead of the world, which is paused until the end.
 
         Args:
             recording: the recording.
@@ -126,7 +126,7 @@ class SessionRecordings:
     def end_replay(self, only_if_over: bool = False) -> None:
         """Show the world again, if a recording is being shown.
 
-        `only_if_over`: go on with a recording that has not reached its end.
+        `only_if_over`: continue a recording that has not reached its end.
         """
         session = self._session
         replay = session.world.replay
@@ -167,7 +167,7 @@ class _LiveActors:
             shown.spectator.pose = compose(shown.pose_of(actor), self._offset)
 
     def take_back(self, shown: ActorTable) -> list[CarlaActor]:
-        """Take over what clients have changed; return the sensors that have lost their parents."""
+        """Take over the clients' changes; return the sensors that have lost their parents."""
         self.actors.spectator.pose = shown.spectator.pose
         self.actors.skip_to(shown.next_number)
         for number in self._shared - shown.actors.keys():

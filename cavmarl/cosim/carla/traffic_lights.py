@@ -1,4 +1,4 @@
-"""`TrafficLights`: the traffic lights of a world, as clients set, time and freeze them.
+"""`TrafficLights`: traffic lights whose states and times clients set, and which they can freeze.
 
 A group is the lights of one signal. It runs its program of the map until a client changes a time,
 freezes or resets the group. From then on, the group goes through the phases of that program with
@@ -38,7 +38,7 @@ class _Group:
 
     first: int  # PHASE row
     following: list[int]
-    durations_s: NDArray[np.float64]  # of each phase
+    durations_s: NDArray[np.float64]  # duration of each phase
     phase: int
     elapsed_s: float
     is_frozen: bool = False
@@ -91,7 +91,7 @@ class TrafficLights:
 
     @property
     def is_frozen(self) -> NDArray[np.bool_]:
-        """Whether the time of each light stands still."""
+        """Whether the time of each light is stopped."""
         frozen = {signal for signal, group in self._groups.items() if group.is_frozen}
         return np.array([one.signal in frozen for one in self._map.approaches], np.bool_)
 
@@ -151,7 +151,8 @@ class TrafficLights:
     def reset(self, light: int | None = None) -> None:
         """Begin the cycle of a light's group, or of all groups, with the first phase.
 
-        Lights of these groups no longer show states that clients have set. Times stay.
+        Lights of these groups no longer show states that clients have set. Their times do not
+        change.
 
         Raises ConfigError: see `set_state`.
         """
@@ -182,7 +183,7 @@ class TrafficLights:
             self._write()
 
     def note(self, step_s: float) -> None:
-        """Note for how long the lights have had their states, after the world's step."""
+        """Record how long the lights have had their states, after the world's step."""
         states = self.states()
         self.elapsed_s[~self.is_frozen] += step_s
         self.elapsed_s[states != self._states] = 0.0

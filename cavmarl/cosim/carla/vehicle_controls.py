@@ -14,7 +14,7 @@ FULL_STEER_RAD = math.radians(70.0)  # angle of the front wheels at steer = 1
 WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles; agents' axles can be farther apart
 THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
-_ROLLING_MPS2 = 0.2  # deceleration without throttle, and its growth with the speed
+_ROLLING_MPS2 = 0.2  # deceleration without throttle, and its increase per m/s
 _DRAG_PER_S = 0.02
 _LARGEST_SINE = 0.99
 _STANDING_MPS = 0.01

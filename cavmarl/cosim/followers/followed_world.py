@@ -1,12 +1,12 @@
-"""`FollowedWorld`: one world whose time a master advances and whose agents are driven by followers.
+"""`FollowedWorld`: a world whose time a master advances and whose agents followers drive.
 
 A cycle is that of Algorithm 1 of the co-simulation paper: the queued controls take effect, the
 world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and u is queued
-for the next cycle. The cycle ends when every follower has answered. So a slow follower holds the
+for the next cycle. The cycle ends when every follower has answered. So a slow follower delays the
 world, and no frame is skipped.
 
-Followers are served in the order of their first agent; followers without agents come last, by name.
-Answers may arrive in any order without effect on the result.
+Followers are served in the order of their first agent; followers without agents come last, sorted
+by name. Answers may arrive in any order without effect on the result.
 """
 
 from __future__ import annotations
@@ -53,12 +53,11 @@ class FollowedWorld:
     left.
 
     Args:
-        env: the world, in this process or run by workers; it has a master until `close`.
+        env: the world, in this process or in workers; it has a time master until `close`.
         address: path of a Unix socket, or a port of this machine; 0 picks a free port.
-        secret: required from followers; necessary for a port, which all users can connect to.
-        timeout_s: maximum time that a step waits for its followers, by the wall clock.
-        own_ticks: handling of a follower's own ticks; see `TimeMaster`.
-        on_drift: see `TimeMaster`.
+        secret: secret that followers must send; necessary for a port, to which all users can
+        connect. timeout_s: maximum time that a step waits for its followers, by the wall clock.
+        own_ticks: handling of a follower's own ticks; see `TimeMaster`. on_drift: see `TimeMaster`.
         bad_controls: handling of invalid controls: `error`: the follower is dropped with a
             `FollowerError`; `hold`: the vehicle's last controls are used, and counted.
         pacer: pace by the wall clock; None: as fast as possible.
@@ -201,7 +200,7 @@ class FollowedWorld:
         return dict(rewards)
 
     def manifest(self) -> dict[str, Any]:
-        """Return what a result depends on: the followers, and when controls take effect."""
+        """Return the conditions of a result: the followers, and when controls take effect."""
         clock = self.env.config.clock
         return {
             "sim_dt_s": clock.sim_dt_s,
@@ -320,7 +319,7 @@ class FollowedWorld:
     def _exchange(self, seats: Sequence[FollowerSeat]) -> None:
         """Send snapshots of the world and queue the followers' controls.
 
-        Raises FollowerError: that of the first follower, in their order, with which the world
+        Raises FollowerError: the error of the first follower, in their order, with which the world
         cannot continue; the controls of the others are queued anyway.
         """
         if self._episode < 0 or not seats:
@@ -332,7 +331,7 @@ class FollowedWorld:
         self._settle(found)
 
     def _hear_others(self) -> None:
-        """Receive what followers have sent that the world does not wait for.
+        """Receive messages of the followers for which the world does not wait.
 
         Raises FollowerError: the messages of one of them are invalid.
         """
@@ -362,7 +361,7 @@ class FollowedWorld:
     def _settle(self, found: BarrierOutcome) -> None:
         """Drop the followers that have left or failed.
 
-        Raises FollowerError: that of the first follower that has failed, in their order.
+        Raises FollowerError: the error of the first failed follower, in their order.
         """
         for seat in found.left:
             self._drop(seat)
@@ -376,7 +375,7 @@ class FollowedWorld:
     def _refuse(self, refused: Mapping[ClientActor, CavmarlError]) -> None:
         """Drop the followers of refused actors, and tell them the reasons.
 
-        Raises CavmarlError: the reason for which an actor of a trace is refused.
+        Raises CavmarlError: an actor of a trace is refused.
         """
         owners = {actor: seat for seat in self._seats for actor in seat.actors}
         for actor, error in refused.items():
@@ -394,7 +393,7 @@ class FollowedWorld:
 
 
 def order_of(request: ActorRequest) -> ActorOrder:
-    """Return what a follower asks for. Raises FollowerError: the size has no three numbers."""
+    """Return a requested actor. Raises FollowerError: the size does not have three numbers."""
     size = request.size_m
     if size and len(size) != 3:
         raise FollowerError(

@@ -27,8 +27,8 @@ from cavmarl.cosim.followers.follower_snapshots import SnapshotTime, see_actors,
 from cavmarl.cosim.time_master import TimeFollower
 from cavmarl.env.parallel import CavEnv
 
-READS_S = 0.5  # for reading a snapshot, if the world does not wait for the follower
-MOST_MESSAGES = 1000  # read from a follower before a step, if the world does not wait for it
+READS_S = 0.5  # time to read a snapshot if the world does not wait for the follower
+MOST_MESSAGES = 1000  # limit per step for a follower for which the world does not wait
 BadControls = Literal["error", "hold"]
 
 
@@ -40,11 +40,11 @@ class FollowerSeat:
     clock: TimeFollower  # its view of the master's clock
     agents: tuple[int, ...]  # indices of the agents that it drives, ascending
     truth: bool = False  # whether it receives the true state of all vehicles
-    actors: tuple[ClientActor, ...] = ()  # that it has brought into the world
+    actors: tuple[ClientActor, ...] = ()  # actors that it has brought into the world
     waits: bool = True  # whether the world waits for its answers
     leads: bool = False  # whether its ticks release the steps of the world
     has_ticked: bool = False  # whether it has released the next step
-    frame: int = -1  # of the last snapshot sent to it; -1: none yet
+    frame: int = -1  # frame of the last snapshot sent to it; -1: none yet
     held: dict[str, Any] = field(default_factory=dict)  # last controls of its vehicles
     answers: int = 0  # number of controls sent in time
     late: int = 0  # number of answers to earlier snapshots, which are discarded
@@ -107,7 +107,7 @@ class Barrier:
                 within_s = self._timeout_s if seat.waits else min(self._timeout_s, READS_S)
                 seat.line.say(Say.SNAPSHOT, snapshot, arrays, within_s)
             except FollowerLostError as error:
-                if error.is_late:  # else the messages read below may contain its goodbye
+                if error.is_late:  # otherwise, the messages read below may contain its goodbye
                     found.failed[seat] = error
                     asked.pop(seat, None)
         if moment.is_over or not asked:
@@ -123,7 +123,7 @@ class Barrier:
         return found
 
     def hear_others(self, seats: Sequence[FollowerSeat], moment: SnapshotTime) -> BarrierOutcome:
-        """Receive what followers that the world does not wait for have sent.
+        """Receive messages of the followers for which the world does not wait.
 
         A follower that has closed its connection has left. `moment`: time of the last snapshot.
         """

@@ -56,13 +56,13 @@ class Follower:
                 follower.answer({"car_0": [0.2, 0.0]})
 
     `address`: path of a Unix socket, or a port of this machine. `vehicles`: agents to drive; none:
-    it only follows the clock and answers with {}. `joins_s`: maximum time for the world to accept
-    the follower, which it does between two steps; None: no limit. `secret`: of the world, if it
-    listens at a port. `truth`: whether snapshots contain all vehicles of the world, which the world
-    has to allow. `actors`: vehicles, people or roadside units to bring into the world; they leave
-    with the follower. `waits`: whether the world waits for the answers; if not, the follower may
-    send poses and controls at any time, and misses snapshots while it has not read earlier ones.
-    `leads`: whether each step of the world waits for a `tick` of this follower.
+    it only follows the clock and answers with {}. `joins_s`: maximum time until the world accepts
+    the follower, which happens between two steps; None: no limit. `secret`: secret of the world, if
+    it listens at a port. `truth`: whether snapshots contain all vehicles of the world, which the
+    world has to allow. `actors`: vehicles, people or roadside units to bring into the world; they
+    leave with the follower. `waits`: whether the world waits for the answers; if not, the follower
+    may send poses and controls at any time, and misses snapshots while it has not read earlier
+    ones. `leads`: whether each step of the world waits for a `tick` of this follower.
 
     Attributes:
         welcome: the world's clock and sensors.

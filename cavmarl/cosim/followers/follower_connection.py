@@ -93,8 +93,8 @@ class _DeadlineSocket(socket.socket):
 class FollowerConnection:
     """Sends and receives frames; any fault of the other end is raised as a `FollowerError`.
 
-    `connection`: a connected socket, owned by this object from now on. `name`: of the other end,
-    for messages. `cure`: advice for when the other end is lost, as the end of a sentence.
+    `connection`: a connected socket, owned by this object from now on. `name`: name of the other
+    end, for messages. `cure`: advice for when the other end is lost, as the end of a sentence.
     """
 
     def __init__(self, connection: socket.socket, name: str, cure: str = "") -> None:
@@ -193,7 +193,7 @@ class FollowerConnection:
     def _peer_errors(self, what: str, within_s: float | None) -> Iterator[None]:
         """Raise errors of the connection as errors of the other end.
 
-        `what`: what the other end had to do, as a participle for the message.
+        `what`: the expected action as a participle, such as "answered", for the message.
         """
         try:
             yield
@@ -239,7 +239,7 @@ def _size(view: ArrayView) -> int:
 def listen(address: Address) -> socket.socket:
     """Listen for followers, on this machine only.
 
-    A Unix socket admits the users that the file system admits, initially its owner. A port of the
+    File permissions decide who may use a Unix socket: initially, its owner. A port of the
     loopback interface admits every user of this machine.
 
     Args:
@@ -347,7 +347,7 @@ class Reception:
         """Yield followers that have introduced themselves since the last call, in order.
 
         Args:
-            within_s: how long to wait for the first; 0: not at all.
+            within_s: how long to wait for the first follower; 0: not at all.
         """
         ready = self._selector.select(within_s)
         for key, _ in sorted(ready, key=lambda found: found[0].fd):

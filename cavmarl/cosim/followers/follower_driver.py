@@ -22,7 +22,7 @@ class StackDriver:
     the vehicles.
 
     Attributes:
-        stacks: of the present vehicles, by agent.
+        stacks: stacks of the present vehicles, by agent.
 
     Raises:
         ConfigError: the map differs, a stage lacks a sensor, or the actions are not continuous.

@@ -35,7 +35,7 @@ VERSION = 4
 MAX_LETTER = 1 << 22
 MAX_DATA = 1 << 28
 MAX_VEHICLES = 4096
-MAX_POSES = 4096  # of one actor in a message
+MAX_POSES = 4096  # maximum number for one actor in a message
 
 
 class Say(IntEnum):
@@ -81,7 +81,7 @@ class ActorRequest:
     moved_by: StrictStr = "poses"  # or `controls`, `nothing`
     rate_hz: StrictFloat = 0.0  # rate of its poses; 0: unknown
     extrapolation_s: StrictFloat = 0.5  # largest time for which a pose is extrapolated
-    # names of the sensors that it carries, of the world's `rig`
+    # names of the sensors of the world's `rig` that it carries
     rig: list[StrictStr] = field(default_factory=list)
 
 
@@ -107,7 +107,7 @@ class SensorView:
     """A sensor that every vehicle has."""
 
     name: StrictStr
-    units: list[StrictStr]  # of its channels
+    units: list[StrictStr]  # units of its channels
     # its keys in `env.yaml`: type, mounting, rate, range and so on
     settings: dict[StrictStr, Any]
 
@@ -157,7 +157,7 @@ class VehicleView:
     vclass: StrictStr  # SUMO's class
     length_m: StrictFloat  # length of its body
     width_m: StrictFloat  # width of its body
-    wheelbase_m: StrictFloat  # each axle is half of it from the centre of the body
+    wheelbase_m: StrictFloat  # distance between the axles; the centre of the body is in the middle
     goal_edge: StrictStr  # destination, an edge of the map
     goal_m: list[StrictFloat]  # end of the destination edge: x and y on the map
     goal_heading_rad: StrictFloat  # heading of the road there
@@ -192,7 +192,7 @@ class FollowerSnapshot:
     # the follower's vehicles in the world, which have to be driven
     vehicles: dict[StrictStr, VehicleView]
     arrays: list[ArrayView]  # new samples of their sensors, and of those of the actors
-    actors: dict[StrictStr, ActorView] = field(default_factory=dict)  # by name
+    actors: dict[StrictStr, ActorView] = field(default_factory=dict)  # actors by name
 
 
 @with_config(_CLOSED)
@@ -214,7 +214,7 @@ class PoseView:
 class ActorPoses:
     """Poses of actors, in any order."""
 
-    poses: dict[StrictStr, list[PoseView]]  # by the name of the actor
+    poses: dict[StrictStr, list[PoseView]]  # poses by name of the actor
 
 
 @with_config(_CLOSED)
@@ -222,9 +222,10 @@ class ActorPoses:
 class Control:
     """The answer to a snapshot."""
 
-    frame: StrictInt  # of the snapshot
-    # of each vehicle: two numbers in [-1, 1], or the number of a meta-action; of an actor that is
-    # moved by controls: two numbers in [-1, 1]; without them, it keeps its last ones
+    frame: StrictInt  # frame of the snapshot
+    # controls of each vehicle: two numbers in [-1, 1], or the number of a meta-action; of an actor
+    # that is moved by controls: two numbers in [-1, 1]; without new controls, it keeps its last
+    # ones
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
     poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
 

@@ -1,7 +1,7 @@
 """`FramedSocket`: frames over a connection.
 
 A frame is a head of fixed size, a payload (mostly a few numbers, encoded as the dialect defines)
-and data (bytes of arrays, whose shapes both ends know). A frame carries numbers and text, never
+and data (bytes of arrays, whose shapes both ends know). A frame contains numbers and text, never
 code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,

@@ -1,6 +1,6 @@
 """Traffic lights and other vehicles as Autoware's messages.
 
-Autoware names a traffic light by the id of its regulatory element in the vector map; those of
+Autoware names a traffic light by the id of its regulatory element in the vector map; the ids of
 `cavmarl map export --autoware` are `FIRST_LIGHT` plus the row of the link.
 """
 
@@ -32,12 +32,12 @@ from cavmarl.roads.network import VEHICLE_CLASSES
 # Paths of objects: length and step.
 PATH_S, PATH_STEP_S = 5.0, 0.5
 
-# Of TrafficLightElement
+# Codes of TrafficLightElement
 RED, AMBER, GREEN = 1, 2, 3
 CIRCLE, SOLID_OFF, SOLID_ON, FLASHING, UNKNOWN = 5, 13, 14, 15, 16
 _LIT = {
     SIGNAL_RED: (RED,),
-    # The driver may turn after a stop, which no element says.
+    # The driver may turn after a stop; no element exists for this state.
     SIGNAL_STOP_THEN_GO: (RED,),
     SIGNAL_RED_YELLOW: (RED, AMBER),
     SIGNAL_YELLOW_MINOR: (AMBER,),
@@ -58,12 +58,12 @@ _ELEMENTS: dict[int, list[Fields]] = {
     for code, shown in _SHOWN.items()
 }
 
-_LABELS = {"truck": 2, "bus": 3, "tram": 3, "motorcycle": 5, "bicycle": 6}  # else a car: 1
+_LABELS = {"truck": 2, "bus": 3, "tram": 3, "motorcycle": 5, "bicycle": 6}  # all others are cars: 1
 _HAS_DIRECTION = 2  # DetectedObjectKinematics: front and rear are known
 
 
 def light_groups(codes: NDArray[np.uint8], stamp_ns: int) -> Fields:
-    """Return a `autoware_perception_msgs/msg/TrafficLightGroupArray`.
+    """Return an `autoware_perception_msgs/msg/TrafficLightGroupArray`.
 
     `codes`: (links,) the SIGNAL_* code of each link of the map.
     """
@@ -137,7 +137,7 @@ def _box_pose(row: Mapping[str, float]) -> Fields:
 def _turning(row: Mapping[str, float]) -> tuple[float, float]:
     """Return the slip angle and the yaw rate of the centre of a kinematic bicycle.
 
-    Half of a vehicle's wheelbase is not among the true states; 0.3 lengths are taken for it.
+    The true states do not contain the wheelbase; half of it is taken to be 0.3 lengths.
     """
     slip = math.atan(0.5 * math.tan(row["steering"]))
     return slip, row["speed"] * math.sin(slip) / max(0.3 * row["length"], 0.1)
@@ -154,7 +154,7 @@ def _path(row: Mapping[str, float]) -> list[Fields]:
     count = round(PATH_S / PATH_STEP_S) + 1
     times_s = PATH_STEP_S * np.arange(count)
     headings = row["heading"] + yaw_rate * times_s
-    # Each piece of an arc has the direction of its middle.
+    # Each piece of an arc has the direction at the middle of the piece.
     courses = headings[:-1] + 0.5 * PATH_STEP_S * yaw_rate + slip
     pieces = row["speed"] * PATH_STEP_S * np.stack([np.cos(courses), np.sin(courses)])
     x, y = np.hstack([np.zeros((2, 1)), np.cumsum(pieces, axis=1)])

@@ -14,7 +14,7 @@ from cavmarl.cosim.ros2.sensor_messages import TrueState
 # A pose of `/initialpose` is accepted up to these differences from the true pose.
 POSE_TOLERANCE_M, POSE_TOLERANCE_RAD = 3.0, 0.5
 
-# Of autoware_vehicle_msgs
+# Codes of autoware_vehicle_msgs
 DRIVE, AUTONOMOUS, DISABLE = 2, 1, 1
 _INDICATORS, _HAZARD, _GEAR = (
     f"/control/command/{name}_cmd" for name in ("turn_indicators", "hazard_lights", "gear")
@@ -28,15 +28,16 @@ class RequestCounts:
     """Requests of one topic."""
 
     accepted: int = 0
-    refused: int = 0  # what the vehicle cannot do
+    refused: int = 0  # requests that the vehicle cannot fulfil
     invalid: int = 0  # bytes that are not a message, and unknown values
 
 
 class AutowareRequests:
     """What nodes of Autoware request of a vehicle besides its motion.
 
-    The world owns the place of the vehicle: a pose of `/initialpose` is accepted if it agrees with
-    the true pose, and moves nothing. There is no gear but DRIVE. Lights are reported as commanded.
+    The world determines the position of the vehicle: a pose of `/initialpose` is accepted if it
+    agrees with the true pose, and moves nothing. The only gear is DRIVE. Lights are reported as
+    commanded.
 
     `types`: message types. `truth`: whether the true pose is known; otherwise there is no topic
     `/initialpose`.
@@ -65,7 +66,7 @@ class AutowareRequests:
         return self._lights[_HAZARD]
 
     def take(self, topic: str, data: bytes, state: TrueState | None) -> str:
-        """Read a message in CDR, and return why it is refused; empty: it is not.
+        """Read a message in CDR, and return why it is refused; empty: it is accepted.
 
         `state`: the true state of the vehicle, if it is known.
         """

@@ -24,7 +24,7 @@ OBJECT_RANGE_M = 100.0  # objects are published up to this distance
 _ACCELERATION = "/localization/acceleration"
 _POSE = "/sensing/gnss/pose_with_covariance"
 _STATUS = "/vehicle/status/{}"
-_REPORTS = {  # of /vehicle/status
+_REPORTS = {  # topics of /vehicle/status
     "velocity_status": "VelocityReport",
     "steering_status": "SteeringReport",
     "gear_status": "GearReport",
@@ -36,12 +36,12 @@ _INITIALIZED = 3  # LocalizationInitializationState
 
 
 class Motion:
-    """What is known of a vehicle's motion without its true state.
+    """The motion of a vehicle as far as it is known without the true state.
 
     Attributes:
         speed_mps: measured speed at the rear axle.
         yaw_rate_radps: measured yaw rate.
-        steering_rad: angle to which the vehicle was last told to steer.
+        steering_rad: last commanded steering angle.
         turn_indicators: state in TurnIndicatorsReport.
         hazard_lights: state in HazardLightsReport.
     """
@@ -58,7 +58,7 @@ class AutowareTopics:
 
     Attributes:
         kinds: type of each topic.
-        latched: topics whose last message is for late subscribers, too.
+        latched: topics whose last message late subscribers also get.
     """
 
     def __init__(self, truth: bool) -> None:

@@ -25,7 +25,7 @@ class BridgedWorld:
     Args:
         env: the world, which the caller closes.
         vehicles: agents to drive.
-        options: of the bridge.
+        options: options of the bridge.
         pacer: pace by the wall clock; None: as fast as possible.
         own_ticks: handling of ticks of the bridge; see `FollowedWorld`.
         follow: makes the bridge's connection to an address; None: a `Follower` of the vehicles.
@@ -35,7 +35,7 @@ class BridgedWorld:
         report: figures of the bridge, after the `with` statement.
 
     Raises:
-        CavmarlError: that of the bridge if it has failed, otherwise that of the world.
+        CavmarlError: the error of the bridge if it has failed, otherwise that of the world.
     """
 
     def __init__(

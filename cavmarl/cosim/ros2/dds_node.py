@@ -19,12 +19,12 @@ from cavmarl.cosim.ros2.ros_types import RosTypes
 MAX_DOMAIN = 101  # higher domains need ports that Linux gives to other programs
 _MAX_PARTICIPANTS = 32
 _KEPT_SAMPLES = 10
-# Types whose messages come one by one and have up to some MB. Of others, several may come at once,
-# and a node that is busy for a second must not lose them.
+# Types with large messages (some MB), which arrive one by one. Several messages of other types may
+# arrive at once, and a node that is busy for a second must not lose them.
 LARGE = ("sensor_msgs/msg/Image", "sensor_msgs/msg/PointCloud2")
 _KEPT_SMALL = 200
 _PARTS = ("builtin", "core", "domain", "idl", "pub", "qos", "sub", "topic", "util")
-_MOST_ENDPOINTS = 4096  # read at a time
+_MOST_ENDPOINTS = 4096  # limit of one read
 _MAX_BLOCKING_S = 10
 _GRAPH = "ros_discovery_info"
 _GRAPH_KIND = "rmw_dds_common/msg/ParticipantEntitiesInfo"
@@ -174,7 +174,7 @@ class DdsNode:
         found = []
         for reader in self._endpoints:
             for endpoint in reader.take(_MOST_ENDPOINTS):
-                # Samples of endpoints that have gone have no names.
+                # Samples of closed endpoints have no names.
                 topic = (endpoint.topic_name or "").removeprefix("rt")
                 kind = self._kinds.get(topic)
                 if kind is not None and endpoint.type_name != _dds_name(kind):
@@ -186,7 +186,7 @@ class DdsNode:
         participant, self._participant = self._participant, None
         if participant is None:
             return
-        # An entity ends when nothing refers to it any more.
+        # DDS deletes an entity when its last reference is gone.
         self._writers, self._readers = {}, {}
         del self._graph, self._wait_set, self._endpoints
         with suppress(Exception):
@@ -295,18 +295,18 @@ def _kept(kind: str) -> int:
 
 
 def _dds_name(kind: str) -> str:
-    """Return the name that a type of ROS has in DDS."""
+    """Return the DDS name of a ROS type."""
     package, folder, name = kind.split("/")
     return f"{package}::{folder}::dds_::{name}_"
 
 
 def _ros_name(name: str) -> str:
-    """Return the name in ROS of a type of DDS."""
+    """Return the ROS name of a DDS type."""
     return name.replace("::dds_", "").replace("::", "/").removesuffix("_")
 
 
 def _loopback(make: Any, domain: int) -> Any:
-    """Return the domain on the loopback interface; a process can have each domain once."""
+    """Return the domain on the loopback interface; a process can open each domain once."""
     with _LOCK:
         found = _DOMAINS.get(domain)
         if found is None:

@@ -34,9 +34,9 @@ log = logging.getLogger(__name__)
 Wait = Literal["stamp", "newest"]
 
 _NODE_NAME = "cavmarl"
-_LOOK_S = 0.1  # how often matched subscribers are counted, wall time
+_LOOK_S = 0.1  # time between two counts of matched subscribers, wall time
 _SETTLED_S = 0.5  # all subscriptions are found if their number is constant for this long, wall time
-_REPEAT_S = 1.0  # how often the clock is repeated while the bridge waits, wall time
+_REPEAT_S = 1.0  # time between two clock messages while the bridge waits, wall time
 
 BUFFER_LIMIT = Path("/proc/sys/net/core/rmem_max")
 BUFFER_BYTES = 4 << 20  # as in `fast_dds.xml`, because a large message arrives in one burst
@@ -50,7 +50,7 @@ class RosOptions:
         profile: topics and frames; see `ros_topics.VehicleTopics`.
         distro: distribution whose types are used.
         domain: ROS_DOMAIN_ID.
-        wait: `stamp`: each step waits for a command whose time is that of the step, less the lag.
+        wait: `stamp`: each step waits for a command with the time of the step, minus the lag.
             `newest`: a step takes the newest command and never waits, so results depend on the wall
             clock.
         deadline_s: a step waits at most this long, wall time; then the last command is held.
@@ -362,7 +362,7 @@ def _warn_of_small_buffers() -> None:
     """Warn if receive buffers on this machine are too small for large messages."""
     try:
         limit = int(BUFFER_LIMIT.read_text())
-    except (OSError, ValueError):  # another system, whose limit is unknown
+    except (OSError, ValueError):  # another operating system, whose limit is unknown
         return
     if limit < BUFFER_BYTES:
         log.warning(

@@ -16,7 +16,7 @@ from cavmarl.cosim.followers.follower_messages import Welcome
 from cavmarl.cosim.ros2.ros_types import RosTypes, ns_of
 
 SPEED_TIME_S = 0.5  # time constant of the approach to a commanded speed
-NEVER = -(1 << 62)  # ns, before all times
+NEVER = -(1 << 62)  # ns; earlier than any time
 _STANDS_MPS = 0.05  # below this speed, a commanded yaw rate means full steering
 
 
@@ -75,7 +75,7 @@ class ControlCounts:
     """Counts of the commands of a vehicle."""
 
     received: int = 0  # messages
-    used: int = 0  # steps with a command of their time
+    used: int = 0  # steps with a command for their time
     held: int = 0  # steps with an older command, or without any (the vehicle brakes)
     late: int = 0  # steps in which no command came before the deadline
     old: int = 0  # messages older than a used message

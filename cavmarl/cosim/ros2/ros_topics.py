@@ -133,13 +133,13 @@ class VehicleTopics:
         profile: `plain`: topics and frames begin with the id. `autoware`: the topics and frames of
             Autoware, for one vehicle.
         names: other names, by sensor; see `read_names`.
-        truth: whether its true state is published.
+        truth: whether the true state is published.
 
     Attributes:
         base: name of the frame `base_link`.
         kinds: type of each topic.
         latched: topics whose last message is for late subscribers, too.
-        motion: what is known of its motion without its true state.
+        motion: its motion as far as it is known without the true state.
 
     Raises:
         ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have one
@@ -299,7 +299,7 @@ class VehicleTopics:
         rows: NDArray[np.float64],
         codes: NDArray[np.uint8] | None,
     ) -> Iterator[RosMessage]:
-        """Yield the messages of the profile `autoware` about the vehicle and what is around it.
+        """Yield the messages of the profile `autoware` about the vehicle and its surroundings.
 
         `rows`: true states of all vehicles. `codes`: (links,) the SIGNAL_* codes of the map.
         """
@@ -336,7 +336,7 @@ class WorldTopics:
         for vehicle in vehicles:
             if taken := sorted(self.kinds.keys() & vehicle.kinds.keys()):
                 raise ConfigError(
-                    f"{taken[0]} of {vehicle.vehicle} is the topic of something else; use one "
+                    f"{taken[0]} of {vehicle.vehicle} is used by another message; use one "
                     "vehicle with the profile autoware, and other names of sensors"
                 )
             self.kinds |= vehicle.kinds

@@ -122,7 +122,7 @@ class RosMessage(NamedTuple):
     topic: str
     kind: str  # for example `sensor_msgs/msg/Imu`
     stamp_ns: int  # simulated time
-    fields: dict[str, Any]  # values by field; nested messages are dicts, too
+    fields: dict[str, Any]  # values by field; nested messages are dicts
 
 
 class RosTypes:

@@ -1,1 +1,1 @@
-"""A reference stack of replaceable stages that drives by sensors and a map alone."""
+"""A reference driving stack with replaceable stages; it uses only sensors and a map."""

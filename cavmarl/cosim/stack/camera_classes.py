@@ -1,4 +1,4 @@
-"""Perception by lidar and camera: the lidar groups echoes, the camera's classes name the objects.
+"""Perception by lidar and camera: echoes are grouped into objects, the camera gives their class.
 
 Echoes of an object are projected into the newest picture of each semantic camera, at three heights
 of a body. The most frequent class of these pixels is the object's class (late fusion, as in Vora
@@ -22,7 +22,7 @@ from cavmarl.cosim.stack.stack_types import EgoPose, Readings, StackSensor
 from cavmarl.sensors.kernels.panorama import SEMANTIC_NAMES
 from cavmarl.sensors.mounted.mount_transforms import mount_rotation
 
-_HEIGHTS_M = (0.3, 0.7, 1.1)  # above the ground
+_HEIGHTS_M = (0.3, 0.7, 1.1)  # heights above the ground
 _NEAREST_M = 0.5  # minimum depth before the camera
 _BEHIND_M = 2.0  # echoes this much deeper than the nearest one in their column may be hidden
 _KINDS = {
@@ -50,7 +50,7 @@ class _Camera(NamedTuple):
 class LidarCamera(LidarObjects):
     """The perception stage `lidar_camera`.
 
-    `sensors`: of the vehicle: lidars, and at least one semantic camera.
+    `sensors`: sensors of the vehicle: lidars, and at least one semantic camera.
 
     Raises ConfigError: there is no semantic camera.
     """

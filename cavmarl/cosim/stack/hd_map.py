@@ -1,4 +1,4 @@
-"""`HdMap`: the road network for a stack: nearby lanes, and places on them."""
+"""`HdMap`: the road network for a stack, with searches for nearby lanes and places on lanes."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ class OnLane(NamedTuple):
     """A place relative to a lane."""
 
     lane: int
-    s_m: float  # along the lane
-    d_m: float  # from the centre of the lane, positive to the left
+    s_m: float  # position along the lane
+    d_m: float  # distance from the centre of the lane, positive to the left
     heading_rad: float  # direction of the lane there
 
 

@@ -48,7 +48,8 @@ _SIZE = 6  # x, y, heading, speed, bias of the fixes east and north
 class GnssInertial:
     """The localisation stage `gnss_imu`.
 
-    `sensors`: of the vehicle, with at least one GNSS. `geodesy`: the map's place on the earth.
+    `sensors`: sensors of the vehicle, with at least one GNSS. `geodesy`: the map's place on the
+    earth.
     """
 
     bias_m = 0.0  # standard deviation of the bias of fixes
@@ -236,7 +237,7 @@ class GnssInertial:
             for place in near
             if abs(wrap_angle(heading - float(seen[3]) - place.heading_rad)) < _FIRST_HEADING_RAD
         ]
-        # Lanes overlap within junctions, so the observed lane would be ambiguous.
+        # Lanes overlap inside junctions, so the observed lane would be ambiguous.
         if not candidates or any(internal[place.lane] for place in near):
             return
         _, place = min(candidates, key=lambda found: found[0])

@@ -47,7 +47,7 @@ class _Track:
 class LidarObjects:
     """The perception stage `lidar`.
 
-    `sensors`: of the vehicle; only lidars are used.
+    `sensors`: sensors of the vehicle; only lidars are used.
     """
 
     def __init__(self, sensors: Sequence[StackSensor], hd_map: HdMap) -> None:
@@ -140,12 +140,12 @@ class LidarObjects:
 
 
 def _differ(one: str, other: str) -> bool:
-    """Return whether two kinds are known and differ."""
+    """Return whether both kinds are known and differ."""
     return one != other and "unknown" not in (one, other)
 
 
 def _along(lanes: Sequence[OnLane], pose: EgoPose) -> float:
-    """Return the direction of the nearest lane, reversed if the own heading is opposite."""
+    """Return the direction of the nearest lane, reversed if the vehicle's heading is opposite."""
     nearest = lanes[0].heading_rad
     apart = abs(wrap_angle(nearest - pose.heading_rad))
     return nearest if apart < 0.5 * math.pi else wrap_angle(nearest + math.pi)
@@ -163,7 +163,7 @@ def _groups(
     level = 0
     if layers > 1:
         rising = elevations(settings["lower_deg"], settings["upper_deg"], layers)
-        level = int(np.argmin(np.abs(rising).round(9)))  # of two, the lower one
+        level = int(np.argmin(np.abs(rising).round(9)))  # of two equal layers, the lower one
     all_around = settings["fov_deg"] == 360.0
     first, step, rays = azimuths(settings["fov_deg"], scan.shape[1])
     turns = first + step * np.arange(rays) + lidar.mount.yaw_rad

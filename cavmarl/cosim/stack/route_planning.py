@@ -1,9 +1,8 @@
-"""Planning over the lane graph: the way to the goal, and the acceleration along it.
+"""Planning on the lane graph: the route to the goal, and the acceleration along it.
 
-The way is that of `roads.routing.make_plans`, without traffic. The acceleration is the minimum of
-the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) over all obstacles on the way. A
-line where a signal or a vehicle with the right of way requires a stop counts as a standing
-obstacle.
+The route is that of `roads.routing.make_plans`, without traffic. The acceleration is the minimum of
+the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000) over all obstacles on the route. A
+line where a signal or a vehicle with the right of way requires a stop counts as a stopped obstacle.
 """
 
 from __future__ import annotations
@@ -31,20 +30,20 @@ from cavmarl.roads.routing import make_plans
 
 _AHEAD_M = 70.0
 _MATCH_M = 5.0
-_HEADING_COST_M = 3.0  # a radian of heading counts like this lateral distance from a lane
-_EXPECTED_M = 1.5  # preference for a lane on the previous way
+_HEADING_COST_M = 3.0  # lateral distance from a lane that counts like a radian of heading
+_EXPECTED_M = 1.5  # preference for a lane on the previous route
 _ACCEL, _DECEL, _HEADWAY_S, _GAP_M = 1.5, 2.5, 1.4, 2.0
 _HARDEST = 6.0
-_BESIDE_M = 0.3  # lateral distance kept to an obstacle beside the way
+_BESIDE_M = 0.3  # lateral distance kept to an obstacle beside the route
 _BESIDE_WALKER_M = 0.8  # the same for a pedestrian
 _WALK_S = 3.0  # time for which a pedestrian's walk is extrapolated
 _BEND_MPS2 = 2.0  # maximum lateral acceleration
 _BRAKE_FOR_YELLOW = 3.0
-# Yield to a vehicle with the right of way that is nearer to its line, in time or in distance.
+# Yield to a vehicle with the right of way within this time or distance of its line.
 _CLEAR_S = 4.0
 _CLEAR_M = 12.0
 _CHANGE_BEHIND_M, _CHANGE_AHEAD_M = 10.0, 6.0
-_SIGHT_M = 50.0  # distance before a line from which it is considered
+_SIGHT_M = 50.0  # distance from which a line is considered
 _STANDS_MPS = 0.7
 
 
@@ -102,7 +101,7 @@ class LaneRoute:
     def _change_lane(
         self, here: OnLane, pose: EgoPose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
     ) -> OnLane:
-        """Return the lane beside the present one if the way needs it and there is room."""
+        """Return the lane beside the present one if the route needs it and there is room."""
         change = int(plan["change"][here.lane])
         row = self._network.lanes[here.lane]
         if change == 0 or row["internal"]:
@@ -125,7 +124,7 @@ class LaneRoute:
     def _way(
         self, here: OnLane, plan: NDArray[np.void]
     ) -> tuple[list[int], list[float], NDArray[np.float64], float | None]:
-        """Return the lanes ahead, their starts, their points, and the end of the way."""
+        """Return the lanes ahead, their starts, their points, and the end of the route."""
         lanes, starts = [here.lane], [-here.s_m]
         pieces = [self._map.polyline(here.lane, here.s_m)]
         reached = float(self._network.lanes["length_m"][here.lane]) - here.s_m
@@ -182,7 +181,7 @@ class LaneRoute:
             on_foot = obstacle.kind == "pedestrian"
             free = 0.5 * mission.width_m + half_width + (_BESIDE_WALKER_M if on_foot else _BESIDE_M)
             least = abs(d)
-            if on_foot:  # its position when the vehicle reaches it
+            if on_foot:  # the pedestrian's position when the vehicle arrives there
                 aside = obstacle.vy_mps * cos - obstacle.vx_mps * sin
                 soon = d + aside * min(s / max(pose.speed_mps, 1.0), _WALK_S)
                 least = 0.0 if d * soon < 0.0 else min(least, abs(soon))
@@ -290,7 +289,7 @@ def _slow_to(speed: float, allowed: float, distance: float) -> float:
 
 
 def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
-    """Return bends as pairs of distance in m from the start of the way, and speed."""
+    """Return bends as pairs: distance in m from the start of the route, and speed."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     headings = np.unwrap(np.arctan2(steps[:, 1], steps[:, 0]))
@@ -307,7 +306,7 @@ def _bends(points: NDArray[np.float64]) -> list[tuple[float, float]]:
 def _beside(
     points: NDArray[np.float64], x_m: float, y_m: float
 ) -> tuple[float, float, float, float]:
-    """Return s and d of a place relative to a way, and the way's direction there."""
+    """Return s and d of a place relative to a route, and the route's direction there."""
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
     units = steps / lengths[:, None]

@@ -32,7 +32,7 @@ from cavmarl.sensors.mounted.geodesy import Geodesy
 Points = NDArray[np.float64]
 
 _RANGE_M = 50.0  # maximum range of used echoes
-_LOWEST_M, _HIGHEST_M = 0.3, 4.0  # above the road: no ground, and no treetops
+_LOWEST_M, _HIGHEST_M = 0.3, 4.0  # heights above the road that exclude ground and treetops
 _UPRIGHT = 0.5  # maximum vertical part of a wall's normal
 _AROUND_M = 60.0  # extent of the map around a scan
 _EXTRUDED_M = (-0.2, 0.0, 0.2)  # copies of a single-layer scan, as for upright walls
@@ -47,10 +47,10 @@ _WEAKEST = 1e-3  # share of the best axis's information below which an axis is i
 # like information along the other axes.
 _LEAST_M = 0.1
 _BIAS_M, _BIAS_DRIFT_M = 3.0, 0.02  # deviation of the fixes' bias, and its drift per second
-_SURE_M = 0.5  # standard deviation of the position below which a scan is tried only there
-_SIGMAS, _STEPS = 2.5, 6  # else: radius of the search in deviations, steps to each side
+_SURE_M = 0.5  # standard deviation below which a scan is tried only at the estimated position
+_SIGMAS, _STEPS = 2.5, 6  # otherwise: radius of the search in deviations, steps to each side
 _TRIED, _TRY_EVERY = 150, 5  # echoes used per try, and scans between tries
-_FIRST_TRIED = 3  # best places that are then matched fully
+_FIRST_TRIED = 3  # number of best places that are then matched fully
 _FAR_COST = 0.05  # penalty at the edge of the tried area, as a share of fitting echoes
 _LOST_SCANS = 20  # consecutive scans without a fit after which the position is unknown
 _ASIDE_M, _WORSE = 0.5, 3.0  # a fit slides unless a shift by _ASIDE_M makes it worse by _WORSE
@@ -60,7 +60,8 @@ _TURN_M = 10.0  # distance that counts like a radian of heading
 class ScanMatching(GnssInertial):
     """The localisation stage `scan_matching`.
 
-    `sensors`: of the vehicle, with a GNSS and a lidar at least. `cloud`: file in the map's frame.
+    `sensors`: sensors of the vehicle, with at least a GNSS and a lidar. `cloud`: file in the map's
+    frame.
 
     Raises:
         ConfigError: there is no lidar or no file, or the cloud has no walls.
@@ -88,10 +89,10 @@ class ScanMatching(GnssInertial):
             )
         self._lidar = max(lidars, key=lambda sensor: int(sensor.settings["layers"]))
         self._walls = _Walls(cloud)
-        self.matched = self.refused = 0  # number of scans
+        self.matched = self.refused = 0  # numbers of scans
         self.lost = 0  # number of times that the position was lost
         self._num_unmatched = 0  # consecutive scans without a fit
-        self._next_try = 0  # scans until one is tried at many places
+        self._next_try = 0  # number of scans until a scan is tried at many places
 
     def locate(self, readings: Readings, mission: Mission, time_s: float) -> EgoPose | None:
         pose = super().locate(readings, mission, time_s)

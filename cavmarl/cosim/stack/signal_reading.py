@@ -9,7 +9,7 @@ from cavmarl.core.records.codes import SIGNAL_NONE, SIGNAL_RED
 from cavmarl.cosim.stack.hd_map import HdMap
 from cavmarl.cosim.stack.stack_types import Readings
 
-SPAT = "v2x.spat"  # in a vehicle's readings: (n, 3) SIGNAL row, PHASE row, age in ticks
+SPAT = "v2x.spat"  # key in a vehicle's readings: (n, 3) SIGNAL row, PHASE row, age in ticks
 
 
 class ToldSignals:

@@ -52,7 +52,7 @@ R = TypeVar("R")
 class Gains(NamedTuple):
     """The control parameters of a vehicle class."""
 
-    lookahead_s: float  # lookahead of the steering in time at the present speed
+    lookahead_s: float  # lookahead of the steering, as time at the present speed
     least_lookahead_m: float  # minimum lookahead
     accel_mps2: float  # maximum acceleration
     brake_mps2: float  # maximum braking, positive
@@ -91,7 +91,7 @@ class PurePursuit:
 
 
 def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[float, float]:
-    """Return the point of the way `ahead_m` beyond the place beside the vehicle."""
+    """Return the point of the route `ahead_m` beyond the place beside the vehicle."""
     points = trajectory.points
     steps = np.diff(points, axis=0)
     lengths = np.hypot(steps[:, 0], steps[:, 1])
@@ -102,7 +102,7 @@ def _point_at(trajectory: Trajectory, pose: EgoPose, ahead_m: float) -> tuple[fl
     off = np.hypot(*(offset - share[:, None] * steps).T)
     beside = int(np.argmin(off))
     s = along[beside] + share[beside] * lengths[beside] + ahead_m
-    if s > along[-1]:  # extend the way in its last direction
+    if s > along[-1]:  # extend the route in its last direction
         past = (s - along[-1]) / safe[-1]
         end = points[-1] + past * steps[-1]
         return float(end[0]), float(end[1])

@@ -58,9 +58,9 @@ class EgoPose(NamedTuple):
 class Obstacle(NamedTuple):
     """A detected object on the road."""
 
-    x_m: float  # of the centre
+    x_m: float  # position of the centre
     y_m: float
-    heading_rad: float  # of its longer axis, along the road
+    heading_rad: float  # direction of its longer axis, along the road
     length_m: float
     width_m: float
     vx_mps: float
@@ -72,7 +72,7 @@ class Mission(NamedTuple):
     """The destination and the body of the vehicle."""
 
     goal_edge: int  # EDGE row; the end of this edge is the destination
-    vclass: str  # SUMO's
+    vclass: str  # SUMO's vehicle class
     length_m: float
     width_m: float
 
@@ -86,10 +86,10 @@ class Control2D(NamedTuple):
 
 @dataclass(frozen=True)
 class Trajectory:
-    """The way to drive, and the acceleration along it."""
+    """The route to drive, and the acceleration along it."""
 
-    points: NDArray[np.float64]  # (n, 2) the way from beside the vehicle; at least two points
-    accel_mps2: float  # along the way, at present
+    points: NDArray[np.float64]  # (n, 2) the route from the vehicle's position; at least two points
+    accel_mps2: float  # acceleration along the route now
     # reason of the acceleration: `free`, `gap`, `pedestrian`, `stop_line`, `yield` or `end`
     reason: str = "free"
     lanes: Sequence[int] = field(default_factory=tuple)
@@ -120,7 +120,7 @@ class SignalReading(Protocol):
 
 
 class Planning(Protocol):
-    """Plans the way and the acceleration from pose, objects and signals."""
+    """Plans the route and the acceleration from pose, objects and signals."""
 
     def plan(
         self,
@@ -129,7 +129,7 @@ class Planning(Protocol):
         signals: NDArray[np.uint8] | None,
         mission: Mission,
     ) -> Trajectory:
-        """Return the way from the present pose.
+        """Return the route from the present pose.
 
         `obstacles`: objects on the road. `signals`: (num_links,) SIGNAL_* codes, 255: no signal;
         None: unknown. `mission`: the destination.

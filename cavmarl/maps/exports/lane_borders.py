@@ -1,7 +1,7 @@
 """`LaneBorders`: the borders of all lanes, with common end points where lanes lead into each other.
 
-Routes of Lanelet2 go from lane to lane over common end points, and change lanes over a common
-border.
+In Lanelet2, a route continues where lanes have common end points, and changes lanes where they have
+a common border.
 """
 
 from __future__ import annotations
@@ -23,8 +23,7 @@ class LaneBorders:
     Attributes:
         places: by lane and side: (n, 3) x, y and z in m, in driving direction.
         joints: (lanes, 2, 2) by lane, side and end: index of the end point.
-        shared: by lane: the neighbour to the left whose right border is the left border of the
-            lane, too.
+        shared: by lane: the left neighbour, if its right border is the left border of the lane.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -65,7 +64,7 @@ class LaneBorders:
         return True
 
     def _meet(self, internal: NDArray[np.bool_]) -> None:
-        """Move the ends to the mean of those that they share, if possible outside of junctions."""
+        """Move joined ends to their mean, if possible outside of junctions."""
         ends = np.array(
             [[[border[0], border[-1]] for border in borders] for borders in self.places]
         ).reshape(-1, 3)

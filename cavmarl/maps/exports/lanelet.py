@@ -31,7 +31,7 @@ _BICYCLE = 1 << VEHICLE_CLASSES.index("bicycle")
 _TURNS = {"s": "straight", "l": "left", "L": "left", "t": "left", "r": "right", "R": "right"}
 # The id of a regulatory element is one of these, plus the row of its link.
 FIRST_LIGHT, FIRST_RIGHT = 1_000_000_000, 2_000_000_000
-# Degrees of the origin of a map without a georeference, of which only local_x and local_y count.
+# Origin in degrees for a map without a georeference, for which only local_x and local_y count.
 _NOWHERE = 45.0, 3.0
 _LIGHT_HEIGHT_M, _LIGHT_SIZE_M = 5.0, 0.5  # a light is this far above the stop line
 
@@ -39,8 +39,8 @@ _LIGHT_HEIGHT_M, _LIGHT_SIZE_M = 5.0, 0.5  # a light is this far above the stop 
 def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -> dict[str, int]:
     """Write each lane as a lanelet; return the numbers of lanelets and rules, and those read back.
 
-    Lanelets of lanes that lead into each other share end points, and those of neighbours a border,
-    so that routes are connected. A link with a signal has a traffic light, whose id is
+    Lanelets of lanes that lead into each other share end points, and lanelets of neighbours share a
+    border, so that routes are connected. A link with a signal has a traffic light, whose id is
     `FIRST_LIGHT` plus the row of the link. A link that gives way to others has a right of way,
     `FIRST_RIGHT` plus its row. Lanes without cars have `participant:vehicle` = no.
 
@@ -171,7 +171,8 @@ def _line_of(network: RoadNetwork, lane: int, side: int) -> str:
 def yields_to(network: RoadNetwork, link: int) -> NDArray[np.int32]:
     """Return the links to which a link gives way.
 
-    At a signal, it gives way where it has the minor green in a phase in which the other has green.
+    At a signal, a link gives way to another link if it has the minor green while the other has
+    green.
     """
     links = network.links
     first, count = (int(links[name][link]) for name in ("first_conflict", "num_conflicts"))
@@ -208,7 +209,7 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
         TrafficLight,
     )
 
-    stop_lines: dict[int, Any] = {}  # of each lane before a junction
+    stop_lines: dict[int, Any] = {}  # stop line of each lane before a junction
     lights: dict[int, Any] = {}
 
     def stop_line(lane: int) -> Any:

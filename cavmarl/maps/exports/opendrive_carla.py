@@ -1,4 +1,4 @@
-"""Changes an OpenDRIVE export into what CARLA and its client programs read.
+"""Changes an OpenDRIVE export into a file that CARLA and its client programs can read.
 
 CARLA's programs look for traffic lights of one type, with one signal on each approach, and find the
 lights of a junction by its controllers. Snapshots have room for short ids of signals only; the name
@@ -116,7 +116,7 @@ def _short_id(signal_id: str, number: int) -> str:
 
 
 def _widen(road: Element, signal: Element) -> None:
-    """Let a signal apply to all lanes of its direction, which have no other signal."""
+    """Let a signal apply to all lanes of its direction; these have no other signal."""
     signal.set("type", LIGHT_TYPE)
     signal.set("subtype", "-1")
     side = "right" if signal.get("orientation") == "+" else "left"
@@ -130,7 +130,7 @@ def _widen(road: Element, signal: Element) -> None:
 def _add_controller(
     road: Element, orientation: str, junctions: dict[str, Element], controller: str
 ) -> None:
-    """Name the controller of a signal in the junction at which the signal stands."""
+    """Name the controller of a signal in the junction of the signal."""
     link = road.find("link/" + ("successor" if orientation == "+" else "predecessor"))
     if link is None or link.get("elementType") != "junction" or not controller:
         return

@@ -20,7 +20,7 @@ _SEALED_M = 1e-3  # maximum gap between lanes that lead into each other
 _SAME_RAD = 1e-4  # 2 mm at the outermost lane of a wide road, 20 m from the reference line
 _PIVOT_M = 0.5  # a shorter line for a U-turn is moved to the other side of its lane
 _SAME_GRADE = 1e-6
-_PARTS = 64  # a curve is divided to compute its length, because some have nearly a cusp
+_PARTS = 64  # parts of a curve for its length, because some curves nearly have a cusp
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _U, _V = ("aU", "bU", "cU", "dU"), ("aV", "bV", "cV", "dV")
 
@@ -165,7 +165,7 @@ def _set_offset(road: Element, offset_m: float) -> float:
 
 
 def _inner_m(road: Element, lane: int) -> float:
-    """Return the border of a lane nearer to the reference line, positive to the left."""
+    """Return the offset of a lane's border towards the reference line, positive to the left."""
     inner_m = _offset_m(road)
     for one in road.iterfind(LANES):
         width = one.find("width")
@@ -181,7 +181,7 @@ def _draw(
     leaves: RoadEnd,
     arrives: RoadEnd,
 ) -> None:
-    """Draw a cubic curve, which is a circular arc if both ends lie on one."""
+    """Draw a cubic curve; it is a circular arc if both ends lie on an arc."""
     chord = math.dist(start, end)
     turn = math.remainder(arrives.heading_rad - leaves.heading_rad, math.tau)
     handle = chord * 2.0 / (3.0 * (1.0 + abs(math.cos(0.5 * turn))))

@@ -71,7 +71,7 @@ def _copied(road: Element, connection: Element, number: str) -> tuple[Element, E
 
 
 def _keep(road: Element, connection: Element, ids: list[str]) -> None:
-    """Keep only the lanes with some ids on a road, and number them from the inside."""
+    """Keep only lanes with the given ids on a road, and number them from the inside."""
     names = {name: str(-number) for number, name in enumerate(ids, start=1)}
     for right in road.iterfind("lanes/laneSection/right"):
         for lane in right.findall("lane"):

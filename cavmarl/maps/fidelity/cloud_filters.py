@@ -21,7 +21,7 @@ def thin_out(cloud: Cloud, voxel_m: float, threads: int = 2) -> Cloud:
     if not 0.0 < voxel_m < np.inf:
         raise ConfigError(f"voxels of {voxel_m:g} m: give a side above 0, or 0 for no filter")
     gicp: Any = require("small_gicp", "maps")
-    # The library numbers voxels from (0, 0, 0) and drops points that are too far from there.
+    # The library numbers voxels from (0, 0, 0) and drops points too far from this origin.
     middle = 0.5 * (cloud.points.min(axis=0) + cloud.points.max(axis=0))
     if np.ptp(cloud.points, axis=0).max() / voxel_m >= 2.0 * (1 << _VOXEL_BITS):
         raise ConfigError(

@@ -24,9 +24,9 @@ BEYOND_M = 3.0  # the cloud's border is searched up to this distance outside of 
 STEP_M = 0.05  # minimum change of height at a border
 _BIN_M = 0.1
 _LEVEL_M = 1.5  # points farther above or below the road do not belong to it
-_FEWEST = 3  # minimum number of points of a bin, and of a height
+_FEWEST = 3  # minimum number of points for a bin and for a height
 _FEWEST_STATIONS = 6
-_OUTLIER = 3.0  # outliers are this many median deviations from the median
+_OUTLIER = 3.0  # distance of outliers from the median, in median deviations
 
 
 @dataclass(frozen=True)
@@ -34,8 +34,8 @@ class RoadFit:
     """The differences between the roads of a cloud and of a map; offsets are cloud minus map."""
 
     stations: int  # cross-sections of the map in the cloud's box
-    edge_offset_m: Points  # of cross-sections with a border in the cloud; positive: farther outside
-    height_offset_m: Points  # of cross-sections with a road in the cloud
+    edge_offset_m: Points  # at sections with a border in the cloud; positive: farther outside
+    height_offset_m: Points  # at cross-sections with a road in the cloud
     # (4, 4) from the cloud to the map; None: too few borders, or all in one direction
     transform: Points | None
 

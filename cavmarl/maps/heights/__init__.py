@@ -1,3 +1,3 @@
-"""Heights of a map: reads terrain models, and drapes networks over them without steps."""
+"""Heights of a map: reads terrain models, and gives networks their heights without steps."""
 
 from __future__ import annotations

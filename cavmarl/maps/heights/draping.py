@@ -37,7 +37,7 @@ class HeightReport:
 
     models: tuple[str, ...]
     cell_m: float  # cell size of the finest model
-    heights_m: tuple[float, float]  # lowest and highest of all lanes
+    heights_m: tuple[float, float]  # lowest and highest point of all lanes
     places: int  # places at which the model was evaluated
     filled_places: int  # places in voids of the model, interpolated
     void_cells: int  # cells of the models around the map without a height

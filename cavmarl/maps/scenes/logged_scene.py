@@ -24,7 +24,7 @@ FARTHEST_M = 1e7  # limit of all coordinates
 class SceneLane(NamedTuple):
     """A lane of a scene.
 
-    `points`: (n, 3) of the centre line in m, in the direction of travel. `speed_mps`: speed limit;
+    `points`: (n, 3) centre line in m, in the direction of travel. `speed_mps`: speed limit;
     None: not stated. `width_m`: None: not stated. `exits`: ids of the lanes that follow; None: not
     stated.
     """
@@ -83,14 +83,14 @@ class LoggedScene:
     """A logged scene.
 
     Attributes:
-        name: as in the file.
+        name: name in the file.
         step_s: time between two samples.
-        lanes: for motor vehicles.
+        lanes: lanes for motor vehicles.
         road_edges: polylines (n, 2) with the road on their left, in m.
-        tracks: of road users that are seen at least once, in the order of the file.
+        tracks: tracks of road users that are seen at least once, in the order of the file.
         own: name of the track of the vehicle that logged the scene; empty: unknown.
         present: number of the sample at which a prediction begins; 0: not stated.
-        notes: what was left out, cut or guessed, with counts.
+        notes: omissions, cuts and guesses, with counts.
     """
 
     name: str
@@ -191,7 +191,7 @@ def count_overlaps(tracks: Sequence[Track]) -> int:
 
 
 def boxes_meet(poses: Numbers, half: Numbers) -> NDArray[np.bool_]:
-    """Return (n, n) which boxes overlap: no axis of two boxes separates them.
+    """Return (n, n) which boxes overlap, by the separating axis theorem.
 
     `poses`: (n, 3) x, y and heading. `half`: (n, 2) half the length and the width.
     """

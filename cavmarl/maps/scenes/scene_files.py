@@ -35,10 +35,10 @@ from cavmarl.maps.scenes.scene_pickle import unpickle
 MOST_BYTES = 1 << 26
 MOST_TIMES = 100_000
 MOST_TRACKS = 4_000  # 900 in Waymo's scenes
-MOST_SAMPLES = 10_000_000  # of all tracks; in a pickle, tracks may share their arrays
-GPUDRIVE_STEP_S = 0.1  # the format does not state it; Waymo's motion data set has 10 Hz
+MOST_SAMPLES = 10_000_000  # limit of all tracks; in a pickle, tracks may share their arrays
+GPUDRIVE_STEP_S = 0.1  # not stated in the file; Waymo's motion data set has 10 Hz
 _MOVING_MPS = 2.0  # above this speed, the heading fits the direction of the motion
-_ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; share of points that are further from the direction
+_ALONG_COS, _MOST_MISFITS = 0.97, 0.05  # 14°; allowed share of points beyond this angle
 # Waymo states the first two, and nuPlan the last one.
 _MPS_PER_UNIT = (("kmh", 1.0 / 3.6), ("mph", 0.44704), ("mps", 1.0))
 _SIZES_M = {"vehicle": (4.5, 1.9, 1.6), "pedestrian": (0.5, 0.5, 1.75), "cyclist": (1.8, 0.7, 1.7)}
@@ -90,7 +90,7 @@ def read_scene(path: str | Path) -> LoggedScene:
 
 
 class _Counts:
-    """Counts what was left out, guessed or changed."""
+    """Counts omissions, guesses and changes."""
 
     def __init__(self) -> None:
         self._counts: Counter[str] = Counter()
@@ -307,8 +307,8 @@ def _gpudrive_object(number: int, entry: Any, counts: _Counts) -> _Object | None
 def _heading_unit(parts: Sequence[_Object]) -> float:
     """Return 1, or π / 180 if the headings are in degrees.
 
-    Versions of the format differ. The unit is that in which headings fit the directions of motion
-    better; without motion, degrees if a heading is above 2 π.
+    Versions of the format differ. The result is the unit in which headings fit the directions of
+    motion better; without motion, degrees if a heading is above 2 π.
     """
     misfit = {1.0: 0.0, np.pi / 180.0: 0.0}
     largest, count = 0.0, 0

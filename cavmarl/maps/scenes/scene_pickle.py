@@ -1,9 +1,9 @@
-"""Reads pickles of strangers: only builtins and NumPy's arrays of numbers and text.
+"""Reads untrusted pickles: only builtins and NumPy's arrays of numbers and text.
 
-A pickle can call any function that it names, and set the state and the attributes of any object
-that it has. This reader knows a fixed list of names, and replaces NumPy's functions and types by
-versions that check arguments and states. Before that, it checks the operations: a place in the memo
-beyond their number, or a length beyond the content, could reserve any amount of memory.
+A pickle can call any function that it names, and set the state and the attributes of its objects.
+This reader knows a fixed list of names, and replaces NumPy's functions and types by versions that
+check arguments and states. Before that, it checks the operations: a place in the memo beyond their
+number, or a length beyond the content, could reserve any amount of memory.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ class _ForbiddenError(pickle.UnpicklingError):
 
 
 class _Function:
-    """A function that a pickle may call. The pickle can set no attribute of it."""
+    """A function that a pickle may call. The pickle cannot set its attributes."""
 
     __slots__ = ("_function",)
 
@@ -53,7 +53,7 @@ class _Function:
 class _Type:
     """A dtype of numbers or text. Its state is only the byte order.
 
-    NumPy would also take flags from the state, which say that an array contains objects.
+    NumPy would also accept flags in the state that declare an array of objects.
     """
 
     __slots__ = ("dtype",)
@@ -72,7 +72,7 @@ class _Type:
 
 
 class _Array(np.ndarray[Any, Any]):
-    """An array whose content follows in the pickle, and whose memory is reserved only with it."""
+    """An array whose content follows in the pickle; memory is reserved when the content arrives."""
 
     def __setstate__(self, state: tuple[Any, ...]) -> None:
         _, shape, kind, is_fortran, data = state
@@ -124,7 +124,7 @@ _NAMES: dict[tuple[str, str], Any] = {
     ("collections", "defaultdict"): defaultdict,
     **{
         ("builtins", kind.__name__): kind
-        for kind in (int, float, set, frozenset)  # the others have opcodes of their own
+        for kind in (int, float, set, frozenset)  # the other builtins have their own opcodes
     },
 }
 _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray", "numpy.core.numeric",
@@ -133,7 +133,7 @@ _MODULES = ("numpy.core.multiarray", "numpy._core.multiarray", "numpy.core.numer
 
 class _RestrictedUnpickler(pickle.Unpickler):
     def find_class(self, module: str, name: str) -> Any:
-        """Return what a name stands for; raise an error for a name that is not on the list."""
+        """Return the object of a name; raise an error for a name that is not on the list."""
         module = module.replace("__builtin__", "builtins")
         if (module, name) in _NAMES:
             return _NAMES[module, name]
@@ -156,7 +156,7 @@ def _check_operations(content: bytes) -> None:
 def unpickle(content: bytes) -> Any:
     """Return the object of a pickle.
 
-    Raises MapError: the pickle is broken, or names something else than builtins and arrays.
+    Raises MapError: the pickle is broken, or contains other objects than builtins and arrays.
     """
     try:
         _check_operations(content)

@@ -1,4 +1,4 @@
-"""Makes a SUMO network of the lanes of a logged scene.
+"""Makes a SUMO network from the lanes of a logged scene.
 
 Each lane keeps its centre line. Parallel lanes become one edge, so that vehicles can change lanes.
 A lane that crosses, leaves or joins other lanes becomes an internal lane of a junction, if it is
@@ -25,11 +25,11 @@ WIDTH_M = 3.5
 STREET_MPS, FREEWAY_MPS = 15.65, 29.06  # 35 and 65 mph
 _SHORTEST_M = 0.5  # shorter lanes are left out
 _SAME_M = 0.01  # closer points are one point
-_JOIN_M = 1.0  # between the end of a lane and the start of its successor
+_JOIN_M = 1.0  # distance between the end of a lane and the start of its successor
 _JOIN_COS = 0.7  # 45°
 _PARALLEL_COS = 0.966  # 15°
-_BESIDE_M = (2.0, 6.0)  # across, between the centre lines of neighbours
-_LEVEL_M = 3.0  # along, between the ends of neighbours
+_BESIDE_M = (2.0, 6.0)  # lateral distance between the centre lines of neighbours
+_LEVEL_M = 3.0  # longitudinal distance between the ends of neighbours
 _INNER_M = 200.0  # the longest path over a junction
 _NEAR_M = 2.0  # closer paths are in conflict
 _SAMPLE_M = 1.0
@@ -40,7 +40,7 @@ _HEIGHT_M = 3.0  # a larger difference in height is a bridge
 
 
 class SceneNetwork(NamedTuple):
-    """A SUMO network: its text, and what was guessed or left out, with counts."""
+    """A SUMO network: its text, and its guesses and omissions, with counts."""
 
     text: str
     notes: tuple[str, ...]
@@ -66,7 +66,7 @@ class _Lane:
 
 
 class _Movement(NamedTuple):
-    """A way from a lane to the next one; `inner`: over this lane, -1: directly."""
+    """A connection from a lane to the next one; `inner`: the lane between them, -1: none."""
 
     source: int
     inner: int
@@ -168,7 +168,7 @@ def _dot(one: tuple[float, float], other: tuple[float, float]) -> float:
 
 
 def _near_pairs(lanes: Sequence[_Lane]) -> dict[int, set[int]]:
-    """Return the lanes whose centre lines come close, besides lanes that follow each other."""
+    """Return pairs of lanes whose centre lines come close, except lanes that follow each other."""
     near: dict[int, set[int]] = defaultdict(set)
     boxes = np.array([lane.box for lane in lanes])
     for k, lane in enumerate(lanes):
@@ -410,7 +410,7 @@ class _Drawing:
 
 
 def _movements_of(lanes: Sequence[_Lane], inner: set[int]) -> list[_Movement]:
-    """Return the ways between lanes that are not paths over junctions."""
+    """Return the connections between lanes that are not paths over junctions."""
     found: dict[tuple[int, int], _Movement] = {}
     for k, lane in enumerate(lanes):
         if k in inner:
@@ -452,7 +452,7 @@ def _are_beside(one: _Lane, other: _Lane) -> bool:
 
 
 def _offset(one: _Lane, other: _Lane, end: int) -> tuple[float, float]:
-    """Return how far the end of another lane is ahead of and left of that of a lane, in m."""
+    """Return how far another lane's end is ahead and to the left of a lane's end, in m."""
     cos, sin = one.start if end == 0 else one.end
     east, north = (other.points[end] - one.points[end])[:2].tolist()
     return east * cos + north * sin, north * cos - east * sin
