@@ -41,9 +41,8 @@ class MapConfig(Section, key="map"):
             each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
-        program: the program of each signal named here, instead of the last one loaded; may be
-        `off`. buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of
-        buildings
+        program: the program of each signal named here, whichever was loaded last; or `off`.
+        buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
             (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,

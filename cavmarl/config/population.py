@@ -25,9 +25,8 @@ class PopulationConfig(Section, key="population"):
             agent's vehicle ends its trip, the agent gets a new one.
         agents: vehicles that policies drive at the same time.
         background: vehicles that the built-in driver drives. In `closed` worlds they are placed at
-            the reset; otherwise each arrival causes a departure, so that their number stays
-        constant. budget: number of agents that may enter in an episode of an `open` world (default:
-        4 ·
+            the reset; otherwise each arrival causes a departure, so their number is constant.
+        budget: number of agents that may enter in an episode of an `open` world (default: 4 ·
             agents); not used in the other modes.
         types: vehicle types of the agents, from `car`, `truck` and `bus`. Agent k has type
             k modulo the length of the list.

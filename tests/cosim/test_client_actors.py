@@ -264,7 +264,7 @@ def test_refusals_say_why_and_change_nothing(address: Path) -> None:
             ([request(x, y, rate_hz=-1.0)], "rate_hz = -1"),
             ([request(x, y, rig=["roof"])], "population.external_agents = true"),
             ([request(x, y), request(x + 20.0, y)], "'own' is named twice"),
-            ([ActorRequest("car_0", "car", x, y, 0.0)], "that of an agent"),
+            ([ActorRequest("car_0", "car", x, y, 0.0)], "an agent's; use another"),
             (
                 [ActorRequest(f"a{k}", "car", x + 20.0 * k, y, 0.0) for k in range(4)],
                 r"all 3 places of population\.external are in use",
@@ -296,7 +296,7 @@ def test_a_world_without_places_for_actors_says_so(address: Path) -> None:
     [
         ({"own": [PoseView(1e3, 0.0, 0.0, 0.0)]}, "is in the future"),
         ({"own": [PoseView(0.0, math.nan, 0.0, 0.0)]}, "x = nan"),
-        ({"other": [PoseView(0.0, 0.0, 0.0, 0.0)]}, "poses of other, which it has not"),
+        ({"other": [PoseView(0.0, 0.0, 0.0, 0.0)]}, "poses of other, not its actor"),
     ],
 )
 def test_a_client_with_invalid_poses_is_dropped_with_its_actor(

@@ -239,7 +239,7 @@ class ClientActors:
                 "that can be printed"
             )
         if order.name in self._env.possible_agents:
-            raise ActionError(f"an actor's name is '{order.name}', that of an agent; use another")
+            raise ActionError(f"an actor's name is '{order.name}', an agent's; use another")
         if len(order.vtype) > MOST_NAME:
             raise ActionError(
                 f"an actor's type has {len(order.vtype)} letters; the limit is {MOST_NAME}"

@@ -80,8 +80,7 @@ class CarlaActor:
         centre, half_m: the bounding box in the actor's frame.
         vehicle: id of the row of a vehicle or walker; -1: none.
         agent: index of the agent that the vehicle belongs to; -1: none.
-        slot: number of a vehicle that a client has spawned, see `ExternalVehicles`; -1: another
-    actor.
+        slot: number of a vehicle that a client has spawned, see `ExternalVehicles`; -1: none.
     """
 
     number: int

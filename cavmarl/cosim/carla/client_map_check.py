@@ -39,8 +39,7 @@ SPAWN_LIMIT_DEG = 15.0
 _EVERY_M = 2.0  # distance between points on a lane
 _MOST_POINTS = 100_000
 _MARGIN_M = 2.0  # distance from the ends of lanes to the ends of paths over junctions
-# The library's paths over a junction can be shorter or longer than cavmarl's: its U-turns are
-# wider.
+# The library's paths over a junction can be shorter than cavmarl's, or longer (wider U-turns).
 _PATH_LONGER_M = (-8.0, 0.0, 8.0, 16.0)
 _PATH_ALONG_M = 5.0
 _PATH_ASIDE_M = 1.5

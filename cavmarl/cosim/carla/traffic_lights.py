@@ -151,8 +151,7 @@ class TrafficLights:
     def reset(self, light: int | None = None) -> None:
         """Begin the cycle of a light's group, or of all groups, with the first phase.
 
-        Lights of these groups no longer show states that clients have set. Their times do not
-        change.
+        Lights of these groups no longer show states that clients have set. Times are kept.
 
         Raises ConfigError: see `set_state`.
         """

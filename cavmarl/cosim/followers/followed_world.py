@@ -55,9 +55,10 @@ class FollowedWorld:
     Args:
         env: the world, in this process or in workers; it has a time master until `close`.
         address: path of a Unix socket, or a port of this machine; 0 picks a free port.
-        secret: secret that followers must send; necessary for a port, to which all users can
-        connect. timeout_s: maximum time that a step waits for its followers, by the wall clock.
-        own_ticks: handling of a follower's own ticks; see `TimeMaster`. on_drift: see `TimeMaster`.
+        secret: secret of followers; necessary for a port, to which all users can connect.
+        timeout_s: maximum time that a step waits for its followers, by the wall clock.
+        own_ticks: handling of a follower's own ticks; see `TimeMaster`.
+        on_drift: see `TimeMaster`.
         bad_controls: handling of invalid controls: `error`: the follower is dropped with a
             `FollowerError`; `hold`: the vehicle's last controls are used, and counted.
         pacer: pace by the wall clock; None: as fast as possible.

@@ -223,9 +223,8 @@ class Control:
     """The answer to a snapshot."""
 
     frame: StrictInt  # frame of the snapshot
-    # controls of each vehicle: two numbers in [-1, 1], or the number of a meta-action; of an actor
-    # that is moved by controls: two numbers in [-1, 1]; without new controls, it keeps its last
-    # ones
+    # by vehicle or actor. Vehicles: two numbers in [-1, 1], or the number of a meta-action. Actors
+    # that are moved by controls: two numbers in [-1, 1]; without new ones, the last ones are kept
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
     poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
 

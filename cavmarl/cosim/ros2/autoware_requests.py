@@ -35,9 +35,8 @@ class RequestCounts:
 class AutowareRequests:
     """What nodes of Autoware request of a vehicle besides its motion.
 
-    The world determines the position of the vehicle: a pose of `/initialpose` is accepted if it
-    agrees with the true pose, and moves nothing. The only gear is DRIVE. Lights are reported as
-    commanded.
+    The world sets the vehicle's position: a pose of `/initialpose` is accepted if it agrees with
+    the true pose, and moves nothing. The only gear is DRIVE. Lights are reported as commanded.
 
     `types`: message types. `truth`: whether the true pose is known; otherwise there is no topic
     `/initialpose`.
@@ -80,7 +79,7 @@ class AutowareRequests:
             refusal = _differs(message, state)
         elif topic == _GEAR:
             given = int(message.command)
-            refusal = "" if given in (0, DRIVE) else f"{topic}: gear {given}: it only has DRIVE (2)"
+            refusal = "" if given in (0, DRIVE) else f"{topic}: gear {given}: only DRIVE (2) exists"
         else:
             given, refusal = int(message.command), ""
             if given > _MOST[topic]:

@@ -48,8 +48,7 @@ _SIZE = 6  # x, y, heading, speed, bias of the fixes east and north
 class GnssInertial:
     """The localisation stage `gnss_imu`.
 
-    `sensors`: sensors of the vehicle, with at least one GNSS. `geodesy`: the map's place on the
-    earth.
+    `sensors`: sensors of the vehicle, with at least one GNSS. `geodesy`: the map's georeference.
     """
 
     bias_m = 0.0  # standard deviation of the bias of fixes

@@ -60,8 +60,7 @@ _TURN_M = 10.0  # distance that counts like a radian of heading
 class ScanMatching(GnssInertial):
     """The localisation stage `scan_matching`.
 
-    `sensors`: sensors of the vehicle, with at least a GNSS and a lidar. `cloud`: file in the map's
-    frame.
+    `sensors`: sensors of the vehicle, with a GNSS and a lidar. `cloud`: file in the map's frame.
 
     Raises:
         ConfigError: there is no lidar or no file, or the cloud has no walls.

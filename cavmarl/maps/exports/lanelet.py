@@ -171,8 +171,7 @@ def _line_of(network: RoadNetwork, lane: int, side: int) -> str:
 def yields_to(network: RoadNetwork, link: int) -> NDArray[np.int32]:
     """Return the links to which a link gives way.
 
-    At a signal, a link gives way to another link if it has the minor green while the other has
-    green.
+    At a signal, a link gives way to another one if it has the minor green while that has green.
     """
     links = network.links
     first, count = (int(links[name][link]) for name in ("first_conflict", "num_conflicts"))

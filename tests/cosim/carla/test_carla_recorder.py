@@ -84,7 +84,7 @@ def test_a_replay_shows_the_recorded_vehicles_and_then_the_world(
     for k in range(11, 26):
         session.tick()
         assert places(session) == due[k]
-    assert session.world.env.state_hash() == left, "the world stands still"
+    assert session.world.env.state_hash() == left, "the world is paused"
     session.tick()
     assert places(session) == last, "the replay is over"
     session.tick()
@@ -290,7 +290,7 @@ def test_names_cannot_leave_the_folder(name: str, own_session: CarlaSession, fol
 
 def test_other_files_are_refused(own_session: CarlaSession, folder: Path) -> None:
     session, call = own_session, calls_of(own_session)
-    with pytest.raises(RuntimeError, match=r"none: is no recording of a CARLA server \(No such"):
+    with pytest.raises(RuntimeError, match=r"none: is not a recording of a CARLA server \(No such"):
         call("replay_file", "none", 0.0, 0.0, 0, False)
     call("start_recorder", "half", False)
     session.tick()

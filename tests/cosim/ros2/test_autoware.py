@@ -205,7 +205,7 @@ def pose(x: float, y: float, heading: float, frame: str = "map") -> dict[str, An
         ("/initialpose", POSES, pose(10.0, 18.0, 0.0), "1.57 rad from the true pose; the world"),
         ("/initialpose", POSES, pose(10.0, 18.0, 1.4, "odom"), "the frame must be map"),
         ("/control/command/gear_cmd", GEARS, {"command": 2}, ""),
-        ("/control/command/gear_cmd", GEARS, {"command": 20}, "gear 20: it only has DRIVE"),
+        ("/control/command/gear_cmd", GEARS, {"command": 20}, "gear 20: only DRIVE"),
     ],
 )
 def test_requests_are_accepted_or_refused(
