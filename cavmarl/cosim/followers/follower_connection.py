@@ -239,8 +239,8 @@ def _size(view: ArrayView) -> int:
 def listen(address: Address) -> socket.socket:
     """Listen for followers, on this machine only.
 
-    File permissions decide who may use a Unix socket: initially, its owner. A port of the
-    loopback interface admits every user of this machine.
+    A Unix socket admits the users that its file permissions allow, initially its owner. A port of
+    the loopback interface admits every user of this machine.
 
     Args:
         address: a path for a Unix socket, which must not exist; or a port, 0: any free port.
