@@ -59,7 +59,9 @@ def test_the_service_starts_without_kernels(tmp_path: Path) -> None:
     """Compilers and learning libraries would take most of the time of its start."""
     with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
-        mapped = {Path(found.path).name for found in psutil.Process(service.process.pid).memory_maps()}
+        mapped = {
+            Path(found.path).name for found in psutil.Process(service.process.pid).memory_maps()
+        }
     assert any("pydantic" in name for name in mapped)
     heavy = ("llvmlite", "_dispatcher", "torch", "pyarrow", "sumo")
     assert {name for name in mapped if any(word in name for word in heavy)} == set()
