@@ -1,4 +1,4 @@
-"""Callers that do not belong to the run, or that it does not need, over real sockets."""
+"""Callers that do not belong to a run, or that the run does not need, over real sockets."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from cavmarl.parallel.nodes.peer_faults import LinkLostError
 from tests.parallel.test_node_joining import WAIT_S, elsewhere
 
 
-class Door:
-    """The end that nodes call, in a thread."""
+class JoinServer:
+    """The end to which nodes connect, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
@@ -46,13 +46,13 @@ class Door:
 
 def test_a_node_with_another_key_is_refused() -> None:
     for address in ("127.0.0.1", elsewhere()):
-        with closing(Door(b"a" * 32, address)) as door:
+        with closing(JoinServer(b"a" * 32, address)) as door:
             with pytest.raises(MessageError, match="give both the same key"):
                 run_node(door.listener.place, b"b" * 32, ANYONE)
 
 
 def answer(server: socket.socket, said: bytes) -> threading.Thread:
-    """Start a process that answers the first caller, and ends."""
+    """Start a thread that sends `said` to the first caller and ends."""
 
     def run() -> None:
         connection, _ = server.accept()
@@ -66,7 +66,7 @@ def answer(server: socket.socket, said: bytes) -> threading.Thread:
 
 
 def test_a_peer_without_encryption_is_refused() -> None:
-    with closing(Door(b"a" * 32, elsewhere())) as door:
+    with closing(JoinServer(b"a" * 32, elsewhere())) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
             stranger.sendall(secrets.token_bytes(100))
@@ -79,7 +79,7 @@ def test_a_peer_without_encryption_is_refused() -> None:
         answering.join()
 
 
-def test_a_missing_library_for_encryption_is_noticed_at_the_start(
+def test_a_missing_library_for_encryption_is_an_error_at_the_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "cryptography", None)
@@ -89,7 +89,7 @@ def test_a_missing_library_for_encryption_is_noticed_at_the_start(
 
 
 def test_another_version_of_the_handshake_is_refused() -> None:
-    with closing(Door(b"a" * 32)) as door:
+    with closing(JoinServer(b"a" * 32)) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
             stranger.sendall(b"cavW" + (VERSION + 1).to_bytes(2, "little") + bytes(20))
@@ -108,19 +108,19 @@ def test_another_version_of_the_handshake_is_refused() -> None:
         ("", 0, "no more nodes are needed"),
     ],
 )
-def test_nodes_that_are_not_needed_are_refused(
+def test_nodes_with_other_code_and_superfluous_nodes_are_refused(
     monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
 ) -> None:
     if code:
         monkeypatch.setattr(joining_nodes, "code_stamp", code_stamp)
         monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
-    with closing(Door(b"a" * 32, room=room)) as door:
+    with closing(JoinServer(b"a" * 32, room=room)) as door:
         with pytest.raises(NodeRefusedError, match=words):
             run_node(door.listener.place, b"a" * 32, ANYONE)
 
 
 def test_an_admitted_caller_with_bad_frames_is_disconnected() -> None:
-    with closing(Door(b"a" * 32)) as door:
+    with closing(JoinServer(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)
             links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))

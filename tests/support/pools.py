@@ -61,7 +61,7 @@ def alive(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def strike_soon(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
+def signal_later(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
     """Send a signal some time later; the process may have died by then."""
 
     def strike() -> None:

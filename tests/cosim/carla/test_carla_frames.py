@@ -138,7 +138,7 @@ def test_each_point_becomes_the_distance_of_its_ray(rays: int, fov_deg: float) -
 
 
 def test_echoes_become_targets() -> None:
-    """Echoes are (speed, azimuth to the right, altitude, distance); wall and car are a target each."""
+    """Echoes are (speed, azimuth to the right, altitude, distance); wall and car are targets."""
     wall = [(-5.0, math.radians(a), 0.0, 10.0 - a) for a in (-20.0, -19.0, -18.0)]
     car = [(2.0, math.radians(a), 0.0, 12.0 + 0.1 * a) for a in (-17.5, -17.0, -16.5)]
     beside = [(9.0, math.radians(-16.0), 0.0, 12.0)]  # at the distance of the car, but faster
