@@ -144,19 +144,19 @@ class Network:
         key = (*place, self._copies[place])
         rates = self.plan.of(kind, self.phase, message.tick)
         self.sent[kind] += 1
-        if self._strikes(kind, key, "drop", rates.drop):
+        if self._has_fault(kind, key, "drop", rates.drop):
             return
-        if self._strikes(kind, key, "corrupt", rates.corrupt) and self._damaged(message, key):
+        if self._has_fault(kind, key, "corrupt", rates.corrupt) and self._damaged(message, key):
             return
         at, rank = self.phase + 1, 0.0
-        if self._strikes(kind, key, "delay", rates.delay):
+        if self._has_fault(kind, key, "delay", rates.delay):
             at += self._later(key, "how long", rates)
-        if self._strikes(kind, key, "reorder", rates.reorder):
+        if self._has_fault(kind, key, "reorder", rates.reorder):
             rank = self.plan.chance(key, "place")
-        refused = kind == "Prepare" and self._strikes(kind, key, "refuse", rates.refuse)
+        refused = kind == "Prepare" and self._has_fault(kind, key, "refuse", rates.refuse)
         delivery = Delivery(destination, message, refused)
         self._fly(at, rank, delivery)
-        if self._strikes(kind, key, "duplicate", rates.duplicate):
+        if self._has_fault(kind, key, "duplicate", rates.duplicate):
             self._fly(at + self._later(key, "the copy", rates), rank, delivery)
 
     def _has_fault(self, kind: str, key: tuple[object, ...], fault: str, rate: float) -> bool:
