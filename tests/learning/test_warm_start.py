@@ -39,6 +39,12 @@ def network(config: NetworkConfig) -> ActorCritic:
     return made
 
 
+def in_double_precision(*networks: ActorCritic) -> None:
+    """Let sums in another order differ by less than the tolerance."""
+    for network in networks:
+        network.double()
+
+
 def named(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
     """Name the observed numbers; the newest frame is the last."""
     frames = range(-sensors.stack, 0)
@@ -53,13 +59,14 @@ def test_a_warm_start_has_the_actions_and_values_of_the_driver(
     driver, run = network(its), network(ours)
     save_network(tmp_path, driver, its)
     assert begin_with(run, ours, tmp_path) == 7
-    more = torch.randn(16, ours.observation_size)
+    in_double_precision(driver, run)
+    more = torch.randn(16, ours.observation_size, dtype=torch.float64)
     more[0] = 0.0  # equal to the mean of the numbers that the driver does not observe
     places = {name: k for k, name in enumerate(named(MORE))}
     columns = [places[name] for name in named(FEWER)]
     if "residual" in form:
         columns += [ours.observation_size - 2, ours.observation_size - 1]
-    states = torch.randn(16, its.state_size) if its.state_size else None
+    states = torch.randn(16, its.state_size, dtype=torch.float64) if its.state_size else None
     torch.testing.assert_close(run(more), driver(more[:, columns]))
     torch.testing.assert_close(run.value(more, states), driver.value(more[:, columns], states))
 
@@ -81,14 +88,15 @@ def test_observations_that_the_run_does_not_have_are_left_out_and_counted(
     driver, run = network(its), network(ours)
     save_network(tmp_path, driver, its)
     begin_with(run, ours, tmp_path)
-    fewer = torch.randn(16, ours.observation_size)
+    in_double_precision(driver, run)
+    fewer = torch.randn(16, ours.observation_size, dtype=torch.float64)
     seen = driver.mean.repeat(16, 1)  # numbers that the run does not observe equal their mean
     places = {name: k for k, name in enumerate(named(MORE))}
     columns = [places[name] for name in named(FEWER)]
     if "residual" in form:
         columns += [its.observation_size - 2, its.observation_size - 1]
     seen[:, columns] = fewer
-    states = torch.randn(16, its.state_size) if its.state_size else None
+    states = torch.randn(16, its.state_size, dtype=torch.float64) if its.state_size else None
     torch.testing.assert_close(run(fewer), driver(seen))
     torch.testing.assert_close(run.value(fewer, states), driver.value(seen, states))
     assert f"observes {len(named(MORE)) - len(named(FEWER))} numbers that this" in caplog.text

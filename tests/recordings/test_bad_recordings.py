@@ -135,7 +135,8 @@ def test_uncommitted_parts_are_ignored(good: Path, bad: Path) -> None:
 def test_vehicles_of_another_part_are_noticed(bad: Path) -> None:
     vehicles = bad / "world-0" / "vehicles"
     shutil.copy(vehicles / "000000.parquet", vehicles / "000001.parquet")
-    with pytest.raises(RecordingError, match="does not add up"):
+    # Parts end by the clock, so two of them may have equally many vehicles.
+    with pytest.raises(RecordingError, match="does not add up|its vehicles have other ticks"):
         read(bad)
 
 
