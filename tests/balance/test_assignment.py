@@ -90,7 +90,7 @@ def test_the_order_of_the_input_does_not_matter(
         ([1e6, 1e-6, 1e6, 1e-6], [1e6, 1e6]),
     ],
 )
-def test_plans_for_extreme_costs_and_loads(costs: list[float], loads: list[float]) -> None:
+def test_extreme_costs_give_the_expected_loads(costs: list[float], loads: list[float]) -> None:
     plan = make_plan(alone(costs, idle_snapshot(2)))
     assert sorted(worker.load_s for worker in plan.workers()) == pytest.approx(sorted(loads))
 

@@ -66,7 +66,7 @@ def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Follo
     return seen
 
 
-def seated(
+def join_world(
     world: FollowedWorld, vehicles: list[str], name: str = "driver", secret: str = ""
 ) -> Follower:
     """Return a follower in this process that has joined the world."""

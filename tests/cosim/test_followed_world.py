@@ -24,7 +24,7 @@ from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.cosim.followers.follower_connection import call
 from cavmarl.cosim.followers.follower_messages import Control, Hello, Say
 from cavmarl.engine.step_trace import QUEUE, SENSORS, STACK, TICK, StepTrace
-from tests.cosim.conftest import drive, hashes, make_env, seated, steer
+from tests.cosim.conftest import drive, hashes, join_world, make_env, steer
 
 Start = Callable[[Callable[[], Any]], threading.Thread]
 
@@ -111,7 +111,7 @@ def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, st
         start(lambda: drive(address, ["car_1"]))
         world.wait_for(2, 10.0)
         world.step()
-        assert world.seats[0].answers == 2  # it has answered this frame and the next one
+        assert world.seats[0].answers == 2  # this frame and the next one
     assert found == reference(8, {})
 
 
@@ -165,14 +165,14 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
         began = time.monotonic()
         hashes(world, 4)
         assert time.monotonic() - began > 0.2
-        assert world.seats[0].wait_wall_s > 0.2  # the last answer need not be waited for
+        assert world.seats[0].wait_wall_s > 0.2  # the world need not wait for the last answer
     assert frames == [0, 1, 2, 3, 4]
 
 
 def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address, timeout_s=0.2) as world:
-        silent = seated(world, ["car_0"], "silent")
+        silent = join_world(world, ["car_0"], "silent")
         with pytest.raises(FollowerLostError, match=r"'silent' has not answered within 0\.2 s"):
             world.reset(seed=1)
         assert world.seats == ()
@@ -185,7 +185,7 @@ def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> 
 
 def test_a_silent_follower_does_not_block_other_followers(address: Path, start: Start) -> None:
     with FollowedWorld(make_env(), address, timeout_s=0.3) as world:
-        with seated(world, ["car_0"], "silent"):
+        with join_world(world, ["car_0"], "silent"):
             start(lambda: drive(address, ["car_1"]))
             world.wait_for(2, 10.0)
             with pytest.raises(FollowerLostError):
@@ -196,7 +196,7 @@ def test_a_silent_follower_does_not_block_other_followers(address: Path, start: 
 
 def test_a_follower_that_leaves_is_no_error(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
-        follower = seated(world, ["car_0"])
+        follower = join_world(world, ["car_0"])
         follower.leave()
         world.reset(seed=1)
         assert world.seats == ()
@@ -304,7 +304,7 @@ def test_own_ticks_of_a_follower_do_not_change_the_world(
 
 def test_a_vehicle_has_one_follower(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
-        with seated(world, ["car_0"], "first"):
+        with join_world(world, ["car_0"], "first"):
             for wanted, match in (
                 (["car_0"], "driven by 'first'"),
                 (["car_9"], "no agent 'car_9'"),

@@ -105,7 +105,7 @@ def test_an_obeyed_tick_of_a_follower_is_detected_before_the_next_tick() -> None
     master = TimeMaster(env, own_ticks="obey", on_drift="record")
     master.reset(seed=0)
     follower = master.follow("rogue")
-    assert not follower.tick()  # a tick repeats the last step, and there is none yet
+    assert not follower.tick()  # a tick would repeat the last step; there is none
     for step in range(10):
         master.step(env.suggest_actions())
         if step % 3 == 0:

@@ -29,7 +29,7 @@ from cavmarl.cosim.followers.follower_messages import (
     read_payload,
 )
 from cavmarl.cosim.followers.framed_socket import FramedSocket
-from tests.cosim.conftest import hashes, make_env, seated
+from tests.cosim.conftest import hashes, join_world, make_env
 from tests.cosim.test_followed_world import reference
 from tests.support.descriptors import without_descriptors
 
@@ -287,7 +287,7 @@ def refusal_of(world: FollowedWorld) -> str:
 def test_followers_can_connect_by_a_local_port() -> None:
     with FollowedWorld(make_env(), 0, secret="of this world") as world:
         assert isinstance(world.address, int)
-        follower = seated(world, ["car_0"], secret="of this world")
+        follower = join_world(world, ["car_0"], secret="of this world")
         caller = threading.Thread(target=lambda: [follower.wait(), follower.leave()])
         caller.start()
         world.reset(seed=0)

@@ -120,7 +120,7 @@ def hashes(processor: Processor, tasks: tuple[str, ...], folder: str) -> Iterato
     with tempfile.TemporaryDirectory() as cache:
         kernels = cache_dir() / "kernels"
         kernels.mkdir(parents=True, exist_ok=True)
-        Path(cache, "kernels").symlink_to(kernels)  # their names identify processors
+        Path(cache, "kernels").symlink_to(kernels)  # their names contain the processor
         settings = {**os.environ, "CAVMARL_CACHE_DIR": cache, **processor.settings}
         command = [sys.executable, "-m", "tests.golden.portability", "--run", folder]
         if processor.emulated:

@@ -260,7 +260,7 @@ def test_the_memory_of_the_monitor_does_not_grow(monkeypatch: pytest.MonkeyPatch
     assert max(held[50:]) <= max(held[:25])
 
 
-def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) -> None:
+def test_the_ghosts_of_a_view_are_read_only(simulation: Simulation) -> None:
     ghosts = simulation.zones.ghosts(1)
     assert len(ghosts)
     with pytest.raises(ValueError, match="read-only"):

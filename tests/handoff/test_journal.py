@@ -49,7 +49,7 @@ def run_events() -> Bench:
 
 @pytest.fixture
 def journal_file(tmp_path: Path) -> Path:
-    """Write the journal of `eventful`."""
+    """Write the journal of `run_events`."""
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
         journal.append(run_events().log)

@@ -100,7 +100,7 @@ def test_a_lost_vehicle_blocks_no_lane_in_any_division(
     assert away_m > divided.zones.loads().halo_m
     street = whole.vehicles(0)
     passed = (street["driver"] != DRIVER_AGENT) & (street["s"] > row["s"])
-    assert passed.sum() >= 3, "other vehicles pass on the lane of the agent"
+    assert passed.sum() >= 3, "fewer than three vehicles have passed the agent"
 
 
 def test_the_built_in_driver_looks_for_its_lane(worlds: tuple[Simulation, Simulation]) -> None:
@@ -117,5 +117,5 @@ def test_the_built_in_driver_looks_for_its_lane(worlds: tuple[Simulation, Simula
         simulation.suggest(raw)
         told.append(raw)
     assert agent_of(whole)["speed"] > SLOW_MPS
-    assert told[0][0, 0, 0] < 0.0, "slowly"
+    assert told[0][0, 0, 0] < 0.0, "the built-in driver does not brake"
     assert told[0].tobytes() == told[1].tobytes()

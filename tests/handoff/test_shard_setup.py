@@ -29,7 +29,7 @@ def test_a_wider_halo_is_accepted_and_a_narrower_halo_is_refused() -> None:
     ):
         halo_m(narrow, 100.0, 4, late_ticks=2)
     assert halo_m(narrow, 99.0, 4, late_ticks=2) == 120.0
-    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "no driver looks over a border"
+    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "one shard has no border"
 
 
 def test_a_world_whose_halo_is_too_narrow_for_exactness_is_refused() -> None:

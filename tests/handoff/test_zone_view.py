@@ -57,7 +57,7 @@ def test_a_view_does_not_change_when_the_world_steps(divided: Simulation) -> Non
         np.testing.assert_array_equal(ghosts, then)
 
 
-def test_transfers_are_passed_on(divided: Simulation) -> None:
+def test_a_view_contains_the_given_transfers(divided: Simulation) -> None:
     one = TransferInFlight(vehicle=7, source=0, target=1, state="offered")
     view = view_zones(divided.shards, divided.partition, HALO_M, transfers=[one])
     assert view.transfers == (one,)

@@ -182,7 +182,7 @@ def test_a_world_with_limit_agents_is_the_same_on_workers_and_nodes(undivided: l
     assert hashes(num_envs=1, zones=3, nodes=2, kill_at=(24,)) == one
 
 
-def test_limits_hold_beside_changes_of_the_caller() -> None:
+def test_the_lower_limit_of_the_caller_and_the_agent_applies() -> None:
     with closing(vec_of(1, overrides={"map.changed_lanes": 3})) as vec:
         vec.reset(seed=1)
         edges = vec.network.lanes["edge"]

@@ -21,8 +21,8 @@ from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 6}
 HUGE = np.full(400, 1 << 40, dtype=np.int64).tobytes()
 GARBAGE = (b"[[[1]]]", b"\xff" * 64, b"[" * 99_999, HUGE)
-# Kinds of forged frames, by the kind of the valid frame before which, or instead of which, they are
-# sent. The keys are sent from a node to the caller, from the caller to a node, and between nodes.
+# Kind of a valid frame → kinds of forged frames that are sent before it or instead of it.
+# The keys are sent from a node to the caller, from the caller to a node, and between nodes.
 FORGED = {
     FrameKind.REPORT: (
         FrameKind.REPORT, FrameKind.SHARE, FrameKind.RESULT, FrameKind.PONG, FrameKind.NOT_MINE,

@@ -54,7 +54,7 @@ def moves_per_round(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
-def test_worlds_that_move_are_the_same(
+def test_moving_worlds_changes_no_result(
     make: Make, moves_per_round: list[int], number: int, env: str
 ) -> None:
     """The numbers of zones and workers depend on the number of the environment."""

@@ -220,7 +220,7 @@ def changing_costs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         ({"env": "town", "num_envs": 4, "overrides": {"sensors.stack": 3}}, {6: [1]}),
     ],
 )
-def test_worlds_that_move_are_the_same(
+def test_moving_worlds_changes_no_result(
     make: Make, changing_costs: list[int], arguments: dict[str, Any], at: dict[int, list[int]]
 ) -> None:
     wanted = WANTED | arguments

@@ -101,16 +101,16 @@ def key_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole() -> Any:
+def undivided_run() -> Any:
     with closing(make_vec("grid4x4", **WANTED)) as vec:
         return drive(vec, steps=20)
 
 
-def keyed(key_file: Path, **more: Any) -> dict[str, Any]:
+def key_settings(key_file: Path, **more: Any) -> dict[str, Any]:
     return {"overrides": {"workers.key_file": str(key_file), **more}}
 
 
-def elsewhere() -> str:
+def outside_address() -> str:
     address = own_address()
     if address is None:
         pytest.skip("this machine has only its loopback address")
@@ -119,16 +119,16 @@ def elsewhere() -> str:
 
 @pytest.mark.parametrize("is_elsewhere", [False, True])
 def test_frames_between_machines_are_encrypted(
-    make: Make, crowd: Crowd, key_file: Path, whole: Any, is_elsewhere: bool
+    make: Make, crowd: Crowd, key_file: Path, undivided_run: Any, is_elsewhere: bool
 ) -> None:
     """A damaged frame loses its sender, and a replayed handshake is refused."""
-    address = elsewhere() if is_elsewhere else "127.0.0.1"
+    address = outside_address() if is_elsewhere else "127.0.0.1"
     place = (address, free_port(address))
     wire = Proxy(place)
     crowd.call(place)
     crowd.call(wire.place, keeps_files=True)
     backend = "nodes:2@{}:{}".format(*place)
-    vec = make("grid4x4", zones=4, backend=backend, **keyed(key_file), **WANTED)
+    vec = make("grid4x4", zones=4, backend=backend, **key_settings(key_file), **WANTED)
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"grid4x4" in said) == (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
@@ -137,7 +137,7 @@ def test_frames_between_machines_are_encrypted(
         if step == 12:
             wire.spoiler = bytes(100)
 
-    assert same(drive(vec, steps=20, before=spoil), whole)
+    assert same(drive(vec, steps=20, before=spoil), undivided_run)
     assert over_nodes(vec).pool.losses == 1
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"cavN" in said) == (not is_elsewhere)
@@ -161,7 +161,11 @@ def test_a_node_that_joins_later_replaces_a_lost_one(
     crowd.call(place, 2)
     one = make("grid4x4", **WANTED)
     vec = make(
-        "grid4x4", zones=4, backend="nodes:2@{}:{}".format(*place), **keyed(key_file), **WANTED
+        "grid4x4",
+        zones=4,
+        backend="nodes:2@{}:{}".format(*place),
+        **key_settings(key_file),
+        **WANTED,
     )
     worlds = over_nodes(vec)
     for each in (one, vec):
@@ -207,14 +211,14 @@ def test_zones_that_move_to_another_node_change_no_result(
     make: Make, moves_per_round: list[int], is_lost: bool
 ) -> None:
     wanted = {"agents": 8, "background": 30, "max_cycles": 8}
-    whole = drive(make("town", **wanted), steps=20)
+    undivided_run = drive(make("town", **wanted), steps=20)
     vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
 
     def kill_in_step(step: int) -> None:
         if is_lost and step == 9:
             os.kill(over_nodes(vec).pool.pids[1], signal.SIGKILL)
 
-    assert same(drive(vec, steps=20, before=kill_in_step), whole)
+    assert same(drive(vec, steps=20, before=kill_in_step), undivided_run)
     mover = over_nodes(vec).mover
     assert mover is not None
     assert mover.moves == sum(moves_per_round) > 0
@@ -236,7 +240,7 @@ def test_actors_of_ray_serve_as_nodes_and_are_replaced(
 
 
 def test_a_node_that_two_other_nodes_cannot_reach_is_lost(
-    make: Make, monkeypatch: pytest.MonkeyPatch, whole: Any
+    make: Make, monkeypatch: pytest.MonkeyPatch, undivided_run: Any
 ) -> None:
     """Cut the connections of a node while its process runs."""
     wires: list[Proxy] = []
@@ -256,13 +260,13 @@ def test_a_node_that_two_other_nodes_cannot_reach_is_lost(
         if step == 9:
             max(wires, key=lambda wire: len(wire.heard)).cut()
 
-    assert same(drive(vec, steps=20, before=cut), whole)
+    assert same(drive(vec, steps=20, before=cut), undivided_run)
     assert over_nodes(vec).pool.losses == 1
     for wire in wires:
         wire.close()
 
 
-def test_many_unknown_callers_do_not_disturb_a_run(make: Make, whole: Any) -> None:
+def test_many_unknown_callers_do_not_disturb_a_run(make: Make, undivided_run: Any) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     worlds = over_nodes(vec)
     address, port = worlds.pool.joining_nodes.place.split(":")
@@ -275,7 +279,7 @@ def test_many_unknown_callers_do_not_disturb_a_run(make: Make, whole: Any) -> No
             if n % 2:
                 strangers[-1].sendall(secrets.token_bytes(100))
 
-    assert same(drive(vec, steps=20, before=call_often), whole)
+    assert same(drive(vec, steps=20, before=call_often), undivided_run)
     assert worlds.pool.losses == 0
     assert psutil.Process().num_fds() <= before + len(strangers) + MAX_CALLERS
     for stranger in strangers:
@@ -288,7 +292,7 @@ def test_many_unknown_callers_do_not_disturb_a_run(make: Make, whole: Any) -> No
 
 def test_a_caller_waits_for_nodes_up_to_a_limit(key_file: Path) -> None:
     port = free_port("127.0.0.1")
-    limited = keyed(key_file, **{"workers.join_timeout_s": 1.0})
+    limited = key_settings(key_file, **{"workers.join_timeout_s": 1.0})
     with closing(Listener("127.0.0.1", b"", port)):
         with pytest.raises(WorkerError, match=f"cannot listen on 127.0.0.1:{port}"):
             make_vec("grid4x4", zones=2, backend=f"nodes:2@127.0.0.1:{port}", **limited)
@@ -337,7 +341,9 @@ def test_a_node_can_be_started_from_the_command_line(
     process = subprocess.Popen(
         [sys.executable, "-m", "cavmarl", *words], stdout=subprocess.PIPE, text=True
     )
-    vec = make(net, zones=2, backend=f"nodes:1@127.0.0.1:{port}", **keyed(key_file), agents=2)
+    vec = make(
+        net, zones=2, backend=f"nodes:1@127.0.0.1:{port}", **key_settings(key_file), agents=2
+    )
     vec.reset(seed=1)
     vec.close()
     said, _ = process.communicate(timeout=WAIT_S)

@@ -224,7 +224,7 @@ def test_a_bad_frame_loses_its_sender_and_not_its_receiver() -> None:
     links.close()
 
 
-def test_of_two_nodes_that_cannot_reach_each_other_one_is_lost_in_turn() -> None:
+def test_nodes_that_cannot_reach_each_other_are_lost_alternately() -> None:
     links, far = pair()
     with far:
         found = []

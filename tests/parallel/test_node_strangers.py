@@ -21,7 +21,7 @@ from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
-from tests.parallel.test_node_joining import WAIT_S, elsewhere
+from tests.parallel.test_node_joining import WAIT_S, outside_address
 
 
 class JoinServer:
@@ -45,7 +45,7 @@ class JoinServer:
 
 
 def test_a_node_with_another_key_is_refused() -> None:
-    for address in ("127.0.0.1", elsewhere()):
+    for address in ("127.0.0.1", outside_address()):
         with closing(JoinServer(b"a" * 32, address)) as door:
             with pytest.raises(MessageError, match="give both the same key"):
                 run_node(door.listener.place, b"b" * 32, ANYONE)
@@ -66,13 +66,13 @@ def answer(server: socket.socket, said: bytes) -> threading.Thread:
 
 
 def test_a_peer_without_encryption_is_refused() -> None:
-    with closing(JoinServer(b"a" * 32, elsewhere())) as door:
+    with closing(JoinServer(b"a" * 32, outside_address())) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
             stranger.sendall(secrets.token_bytes(100))
             with suppress(ConnectionResetError):
                 assert b"cav" not in stranger.recv(100)
-    with socket.create_server((elsewhere(), 0)) as server:
+    with socket.create_server((outside_address(), 0)) as server:
         answering = answer(server, bytes(100))
         with pytest.raises(MessageError, match="does not use the encryption of cavmarl"):
             call(server.getsockname()[:2], b"a" * 32, ANYONE)
@@ -84,7 +84,7 @@ def test_a_missing_library_for_encryption_is_an_error_at_the_start(
 ) -> None:
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(MissingExtraError, match="nodes"):
-        Listener(elsewhere(), secrets.token_bytes(32))
+        Listener(outside_address(), secrets.token_bytes(32))
     Listener("127.0.0.1").close()
 
 

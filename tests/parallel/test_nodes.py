@@ -298,7 +298,7 @@ def test_the_loss_of_the_only_node_changes_no_result(make: Make) -> None:
     assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 2)
 
 
-def test_nothing_is_left_behind(make: Make) -> None:
+def test_no_process_or_descriptor_remains(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
     vec.reset(seed=1)
     pids = over_nodes(vec).pool.pids

@@ -66,7 +66,7 @@ def maps(pid: int) -> list[str]:
 
 
 @pytest.mark.parametrize("way", ["close", "forget"])
-def test_nothing_is_left_behind(way: str) -> None:
+def test_no_process_or_descriptor_remains(way: str) -> None:
     Pool(program(1), 60.0, 3).close()  # start the fork server, which outlives each pool
     gc.collect()  # free objects of other tests
     files = len(os.listdir("/proc/self/fd"))

@@ -57,7 +57,7 @@ def cluster(two_nodes: Any) -> Any:
 
 
 @pytest.fixture
-def whole(make: Make) -> Any:
+def undivided_run(make: Make) -> Any:
     return drive(make("grid4x4", **WANTED))
 
 
@@ -109,7 +109,7 @@ def test_some_worlds_are_reset_on_their_ray_nodes(make: Make, cluster: Any) -> N
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=slow)])
 def test_a_dead_actor_changes_no_result(
-    make: Make, cluster: Any, whole: Any, how: signal.Signals
+    make: Make, cluster: Any, undivided_run: Any, how: signal.Signals
 ) -> None:
     vec = make("grid4x4", backend="ray:2", overrides={"workers.timeout_s": 2.0}, **WANTED)
     struck: list[int] = []
@@ -121,7 +121,7 @@ def test_a_dead_actor_changes_no_result(
             times.append(time.time())
             os.kill(struck[-1], how)
 
-    assert same(drive(vec, before=kill_in_step), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     assert losses_of(vec) == [1, 1]
     assert (
         psutil.Process(pids_of(vec)[0]).create_time() < times[0]
@@ -131,7 +131,7 @@ def test_a_dead_actor_changes_no_result(
 
 @slow
 def test_an_actor_that_dies_during_a_step_changes_no_result(
-    make: Make, cluster: Any, whole: Any
+    make: Make, cluster: Any, undivided_run: Any
 ) -> None:
     vec = make("grid4x4", backend="ray:2", **WANTED)
     timers: list[Timer] = []
@@ -142,7 +142,7 @@ def test_an_actor_that_dies_during_a_step_changes_no_result(
             timers.append(Timer(0.001 * step, os.kill, (pid, signal.SIGKILL)))
             timers[-1].start()
 
-    assert same(drive(vec, before=kill_in_step), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     for timer in timers:
         timer.join()
     drive(vec, steps=1)
@@ -155,7 +155,7 @@ def test_an_actor_that_dies_during_a_step_changes_no_result(
 def test_the_pettingzoo_environment_on_ray_gives_the_results_of_one_process(
     cluster: Any, more: dict[str, Any]
 ) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+    undivided_run = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", **settings("open", "dict"), **more)
     pools = [group.pool for group in getattr(env.worlds, "groups", [env.worlds])]
 
@@ -163,7 +163,7 @@ def test_the_pettingzoo_environment_on_ray_gives_the_results_of_one_process(
         if step % 9 == 4:
             os.kill(pools[0].pids[0], signal.SIGKILL)
 
-    assert drive_view(env, before=kill) == whole
+    assert drive_view(env, before=kill) == undivided_run
     assert pools[0].losses > 0
     with pytest.raises(ConfigError, match="backend='local'"):
         _ = env.simulation
@@ -177,7 +177,7 @@ def test_worlds_that_move_between_ray_nodes_give_the_same_results(
     make: Make, cluster: Any, changing_costs: list[int]
 ) -> None:
     """Worlds move before an actor dies, so that it no longer runs its first worlds."""
-    whole = drive(make("grid4x4", **WANTED), steps=16)
+    undivided_run = drive(make("grid4x4", **WANTED), steps=16)
     vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
     assert len(set(nodes_of(pids_of(vec)))) == 2
@@ -186,16 +186,16 @@ def test_worlds_that_move_between_ray_nodes_give_the_same_results(
         if step in (5, 11):
             os.kill(pids_of(vec)[step % 3], signal.SIGKILL)
 
-    assert same(drive(vec, steps=16, before=kill_in_step), whole)
+    assert same(drive(vec, steps=16, before=kill_in_step), undivided_run)
     assert sum(losses_of(vec)) == 2
     assert sum(changing_costs) > 0
 
 
 def test_ray_actors_run_the_zones_of_one_world(cluster: Any) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+    undivided_run = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", backend="ray:2", **settings("open", "dict"))
     assert isinstance(env.worlds, NodeWorlds)
-    assert drive_view(env) == whole
+    assert drive_view(env) == undivided_run
     env.close()
 
 
@@ -219,7 +219,7 @@ def test_closing_worlds_ends_their_actors_but_not_the_cluster(make: Make, cluste
     assert ray.is_initialized()
 
 
-def test_a_dead_node_changes_no_result(make: Make, cluster: Any, whole: Any) -> None:
+def test_a_dead_node_changes_no_result(make: Make, cluster: Any, undivided_run: Any) -> None:
     """All processes of the node die at once, and its worlds resume on the other node."""
     node = cluster.add_node(num_cpus=1)
     vec = make("grid4x4", backend="ray:4", **WANTED)
@@ -235,7 +235,7 @@ def test_a_dead_node_changes_no_result(make: Make, cluster: Any, whole: Any) -> 
                 lambda: not psutil.pid_exists(pids[victim])
             )  # the actor ends with the raylet that started it
 
-    assert same(drive(vec, before=kill_in_step), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     assert losses_of(vec)[victim] == 1
     assert raylet not in nodes_of(pids_of(vec))
 

@@ -50,7 +50,7 @@ def test_split_worlds_equal_the_undivided_one(
     assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole)
 
 
-def test_rows_change_their_side_for_all_workers(make: Make) -> None:
+def test_a_long_run_over_workers_equals_the_undivided_one(make: Make) -> None:
     wanted = {"agents": 3, "background": 60, "max_cycles": 50}
     whole = drive(make("grid4x4", **wanted), steps=80)
     assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
@@ -62,7 +62,7 @@ def test_worlds_with_next_step_autoreset_are_equal(make: Make) -> None:
     assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
 
 
-def test_a_step_with_divided_and_undivided_worlds_is_equal(make: Make) -> None:
+def test_worlds_over_three_workers_equal_undivided_worlds(make: Make) -> None:
     wanted = {"num_envs": 2, "agents": 4, "background": 10, "max_cycles": 6}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=3, **wanted)
@@ -124,7 +124,7 @@ def test_workers_that_die_at_any_time_change_no_result(make: Make, env: str) -> 
     assert alive([*pids, *left]) == []
 
 
-def test_the_process_that_forks_may_die(make: Make) -> None:
+def test_a_killed_fork_server_changes_no_result(make: Make) -> None:
     wanted = {"agents": 3, "background": 20}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=2, **wanted)

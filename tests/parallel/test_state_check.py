@@ -473,7 +473,7 @@ def test_forged_rows_of_vehicles_that_change_their_zone_are_refused(make: Make) 
                 codec.unpack(codec.pack(forged, 0, 0, tick), vehicle, tick, rows.copy(), 0, 0)
 
 
-def test_a_departure_that_comes_back_is_refused(make: Make, tmp_path: Path) -> None:
+def test_a_state_that_repeats_a_departure_is_refused(make: Make, tmp_path: Path) -> None:
     vec = _with_demand(make, tmp_path)
     worlds = _worlds(vec)
     place = next(

@@ -140,7 +140,7 @@ def test_a_worker_is_replaced_before_every_step(make: Make, env: str) -> None:
     assert len(pool_of(vec).deaths) == STEPS
 
 
-def test_the_process_that_forks_may_die(make: Make) -> None:
+def test_a_killed_fork_server_changes_no_result(make: Make) -> None:
     wanted = {"num_envs": 3, "agents": 3, "background": 3}
     whole = drive(make("ring", **wanted))
     vec = make("ring", workers=2, **wanted)

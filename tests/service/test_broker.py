@@ -507,7 +507,7 @@ def test_the_rate_of_requests_of_a_caller_is_limited(fleet: Fleet) -> None:
     limit.take("ada")
 
 
-def test_the_caller_that_asked_longest_ago_is_forgotten_first(
+def test_the_rate_limit_drops_the_caller_that_asked_longest_ago(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rate_limit, "MOST_BUCKETS", 2)

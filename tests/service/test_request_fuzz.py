@@ -27,7 +27,7 @@ from tests.support.request_fuzz import (
 
 ROOT = Path(__file__).resolve().parents[2]
 PLACES = [str(ROOT), sys.prefix, str(Path.home())]
-RENEWED_EVERY = 100  # in requests
+RENEWED_EVERY = 100  # number of requests
 LONGEST_LINE = 500  # longest log line in characters
 WORLD = {"environment": "ring", "agents": 1, "background": 1}
 

@@ -97,12 +97,14 @@ def test_closing_a_job_ends_its_process(cluster: Cluster, client: Client) -> Non
     node = next(one for one in cluster.processes.values() if one.poll() is None)
 
     def is_over() -> bool:
-        return not [one for one in psutil.Process(node.pid).children() if "fresh" in told(one)]
+        return not [
+            one for one in psutil.Process(node.pid).children() if "fresh" in command_line_of(one)
+        ]
 
     wait_for(is_over)
 
 
-def told(process: psutil.Process) -> str:
+def command_line_of(process: psutil.Process) -> str:
     try:
         return " ".join(process.cmdline())
     except psutil.NoSuchProcess:

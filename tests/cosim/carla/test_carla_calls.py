@@ -221,7 +221,9 @@ def test_ticks_of_a_second_client_are_detected(
         assert master.own_ticks == 1
 
 
-def test_a_step_that_does_not_fit_restarts_the_world(session: CarlaSession, call: Call) -> None:
+def test_a_step_shorter_than_that_of_the_world_restarts_the_world(
+    session: CarlaSession, call: Call
+) -> None:
     rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
     episode, lights = session.episode, session.actors.lights["id"].tolist()
     call("set_episode_settings", [True, False, [True, 0.02], *rest])

@@ -1,4 +1,4 @@
-"""Worlds with a ROS 2 bridge, and the other end of its topics."""
+"""Worlds with a ROS 2 bridge, and a node that uses its topics."""
 
 from __future__ import annotations
 
