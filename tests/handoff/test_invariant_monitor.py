@@ -160,7 +160,7 @@ VIOLATIONS = {
 }
 
 
-@pytest.mark.parametrize("meddle", VIOLATIONS, ids=lambda change: change.__name__)
+@pytest.mark.parametrize("change", VIOLATIONS, ids=lambda change: change.__name__)
 def test_the_monitor_detects_each_violation(
     change: Callable[[RowChanger], None], simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
