@@ -29,7 +29,7 @@ from cavmarl.zones.partition.zone_file import named_zones
 
 ROUND_S = 10  # simulated seconds per recorded round
 BEFORE_S = 20  # simulated seconds before the first round
-AFTER_S = 1  # so that no episode ends within the last round
+AFTER_S = 1  # after the last round, so that no episode ends in it
 
 
 def measure(
@@ -123,7 +123,7 @@ def generated_traces(
     seeds: Sequence[int],
     overrides: Mapping[str, Any],
 ) -> Iterator[LoadTrace]:
-    """Yield a trace of a generated crowd on the environment's map for each seed."""
+    """Yield a trace for each seed: a generated crowd on the environment's map."""
     if overrides:
         raise ConfigError("--set: a generated crowd has no settings; add --recorded")
     network = load_network(find_map(env))
@@ -142,7 +142,7 @@ def recorded_traces(
     seeds: Sequence[int],
     overrides: Mapping[str, Any],
 ) -> Iterator[LoadTrace]:
-    """Yield the recorded costs of zones, with the built-in driver in all seats, for each seed."""
+    """Yield a trace for each seed: recorded costs of zones with built-in drivers."""
     for seed in seeds:
         simulation = world_maker(
             env,

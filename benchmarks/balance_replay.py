@@ -1,9 +1,9 @@
 """Replay of load traces through each placement strategy, compared with static placement.
 
-The replay uses a model of the true cost: a worker gets the share of its processor that other
-programs leave, so the time of its shards is their cost over 1 - CPU. Memory and GPU in use do not
-slow a worker down. All workers wait for the slowest. Moving a shard costs the rule's `move_s` once,
-and a vehicle that changes its zone because the map is cut again costs `HANDOFF_S`.
+The replay uses a model of true times. A worker gets the share of its processor that other programs
+leave, so its shards take their cost / (1 - CPU). Used memory and a used GPU do not slow a worker
+down. All workers wait for the slowest worker. A moved shard costs the rule's `move_s` once, and a
+vehicle that changes its zone because the map is cut again costs `HANDOFF_S`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from cavmarl.evaluate.statistics import Interval, mean_interval
 __all__ = ["BalanceReplay", "StrategyResult", "Verdict", "replay_traces"]
 
 HANDOFF_S = 1e-4
-WARM_SHARE = 0.25  # share of rounds before learnt values are used and times count
+WARM_SHARE = 0.25  # share of rounds for learning; times count after them
 
 
 Verdict = Literal[
@@ -38,18 +38,18 @@ Verdict = Literal[
 
 @dataclass(frozen=True)
 class StrategyResult:
-    """One placement strategy; all values are means over traces."""
+    """The results of one placement strategy; all values are means over traces."""
 
-    name: str  # of `STRATEGIES`, or `perfect`: with arbitrarily divisible shards
-    ratio: float  # time over that of the static placement
+    name: str  # of `STRATEGIES`, or `perfect` for arbitrarily divisible shards
+    ratio: float  # time / time of the static placement
     ratio95: Interval | None  # between traces; None: a single trace
-    beside_balanced: float  # time over that of `balanced`
+    beside_balanced: float  # time / time of `balanced`
     beside_balanced95: Interval | None  # between traces; None: a single trace
-    imbalance: float  # maximum over mean of the workers' ticks, mean over rounds
+    imbalance: float  # maximum / mean of the workers' ticks, mean over rounds
     moves: float  # moved shards per round
-    handoffs: float  # vehicles per round that changed their zone by a new cut
+    handoffs: float  # vehicles per round that changed their zone because of a new cut
     weights: tuple[float, float, float]  # weights of the last round's score, mean
-    verdict: Verdict  # from `ratio95`
+    verdict: Verdict  # derived from `ratio95`
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class BalanceReplay:
     zones: int  # number of zones
     workers: int  # number of workers
     traces: int  # number of traces
-    rounds: int  # rounds per trace, including those before times count
+    rounds: int  # rounds per trace, including rounds for learning
     ticks: int  # ticks per round
     rule: BalanceRule  # conditions for moving shards, and the cost of a move
     rows: tuple[StrategyResult, ...]  # results by strategy
@@ -68,7 +68,7 @@ class BalanceReplay:
 
 @dataclass(frozen=True)
 class _Totals:
-    """Sums of one strategy on one trace, from the first round that counts."""
+    """Sums of one strategy on one trace, without the rounds for learning."""
 
     time_s: float
     imbalance: float

@@ -18,7 +18,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 __all__ = ["STRATEGIES", "LoadStrategy", "Placed", "StaticPlacement"]
 
 STRATEGIES = ("static", "balanced", "calibrated", "predicted", "repartitioned")
-RECUT_EVERY = 10  # rounds
+RECUT_EVERY = 10  # least number of rounds between two cuts
 
 
 @dataclass(frozen=True)
@@ -27,8 +27,8 @@ class Placed:
 
     partition: ZonePartition  # the zones
     homes: tuple[int, ...]  # worker of each zone
-    moved_shards: int = 0  # since the previous round
-    moved_vehicles: int = 0  # that changed their zone because the map was cut again
+    moved_shards: int = 0  # shards moved since the previous round
+    moved_vehicles: int = 0  # vehicles that changed their zone because the map was cut again
 
 
 class StaticPlacement:
@@ -40,7 +40,7 @@ class StaticPlacement:
 
     Attributes:
         partition: the present zones.
-        balancer: has the plan.
+        balancer: the object that has the plan.
     """
 
     def __init__(self, trace: LoadTrace, rule: BalanceRule) -> None:
@@ -50,7 +50,7 @@ class StaticPlacement:
         self.balancer = self._begin(trace.partition, equal_costs(1, trace.partition.count), 0)
 
     def place(self, number: int) -> Placed:
-        """Return the placement in a round, from the knowledge before it."""
+        """Return the placement in a round, based on earlier rounds."""
         return Placed(self.partition, self.balancer.plan.homes)
 
     def learn(self, number: int) -> None:
@@ -92,10 +92,10 @@ class LoadStrategy(StaticPlacement):
         self._ticks: list[LoggedTick] = []
         self._contents: list[ShardContent] = []
         self._measured_s: list[float] = []
-        self._usual = np.array(trace.contents(0, trace.partition))  # smoothed like costs
+        self._usual = np.array(trace.contents(0, trace.partition))  # contents, smoothed like costs
 
     def place(self, number: int) -> Placed:
-        """Return the placement in a round, from the knowledge before it."""
+        """Return the placement in a round, based on earlier rounds."""
         before = self.balancer.plan.homes
         if number == 0:
             return Placed(self.partition, before)

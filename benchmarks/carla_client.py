@@ -4,8 +4,9 @@
 
 The program needs CARLA's client and nothing of cavmarl. SENSORS and OUTPUT are JSON files. SENSORS
 has a list of blueprints with attributes, which are mounted on the first agent. OUTPUT has the wall
-time of all ticks in s; the largest number of vehicles; for each sensor, the time in ms from the
-call of `tick` to the arrival of the frame of this tick, for the frames that came in order.
+time of all ticks in s, the largest number of vehicles, and for each sensor the delays of its frames
+in ms. A delay is the time from the call of `tick` to the arrival of the frame of this tick. Frames
+that come out of order have no delay.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ class Listener:
         sensor.listen(lambda data: self.arrivals.put((data.frame, time.perf_counter())))
 
     def take(self, frame: int, start_s: float) -> None:
-        """Wait for the next frame; only the frame of this tick counts."""
+        """Wait for the next frame; store its delay if it is the frame of this tick."""
         with suppress(Empty):
             seen, arrived_s = self.arrivals.get(timeout=TIMEOUT_S)
             if seen == frame:

@@ -1,8 +1,8 @@
-"""The clocks of two of CARLA's clients that share a world: one ticks it, the other one follows.
+"""The clocks of two of CARLA's clients that share a world: one client ticks, one follows.
 
-The world is cavmarl's, behind its server for CARLA's client; SUMO can move its traffic. So three
-programs are in lock step, as in the co-simulation paper: SUMO, the world in place of CARLA, and
-clients. The second client ticks by itself in a share of the steps, as the paper's bridge does.
+The world is cavmarl's, behind its server for CARLA's client; SUMO can move its traffic. As in the
+co-simulation paper, three programs are in lock step: SUMO, the world in place of CARLA, and the
+clients. In a share of the steps, the second client also ticks, like the paper's bridge.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ from cavmarl.engine.world_setup import find_map
 from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import CARS
 
-_HEADWAY_S = 2  # between departures of SUMO's vehicles
+_HEADWAY_S = 2  # time between departures of SUMO's vehicles
 
 
 @with_world("agents", "background", "seed", "settings")
@@ -118,7 +118,7 @@ def measure_client_drift(
 
 
 def trips(spec: WorldSpec, number: int) -> str:
-    """Return SUMO's demand: cars between random roads of a map, in its random order."""
+    """Return SUMO's demand: cars between random roads of a map."""
     network = load_network(find_map(spec.env))
     for_cars = (network.lanes["permissions"] & CARS) != 0
     moves = network.links[for_cars[network.links["from_lane"]]]
@@ -140,7 +140,7 @@ def serving(spec: WorldSpec, other_ticks: OtherTicks) -> Iterator[CarlaServer]:
         thread.start()
         try:
             yield server
-        finally:  # the world must not be closed while the thread steps it
+        finally:  # the thread still steps the world
             over.set()
             thread.join()
 

@@ -1,12 +1,12 @@
-"""Two of CARLA's clients share a world: one ticks it, the other one follows, or ticks by itself.
+"""Two of CARLA's clients share a world: one client ticks, the other follows or ticks, too.
 
     python carla_clock_client.py PORT STEPS SHARE WAITS OUTPUT
 
-The program needs CARLA's client and nothing of cavmarl. The second client ticks by itself in SHARE
-of the steps, evenly spread. With WAITS = 1, a tick of its own waits for the first client's next
-tick, so the first client does not wait for it. OUTPUT is a JSON file: the frames that the first
-client has got from its ticks; the frame in which the second client knows the world after each step;
-and its own ticks, also those that were refused.
+The program needs CARLA's client and nothing of cavmarl. The second client ticks in SHARE of the
+steps, evenly spread. With WAITS = 1, its own tick waits for the next tick of the first client, and
+the first client does not wait for the second. OUTPUT is a JSON file. It has the frames that the
+first client got from its ticks, the frame that the second client knows after each step, and the
+numbers of own and of refused ticks of the second client.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ TIMEOUT_S = 20.0
 
 
 def is_due(step: int, share: Fraction) -> bool:
-    """Return whether to tick in a step, from 1; of the first n steps, floor(n · share) are due."""
+    """Return whether to tick in a step; of the steps 1 to n, floor(n · share) are due."""
     return int(step * share) > int((step - 1) * share)
 
 
@@ -38,12 +38,12 @@ def connect(port: int) -> Any:
 
 
 class Second(threading.Thread):
-    """The second client; `share`: of the steps in which it ticks by itself.
+    """The second client, which ticks in a share of the steps.
 
     Attributes:
-        steps: a place in the queue for each tick of the first client; None ends the thread.
-        done: number of steps that it has taken.
-        own, refused: number of its own ticks, and of those with an error.
+        steps: a queue with an entry for each tick of the first client; None ends the thread.
+        done: number of finished steps.
+        own, refused: number of own ticks, and of own ticks with an error.
     """
 
     def __init__(self, port: int, share: Fraction) -> None:
@@ -65,7 +65,7 @@ class Second(threading.Thread):
             self.done += 1
 
     def wait_for(self, frame: int, steps: int) -> None:
-        """Wait until this client knows a frame, and has taken a number of steps."""
+        """Wait until this client knows a frame and has finished a number of steps."""
         until_s = time.monotonic() + TIMEOUT_S
         while self.done < steps or self.world.get_snapshot().frame < frame:
             if time.monotonic() > until_s:
@@ -92,7 +92,7 @@ def main() -> None:
         seen.append(int(second.world.get_snapshot().frame))
     second.steps.put(None)
     while second.is_alive():
-        world.tick()  # for a second client that waits
+        world.tick()  # for own ticks that wait
         second.join(0.002)
     settings.synchronous_mode, settings.fixed_delta_seconds = False, None
     world.apply_settings(settings)

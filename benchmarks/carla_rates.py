@@ -1,4 +1,4 @@
-"""Ticks per second of a world that CARLA's client ticks, and delays of frames of its sensors."""
+"""Ticks per second of a world that CARLA's client ticks, and delays of its sensors' frames."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ TEN_SENSORS = (
 
 
 class Load(NamedTuple):
-    """What a client does."""
+    """The sensors and the required rate of a client."""
 
     name: str
     vehicles: int

@@ -1,7 +1,7 @@
-"""Hand-overs between zones that servers for CARLA's client run: ticks per second and latency.
+"""Hand-overs between zones that servers for CARLA's client run: rates and latencies.
 
-It repeats the hand-overs of the first paper (Table 4). Each zone of a world has a server in a
-process of its own, and a process with CARLA's official client.
+The benchmark repeats the hand-overs of the first paper (Table 4). Each zone of a world has a
+process with a server, and a process with CARLA's official client.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ def measure(
 
 
 def measure_zones(spec: WorldSpec, zones: int, vehicles: int, steps: int) -> dict[str, Any]:
-    """Return the rate of a world, the latencies of its hand-overs, and how many it has lost.
+    """Return the rate of a world, and the latencies and losses of its hand-overs.
 
     Raises:
         MissingExtraError: CARLA's client is not installed.
@@ -127,7 +127,7 @@ def measure_zones(spec: WorldSpec, zones: int, vehicles: int, steps: int) -> dic
 
 @contextmanager
 def _server(env: str, places: int) -> Iterator[int]:
-    """Run a server without vehicles of its own in a process of its own; yield its port."""
+    """Run a server of an empty world in a new process; yield the port."""
     words = ["carla", env, "--agents", "1", "--background", "0", "--port", "0"]
     process = subprocess.Popen(
         dying_with_parent(

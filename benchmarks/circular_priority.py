@@ -11,7 +11,7 @@ SIGNED = [ord(state) for state in "Mms"]  # link states: major, minor, stop sign
 
 
 def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
-    """Return the LINK rows that yield in a circle or lie between two circles.
+    """Return the LINK rows that yield in a circle, or between two such circles.
 
     Only junctions with priority signs count: at uncontrolled junctions, all-way stops and signals,
     drivers resolve the conflict in other ways.
@@ -23,7 +23,7 @@ def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
     asked = network.conflicts["must_yield"] & signed[owner] & signed[foe]
     edges = np.stack([owner[asked], foe[asked]], axis=1)
     while True:
-        left = np.intersect1d(edges[:, 0], edges[:, 1])  # the link yields, and others yield to it
+        left = np.intersect1d(edges[:, 0], edges[:, 1])  # links that yield and that are yielded to
         inside = np.isin(edges, left).all(axis=1)
         if inside.all():
             return left

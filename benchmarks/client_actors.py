@@ -1,4 +1,4 @@
-"""Actors of a client in another thread: steps and time until they are there, and their cost."""
+"""Actors that a client in another thread brings: delay until they appear, and their cost."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ from cavmarl.cosim.followers.follower_messages import ActorRequest, PoseView
 from cavmarl.env.parallel import CavEnv, parallel_env
 
 STEP_S = 0.05
-SPACING_M = 15.0  # between the places of actors
-ASIDE_M = 90.0  # outside of the map, so that no other vehicle sees them
+SPACING_M = 15.0  # distance between actors
+ASIDE_M = 90.0  # distance from the map, so that no vehicle sees the actors
 
 
 @with_world("agents", "background", "seed", "settings")
@@ -37,7 +37,7 @@ def measure(
     steps: Annotated[int, about("Steps of each visit, and of each pause.")] = 20,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Let clients bring actors and leave, beside the same world without clients."""
+    """Compare a world to which clients bring actors with the same world without clients."""
     check_range(
         visits=(visits, 1, 10_000), actors=(actors, 1, 50), rate_hz=(rate_hz, 1.0, 1000.0),
         steps=(steps, 2, 10_000),
@@ -92,7 +92,7 @@ class _Run:
         self._others: list[bytes] = []
 
     def measured(self, name: str) -> dict[str, Any]:
-        """Return the figures of the run."""
+        """Return the measurements of the run."""
         there_s, steps_until = [], []
         with (
             tempfile.TemporaryDirectory() as folder,

@@ -39,12 +39,11 @@ class DriftRow:
 
     step: int  # steps since the follower joined
     master_s: float  # master's time since the follower joined
-    follower_s: float  # world time as known to the follower
-    normalised_s: float  # the same since the follower joined
+    follower_s: float  # world time that the follower knows
+    normalised_s: float  # this time since the follower joined
     delta_s: float  # follower's lead over the master
-    ratio: float  # follower's time over the master's
-    # lead of the follower's (unused) process clock over the master's clock; None: steps are not
-    # paced
+    ratio: float  # follower's time / master's time
+    # lead of the follower's process clock, which is not used; None: steps are not paced
     own_delta_s: float | None
 
 
@@ -58,14 +57,14 @@ class ClockDrift:
     answer: OwnTicks | OtherTicks  # the master's reaction to such ticks
     pace: float | None  # simulated seconds per second of the master; None: unpaced
     rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000, …, and the last one
-    own_ticks: int  # number of its own ticks counted by the follower
-    counted: int  # the same, counted by the master
-    drift_events: int  # number of times that the master noticed the world had advanced without it
+    own_ticks: int  # number of the follower's own ticks, counted by the follower
+    counted: int  # this number, counted by the master
+    drift_events: int  # how often the master noticed that the world had advanced without its tick
     noticed_ticks: int | None  # ticks of the master until it first noticed; None: never
 
     @property
     def holds(self) -> bool:
-        """Return whether the clocks agree or, with obeyed own ticks, the master noticed in time."""
+        """Return whether the clocks agree, or the master noticed the follower's ticks in time."""
         if self.answer == "obey" and self.own_ticks:
             return self.noticed_ticks is not None and self.noticed_ticks <= 1
         return all(row.delta_s == 0.0 and row.ratio == 1.0 for row in self.rows)
@@ -82,8 +81,8 @@ def measure_drift(
 ) -> ClockDrift:
     """Run a world as time master, with a follower in its own process that reads the clock.
 
-    With `pace`, the master's steps wait for the wall clock, and the table also shows the error of a
-    follower that used its own process clock instead of the master's.
+    With `pace`, the master's steps wait for the wall clock. The table then also has the error of a
+    follower that would use its own process clock.
     """
     pacer = _FromJoining(Unpaced() if pace is None else RealTime(pace))
     check_range(steps=(steps, 1, math.inf), rogue=(rogue, 0.0, 1.0))
@@ -140,7 +139,7 @@ def drift_report(
 ) -> BenchmarkReport:
     """Return Table II as a report.
 
-    `clocks`: names of the two clocks. `facts`: figures besides those of the drift.
+    `clocks`: names of the two clocks. `facts`: additional figures.
     """
     master, follower = clocks
     columns = {
@@ -178,7 +177,7 @@ class _FromJoining:
 def _followed(
     world: FollowedWorld, pacer: _FromJoining, steps: int, rogue: float
 ) -> tuple[list[int], dict[str, Any]]:
-    """Return the master's ticks per step since the follower joined, and the follower's output."""
+    """Return the master's tick after each step since the follower joined, and its output."""
     words = ["-m", PROGRAM, str(world.address), str(rogue)]
     with start_python(words, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -199,7 +198,7 @@ def _followed(
 
 
 def own_s(seconds: list[float], pace: float | None) -> list[float] | None:
-    """Convert the follower's own clock to simulated seconds, if there is a pace."""
+    """Return the follower's own clock in simulated seconds, if steps are paced."""
     return None if pace is None else [pace * since_s for since_s in seconds]
 
 

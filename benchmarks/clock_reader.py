@@ -2,9 +2,9 @@
 
     python -m benchmarks.clock_reader ADDRESS SHARE
 
-At the end it prints one line of JSON: the world's tick when it joined and after each step, as known
-to the follower; its own process clock (seconds since it joined); and the number of its own ticks
-that were refused. It ticks on its own in SHARE of the steps, evenly spread.
+The follower ticks on its own in SHARE of the steps, evenly spread. At the end, it prints one line
+of JSON: the world's tick that it knew when it joined and after each step, its own process clock in
+seconds since it joined, and the number of refused own ticks.
 """
 
 from __future__ import annotations

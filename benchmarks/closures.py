@@ -63,7 +63,7 @@ def measure(
 def compare(
     map_name: str, closed: Sequence[str], vehicles: int, seconds: int, close_s: int, seed: int
 ) -> dict[str, Any]:
-    """Return arrivals and mean travel times of both simulators."""
+    """Run cavmarl and SUMO; return arrivals and mean travel times of each."""
     map_file = find_map(map_name)
     network = load_network(map_file)
     with tempfile.TemporaryDirectory() as name:
@@ -91,7 +91,7 @@ def roads_of(network: RoadNetwork) -> list[str]:
 
 
 def trips(network: RoadNetwork, vehicles: int, within_s: float, seed: int) -> str:
-    """Return a file of trips between random roads, none of which is in `ROADS`."""
+    """Return a file of trips between random roads that are not in `ROADS`."""
     random = np.random.default_rng(seed)
     starts, goals = (
         {network.edge_ids[edge] for edge in network.lanes["edge"][network.links[side]].tolist()}
@@ -123,7 +123,7 @@ def sumo_trip_times(job: SumoJob) -> list[float]:
 
 
 def rerouter(edges: Sequence[str], closed: Sequence[str], close_s: int) -> str:
-    """Return SUMO's file of a rerouter on all edges that closes roads."""
+    """Return SUMO's file of a rerouter on all edges, which closes roads from a time on."""
     closings = "".join(f'<closingReroute id="{edge}"/>' for edge in closed)
     interval = f'<interval begin="{close_s}" end="1000000">{closings}</interval>'
     rule = f'<rerouter id="closures" edges="{" ".join(edges)}">{interval}</rerouter>'

@@ -1,9 +1,9 @@
 """Cost models that the balance benchmark compares with measured costs; cavmarl does not use them.
 
-Calibrated: the LoadScore is the share of a worker that its shards do not get. If a worker takes
-`tick_s` for shards that cost `load_s`, it has lost the share 1 - load_s / tick_s; the weights are
-fitted to the lost shares. Predicted: a shard's future cost is linear in its present vehicles,
-sensor readings and migrations. No coefficient is negative.
+Calibrated model: the LoadScore is the share of a worker that its shards do not get. If a worker
+takes `tick_s` for shards that cost `load_s`, the lost share is 1 - load_s / tick_s. The weights of
+the score are fitted to lost shares. Predicting model: the future cost of a shard is linear in its
+present vehicles, sensor readings and migrations. No coefficient is negative.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ Floats = NDArray[np.float64]
 
 
 class LoggedTick(NamedTuple):
-    """Other load on a worker, the cost of its shards, and its time, in seconds per tick."""
+    """The other load on a worker, and the cost and time of its shards in seconds per tick."""
 
     use: Utilisation
     load_s: float
@@ -49,7 +49,7 @@ class CostModel(NamedTuple):
         return self.shard_s + float(np.dot(self[1:], content))
 
     def shift(self, cost_s: float, before: ShardContent, now: ShardContent) -> float:
-        """Return the cost of a shard after its content changes, given its cost before."""
+        """Return the cost of a shard after a change of its content."""
         return max(cost_s + self.predict(now) - self.predict(before), 0.0)
 
 

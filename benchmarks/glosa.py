@@ -33,12 +33,12 @@ ADVISED: dict[str, Any] = {
 
 
 class Driving(NamedTuple):
-    """What all agents of one or several worlds did."""
+    """Sums over all agents of one or several worlds."""
 
     stops: float
     stood_s: float
     driven_s: float
-    delay_s: float  # driven time beyond that at the desired speed
+    delay_s: float  # driving time minus the time at the desired speed
     distance_m: float
     co2_g: float
 
@@ -62,7 +62,7 @@ def drive_worlds(
 ) -> list[Driving]:
     """Let agents drive without background vehicles; a new trip follows each trip.
 
-    `controller`: chooses greens, if `signals.agents` is set. Returns the sums of each world.
+    With `signals.agents`, a controller chooses greens. Return the sums of each world.
     """
     keys = {**ADVISED, "horizon_s": seconds + 10.0, **(overrides or {})}
     vec = make_vec(env, num_envs=worlds, agents=agents, background=0, overrides=keys)
@@ -86,7 +86,7 @@ def drive_worlds(
 
 
 class _Meter:
-    """Adds up what the agents of a world do; `sums` are those of `Driving`."""
+    """Adds up the values of `Driving` for the agents of a world."""
 
     def __init__(self, step_s: float) -> None:
         self._step_s = step_s

@@ -1,4 +1,4 @@
-"""Inference of driver networks by the kernel compared with torch, in turn, on one core.
+"""Inference of driver networks: the kernel compared with torch, in turn, on one core.
 
 All weights and observations are random. Both sides evaluate the same rows; torch uses
 `inference_mode` and one thread.
@@ -32,7 +32,7 @@ from cavmarl.core.errors import require
 from cavmarl.networks.driver_network import DriverNetwork
 from cavmarl.networks.network_files import MAX_OBSERVATION_SIZE, MAX_WIDTH, NetworkConfig
 
-FORMS = {"tanh": False, "LayerNorm, ReLU": True}  # kind of layers → `shared`
+FORMS = {"tanh": False, "LayerNorm, ReLU": True}  # kind of layers: value of `shared`
 
 Pass = Callable[[], NDArray[np.float32]]
 
@@ -93,7 +93,7 @@ def _compare(config: NetworkConfig, rows: int, repeats: int, say: Say) -> dict[s
 
 
 def _sides(config: NetworkConfig, rows: int) -> tuple[Pass, Pass]:
-    """Return a forward pass of one network on the same observations: by the kernel, by torch."""
+    """Return functions that evaluate one network on the same observations: kernel, torch."""
     import torch
 
     from cavmarl.learning.actor_critic import ActorCritic

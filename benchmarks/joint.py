@@ -1,8 +1,8 @@
 """Speed advice and learned signals, alone and together, over the loss of messages.
 
-All vehicles are agents. They follow `glosa` with advice, else `idm`. Signals follow the map's
-programs, or networks that `train/signals_sb3.py` has trained: with drivers of `idm`, or with those
-that get advice (`together`). The first run trains the networks, and keeps them in a folder.
+All vehicles are agents with the driver `glosa` (advice) or `idm` (no advice). Signals follow the
+map's programs, or networks that `train/signals_sb3.py` has trained with drivers `idm` or, for the
+side `together`, with drivers `glosa`. The first run trains the networks and stores them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class Side(NamedTuple):
 
     name: str
     drivers: str
-    trained_with: str  # drivers in the training of the signals; empty: programs
+    trained_with: str  # drivers in the training of signals; empty: signals follow programs
 
 
 SIDES = (
@@ -172,7 +172,7 @@ def _vehicles(drivers: str, agents: int) -> Sequence[object]:
 
 
 def _savings(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return lines about what advice saves beside signals, from world to world."""
+    """Return lines with the savings by advice over learned signals alone, paired by world."""
     alone = next((row for row in rows if row["side"] == "signals"), None)
     found = []
     for row in rows:

@@ -50,7 +50,7 @@ def measure(
     settings = {"agents": agents, "background": 0, "overrides": KEYS}
     rows: list[dict[str, Any]] = []
     with one_core(), _one_thread(), warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # notices of the libraries
+        warnings.simplefilter("ignore")  # warnings of the libraries
         for view, make in VIEWS.items():
             say(f"measuring {view}")
             row: dict[str, Any] = {"view": view, "step_ms": None, "added_ms": None, "missing": ""}
@@ -82,7 +82,7 @@ def _measured(step: Step, arrays: Step, steps: int) -> dict[str, float]:
 
 
 def _milliseconds(step: Step) -> float:
-    """Return the processor time, which other programs do not affect."""
+    """Return the processor time of a step in ms; other programs do not affect it."""
     began = time.process_time_ns()
     step()
     return (time.process_time_ns() - began) / 1e6
@@ -90,7 +90,7 @@ def _milliseconds(step: Step) -> float:
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Restrict torch, if installed, to one thread, like the other adapters."""
+    """Restrict torch, if it is installed, to one thread."""
     try:
         torch = require("torch", "train")
     except MissingExtraError:

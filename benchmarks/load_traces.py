@@ -1,8 +1,7 @@
 """Load traces: positions and costs of vehicles, and other load on workers.
 
 A trace is generated or recorded; `balance_replay` replays both kinds through the same balancer. The
-other load is always generated, because a program that loads the machine on purpose would affect the
-measurement.
+load by other programs is always generated, because a real load would affect the measurement.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class LoadRound:
-    """One round between two opportunities to move shards."""
+    """The loads between two placements of shards."""
 
     ids: NDArray[np.int64]  # (n,) vehicles
     places: Floats  # (n, 2) positions, m
     agents: NDArray[np.bool_]  # (n,) whether an agent drives the vehicle
     vehicle_s: Floats  # (n,) cost of each vehicle, s per tick
-    noise: Floats  # (k,) measured over true cost of each zone
+    noise: Floats  # (k,) measured / true cost of each zone
     snapshot: LoadSnapshot  # other load on workers
 
 
@@ -46,7 +45,7 @@ class LoadTrace:
     network: RoadNetwork  # the map
     partition: ZonePartition  # its initial zones
     ticks: int  # per round
-    # additional cost of a vehicle that has changed its zone since the last round, s per tick
+    # additional cost of a vehicle that changed its zone in a round, s per tick
     migration_s: float
     rounds: tuple[LoadRound, ...]  # in temporal order
 
@@ -92,9 +91,9 @@ class Crowd:
     agent_s: float = 4e-6  # additional cost of an agent's sensors, s per tick
     migration_s: float = 2e-5  # cost of a change of zone, once
     ticks: int = 200  # per round
-    pull: float = 15.0  # density at the hot spot over the density elsewhere
+    pull: float = 15.0  # density at the hot spot / density elsewhere
     width: float = 0.2  # width of the hot spot, as a share of the map's shorter side
-    stride: float = 0.04  # movement of the hot spot per round, as a share of the same side
+    stride: float = 0.04  # movement of the hot spot per round, as a share of the shorter side
     turnover: float = 0.2  # share of vehicles that get a new position each round
     noise: float = 0.1  # standard deviation of the logarithm of measured costs
 
@@ -147,7 +146,7 @@ def recorded_trace(
     workers: int,
     seed: int,
 ) -> LoadTrace:
-    """Build a trace from measurements; outside its zone, a vehicle has its mean measured cost."""
+    """Build a trace from measured costs of zones; each vehicle has the mean cost in its zone."""
     others = _other_loads(np.random.default_rng(seed), len(measured), workers)
     return LoadTrace(
         network,
@@ -174,7 +173,7 @@ _STAYS = 0.9  # autocorrelation of the deviation from round to round
 
 
 def _other_loads(draw: np.random.Generator, rounds: int, workers: int) -> list[LoadSnapshot]:
-    """Draw slowly varying utilisations; now and then a worker exceeds its threshold."""
+    """Draw slowly varying utilisations, which sometimes exceed the thresholds of workers."""
     means, spreads, most = np.array(list(_OTHERS.values())).T
     stray = draw.normal(0.0, spreads, (workers, len(means)))
     found = []

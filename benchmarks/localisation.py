@@ -1,6 +1,7 @@
 """Localisation error of the reference stack, without and with scan matching.
 
-The built-in driver drives; both stages get the same sensor data. The first seconds are left out.
+The built-in driver drives. Both stages, without and with scan matching, get the same sensor data.
+The first seconds are left out.
 """
 
 from __future__ import annotations
@@ -33,7 +34,7 @@ from cavmarl.maps.fidelity.map_surface import map_surface
 AGENT = "car_0"
 STEP_S = 0.05
 STAGES = {"gnss_imu": "filter", "scan_matching": "scans"}  # names in the table
-CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # for points on the map's own surface
+CLOUD_SPACING_M, CLOUD_NOISE_M = 0.4, 0.03  # points on the surface of the map
 
 
 def measure(
@@ -78,7 +79,7 @@ def measure(
 
 
 def rig_with(noise_m: float, bias_m: float, markings: bool) -> dict[str, dict[str, Any]]:
-    """Return the reference rig with other GNSS errors."""
+    """Return the reference rig with these GNSS errors."""
     rig = {name: dict(keys) for name, keys in REFERENCE_RIG.items()}
     rig["gnss"] |= {"noise": [noise_m, noise_m, 2.0 * noise_m], "bias": [bias_m, bias_m, 0.0]}
     if not markings:
@@ -118,7 +119,7 @@ class Drive:
     """One trip of the first agent, located by each stage.
 
     Attributes:
-        off_m: position error in each step, by stage.
+        off_m: position errors of each stage, one per step.
         fixes_m: errors of fixes, east and north.
         busy_s: processor time of scan matching.
     """
@@ -142,7 +143,7 @@ class Drive:
         self.steps = 0
 
     def step(self) -> bool:
-        """Locate the vehicle once and step; return False when the trip has ended."""
+        """Locate the vehicle and run a step; return False if the trip has ended."""
         world = self._world
         if AGENT not in world.agents:
             return False

@@ -1,7 +1,8 @@
-"""`MapDriver`: drives along a vector map, by objects, traffic lights and rights of way.
+"""`MapDriver`: a driver on a vector map, which observes objects, lights and rights of way.
 
-The acceleration is the smallest of the Intelligent Driver Model (Treiber, Hennecke, Helbing, 2000)
-over all obstacles on the way, where a line at which the vehicle has to stop is an obstacle, too.
+Each obstacle on the way gives an acceleration by the Intelligent Driver Model (Treiber, Hennecke,
+Helbing, 2000). A line at which the vehicle has to stop is an obstacle, too. The driver uses the
+smallest acceleration.
 """
 
 from __future__ import annotations
@@ -17,21 +18,21 @@ from benchmarks.vector_map import CHANGE_S, MapLanelet, VectorMap, wrapped
 from cavmarl.cosim.stack.stack import PurePursuit
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Trajectory
 
-LENGTH_M, WIDTH_M, WHEELBASE_M = 5.0, 2.0, 5.0  # the vehicle
+LENGTH_M, WIDTH_M, WHEELBASE_M = 5.0, 2.0, 5.0  # of the driven vehicle
 AHEAD_M = 90.0
 ACCEL, BRAKE, HARDEST = 1.5, 2.5, 6.0  # m/s²
 HEADWAY_S, GAP_M = 1.4, 2.5
 BEND_MPS2 = 1.8  # lateral acceleration
 BESIDE_M = 0.4  # distance to objects beside the way
-LINE_M = 1.0  # the front stops this far before a line
-SIGHT_M = 60.0  # foes are looked for up to here before their line
+LINE_M = 1.0  # distance of the front to a line when stopped
+SIGHT_M = 60.0  # distance before a line up to which foes count
 MARGIN_S = 1.5
-PATIENCE_S = 20.0  # then standing foes are taken to wait for others
+PATIENCE_S = 20.0  # waiting time after which standing foes do not count
 GREEN, AMBER = 3, 2
 
 
 class Seen(NamedTuple):
-    """An object."""
+    """A perceived object."""
 
     place: NDArray[np.float64]  # (2,) of its centre, m
     heading: float
@@ -41,7 +42,7 @@ class Seen(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A lanelet of the way."""
+    """A lanelet of the way, with its position on the way."""
 
     lanelet: MapLanelet
     begin_m: float  # on the way
@@ -59,7 +60,7 @@ class MapDriver:
         self.begin(np.zeros(2), 0.0)
 
     def begin(self, goal: NDArray[np.float64], heading: float) -> None:
-        """Take another destination (2,) with the heading of its road."""
+        """Set a new destination (2,) and the heading of its road."""
         self._costs = self._map.costs_to(goal, heading)
         self._control = PurePursuit(self._tick_s)
         self._expected: set[int] = set()
@@ -71,7 +72,7 @@ class MapDriver:
     ) -> tuple[float, float]:
         """Return acceleration in m/s² and angle of the front wheels in rad.
 
-        `pose`: of the centre of the vehicle. `lights`: lit colors by id.
+        `pose`: pose of the centre of the vehicle. `lights`: lit colours by id of the light.
         """
         place = np.array([pose.x_m, pose.y_m])
         here = self._here(place, pose.heading_rad)
@@ -122,7 +123,7 @@ class MapDriver:
         pose: EgoPose,
         objects: Sequence[Seen],
     ) -> tuple[MapLanelet, bool]:
-        """Return the lanelet to drive on, and whether the way ends unless the lane is changed."""
+        """Return the lanelet to drive on, and whether only a lane change continues the way."""
         then = self._next(here)
         staying = math.inf if then is None else self._costs[then.id]
         staying += here.length_m / here.speed_mps
@@ -139,9 +140,9 @@ class MapDriver:
     def _way(
         self, here: MapLanelet, place: NDArray[np.float64], pose: EgoPose
     ) -> tuple[list[Piece], NDArray[np.float64], float]:
-        """Return lanelets, points from beside the vehicle on, and its place on the first lanelet.
+        """Return the lanelets and points of the way, and the vehicle's s on the first lanelet.
 
-        An offset of the vehicle to the side is reduced over some distance.
+        The points begin beside the vehicle; its lateral offset is reduced over some distance.
         """
         s0, off, _ = here.project(place)
         pieces, length_m = [Piece(here, 0.0)], here.length_m
@@ -230,7 +231,7 @@ class MapDriver:
             distance = np.hypot(*(outline[:, None] - points[None]).transpose(2, 0, 1))
             nearest = distance.argmin(axis=1)
             is_on = distance.min(axis=1) < 0.5 * WIDTH_M + BESIDE_M
-            # an outline beside or behind the vehicle is no obstacle on the way
+            # points of an outline beside or behind the vehicle do not count
             is_on &= nearest > 0
             if not is_on.any():
                 continue
@@ -260,7 +261,7 @@ class MapDriver:
                 continue
             one = piece.lanelet
             needed = pose.speed_mps**2 / (2.0 * max(line_m - LINE_M, 0.1))
-            is_late = needed > 4.0  # the vehicle cannot stop any more
+            is_late = needed > 4.0  # too late to stop
             lit = {color for light in one.lights for color in lights.get(light, frozenset())}
             if one.lights and GREEN not in lit and not (lit == {AMBER} and is_late):
                 found.append((self._stop(pose, line_m), "light"))
@@ -277,7 +278,7 @@ class MapDriver:
     def _room(
         self, pieces: Sequence[Piece], n: int, objects: Sequence[Seen], front_m: float
     ) -> float:
-        """Return the room behind standing objects beyond the junction that begins with piece n."""
+        """Return the free length behind the junction that begins with piece n."""
         room_m = math.inf
         for piece in pieces[n:]:
             for each in objects:
@@ -347,7 +348,7 @@ def _approach(speed: float, limit: float, distance_m: float) -> float:
 
 
 def _blocks(lanelet: MapLanelet, s: float, speed: float, each: Seen) -> bool:
-    """Return whether an object is in the way of a change of the lane at s."""
+    """Return whether an object prevents a change to the lanelet at s."""
     if np.hypot(*(each.place - lanelet.centre[0])) > lanelet.length_m + 30.0:
         return False
     other, off, direction = lanelet.project(each.place)
@@ -359,7 +360,7 @@ def _blocks(lanelet: MapLanelet, s: float, speed: float, each: Seen) -> bool:
 
 
 def _crossing(one: MapLanelet, other: MapLanelet) -> tuple[float, float]:
-    """Return where the paths of two lanelets are nearest, on each of them."""
+    """Return the positions on two lanelets at which their paths are nearest."""
     distance = np.hypot(*(one.centre[:, None] - other.centre[None]).transpose(2, 0, 1))
     n, m = np.unravel_index(int(distance.argmin()), distance.shape)
     return float(one.along_m[n]), float(other.along_m[m])
@@ -371,7 +372,7 @@ def _time_s(speed: float, distance_m: float) -> float:
 
 
 def _distance_to(foe: MapLanelet, each: Seen, foe_m: float) -> float | None:
-    """Return the way of an object to the crossing at `foe_m`; None: it does not get there."""
+    """Return the distance of an object to the crossing at `foe_m`; None: not on the way there."""
     todo = [(foe, foe_m)]
     seen = set()
     while todo:

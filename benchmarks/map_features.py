@@ -1,4 +1,4 @@
-"""Properties of a map by which worlds are grouped."""
+"""Properties of maps by which worlds are grouped."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Speedup of moving worlds of unequal cost between workers."""
+"""Speedup by moving worlds of unequal cost between workers."""
 
 from __future__ import annotations
 
@@ -47,11 +47,11 @@ def measure(
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare worlds of unequal cost on workers: placed once, and moving by their costs.
+    """Compare worlds of unequal cost that stay on their workers with worlds that move.
 
-    The worlds fill with vehicles, and half of them restart. Both sides are then stepped in turn.
-    Initially, each worker gets the same number of worlds, so the first half of the workers has the
-    full worlds.
+    The worlds fill with vehicles, and half of the worlds restart. Then both sides step in turn.
+    Each worker begins with the same number of worlds, so the first half of the workers has the full
+    worlds.
     """
     check_positive("--at-least", at_least)
     if not 2 <= workers <= worlds or min(lead, every, steps, repeats) < 1 or not period > 0.0:
@@ -65,7 +65,9 @@ def measure(
     with TemporaryDirectory() as folder:
         path = Path(folder) / "filling.rou.xml"
         world = load_world(env, overrides=overrides)
-        all_steps = lead + SETTLE_ROUNDS * every + repeats * steps + 1  # no episode ends
+        all_steps = (
+            lead + SETTLE_ROUNDS * every + repeats * steps + 1
+        )  # the horizon, so that no episode ends
         seconds = all_steps * world.config.clock.ctrl_dt_s
         write_filling_demand(world.network, path, seconds=seconds, period_s=period)
         wanted = {

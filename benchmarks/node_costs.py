@@ -15,7 +15,7 @@ import numpy as np
 from cavmarl.driving.vehicles import VEHICLE
 
 CACHES = Path("/sys/devices/system/cpu/cpu0/cache")
-CACHE_BYTES = {"index2": 1 << 20, "index3": 32 << 20}  # if the system does not report them
+CACHE_BYTES = {"index2": 1 << 20, "index3": 32 << 20}  # used if the system reports none
 ROW_BYTES = 2 * VEHICLE.itemsize  # per vehicle: a tick reads one table and writes another
 
 
@@ -23,16 +23,16 @@ ROW_BYTES = 2 * VEHICLE.itemsize  # per vehicle: a tick reads one table and writ
 class NodeSample:
     """One run of a city over nodes; 0 nodes: undivided, in one process."""
 
-    vehicles: int  # total number
+    vehicles: int  # number of vehicles in the city
     nodes: int  # number of nodes
     tick_s: float  # wall time
-    node_s: float  # processor time per tick of the most expensive node; undivided: of the process
+    node_s: float  # processor time per tick of the most expensive node, or of the undivided process
     caller_s: float  # processor time per tick of the caller
     own: float  # vehicles of the most expensive node
-    ghosts: float  # its ghosts
+    ghosts: float  # ghosts of this node
     crossings: float  # vehicles that change their node, per step
     memory_bytes: float  # resident memory of the largest process
-    latency_s: float  # added to each connection
+    latency_s: float  # latency added to each connection
     ticks_per_step: float
 
     def to_dict(self) -> dict[str, float]:
@@ -40,14 +40,14 @@ class NodeSample:
 
 
 class Caches(NamedTuple):
-    """Numbers of vehicles whose rows fit the caches, and the number of cores per shared cache."""
+    """How many vehicles have rows that fit the caches, and how many cores share a cache."""
 
     own: float  # cache of a core
     shared: float  # cache of all cores
     cores: int
 
     def beyond(self, rows: float, busy: int) -> tuple[float, float]:
-        """Return a core's rows beyond its own cache, and beyond its share of the shared one."""
+        """Return how many rows of a core exceed its own cache, and its share of all caches."""
         share = self.shared / max(min(busy, self.cores), 1)
         return max(rows - self.own, 0.0), max(rows - share, 0.0)
 
@@ -57,20 +57,20 @@ class NodeCosts:
     """Parameters of the cost model."""
 
     tick_s: float  # processor time of a node per tick, constant part
-    ghost_s: float  # per ghost
-    whole_s: float  # of an undivided tick, constant part
-    vehicle_s: float  # per vehicle, of a node or undivided
+    ghost_s: float  # processor time per ghost
+    whole_s: float  # processor time of an undivided tick, constant part
+    vehicle_s: float  # processor time per vehicle
     far_s: float  # additional time per row, including ghosts, beyond a core's own cache
     memory_s: float  # additional time per row beyond all caches
     caches: Caches
     caller_s: float  # processor time of the caller per tick
     caller_node_s: float  # additional processor time of the caller per node and tick
     wake_s: float  # time from one process to another, without latency
-    uneven: float  # additional time of the last node in a tick, as a share
+    uneven: float  # additional time of the slowest node in a tick, as a share
     base_bytes: float  # memory of a node, constant part
-    city_bytes: float  # map and tables at every node, per vehicle that the city has room for
+    city_bytes: float  # memory of map and tables at a node, per vehicle of the city
     own_bytes: float  # additional memory per owned vehicle and ghost
-    ghost_factor: float  # ghosts over the square root of a node's vehicles, per border
+    ghost_factor: float  # ghosts per border / square root of a node's vehicles
     crossing_share: float  # share of a node's ghosts that change their node in a step
     ticks_per_step: float
 
@@ -81,8 +81,8 @@ class NodeCosts:
     def hops(self, vehicles: float, nodes: int) -> float:
         """Return the mean number of sequential messages of a tick.
 
-        Each step has a command and a report. Several nodes also exchange messages for each tick and
-        for the agents. If a vehicle has crossed a border, an offer and its answer replace the
+        Each step has a command and a report. With several nodes, there are also messages in each
+        tick and for the agents. If a vehicle crosses a border, an offer and its answer replace the
         report.
         """
         if nodes < 2:
@@ -92,7 +92,7 @@ class NodeCosts:
         return (self.ticks_per_step + 3.0 + offers) / self.ticks_per_step
 
     def work(self, vehicles: float, ghosts: float, busy: int) -> float:
-        """Return the processor time per tick for stepping vehicles, without the cost of ghosts.
+        """Return the processor time per tick of stepping vehicles; the cost of ghosts is extra.
 
         Rows that fit a cache are read from the cache, the other rows from memory. `busy`: number of
         working cores.
@@ -178,7 +178,7 @@ def fitted(samples: Sequence[NodeSample], caches: Caches) -> NodeCosts:
         crossing_share=_mean([s.crossings / (s.ghosts * s.nodes) for s in divided if s.ghosts]),
         ticks_per_step=samples[0].ticks_per_step,
     )
-    # The rest of the wall time passes while a process wakes or waits for the last node.
+    # The rest of the wall time is waking processes and waiting for the slowest node.
     waits = [s.tick_s - s.node_s - s.caller_s for s in calm]
     hops = [costs.hops(s.vehicles, s.nodes) for s in calm]
     rows = [[n, s.node_s if s.nodes > 1 else 0.0] for n, s in zip(hops, calm, strict=True)]
@@ -193,13 +193,13 @@ def _mean(values: Sequence[float]) -> float:
 def _solve(
     rows: Sequence[Sequence[float]],
     values: Sequence[float],
-    scales: Sequence[float] = (),  # deviations are relative to these; by default to the values
+    scales: Sequence[float] = (),  # deviations are relative to the scales, by default to the values
 ) -> list[float]:
     """Solve a non-negative least-squares problem with relative deviations."""
     weights = 1.0 / np.maximum(np.array(scales or values), 1e-12)
     matrix, wanted = np.array(rows, dtype=np.float64) * weights[:, None], values * weights
     chosen = list(range(matrix.shape[1]))
-    while True:  # drop negative coefficients
+    while True:  # until no coefficient is negative
         found = np.zeros(matrix.shape[1])
         found[chosen] = np.linalg.lstsq(matrix[:, chosen], wanted, rcond=None)[0]
         below = [n for n in chosen if found[n] < 0.0]

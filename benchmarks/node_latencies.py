@@ -29,7 +29,7 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 
 TURN_STEPS = 50
-LEAST_STEPS = 3  # per round, before a node is killed
+LEAST_STEPS = 3  # steps per round before a node is killed
 REPLACED_S = 120.0  # time limit for a replacement node to join
 LOCAL = "127.0.0.1"
 FRAME = bytes(96)  # about the size of the messages of an empty tick
@@ -47,7 +47,7 @@ def measure(
     seed: Annotated[int, about("Seed of the times at which nodes are killed.")] = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time ticks of a world with one vehicle; then kill nodes and wait until the zones continue."""
+    """Time ticks of a nearly empty world; then kill nodes and time until the zones continue."""
     check_positive("--turns", turns)
     check_positive("--kills", kills)
     if nodes < 2:
@@ -127,7 +127,7 @@ def _empty_ticks(env: str, nodes: int, turns: int) -> list[dict[str, Any]]:
 
 
 class _Least:
-    """Processes that exchange the messages of empty ticks; this process is the caller."""
+    """Processes that only exchange the messages of empty ticks; this process is the caller."""
 
     def __init__(self, env: str, nodes: int, ticks_per_step: int) -> None:
         with socket.create_server((LOCAL, 0)) as listener:
@@ -160,7 +160,7 @@ class _Least:
 
 
 def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> None:
-    """Run one of the nodes; its number is independent of the caller's numbering."""
+    """Run a node."""
     config, base_dir = load_config(env, agents=1, background=0, max_cycles=1_000_000)
     worlds = LocalWorlds(make_world(config, base_dir), 1, warm=True)
     worlds.arrays.chosen[:] = True
@@ -180,7 +180,7 @@ def serve(env: str, port: str, nodes: str, ticks_per_step: str, number: str) -> 
         for tick in range(int(ticks_per_step)):
             is_last = tick == int(ticks_per_step) - 1
             worlds.simulation.run_tick(commands, tick == 0, is_last)
-            for _ in range(1 + is_last):  # rows and, after the last tick, the agents' outputs
+            for _ in range(1 + is_last):  # rows; after the last tick also the outputs of agents
                 for other in others:
                     other.sendall(_framed())
                 for other in others:

@@ -1,7 +1,7 @@
-"""Upper bound of the speedup of two nodes: two independent worlds of half the size.
+"""Upper bound of the speedup by two nodes, measured with two independent half worlds.
 
 Both nodes of a divided world do at least this work, and also exchange ghosts and leases. If the
-halves are slow, the machine is the limit: programs share a cache, memory, or the units of a core.
+halves are slow, the machine is the limit, because programs share a cache, memory or a core.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def measure(
     repeats: Annotated[int, about("Turns of each side.")] = 7,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Time a city, half of it alone, and two halves at once, in turn."""
+    """Time in turn a city, half of the city alone, and two halves at the same time."""
     check_positive("--steps", steps)
     check_positive("--repeats", repeats)
     if vehicles < PER_JUNCTION * 32:

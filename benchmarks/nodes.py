@@ -42,11 +42,11 @@ def measure(
     ] = False,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure worlds in turn, fit a model to the runs with 0 to 2 nodes, and compare the others.
+    """Measure worlds in turn, fit a model to runs with 0 to 2 nodes, and predict the other runs.
 
-    Each world has its own processes, with its heap in huge pages. The worlds take turns in one
-    order, then in reverse. A turn begins with unmeasured steps, because other worlds have used the
-    cache.
+    Each world has its own processes with the heap in huge pages. The worlds take turns in one order
+    and then in reverse. The first steps of a turn are not measured, because other worlds have used
+    the cache.
     """
     if steps < 1 or repeats < 1:
         raise ConfigError(f"{steps} steps, {repeats} turns: must be at least 1")
@@ -58,7 +58,9 @@ def measure(
             f"{PER_JUNCTION * 16}, and the nodes 1 and 2, to which the model is fitted"
         )
     sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
-    sides += [_Side(size, 0, 0.0) for size in sizes]  # last, when maps are in the cache
+    sides += [
+        _Side(size, 0, 0.0) for size in sizes
+    ]  # after the divided worlds, which load the maps
     turns = _turns(sides, steps, repeats, realtime, say)
     samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]
@@ -156,7 +158,7 @@ def _row(
 
 
 def _predictions(costs: NodeCosts, cores: int) -> list[str]:
-    """Describe at which sizes dividing pays by the model, with a core for each node."""
+    """Return the sizes from which dividing a city pays, by the model with a core for each node."""
     lines = []
     for vehicles in PREDICTED:
         found = {n: costs.tick(vehicles, n, 0.0, cores) for n in (0, *OVER)}

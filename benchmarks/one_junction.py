@@ -18,7 +18,7 @@ from cavmarl.cli.output import about
 from cavmarl.core.errors import ConfigError, require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 
-# Kind of junction → vehicles per hour and arm that go straight on, left, right.
+# Kind of junction: vehicles per hour and arm that go straight on, left and right.
 FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
     "traffic_light": ((900, 0, 0), (0, 300, 0), (0, 0, 600), (300, 150, 0), (300, 0, 150)),
     "priority": ((150, 60, 60), (80, 30, 30)),
@@ -28,7 +28,7 @@ FLOWS: dict[str, tuple[tuple[int, int, int], ...]] = {
 }
 ARM_M = 400
 ARMS = ("top", "right", "bottom", "left")  # clockwise, so that the opposite arm has the index + 2
-TURNS = (2, 1, 3)  # number of arms further on for straight on, left and right
+TURNS = (2, 1, 3)  # offset of the arm for straight on, left and right
 
 
 def measure(

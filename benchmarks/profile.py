@@ -15,7 +15,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Agents, Background, Seed, Settings, about, parse_settings
 from cavmarl.env.vector import CavVectorEnv, make_vec
 
-VIEW = "view"  # checking and decoding actions, copying results: time outside all phases
+VIEW = "view"  # time outside all phases: decoding of actions, copies of results
 
 
 def measure(
@@ -76,13 +76,13 @@ def measure(
 
 @dataclass(frozen=True)
 class _Turn:
-    ns: float  # in steps only
+    ns: float  # time of steps
     vehicle_steps: int
     agent_steps: int
 
 
 def _drive(vec: CavVectorEnv, watch: Stopwatch, steps: int, seed: int) -> _Turn:
-    """Step from a reset, with the built-in driver in all seats, which is not timed."""
+    """Reset and run steps; decisions of the built-in drivers are not timed."""
     vec.reset(seed=seed)
     vec.step(vec.suggest_actions())
     watch.clear()

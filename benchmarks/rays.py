@@ -28,7 +28,7 @@ ENV = "grid4x4"
 CARS_PER_KM2 = 400
 AGENTS = 100
 WARM_S = 10
-TICKS = 20  # per turn
+TICKS = 20  # ticks per turn
 
 DT_S = 0.05
 TEN_SENSORS = "ten_sensors"
@@ -100,7 +100,7 @@ def _area_km2(simulation: Simulation) -> float:
 
 
 def _driven(agents: int, rig: dict[str, dict[str, Any]]) -> Simulation:
-    """Create a world of agents with all sensors due in every tick, some time after its reset."""
+    """Create a world of agents whose sensors are due in every tick, and drive it for some time."""
     probe = world_maker(ENV, seconds=2 * WARM_S, agents=1, background=0)(1)
     cars = round(CARS_PER_KM2 * _area_km2(probe))
     simulation = world_maker(

@@ -18,7 +18,7 @@ from cavmarl.core.errors import require
 from cavmarl.evaluate.traffic.traffic_comparison import compare_traffic
 from cavmarl.evaluate.traffic.traffic_metrics import TrafficFigures
 
-DEMANDS = {  # folder, map and demand; MAPS: the folder of maps, GAME: the games in the wheel
+DEMANDS = {  # (folder, map, demand); MAPS is the folder of maps, GAME the games in the wheel
     "Bologna Acosta": "MAPS/net/bologna_acosta acosta_buslanes.net.xml run.sumocfg",
     "Mcity": "MAPS/net/mcity mcity.net.xml mcity.rou.xml mcity.add.xml",
     "Town10HD, 25 vehicles": "MAPS net/Town10HD.net.xml demand/town10hd_25.rou.xml",
@@ -27,7 +27,7 @@ DEMANDS = {  # folder, map and demand; MAPS: the folder of maps, GAME: the games
     "cross_demo": "GAME cross/cross.net.xml cross_demo.sumocfg",
     "ramp": "GAME/ramp ramp.net.xml ramp.rou.xml",
 }
-COLUMNS: dict[str, tuple[str, str]] = {  # column head → figure and its format
+COLUMNS: dict[str, tuple[str, str]] = {  # head of a column: (figure, format)
     "arrived": ("arrived", ",.0f"),
     "mean speed, m/s": ("mean_speed_mps", ".2f"),
     "mean delay, s": ("mean_delay_s", ".0f"),
@@ -43,7 +43,7 @@ def measure(
     seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare with SUMO over several seeds; show the least and the greatest of each figure."""
+    """Compare with SUMO over several seeds; show the range of each figure."""
     check_range(seconds=(seconds, 1, 100_000))
     chosen = numbers_of("--seeds", seeds)
     game = Path(require("sumo", "sumo").SUMO_HOME) / "tools" / "game"

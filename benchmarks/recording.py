@@ -1,4 +1,4 @@
-"""Cost of recording a step: the same worlds with and without a recording, in turn."""
+"""Cost of recording, measured with the same worlds with and without a recording, in turn."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def measure(
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure ms per step with and without a recording; both drive the same episodes.
+    """Measure ms per step of the same episodes with and without a recording.
 
     Both wall time and processor time of the stepping thread are shown; the latter is not affected
     by other programs.
@@ -92,7 +92,7 @@ def measure(
 
 
 def _steps_s(vec: CavVectorEnv, steps: int, own: list[float]) -> float:
-    """Return the time of steps of built-in drivers, s, without the choice of actions.
+    """Return the time of steps in s; decisions of the built-in drivers are not timed.
 
     Append the processor time of this thread in s to `own`.
     """

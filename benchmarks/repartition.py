@@ -1,4 +1,4 @@
-"""Balance of zones that are cut again while a world runs, and the cost of cutting."""
+"""Balance of zones that are cut again while a world runs, and the cost of a cut."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """Create a rig for the benchmark `sensors` that takes a given time per tick.
 
-Every sensor is due in every tick. Resolutions are raised until all sensors together take this time,
-each about the same share, as far as its resolution can be changed.
+Every sensor is due in every tick. Resolutions are raised until all sensors together take this time.
+Sensors with variable resolution take about equal shares.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.config.rig import MAX_SAMPLE_NUMBERS, MountedConfig
 from cavmarl.config.world_spec import WorldSpec
 from cavmarl.core.errors import ConfigError
 
-TRIES = 8  # to find a load
+TRIES = 8  # attempts to find a load
 TRIED_STEPS = 12
 MARGIN = 1.15  # margin above the requested load
 TOO_MUCH = 1.5
@@ -82,7 +82,8 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     """Return the job with resolutions at which the sensors take a given time per tick.
 
     Sensors with variable resolution take about equal times. Times are not proportional to
-    resolutions, so the next rig is interpolated between a too light and a too heavy rig.
+    resolutions, so the next attempt lies between a rig that takes too little time and a rig that
+    takes too much.
     """
     even, found_ms = _evened(job, load_ms, say), 0.0
     scale, light, heavy = 1.0, 0.0, math.inf
@@ -104,15 +105,15 @@ def loaded(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
 
 
 def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
-    """Return the job with each sensor due in every tick and taking about its share of a load."""
+    """Return the job in which each sensor is due in every tick and takes an equal share."""
     dt_s = job_config(job).clock.sim_dt_s
     even = _changed(job, {"clock.ctrl_dt_s": dt_s})
     factors = dict.fromkeys(job.spec.overrides["rig"], 1.0)
     share_ms = load_ms / len(factors)
-    for grown in (False, True):  # at a low resolution, times are not representative
+    for grown in (False, True):  # low resolutions do not scale
         even = _scaled_by(even, factors)
         found_ms, costs_ms = _tried(even, load_ms, say)
-        if grown:  # some sensors cannot take their share; the others take the rest
+        if grown:  # other sensors take the rest
             share_ms *= MARGIN * load_ms / found_ms
         for name, cost_ms in zip(factors, costs_ms, strict=True):
             factors[name] = share_ms / (cost_ms * (job.spec.agents or 1)) if cost_ms else 1.0

@@ -1,7 +1,7 @@
 """Effect of one driver among 21 human drivers: the mean speed on `ring22`.
 
-This is Flow's measure of a driver that stabilises a ring (Wu et al. 2017): the mean speed of all 22
-cars after stop-and-go waves have formed, compared with the mean speed of 22 human drivers.
+The measure is that of Flow (Wu et al. 2017): the mean speed of all 22 cars after stop-and-go waves
+have formed, compared with the mean speed of 22 human drivers.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ def measure(
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure the mean speed of all cars of `ring22`, by the driver of one of them.
+    """Measure the mean speed of all cars of `ring22` for different drivers of one car.
 
     Episodes differ in the agent's starting position. Episodes with a crash have no mean speed.
     """
@@ -75,7 +75,7 @@ def _row(name: str, means: NDArray[np.float64], base: float | None) -> dict[str,
 
 
 def human_mps(after_s: float) -> float:
-    """Return the mean speed of 22 human drivers, who make no random choices."""
+    """Return the mean speed of 22 human drivers, whose model has no random numbers."""
     world = load_world(ENV, agents=0, overrides=ALL_HUMAN)
     simulation = Simulation(world.config, world.network, demand=world.demand)
     simulation.seed(0)
@@ -100,7 +100,7 @@ def driver_mps(name: str, episodes: int, after_s: float, seed: int) -> NDArray[n
         policy.reset(seed)
         steps, first = _steps(vec.worlds.simulation, after_s)
         sums, crashed = np.zeros(episodes), np.zeros(episodes, dtype=bool)
-        for step in range(steps - 1):  # all agents restart in the last step
+        for step in range(steps - 1):  # the last step restarts all agents
             actions = policy.act_batch(observations, infos["mask"])
             observations, _, ended, _, infos = vec.step(actions)
             crashed |= ended.any(1)

@@ -1,7 +1,7 @@
 """The clocks of a world and of a node of ROS 2 that drives in it, through the bridge.
 
-The node is one of `rclpy`, in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two).
-The bridge can tick by itself in a share of the steps, as that of the co-simulation paper does.
+The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two). In a
+share of the steps, the bridge can tick by itself, like the bridge of the co-simulation paper.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def measure(
 
 
 class _RogueFollower(Follower):
-    """A follower that also ticks in a share of its steps."""
+    """A follower that also ticks in a share of the steps."""
 
     share = Fraction(0)
     answers = own_ticks = 0
@@ -133,7 +133,7 @@ def measure_ros_drift(
         if node.returncode:
             raise EvaluationError(f"the node has ended with {node.returncode}; see its output")
         master = bridged.world.master
-    # The bridge repeats a clock while it waits.
+    # A waiting bridge repeats its clock.
     stamps = [ns for ns, _ in groupby(json.loads(output))]
     heard = [round(ns / (1e9 * STEP_S)) for ns in stamps]
     drift = ClockDrift(

@@ -1,9 +1,9 @@
-"""A node of ROS 2 that answers each clock with a command of its time.
+"""A node of ROS 2 that answers each clock message with a command that has the same time.
 
     python ros2_clock_node.py
 
 The program needs `rclpy` and nothing of cavmarl. When the clock has no publisher any more, it
-prints one line of JSON: the times of the clock that it has heard, in ns.
+prints one line of JSON: the received times of the clock, in ns.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A stand-in for Autoware drives a vehicle by the topics of Autoware and a map folder alone.
+"""A stand-in for Autoware drives a vehicle with only Autoware's topics and a map folder.
 
     python -m benchmarks.ros2_driving grid4x4 --episodes 10
 
@@ -34,7 +34,7 @@ from cavmarl.roads.cache import load_network
 
 AGENT = "car_0"
 ENDS_S = 60.0
-# Events of the agent's vehicle, the worst first; a vehicle may run a red light and arrive.
+# Events of the agent's vehicle, the worst first, because a trip can have several events.
 OUTCOMES = ("collision", "red_light", "off_road", "wrong_way", "arrived", "out_of_time")
 
 
@@ -51,7 +51,7 @@ def measure(
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Drive by the topics of Autoware and a map folder alone."""
+    """Drive with only Autoware's topics and a map folder."""
     check_range(episodes=(episodes, 1, 10_000), step_s=(step_s, 0.01, 1.0))
     with TemporaryDirectory() as name:
         if map_folder is None:
@@ -98,12 +98,12 @@ def drive_by_topics(
 ) -> dict[str, Any]:
     """Run episodes of a world, its bridge, and the stand-in in another process.
 
-    `folder`: map folder of Autoware.
+    `folder`: a map folder in Autoware's format.
 
     Returns:
         `rows`: seed, outcome, time and distance of each episode; `controls` and `requests`: counts
-        of the bridge; `steps_per_s`; `reasons`: steps of the stand-in by the reason of their
-        acceleration.
+        of the bridge; `steps_per_s`; `reasons`: number of steps of the stand-in for each reason of
+        its acceleration.
 
     Raises:
         EvaluationError: the stand-in fails.

@@ -1,7 +1,7 @@
 """Clouds, pictures and inertial samples from a world to a node of ROS 2: how many are lost.
 
-The node is one of `rclpy`, in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two),
-with reliable subscriptions and the profile of Fast DDS in `cavmarl/cosim/ros2/fast_dds.xml`.
+The node uses `rclpy` in a Python that `CAVMARL_RCLPY_PYTHON` names (`make ros2` makes two). It has
+reliable subscriptions, and the profile of Fast DDS in `cavmarl/cosim/ros2/fast_dds.xml`.
 """
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ from cavmarl.cosim.time_master import RealTime
 from cavmarl.env.parallel import parallel_env
 
 _RATES_HZ = {CLOUD: 10.0, PICTURE: 20.0, IMU: 100.0}
-_READY_S = 8.0  # the node is found, and its subscriptions
-_ARRIVES_S = 1.0  # the last messages arrive within this time
+_READY_S = 8.0  # time to discover the node and its subscriptions
+_ARRIVES_S = 1.0  # time for the last messages to arrive
 RIG: dict[str, dict[str, Any]] = {
     # All 64,000 rays meet the ground.
     "roof": {

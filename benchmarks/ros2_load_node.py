@@ -13,7 +13,7 @@ import time
 from typing import Any
 
 CLOUD, PICTURE, IMU = "/car_0/roof/points", "/car_0/front/image_raw", "/car_0/imu"
-QUIET_S = 1.0  # the last messages arrive within this time
+QUIET_S = 1.0  # time for the last messages to arrive
 
 
 def main() -> None:

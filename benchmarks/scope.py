@@ -31,7 +31,7 @@ TOLD = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.perception.ra
 
 @dataclass(frozen=True)
 class Found:
-    """The result of a check, and whether it is as required."""
+    """The result of a check, and whether the requirement holds."""
 
     shown: str
     holds: bool

@@ -21,7 +21,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Seed, about
 from cavmarl.evaluate.statistics import share_interval
 
-# In addition to the paper's weights: equal, each resource alone, and each pair.
+# Weights besides those of the paper: equal ones, each resource alone, and each pair.
 OTHER_WEIGHTS = (
     (1 / 3, 1 / 3, 1 / 3),
     (0.5, 0.25, 0.25),
@@ -32,7 +32,7 @@ OTHER_WEIGHTS = (
     (0.0, 1.0, 0.0),
     (0.0, 0.0, 1.0),
 )
-FEW, MANY = 5, 100  # numbers of workers for choices, and for timing
+FEW, MANY = 5, 100  # numbers of workers to choose from, and to time
 
 
 def measure(

@@ -55,7 +55,7 @@ class SensorBench:
     seed: int  # seed of every run, and of their order
     placement: str  # placement of sensors: by `cost` or `in_turn`
     turns: tuple[Turn, ...]  # all runs, in order
-    # limit by independent programs, one per worker, at most one per core; None: a single program
+    # speedup of independent programs, one per worker, at most one per core; None: one program
     ceiling: CoreCeiling | None
 
     def of(self, workers: int) -> list[SensorRun]:
@@ -76,7 +76,7 @@ class SensorBench:
 
     @property
     def is_same(self) -> bool:
-        """Return whether all runs have the same states and frames, step by step."""
+        """Return whether all runs have equal states and frames in each step."""
         return len({turn.run.digests for turn in self.turns}) == 1
 
     def parts_ms(self, workers: int) -> dict[str, float]:
@@ -97,8 +97,8 @@ class SensorBench:
     def shares(self, workers: int) -> dict[str, Shares]:
         """Return both placements of all sensors of one vehicle, by their measured costs.
 
-        All lines of a frame are assumed to cost the same; dividing frames at run time corrects
-        this.
+        It assumes that all lines of a frame have equal costs. At run time, the division of frames
+        is corrected by measured costs.
         """
         costs_ms = self.costs_ms
         num_lines = [sensor["lines"] for sensor in self.turns[0].run.sensors]

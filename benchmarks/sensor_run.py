@@ -1,6 +1,6 @@
 """One run of a world with sensor workers, step by step, and its measurements.
 
-Time outside all parts is not measured, so the parts may sum up to less than the step.
+Time outside of all parts is not measured, so the sum of the parts may be less than the step.
 """
 
 from __future__ import annotations
@@ -25,14 +25,14 @@ from cavmarl.sensors.registry import type_of
 
 Rig = dict[str, dict[str, Any]]
 
-WINDOW = 25  # steps
+WINDOW = 25  # number of steps
 
 PARTS = (
     "physics", "SUMO", "ghosts", "transfers", "sensor compute", "sensor transport", "barrier",
     "observation", "environment",
 )  # fmt: skip
-# Calls of the runtime by part; all other calls of executor and traffic are physics. `SUMO` is the
-# time that this process waits for SUMO's step, plus that of processing its results.
+# Calls of the runtime by part. All other calls of executor and traffic are physics. `SUMO` is the
+# time of waiting for SUMO's step and of processing its results.
 _PART_OF = {
     **dict.fromkeys(("step", "mirror", "forgive", "let_in", "order", "send_on", "show"), "SUMO"),
     "exchange": "ghosts",
@@ -73,7 +73,7 @@ def describe_rig(config: EnvConfig) -> list[dict[str, Any]]:
 class SensorJob:
     """A run to measure."""
 
-    spec: WorldSpec  # each agent has a rig; background vehicles are sensed
+    spec: WorldSpec  # the agents have the rig
     sensor_workers: int  # number of sensor workers
     warmup: int  # unmeasured steps
     steps: int  # measured steps
@@ -85,9 +85,9 @@ class Window:
 
     steps: int  # number of steps
     leader_cpu_s: float  # processor time of the process with the state
-    worker_cpu_s: tuple[float, ...]  # of each sensor worker
+    worker_cpu_s: tuple[float, ...]  # processor time of each sensor worker
     leader_rss_mb: float  # resident memory at the end, including shared memory
-    worker_rss_mb: tuple[float, ...]  # of each sensor worker
+    worker_rss_mb: tuple[float, ...]  # resident memory of each sensor worker
     sent_bytes: int  # input of the workers
     got_bytes: int  # frames written by the workers
     messages: int  # orders and answers
@@ -97,10 +97,10 @@ class Window:
 class SensorRun:
     """Result of a run."""
 
-    step_ms: tuple[float, ...]  # per step: tick and sensors, everything in `step`
-    wait_ms: tuple[float, ...]  # share of that waiting for sensor workers
+    step_ms: tuple[float, ...]  # time of each `step`
+    wait_ms: tuple[float, ...]  # part of this time that waits for sensor workers
     parts_ms: dict[str, tuple[float, ...]]  # per step, by the names of `PARTS`
-    windows: tuple[Window, ...]  # resources
+    windows: tuple[Window, ...]  # used resources, by windows of steps
     costs_ms: tuple[float, ...]  # processor time of one agent's frame of each sensor
     sensors: list[dict[str, Any]]  # type, resolution, rate and placement of each
     digests: tuple[str, ...]  # hashes of state and frames, after warm-up steps and the last
@@ -200,7 +200,7 @@ class _Timed:
             self._parts_ms[name].append(1e3 * part_s)
 
     def digest(self) -> None:
-        """Record the state's hash; not between measured steps, because it reads all frames."""
+        """Record the state's hash; not for measured steps, because it reads all frames."""
         self._digests.append(self._vec.state_hash())
 
     def run(self, windows: tuple[Window, ...]) -> SensorRun:

@@ -1,9 +1,8 @@
 """Derived figures and the plot of step times over numbers of sensor workers.
 
-All figures of the table are computed here from raw series. The standard deviation within a run is
-computed from its steps (n - 1), and does not describe differences between runs. The interval
-between runs does; it needs at least five runs. Numbers of workers that were not measured are not
-predicted.
+All figures of the table are computed here from raw series. The standard deviation within a run
+describes the steps of a run (divisor n - 1). The interval between runs describes the differences of
+runs, and needs at least five runs. Numbers of workers that were not measured are not predicted.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ from cavmarl.evaluate.traffic.traffic_plot import save_figure
 
 MIN_RUNS = 5  # smallest number of runs for an interval between runs
 FPS, STEP = "#2f6db5", "#d1793b"
-HEADROOM = 1.1  # end of the axis over the largest value
+HEADROOM = 1.1  # end of the axis / largest value
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,7 @@ class Series:
     """The steps of one run."""
 
     step_ms: Sequence[float]  # tick and sensors, per step
-    wait_ms: Sequence[float]  # share of that waiting for sensors
+    wait_ms: Sequence[float]  # part of `step_ms` that waits for sensors
 
 
 @dataclass(frozen=True)
@@ -61,7 +60,7 @@ class ScalingRow:
     rest_ms: float  # T minus waiting time
     fps_gain_pct: float  # relative to the FPS of the fewest workers
     step_gain_pct: float  # relative to T of the fewest workers; negative if shorter
-    is_best: bool  # whether T is the shortest of those measured
+    is_best: bool  # whether T is the shortest
 
 
 def summarize(runs: Mapping[int, Sequence[Series]]) -> list[Measured]:

@@ -1,4 +1,4 @@
-"""Cost of coordination: selection among many nodes, heartbeats, and a day of churn."""
+"""Cost of the service: selection among many nodes, heartbeats, and a day of churn."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ from cavmarl.service.event_store import EventStore
 from cavmarl.service.request_bodies import BeatBody, NodeBody
 
 CONFIGURATION = "0" * 64
-NODES_AN_IDENTITY = 100  # requests of one identity share a rate limit
-SESSION_S, NODE_S = 600.0, 7200.0  # mean lifetimes
-FLUSHED_EVERY = 20  # seconds of churn
+NODES_AN_IDENTITY = 100  # the rate limit is per identity
+SESSION_S, NODE_S = 600.0, 7200.0  # mean durations
+FLUSHED_EVERY = 20  # simulated seconds between flushes of the log
 
 
 def measure(
@@ -125,7 +125,7 @@ def _selections(
                 fleet.broker.close(fleet.client, number)
             opened.clear()
             fleet.log.flush()
-        began = time.thread_time_ns()  # of the processor: other programs do not count
+        began = time.thread_time_ns()  # processor time
         opened.append(fleet.broker.open(fleet.client, CONFIGURATION).id)
         spent.append(1e-6 * (time.thread_time_ns() - began))
         if k % 1000 == 999:
@@ -136,7 +136,7 @@ def _selections(
 
 
 def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
-    """Return a real service's processor time per second of heartbeats, and their rate."""
+    """Return the processor time of a service per second of heartbeats, and the achieved rate."""
     words = [sys.executable, "-m", "cavmarl", "serve", "--port", "0", "--store", str(store)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as process:
         try:
@@ -156,7 +156,7 @@ def _beats(store: Path, nodes: int, seconds: int) -> tuple[float, float]:
 async def _beat(
     url: str, granted: list[str], nodes: int, seconds: int, process: psutil.Process
 ) -> tuple[float, float]:
-    """Send the heartbeats of one identity's nodes over each connection, one after another."""
+    """Send heartbeats of nodes; each connection has the nodes of one identity, in turn."""
     tokens = []
     async with httpx.AsyncClient(base_url=f"{url}/v1") as http:
         for secret in granted:
@@ -198,11 +198,11 @@ async def _beat(
     used_s = sum(process.cpu_times()[:2]) - before_s
     for _, writer in lines:
         writer.close()
-    return used_s / seconds, nodes * seconds / took_s  # per second with one heartbeat of each node
+    return used_s / seconds, nodes * seconds / took_s  # s of processor time, heartbeats/s
 
 
 def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> dict[str, float]:
-    """Let nodes fail, drain and return, and sessions begin and end; then replay the log."""
+    """Let nodes fail, drain and return, and sessions begin and end; then replay the event log."""
     fleet = _Fleet(store, rng)
     names = [f"node-{k}" for k in range(nodes)]
     dead_until = dict.fromkeys(names, 0.0)
@@ -215,7 +215,7 @@ def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> d
         for name in names:
             if fleet.now_s < dead_until[name]:
                 continue
-            if rng.random() < 1.0 / NODE_S:  # it fails, is drained, or restarts
+            if rng.random() < 1.0 / NODE_S:  # the node fails, drains or restarts
                 dead_until[name] = fleet.now_s + rng.exponential(60.0)
                 if rng.random() < 0.5:
                     fleet.broker.drain(fleet.nodes, name, rng.random() < 0.5)

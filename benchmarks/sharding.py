@@ -1,9 +1,9 @@
 """Cost of dividing a world, by phases of the tick, compared with the undivided world.
 
 All zones run in this process on one core, so the whole work is visible. For each number of zones
-there are two worlds, one of them with a stopwatch on every phase. All worlds advance in turn, each
-by a part of its turn, in a random order per part; ratios are taken within a turn. So other load on
-the machine, and data evicted from caches, affect all worlds.
+there are two worlds; one of them has a stopwatch on every phase. A turn is divided into parts. In
+each part, all worlds advance in a random order. Ratios are taken within a turn. So other load on
+the machine and data evicted from caches affect all worlds.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ from cavmarl.engine.simulation import Simulation
 from cavmarl.evaluate.built_in_runs import world_maker
 
 TURN_S = 10
-PARTS = 5  # per turn, interleaved with the other worlds
+PARTS = 5  # parts of a turn
 
 
 def measure(
@@ -48,7 +48,7 @@ def measure(
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:  # fmt: skip
-    """Measure the same world in several numbers of zones, by phase; fail if the states differ."""
+    """Measure a world in several numbers of zones, by phase; fail if the states differ."""
     counts = numbers_of("--zones", zones)
     check_numbers(counts, after, repeats)
     if demand and (agents, background) != (None, None):
@@ -81,7 +81,7 @@ def measure_sharding(
     make_checked: Callable[[int], Simulation] | None = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure in turn on one core."""
+    """Measure the worlds in turn on one core."""
     check_numbers(zones, after_s, repeats)
     with one_core():
         say("creating the worlds")
@@ -176,8 +176,9 @@ def _check_equal(worlds: Sequence[TwinWorlds]) -> None:
 def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str, Any]:
     """Return means of the loads and medians of the times over all turns.
 
-    `largest_share` is the number of rows of the fullest zone, including ghosts, over all vehicles:
-    a lower bound of the time of one worker per zone, relative to the undivided tick.
+    `largest_share` is the number of rows of the fullest zone, including ghosts, divided by the
+    number of all vehicles. With one worker per zone, it is a lower bound of the time relative to
+    the undivided tick.
     """
     simulation = own.plain.simulation
     min_x, min_y, max_x, max_y = simulation.network.extent_m
@@ -187,7 +188,7 @@ def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str,
     }
     steps = loads["steps"]
     moves = sum(sum(turn.plain.moves) for turn in turns)
-    # The phases of one turn, because medians per phase would not add up to a tick.
+    # Use the phases of a single turn, because medians of phases would not add up to a tick.
     middle_ns = median_low([turn.timed_ns for turn in turns])
     middle = next(turn for turn in turns if turn.timed_ns == middle_ns)
     pairs = zip(turns, undivided, strict=True)
@@ -213,7 +214,7 @@ def _row(own: TwinWorlds, turns: list[Pair], undivided: list[Pair]) -> dict[str,
 
 
 def _migration_us(turns: Sequence[Turn]) -> float | None:
-    """Return the additional time of `migrate` per moving vehicle, by regression over steps."""
+    """Return the time of `migrate` per vehicle that changes its zone, by regression over steps."""
     moves = [number for turn in turns for number in turn.moves]
     if len(set(moves)) < 2:
         return None

@@ -1,4 +1,4 @@
-"""Turns of one world in zones, without a stopwatch and with one on every phase.
+"""Turns of one world in zones, without a stopwatch and with a stopwatch on every phase.
 
 A turn is run in parts, interleaved with parts of other worlds, so that other load on the machine
 affects all worlds.
@@ -20,7 +20,7 @@ from cavmarl.zones.partition.zone_statistics import imbalance
 __all__ = ["PHASES", "Pair", "Turn", "TwinWorlds"]
 
 PHASES = ("traffic", "advance", "exchange", "resolve", "migrate", "sense", "other")
-# Phases by the runtime's calls that have other names than their phase; other calls are `other`.
+# Phases of calls of the runtime that are not named like their phase; other calls are `other`.
 _MEMBERS = {
     "traffic": (
         "choose_goals", "leave", "settle",
@@ -37,13 +37,13 @@ _PHASE_OF = {phase: phase for phase in PHASES} | {
 
 @dataclass(frozen=True)
 class Turn:
-    """One turn of one world or a part of it: sums over its steps."""
+    """Sums over the steps of a turn of one world, or of a part of a turn."""
 
     ns: float  # time of the steps
     steps: int  # number of steps
-    vehicles: int  # in the world
-    ghosts: int  # in all zones
-    imbalance: float  # maximum over mean of the vehicles that zones own
+    vehicles: int  # vehicles in the world
+    ghosts: int  # ghosts in all zones
+    imbalance: float  # maximum / mean of the vehicles that zones own
     largest: int  # rows of the fullest zone
     moves: tuple[int, ...]  # vehicles that changed their zone, per step
     move_ns: tuple[int, ...]  # time of the phase `migrate`, per step; 0 without a stopwatch
@@ -63,7 +63,7 @@ class Pair:
 
 
 class TwinWorlds:
-    """The same world twice in a number of zones, once with a stopwatch.
+    """A world in a number of zones, twice: without and with a stopwatch.
 
     Args:
         make: creates the world in k zones, at the start of an episode.
@@ -74,7 +74,7 @@ class TwinWorlds:
         zones: number of zones.
         plain: the world without a stopwatch.
         timed: the world with a stopwatch.
-        checked: a third world with the monitor; None: not requested, or undivided.
+        checked: the world with the monitor; None: not requested, or undivided.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class TwinWorlds:
         return [self.plain, self.timed, *([] if self.checked is None else [self.checked])]
 
     def run(self, number: int, steps: int) -> None:
-        """Run the next steps of one of `worlds`, as a part of the present turn."""
+        """Run the next steps of one of `worlds`; they belong to the present turn."""
         if not any(self._parts):
             self._watch.clear()
         self._parts[number].append(_run(self.worlds[number], steps, self._watch))
@@ -136,7 +136,7 @@ def _joined(parts: Sequence[Turn]) -> Turn:
 
 
 def _run(world: DrivenWorld, steps: int, watch: Stopwatch) -> Turn:
-    """Run steps of a world; decisions of agents and counting are not timed."""
+    """Run and time steps of a world, without the decisions of agents and the counting."""
     simulation = world.simulation
     ns = vehicles = ghosts = largest = 0
     uneven = 0.0

@@ -1,4 +1,4 @@
-"""Parts of a map on which vehicles touch although drivers obey all rules, grouped by property."""
+"""Parts of maps on which vehicles touch although drivers obey all rules."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ STEP_M = 1.0
 
 
 def shared_ground(network: RoadNetwork) -> list[tuple[int, int]]:
-    """Return pairs of LANE rows that are closer than a car's width without any right of way.
+    """Return pairs of LANE rows that are closer than a car's width and have no right of way.
 
-    These are lanes of two roads that do not lead to each other; movements over two junctions that
-    do not lead to the roads before each other; or lanes of a road and of a junction elsewhere.
+    The lanes of a pair belong to two roads that do not lead to each other, to two junctions that do
+    not lead to each other, or to a road and a junction that are not connected.
     """
     grid = lane_grid(network)
     links = network.links[network.links["direction"] != ord("t")]
@@ -49,11 +49,11 @@ def stub_lanes(network: RoadNetwork) -> NDArray[np.int64]:
 
 
 class _Owners(NamedTuple):
-    """The road or junction of each lane, and the elements before and after it."""
+    """The road or junction of each lane, and the road or junction before and after it."""
 
-    inside: list[bool]  # whether it is part of a junction
+    inside: list[bool]  # whether the lane is in a junction
     ground: list[int]  # EDGE or JUNCTION row
-    before: list[int]  # JUNCTION row before a road, EDGE row before a movement over a junction
+    before: list[int]  # JUNCTION row before a road, EDGE row before a lane in a junction
     beyond: list[int]
 
 

@@ -39,7 +39,7 @@ def measure(
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Compare one world undivided, in zones on one worker, and in zones on several, in turn."""
+    """Compare a world in turn: undivided, with zones on one worker, and on several workers."""
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
             f"{workers} workers, {steps} steps, {repeats} turns: must be at least 2, 1 and 1"
@@ -81,7 +81,7 @@ def measure(
 
 
 def split_line(found: Sequence[tuple[int, float]]) -> int | None:
-    """Return the smallest number of vehicles from which every split world was faster, if any."""
+    """Return the number of vehicles from which on every divided world was faster, if any."""
     line = None
     for vehicles, ratio in sorted(found, reverse=True):
         if ratio <= 1.0:

@@ -12,7 +12,7 @@ TRIALS = 10
 
 
 class Stopwatch:
-    """Adds up the times of named calls, minus its own time; `clock` is in ns."""
+    """Adds up the times of named calls without its own time; `clock` returns ns."""
 
     def __init__(self, clock: Callable[[], int] = time.process_time_ns) -> None:
         self._clock = clock
@@ -20,12 +20,12 @@ class Stopwatch:
         self.calls: Counter[str] = Counter()
         self._inside = self._around = 0.0
         trials = [self._time_empty_calls() for _ in range(TRIALS)]
-        # another program can only make a trial longer, so the shortest one is the nearest
+        # other programs only lengthen a trial, so the shortest trial is the best
         self._inside = min(inside for inside, _ in trials)
         self._around = min(around for _, around in trials)
 
     def _time_empty_calls(self) -> tuple[float, float]:
-        """Return the time of an empty call as measured inside, and with the measurement, ns."""
+        """Return the measured time of an empty call, and the time including the measurement, ns."""
         empty = self.around(_Nothing())
         began = self._clock()
         for _ in range(CALIBRATION):
@@ -44,7 +44,7 @@ class Stopwatch:
         return _Timed(self, part, self._clock)
 
     def forget(self, *names: str) -> None:
-        """Drop the times of these names."""
+        """Delete the times of these names."""
         for name in names:
             del self.spent[name], self.calls[name]
 
@@ -74,7 +74,7 @@ class _Timed:
 
     def __getattr__(self, name: str) -> Any:
         method = getattr(self._part, name)
-        if not callable(method):  # constant values; looking them up again would take time
+        if not callable(method):  # keep constants, to save lookups
             self.__dict__[name] = method
             return method
         watch, clock = self._watch, self._clock

@@ -1,8 +1,8 @@
 """Cost of SUMO as global traffic: libsumo alone, compared with a world coupled to SUMO.
 
-Both run the same demand with the same step length and seed up to the same second, then take turns
-of equal simulated length. The time of the coupled world includes both of its processes and their
-communication.
+Both simulations run the same demand with the same step length and seed up to the same second. Then
+they take turns of equal simulated length. The time of the coupled world includes both of its
+processes and their communication.
 """
 
 from __future__ import annotations

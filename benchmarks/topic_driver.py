@@ -1,11 +1,11 @@
-"""A stand-in for Autoware: drives a vehicle by topics and a map folder alone.
+"""A stand-in for Autoware, which drives a vehicle with only topics and a map folder.
 
     python -m benchmarks.topic_driver FOLDER --domain N
 
-It subscribes to the clock, odometry, traffic lights, predicted objects and the destination, and
-publishes `autoware_control_msgs/msg/Control` with the time of each clock. Of cavmarl, it uses the
-DDS node, the message types and the pursuit of a path. When the clock has no publisher any more, it
-prints one line of JSON: the number of steps by the reason of their acceleration.
+It subscribes to the clock, odometry, traffic lights, predicted objects and the destination. It
+publishes `autoware_control_msgs/msg/Control` with the time of each clock message. From cavmarl, it
+uses the DDS node, the message types and path tracking. When the clock has no publisher any more, it
+prints one line of JSON: the number of steps for each reason of its acceleration.
 """
 
 from __future__ import annotations
@@ -40,12 +40,12 @@ KINDS = {
     GOAL: "geometry_msgs/msg/PoseStamped",
 }
 CONTROL, CONTROL_KIND = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
-ENDS_S = 3.0  # without a publisher of the clock
-MISSES_S = 5.0  # after this time, missing messages are named
+ENDS_S = 3.0  # ends after this time without a publisher of the clock
+MISSES_S = 5.0  # after this time, reports missing messages
 
 
 class TopicDriver:
-    """The node, and what it has heard.
+    """The node with its received messages.
 
     `step_s`: time between two clocks.
     """
@@ -58,7 +58,7 @@ class TopicDriver:
         self.reasons: Counter[str] = Counter()
 
     def run(self) -> None:
-        """Answer each clock until it has no publisher any more."""
+        """Answer each clock message until the clock has no publisher any more."""
         silent_s, answered_ns, due_s = 0.0, -1, math.inf
         while answered_ns < 0 or silent_s < ENDS_S:
             began_s = time.monotonic()
@@ -82,7 +82,7 @@ class TopicDriver:
         self._node.close()
 
     def _hear(self) -> bool:
-        """Take new messages; a new destination begins a new way."""
+        """Read new messages; a new destination begins a new way."""
         is_new = False
         for topic, kind in KINDS.items():
             for received in self._node.take(topic):
@@ -96,7 +96,7 @@ class TopicDriver:
         return is_new
 
     def _missing(self, now_ns: int) -> list[str]:
-        """Return the topics whose message of a time has not come; they have no common order."""
+        """Return the topics without a message of this time; the order of topics is not defined."""
         found = [topic for topic in KINDS if topic not in self._newest]
         for topic in (ODOMETRY, OBJECTS, LIGHTS):
             if topic in self._newest:
@@ -157,7 +157,7 @@ def main(
     domain: Annotated[int, typer.Option(help="ROS_DOMAIN_ID.")] = 0,
     step_s: Annotated[float, typer.Option(help="Simulated seconds from clock to clock.")] = 0.1,
 ) -> None:
-    """Drive by topics and the map in FOLDER."""
+    """Drive with topics and the map in FOLDER."""
     driver = TopicDriver(folder, domain, step_s)
     driver.run()
     print(json.dumps(driver.reasons))

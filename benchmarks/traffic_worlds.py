@@ -41,7 +41,7 @@ def measure(
     ] = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Draw worlds, run those without a row, and show all rows and the worst."""
+    """Draw worlds, run worlds without results, and show a summary and the worst worlds."""
     make_folder(out)
     job = WorldSeries(out, worlds, first_seed, seconds, dt, tuple(without or ()), maps)
 

@@ -19,7 +19,7 @@ __all__ = ["TrivialJob", "make_jobs"]
 
 
 class TrivialJob(Job):
-    """Worlds in which every agent observes the number of tasks so far.
+    """Worlds in which every agent observes the number of executed tasks.
 
     Args:
         arrays: arrays of these worlds.
@@ -37,7 +37,7 @@ class TrivialJob(Job):
         self._arrays.observations[:] = self._tasks[0]
 
     def save(self) -> list[NDArray[Any]]:
-        """Return the number of tasks so far."""
+        """Return the number of executed tasks."""
         return [self._tasks]
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

@@ -1,7 +1,7 @@
-"""Cost of messages per tick: several channels on the vehicles of one world.
+"""Cost of messages per tick, for several channels with the vehicles of one world.
 
-The world itself runs without messages. After each of its ticks, every bus sends and receives with
-the same rows, and is timed, so that all channels are measured under the same conditions.
+The world itself has no messages. After each of its ticks, the message bus of each channel sends and
+receives with the world's rows. So all channels are timed under the same conditions.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""`VectorMap`: lanelets of a map folder of Autoware, read as plain XML in the frame `map`."""
+"""`VectorMap`: the lanelets of a map folder of Autoware, read from its XML."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from cavmarl.config.io import read_yaml
 from cavmarl.core.errors import MapError
 
-CHANGE_S = 6.0  # a change of the lane counts like this much time
-_POINTS_M = 2.0  # spacing of the points by which lanelets are found
+CHANGE_S = 6.0  # cost of a lane change
+_POINTS_M = 2.0  # spacing of points for the search of lanelets
 
 
 @dataclass
@@ -41,7 +41,7 @@ class MapLanelet:
         return float(self.along_m[-1])
 
     def project(self, place: NDArray[np.float64]) -> tuple[float, float, float]:
-        """Return for a place (2,): s, lateral offset (left positive), and heading there."""
+        """Return s, lateral offset (left positive) and heading of the lanelet at a place (2,)."""
         steps = np.diff(self.centre, axis=0)
         lengths = np.maximum(np.hypot(*steps.T), 1e-9)
         offset = place - self.centre[:-1]
@@ -57,7 +57,7 @@ class VectorMap:
     """The lanelets for cars of a map folder.
 
     Raises:
-        MapError: the folder does not have the files, or has another projector than `Local`.
+        MapError: a file is missing, or the projector is not `Local`.
     """
 
     def __init__(self, folder: Path) -> None:
@@ -83,7 +83,7 @@ class VectorMap:
     def costs_to(self, goal: NDArray[np.float64], heading: float) -> dict[int, float]:
         """Return the seconds from the beginning of each lanelet to a goal (2,), by id.
 
-        Lanelets from which no way leads there are missing.
+        Lanelets from which no way leads to the goal are left out.
         """
         ends = []
         for one in self.near(goal, 3.0):
@@ -101,7 +101,7 @@ class VectorMap:
             one = by_id[number]
             for other in one.before:
                 heapq.heappush(heap, (cost + other.length_m / other.speed_mps, other.id))
-            for other in one.beside:  # neighbours are neighbours of each other
+            for other in one.beside:  # the relation is symmetric
                 heapq.heappush(heap, (cost + CHANGE_S, other.id))
         return costs
 
@@ -180,7 +180,7 @@ def _connect(
     bounds: dict[int, tuple[int, int]],
     ways: dict[int, tuple[list[int], dict[str, str]]],
 ) -> None:
-    """Link lanelets that share end points, or a dashed border."""
+    """Link lanelets with common end points, and neighbours with a dashed border."""
     begins = defaultdict(list)
     right_of = {}
     for number, (left, right) in bounds.items():

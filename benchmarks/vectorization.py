@@ -1,9 +1,9 @@
 """Overhead of stepping worlds over worker processes, measured with worlds that do nothing.
 
-The agents are divided evenly among the workers, one world each. In every library, they observe the
-same numbers, all rewards are 0, and no agent leaves, so a step takes only the time of
-vectorization. `ORDER` is the time of cavmarl's workers alone: actions are written to shared memory,
-the command is sent, and results are committed, without checking actions and copying results.
+Each worker has one world with an equal share of the agents. In every library, agents observe the
+same numbers, all rewards are 0 and no agent leaves. So a step takes only the time of vectorization.
+`ORDER` is the time of cavmarl's workers without checking actions and copying results: actions are
+written to shared memory, the command is sent and results are committed.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from cavmarl.shards.shard import Commands
 
 PROGRAM = "benchmarks.trivial_worker"
 SETTINGS = {"population.mode": "respawn", "observation.kind": "flat", "action.kind": "continuous"}
-STEPS = 300  # per turn
+STEPS = 300  # steps per turn
 WARM_STEPS = 50
 ORDER = "our workers alone"
 LIBRARIES = {
@@ -63,7 +63,7 @@ def measure(
     steps: dict[str, Step] = {}
     missing: dict[str, str] = {}
     with ExitStack() as stack:
-        # Libraries that fork this process go first, before it has mapped memory.
+        # Measure libraries that fork this process first, before it maps shared memory.
         for library, make in (("supersuit", _supersuit), ("gymnasium", _gymnasium)):
             say(f"starting the workers of {library}")
             try:
@@ -127,7 +127,7 @@ def _gymnasium(agents: int, size: int, workers: int) -> Iterator[Step]:
 @contextmanager
 def _supersuit(agents: int, size: int, workers: int) -> Iterator[Step]:
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # notices of the library
+        warnings.simplefilter("ignore")  # warnings of the library
         supersuit = require("supersuit", "bench")
         rows = supersuit.pettingzoo_env_to_vec_env_v1(_TrivialAgents(agents, size))
         vec = supersuit.concat_vec_envs_v1(rows, workers, workers, base_class="gymnasium")

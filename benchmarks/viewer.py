@@ -1,7 +1,7 @@
 """Cost of the viewer: bytes and time of a frame, many clients, and the page's JavaScript.
 
-Generated vehicles, all moving in each frame, are sent through the viewer's own server. With
-Chromium and Playwright, the page itself is measured too.
+Frames of generated vehicles that all move are sent through the viewer's server. With Chromium and
+Playwright, the page is measured, too.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ def measure(
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure bytes, milliseconds and shares of one core that the viewer costs."""
+    """Measure the size of frames, and the time and the share of a core that the viewer takes."""
     if moving < 10:
         raise ConfigError(f"moving = {moving}: must be at least 10")
     if not (1 <= vehicles <= 100_000 and 0 <= clients <= 200 and rate_hz > 0.0 and seconds > 0.0):
@@ -89,7 +89,7 @@ def measure(
 
 
 def made_up_frames(env: CavEnv, count: int, seed: int, number: int = 20) -> list[WorldFrame]:
-    """Return frames of vehicles all over the map, with 1 % entering or leaving per frame."""
+    """Return frames of vehicles on the whole map; 1 % of them enter or leave per frame."""
     random = np.random.default_rng(seed)
     min_x, min_y, max_x, max_y = env.network.extent_m
     signals = np.zeros(len(env.network.signals), np.int32)
@@ -224,7 +224,7 @@ async def _read(address: str, clients: int, seconds: float, pipe: Connection) ->
 
 
 def drawing(env: CavEnv, frames: list[WorldFrame], seconds: float) -> dict[str, Any]:
-    """Measure the page's main-thread JavaScript, with software GL, which does not count."""
+    """Measure the JavaScript of the page's main thread; the time of software GL does not count."""
     from playwright.sync_api import sync_playwright
 
     audience, server, encoder = served(env)

@@ -1,4 +1,4 @@
-"""Speedup by workers, the cost of workers, and the limit of the machine.
+"""Speedup by workers, cost of workers, and the limit that the machine sets.
 
 The limit of the machine is the speedup of independent programs that run at the same time. Workers
 cannot exceed it. It is less than the number of cores if cores share memory, caches or clocks, or if
@@ -31,7 +31,7 @@ from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 
 WARM_STEPS = 20
-PINGS = 2000  # per turn
+PINGS = 2000  # empty commands per turn
 IDLE_S = 1.0
 START_S = 300.0  # time limit for a program to start
 
@@ -42,7 +42,7 @@ class Row:
 
     workers: int  # number of workers; 0: all worlds in the caller's process
     made_s: float  # time until the worlds could be reset
-    step_ms: tuple[float, ...]  # per turn, ms per step
+    step_ms: tuple[float, ...]  # ms per step in each turn
     busiest_ms: float | None  # processor time per step of the busiest worker, ms
 
 
@@ -52,9 +52,11 @@ class WorkerSpeed:
 
     env: str  # name of the environment
     worlds: int  # number of worlds
-    steps: int  # per turn
+    steps: int  # steps per turn
     rows: tuple[Row, ...]  # without workers, with one, and with the requested number
-    barrier_us: tuple[float, ...]  # empty commands to all workers: quantiles 5, 50, 95 and 99 %
+    barrier_us: tuple[
+        float, ...
+    ]  # time of empty commands to all workers: 5, 50, 95 and 99 % quantiles
     idle_s: float  # processor time of idle workers per second, s
     hardware: dict[str, Any]  # hardware of the machine
 
@@ -65,7 +67,7 @@ class WorkerSpeed:
 
     @property
     def processor_ratio(self) -> float:
-        """Speedup by processor time of the busiest worker: the speedup with enough free cores."""
+        """Speedup with enough free cores, by the processor time of the busiest worker."""
         one, many = self.rows[1].busiest_ms, self.rows[2].busiest_ms
         return math.nan if one is None or many is None else one / many
 
@@ -90,8 +92,8 @@ def measure_workers(
 ) -> WorkerSpeed:
     """Step the same worlds without workers, with one, and with several, in turn.
 
-    The built-in driver drives the agents and is not timed. Observations are read in place, as by a
-    trainer whose tensors share the memory.
+    The built-in driver drives the agents and is not timed. Observations are not copied, as in a
+    training whose tensors share the memory.
     """
     if workers < 2 or steps < 1 or repeats < 1:
         raise ConfigError(
@@ -134,7 +136,7 @@ def drive_ms(vec: CavVectorEnv, steps: int) -> float:
 
 
 class Measured:
-    """Worlds over a number of workers, reset and warm, and the times of their turns."""
+    """Worlds on a number of workers, after a warm-up, with the times of their turns."""
 
     def __init__(self, spec: WorldSpec, workers: int, **more: Any) -> None:
         began = time.perf_counter()
@@ -149,7 +151,7 @@ class Measured:
         drive_ms(self.vec, WARM_STEPS)
 
     def count_turn(self, steps: int) -> None:
-        """Run a timed turn, then as many steps for the processor time, whose query is slow."""
+        """Run a timed turn, and then equally many steps to measure processor time."""
         self._step_ms.append(drive_ms(self.vec, steps))
         for _ in range(steps):
             actions = self.vec.suggest_actions()
@@ -170,8 +172,10 @@ class CoreCeiling:
     """Independent programs that step worlds, one at a time and all at once."""
 
     programs: int  # number of programs
-    alone_ms: tuple[float, ...]  # per turn, ms per step of all worlds, one program after another
-    together_ms: tuple[float, ...]  # per turn, ms per step of the slowest program while all run
+    alone_ms: tuple[float, ...]  # ms per step of all worlds in each turn, one program after another
+    together_ms: tuple[
+        float, ...
+    ]  # ms per step of the slowest program in each turn, while all programs run
 
     @property
     def ratio(self) -> float:
@@ -206,7 +210,9 @@ def measure_ceiling(
             ours, theirs = context.Pipe()
             given = (theirs, spec, last - first, 0 if alike else first)
             processes.append(context.Process(target=_serve, args=given, daemon=True))
-            before = signal.pthread_sigmask(signal.SIG_BLOCK, [signal.SIGINT])  # for the program
+            before = signal.pthread_sigmask(
+                signal.SIG_BLOCK, [signal.SIGINT]
+            )  # inherited by the program
             try:
                 processes[-1].start()
             finally:
@@ -246,7 +252,7 @@ def _hear(wire: Connection) -> float:
 
 
 def _serve(wire: Connection, spec: WorldSpec, worlds: int, first: int) -> None:
-    """Run one program: step as often as commanded, until the connection is closed."""
+    """Run a program: step on each command until the connection is closed."""
     vec = make_vec(spec.env, num_envs=worlds, copy=False, **spec.keywords)
     vec.reset(seed=spec.seed, options={"first_world": first})
     steps = WARM_STEPS

@@ -23,7 +23,7 @@ def measure(
     at_least: AtLeast = None,
     say: Say = silent,
 ) -> BenchmarkReport:
-    """Measure worlds without workers, with one and with several, and an empty command."""
+    """Measure steps without workers, with one and with several workers, and an empty command."""
     turns: dict[str, Any] = {"worlds": worlds, "steps": steps, "repeats": repeats}
     found = measure_workers(world, workers=count, say=say, **turns)
     say("stepping worlds in independent programs")

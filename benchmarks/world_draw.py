@@ -16,9 +16,9 @@ from cavmarl.core.errors import ConfigError
 
 Drawn = TypeVar("Drawn")
 
-# Features of a draw, with their probabilities; each can be excluded by name. Kinds of nets:
+# Features of a draw with their probabilities; features can be excluded by name. Kinds of nets:
 KINDS = {"grid": 0.36, "spider": 0.2, "random": 0.29, "cut": 0.15}
-# nets with narrow places, drawn from a stream of their own instead of one of `KINDS`,
+# nets with narrow places instead of `KINDS`, drawn with separate random numbers,
 NARROW = {"zipper": 0.05, "signal_pair": 0.05}
 # types of junctions (SUMO's names; zipper and unregulated define no right of way where ways cross),
 JUNCTIONS = {
@@ -36,8 +36,8 @@ SHARES = {  # and additional features of a net
     "perturbed": 0.2,
     "random_lanes": 0.2,
     "random_priority": 0.35,
-    "one_way": 0.3,  # of random nets
-    "shared_track": 0.05,  # both directions share one lane's ground
+    "one_way": 0.3,  # share of random nets
+    "shared_track": 0.05,  # lanes of both directions overlap
     "turnarounds": 0.5,
     "lefthand": 0.12,
 }
@@ -64,9 +64,9 @@ _LANES = (1, 1, 2, 2, 3, 4)
 class NetDraw:
     """The properties of a net."""
 
-    kind: str  # of `KINDS` or `NARROW`
-    options: tuple[str, ...]  # of netgenerate, or of netconvert for a cut or a zipper
-    length_m: float  # of a typical edge, or half the side of a cut
+    kind: str  # one of `KINDS` or `NARROW`
+    options: tuple[str, ...]  # options of netgenerate, or of netconvert for a cut or a zipper
+    length_m: float  # length of a typical edge, or half the side of a cut
     num_lanes: int  # upper bound on netgenerate's edges
 
 
@@ -76,7 +76,7 @@ class DemandDraw:
 
     junction_per_h: float  # vehicles per hour into a typical junction, per lane
     fringe: bool  # whether trips begin and end at the net's ends, if it has any
-    shares: dict[str, float]  # of vehicle classes
+    shares: dict[str, float]  # shares of vehicle classes
     departure: dict[str, str]  # attributes of departure
 
 
@@ -85,7 +85,7 @@ class WorldDraw:
     """One random world."""
 
     seed: int  # seed of the draw
-    features: tuple[str, ...]  # its features, of `FEATURES`
+    features: tuple[str, ...]  # the drawn `FEATURES`
     net: NetDraw
     demand: DemandDraw
 
@@ -138,7 +138,7 @@ class _Chance:
         self.features: list[str] = []
 
     def one_of(self, shares: dict[str, float]) -> str:
-        """Draw a feature by its share among the features that are not excluded."""
+        """Draw one of the features that are not excluded, by their shares."""
         left = {name: share for name, share in shares.items() if name not in self._without}
         if not left:
             raise ConfigError(f"--without: excludes all of {', '.join(shares)}; exclude fewer")
@@ -148,7 +148,7 @@ class _Chance:
         return chosen
 
     def has(self, feature: str) -> bool:
-        """Return whether a world has a feature of `SHARES`."""
+        """Draw whether a world has a feature of `SHARES`."""
         drawn = bool(self._random.random() < SHARES[feature]) and feature not in self._without
         if drawn:
             self.features.append(feature)
@@ -161,14 +161,14 @@ class _Chance:
         return float(self._random.uniform(low, high))
 
     def whole(self, low: int, high: int) -> int:
-        """Draw an integer within both bounds, inclusive."""
+        """Draw an integer from `low` to `high`, both included."""
         return int(self._random.integers(low, high + 1))
 
 
 def _narrow(seed: int, without: Collection[str]) -> str:
     """Draw a feature of `NARROW`, or "" for the other worlds.
 
-    A stream of its own leaves the other worlds of all seeds as they are.
+    Separate random numbers keep the other worlds of all seeds unchanged.
     """
     place = float(np.random.default_rng([seed, 3]).random())
     for name, share in NARROW.items():
@@ -180,14 +180,14 @@ def _narrow(seed: int, without: Collection[str]) -> str:
 
 
 def _zipper(chance: _Chance) -> NetDraw:
-    """Draw a road in both directions, on which lanes become one in turn."""
+    """Draw a two-way road with zipper merges."""
     limit_mps = chance.any_of(_SPEEDS_MPS)
     length_m = round(chance.between(150.0, 300.0) * max(1.0, limit_mps / 13.89), 1)
     return NetDraw("zipper", (f"--default.speed={limit_mps}",), length_m, chance.whole(2, 4))
 
 
 def _signal_pair(chance: _Chance) -> NetDraw:
-    """Draw pairs of signals on parallel roads, 10 to 40 m of road apart."""
+    """Draw pairs of signals on parallel roads; the signals of a pair are 10 to 40 m apart."""
     length_m, num_lanes = round(chance.between(120.0, 220.0), 1), chance.whole(1, 2)
     apart_m = chance.between(10.0, 40.0) + 14.0 + 6.4 * num_lanes
     words = ["--grid=true", f"--grid.x-length={length_m}", f"--grid.y-length={apart_m:.1f}"]
@@ -200,7 +200,7 @@ def _signal_pair(chance: _Chance) -> NetDraw:
 
 
 def _generated(chance: _Chance, kind: str) -> NetDraw:
-    """Draw a net by netgenerate."""
+    """Draw the options of a net for netgenerate."""
     limit_mps = chance.any_of(_SPEEDS_MPS)
     length_m = round(chance.between(80.0, 220.0) * max(1.0, limit_mps / 13.89), 1)
     words = {

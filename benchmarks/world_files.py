@@ -21,12 +21,12 @@ from cavmarl.roads.cache import load_network
 from cavmarl.roads.network import RoadNetwork
 
 NET_FILE, ROUTES_FILE = "world.net.xml", "world.rou.xml"
-# Maps of real cities in the wheel's `tools/game` from which cuts are taken; levels by height.
+# Maps of real cities in the wheel's `tools/game` for cuts; roads have heights.
 GAME_MAPS = ("kuehne/kuehne", "bs3d/bs", "fokr_bs_demo/fokr_bs", "DRT/osm", "fkk_in/ingolstadt")
-_DRAWN_TRIPS = 1500  # number of trips from which departures are taken
-_LEAST_EDGES = 12  # smaller cuts are drawn again
+_DRAWN_TRIPS = 1500  # number of trips that randomTrips draws
+_LEAST_EDGES = 12  # cuts with fewer edges are drawn again
 _CUTS = 20
-_END_PER_H = 600.0  # upper bound per road into the net, so that vehicles can enter
+_END_PER_H = 600.0  # upper bound of the flow on a road into the net, so that vehicles can enter
 _TOOL_S = 300.0
 
 
@@ -104,7 +104,7 @@ def _cut(draw: WorldDraw, net: Path, maps: Sequence[Path]) -> None:
 
 
 def _zippers(draw: WorldDraw, net: Path) -> None:
-    """Build a road in both directions whose two inner lanes become one at each node."""
+    """Build a two-way road on which the two inner lanes merge at each node."""
     most = draw.net.num_lanes
     nodes, edges, connections = (Element(name) for name in ("nodes", "edges", "connections"))
     for n in range(most + 1):
@@ -129,7 +129,7 @@ def _write_demand(draw: WorldDraw, net: Path, routes: Path, seconds: int) -> Non
     """Write routes of randomTrips, with departures by the flow of the draw."""
     drawn = routes.with_name("drawn.rou.xml")
     network = load_network(net)
-    # Use ends of roads only if there are enough; otherwise all traffic would be on two edges.
+    # With few ends of roads, trips begin anywhere; otherwise all traffic would be on two edges.
     fringe = draw.demand.fringe and _num_ends(network) >= 4
     _run_tool(
         "tools/randomTrips.py",
@@ -166,7 +166,7 @@ def _num_ends(network: RoadNetwork) -> int:
 
 
 def _gap_s(demand: DemandDraw, network: RoadNetwork, found: Sequence[Element]) -> float:
-    """Return the gap between departures, s, at which a typical junction has the drawn flow."""
+    """Return the time between departures in s that gives a typical junction the drawn flow."""
     edges = network.edges[~network.edges["internal"]]
     num_junctions = len(np.unique(edges["to_junction"])) - _num_ends(network)
     lanes = float(edges["num_lanes"].mean())

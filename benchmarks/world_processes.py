@@ -27,10 +27,10 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.shards.shard import Commands
 from cavmarl.verify.faulty_network import FaultyNetwork
 
-PER_JUNCTION = 25  # vehicles
+PER_JUNCTION = 25  # vehicles per junction
 EDGE_M = 200
-FIRST_STEPS = 3  # after creation
-WARM_STEPS = 2  # unmeasured steps per turn, because other worlds have used the cache
+FIRST_STEPS = 3  # steps after creation
+WARM_STEPS = 2  # unmeasured steps of a turn, which fill the cache
 PINGS = 40
 PING = bytes(1 << 14)  # about the size of the nodes' messages in a tick
 LOCAL = "127.0.0.1"
@@ -44,7 +44,7 @@ class Turn(NamedTuple):
     node_s: float  # processor time per tick of the most expensive node; undivided: of the process
     caller_s: float  # processor time per tick of the caller
     own: float  # vehicles of the most expensive node
-    ghosts: float  # its ghosts
+    ghosts: float  # ghosts of this node
     crossings: float  # vehicles that changed their node, per step
     memory_bytes: float  # resident memory of the largest process
     latency_s: float  # measured latency added to each connection
@@ -59,13 +59,13 @@ class WorldProcess:
         net: Path,
         vehicles: int,
         nodes: int = 0,  # 0: undivided
-        latency_s: float = 0.0,  # added to each connection
-        is_realtime: bool = False,  # during its turns
+        latency_s: float = 0.0,  # latency added to each connection
+        is_realtime: bool = False,  # real-time priority in turns
     ) -> None:
         words = [str(net), str(vehicles), str(nodes), repr(latency_s), str(int(is_realtime))]
         self._process: subprocess.Popen[Any] = start_python(
             ["-c", SERVES, *words],
-            env=huge_heap(),  # as for nodes
+            env=huge_heap(),  # as nodes have
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,
@@ -118,7 +118,7 @@ def make_city(folder: Path, vehicles: int) -> Path:
 
 
 def serve(net: str, vehicles: str, nodes: str, latency_s: str, is_realtime: str) -> None:
-    """Run a world: step as often as each input line says, until an empty line."""
+    """Run a world: each input line has a number of steps; an empty line ends the program."""
     with _network(float(latency_s)) as network:
         world = _World(Path(net), int(vehicles), int(nodes), network, bool(int(is_realtime)))
         try:
@@ -201,7 +201,7 @@ class _World:
         )
 
     def _loads(self) -> tuple[Sequence[Any], int]:
-        """Return the nodes' loads since the last call, and changes of owner since the start."""
+        """Return the loads of nodes since the last call, and all ownership changes so far."""
         if not isinstance(self._worlds, NodeWorlds):
             return (), 0
         return self._worlds.node_loads(), self._worlds.migrations

@@ -1,4 +1,4 @@
-"""Comparison with SUMO in one random world as a row of figures, and summaries of many rows."""
+"""Rows, each with the comparison of a random world with SUMO, and summaries of rows."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from cavmarl.evaluate.traffic.traffic_comparison import TrafficComparison
 
 Row = dict[str, Any]  # a line of worlds.jsonl
 
-# Tolerances as a share of SUMO's mean; delay also in seconds.
+# Tolerances as shares of SUMO's mean; the delay also has a tolerance in seconds.
 SPEED_SHARE, COUNT_SHARE, DELAY_SHARE, DELAY_S = 0.15, 0.05, 0.25, 3.0
 LOCK_S = 120.0
 _SPREAD_OF = ("departed", "arrived", "mean_speed_mps", "mean_delay_s", "queue", "longest_lock_s")
 
 
 def row_of(draw: WorldDraw, found: TrafficComparison, of_map: Sequence[str] = ()) -> Row:
-    """Return the row of a comparison: all figures, and SUMO's per seed.
+    """Return the row of a comparison, with the figures of cavmarl and of each of SUMO's seeds.
 
-    `of_map`: names of `map_features` that the net has.
+    `of_map`: the `map_features` of the net.
     """
     sumo = [asdict(figures) for figures in (found.sumo.figures, *found.sumo_others)]
     return {
@@ -44,7 +44,7 @@ def failed_row(draw: WorldDraw, seconds: int, dt_s: float, error: Exception) -> 
 
 
 def deviation(row: Mapping[str, Any], figure: str) -> float | None:
-    """Return the relative deviation from the mean of SUMO's seeds; None without a reference."""
+    """Return the relative deviation from the mean of SUMO's seeds; None if SUMO has no value."""
     ours, theirs = row["ours"][figure], _known(row["sumo_spread"][figure])
     mean = sum(theirs) / len(theirs) if theirs else 0.0
     return ours / mean - 1.0 if ours is not None and mean else None
@@ -72,13 +72,13 @@ def is_delay_near(row: Mapping[str, Any]) -> bool:
 
 
 def has_own_lock(row: Mapping[str, Any]) -> bool:
-    """Return whether a lock lasts longer than `LOCK_S` that occurs with none of SUMO's seeds."""
+    """Return whether a lock of over `LOCK_S` occurs here, but with none of SUMO's seeds."""
     theirs = max(row["sumo_spread"]["longest_lock_s"])
     return bool(row["ours"]["longest_lock_s"] > LOCK_S >= theirs)
 
 
 def sumo_beside_itself(row: Mapping[str, Any]) -> list[Row]:
-    """Return a row for each of SUMO's seeds, compared with its other seeds."""
+    """Return a row for each of SUMO's seeds in comparison with SUMO's other seeds."""
     spread = row["sumo_spread"]
     return [
         {
@@ -140,7 +140,7 @@ def summary(rows: Sequence[Row]) -> Row:
 
 
 def by_feature(rows: Sequence[Row]) -> dict[str, Row]:
-    """Return the summary of the worlds with each feature, by feature."""
+    """Return for each feature the summary of the worlds that have it."""
     names = sorted({name for row in rows for name in row["features"]})
     return {name: summary([row for row in rows if name in row["features"]]) for name in names}
 

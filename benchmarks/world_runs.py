@@ -1,4 +1,4 @@
-"""Many random worlds in sequence, in a folder from which a run can be resumed."""
+"""Runs of many random worlds, with results in a folder from which a run can resume."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class WorldSeries:
 
     out: Path  # folder of the results
     count: int  # number of worlds
-    first_seed: int  # seeds are consecutive
+    first_seed: int  # first of consecutive seeds
     seconds: int = 400  # simulated duration of both sides
     dt_s: float = 0.1  # step length of both sides
     without: tuple[str, ...] = ()  # features to exclude
@@ -63,7 +63,7 @@ class WorldSeries:
 def run_worlds(
     job: WorldSeries, progress: Callable[[int, int], None] = lambda done, count: None
 ) -> list[Row]:
-    """Run the worlds without a row; return the rows of the whole series, by seed.
+    """Run the worlds that have no row yet; return the rows of all worlds, by seed.
 
     A row is added to `worlds.jsonl` when its world is done. The files of the worst worlds so far
     are kept.
@@ -92,7 +92,7 @@ def run_worlds(
 
 
 def read_rows(path: Path) -> Iterator[Row]:
-    """Yield the rows of a file, none if it does not exist.
+    """Yield the rows of a file; a missing file has no rows.
 
     Raises ConfigError: a line is not a row.
     """
@@ -128,7 +128,7 @@ def run_world(job: WorldSeries, seed: int) -> Row:
     """Draw a world, run it here and in SUMO, and return its row."""
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
-    shutil.rmtree(folder, ignore_errors=True)  # left by an interrupted run
+    shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
     try:
         net, routes = make_files(draw, folder, job.seconds, job.cut_from)
         _write_commands(job, draw, folder)

@@ -1,6 +1,6 @@
-"""The built-in driver in agents' seats, alone and in traffic, on any maps.
+"""The built-in driver as agents, alone and in traffic, on any maps.
 
-Every trip counts, including trips that the end of the run cuts off. A vehicle stands without a
+Every trip counts, including trips that the end of the run truncates. A vehicle stands without a
 cause if it has stood for `STANDS_S` and none of these causes applies:
 
 - its signal is red;
@@ -8,7 +8,7 @@ cause if it has stood for `STANDS_S` and none of these causes applies:
 - another vehicle, or its rear, is on a path that crosses its own;
 - a vehicle with priority approaches, within its `registration_distance_m`.
 
-Contacts on ground that the map gives to two roads are counted separately (`shared_ground`).
+Contacts on lanes of different roads that overlap are counted separately (`shared_ground`).
 """
 
 from __future__ import annotations
@@ -46,15 +46,15 @@ from cavmarl.roads.sumo_net.reader import map_name
 
 MOST_SHARE = 0.0005  # largest share of trips that may end off the road or in a collision
 STANDS_S = 120.0
-NEAR_AHEAD_M = 20.0  # a vehicle whose centre is this close ahead is a cause to stand
-AXIS_PLACES = 9  # points on a vehicle's axis for finding contacts
-NEAR_AXIS_M = 4.0  # the axes of touching vehicles are closer than this
-TOGETHER = 100  # approximate number of vehicles stepped at once
+NEAR_AHEAD_M = 20.0  # a vehicle whose centre is at most this far ahead is a cause
+AXIS_PLACES = 9  # number of points on a vehicle's axis
+NEAR_AXIS_M = 4.0  # largest distance of the axes of touching vehicles
+TOGETHER = 100  # approximate number of vehicles in all parallel worlds
 RECORDED = ("off_road", "collision", "wrong_way", "red_light")
-OF_TRIPS = (*RECORDED, "shared_ground")  # the last are collisions, counted separately
+OF_TRIPS = (*RECORDED, "shared_ground")  # the last name is of collisions on shared ground
 FAULTS = (*OF_TRIPS, "stands")
-HEADS = {"collision": "colli-\nsion"}  # all columns fit a terminal of 80 characters
-SHOWN = 12  # number of faults listed below the table
+HEADS = {"collision": "colli-\nsion"}  # broken, so that the table fits 80 characters
+SHOWN = 12  # number of faults below the table
 GREEN = [SIGNAL_STATES.index(letter) for letter in "gGoOs"] + [SIGNAL_NONE]
 
 
@@ -65,7 +65,7 @@ class Drive:
     trips: int = 0
     arrived: int = 0
     counts: dict[str, int] = field(default_factory=lambda: dict.fromkeys(FAULTS, 0))
-    faults: list[dict[str, Any]] = field(default_factory=list)  # position and time
+    faults: list[dict[str, Any]] = field(default_factory=list)  # faults with position and time
 
     def add(self, other: Drive) -> None:
         self.trips += other.trips
@@ -153,7 +153,7 @@ def labels(maps: Sequence[str]) -> dict[str, str]:
 def _maps(
     named: Mapping[str, str], seeds: Sequence[int], folder: Path
 ) -> Iterator[tuple[str, Callable[[], str]]]:
-    """Yield label and factory of each map."""
+    """Yield for each map its label and a function that makes its worlds."""
     for name, label in named.items():
         yield label, lambda name=name: name  # type: ignore[misc]
     cuts = cut_maps(None) if seeds else ()
@@ -171,7 +171,7 @@ def _told(name: str, model: str, agents: int, fault: dict[str, Any]) -> str:
 
 
 def drive(env: str, model: str, agents: int, seconds: int, seed: int) -> Drive:
-    """Run the built-in driver in a number of seats for some time."""
+    """Let the built-in driver drive a number of agents for some time."""
     overrides = {
         "traffic.model": model,
         "population.mode": "respawn",
@@ -224,7 +224,7 @@ def _place(vec: CavVectorEnv, what: str, world: int, row: np.void, step: int) ->
 
 
 class SharedGround:
-    """Finds collisions between two roads that a map draws on the same ground."""
+    """Finds collisions between vehicles on overlapping lanes of different roads."""
 
     def __init__(self, network: RoadNetwork) -> None:
         self._network = network
@@ -234,12 +234,12 @@ class SharedGround:
         return frozenset(shared_ground(self._network))
 
     def holds(self, row: np.void, rows: NDArray[np.void], dt: float) -> bool:
-        """Return whether the vehicle about to be touched is on a lane that shares the ground.
+        """Return whether the other vehicle of a contact is on a lane that overlaps.
 
-        The other vehicle has the nearest axis. `dt`: upper bound of the time until they touch, s.
-        If no vehicle is near, the other vehicle has just departed on the other lane, because
-        vehicles do not depart too close on the same lane. Inside a junction, a vehicle counts as on
-        the lanes before and after it.
+        The other vehicle has the nearest axis. `dt` is the upper bound of the time until they
+        touch, in s. If no vehicle is near, the other vehicle has just departed on the overlapping
+        lane, because departures on the same lane keep a distance. Inside a junction, a vehicle
+        counts as on the lanes before and after it.
         """
         others = rows[rows["id"] != row["id"]]
         own_x, own_y = _axes(rows[rows["id"] == row["id"]], dt)
@@ -271,7 +271,7 @@ def _axes(rows: NDArray[np.void], dt: float) -> tuple[NDArray[np.float64], NDArr
 
 
 class StandingVehicles:
-    """Finds vehicles that have stood for `STANDS_S` without a cause, each once."""
+    """Finds vehicles that have stood for `STANDS_S` without a cause, and reports each one once."""
 
     def __init__(self, vec: CavVectorEnv) -> None:
         self._vec = vec
@@ -292,11 +292,11 @@ class StandingVehicles:
                     yield world, rows[i]
 
     def has_cause(self, rows: NDArray[np.void], i: int, shown: NDArray[np.uint8]) -> bool:
-        """Return whether vehicle `i` has a cause to stand; `shown`: the signal of each link."""
+        """Return whether vehicle `i` has a cause to stand; `shown` has the signal of each link."""
         row = rows[i]
         others = rows[np.arange(len(rows)) != i]
         lane = self._vec.network.lanes[row["lane"]]
-        inside = bool(lane["internal"])  # then a signal no longer applies
+        inside = bool(lane["internal"])  # where signals do not apply
         step = self._vec.simulation.plans[row["goal"], row["lane"]]
         link = int(lane["link"] if inside else step["link"])
         along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
@@ -308,7 +308,7 @@ class StandingVehicles:
         return link >= 0 and self.gives_way(others, link)
 
     def gives_way(self, others: NDArray[np.void], link: int) -> bool:
-        """Return whether there is no room behind a link, or a vehicle with priority approaches."""
+        """Return whether there is no room behind a link, or another vehicle has priority."""
         network = self._vec.network
         lanes, target = network.lanes, network.links[link]
         if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():

@@ -1,4 +1,4 @@
-"""Fixtures that all tests share."""
+"""Options and hooks of the test run, and fixtures of all tests."""
 
 from __future__ import annotations
 
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    """Add the option of `make rotation`."""
+    """Add the option `--turn` of `make rotation`."""
     told = f"run only those slow tests that come up in this turn; each does in {TURNS} turns"
     parser.addoption("--turn", type=int, help=told)
 
 
 def pytest_report_header(config: pytest.Config) -> str | None:
-    """Print the number of the turn that selects slow tests."""
+    """Return the line of the header that says which part of the slow tests runs."""
     turn = config.option.turn
     return None if turn is None else f"slow tests: part {turn % TURNS + 1} of {TURNS}"
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    """Measure the processor time of tests, and check their tiers."""
+    """Register the plugins that measure tests, and the profiles of hypothesis."""
     config.pluginmanager.register(CpuTimes(), "cpu_times")
     config.pluginmanager.register(ProcessWatch(), "process_watch")
     if limit_s := os.environ.get("CAVMARL_QUICK_S"):
         config.pluginmanager.register(TimeLimit(float(limit_s)), "time_limit")
-    # Deadlines fail on a busy machine; without the compiler a few examples are enough.
+    # A busy machine misses deadlines. Without the compiler, few examples are enough.
     settings.register_profile("compiled", deadline=None)
     settings.register_profile("python", deadline=None, max_examples=25)
     settings.load_profile("python" if os.environ.get("NUMBA_DISABLE_JIT") == "1" else "compiled")
@@ -55,7 +55,7 @@ def pytest_configure(config: pytest.Config) -> None:
 
 @pytest.hookimpl(wrapper=True)
 def pytest_collection() -> Iterator[None]:
-    """Collect tests without the garbage collector, which would look at ever more objects."""
+    """Switch the garbage collector off during the collection, because it would take long."""
     gc.disable()
     try:
         return (yield)
@@ -64,20 +64,20 @@ def pytest_collection() -> Iterator[None]:
 
 
 def pytest_collection_finish() -> None:
-    """Freeze the objects that all tests share, so that the garbage collector skips them."""
+    """Make the garbage collector ignore all objects that exist after the collection."""
     gc.collect()
     gc.freeze()
 
 
 def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
-    """Skip files that have no test of the tier that `-m` names."""
+    """Skip files without tests of the selected tier (option `-m`)."""
     options = config.option
     is_read = is_needed(collection_path, config.rootpath, options.markexpr, options.turn)
     return None if is_read else True
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Mark each test with its tier, and put long files first: no process starts one late."""
+    """Mark each test with its tier, and sort files by cost, so that long files start early."""
     rare = rare_tests((item.nodeid for item in items), known_costs(), argued())
     for item in items:
         mark(item)
@@ -108,7 +108,7 @@ def _let_start(patch: pytest.MonkeyPatch, start: Callable[..., object], context:
 
 @pytest.fixture(scope="session", autouse=True)
 def forked_processes() -> Iterator[None]:
-    """Start the processes of pools and evaluations as forks of a process with loaded kernels."""
+    """Replace new processes by forks of a process that has loaded the kernels."""
     from tests.support.forked_processes import FORKS, start_forked
 
     with pytest.MonkeyPatch.context() as patch:
@@ -118,7 +118,7 @@ def forked_processes() -> Iterator[None]:
 
 @pytest.fixture
 def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Start new interpreters instead of forks, as outside of the tests."""
+    """Start new interpreters instead of forks, as cavmarl does outside of tests."""
     from cavmarl.core.processes import start_python
 
     _let_start(monkeypatch, start_python, get_context("spawn"))
@@ -126,7 +126,7 @@ def fresh_processes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 @pytest.fixture
 def make() -> Iterator[Make]:
-    """Yield `make_vec`, and close its environments at the end."""
+    """Yield `make_vec`; close the made environments after the test."""
     from cavmarl import make_vec
 
     made: list[CavVectorEnv] = []
@@ -152,7 +152,7 @@ def shared_maps() -> Path:
 
 @pytest.fixture(scope="session")
 def built_map(shared_maps: Path) -> Callable[[str], Path]:
-    """Return a function that builds a real map tolerantly, and caches it: `built_map("x.osm")`."""
+    """Return a function that builds a real map, or reads it from a cache: `built_map("x.osm")`."""
     from tests.support.kept_maps import built
 
     return lambda name: built(shared_maps / name)

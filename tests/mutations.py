@@ -1,12 +1,12 @@
-"""Mutation tests: each fault must make the tests of its place fail.
+"""Mutation tests: each fault in `mutations.md` must make the tests in its row fail.
 
     python -m tests.mutations            # all rows of mutations.md
     python -m tests.mutations 3 14       # some of them
 
-Each row of `mutations.md` names a file, a piece of it that occurs once, what replaces it, and the
-tests. The checkout is copied, the piece is replaced, the tests run there (kernels without the
-compiler), and the copy is removed. The same tests pass without the fault. Exit code 1: a fault was
-not noticed, or a row no longer fits.
+Each row of `mutations.md` has a file, a text that occurs once in the file, a replacement and tests.
+The text is replaced in a copy of the checkout, and the tests run there. Kernels run without the
+compiler. The same tests must pass without the replacement. The exit code is 1 if the tests pass
+with a fault, or fail without it.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ COPIED = (
     *("cavmarl", "tests", "envs", "agents", "configs", "train", "benchmarks", "docs", "examples"),
     "pyproject.toml",
 )
-LIMIT_S = 1800.0  # time limit of the tests of a row, in s
-# Random numbers are products that wrap around. Without the compiler, NumPy warns of that.
+LIMIT_S = 1800.0  # time limit for the tests of a row
+# Random numbers are products that overflow. Without the compiler, NumPy warns of the overflow.
 WRAPS = "ignore:overflow encountered:RuntimeWarning"
 
 
 class Mutation(NamedTuple):
-    """A row of the table: `old` in `file` becomes `new`, and `tests` have to fail."""
+    """A row of the table: with `new` instead of `old` in `file`, `tests` must fail."""
 
     number: int
     file: str
@@ -48,7 +48,7 @@ def read_table() -> list[Mutation]:
 
 
 def mutated(mutation: Mutation) -> str:
-    """Return the text of the file with the fault."""
+    """Return the text of the file with the mutation."""
     text = (ROOT / mutation.file).read_text()
     found = text.count(mutation.old)
     if found != 1:
@@ -57,7 +57,7 @@ def mutated(mutation: Mutation) -> str:
 
 
 def is_passed(tests: str, *, interpreted: bool, file: str = "", text: str = "") -> bool:
-    """Return whether tests pass in a copy of the checkout, with one changed file if given."""
+    """Return whether tests pass in a copy of the checkout, in which `file` has the given text."""
     with tempfile.TemporaryDirectory(prefix="mutation-") as folder:
         place = Path(folder) / "checkout"
         place.mkdir()

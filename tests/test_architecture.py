@@ -1,4 +1,4 @@
-"""`docs/explanation/architecture.md` agrees with the folders and the contract of imports."""
+"""`docs/explanation/architecture.md` agrees with the folders and with the layers of imports."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs/explanation/architecture.md").read_text(encoding="utf-8")
 PACKAGE = ROOT / "cavmarl"
 MAX_WORDS = 1_500
-ELSEWHERE = {"cavmarl/data/", "kernels/"}  # a folder of the wheel; a folder in many domains
+ELSEWHERE = {"cavmarl/data/", "kernels/"}  # in the wheel; in several folders
 QUESTIONS = re.findall(r"^\| ([^|]+\?) \| (.+) \|$", PAGE, re.MULTILINE)
 
 
-def test_the_page_is_short() -> None:
-    # Words without the bars of tables.
+def test_the_page_has_at_most_1500_words() -> None:
+    # The bars of tables do not count as words.
     words = [word for word in PAGE.split() if re.search(r"\w", word)]
     assert len(words) <= MAX_WORDS
 
 
-def test_the_drawing_has_the_layers_of_the_contract_in_their_order() -> None:
+def test_the_drawing_has_the_layers_of_the_contract() -> None:
     drawing = re.search(r"<!-- layers -->\n```\n(.*?)\n```\n<!-- end -->", PAGE, re.DOTALL)
     assert drawing
     inside = [line.split("│")[1] for line in drawing[1].splitlines() if "│" in line]
@@ -35,7 +35,7 @@ def test_the_table_of_the_package_has_each_folder_once() -> None:
     assert sorted(rows) == sorted(folders)
 
 
-def test_there_are_at_least_twenty_questions() -> None:
+def test_the_page_answers_at_least_twenty_questions() -> None:
     assert len(QUESTIONS) >= 20
 
 
@@ -47,13 +47,13 @@ def test_the_file_that_answers_a_question_exists(question: str, answer: str) -> 
         assert (PACKAGE / path).is_file(), path
 
 
-def test_every_place_that_the_page_names_exists() -> None:
+def test_each_path_on_the_page_exists() -> None:
     for path in re.findall(r"`(\w+/[\w/]*(?:\.py)?)`", PAGE):
         assert (PACKAGE / path).exists() or (ROOT / path).exists() or path in ELSEWHERE, path
 
 
 def layers() -> list[list[str]]:
-    """Return the names of each layer of the contract; "|" if siblings may not import each other."""
+    """Return the folders of each layer of the contract, with "|" between independent folders."""
     settings = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
     contracts = settings["tool"]["importlinter"]["contracts"]
     contract = next(contract for contract in contracts if contract["id"] == "layers")

@@ -1,4 +1,4 @@
-"""Wrong input: a typed error with place and remedy, and an unchanged world."""
+"""Invalid input raises a typed error with place and remedy, and does not change the world."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def make(mode: str = "closed", **overrides: Any) -> CavEnv:
     return env
 
 
-def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> None:
-    """Check that `actions` raise an `error` with `words`, and that the step can be repeated."""
+def check_refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> None:
+    """Check that a step with `actions` raises an `error` with `words` and can be repeated."""
     before, stats, agents = env.state_hash(), env.traffic_stats(), list(env.agents)
     with pytest.raises(error) as caught:
         env.step(actions)
@@ -54,7 +54,7 @@ def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> N
     assert twin.state_hash() == before
     env.step(fine)
     twin.step(fine)
-    assert env.state_hash() == twin.state_hash(), "the refused step left a trace"
+    assert env.state_hash() == twin.state_hash(), "the refused step changed the world"
 
 
 # Actions
@@ -87,12 +87,12 @@ def refused(env: CavEnv, actions: Any, error: type[Exception], *words: str) -> N
     ],
     ids=repr,
 )
-def test_a_wrong_continuous_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
-    refused(make(), {"car_0": FINE, "car_1": value, "car_2": FINE}, ActionError, *words)
+def test_an_invalid_continuous_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
+    check_refused(make(), {"car_0": FINE, "car_1": value, "car_2": FINE}, ActionError, *words)
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64])
-def test_floats_of_any_size_are_accepted(dtype: type[np.generic]) -> None:
+def test_all_float_types_are_accepted(dtype: type[np.generic]) -> None:
     env, twin = make(), make()
     env.step(dict.fromkeys(env.agents, np.array([1, 0], dtype=dtype)))
     twin.step(dict.fromkeys(twin.agents, np.array([1.0, 0.0])))
@@ -116,29 +116,29 @@ def test_floats_of_any_size_are_accepted(dtype: type[np.generic]) -> None:
     ],
     ids=repr,
 )
-def test_a_wrong_meta_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
+def test_an_invalid_discrete_action_is_refused(value: Any, words: tuple[str, ...]) -> None:
     env = make(action__kind="discrete")
-    refused(env, {"car_0": 1, "car_1": value, "car_2": 1}, ActionError, *words)
+    check_refused(env, {"car_0": 1, "car_1": value, "car_2": 1}, ActionError, *words)
 
 
-def test_all_missing_actions_are_named() -> None:
-    refused(make(), {"car_1": FINE}, ActionError, "car_0, car_2", "missing_action")
-    refused(make(), {}, ActionError, "car_0, car_1, car_2")
+def test_the_error_for_missing_actions_names_all_agents() -> None:
+    check_refused(make(), {"car_1": FINE}, ActionError, "car_0, car_2", "missing_action")
+    check_refused(make(), {}, ActionError, "car_0, car_1, car_2")
 
 
 @pytest.mark.parametrize("stranger", ["car_3", "Car_0", "", 0, None, ("car_0",)])
 def test_actions_for_unknown_agents_are_refused(stranger: Any) -> None:
     actions = {**dict.fromkeys(["car_0", "car_1", "car_2"], FINE), stranger: FINE}
-    refused(make(), actions, ActionError, repr(stranger), "car_0", "car_2")
+    check_refused(make(), actions, ActionError, repr(stranger), "car_0", "car_2")
 
 
 @pytest.mark.parametrize("actions", [None, [FINE] * 3, np.zeros((3, 2)), "car_0", 3])
 def test_actions_that_are_no_dict_are_refused(actions: Any) -> None:
-    refused(make(), actions, ActionError, "dict")
+    check_refused(make(), actions, ActionError, "dict")
 
 
-def lose_one(env: CavEnv) -> str:
-    """Drive one agent off the road."""
+def drive_off_the_road(env: CavEnv) -> str:
+    """Drive the agent `car_0` off the road; return its name."""
     while "car_0" in env.agents:
         actions = env.suggest_actions()
         actions["car_0"] = np.array([1.0, 1.0], np.float32)
@@ -149,17 +149,17 @@ def lose_one(env: CavEnv) -> str:
 
 def test_actions_for_an_agent_that_has_left_are_refused() -> None:
     env = make()
-    gone = lose_one(env)
+    gone = drive_off_the_road(env)
     before = env.state_hash()
     with pytest.raises(ActionError, match=r"car_0.*not in the episode.*late_actions = ignore"):
         env.step({**env.suggest_actions(), gone: FINE})
     assert env.state_hash() == before
 
 
-def test_late_actions_can_be_ignored_and_are_counted() -> None:
+def test_late_actions_can_be_ignored_and_counted() -> None:
     env, twin = make(action__late_actions="ignore"), make()
-    gone = lose_one(env)
-    lose_one(twin)
+    gone = drive_off_the_road(env)
+    drive_off_the_road(twin)
     env.step({**env.suggest_actions(), gone: np.array([np.nan, 7.0])})
     twin.step(twin.suggest_actions())
     assert env.state_hash() == twin.state_hash()
@@ -168,7 +168,7 @@ def test_late_actions_can_be_ignored_and_are_counted() -> None:
         env.step({**env.suggest_actions(), "car_99": FINE})
 
 
-def test_values_beyond_the_range_can_be_clipped_and_are_counted() -> None:
+def test_values_beyond_the_range_can_be_clipped_and_counted() -> None:
     env, twin = make(action__out_of_range="clip"), make()
     env.step({**env.suggest_actions(), "car_1": np.array([1e9, -2.0])})
     twin.step({**twin.suggest_actions(), "car_1": np.array([1.0, -1.0])})
@@ -185,7 +185,7 @@ def test_values_beyond_the_range_can_be_clipped_and_are_counted() -> None:
 @pytest.mark.parametrize(
     ("kind", "first", "idle"), [("continuous", [0.5, 0.1], [0.0, 0.0]), ("discrete", 3, 1)]
 )
-def test_missing_actions_can_be_held_and_are_counted(kind: str, first: Any, idle: Any) -> None:
+def test_missing_actions_can_be_held_and_counted(kind: str, first: Any, idle: Any) -> None:
     env = make(action__missing_action="hold", action__kind=kind)
     twin = make(action__kind=kind)
     for given in ({"car_1": first}, {}, {"car_0": first}):
@@ -199,10 +199,10 @@ def test_missing_actions_can_be_held_and_are_counted(kind: str, first: Any, idle
     twin.reset(seed=0)
     env.step({})
     twin.step(dict.fromkeys(twin.agents, idle))
-    assert env.state_hash() == twin.state_hash(), "a new episode holds nothing of the old"
+    assert env.state_hash() == twin.state_hash(), "an action of the previous episode was held"
 
 
-# Calls that do not fit the episode
+# Calls before, in and after an episode
 
 
 def test_step_and_render_before_reset_are_refused() -> None:
@@ -215,7 +215,7 @@ def test_step_and_render_before_reset_are_refused() -> None:
 
 
 def test_a_lenient_world_accepts_and_counts_actions_of_libraries() -> None:
-    """All leniencies at once, also for agents that have left, and when all have left."""
+    """With `lenient`, values are clipped, missing actions held and late actions ignored."""
     env = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3, lenient=True)
     strict = parallel_env("ring", agents=2, background=0, seed=0, max_cycles=3)
     env.reset()
@@ -245,7 +245,7 @@ def test_actions_after_the_end_are_refused() -> None:
     assert env.state_hash() == before
 
 
-def test_render_without_a_mode_warns_as_other_environments_do() -> None:
+def test_render_without_a_mode_warns() -> None:
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert make().render() is None
 
@@ -262,7 +262,7 @@ def test_invalid_seeds_are_refused(seed: Any) -> None:
         parallel_env("ring", seed=seed).reset()
 
 
-# Many worlds
+# Vectorized environments
 
 
 @pytest.mark.parametrize(
@@ -284,7 +284,7 @@ def test_invalid_seeds_are_refused(seed: Any) -> None:
     ],
     ids=lambda value: str(getattr(value, "shape", value)),
 )
-def test_wrong_arrays_are_refused_before_any_world_moves(
+def test_invalid_arrays_are_refused_before_any_world_moves(
     actions: Any, words: tuple[str, ...]
 ) -> None:
     vec = make_vec("ring", num_envs=2, agents=3, background=4, seed=0)
@@ -298,7 +298,7 @@ def test_wrong_arrays_are_refused_before_any_world_moves(
     vec.step(vec.suggest_actions())
 
 
-def test_the_world_with_the_wrong_value_is_named() -> None:
+def test_the_error_names_the_world_of_an_invalid_value() -> None:
     vec = make_vec("ring", num_envs=3, agents=3, background=0, seed=0)
     vec.reset()
     actions = np.zeros((3, 3, 2))
@@ -373,7 +373,7 @@ def test_an_invalid_world_is_refused(arguments: dict[str, Any], words: tuple[str
         assert word in str(caught.value)
 
 
-def test_more_agents_than_the_map_can_take_are_refused() -> None:
+def test_more_agents_than_the_map_has_room_for_are_refused() -> None:
     with pytest.raises(CapacityError, match=r"= 500.*room for \d+ vehicles"):
         parallel_env("ring", agents=500, background=0)
     with pytest.raises(CapacityError, match=r"= 3004.*room for \d+ vehicles"):
@@ -391,10 +391,10 @@ def test_the_error_for_an_unknown_environment_lists_environments() -> None:
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "", "\ud800"])
-def test_names_that_are_invalid_as_files_are_refused(name: str) -> None:
+def test_names_that_are_no_valid_file_names_are_refused(name: str) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(name)
-    with pytest.raises(PolicyError):  # "" is the working directory
+    with pytest.raises(PolicyError):  # "" names the working directory
         load_policy(name, parallel_env("ring"))
     with pytest.raises((MapError, ConfigError), match=r"map\.source|not allowed"):
         parallel_env("ring", overrides={"map.source": f"{name}.net.xml"})

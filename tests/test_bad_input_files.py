@@ -1,4 +1,4 @@
-"""Wrong maps and demand, as a user sees them; tests of the readers are in their own folders."""
+"""Errors that a user of an environment sees for invalid maps and demand."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def test_a_broken_map_is_refused(write: Write, text: str) -> None:
         parallel_env(path)
 
 
-def test_a_map_in_two_parts_is_driven_within_each_part(write: Write) -> None:
+def test_trips_on_a_map_in_two_parts_stay_in_their_part(write: Write) -> None:
     env = parallel_env(write(NET), agents=2, background=4, seed=0)
     env.reset()
     network = env.network
@@ -89,7 +89,7 @@ def test_a_map_in_two_parts_is_driven_within_each_part(write: Write) -> None:
             env.step(env.suggest_actions())
 
 
-def test_a_way_across_the_parts_is_refused(write: Write) -> None:
+def test_a_trip_between_unconnected_parts_is_refused(write: Write) -> None:
     with pytest.raises(ConfigError, match=r"no trip|no way"):
         parallel_env(
             write(NET), overrides={"traffic.origins": ["a"], "traffic.destinations": ["b"]}
@@ -102,7 +102,7 @@ def test_a_map_without_a_road_for_cars_is_refused(write: Write) -> None:
         parallel_env(write(text))
 
 
-def test_a_map_that_is_not_there_is_refused(tmp_path: Path) -> None:
+def test_a_missing_map_is_refused(tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "env.yaml").write_text("name: mine\nmap: {source: lost.net.xml}\n")
@@ -116,7 +116,7 @@ AROUND = "A0B0 B0B1 B1A1 A1A0"
 LOST = '<vehicle id="v" depart="0"><route edges="A0B0 lost"/></vehicle>'
 
 
-def demanding(write: Write, body: str, **more: str) -> CavEnv:
+def env_with_demand(write: Write, body: str, **more: str) -> CavEnv:
     path = write(f"<routes>\n{body}\n</routes>", "x.rou.xml")
     overrides = {"traffic.demand": [str(path)], **more}
     return parallel_env("grid4x4", agents=1, background=0, seed=0, overrides=overrides)
@@ -147,18 +147,18 @@ def demanding(write: Write, body: str, **more: str) -> CavEnv:
     ],
     ids=["edge", "map", "route", "trip", "type", "times", "many"],
 )
-def test_invalid_demand_is_refused_with_its_line(
+def test_the_error_for_invalid_demand_names_the_line(
     write: Write, body: str, error: type[Exception], words: tuple[str, ...]
 ) -> None:
     with pytest.raises(error) as caught:
-        demanding(write, body)
+        env_with_demand(write, body)
     for word in ("x.rou.xml, line 2", *words):
         assert word in str(caught.value)
 
 
-def test_vehicles_without_a_way_can_be_skipped_and_are_counted(write: Write) -> None:
+def test_vehicles_without_a_route_can_be_skipped_and_counted(write: Write) -> None:
     body = '<vehicle id="v" depart="0"><route edges="A0B0 A1B1"/></vehicle>'
-    env = demanding(write, body, **{"traffic.on_bad_route": "skip"})
+    env = env_with_demand(write, body, **{"traffic.on_bad_route": "skip"})
     assert env.simulation.demand is not None
     (line,) = env.simulation.demand.report.lines()
     assert "1 vehicle or flow that cannot drive its route is left out" in line
@@ -167,20 +167,20 @@ def test_vehicles_without_a_way_can_be_skipped_and_are_counted(write: Write) -> 
 
 @pytest.mark.parametrize("body", ["", '<vType id="t"/>', '<vType id="t" vClass="rail"/>'])
 def test_demand_without_vehicles_gives_a_world_without_vehicles(write: Write, body: str) -> None:
-    env = demanding(write, body)
+    env = env_with_demand(write, body)
     env.reset()
     env.step(env.suggest_actions())
     assert env.traffic_stats()["departed"] == 1
 
 
-def test_times_out_of_order_are_put_in_order(write: Write) -> None:
-    # Random draws depend on the position in the file, so nothing is random here.
+def test_departures_are_sorted_by_time(write: Write) -> None:
+    # No random draws: they depend on the position in the file.
     alike = '<vType id="alike" speedDev="0"/>'
     vehicle = f'<vehicle id="{{}}" type="alike" depart="{{}}"><route edges="{AROUND}"/></vehicle>'
     one, other = vehicle.format("a", 3), vehicle.format("b", 1)
     hashes = []
     for body in (one + other, other + one):
-        env = demanding(write, alike + body)
+        env = env_with_demand(write, alike + body)
         env.reset()
         for _ in range(50):
             env.step(env.suggest_actions())
@@ -190,9 +190,9 @@ def test_times_out_of_order_are_put_in_order(write: Write) -> None:
     assert hashes[0] == hashes[1]
 
 
-def test_more_demand_than_the_map_can_take_waits_and_is_counted(write: Write) -> None:
+def test_departures_without_room_wait_and_are_counted(write: Write) -> None:
     flow = f'<flow id="f" begin="0" end="9" number="20000"><route edges="{AROUND}"/></flow>'
-    env = demanding(write, flow)
+    env = env_with_demand(write, flow)
     env.reset()
     for _ in range(100):
         env.step(env.suggest_actions())

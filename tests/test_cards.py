@@ -43,10 +43,10 @@ OFF = SensorsConfig(
     neighbors=NeighborsConfig(count=0),
     signal=SignalAheadConfig(enabled=False),
     lidar=LidarConfig(rays=0),
-    kinematics=KinematicsConfig(vehicles_count=1),  # at least one sensor must be on
+    kinematics=KinematicsConfig(vehicles_count=1),  # one sensor must be on
 )
 
-# The sensors that environments switch off, with the default settings of their authors.
+# Sensors that are off in the environments, with their default settings.
 OPTIONAL = (
     replace(OFF, kinematics=KinematicsConfig(vehicles_count=5)),
     replace(
@@ -59,7 +59,7 @@ OPTIONAL = (
 
 
 def optional_table() -> str:
-    """Return one table of the sensors of `OPTIONAL`; the indices of each sensor begin at 0."""
+    """Return one table of all sensors in `OPTIONAL`; the indices of each one begin at 0."""
     head, *rows = observation_table(OPTIONAL[0]).split("\n", 1)
     for config in OPTIONAL[1:]:
         rows.append(observation_table(config).split("\n", 2)[2])
@@ -70,30 +70,30 @@ def optional_table() -> str:
     "page",
     ["docs/reference/environments.md", *(f"envs/{name}/README.md" for name in sorted(entries()))],
 )
-def test_a_page_has_the_sensors_that_can_be_switched_on(page: str) -> None:
+def test_a_page_has_the_table_of_optional_sensors(page: str) -> None:
     check_block(ROOT / page, "optional sensors", optional_table())
 
 
 @pytest.mark.parametrize("name", sorted(entries()))
-def test_a_card_has_the_observation_index_by_index(name: str) -> None:
+def test_a_card_has_the_table_of_observations(name: str) -> None:
     config, base_dir = load_config(name)
     check_block(base_dir / "README.md", "observation table", observation_table(config.sensors))
 
 
 @pytest.mark.parametrize("name", sorted(entries()))
-def test_the_card_of_an_environment_says_where_observations_come_from(name: str) -> None:
+def test_the_card_of_an_environment_has_the_sources_of_observations(name: str) -> None:
     config, base_dir = load_config(name)
     check_block(base_dir / "README.md", "reads", readings_table(readings_of(config.sensors)))
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_card_of_a_driver_says_what_it_reads(name: str) -> None:
+def test_the_card_of_a_driver_has_the_sources_of_its_observations(name: str) -> None:
     config = read_network_config(TRAINED[name])
     readings = readings_of(config.sensors, config.residual)
     check_block(TRAINED[name] / "README.md", "reads", readings_table(readings))
 
 
-def test_a_driver_that_adds_to_the_built_in_driver_reads_the_state_of_the_world() -> None:
+def test_a_residual_driver_reads_the_state_of_the_world() -> None:
     config = read_network_config(TRAINED["cities_residual"])
     alone, residual = (readings_of(config.sensors, residual) for residual in (False, True))
     (added,) = [reading for reading in residual if reading not in alone]
@@ -102,7 +102,7 @@ def test_a_driver_that_adds_to_the_built_in_driver_reads_the_state_of_the_world(
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_maps_of_an_environment_have_the_kinds_that_its_driver_was_trained_on(
+def test_a_driver_was_trained_on_the_kinds_of_map_of_its_environment(
     name: str,
 ) -> None:
     config = read_network_config(TRAINED[name])
@@ -119,7 +119,7 @@ def test_the_maps_of_an_environment_have_the_kinds_that_its_driver_was_trained_o
         ({"lanes": LanesConfig(range_m=50.0)}, "the paths of vehicles on other lanes"),
     ],
 )
-def test_plans_of_others_and_times_of_signals_are_labelled_as_state_of_the_world(
+def test_plans_of_other_vehicles_and_signal_times_are_state_of_the_world(
     settings: dict[str, Any], said: str
 ) -> None:
     readings = readings_of(replace(OFF, **settings))
@@ -128,7 +128,7 @@ def test_plans_of_others_and_times_of_signals_are_labelled_as_state_of_the_world
 
 
 @pytest.mark.parametrize("name", ["cities_sensed", "cities_test", "cities_test_left"])
-def test_drivers_by_sensors_alone_are_trained_and_judged_without_the_state_of_the_world(
+def test_the_environments_of_sensed_drivers_do_not_use_the_state_of_the_world(
     name: str,
 ) -> None:
     sensors = load_config(name)[0].sensors
@@ -140,22 +140,22 @@ def test_drivers_by_sensors_alone_are_trained_and_judged_without_the_state_of_th
     assert not any("change_" in name and name.startswith("line") for name in features)
 
 
-def test_the_training_by_sensors_alone_has_the_sensors_of_its_environment() -> None:
-    """A run that starts from a driver has the driver's sensors, except for its settings."""
+def test_the_training_of_cities_sensed_has_the_sensors_of_its_environment() -> None:
+    """The run starts from a driver with other sensors, so its settings must change them."""
     given: Any = read_yaml(ROOT / "configs/train/cities_sensed.yaml")
     overrides = driver_keys(given["start"]) | parse_settings(given["settings"].split(","))
     sensors = load_config(given["env"], overrides=overrides)[0].sensors
     assert sensors == load_config(given["env"])[0].sensors
 
 
-def test_an_indicator_that_is_visible_near_a_junction_is_not_state_of_the_world() -> None:
+def test_indicators_near_a_junction_are_not_state_of_the_world() -> None:
     conflicts = ConflictsConfig(count=1, indicators=True, indicators_m=40.0)
     readings = readings_of(replace(OFF, conflicts=conflicts))
     assert not any(one.source == "world's state" for one in readings)
     assert any("indicators of these vehicles, up to 40 m" in one.what for one in readings)
 
 
-def test_each_sensor_says_what_it_reads() -> None:
+def test_each_sensor_lists_the_sources_of_its_features() -> None:
     config = SensorsConfig(
         lanes=LanesConfig(range_m=50.0),
         kinematics=KinematicsConfig(vehicles_count=2),
@@ -171,7 +171,7 @@ def test_each_sensor_says_what_it_reads() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(entries()))
-def test_a_card_shows_its_world(name: str) -> None:
+def test_a_card_has_a_picture_of_its_environment(name: str) -> None:
     _, base_dir = load_config(name)
     assert f"](../../docs/images/{name}.png)" in (base_dir / "README.md").read_text("utf-8")
     assert (ROOT / "docs" / "images" / f"{name}.png").stat().st_size > 5_000

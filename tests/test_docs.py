@@ -66,7 +66,7 @@ def test_the_page_of_sensors_lists_every_type_and_key() -> None:
     check_block(page, "keys", table(("of", *header), own))
 
 
-def test_the_page_of_co_simulation_draws_the_cycle() -> None:
+def test_the_drawing_of_the_cosimulation_cycle_equals_the_code() -> None:
     source = inspect.getsource(step_trace)
     meanings = dict(re.findall(r'^[A-Z]+ = "(\w+)"  # (.+)$', source, re.MULTILINE))
     nodes = [f'    {phase}["{phase}: {meanings[phase]}"]' for phase in step_trace.PHASES]
@@ -75,7 +75,7 @@ def test_the_page_of_co_simulation_draws_the_cycle() -> None:
     check_block(ROOT / "docs/guides/cosimulation.md", "cycle", "\n".join(lines))
 
 
-def test_the_comparison_with_papers_draws_the_five_layers() -> None:
+def test_the_drawing_of_the_five_layers_equals_its_table() -> None:
     page = ROOT / "docs/explanation/papers.md"
     text = page.read_text(encoding="utf-8").split("## Five layers")[1].split("\n## ")[0]
     rows = re.findall(r"^\| ([^|`]+) \| ([^|]*`[^|]*) \|", text, re.MULTILINE)
@@ -96,12 +96,12 @@ def test_the_page_of_environments_explains_every_term() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_links_between_pages_lead_somewhere(page: Path) -> None:
+def test_links_between_pages_lead_to_existing_files(page: Path) -> None:
     for target in re.findall(r"\]\((?!https?:)([^)#]+)", page.read_text(encoding="utf-8")):
         assert (page.parent / target).exists(), target
 
 
-def test_the_readme_is_one_page_and_its_first_example_runs() -> None:
+def test_the_readme_has_at_most_100_lines_and_its_example_runs() -> None:
     text = (ROOT / "README.md").read_text(encoding="utf-8")
     assert len(text.splitlines()) <= 100
     example = re.search(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
@@ -111,7 +111,7 @@ def test_the_readme_is_one_page_and_its_first_example_runs() -> None:
     assert not names["env"].agents
 
 
-def test_pages_and_errors_install_from_a_checkout() -> None:
+def test_pages_and_errors_name_an_installation_from_a_checkout() -> None:
     by_name = re.compile(r"pip install[^`\n]*\bcavmarl\[")
     texts = [*PAGES, *ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("train/*.py")]
     assert [path.name for path in texts if by_name.search(path.read_text(encoding="utf-8"))] == []
@@ -121,7 +121,7 @@ def test_pages_and_errors_install_from_a_checkout() -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_anchors_of_links_are_headings(page: Path) -> None:
+def test_anchors_of_links_exist(page: Path) -> None:
     text = page.read_text(encoding="utf-8")
     for target, anchor in re.findall(r"\]\((?!https?:)([^)#]*)#([^)]+)\)", text):
         other = page.parent / target if target else page
@@ -129,8 +129,8 @@ def test_anchors_of_links_are_headings(page: Path) -> None:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_lines_are_short(page: Path) -> None:
-    """Rows of tables and lines of code cannot be broken."""
+def test_lines_of_pages_are_short(page: Path) -> None:
+    """Rows of tables and code are exempt, because they cannot be wrapped."""
     code = False
     for number, line in enumerate(page.read_text(encoding="utf-8").splitlines(), start=1):
         code ^= line.lstrip().startswith("```")
@@ -140,15 +140,15 @@ def test_lines_are_short(page: Path) -> None:
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_pages_use_no_words_for_persons(page: Path) -> None:
-    """Pages say vehicle, zone or worker; generated blocks are not checked."""
+    """Generated blocks are not checked."""
     text = re.sub(r"<!-- [\w ]+ -->.*?<!-- end -->", "", page.read_text("utf-8"), flags=re.DOTALL)
     words = r"\b(?:nobody|somebody|anybody|everybody|whoever)\b.*"
     assert not re.findall(words, text, re.IGNORECASE)
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
-def test_files_of_code_that_a_page_names_exist(page: Path) -> None:
-    """Pages name files by path from the root, from `cavmarl/` or from the page, or by name."""
+def test_python_files_that_a_page_names_exist(page: Path) -> None:
+    """A path is relative to the root, to `cavmarl/` or to the page; a file name has no path."""
     for named in re.findall(r"`([\w./-]+\.py)`", page.read_text(encoding="utf-8")):
         if page.name == "CHANGELOG.md" or "NAME" in named or named.startswith("my_"):
             continue
@@ -185,7 +185,7 @@ def anchors_of(page: Path) -> frozenset[str]:
 
 
 def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str, str]]:
-    """Yield (key, type, unit, default, meaning) of each key of a configuration class."""
+    """Return (key, type, unit, default, meaning) for each key of a configuration class."""
     hints, rows = get_type_hints(kind), []
     meanings = {"type": ""}
     for base in reversed(kind.__mro__[:-1]):
@@ -204,7 +204,7 @@ def key_rows(kind: type[Any], prefix: str = "") -> list[tuple[str, str, str, str
 
 
 def attribute_texts(kind: type[Any]) -> dict[str, str]:
-    """Return field → description under `Attributes:` in the class's docstring, on one line."""
+    """Return the description of each field under `Attributes:` in a docstring, on one line."""
     _, _, section = (inspect.getdoc(kind) or "").partition("Attributes:\n")
     items = re.findall(r"^    (\w+): (.*(?:\n {8}.*)*)", section, re.MULTILINE)
     return {name: " ".join(text.split()).replace("|", "\\|") for name, text in items}
@@ -258,14 +258,14 @@ def default_text(value: object) -> str:
     [page for page in PAGES if page.name != "CHANGELOG.md" and page.parent.name != "decisions"],
     ids=lambda page: page.relative_to(ROOT).as_posix(),
 )
-def test_commands_of_pages_are_understood(page: Path) -> None:
-    """Each command exists, and has the options of the page."""
+def test_commands_on_pages_are_valid(page: Path) -> None:
+    """Commands on pages exist and have the given options."""
     for line in commands_of(page.read_text(encoding="utf-8")):
         check_command(line)
 
 
 def commands_of(text: str) -> list[str]:
-    """Yield calls of `cavmarl` in code, without comments and brackets around optional parts."""
+    """Return the calls of `cavmarl` in code, without redirections and optional parts."""
     blocks = re.findall(r"```(?:sh|bash|console)\n(.*?)```", text, re.DOTALL)
     lines = [line for block in blocks for line in re.sub(r"\\\n\s*", " ", block).splitlines()]
     lines += [re.sub(r"\s+", " ", inline) for inline in re.findall(r"`(cavmarl [^`]+)`", text)]

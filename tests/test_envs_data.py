@@ -32,7 +32,7 @@ def test_the_folder_has_the_name_of_its_environment(folder: Path) -> None:
 
 
 @each_folder
-def test_the_map_can_be_driven_and_has_the_edges_that_are_named(folder: Path) -> None:
+def test_the_map_can_be_driven_and_has_the_configured_edges(folder: Path) -> None:
     config, base_dir = load_config(folder.name)
     map_paths = maps_or_skip(config, base_dir)
     assert all(check_map(path).drivable for path in map_paths)
@@ -49,7 +49,7 @@ def test_the_card_agrees_with_the_configuration(folder: Path) -> None:
     text = card.read_text(encoding="utf-8")
     assert f'cavmarl.parallel_env("{config.name}")' in text
     assert re.search(rf"## Versions\n\n- {config.version}: ", text), (
-        "the newest version comes first"
+        "the card does not begin with this version"
     )
 
 

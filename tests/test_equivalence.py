@@ -1,4 +1,4 @@
-"""A divided world equals the undivided one bit for bit at each step, as a user sees it."""
+"""Divided worlds equal the undivided world bit for bit, compared through the public interface."""
 
 from __future__ import annotations
 
@@ -30,12 +30,12 @@ from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, rerouter, writ
 from tests.support.world import traffic_of
 
 ZONES = (2, 3, 4, 9)
-# The built-in driver with noise: some vehicles collide or leave the road, and are replaced.
-TREMBLING = """
+# The built-in driver with noise, so that some vehicles collide or leave the road.
+NOISY_DRIVER = """
 import numpy as np
 from cavmarl.policies.policy import Policy
 
-class Trembling(Policy):
+class NoisyDriver(Policy):
     def reset(self, seed=None):
         self.random = np.random.default_rng(seed)
 
@@ -44,7 +44,7 @@ class Trembling(Policy):
         return np.clip(actions + self.random.normal(0.0, 0.3, actions.shape), -1.0, 1.0)
 
 def make_policy(env):
-    return Trembling(env)
+    return NoisyDriver(env)
 """
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 SENSORS = {
@@ -55,14 +55,14 @@ SENSORS = {
 
 
 @pytest.fixture(scope="module")
-def trembling(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    path = tmp_path_factory.mktemp("policy") / "trembling.py"
-    path.write_text(TREMBLING, encoding="utf-8")
+def noisy_driver(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("policy") / "noisy_driver.py"
+    path.write_text(NOISY_DRIVER, encoding="utf-8")
     return path
 
 
-def equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
-    """Run `verify_zones`; check that all divisions are equal, with enough crossings of borders."""
+def check_equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
+    """Check with `verify_zones` that divided worlds are equal and vehicles cross borders."""
     overrides = FAST | dict(settings.pop("overrides", {}))
     found = verify_zones(env, settings.pop("zones", ZONES), overrides=overrides, **settings)
     for result in found.results:
@@ -74,7 +74,7 @@ def equal(env: str | Path, *, crossings: int, **settings: Any) -> Equivalence:
 
 @dataclass(frozen=True)
 class Case:
-    """Settings of worlds to divide."""
+    """Settings of a comparison."""
 
     env: str
     overrides: Mapping[str, Any] = field(default_factory=dict)
@@ -105,13 +105,13 @@ CASES = {
 
 
 @pytest.mark.parametrize("name", CASES)
-def test_results_of_agents_do_not_depend_on_zones(name: str, trembling: Path) -> None:
+def test_results_of_agents_do_not_depend_on_zones(name: str, noisy_driver: Path) -> None:
     case = CASES[name]
-    equal(
+    check_equal(
         case.env,
         crossings=10,
         zones=case.zones,
-        policy="random_actions" if name in ("meta-actions", "grid of actions") else trembling,
+        policy="random_actions" if name in ("meta-actions", "grid of actions") else noisy_driver,
         worlds=case.worlds,
         steps=case.steps,
         seed=case.seed,
@@ -121,13 +121,17 @@ def test_results_of_agents_do_not_depend_on_zones(name: str, trembling: Path) ->
 
 @pytest.mark.parametrize("avoid", [False, True])
 @pytest.mark.parametrize("layout", ["grid", "strips", "bisection"])
-def test_cuts_may_lie_anywhere(layout: str, avoid: bool, trembling: Path) -> None:
+def test_results_do_not_depend_on_the_layout_of_zones(
+    layout: str, avoid: bool, noisy_driver: Path
+) -> None:
     overrides = {"population.background": 90, "zones.avoid_junctions": avoid}
-    equal("grid4x4", crossings=10, layout=layout, policy=trembling, steps=40, overrides=overrides)
+    check_equal(
+        "grid4x4", crossings=10, layout=layout, policy=noisy_driver, steps=40, overrides=overrides
+    )
 
 
-def test_zones_of_a_file_can_be_as_narrow_as_cars(tmp_path: Path) -> None:
-    # Cuts along a junction and through it, and zones that a car crosses in a second.
+def test_results_do_not_depend_on_narrow_zones_of_a_file(tmp_path: Path) -> None:
+    # Cuts beside and through a junction; a car crosses one of the zones in a second.
     low_x, low_y, high_x, high_y = load_network(find_map("grid4x4")).extent_m
     middle_x, middle_y = 0.5 * (low_x + high_x), 0.5 * (low_y + high_y)
     cuts = [low_x - 9.0, middle_x - 8.0, middle_x, middle_x + 8.0, high_x + 9.0]
@@ -140,38 +144,40 @@ def test_zones_of_a_file_can_be_as_narrow_as_cars(tmp_path: Path) -> None:
     path = tmp_path / "zones.json"
     write_zones(path, ZonePartition(bounds, np.array(rects)))
     overrides = {"population.background": 90}
-    found = equal("grid4x4", crossings=20, zones=None, layout=path, steps=40, overrides=overrides)
+    found = check_equal(
+        "grid4x4", crossings=20, zones=None, layout=path, steps=40, overrides=overrides
+    )
     assert [result.zones for result in found.results] == [8]
 
 
-def test_actuated_signals_switch_as_in_one_zone(tmp_path: Path) -> None:
-    equal(actuated_grid(tmp_path), crossings=20, zones=(4, 9), steps=60)
+def test_actuated_signals_do_not_depend_on_zones(tmp_path: Path) -> None:
+    check_equal(actuated_grid(tmp_path), crossings=20, zones=(4, 9), steps=60)
 
 
 def test_a_real_map_with_its_demand_does_not_depend_on_zones(
-    shared_maps: Path, trembling: Path
+    shared_maps: Path, noisy_driver: Path
 ) -> None:
     folder = shared_maps / "net" / "mcity"
     demand = [str(folder / "mcity.rou.xml"), str(folder / "mcity.add.xml")]
-    equal(
+    check_equal(
         folder / "mcity.net.xml",
         crossings=20,
         zones=(4, 9),
-        policy=trembling,
+        policy=noisy_driver,
         steps=60,
         overrides={"traffic.demand": demand, "population.mode": "respawn"},
     )
 
 
-def same(one: StepResult, other: StepResult) -> None:
+def check_same_results(one: StepResult, other: StepResult) -> None:
     for mine, theirs in zip(one[:4], other[:4], strict=True):
         np.testing.assert_array_equal(mine, theirs)
     for key, array in one[4].items():
         np.testing.assert_array_equal(array, other[4][key], err_msg=key)
 
 
-def test_worlds_reset_independently() -> None:
-    # Agents that are alone in their world leave the road at different times.
+def test_autoresets_of_worlds_do_not_depend_on_zones() -> None:
+    # Each world has one agent, which ends the episode by leaving the road at its own time.
     settings: dict[str, Any] = {
         "num_envs": 4,
         "agents": 1,
@@ -186,7 +192,7 @@ def test_worlds_reset_independently() -> None:
         np.testing.assert_array_equal(actions, divided.suggest_actions())
         actions[step % 15 // 4 :, 0] = 1.0  # full throttle, full steering
         results = [vec.step(actions) for vec in (whole, divided)]
-        same(*results)
+        check_same_results(*results)
         over = results[0][4]["episode_over"]
         alone += over.any() and not over.all()
         for world in range(4):
@@ -195,7 +201,7 @@ def test_worlds_reset_independently() -> None:
     assert alone > 3
 
 
-def test_dicts_and_the_global_state_are_equal() -> None:
+def test_results_of_parallel_environments_do_not_depend_on_zones() -> None:
     settings: dict[str, Any] = {"agents": 6, "overrides": {"population.mode": "respawn"} | FAST}
     whole, divided = (parallel_env("merge", zones=zones, **settings) for zones in (1, 4))
     (seen, infos), (other_seen, other_infos) = (env.reset(seed=4) for env in (whole, divided))
@@ -215,8 +221,8 @@ def test_dicts_and_the_global_state_are_equal() -> None:
         assert whole.state_hash() == divided.state_hash()
 
 
-# Worlds of demand files alone have no agents, and so no public view: their hashes are compared.
-def hashes_agree(
+# Worlds without agents have no observations, so compare the hashes of their states.
+def check_equal_hashes(
     build: Callable[[dict[str, Any]], Simulation], steps: int, zones: tuple[int, ...] = ZONES
 ) -> Simulation:
     whole, *divided = (build({"zones.count": count}) for count in (1, *zones))
@@ -234,8 +240,8 @@ def hashes_agree(
 
 
 @pytest.mark.parametrize("env", ["merge", "grid4x4"])
-def test_departures_of_a_demand_do_not_depend_on_zones(env: str, tmp_path: Path) -> None:
-    whole = hashes_agree(lambda zones: tiny(env, tmp_path, overrides=FAST | zones), 350)
+def test_departures_of_demand_do_not_depend_on_zones(env: str, tmp_path: Path) -> None:
+    whole = check_equal_hashes(lambda zones: tiny(env, tmp_path, overrides=FAST | zones), 350)
     assert whole.traffic_stats().departed > 30
 
 
@@ -247,18 +253,18 @@ def test_the_capacity_of_a_world_does_not_depend_on_zones(tmp_path: Path) -> Non
         vars(traffic_of(simulation))["capacity"] = most
         return simulation
 
-    whole = hashes_agree(build, 150, (2, 4))
+    whole = check_equal_hashes(build, 150, (2, 4))
     assert whole.traffic_stats().running == most
     assert whole.traffic_stats().waiting > 5
 
 
-def test_rerouted_vehicles_find_the_same_routes(tmp_path: Path) -> None:
+def test_routes_of_rerouted_vehicles_do_not_depend_on_zones(tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(
         tmp_path, CARS.format(device=DEVICE) + FLOW, rerouter('<closingReroute id="narrow"/>')
     )
     clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
-    whole = hashes_agree(
+    whole = check_equal_hashes(
         lambda zones: make(net, files, num_worlds=2, overrides=clock | zones), 200, (2, 4)
     )
     assert whole.traffic_stats().rerouted > 20
@@ -282,7 +288,7 @@ BEHIND_THE_LAST = """<routes>
 </routes>"""
 
 
-def test_a_departure_behind_a_far_last_vehicle_enters_once(tmp_path: Path) -> None:
+def test_a_departure_behind_the_last_vehicle_does_not_depend_on_zones(tmp_path: Path) -> None:
     # The zone at the end of the road decides the position; another zone has the last vehicle.
     on_a_long_road(tmp_path, BEHIND_THE_LAST)
 
@@ -291,7 +297,9 @@ def on_a_long_road(tmp_path: Path, routes: str) -> Simulation:
     road, demand = tmp_path / "long.net.xml", tmp_path / "x.rou.xml"
     road.write_text(LONG_ROAD, encoding="utf-8")
     demand.write_text(routes, encoding="utf-8")
-    return hashes_agree(lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4))
+    return check_equal_hashes(
+        lambda zones: make(road, [demand], overrides=FAST | zones), 300, (2, 4)
+    )
 
 
 TURNING_ROUND = """<routes>
@@ -310,13 +318,13 @@ FROM_DEAD_ENDS = (
 @pytest.mark.parametrize(
     ("grid", "buses", "cars"),
     [
-        # Departures at the starts of lanes in the middle of the map look at vehicles on junctions.
+        # Departures at the start of a lane behind a junction depend on vehicles on the junction.
         ("--grid.number=3 -j=allway_stop", TURNS, (*TURNS, *BETWEEN)),
-        # At dead ends, vehicles enter where no link leads; before left turns, they wait inside.
+        # At dead ends, vehicles depart on lanes to which no link leads. Left turns wait.
         ("--grid.number=2 --grid.attach-length=90 -j=priority", AT_DEAD_ENDS, FROM_DEAD_ENDS),
     ],
 )
-def test_turning_buses_have_the_same_effects_in_all_divisions(
+def test_effects_of_turning_buses_do_not_depend_on_zones(
     tmp_path: Path, grid: str, buses: tuple[str, ...], cars: tuple[str, ...]
 ) -> None:
     options = ("--grid", "--grid.length=110", "-L=2", *grid.split())
@@ -330,16 +338,18 @@ def test_turning_buses_have_the_same_effects_in_all_divisions(
     )
     demand = tmp_path / "turns.rou.xml"
     demand.write_text(TURNING_ROUND.format(flows=flows), encoding="utf-8")
-    whole = hashes_agree(lambda zones: make(net, [demand], overrides=FAST | zones), 500)
+    whole = check_equal_hashes(lambda zones: make(net, [demand], overrides=FAST | zones), 500)
     assert whole.traffic_stats().departed > 100
 
 
 @pytest.mark.parametrize("narrow", [zipper, signal_pair])
-def test_narrow_places_have_the_same_traffic_in_all_divisions(
+def test_traffic_at_narrow_places_does_not_depend_on_zones(
     narrow: Callable[[Path], tuple[Path, Path]], tmp_path: Path
 ) -> None:
     net, routes = narrow(tmp_path)
-    whole = hashes_agree(lambda zones: make(net, [routes], overrides=FAST | zones), 400, (2, 4))
+    whole = check_equal_hashes(
+        lambda zones: make(net, [routes], overrides=FAST | zones), 400, (2, 4)
+    )
     assert whole.traffic_stats().departed > 20
 
 
@@ -351,22 +361,22 @@ SLOW_AT_THE_START = """<routes>
 </routes>"""
 
 
-def test_the_mean_speed_of_a_departure_behind_the_last_vehicle_does_not_depend_on_zones(
+def test_the_speed_of_a_departure_behind_the_last_vehicle_does_not_depend_on_zones(
     tmp_path: Path,
 ) -> None:
-    # The zone at the end does not have the slow vehicles that enter at the start.
+    # The slow vehicles that enter at the start are in another zone than the departure.
     assert on_a_long_road(tmp_path, SLOW_AT_THE_START).traffic_stats().departed > 5
 
 
-def test_solid_lines_hold_in_every_zone(tmp_path: Path) -> None:
+def test_lane_changes_at_solid_lines_do_not_depend_on_zones(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "grid.net.xml", "--grid", "--grid.number", "3", "-L", "2")
     barred = re.sub(r'(id="[AC][0-2][A-C][0-2]_0")', r'\1 changeLeft="bus"', path.read_text())
     path.write_text(re.sub(r'(id="B[0-2][A-C][0-2]_1")', r'\1 changeRight="bus"', barred))
-    equal(path, zones=(2, 4), steps=60, crossings=20, overrides={"population.background": 60})
+    check_equal(path, zones=(2, 4), steps=60, crossings=20, overrides={"population.background": 60})
 
 
 @pytest.mark.parametrize("halo_m", [0.0, 12.0])
-def test_a_halo_that_is_too_narrow_is_detected(
+def test_verify_zones_finds_the_difference_of_a_halo_that_is_too_narrow(
     halo_m: float, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: halo_m)

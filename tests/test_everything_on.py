@@ -1,4 +1,4 @@
-"""With all sensors and messages, a divided world equals the undivided one, also in a scenario."""
+"""Divided worlds with all sensors and messages equal the undivided world."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ EVERYTHING: dict[str, Any] = {
 CROWD = {"population.mode": "respawn", "population.agents": 4, "population.background": 80}
 
 
-def test_every_type_of_sensor_is_on() -> None:
+def test_the_settings_have_every_type_of_sensor() -> None:
     rig = make_vec("grid4x4", overrides=EVERYTHING).config.rig
     assert {type(sensor) for sensor in rig.values()} == set(TYPES)
 
@@ -68,18 +68,18 @@ def check_zones(env: str | Path, overrides: dict[str, Any], steps: int, crossing
     assert sum(result.crossings for result in found.results) >= crossings
 
 
-def test_all_sensors_in_native_traffic() -> None:
+def test_a_divided_world_with_all_sensors_equals_the_undivided_one() -> None:
     check_zones("grid4x4", EVERYTHING | CROWD, 20, 20)
 
 
 @pytest.mark.parametrize("name", ["pedestrian_crossing", "unprotected_left_turn"])
-def test_all_sensors_in_a_scenario(name: str) -> None:
+def test_a_divided_scenario_with_all_sensors_equals_the_undivided_one(name: str) -> None:
     alone = {"population.agents": 1, "population.background": 20, "scenario.name": name}
     check_zones("grid4x4", EVERYTHING | alone, 20, 5)
 
 
 @pytest.mark.parametrize("worlds", [1, 2])
-def test_all_sensors_over_two_workers(worlds: int) -> None:
+def test_results_of_all_sensors_do_not_depend_on_workers(worlds: int) -> None:
     alone, shared = (
         make_vec("grid4x4", num_envs=worlds, zones=2, workers=workers, overrides=EVERYTHING | CROWD)
         for workers in (0, 2)

@@ -1,4 +1,4 @@
-"""The notebooks of `examples/` equal the scripts beside them, and run cell by cell."""
+"""The notebooks of `examples/` equal the scripts beside them, and their cells run."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SCRIPTS = scripts()
 
 each = pytest.mark.parametrize("script", SCRIPTS, ids=lambda path: path.stem)
 
-# Run the code cells of a notebook one after the other, like Jupyter's "run all".
+# Run all code cells of a notebook in order.
 RUN = """\
 import json, sys
 shared = {"__name__": "__main__"}
@@ -45,7 +45,7 @@ def test_a_notebook_equals_its_script(script: Path) -> None:
 
 
 @each
-def test_a_notebook_shows_the_output_of_each_cell_that_prints(script: Path) -> None:
+def test_a_notebook_has_the_output_of_each_cell_that_prints(script: Path) -> None:
     made = json.loads(script.with_suffix(".ipynb").read_text(encoding="utf-8"))
     for cell in made["cells"]:
         if cell["cell_type"] == "code":

@@ -1,4 +1,4 @@
-"""The extras of `pyproject.toml`: errors name existing extras, and `all` includes all tasks."""
+"""The extras in `pyproject.toml`, and the errors and pages that name them."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from cavmarl.core.errors import MissingExtraError, missing, require_all
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-# The packages of these extras conflict with other libraries, do not run on each machine, or bring
-# clients of services that few users have (`trackers`, `cluster`).
+# The extra `all` does not include these extras. Their packages conflict with other packages, do not
+# run on each machine, or are clients of services that few users have (`trackers`, `cluster`).
 APART = {"benchmarl", "rllib", "lanelet2", "trackers", "cluster"}
 TOOLS = {"all", "bench", "dev", "fuzz"}
 
 
 def named_extras() -> Iterator[tuple[str, str]]:
-    """Yield (extra, file) of each call of `require` or `missing`."""
+    """Yield (extra, file) for each call of `require` or `missing`."""
     for folder in ("cavmarl", "benchmarks", "docs", "train"):
         for path in sorted((ROOT / folder).rglob("*.py")):
             for node in ast.walk(ast.parse(path.read_bytes())):
@@ -35,13 +35,13 @@ def named_extras() -> Iterator[tuple[str, str]]:
                         yield str(extra.value), path.relative_to(ROOT).as_posix()
 
 
-def reached(extra: str) -> set[str]:
-    """Return an extra, and the extras of cavmarl that it includes."""
+def included_extras(extra: str) -> set[str]:
+    """Return an extra and all extras that it includes."""
     found = {extra}
     for line in EXTRAS[extra]:
         need = Requirement(line)
         if need.name == "cavmarl":
-            found = found.union(*map(reached, need.extras))
+            found = found.union(*map(included_extras, need.extras))
     return found
 
 
@@ -52,7 +52,7 @@ def test_errors_name_existing_extras() -> None:
 
 
 def extras_of_pages() -> Iterator[tuple[str, str]]:
-    """Yield (extra, file) of each extra that a page or a program tells the reader to install."""
+    """Yield (extra, file) for each extra that a page or a program names for installation."""
     pages = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").rglob("*.md")]
     for path in (*pages, *(ROOT / "examples").rglob("*.*"), *(ROOT / "train").rglob("*.py")):
         text = path.read_text(encoding="utf-8", errors="ignore")
@@ -68,16 +68,16 @@ def test_pages_name_existing_extras() -> None:
     assert not [(extra, file) for extra, file in named if extra not in EXTRAS]
 
 
-def test_all_has_each_task_whose_packages_fit_together() -> None:
-    assert reached("all") == set(EXTRAS) - APART - TOOLS | {"all"}
+def test_the_extra_all_includes_all_extras_without_conflicts() -> None:
+    assert included_extras("all") == set(EXTRAS) - APART - TOOLS | {"all"}
 
 
 @pytest.mark.parametrize("extra", ["all", "bench"])
-def test_the_extra_dev_includes_all_and_the_compared_libraries(extra: str) -> None:
-    assert extra in reached("dev")
+def test_the_extra_dev_includes_the_extras_all_and_bench(extra: str) -> None:
+    assert extra in included_extras("dev")
 
 
-def test_all_missing_modules_are_named_at_once(
+def test_one_error_names_all_missing_modules(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -90,6 +90,8 @@ def test_all_missing_modules_are_named_at_once(
         require_all({"no_torch": "train"})
 
 
-def test_a_wheel_is_extended_by_its_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_of_an_installed_wheel_names_cavmarl_as_the_package(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("cavmarl.core.errors.__file__", "/site-packages/cavmarl/core/errors.py")
     assert "pip install 'cavmarl[train]'" in str(missing("torch", "train"))

@@ -1,4 +1,4 @@
-"""Each environment in each population mode, and bare maps, pass the tests of PettingZoo."""
+"""All environments and some bare maps pass the tests of PettingZoo in each population mode."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.config.registry import entries
 from cavmarl.env.parallel import CavEnv
 
 with warnings.catch_warnings():
-    # PettingZoo's tests import its own environments in a deprecated way.
+    # PettingZoo's test module imports environments in a deprecated way.
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import (
         api_test,
@@ -34,10 +34,10 @@ Make = Callable[..., Any]
 
 
 def worlds(*often: str, modes: tuple[str, ...] = MODES, bare: tuple[str, ...] = BARE_MAPS) -> Any:
-    """Parametrize a test by environment and mode; modes of entries in `often` are never slow.
+    """Return a mark that parametrizes a test by environment and population mode.
 
-    Each environment is tested in its first mode in every run of the tests; other modes behave alike
-    on all maps, which `test_parallel_api` shows for each mode.
+    The first mode, and all modes of the environments in `often`, are in every run of the tests. The
+    other variants are slow tests.
     """
     return pytest.mark.parametrize(
         "arguments",
@@ -59,13 +59,13 @@ in_few_worlds = worlds("grid4x4", "merge")
 
 @pytest.fixture
 def arguments(request: pytest.FixtureRequest) -> dict[str, Any]:
-    """Return the arguments of `parallel_env`: a small population of each mode, short episodes."""
+    """Return arguments of `parallel_env` for a small population and short episodes."""
     source, mode = request.param
     if source in BARE_MAPS:
         source = request.getfixturevalue("shared_maps") / source
     return {
         "env": source,
-        "agents": 1 if source == "ring22" else 3,  # ring22 has room for one agent among 21 vehicles
+        "agents": 1 if source == "ring22" else 3,  # no room for more
         "background": 6,
         "seed": 0,
         "max_cycles": STEPS,
@@ -84,14 +84,14 @@ def make_aec(arguments: dict[str, Any]) -> Make:
     return partial(cavmarl.env, arguments.pop("env"), **arguments)
 
 
-# An episode ends at its horizon, even if some declared agents have not entered.
+# An episode can end before all possible agents have entered.
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
 @worlds(*sorted(entries()), *BARE_MAPS)
 def test_parallel_api(make: Make) -> None:
     parallel_api_test(make(), num_cycles=STEPS)
 
 
-# A seat that waits for a vehicle observes zeros.
+# An agent without a vehicle observes zeros.
 @pytest.mark.filterwarnings("ignore:Observation numpy array is all zeros")
 @in_few_worlds
 def test_aec_api(make_aec: Make) -> None:
@@ -100,8 +100,8 @@ def test_aec_api(make_aec: Make) -> None:
 
 @in_few_worlds
 def test_max_cycles(arguments: dict[str, Any], make: Make, make_aec: Make) -> None:
-    # The test needs most possible agents to act until the end, so all must have entered, and random
-    # actions must not lead off the road in a few steps.
+    # PettingZoo's test expects most possible agents to act until the end. So all agents enter at
+    # the reset, and small steering angles keep them on the road.
     few = {"population.budget": arguments["agents"], "action.steering_rad": 0.05}
     whole = {**arguments["overrides"], **few}
     max_cycles_test(
@@ -116,7 +116,7 @@ def test_state(make: Make, make_aec: Make) -> None:
     state_test(make_aec(), make(), num_cycles=STEPS)
 
 
-@worlds(bare=())  # drawing does not depend on the population mode
+@worlds(bare=())  # without bare maps
 def test_render(make_aec: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame", reason="frames need the extra 'render'")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
@@ -127,7 +127,7 @@ Step = tuple[Any, ...]
 
 
 def episode(env: CavEnv, seed: int, actions_seed: int = 0) -> Iterator[Step]:
-    """Yield all results of an episode of random actions, step by step."""
+    """Yield all results of each step of an episode with random actions."""
     rng = np.random.default_rng(actions_seed)
     observations, infos = env.reset(seed=seed)
     yield observations, {}, {}, {}, infos, env.state(), env.state_hash()
@@ -150,7 +150,7 @@ def assert_equal(one: Step, other: Step, where: str) -> None:
 
 
 @in_few_worlds
-def test_the_seed_decides_every_step(make: Make) -> None:
+def test_episodes_with_equal_seeds_are_equal(make: Make) -> None:
     fresh, used = make(), make()
     for _ in episode(used, seed=99, actions_seed=1):
         pass
@@ -161,14 +161,14 @@ def test_the_seed_decides_every_step(make: Make) -> None:
         assert_equal(one, other, f"step {steps}")
     assert steps > 5
     hashes = [step[-1] for step in episode(fresh, seed=4)]
-    assert hashes == [step[-1] for step in episode(used, seed=4)], "a second episode of one seed"
+    assert hashes == [step[-1] for step in episode(used, seed=4)], "the second episode differs"
     assert len(set(hashes)) == len(hashes)
     others = [step[-1] for step in episode(fresh, seed=5)]
-    assert not set(hashes) & set(others), "another seed gives another world"
+    assert not set(hashes) & set(others), "another seed gives the same state"
 
 
 @in_few_worlds
-def test_resets_without_a_seed_continue_a_repeatable_sequence(make: Make) -> None:
+def test_resets_without_a_seed_follow_from_the_last_seed(make: Make) -> None:
     env = make()
     runs = []
     for seed in (7, None, None, 7, None):

@@ -1,4 +1,4 @@
-"""Packages of an installation: the page lists their licences, and locked files have hashes."""
+"""The table of licences has all installed packages, and `hashes.txt` fits the constraints."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.generated import check_block
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_the_page_has_the_licence_of_each_package() -> None:
+def test_the_table_of_licences_has_each_installed_package() -> None:
     rows = list(licences())
     if not {"ray", "torchrl", "stable-baselines3"} <= {name for name, *_ in rows}:
         pytest.skip("an installation of less than cavmarl[dev]: `make test` has all of it")
@@ -22,7 +22,7 @@ def test_the_page_has_the_licence_of_each_package() -> None:
     check_block(ROOT / "docs" / "reference" / "licences.md", "licences", "\n".join(lines))
 
 
-def test_each_locked_file_has_the_version_of_the_constraints() -> None:
+def test_the_versions_with_hashes_equal_the_constraints() -> None:
     exact = dict(
         line.lower().replace("_", "-").split("==")
         for line in (ROOT / "constraints/exact.txt").read_text().splitlines()

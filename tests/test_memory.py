@@ -30,7 +30,7 @@ pytestmark = pytest.mark.skipif(not STATM.exists(), reason="memory is read from 
 
 @pytest.fixture(params=["closed", "open", "respawn", "demand"])
 def world(request: pytest.FixtureRequest, tmp_path: Path) -> dict[str, Any]:
-    """Return the arguments of a world of each population mode, and of a world with demand."""
+    """Return the arguments of a world with this population mode, or with demand."""
     overrides: dict[str, Any] = {"population.mode": request.param}
     if request.param == "demand":
         path = tmp_path / "x.rou.xml"
@@ -44,7 +44,7 @@ def resident_mb() -> float:
 
 
 def growth_mb(work: Callable[[], object], times: int) -> float:
-    """Return the growth of the process by `times` calls, after a tenth of them as warm-up."""
+    """Return the growth of the process in `times` calls, measured after a warm-up."""
     for _ in range(times // 10):
         work()
     before = resident_mb()
@@ -54,7 +54,7 @@ def growth_mb(work: Callable[[], object], times: int) -> float:
 
 
 @pytest.mark.slow
-def test_a_thousand_resets(world: dict[str, Any]) -> None:
+def test_memory_does_not_grow_in_a_thousand_resets(world: dict[str, Any]) -> None:
     env = parallel_env(**world)
 
     def episode() -> None:
@@ -67,7 +67,7 @@ def test_a_thousand_resets(world: dict[str, Any]) -> None:
 
 
 @pytest.mark.slow
-def test_a_million_agent_steps(world: dict[str, Any]) -> None:
+def test_memory_does_not_grow_in_a_million_agent_steps(world: dict[str, Any]) -> None:
     vec = make_vec(**world, num_envs=8)
     _, infos = vec.reset()
     acted = int(infos["mask"].sum())
@@ -79,12 +79,12 @@ def test_a_million_agent_steps(world: dict[str, Any]) -> None:
 
     number = AGENT_STEPS // (vec.num_envs * world["agents"])
     assert growth_mb(step, number) < GROWTH_MB
-    assert acted > AGENT_STEPS // 10, "too few agents drove for a meaningful test"
+    assert acted > AGENT_STEPS // 10, "too few decisions of agents"
 
 
 @pytest.mark.slow
-def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
-    # Run divided and undivided worlds: they are equal after each step, and memory does not grow.
+def test_memory_does_not_grow_in_a_hundred_thousand_ticks_of_a_divided_city() -> None:
+    # Two divided worlds and the undivided one run step by step.
     step_ticks = load_config("rush")[0].clock.ticks_per_step
     steps = CITY_TICKS // step_ticks
     memory_mb: list[float] = []
@@ -101,15 +101,15 @@ def test_a_hundred_thousand_ticks_of_a_divided_city() -> None:
 
 
 @pytest.mark.slow
-def test_a_thousand_worlds_made() -> None:
+def test_memory_does_not_grow_while_a_thousand_worlds_are_made() -> None:
     def make() -> None:
         parallel_env("ring", agents=2, background=2, seed=0).reset()
 
     assert growth_mb(make, 1000) < GROWTH_MB
 
 
-def test_a_hundred_resets_of_divided_worlds() -> None:
-    """The short variant, which is part of every run of the tests."""
+def test_memory_does_not_grow_in_a_hundred_resets_of_divided_worlds() -> None:
+    """This is the short variant of `test_memory_does_not_grow_in_a_thousand_resets`."""
     vec = make_vec("grid4x4", num_envs=2, zones=4, agents=8, background=20, seed=0)
 
     def episode() -> None:
@@ -119,5 +119,5 @@ def test_a_hundred_resets_of_divided_worlds() -> None:
 
     vec.reset()
     while not vec.step(vec.suggest_actions())[4]["vehicle_done"].any():
-        pass  # kernels for new vehicles are loaded at the first end of a trip
+        pass  # the first end of a trip loads kernels
     assert growth_mb(episode, 100) < GROWTH_MB / 5

@@ -1,4 +1,4 @@
-"""Any input either works, or raises an error of cavmarl and changes nothing."""
+"""Random input either works, or raises an error of cavmarl and changes nothing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ NUMBERS = [0.0, 1e-9, 0.001, 0.05, 0.1, 0.2, 0.5, 1.0, 2.0, 10.0, 60.0, 300.0, 3
 
 
 def values(hint: Any) -> st.SearchStrategy[Any]:
-    """Draw values of the type of a field, also likely limits."""
+    """Return a strategy for values of a field's type, with likely limits among them."""
     origin, arguments = get_origin(hint), get_args(hint)
     if origin is Literal:
         return st.sampled_from(arguments)
@@ -68,7 +68,7 @@ def values(hint: Any) -> st.SearchStrategy[Any]:
 
 
 def settings_of(kind: type[Any], prefix: str = "") -> dict[str, st.SearchStrategy[Any]]:
-    """Return dotted key → strategy of values, for each key of `EnvConfig`."""
+    """Return a strategy for the values of each dotted key of a configuration class."""
     found: dict[str, st.SearchStrategy[Any]] = {}
     hints = get_type_hints(kind)
     for field in fields(kind):
@@ -95,7 +95,7 @@ SMALL = {"population.agents": 2, "population.background": 2}
 @settings(max_examples=150, deadline=None, suppress_health_check=list(HealthCheck))
 @given(pairs=st.lists(NEAR | NEAR | NEAR | STRANGE, min_size=1, max_size=3))
 def test_any_configuration_is_a_world_or_is_refused(pairs: list[tuple[str, Any]]) -> None:
-    with TemporaryDirectory() as room, chdir(room):  # a journal may be written there
+    with TemporaryDirectory() as room, chdir(room):  # journals are written there
         try:
             env = parallel_env("ring", seed=0, overrides=SMALL | dict(pairs))
             observations, _ = env.reset()

@@ -1,4 +1,4 @@
-"""The names and the cost of `import cavmarl`."""
+"""Public names, and the duration of `import cavmarl`."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ print(json.dumps([share, sorted(name.split(".")[0] for name in sys.modules)]))
 
 @pytest.fixture(scope="module")
 def imported() -> tuple[float, set[str]]:
-    """Return the cost of `import cavmarl` beyond that of its libraries, and the loaded packages.
+    """Return the cost of `import cavmarl` without its libraries, and the imported packages.
 
-    The cost is processor time in s, the least of three new processes.
+    The cost is the least processor time of three new processes, in s.
     """
     runs = []
     for _ in range(3):
@@ -51,13 +51,13 @@ def test_the_import_is_quick(imported: tuple[float, set[str]]) -> None:
 
 
 @pytest.mark.parametrize("package", LATE)
-def test_optional_and_heavy_packages_are_loaded_when_they_are_needed(
+def test_import_cavmarl_does_not_import_optional_and_heavy_packages(
     imported: tuple[float, set[str]], package: str
 ) -> None:
     assert package not in imported[1]
 
 
-def test_all_lists_the_public_names_in_order() -> None:
+def test_all_is_sorted_and_its_names_exist() -> None:
     constants, classes = str.isupper, str.istitle
     assert cavmarl.__all__ == sorted(
         cavmarl.__all__, key=lambda name: (not constants(name), not classes(name[0]), name)
@@ -75,7 +75,7 @@ def test_all_lists_the_public_names_in_order() -> None:
         assert getattr(cavmarl, name) is not None
 
 
-def test_the_function_is_not_hidden_by_the_folder_of_its_name() -> None:
+def test_the_function_env_is_not_hidden_by_the_folder_env() -> None:
     probe = (
         "import pickle, cavmarl, cavmarl.env.vector\n"
         "assert callable(cavmarl.env), cavmarl.env\n"
@@ -84,7 +84,7 @@ def test_the_function_is_not_hidden_by_the_folder_of_its_name() -> None:
     subprocess.run([sys.executable, "-c", probe], cwd=ROOT, check=True)
 
 
-def test_names_in_the_readme_exist() -> None:
+def test_the_functions_of_the_readme_exist() -> None:
     for name in ("parallel_env", "env", "raw_env", "make_vec", "load_policy"):
         assert name in cavmarl.__all__
         assert callable(getattr(cavmarl, name))

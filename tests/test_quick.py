@@ -1,4 +1,4 @@
-"""`make quick` runs at least the closest test file, and fails if no test ran."""
+"""`make quick` runs at least the first test file, and fails if no test ran."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ pytest_plugins = ["pytester"]
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_when_time_is_over_only_the_first_file_runs(pytester: pytest.Pytester) -> None:
+def test_after_the_time_limit_only_the_first_file_runs(pytester: pytest.Pytester) -> None:
     first = pytester.makepyfile(test_b="def test_one(): pass\ndef test_two(): pass\n")
     second = pytester.makepyfile(test_a="def test_three(): pass\n")
     count = RunCount()

@@ -1,4 +1,4 @@
-"""The motion models against highway-env's own objects, on its own roads."""
+"""The motion models, compared with those of highway-env on its roads."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 with warnings.catch_warnings():
-    # pygame warns on import about a deprecated package that it uses.
+    # pygame uses a deprecated package.
     warnings.simplefilter("ignore", DeprecationWarning)
     warnings.simplefilter("ignore", UserWarning)
     pytest.importorskip("highway_env", reason="needs the extra 'bench'")
@@ -30,7 +30,7 @@ from tests.naive.kinematics import clip_control
 IDM_DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADWAY_S)
 
 
-def test_defaults_equal_highway_env() -> None:
+def test_default_parameters_equal_those_of_highway_env() -> None:
     assert IDMVehicle.COMFORT_ACC_MAX == idm.ACCEL_MAX
     assert -IDMVehicle.COMFORT_ACC_MIN == idm.DECEL_COMFORT
     assert IDMVehicle.DISTANCE_WANTED == idm.JAM_DISTANCE_M
@@ -67,11 +67,11 @@ def test_the_bicycle_model_equals_that_of_highway_env(seed: int) -> None:
         )
         assert [x, y, speed] == pytest.approx([*theirs.position, theirs.speed], rel=0, abs=1e-12)
         assert abs(wrap_angle(heading - theirs.heading)) < 1e-12
-        # Restart from equal bits: rounding may differ in a tick, but must not accumulate.
+        # Continue from equal numbers, so that differences of rounding do not add up.
         (x, y), heading, speed = theirs.position, theirs.heading, theirs.speed
 
 
-def test_the_bicycle_model_stays_close_for_a_minute() -> None:
+def test_the_bicycle_model_stays_close_to_that_of_highway_env_for_a_minute() -> None:
     theirs = Vehicle(None, [0.0, 0.0], heading=0.4, speed=12.0)
     x, y, heading, speed = 0.0, 0.0, 0.4, 12.0
     for tick in range(1200):
@@ -103,21 +103,21 @@ def random_road(seed: int, lanes: int = 3, cars: int = 12) -> Road:
 
 
 def our_acceleration(car: IDMVehicle | None, front: IDMVehicle | None) -> float:
-    """Return the acceleration of cavmarl's model for a car of highway-env behind another."""
+    """Return the acceleration of cavmarl's IDM for a car of highway-env behind another car."""
     if car is None:
         return 0.0
     target_speed = min(max(car.target_speed, 0.0), car.lane.speed_limit)
     if front is None:
         return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX)
     front_speed = float(front.velocity @ car.direction)
-    # highway-env also projects the car's own speed, which is exact only up to the last bit.
+    # highway-env also projects the car's own speed, which changes the last bit.
     distance = car.lane_distance_to(front)
     taken = idm.idm_interaction(car.speed, distance, front_speed, *IDM_DEFAULTS)
     return idm.idm_free(car.speed, target_speed, idm.ACCEL_MAX) - taken
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_acceleration_equals_highway_env(seed: int) -> None:
+def test_accelerations_equal_those_of_highway_env(seed: int) -> None:
     cars = random_road(seed).vehicles
     for car in cars:
         for front in (None, *cars):
@@ -127,7 +127,7 @@ def test_acceleration_equals_highway_env(seed: int) -> None:
 
 
 def our_mobil(car: IDMVehicle, lane: tuple[str, str, int], mandatory: bool) -> bool:
-    """Return the decision of cavmarl's model with the neighbours that highway-env finds."""
+    """Return the decision of cavmarl's MOBIL with the neighbours that highway-env finds."""
     ahead, behind = car.road.neighbour_vehicles(car)
     new_ahead, new_behind = car.road.neighbour_vehicles(car, lane)
     return lane_change.mobil_accepts(
@@ -141,7 +141,7 @@ def our_mobil(car: IDMVehicle, lane: tuple[str, str, int], mandatory: bool) -> b
     )
 
 
-def test_lane_changes_equal_highway_env() -> None:
+def test_lane_changes_equal_those_of_highway_env() -> None:
     decisions = []
     for seed in range(60):
         road = random_road(seed)
@@ -152,7 +152,7 @@ def test_lane_changes_equal_highway_env() -> None:
     assert 0.05 < np.mean(decisions) < 0.95
 
 
-def test_lane_changes_for_a_route_equal_highway_env() -> None:
+def test_lane_changes_for_a_route_equal_those_of_highway_env() -> None:
     decisions = []
     for seed in range(60):
         road = random_road(seed)
@@ -172,7 +172,7 @@ LANES = {
 
 
 @pytest.mark.parametrize("name", LANES)
-def test_controllers_equal_highway_env(name: str) -> None:
+def test_steering_and_speed_control_equal_those_of_highway_env(name: str) -> None:
     rng = np.random.default_rng(3)
     lane = LANES[name]
     network = RoadNetwork()

@@ -1,4 +1,4 @@
-"""Registered extensions of users give the same bytes in all divisions and backends.
+"""Extensions that users register; their results do not depend on zones and backends.
 
 The files are the examples of docs/guides/extending.md.
 """
@@ -28,7 +28,7 @@ KINDS = ("A term", "A sensor", "A driver model", "A backend")
 
 @pytest.fixture(scope="module")
 def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, ModuleType]]:
-    """Return the examples of the page by heading, each imported from its own file."""
+    """Import the code of each section of the page as a module; yield the modules by heading."""
     folder = tmp_path_factory.mktemp("outside")
     sys.path.insert(0, str(folder))
     found = {}
@@ -47,7 +47,7 @@ def examples(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Mod
 
 
 def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], np.ndarray, Any]:
-    """Return the bytes of each step, the states' hashes, the last terms and the settings."""
+    """Run worlds; return bytes of each step, hashes, sums of terms and the last observations."""
     vec = cavmarl.make_vec(
         ENV, num_envs=2, agents=AGENTS, background=BACKGROUND, overrides=overrides, **how
     )
@@ -69,7 +69,7 @@ def run(overrides: dict[str, Any], **how: Any) -> tuple[list[bytes], list[str], 
 
 
 def same_bytes(overrides: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    """Compare one zone, four zones and two workers; return the terms and observed features."""
+    """Compare one zone, four zones and two workers; return sums of terms and observations."""
     whole = run(overrides)
     for how in ({"zones": 4}, {"zones": 4, "workers": 2}):
         divided = run(overrides, **how)
@@ -89,13 +89,15 @@ def test_a_registered_term_is_part_of_the_reward_terms(examples: dict[str, Modul
     env.close()
 
 
-def test_a_batched_term_equals_that_of_single_agents(examples: dict[str, ModuleType]) -> None:
+def test_a_batched_term_equals_the_same_term_of_single_agents(
+    examples: dict[str, ModuleType],
+) -> None:
     weights = {"headway": -0.5, "headway_of_all": -0.25}
     terms, _ = same_bytes({"terms.weights": weights})
     assert terms[-1] == terms[-2] > 0.0
 
 
-def test_batched_results_belong_to_their_agents() -> None:
+def test_a_batched_term_that_depends_on_other_agents_is_refused() -> None:
     def against_the_mean(view: cavmarl.BatchView) -> np.ndarray:
         return view.own["speed"] - view.own["speed"].mean()
 
@@ -107,7 +109,7 @@ def test_batched_results_belong_to_their_agents() -> None:
 
 
 def test_workers_need_only_the_extensions_of_their_worlds() -> None:
-    """For example, a notebook has registered a term, and worlds without it have workers."""
+    """A notebook can make worlds in workers that do not use the notebook's term."""
 
     def zero(view: cavmarl.AgentView) -> float:
         return 0.0
@@ -132,27 +134,31 @@ def test_a_batched_function_must_return_a_number_for_each_agent() -> None:
 
 def test_a_registered_sensor_is_observed_last(examples: dict[str, ModuleType]) -> None:
     _, seen = same_bytes({"sensors.registered": ["crowd"]})
-    assert np.abs(seen[..., -2:]).sum() > 0.0, "features of registered sensors come last"
+    assert np.abs(seen[..., -2:]).sum() > 0.0, "the last features are zero"
     assert "crowd" in sensor_names()
     assert REGISTERED_SENSORS["crowd"].name == "crowd"
     with pytest.raises(ConfigError, match=r"cavmarl\.register_sensor"):
         REGISTERED_SENSORS["cloud"]
 
 
-def test_a_registered_driver_model_drives_in_its_own_way(examples: dict[str, ModuleType]) -> None:
+def test_a_registered_driver_model_differs_from_all_other_models(
+    examples: dict[str, ModuleType],
+) -> None:
     whole = run({"traffic.model": "relaxed"})
     same_bytes({"traffic.model": "relaxed"})
     others = [run({"traffic.model": model})[1] for model in ("IDM", "Krauss", "ACC")]
     hashes = [whole[1], *others]
-    assert len({tuple(one) for one in hashes}) == len(hashes), "every model drives in its own way"
+    assert len({tuple(one) for one in hashes}) == len(hashes), (
+        "two driver models give equal results"
+    )
 
 
 def test_a_registered_backend_gives_the_same_results(examples: dict[str, ModuleType]) -> None:
     assert run({}, backend="at_most_two")[:2] == run({})[:2]
 
 
-def test_a_sensor_is_asked_in_every_step() -> None:
-    """No number of an earlier step remains."""
+def test_a_registered_sensor_is_called_in_every_step() -> None:
+    """The observation has the numbers of the present step."""
 
     def parity(view: cavmarl.AgentView) -> float:
         return float(view.own["tick"] % 7) / 7.0
@@ -169,7 +175,7 @@ def test_a_sensor_is_asked_in_every_step() -> None:
 
 
 def drive(env: cavmarl.CavEnv) -> None:
-    """Drive three steps."""
+    """Reset an environment and run three steps."""
     env.reset(seed=0)
     for _ in range(3):
         env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
@@ -186,7 +192,7 @@ def test_functions_that_depend_on_the_order_of_vehicles_are_refused() -> None:
     env.close()
 
 
-def test_unknown_and_taken_names_are_refused() -> None:
+def test_unknown_and_used_names_are_refused() -> None:
     def nothing(view: Any) -> float:
         return 0.0
 

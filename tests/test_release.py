@@ -1,4 +1,4 @@
-"""Public files of a release: versions, badges and forms agree with the package."""
+"""Versions, badges and issue forms agree with the package."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_all_files_name_the_same_version_and_licence() -> None:
     ]
 
 
-def test_the_citation_has_what_its_format_requires() -> None:
+def test_the_citation_has_the_required_fields() -> None:
     assert {"cff-version", "message", "title", "authors"} <= CITATION.keys()
     assert CITATION["title"].startswith("cavmarl: ")
 
@@ -50,12 +50,12 @@ def test_badges_agree_with_the_package(name: str, values: list[str]) -> None:
     assert f"{', '.join(values)}](docs/images/badge_{name}.svg)" in readme
 
 
-def test_there_are_two_forms_for_issues() -> None:
+def test_there_are_two_issue_forms() -> None:
     assert [path.stem for path in FORMS] == ["bug_report", "feature_request"]
 
 
 @pytest.mark.parametrize("path", FORMS, ids=lambda path: path.stem)
-def test_a_form_has_fields_that_its_host_can_show(path: Path) -> None:
+def test_an_issue_form_has_valid_fields(path: Path) -> None:
     form: Any = yaml.safe_load(path.read_text("utf-8"))
     assert {"name", "description", "labels", "body"} == form.keys()
     assert {field["type"] for field in form["body"]} <= KINDS

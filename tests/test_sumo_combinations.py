@@ -1,4 +1,4 @@
-"""SUMO combined with messages, mounted sensors, sensor workers and followers."""
+"""Worlds with SUMO's traffic together with messages, mounted sensors, workers and followers."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ pytestmark = pytest.mark.filterwarnings("ignore:.*workers.*there are:RuntimeWarn
 
 PEOPLE = {"agents": 4, "background": 60}
 STEPS = 20
-# A follower computes its controls from a flat observation.
+# Followers use flat observations and no rig.
 PLAIN: dict[str, Any] = {"observation.mode": "ground_truth", "rig": {}, "clock.ctrl_dt_s": 0.1}
 
 
 def settings(folder: Path, source: str) -> dict[str, Any]:
-    """Return settings with SUMO, all sensors and messages, and steps of two ticks."""
+    """Return settings with SUMO, all sensors and messages."""
     demand = {"traffic.source": source, "traffic.demand": [str(tiny_file(folder))]}
     return EVERYTHING | demand | {"sensors.signal.timing": False, "population.mode": "respawn"}
 
@@ -37,7 +37,7 @@ def settings(folder: Path, source: str) -> dict[str, Any]:
 def drive(
     source: str, folder: Path, steps: int = STEPS, **keywords: Any
 ) -> list[list[str | bytes]]:
-    """Yield frames of all sensors and digests of all worlds, step by step."""
+    """Return the frames of all sensors and the hashes of all worlds for each step."""
     overrides = settings(folder, source)
     vec = make_vec("grid4x4", overrides=overrides, **PEOPLE, **keywords)
     try:
@@ -47,7 +47,7 @@ def drive(
             vec.step(vec.suggest_actions())
             seen.append(results(vec))
         told = vec.traffic_stats()
-        assert told["departed"] > sum(PEOPLE.values()), "no vehicle comes from SUMO"
+        assert told["departed"] > sum(PEOPLE.values()), "no vehicle of SUMO departed"
         assert told["v2x_received"] > 0
     finally:
         vec.close()
@@ -60,7 +60,9 @@ def results(vec: CavVectorEnv) -> list[str | bytes]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_zones_with_all_sensors_and_messages(tmp_path: Path, source: str) -> None:
+def test_a_divided_world_with_all_sensors_and_messages_equals_the_undivided_one(
+    tmp_path: Path, source: str
+) -> None:
     found = verify_zones(
         "grid4x4",
         (1, 2, 4),
@@ -77,7 +79,7 @@ def test_zones_with_all_sensors_and_messages(tmp_path: Path, source: str) -> Non
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_sensor_workers_and_workers(tmp_path: Path, source: str) -> None:
+def test_results_do_not_depend_on_sensor_workers_and_workers(tmp_path: Path, source: str) -> None:
     alone = drive(source, tmp_path)
     assert drive(source, tmp_path, sensor_workers=2) == alone
     assert drive(source, tmp_path, zones=4, sensor_workers=2) == alone
@@ -85,10 +87,8 @@ def test_sensor_workers_and_workers(tmp_path: Path, source: str) -> None:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_worker_that_dies_with_all_sensors_and_messages_changes_no_result(
-    tmp_path: Path, source: str
-) -> None:
-    """The commands to SUMO are repeated; sensors and messages resume from the image."""
+def test_a_killed_worker_changes_no_result(tmp_path: Path, source: str) -> None:
+    """A new worker repeats the commands to SUMO and loads the saved sensors and messages."""
     made: dict[str, Any] = {"num_envs": 2, "overrides": settings(tmp_path, source), **PEOPLE}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
     try:
@@ -107,7 +107,7 @@ def test_a_worker_that_dies_with_all_sensors_and_messages_changes_no_result(
 
 
 def followed(source: str, folder: Path, zones: int, address: Path) -> list[str]:
-    """Let a follower drive one of the agents; return the digests of the world."""
+    """Let a follower drive an agent; return the hash of the world after each step."""
     env = cavmarl.parallel_env(
         "grid4x4", zones=zones, overrides=settings(folder, source) | PLAIN, **PEOPLE
     )
@@ -128,8 +128,8 @@ def followed(source: str, folder: Path, zones: int, address: Path) -> list[str]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_follower_gives_the_same_results_for_any_zones(tmp_path: Path, source: str) -> None:
-    """Views and controls are equal; other controls would give another world."""
+def test_results_with_a_follower_do_not_depend_on_zones(tmp_path: Path, source: str) -> None:
+    """Equal hashes show that the follower's observations and controls are equal."""
     alone = followed(source, tmp_path, 1, tmp_path / "s")
     assert followed(source, tmp_path, 4, tmp_path / "s") == alone
     assert len(set(alone)) == STEPS

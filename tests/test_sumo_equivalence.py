@@ -1,4 +1,4 @@
-"""Worlds that are coupled with SUMO are equal bit for bit in all divisions."""
+"""Divided worlds that are coupled with SUMO equal the undivided world bit for bit."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ def overrides(source: str, demand: Path) -> dict[str, object]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
-    """With agents, generated cars and SUMO's cars; the rows are compared after each tick."""
+def test_results_with_sumo_do_not_depend_on_zones(tmp_path: Path, source: str) -> None:
+    """The world has agents, generated vehicles and SUMO's vehicles."""
     found = verify_zones(
         "grid4x4",
         (1, 2, 4, 9),
@@ -41,18 +41,18 @@ def test_zones_change_nothing(tmp_path: Path, source: str) -> None:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_bologna_runs_for_minutes(shared_maps: Path, source: str) -> None:
+def test_counts_of_bologna_equal_sumos_for_two_minutes(shared_maps: Path, source: str) -> None:
     bologna(shared_maps, source, 120)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("source", MODES)
-def test_bologna_runs_for_an_hour(shared_maps: Path, source: str) -> None:
+def test_counts_of_bologna_equal_sumos_for_an_hour(shared_maps: Path, source: str) -> None:
     bologna(shared_maps, source, 3600)
 
 
 def bologna(maps: Path, source: str, seconds: int) -> None:
-    """Run Bologna with its own demand, signals, buses and stops; compare counts with SUMO's."""
+    """Run the map of Bologna with its demand; compare counts of vehicles with SUMO's."""
     folder = maps / "net" / "bologna_acosta"
     own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5, "horizon_s": float(seconds + 10)}
     with coupled(

@@ -1,6 +1,6 @@
-"""The package is tidy: one name per concept, the words of the field, and bounds of size.
+"""Rules of style for the package, its tests and pages: names, words and sizes.
 
-Exceptions are listed, and should become fewer.
+Each rule lists its exceptions. The lists should become shorter.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from tests.support.tiers import ALONE_FILES, is_needed
 ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("cavmarl", "tests", "train", "agents", "fuzz", "docs", "examples", "benchmarks")
 
-# Bounds of properties that make code hard to follow. Sets list exactly the present exceptions.
-PUBLIC_METHODS = 25  # of a class with its bases, without properties
+# Bounds of sizes that make code hard to follow. The sets have exactly the present exceptions.
+PUBLIC_METHODS = 25  # of a class with its bases; properties do not count
 WIDE_CLASSES: set[str] = set()
 
 ATTRIBUTES = 20  # attributes that a class and its bases set
@@ -46,11 +46,11 @@ LARGE_CLASSES = {
 }
 
 PARAMETERS = (
-    10  # without keyword-only parameters of public functions, and without parameters of kernels
+    10  # keyword-only parameters of public functions and parameters of kernels do not count
 )
 WIDE_FUNCTIONS: set[str] = set()
 
-# Functions with untyped `*arguments`, which are arguments of a kernel or of another library.
+# Functions with untyped `*arguments`, which they pass to a kernel or to another library.
 PASSED_ON = {
     "cavmarl.adapters.sb3_vec_env.CavSb3VecEnv.env_method",
     "cavmarl.core.compiled.compiler.KernelCompiler.__init__",
@@ -71,31 +71,31 @@ PASSED_ON = {
     "cavmarl.render.topdown.TopDownRenderer.frame",
 }
 
-# A new capability raises these two bounds by the lines that it needs; the commit says why.
+# The commit that raises one of these bounds gives the reason.
 PACKAGE_LINES = 155_400
 REACHABLE_LINES = 93_000  # lines that `make_vec` and `parallel_env` can reach
 
 # Module names that occur more than once, outside of cli/ and config/.
-SHARED_MODULE_NAMES = {"observations.py"}  # a module of sumo-rl has this name
+SHARED_MODULE_NAMES = {"observations.py"}  # named like sumo-rl's module
 
 # Names of public classes that occur in several modules.
 SHARED_CLASS_NAMES = {"Job", "Parameters", "Spread", "Turn", "Within"}
 
-# Public names with an underscore of other libraries or of Python.
+# Public names of Python and of other libraries that begin with an underscore.
 UNDERSCORED = {"_asdict", "_exit", "_fields", "_foes", "_multiarray_umath", "_replace"}
 UNDERSCORED |= {"_repr_html_"}
 
-# Words for persons; the field says vehicle, zone or worker. Two texts are about pedestrians.
+# Words for persons that stand for vehicles, zones or workers. Two texts are about pedestrians.
 PERSONS = re.compile(r"\b(who|whoever|nobody|somebody)\b", re.IGNORECASE)
 PERSONS_AT_MOST = {"cavmarl": 2, "docs": 2}
 
-# Phrases that stand in for a noun or a verb. The number of package and pages may only fall.
+# Phrases that hide a noun or a verb. Their number in the package and the pages may only fall.
 PHRASES = re.compile(
     r"\b(likewise|one that|those that|so many|everybody|of which)\b|\bas of `", re.IGNORECASE
 )
 PHRASES_AT_MOST = 40
 
-WORDS_OF_A_PAGE = 2500  # outside of tables, generated blocks and code
+WORDS_OF_A_PAGE = 2500  # tables, generated blocks and code do not count
 LONG_PAGES: set[str] = set()
 
 
@@ -107,7 +107,7 @@ def sources(*folders: str) -> Iterator[tuple[str, str]]:
 
 
 def private_names(text: str) -> list[tuple[int, str]]:
-    """Return the private names of others that a file uses, with their lines."""
+    """Return (line, name) for each private name of another class or module that a file uses."""
     found: list[tuple[int, str]] = []
     for node in ast.walk(ast.parse(text)):
         names: list[str] = []
@@ -136,18 +136,24 @@ def package() -> PackageCode:
     return PackageCode()
 
 
-def test_classes_and_calls_are_narrow(package: PackageCode) -> None:
+def test_classes_and_functions_have_bounded_sizes(package: PackageCode) -> None:
     classes, functions = list(package.classes()), list(package.functions())
     wide = {name for name, node in classes if len(package.public_methods(node)) > PUBLIC_METHODS}
     large = {name for name, node in classes if len(package.attributes(node)) > ATTRIBUTES}
-    assert wide == WIDE_CLASSES, f"over {PUBLIC_METHODS} public methods, or no longer"
-    assert large == LARGE_CLASSES, f"over {ATTRIBUTES} attributes, or no longer"
+    assert wide == WIDE_CLASSES, (
+        f"update WIDE_CLASSES: classes with over {PUBLIC_METHODS} public methods"
+    )
+    assert large == LARGE_CLASSES, (
+        f"update LARGE_CLASSES: classes with over {ATTRIBUTES} attributes"
+    )
     long = {
         name
         for name, node, is_method in functions
         if counted_parameters(node, is_method) > PARAMETERS
     }
-    assert long == WIDE_FUNCTIONS, f"over {PARAMETERS} parameters, or no longer"
+    assert long == WIDE_FUNCTIONS, (
+        f"update WIDE_FUNCTIONS: functions with over {PARAMETERS} parameters"
+    )
     untyped = {name for name, node, _ in functions if has_untyped_arguments(node)}
     assert untyped == PASSED_ON, "name the parameters, or pass a tuple"
 
@@ -162,7 +168,7 @@ def test_the_package_does_not_grow_unnoticed(package: PackageCode) -> None:
     assert reachable <= REACHABLE_LINES
 
 
-def test_no_two_modules_have_one_name() -> None:
+def test_modules_have_different_names() -> None:
     places = defaultdict(list)
     for path, _ in sources("cavmarl"):
         _, *folders, file = path.split("/")
@@ -176,7 +182,7 @@ def test_no_two_modules_have_one_name() -> None:
     assert not shared, f"rename one module of each list: {shared}"
 
 
-def test_no_two_public_classes_have_one_name() -> None:
+def test_public_classes_have_different_names() -> None:
     places = defaultdict(list)
     for path, text in sources("cavmarl"):
         for node in ast.parse(text).body:
@@ -187,7 +193,7 @@ def test_no_two_public_classes_have_one_name() -> None:
 
 
 def test_tests_use_no_private_names() -> None:
-    """Access to private names is in `tests/support`."""
+    """Only `tests/support` may use private names of the package."""
     found = {
         path: names
         for path, text in sources("tests")
@@ -199,20 +205,20 @@ def test_tests_use_no_private_names() -> None:
 
 
 @pytest.mark.parametrize("folder", PERSONS_AT_MOST)
-def test_things_are_not_called_persons(folder: str) -> None:
+def test_texts_use_no_words_for_persons(folder: str) -> None:
     texts = list(pages().values()) if folder == "docs" else [text for _, text in sources(folder)]
     found = sum(len(PERSONS.findall(text)) for text in texts)
     assert found <= PERSONS_AT_MOST[folder], "say vehicle, zone, worker, message"
 
 
-def test_sentences_name_their_subjects() -> None:
+def test_texts_have_few_phrases_that_hide_a_noun() -> None:
     texts = [*pages().values(), *(text for _, text in sources("cavmarl"))]
     assert sum(len(PHRASES.findall(text)) for text in texts) <= PHRASES_AT_MOST, "name the noun"
 
 
 def test_pages_are_short() -> None:
     long = {path for path, text in pages().items() if words_of(text) > WORDS_OF_A_PAGE}
-    assert long == LONG_PAGES, f"over {WORDS_OF_A_PAGE} words, or no longer"
+    assert long == LONG_PAGES, f"update LONG_PAGES: pages with over {WORDS_OF_A_PAGE} words"
     assert words_of("one\n| two |\n```\nthree\n```\n<!-- a -->\nfour\n<!-- end -->\nfive") == 2
 
 
@@ -228,15 +234,15 @@ def words_of(page: str) -> int:
     return sum(len(line.split()) for line in prose.splitlines() if not line.startswith("|"))
 
 
-def test_expensive_tests_are_slow_unless_they_are_listed() -> None:
+def test_expensive_tests_are_slow_unless_argued_txt_lists_them() -> None:
     costs = {"a[1]": 1.2, "a[2]": 0.3, "a[3]": 0.1, "b[1]": 1.9, "b[2]": 1.8, "c": 9.0, "d": 1.0}
-    assert rare_tests(costs, costs) == {"a[1]", "b[1]", "c"}, "the cheapest variants stay"
+    assert rare_tests(costs, costs) == {"a[1]", "b[1]", "c"}, "the cheapest variants must stay"
     assert rare_tests(costs, costs, frozenset({"c"})) == {"a[1]", "b[1]"}
     assert rare_tests(costs, costs, frozenset({"a[*]"})) == {"b[1]", "c"}
     assert rare_tests([*costs, "b[3]"], costs) == {"a[1]", "b[1]", "b[2]", "c"}
 
 
-def test_each_slow_test_runs_in_one_turn_unless_it_is_long() -> None:
+def test_each_slow_test_that_is_not_long_runs_in_one_turn() -> None:
     names = [f"tests/a.py::test[{number}]" for number in range(3000)]
     never = ["tests/a.py::others[1]", "tests/b.py::test", "tests/b.py::test[2]"]
     long = frozenset({"tests/a.py::others", "tests/b.py"})
@@ -245,11 +251,13 @@ def test_each_slow_test_runs_in_one_turn_unless_it_is_long() -> None:
             [name for name in names + never if is_due(name, turn, long)]
             for turn in range(first, first + 30)
         ]
-        assert sorted(name for turn in turns for name in turn) == sorted(names), "once each"
+        assert sorted(name for turn in turns for name in turn) == sorted(names), (
+            "each slow test must run once"
+        )
         assert 50 < min(map(len, turns)) <= max(map(len, turns)) < 150
 
 
-def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
+def test_costs_of_files_are_summed_and_small_tiers_read_few_files() -> None:
     costs = costs_of_files(["a.py::b", "a.py::c[1]", "d.py::e"], {"a.py::b": 2.0, "d.py::e": 9.0})
     assert costs == {"a.py": pytest.approx(2.05), "d.py": 9.0}
     files = [*(ROOT / "tests").rglob("test_*.py")]
@@ -264,12 +272,12 @@ def test_long_files_come_first_and_small_tiers_read_only_their_own() -> None:
     assert listed <= {path.relative_to(ROOT).as_posix() for path in set().union(*turns)}
 
 
-def test_argued_tests_are_expensive() -> None:
+def test_tests_in_argued_txt_are_expensive() -> None:
     alone = [name for name in argued() if not name.endswith("[*]")]
     assert [name for name in alone if known_costs().get(name, 0.0) <= ARGUED_S] == []
 
 
-def test_the_lists_of_costs_and_of_argued_and_long_tests_name_existing_tests() -> None:
+def test_the_lists_of_tests_name_existing_tests() -> None:
     for name in (*known_costs(), *argued(), *long_tests()):
         path, test = (*name.split("::"), "")[:2]
         function = test.split("[", 1)[0]
@@ -277,7 +285,7 @@ def test_the_lists_of_costs_and_of_argued_and_long_tests_name_existing_tests() -
 
 
 def test_names_in_docstrings_and_comments_exist() -> None:
-    """Each is a module, a member of a class, a key of `env.yaml` or a file of the repository."""
+    """A name is a module, a member of a class, a key of `env.yaml` or a file."""
     package = Package()
     assert package.dead() == []
     text = '"""See `runtime.pool`, `engine.tick.Tick.sense`, `zones.count` and `gone/there.py`."""'

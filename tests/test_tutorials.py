@@ -1,4 +1,4 @@
-"""Each tutorial runs as written: its Python code, and its lines of shell."""
+"""The Python code and the shell commands of each tutorial run."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from cavmarl.core.extensions import REGISTERED_MODELS, REGISTERED_SENSORS, REGIS
 ROOT = Path(__file__).resolve().parents[1]
 FOLDER = ROOT / "docs" / "tutorials"
 NEEDS_SERVICE = "nodes_and_service"
-DEAR = {"train"}  # limit in s; the page trains
+EXPENSIVE = {"train"}  # trains a driver
 PAGES = sorted(path.stem for path in FOLDER.glob("*.md") if path.stem != "README")
-QUICK = [name for name in PAGES if name not in (NEEDS_SERVICE, *DEAR)]
+QUICK = [name for name in PAGES if name not in (NEEDS_SERVICE, *EXPENSIVE)]
 
 
 @pytest.fixture(autouse=True)
-def nothing_stays_registered() -> Iterator[None]:
-    """Remove the names that a page has registered."""
+def remove_registrations() -> Iterator[None]:
+    """Remove the terms, sensors and models that a page has registered."""
     registries = (REGISTERED_TERMS, REGISTERED_SENSORS, REGISTERED_MODELS)
     before = [set(registry.names) for registry in registries]
     yield
@@ -50,7 +50,7 @@ def run_page(name: str) -> None:
 
 
 def run_line(words: list[str]) -> None:
-    if words[0] == "cavmarl" and words[1] != "train":  # this file becomes the program
+    if words[0] == "cavmarl" and words[1] != "train":  # without a new process
         done = CliRunner().invoke(app, words[1:], catch_exceptions=False)
         assert done.exit_code == 0, done.output
         return
@@ -64,8 +64,8 @@ def test_a_tutorial_runs(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPa
     run_page(name)
 
 
-@pytest.mark.slow  # the page trains
-@pytest.mark.parametrize("name", sorted(DEAR))
+@pytest.mark.slow  # trains a driver
+@pytest.mark.parametrize("name", sorted(EXPENSIVE))
 def test_an_expensive_tutorial_runs(
     name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -73,7 +73,7 @@ def test_an_expensive_tutorial_runs(
     run_page(name)
 
 
-@pytest.mark.slow  # tests/service/test_service_page.py always runs the same commands
+@pytest.mark.slow  # tests/service/test_service_page.py runs its commands
 def test_the_tutorial_of_the_service_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     from tests.support.service import Cluster, running_service
 
@@ -87,7 +87,7 @@ def test_the_tutorial_of_the_service_runs(tmp_path: Path, monkeypatch: pytest.Mo
         cluster.stop()
 
 
-def test_the_list_of_tutorials_has_each_page() -> None:
+def test_the_list_of_tutorials_is_complete() -> None:
     text = (FOLDER / "README.md").read_text(encoding="utf-8")
     assert sorted(re.findall(r"\]\((\w+)\.md\)", text)) == PAGES
     navigation = (ROOT / "mkdocs.yml").read_text(encoding="utf-8")

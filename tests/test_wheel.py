@@ -1,4 +1,4 @@
-"""A wheel works outside of the checkout, and contains the data folders."""
+"""The wheel: its content, and its use outside of the checkout."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Build a wheel."""
+    """Build the wheel."""
     folder = tmp_path_factory.mktemp("wheel")
     build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
     subprocess.run(build, cwd=ROOT, check=True, capture_output=True)
@@ -32,7 +32,7 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture(scope="module")
 def site(wheel: Path) -> Path:
-    """Return a folder with the content of the wheel."""
+    """Return a folder with the unpacked wheel."""
     zipfile.ZipFile(wheel).extractall(wheel.parent / "site")
     return wheel.parent / "site"
 
@@ -41,7 +41,7 @@ def site(wheel: Path) -> Path:
 def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Return the `bin` folder of a virtual environment with the installed wheel.
 
-    Dependencies are those of this environment, because a test must not need a network.
+    It uses the dependencies of the present environment, so that no network is needed.
     """
     folder = tmp_path_factory.mktemp("elsewhere")
     subprocess.run([sys.executable, "-m", "venv", str(folder)], check=True)
@@ -54,7 +54,7 @@ def elsewhere(wheel: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def room(cache: Path) -> dict[str, str]:
-    """Return the environment variables for an empty cache."""
+    """Return environment variables that set the folder of the cache."""
     return {"CAVMARL_CACHE_DIR": str(cache)}
 
 
@@ -68,7 +68,7 @@ def run(command: list[str], cwd: Path, settings: Mapping[str, str] = MappingProx
     return done.stdout
 
 
-# Make the compiler and torch appear as not installed.
+# Make imports of the compiler and of torch fail.
 BARE = """
 import sys
 for name in ("numba", "llvmlite", "torch"):
@@ -92,7 +92,7 @@ print(json.dumps([cavmarl.__file__, steps]))
 
 
 @pytest.mark.slow
-def test_every_environment_drives_from_an_installed_wheel(elsewhere: Path, tmp_path: Path) -> None:
+def test_every_environment_runs_from_an_installed_wheel(elsewhere: Path, tmp_path: Path) -> None:
     out = run([str(elsewhere / "python"), "-c", BARE + DRIVE], tmp_path)
     place, departed = json.loads(out)
     assert place.startswith(str(elsewhere.parent))
@@ -125,7 +125,7 @@ PREBUILT = {"CAVMARL_KERNELS": "prebuilt"}
 
 
 @pytest.mark.slow
-def test_an_installed_wheel_compiles_nothing_for_zones_workers_nodes_and_sensors(
+def test_an_installed_wheel_has_all_kernels_for_zones_workers_nodes_and_sensors(
     elsewhere: Path, tmp_path: Path
 ) -> None:
     script = tmp_path / "everything.py"
@@ -157,7 +157,9 @@ def test_a_read_only_installation_works_without_a_cache(elsewhere: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_damaged_library_is_compiled_again_with_a_reason(site: Path, tmp_path: Path) -> None:
+def test_a_damaged_library_is_reported_and_replaced_by_compiled_kernels(
+    site: Path, tmp_path: Path
+) -> None:
     damaged = tmp_path / "site"
     shutil.copytree(site, damaged)
     library = damaged / "cavmarl/core/compiled/prebuilt/kernels.so"
@@ -192,12 +194,12 @@ def test_an_installed_wheel_trains(elsewhere: Path, tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["envs", "agents", "configs", "train"])
-def test_a_wheel_carries_the_data_folders_whole(site: Path, kind: str) -> None:
+def test_the_wheel_has_all_files_of_the_data_folders(site: Path, kind: str) -> None:
     assert files(site / "cavmarl" / "data" / kind) == files(ROOT / kind)
 
 
 @pytest.mark.slow
-def test_a_wheel_finds_its_own_entries(site: Path) -> None:
+def test_an_installed_wheel_finds_its_own_entries(site: Path) -> None:
     code = (
         "import json; from cavmarl.config.registry import *; "
         "maps = [str(m) for name in entries() for m in resolve_maps(*load_config(name))]; "
@@ -212,7 +214,7 @@ def test_a_wheel_finds_its_own_entries(site: Path) -> None:
 
 
 def files(folder: Path) -> set[Path]:
-    """Return all files below a folder by relative path, without Python's caches."""
+    """Return the relative paths of all files in a folder, without Python's caches."""
     return {
         path.relative_to(folder)
         for path in folder.rglob("*")

@@ -3,11 +3,11 @@
     python train/five_seeds.py --config configs/train/merge.yaml
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
 
-The program trains with each seed (`ppo.py`, one core each) and evaluates the trained and the
-scripted drivers on the same held-out episodes. It writes into the folder: `table.md`,
-`result.json`, `curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with
-its own manifest. Finished seeds are not trained again; interrupted seeds resume from their
-checkpoints. Trainings end with this program, however it ends.
+The program runs `ppo.py` with each seed on one core, and evaluates the trained and the scripted
+drivers on the same held-out episodes. It writes into the folder: `table.md`, `result.json`,
+`curves.svg`, `evaluation/` with its manifest and raw tables, and the runs, each with its own
+manifest. Finished seeds are not trained again; interrupted seeds resume from their checkpoints. If
+this program ends for any reason, its trainings end, too.
 
 Trained drivers have the interval of the mean over training seeds, scripted drivers the interval of
 the mean over evaluation runs. Both are 95 % by Student's t, clipped to 0 and 100 % for shares.
@@ -106,7 +106,7 @@ def parse_args(words: Sequence[str] | None = None) -> list[Args]:
 
 
 def env_of(config: Path) -> str:
-    """Return the environment named in a file of settings."""
+    """Return the environment in a file of settings."""
     settings = read_yaml(config)
     if not isinstance(settings, dict):
         raise ConfigError(f"{config}: must be a mapping of settings")
@@ -115,7 +115,7 @@ def env_of(config: Path) -> str:
 
 @dataclass(frozen=True)
 class Row:
-    """A metric of a driver: the mean of its runs, with an interval."""
+    """The mean of a driver's metric over runs, with its interval."""
 
     mean: float | None
     interval: Interval | None
@@ -176,14 +176,14 @@ class Children:
                 dying_with_parent(command), stdout=subprocess.DEVNULL, start_new_session=True
             )
             self._running.add(child)
-        print(f"{announcement}\n", end="", flush=True)  # one write: threads print in parallel
+        print(f"{announcement}\n", end="", flush=True)  # one write, because several threads print
         try:
             return child.wait()
         finally:
             self._running.discard(child)
 
     def end(self) -> None:
-        """End all child processes, and start no more."""
+        """End all child processes; later calls of `run` start none."""
         with self._lock:
             self._are_to_end = True
             for child in tuple(self._running):
@@ -191,14 +191,14 @@ class Children:
 
 
 def interval_of(means: NDArray[np.float64], are_shares: bool) -> Interval | None:
-    """Return the interval of the mean over training seeds; clipped to [0, 1] for shares."""
+    """Return the interval of the mean over training seeds; shares are clipped to [0, 1]."""
     return bounded_interval(means, 0.0) if are_shares else mean_interval(means)
 
 
 def summarise(
     report: EvaluationReport, alone: EvaluationReport, args: Args
 ) -> dict[str, dict[str, Row]]:
-    """Return rows by driver and metric; trained drivers are merged. `alone`: a report of `idm`."""
+    """Return rows by driver and metric, with one driver for all trained ones and `idm` alone."""
     trained = [report[f"seed_{seed}"] for seed in args.seeds]
     found: dict[str, dict[str, Row]] = {"trained": {}}
     for metric in METRICS:
@@ -262,7 +262,7 @@ def read_curve(folder: Path) -> dict[str, list[float]]:
 
 
 def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], title: str) -> None:
-    """Plot the learning curves of all seeds and of other runs."""
+    """Plot the learning curves of all seeds, and those of other runs."""
     require("matplotlib", "report")
     from matplotlib.figure import Figure
 
@@ -284,7 +284,7 @@ def draw_curves(path: Path, folders: Sequence[Path], others: Sequence[Path], tit
 
 
 def compare(args: Args) -> str:
-    """Train on an environment, evaluate, and write the results; return the table."""
+    """Train on an environment, evaluate the drivers and write the results; return the table."""
     args.out.mkdir(parents=True, exist_ok=True)
     folders = train(args)
     drivers = {folder.name: folder for folder in folders.values()}

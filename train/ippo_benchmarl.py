@@ -97,7 +97,7 @@ def make_experiment(args: Args) -> Experiment:
     )
     stem = Path(args.env).name.split(".")[0]
     algorithm = algorithm_config_registry[args.algorithm].get_from_yaml()
-    if hasattr(algorithm, "use_tanh_normal"):  # drivers have clipped means, not squashed ones
+    if hasattr(algorithm, "use_tanh_normal"):  # drivers clip means instead
         algorithm.use_tanh_normal = False
     return Experiment(
         task=CavTaskClass(stem, {"env": args.env, "overrides": {"action.out_of_range": "clip"}}),
@@ -112,7 +112,8 @@ def make_experiment(args: Args) -> Experiment:
 def save_driver(experiment: Experiment, args: Args) -> tuple[str, ...]:
     """Write the network in the form of cavmarl's drivers; return the names of its files.
 
-    Networks other than those of IPPO with continuous actions have no such form; nothing is written.
+    Only networks of IPPO with continuous actions have this form; for other networks, nothing is
+    written.
     """
     env = load_config(args.env)[0]
     if args.algorithm != "ippo" or env.action.kind != "continuous":
@@ -152,7 +153,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     args.folder.mkdir(parents=True, exist_ok=True)
     experiment = make_experiment(args)
     with RunFolder(args, experiment.test_env.base_env.vec.worlds.world) as folder:

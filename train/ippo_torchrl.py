@@ -40,7 +40,7 @@ from cavmarl.learning.options import LOGGERS, RESUME, check_at_least, run_folder
 from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.networks.network_files import NetworkConfig
 
-LEAST_DEVIATION = 0.02  # lower bound on an observation's scale, so that constants are not amplified
+LEAST_DEVIATION = 0.02  # smallest scale of an observation, for constants
 OBSERVATION, MASK, ACTION, LOG_PROB, VALUE = (
     (VEHICLES, name) for name in ("observation", "mask", "action", "log_prob", "state_value")
 )
@@ -173,7 +173,12 @@ class Learner:
         self._optimizer.load_state_dict(saved["optimizer"])
 
     def update(self, batch: TensorDict, left: float) -> int:
-        """Learn from (W, T) steps; return the number of decisions. `left`: remaining share."""
+        """Learn from (W, T) steps; return the number of decisions.
+
+        Args:
+            batch: the steps.
+            left: remaining share of the run.
+        """
         rows = rows_of(batch)
         with torch.no_grad():
             self._advantages(rows)
@@ -195,7 +200,7 @@ class Learner:
 
 
 class Curve:
-    """Writes a line per update. Trips cut by the horizon do not count.
+    """Writes a line per update. Trips that the horizon truncates do not count.
 
     Args:
         folder: folder of the run.
@@ -277,7 +282,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     torch.manual_seed(args.seed)
     worlds = make_worlds(args)
     network, config = make_network(args, worlds)
@@ -289,10 +294,10 @@ def train(args: Args) -> Path:
 
 
 def learn(args: Args, folder: RunFolder, worlds: CavTorchRLEnv, network: ActorCritic) -> int:
-    """Train the network with steps of the worlds; return the run's number of decisions."""
+    """Train the network with steps of the worlds; return the number of decisions of the run."""
     learner, curve = Learner(network, args), Curve(folder)
     decisions = folder.began.agent_steps
-    if folder.began.parts:  # the collector's worlds cannot be restored: they begin new episodes
+    if folder.began.parts:  # worlds begin new episodes
         worlds.set_seed(args.seed + curve.updates)
     frames = args.num_worlds * args.num_steps
     collector = Collector(worlds, learner.actor, frames_per_batch=frames, total_frames=-1)

@@ -4,10 +4,10 @@
 
 The network first imitates the feedback controller, then learns from the rewards.
 
-Afterwards, the network, the feedback controller and no control run in worlds of other seeds. The
-table has the mean time of a vehicle in the world or before it, and the vehicles that have arrived.
-The run's folder has stable-baselines3's `model.zip`, the figures as `evaluation.json`, and
-`manifest.json` with the conditions of the training.
+Afterwards, worlds of other seeds run with the network, with the feedback controller and without
+control. The table has the mean time of a vehicle in the world or waiting to enter, and the number
+of arrived vehicles. The run's folder has stable-baselines3's `model.zip`, the figures as
+`evaluation.json`, and `manifest.json` with the conditions of the training.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ from cavmarl.learning.run_folder import RunFolder, parse_run
 from cavmarl.limits.limit_controllers import Feedback
 
 MODEL_FILE, FIGURES_FILE = "model.zip", "evaluation.json"
-FIRST_SEED = 1000  # of the evaluation
+FIRST_SEED = 1000  # first seed of the evaluation
 IMITATION_RATE, IMITATION_PASSES, IMITATION_BATCH = 2e-3, 30, 256
 LONGEST_STEP_S = 10.0  # see `clock.ctrl_dt_s`
 
@@ -168,7 +168,7 @@ def _worlds(vec: Any) -> range:
 
 
 def evaluate(args: Args, model: PPO) -> dict[str, dict[str, list[float]]]:
-    """Run the network, the feedback controller and no control in worlds of equal seeds."""
+    """Run worlds of equal seeds with the network, with the feedback controller and uncontrolled."""
     feedback = Feedback()
     chosen: dict[str, Choose] = {
         "PPO": choices_of(model),
@@ -197,7 +197,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     model, rows = make_model(args)
     with closing(rows), RunFolder(args, rows.get_attr("worlds")[0].world) as folder:
         if args.imitate:

@@ -4,9 +4,9 @@
 
 The program trains two arms with each seed, as `five_seeds.py` does: `on` with all messages and
 `off` without messages (`v2x.channel.loss=1`, so that observations keep their shape). Both arms
-drive the same episodes, `on` also with increasing loss. The folder gets `table.md`, `result.json`,
-`loss.svg` and the runs. All intervals are 95 % by Student's t over the training seeds, clipped to 0
-and 100 % for shares; the arms are paired by seed.
+drive the same episodes; `on` also drives with increasing loss of messages. The folder gets
+`table.md`, `result.json`, `loss.svg` and the runs. All intervals are 95 % by Student's t over the
+training seeds, clipped to 0 and 100 % for shares; the arms are paired by seed.
 """
 
 from __future__ import annotations
@@ -33,11 +33,11 @@ METRICS = {
     "success": ("success, % of trips", 100.0),
     "delay_s": ("delay of arrivals, s", 1.0),
 }
-Figures = Mapping[str, NDArray[np.float64]]  # by metric, (seeds,)
+Figures = Mapping[str, NDArray[np.float64]]  # metric: (seeds,)
 
 
 def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Figures:
-    """Return the results of an arm's drivers with a given loss of messages."""
+    """Drive an arm's drivers with a loss of messages; return the results by metric."""
     drivers = {folder.name: folder for folder in folders.values()}
     report = evaluate(
         args.env,
@@ -55,7 +55,7 @@ def drive(args: Args, folders: Mapping[int, Path], loss: float, out: Path) -> Fi
 
 
 def row(values: NDArray[np.float64], percent: bool = False) -> Row:
-    """Return mean and interval of one value per seed (S,); `percent`: shares from 0 to 100."""
+    """Return mean and interval of values (S,), one per seed; `percent` clips to 0 and 100."""
     found = interval_of(values / 100.0 if percent else values, percent)
     if found and percent:
         found = Interval(100.0 * found.low, 100.0 * found.high)
@@ -80,7 +80,7 @@ def table(arms: Mapping[str, Figures], args: Args) -> str:
 
 
 def _cell(found: Row) -> str:
-    if found.mean is None or np.isnan(found.mean):  # there is no delay without an arrival
+    if found.mean is None or np.isnan(found.mean):  # no vehicle arrived
         return "-"
     interval = "" if found.interval is None else _ends(found.interval)
     return f"{found.mean:.2f}{interval}"
@@ -91,7 +91,7 @@ def _ends(interval: Interval) -> str:
 
 
 def draw(path: Path, curve: Mapping[float, Figures], off: Figures) -> None:
-    """Plot collisions and delay over loss: each seed, the mean, and the mean without messages."""
+    """Plot collisions and delay over the loss of messages, with the mean without messages."""
     require("matplotlib", "report")
     from matplotlib.figure import Figure
 

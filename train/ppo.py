@@ -5,9 +5,9 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
     torchrun --nproc-per-node 2 train/ppo.py --env merge
 
-From top to bottom: settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
-the update; `Run`, which alternates both (Schulman et al. 2017; de Witt et al. 2020;
-docs/guides/train.md).
+The file has the settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
+which updates the network; `Run`, which alternates collecting and learning (Schulman et al. 2017; de
+Witt et al. 2020; docs/guides/train.md).
 """
 
 from __future__ import annotations
@@ -134,11 +134,11 @@ class Batch:
     observations: Tensor  # (T, W, A, D)
     states: Tensor  # (T, W, S) states of worlds; S is 0 if the critic does not see them
     actions: Tensor  # (T, W, A, …) as sampled
-    log_probs: Tensor  # (T, W, A) of the actions
+    log_probs: Tensor  # (T, W, A) log-probabilities of the actions
     values: Tensor  # (T, W, A)
     rewards: Tensor  # (T, W, A)
     acted: Tensor  # (T, W, A) whether the entry is a decision of the network
-    next_values: Tensor  # (T, W, A) value after the step; 0 where a vehicle ended
+    next_values: Tensor  # (T, W, A) value after the step; 0 at the end of a trip
     goes_on: Tensor  # (T, W, A) whether entry t + 1 has the same vehicle and episode
     suggested: Tensor | None = None  # (T, W, A, …) actions of the imitated driver, if any
 
@@ -158,10 +158,10 @@ class Batch:
 
 
 class Collector:
-    """Drives the worlds with a network, stores the data, and measures times.
+    """Drives the worlds with a network, stores the decisions, and measures times.
 
-    If the critic sees states, worlds restart in the next step: otherwise, the last state of an
-    episode would be overwritten.
+    With a central critic, worlds restart in the step after the end of an episode, because an
+    immediate restart would overwrite the last state.
 
     Attributes:
         opponents: drivers of some vehicles, whose data are not used for training.
@@ -183,7 +183,7 @@ class Collector:
 
     @torch.inference_mode()
     def collect(self, with_suggested: bool) -> Batch:
-        """Step all worlds; on request, also store the imitated driver's actions."""
+        """Step all worlds; `with_suggested` also stores the actions of the imitated driver."""
         simulated_s = self.vec.simulated_s
         with self.times.rest("transfer"):
             batch = self._empty(with_suggested)
@@ -211,7 +211,7 @@ class Collector:
             )
 
     def _step(self, batch: Batch, t: int) -> None:
-        """Let the network decide, and fill entry `t` of a batch."""
+        """Let the network decide, step the worlds, and fill entry `t` of a batch."""
         if batch.suggested is not None:
             with self.times.of("simulation"):
                 batch.suggested[t] = self._suggest(self._observations, self._mask)
@@ -232,13 +232,13 @@ class Collector:
         batch.goes_on[t] = torch.from_numpy(acted & self._mask & ~ended & ~cut)
         if len((rows := (cut & ~ended).nonzero())[0]):
             last = torch.from_numpy(infos["final_observations"][rows]).to(self._device)
-            # The built-in driver's action in the last observation is unknown; use 0.
+            # Final observations lack the actions of the built-in driver, so use 0.
             last = nn.functional.pad(last, (0, len(self.network.mean) - last.shape[1]))
             batch.next_values[t][rows] = self.network.value(last, self._look()[rows[0]])
         self.trips.add(reward, infos["vehicle_done"] & ours, cut, infos["terms"])
 
     def _expect(self, batch: Batch) -> None:
-        """Set the value after each step of a vehicle that continues."""
+        """Fill `next_values` for the steps of trips that go on."""
         seen = self._seen()
         with self.times.of("inference"):
             after = self._heads(seen.to(self._device), self._look())[1]
@@ -246,7 +246,7 @@ class Collector:
         batch.next_values = torch.where(batch.goes_on, following, batch.next_values)
 
     def _seen(self) -> Tensor:
-        """Return (W, A, D) observations; if `residual`, with the built-in driver's action."""
+        """Return (W, A, D) observations; if residual, with the built-in driver's actions."""
         if not self.network.residual:
             return self._observations
         with self.times.of("simulation"):
@@ -313,7 +313,7 @@ class Learner:
             order = chosen[torch.randperm(len(chosen), device=chosen.device)]
             for rows in order.tensor_split(args.minibatches):
                 self.optimizer.zero_grad()
-                count = rows.numel() if rows.numel() > 1 else 0  # the advantage of one is undefined
+                count = rows.numel() if rows.numel() > 1 else 0  # one row has no deviation
                 if count:
                     found.append(self._differentiate(batch, advantages, rows, share, left))
                 if self._ranks.average_gradients(network, count):
@@ -361,7 +361,7 @@ class Learner:
             return torch.stack([policy_loss, value_loss, entropy.mean(), kl, clipped]).detach()
 
     def _filtered(self, advantages: Tensor, acted: Tensor, all_of_them: bool) -> Tensor:
-        """Return the rows to learn from, by large advantages (Cusumano-Towner et al. 2025)."""
+        """Return the rows with the largest absolute advantages (Cusumano-Towner et al. 2025)."""
         if all_of_them or self._args.keep == 1.0:
             return acted
         size = advantages[acted].abs()
@@ -370,7 +370,7 @@ class Learner:
 
     @torch.no_grad()
     def _average(self) -> None:
-        """Move the averaged weights towards the new ones; the scales are the new ones."""
+        """Move the averaged weights towards the new weights, and copy the scales."""
         latest, kept = self.network.state_dict(), self._args.average
         for name, tensor in self.averaged.state_dict().items():
             tensor.lerp_(latest[name], 1.0 if name in ("mean", "deviation") else 1.0 - kept)
@@ -413,18 +413,18 @@ class Run:
             self.learner.scales.start(self.config, policy_files(args.start)[0].parent)
         ranks.copy_weights(self.network)
         self.learner.averaged.load_state_dict(self.network.state_dict())
-        if ranks.rank:  # each process samples other actions
+        if ranks.rank:  # processes draw different actions
             torch.manual_seed(args.seed + self.updates + ranks.rank * 1_000_003)
         seed = args.seed + self.updates
         self.collector = Collector(vec, self.network, args, seed, ranks.rank)
         if not folder.began.parts:
-            self.save()  # a run that is killed before its first checkpoint restarts from here
+            self.save()  # the first checkpoint
         if parts := folder.resume():
             self.learner.load(parts["learner"])
             self.collector.load(parts["collector"])
 
     def done(self) -> float:
-        """The completed share of the run, by decisions or by time."""
+        """The completed share of the run, by decisions or by minutes."""
         done = self.agent_steps / self.args.total_agent_steps
         if self.args.minutes:
             done = max(done, self.folder.seconds / (60.0 * self.args.minutes))

@@ -2,11 +2,11 @@
 
     python train/ppo_gymnasium.py --env merge --minutes 8
 
-Every agent is a row of `gymnasium.make_vec`; rows restart in the next step, so the observation
-after a row's last step is its final one. The run's folder has the driver (`model.safetensors` and
-`config.json`, which `cavmarl evaluate --policy FOLDER` reads), `progress.csv` with the columns of
-`ppo.py`, `manifest.json` with the conditions of the training, and `checkpoint.pt`, from which
-`--resume FOLDER` continues bit for bit.
+Every agent is a row of `gymnasium.make_vec`. Rows restart in the step after the end of a trip, so
+the observation after the last step of a trip is its final observation. The run's folder has the
+driver (`model.safetensors` and `config.json`, which `cavmarl evaluate --policy FOLDER` reads),
+`progress.csv` with the columns of `ppo.py`, `manifest.json` with the conditions of the training,
+and `checkpoint.pt`, from which `--resume FOLDER` continues bit for bit.
 """
 
 from __future__ import annotations
@@ -99,7 +99,7 @@ class Learner:
         args: settings of the run.
 
     Attributes:
-        trips: (return, arrived) of the last trips; trips cut by the horizon do not count.
+        trips: (return, arrived) of the last trips; trips that the horizon truncates do not count.
         num_trips: number of trips so far.
     """
 
@@ -147,7 +147,7 @@ class Learner:
         return {name: getattr(self._rows.env, name) for name in names}
 
     def update(self, left: float) -> int:
-        """Collect and learn; return the number of decisions. `left`: remaining share of the run."""
+        """Collect and learn; `left` is the remaining share. Return the number of decisions."""
         with torch.inference_mode():
             steps = self._collect()
         active = steps.pop("active")
@@ -175,7 +175,7 @@ class Learner:
                     "log_probs": log_probs,
                     "active": self._active,
                     "values": self._network.value(before),
-                    # Include final observations, so that the value of a cut trip is known.
+                    # Include final observations, because the value of a truncated trip is needed.
                     "next_values": self._network.value(self._observations),
                     "rewards": torch.from_numpy(rewards.copy()),
                     "ended": torch.from_numpy(ended.copy()),
@@ -229,7 +229,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     torch.manual_seed(args.seed)
     rows = make_rows(args)
     env = rows.unwrapped.vec.config

@@ -103,10 +103,10 @@ class Driver(TorchRLModule, ValueFunctionAPI):  # type: ignore[misc] # RLlib is 
 
 
 class Trips(RLlibCallback):  # type: ignore[misc] # RLlib is not typed
-    """Adds the results of trips to RLlib's metrics. Trips cut by the horizon do not count."""
+    """Adds the results of trips to RLlib's metrics; truncated trips do not count."""
 
     def on_episode_step(self, *, episode: Any, metrics_logger: Any, **_: Any) -> None:
-        """Add each agent's reward, and its trip if it has ended."""
+        """Add the reward of each agent, and the trips that have ended."""
         returns = episode.custom_data.setdefault("returns", defaultdict(float))
         infos = episode.get_infos(-1)
         for agent, reward in episode.get_rewards(-1).items():
@@ -166,7 +166,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     world = parallel_env(args.env, overrides={"observation.kind": "flat"})
     env = world.config
     refuse_signal_agents(env, "this program")

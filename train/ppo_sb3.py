@@ -77,7 +77,7 @@ class Args:
 class Curve(BaseCallback):
     """Writes progress and checkpoints, and stops the run at its time limit.
 
-    Trips cut by the horizon do not count, as in `ppo.py`.
+    Trips that the horizon truncates do not count, as in `ppo.py`.
     """
 
     def __init__(self, folder: RunFolder, minutes: float) -> None:
@@ -115,7 +115,7 @@ class Curve(BaseCallback):
                 self._ended.append((info["episode"]["r"], info["is_success"]))
                 self._trips += 1
         in_time = self._folder.has_time(self._minutes)
-        if not in_time:  # the library stops before it stores the present observation
+        if not in_time:  # the library would not store these
             self.model._last_obs = self.locals["new_obs"]
             self.model._last_episode_starts = self.locals["dones"]
         return in_time
@@ -181,7 +181,7 @@ def make_model(args: Args) -> tuple[PPO, VecNormalize]:
 
 
 def save_driver(args: Args, folder: RunFolder, model: PPO, worlds: VecNormalize) -> None:
-    """Save the library's network as the seats' driver, in cavmarl's equivalent form."""
+    """Save the library's network as a driver in cavmarl's form, with equal outputs."""
     env = load_config(args.env)[0]
     config = NetworkConfig(
         environment=env.name,
@@ -219,7 +219,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     model, worlds = make_model(args)
     stepped = worlds.get_attr("worlds")[0]
     with RunFolder(args, stepped.world, stepped.plans) as folder:

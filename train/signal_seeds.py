@@ -3,11 +3,11 @@
     python train/signal_seeds.py --maps nets/RESCO --out docs/figures/signal_control.json
     python train/signal_seeds.py --table docs/figures/signal_control.json
 
-The first command trains each seed on each map (`signals_sb3.py`, one after the other, seed by
-seed), runs the scripted controllers in the same worlds, and writes all figures after each step. Run
-the same command again to continue. The second command prints the table. Trained networks have the
-95 % interval of the mean between training seeds, scripted controllers that between the evaluation
-runs.
+The first command trains on each map with each seed (`signals_sb3.py`, one training at a time), runs
+the scripted controllers in the same worlds, and writes all figures after each training or run. If
+the command is interrupted, run it again to continue. The second command prints the table. Trained
+networks have the 95 % interval of the mean over training seeds, scripted controllers that over
+evaluation runs.
 
 The maps are in the wheel of sumo-rl (`sumo_rl/nets/RESCO`). Their licences are non-commercial or
 the GPL, so the package does not contain them.
@@ -36,7 +36,7 @@ from cavmarl.learning.options import run_to_end
 PROGRAM = Path(__file__).with_name("signals_sb3.py")
 FIRST_SEED, NUM_RUNS, SECONDS = 1000, 5, 3600  # of the evaluation, as in `signals_sb3.py`
 RANGE_M = 50.0
-# Parallel worlds of a training on each map: fewer worlds where a world has more signals.
+# Number of parallel worlds in a training on each map; maps with more signals have fewer worlds.
 WORLDS = {
     "grid4x4": 2,
     "arterial4x4": 2,
@@ -46,8 +46,8 @@ WORLDS = {
     "ingolstadt7": 4,
 }
 KEPT = ("delay_of_all_s", "arrived", "never_departed", "jams")  # figures of each run
-LAST_LANE = "last lane: "  # controllers that count the vehicles on the last lane alone
-LONG_LANES = ("grid4x4", "arterial4x4")  # whose last lanes are longer than `RANGE_M`
+LAST_LANE = "last lane: "  # prefix of controllers that only count vehicles on the last lane
+LONG_LANES = ("grid4x4", "arterial4x4")  # maps with last lanes longer than `RANGE_M`
 SCRIPTED: dict[str, tuple[str, float]] = {
     OWN_PROGRAM: (OWN_PROGRAM, RANGE_M),
     "program": ("program", RANGE_M),
@@ -61,7 +61,7 @@ Runs = list[dict[str, Any]]
 
 
 def train(env: Path, seed: int, runs: Path) -> Runs:
-    """Return the figures of the evaluation of a trained seed; train it if there are none."""
+    """Return the evaluation of a training with this seed; train if it does not exist."""
     name = env.name.split(".")[0]
     found = runs / f"{name}_signals_{seed}" / "evaluation.json"
     if not found.is_file():
@@ -90,7 +90,7 @@ def script(env: Path, name: str) -> Runs:
 
 
 def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
-    """Add what is missing in the file of figures."""
+    """Measure all figures that the file does not have, and add them to the file."""
     envs = {name: maps / name / f"{name}.sumocfg" for name in WORLDS}
     for env in envs.values():
         if not env.is_file():
@@ -104,7 +104,7 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
         if each in found[name][kind]:
             continue
         known = found[name][kind].get(each.removeprefix(LAST_LANE))
-        if known is not None and name in LONG_LANES:  # the same lanes
+        if known is not None and name in LONG_LANES:  # no lane is shorter than the range
             found[name][kind][each] = known
         elif kind == "scripted":
             found[name][kind][each] = script(envs[name], each)
@@ -122,7 +122,7 @@ def measure(maps: Path, seeds: Sequence[int], out: Path, runs: Path) -> None:
 
 
 def table(maps: Mapping[str, Any]) -> Iterator[str]:
-    """Yield the lines of the table: mean and median delay of all trips, and runs that jam."""
+    """Yield the lines of the table: delays of all trips, and the number of runs that jam."""
     yield f"| map | seeds | trained | {' | '.join(f'`{name}`' for name in SCRIPTED)} |"
     yield f"| --- {'| ---: ' * (len(SCRIPTED) + 2)}|"
     for name, found in maps.items():

@@ -150,7 +150,7 @@ def train(args: Args) -> Path:
     Raises:
         CavmarlError: the settings or the environment are invalid.
     """
-    torch.set_num_threads(1)  # more threads slow small networks down
+    torch.set_num_threads(1)  # faster for small networks
     model, rows = make_model(args)
     with closing(rows), RunFolder(args, rows.get_attr("worlds")[0].world) as folder:
         model.learn(args.updates * args.num_steps * rows.num_envs)

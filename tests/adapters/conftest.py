@@ -1,4 +1,4 @@
-"""A substitute for moviepy, which recorders of other libraries use to write videos."""
+"""A substitute for moviepy, with which recorders of other libraries write videos."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 
 class Video:
-    """A video that a recorder has written: its frames and the frame rate."""
+    """A video from a recorder: its frames and its frame rate."""
 
     written: list[Video]
 
@@ -25,7 +25,7 @@ class Video:
 
 @pytest.fixture
 def recorded(monkeypatch: pytest.MonkeyPatch) -> list[Video]:
-    """Collect the videos that the recorders of a test write, instead of files."""
+    """Return the list of videos that recorders write during a test; no file is written."""
     pytest.importorskip("pygame", reason="needs the extra: render")
     Video.written = []
     clips = ModuleType("moviepy.video.io.ImageSequenceClip")

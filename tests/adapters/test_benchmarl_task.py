@@ -1,4 +1,4 @@
-"""Each population mode is a task of BenchMARL on which its algorithms run."""
+"""Algorithms of BenchMARL run on tasks of cavmarl, in each population mode."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def run(
     agents: int = 2,
     **overrides: Any,
 ) -> tuple[Any, list[float]]:
-    """Return an experiment after two iterations and an evaluation, and its logged mean rewards."""
+    """Run two iterations and an evaluation; return the experiment and its logged mean rewards."""
     import benchmarl.algorithms
     from benchmarl.experiment import Experiment, ExperimentConfig
     from benchmarl.models.mlp import MlpConfig
@@ -55,7 +55,9 @@ def run(
         config=config,
     )
     experiment.run()
-    (table,) = folder.rglob("collection_reward_reward_mean.csv")  # means over all groups
+    (table,) = folder.rglob(
+        "collection_reward_reward_mean.csv"
+    )  # this table has means over all groups
     rewards = [float(line.split(",")[1]) for line in table.read_text().splitlines()]
     return experiment, rewards
 
@@ -72,7 +74,7 @@ def test_ippo_runs_two_iterations(tmp_path: Path, mode: str) -> None:
     }
 
 
-def test_a_central_critic_meta_actions_and_named_observations_run(tmp_path: Path) -> None:
+def test_mappo_runs_with_meta_actions_and_dict_observations(tmp_path: Path) -> None:
     keys = {"observation.kind": "dict"}
     experiment, _ = run(tmp_path, "Mappo", continuous=False, **keys)
     assert experiment.n_iters_performed == 2
@@ -83,10 +85,10 @@ SIGNALS = {"signals.agents": "all", "clock.ctrl_dt_s": 5.0, "population.mode": "
 
 @pytest.mark.parametrize("algorithm", ["Mappo", "Iql"])
 @pytest.mark.parametrize("agents", [0, 2])
-def test_each_kind_of_agents_is_a_group_that_learns(
+def test_vehicles_and_signals_are_groups_that_learn(
     tmp_path: Path, algorithm: str, agents: int
 ) -> None:
-    """Signals choose only actions that their masks allow."""
+    """With `signals.forbidden: error`, an action that a mask forbids would be an error."""
     keys = SIGNALS | {"signals.forbidden": "error"}
     experiment, rewards = run(tmp_path, algorithm, task="GRID4X4", agents=agents, **keys)
     assert not experiment.continuous_actions
@@ -96,14 +98,14 @@ def test_each_kind_of_agents_is_a_group_that_learns(
     assert np.isfinite(rewards).all()
     for group in groups:
         optimized = experiment.optimizers[group]
-        assert all(optimizer.state for optimizer in optimized.values()), f"{group} learns"
+        assert all(optimizer.state for optimizer in optimized.values()), f"{group} does not learn"
 
 
 def test_the_seed_determines_the_results(tmp_path: Path) -> None:
     assert run(tmp_path / "one")[1] == run(tmp_path / "other")[1]
 
 
-def test_every_entry_is_a_task() -> None:
+def test_every_environment_is_a_task() -> None:
     from cavmarl.adapters.benchmarl_task import CavTask
 
     assert {task.get_task().config["env"] for task in CavTask} == set(entries())

@@ -1,4 +1,4 @@
-"""A copy or a pickle of an adapter has its own worlds, which continue bit for bit."""
+"""A copy or pickle of an adapter has its own worlds, which continue bit for bit."""
 
 from __future__ import annotations
 
@@ -50,12 +50,12 @@ def torchrl(**arguments: Any) -> Any:
 
 
 def step_rows(env: Any) -> list[bytes]:
-    """Return the results of a step, without infos."""
+    """Step once; return the results without infos."""
     return [part.tobytes() for part in env.step(np.full((ROWS, 2), 0.3, np.float32))[:3]]
 
 
 def step_tensors(env: Any) -> list[bytes]:
-    """Return the results of a step of TorchRL, whose worlds reset themselves."""
+    """Step TorchRL's environment once; return observations, rewards and ends."""
     tensors = env.full_action_spec.zero()
     tensors["vehicles", "action"][:] = 0.3
     told = env.step(tensors)["next"]
@@ -83,21 +83,21 @@ def test_a_copy_continues_like_the_original(view: str, how: str) -> None:
     for _ in range(3):
         step(env)
     other = COPIES[how](env)
-    first = [step(env) for _ in range(15)]  # past the end of an episode
+    first = [step(env) for _ in range(15)]  # 15 steps end an episode
     assert [step(other) for _ in range(15)] == first
-    assert len({parts[0] for parts in first}) > 10, "the worlds move"
+    assert len({parts[0] for parts in first}) > 10, "the worlds do not change"
 
 
 @pytest.mark.parametrize("view", VIEWS)
-def test_views_of_worker_processes_are_refused(view: str) -> None:
+def test_copies_of_worlds_in_worker_processes_are_refused(view: str) -> None:
     env = VIEWS[view][0](workers=1)
     with pytest.raises(cavmarl.ConfigError, match="backend='local'"):
         copy.deepcopy(env)
     env.close()
 
 
-def test_supersuits_copies_are_worlds_of_their_own() -> None:
-    """PettingZoo documents SuperSuit as the way to stable-baselines3."""
+def test_copies_that_supersuit_makes_are_different_worlds() -> None:
+    """PettingZoo recommends SuperSuit for training with stable-baselines3."""
     supersuit = pytest.importorskip("supersuit", reason="needs the extra: bench")
     stable_baselines3 = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     world = cavmarl.parallel_env("merge", agents=2, **SMALL)
@@ -106,8 +106,8 @@ def test_supersuits_copies_are_worlds_of_their_own() -> None:
     )
     seen = joined.reset()
     assert seen.shape[0] == 4
-    assert (np.abs(seen).sum(axis=1) > 0.0).all(), "no row is empty"
-    assert len({row.tobytes() for row in seen}) == 4, "all worlds differ"
+    assert (np.abs(seen).sum(axis=1) > 0.0).all(), "a row is empty"
+    assert len({row.tobytes() for row in seen}) == 4, "two rows are equal"
     model = stable_baselines3.PPO("MlpPolicy", joined, n_steps=8, batch_size=16, n_epochs=1)
     model.learn(2 * 8 * 4)
     joined.close()

@@ -1,4 +1,4 @@
-"""One vehicle as a Gymnasium environment, tested with Gymnasium's checker and wrappers."""
+"""One vehicle as an environment of Gymnasium: checker, wrappers, settings and infos."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ def make(mode: str = "closed", kind: str = "flat", **arguments: Any) -> gymnasiu
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])
 @pytest.mark.parametrize("mode", MODES)
-def test_one_vehicle_of_a_world_passes_gymnasiums_checker(mode: str, kind: str) -> None:
+def test_the_environment_passes_the_checker_of_gymnasium(mode: str, kind: str) -> None:
     world = make(mode, kind, background=5).unwrapped
     assert isinstance(world.observation_space, gymnasium.spaces.Dict) == (kind == "dict")
     check_env(world, skip_render_check=True)
 
 
-def test_the_other_agents_become_background() -> None:
+def test_other_agents_become_background_vehicles() -> None:
     population = make().unwrapped.parallel_env.config.population
     entry, _ = load_config("merge")
     everybody = entry.population.agents + entry.population.background
@@ -39,7 +39,7 @@ def test_the_other_agents_become_background() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_an_episode_is_one_trip_or_is_cut_at_the_horizon(mode: str) -> None:
+def test_an_episode_ends_with_the_trip_or_at_the_horizon(mode: str) -> None:
     world = RecordEpisodeStatistics(FlattenObservation(make(mode, "dict", background=5)))
     crashes = cuts = 0
     for seed in range(6):
@@ -73,7 +73,7 @@ def test_other_numbers_of_agents_are_refused(arguments: dict[str, Any], key: str
         gymnasium.make("cavmarl/ring-v5", **arguments)
 
 
-def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
+def test_the_spec_contains_the_horizon_and_makes_an_equal_environment() -> None:
     world = make()
     assert world.spec is not None
     assert world.spec.max_episode_steps == 40
@@ -81,13 +81,13 @@ def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
     cut = gymnasium.make("cavmarl/ring-v5", max_episode_steps=2)
     cut.reset(seed=0)
     cut.step(cut.action_space.sample())
-    assert cut.step(cut.action_space.sample())[3], "Gymnasium's own limit works, too"
+    assert cut.step(cut.action_space.sample())[3], "max_episode_steps does not truncate the episode"
     with pytest.warns(UserWarning, match="without a render_mode"):
         assert cut.unwrapped.render() is None
 
 
-def test_infos_equal_those_of_highway_env() -> None:
-    """The vehicle follows the built-in driver, or hits other vehicles at full throttle."""
+def test_infos_contain_the_keys_of_highway_env() -> None:
+    """In even episodes, the built-in driver drives; in odd ones, full throttle causes a contact."""
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):
         driven = seed % 2 == 0
@@ -111,12 +111,12 @@ def test_infos_equal_those_of_highway_env() -> None:
     assert min(ends.values()) > 0
 
 
-def test_config_holds_nested_keys_of_the_entry() -> None:
+def test_config_may_contain_nested_keys_of_the_environment() -> None:
     config = {"sensors": {"lidar": {"rays": 8}}, "terms": {"weights": {"collision": -9.0}}}
     made = make(config=config).unwrapped.parallel_env.config
     entry, _ = load_config("merge")
     assert made.sensors.lidar.rays == 8
-    assert made.sensors.lanes == entry.sensors.lanes, "other keys keep their values"
+    assert made.sensors.lanes == entry.sensors.lanes, "another key has changed"
     assert made.terms.weights == {**entry.terms.weights, "collision": -9.0}
     with pytest.raises(ConfigError, match="lanes_count"):
         gymnasium.make("cavmarl/merge-v6", config={"lanes_count": 4})

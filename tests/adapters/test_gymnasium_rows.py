@@ -1,4 +1,4 @@
-"""Agents as rows of a Gymnasium vector environment, compared with their worlds, and in wrappers."""
+"""Agents as rows of a vector environment of Gymnasium: equality with worlds, and wrappers."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def make(mode: str = "respawn", kind: str = "flat", **arguments: Any) -> Any:
 
 
 def wild(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
-    """Return (count, 2) full throttle and random steering: most trips soon end."""
+    """Return actions (count, 2) of full throttle and random steering, which soon end most trips."""
     actions = rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)
     actions[:, 0] = 1.0
     return actions
@@ -42,7 +42,7 @@ def wild(rng: np.random.Generator, count: int) -> NDArray[np.float32]:
 
 @pytest.mark.parametrize("autoreset", AUTORESET)
 @pytest.mark.parametrize("mode", MODES)
-def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None:
+def test_results_of_rows_equal_those_of_the_agents(mode: str, autoreset: AutoresetMode) -> None:
     rows = make(mode, autoreset_mode=autoreset)
     per_world = ROWS // WORLDS
     vec = make_vec(
@@ -94,7 +94,7 @@ def test_rows_are_the_worlds_agents(mode: str, autoreset: AutoresetMode) -> None
 
 @pytest.mark.parametrize("autoreset", AUTORESET)
 @pytest.mark.parametrize("mode", MODES)
-def test_gymnasium_records_the_trips_of_all_rows(mode: str, autoreset: AutoresetMode) -> None:
+def test_gymnasium_records_the_returns_of_all_rows(mode: str, autoreset: AutoresetMode) -> None:
     rows = wrappers.RecordEpisodeStatistics(make(mode, autoreset_mode=autoreset))
     if autoreset is AutoresetMode.SAME_STEP and gymnasium.__version__.startswith("1.2."):
         pytest.skip("this Gymnasium's wrapper counts as if every reset had a step of its own")
@@ -145,7 +145,7 @@ def test_observations_of_rows_can_be_dicts(autoreset: AutoresetMode) -> None:
     assert (ended > 0) == (autoreset is AutoresetMode.SAME_STEP)
 
 
-def test_gymnasiums_wrappers_take_the_rows() -> None:
+def test_wrappers_of_gymnasium_accept_the_rows() -> None:
     rows: Any = wrappers.NormalizeObservation(make(autoreset_mode="NextStep"))
     rows = wrappers.NormalizeReward(wrappers.DictInfoToList(rows))
     rows.reset(seed=0)
@@ -191,8 +191,8 @@ def test_invalid_rows_are_refused(arguments: dict[str, Any], message: str) -> No
         gymnasium.make_vec("cavmarl/mergeAgents-v6", num_envs=ROWS, **arguments)
 
 
-def test_rows_without_autoreset_start_an_episode_on_reset() -> None:
-    """With one row per world, each row is reset alone, and other rows continue."""
+def test_rows_without_autoreset_begin_an_episode_on_reset() -> None:
+    """There is one row per world, so each row can be reset while other rows continue."""
     rows = make(num_worlds=ROWS, autoreset_mode="Disabled")
     assert rows.autoreset_mode is AutoresetMode.DISABLED
     seen, _ = rows.reset(seed=5)
@@ -210,7 +210,7 @@ def test_rows_without_autoreset_start_an_episode_on_reset() -> None:
     assert ended > ROWS
 
 
-def test_rows_of_a_world_start_an_episode_together() -> None:
+def test_rows_of_one_world_begin_an_episode_together() -> None:
     rows = make(autoreset_mode="Disabled")
     rows.reset(seed=5)
     first = np.arange(ROWS) == 0
@@ -225,7 +225,9 @@ def test_rows_of_a_world_start_an_episode_together() -> None:
         over = terminated | cut
         if over.any():
             seen, told = rows.reset(options={"reset_mask": over})
-            assert not seen[over & ~told["active"]].any(), "a waiting row observes zeros"
+            assert not seen[over & ~told["active"]].any(), (
+                "a waiting row observes other values than 0"
+            )
             whole += bool(told["active"][over].all())
             waiting += bool((over & ~told["active"]).any())
     assert whole > 0
@@ -233,7 +235,7 @@ def test_rows_of_a_world_start_an_episode_together() -> None:
 
 
 def test_a_world_may_end_while_none_of_its_rows_has_a_vehicle() -> None:
-    """Without autoreset, no finished world is stepped if all ended rows are reset each time."""
+    """If all ended rows are reset after each step, the steps raise no error."""
     rows = make(num_worlds=4, autoreset_mode="Disabled")
     rows.reset(seed=0)
     rng = np.random.default_rng(0)
@@ -252,15 +254,15 @@ def test_a_world_may_end_while_none_of_its_rows_has_a_vehicle() -> None:
 @pytest.mark.parametrize("autoreset", ["Disabled", "SameStep"])
 @pytest.mark.filterwarnings("ignore::DeprecationWarning:torchrl")
 @pytest.mark.filterwarnings("ignore:Creating .* inherits from WeightUpdaterBase")
-def test_torchrls_wrapper_takes_the_rows(autoreset: str) -> None:
+def test_the_wrapper_of_torchrl_accepts_the_rows(autoreset: str) -> None:
     envs = pytest.importorskip("torchrl.envs", reason="needs the extra: torchrl")
     wrapped = envs.GymWrapper(make(autoreset_mode=autoreset))
     told = wrapped.rollout(30, break_when_any_done=False)
     assert told["observation"].shape == (ROWS, 30, wrapped.observation_spec["observation"].shape[1])
-    assert told["next", "done"].any(dim=1).all(), "each row ends and continues"
+    assert told["next", "done"].any(dim=1).all(), "a row did not end"
 
 
-def test_the_spec_has_the_horizon_and_makes_an_equal_environment() -> None:
+def test_the_spec_contains_the_horizon_and_makes_an_equal_environment() -> None:
     rows = make()
     assert rows.spec.id == "cavmarl/mergeAgents-v6"
     assert rows.spec.max_episode_steps == 12
@@ -280,8 +282,10 @@ def test_gymnasium_records_a_video_of_the_rows(tmp_path: Any, recorded: Any) -> 
     frames = rows.render()
     film.close()
     assert len(frames) == ROWS
-    assert (frames[0] == frames[ROWS // WORLDS - 1]).all(), "rows of a world show that world"
-    assert (frames[0] != frames[-1]).any(), "rows of the other world show the other world"
+    assert (frames[0] == frames[ROWS // WORLDS - 1]).all(), (
+        "rows of one world show different pictures"
+    )
+    assert (frames[0] != frames[-1]).any(), "rows of two worlds show one picture"
     (video,) = recorded
     assert len(video.frames) == 3
     assert video.fps == rows.metadata["render_fps"] == 5

@@ -1,4 +1,4 @@
-"""Tasks of highway-env: its scripts run with a changed id, and numbers have the same meaning."""
+"""Tasks with the API of highway-env: loop, spaces, settings and meaning of actions."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-import cavmarl  # registers the ids
+import cavmarl  # registers the ids in Gymnasium
 from cavmarl.adapters.highway_tasks import TASKS
 from cavmarl.config.library_names import HIGHWAY_TASKS
 from cavmarl.core.errors import ConfigError
@@ -36,7 +36,7 @@ def test_each_task_has_an_id() -> None:
 
 
 @pytest.mark.parametrize("task", sorted(TASKS))
-def test_the_loop_of_highway_envs_readme_runs(task: str, make: Any) -> None:
+def test_the_loop_of_the_readme_of_highway_env_runs(task: str, make: Any) -> None:
     env = make(task, render_mode="rgb_array", config={"duration": 4})
     obs, info = env.reset(seed=1)
     terminated = truncated = False
@@ -55,7 +55,7 @@ def test_the_loop_of_highway_envs_readme_runs(task: str, make: Any) -> None:
     assert obs.shape[0] == rows
 
 
-def test_gymnasium_accepts_a_task(make: Any) -> None:
+def test_a_task_passes_the_checker_of_gymnasium(make: Any) -> None:
     check_env(make("highway-fast").unwrapped, skip_render_check=True)
 
 
@@ -68,7 +68,7 @@ def test_gymnasium_accepts_a_task(make: Any) -> None:
         ({"type": "LidarObservation", "cells": 24}, (24, 2)),
     ],
 )
-def test_observations_have_highway_envs_shapes(
+def test_observations_have_the_shapes_of_highway_env(
     observation: dict[str, Any], shape: tuple[int, ...], make: Any
 ) -> None:
     env = make("merge", config={"observation": observation})
@@ -87,7 +87,9 @@ def test_steering_has_the_sign_of_highway_env(make: Any) -> None:
     before = env.reset(seed=0)[0][0, 0]
     for _ in range(5):
         obs, *_ = env.step(np.array([0.0, 0.1], dtype=np.float32))
-    assert obs[0, 0] > before  # y grows to the right of a car that drives to the east
+    assert (
+        obs[0, 0] > before
+    )  # y grows to the south, which is to the right of a car that drives east
 
 
 @pytest.mark.parametrize(
@@ -102,7 +104,7 @@ def test_steering_has_the_sign_of_highway_env(make: Any) -> None:
         ),
     ],
 )
-def test_actions_have_highway_envs_spaces(
+def test_actions_have_the_spaces_of_highway_env(
     action: dict[str, Any], space: gymnasium.Space[Any], make: Any
 ) -> None:
     env = make("merge", config={"action": action})
@@ -111,7 +113,7 @@ def test_actions_have_highway_envs_spaces(
     env.step(env.action_space.sample())
 
 
-def test_faster_drives_faster_and_is_rewarded(make: Any) -> None:
+def test_the_action_faster_has_a_higher_reward_than_slower(make: Any) -> None:
     rewards = {}
     for name in ("FASTER", "SLOWER"):
         env = make("highway")

@@ -1,4 +1,4 @@
-"""An adapter whose library is missing names the extra to install."""
+"""If the library of an adapter is missing, the error names the extra to install."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ from cavmarl.core.errors import MissingExtraError
     ],
 )
 @pytest.mark.filterwarnings("ignore")  # TorchRL warns about its own code
-def test_a_missing_library_is_named_with_its_extra(
+def test_the_error_for_a_missing_library_names_the_extra(
     monkeypatch: pytest.MonkeyPatch, view: str, library: str, extra: str
 ) -> None:
     pytest.importorskip("torch", reason="needs the extra: train")

@@ -1,6 +1,6 @@
 """Worlds inside workers of other libraries have the same results as worlds of this process.
 
-Such a worker may not start `multiprocessing` children.
+Python forbids such workers to start children with `multiprocessing`.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ STEPS = 30
 
 
 class OneRow(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
-    """The first agent of batched worlds, as a library's worker steps it."""
+    """An environment of the first agent of batched worlds, for workers of other libraries."""
 
     def __init__(self, workers: int) -> None:
         self.vec = make_vec(
@@ -51,7 +51,7 @@ class OneRow(gymnasium.Env[NDArray[np.float32], NDArray[np.float32]]):
 
 
 def drive(step: Callable[[NDArray[np.float32]], Any], count: int) -> list[Any]:
-    """Return the results of STEPS steps of `count` rows."""
+    """Step `count` rows STEPS times with random actions; return the results."""
     rng = np.random.default_rng(0)
     return [step(rng.uniform(-1.0, 1.0, (count, 2)).astype(np.float32)) for _ in range(STEPS)]
 

@@ -1,4 +1,4 @@
-"""Run the examples of docs/guides/libraries.md that need another library."""
+"""Examples of docs/guides/libraries.md that need other libraries run."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ LIBRARIES = ("supersuit", "tianshou", "skrl", "agilerl", "ray.rllib")
 
 
 def example(library: str) -> str:
-    """Return the program of the page that imports a library."""
+    """Return the only program of the page that imports this library."""
     text = PAGE.read_text(encoding="utf-8")
     programs: list[str] = re.findall(r"^```python\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
     uses = re.compile(rf"^(from|import) {library}\b", re.MULTILINE)

@@ -45,11 +45,11 @@ def cluster() -> Iterator[None]:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_rllib_gets_the_agents_of_the_world(mode: str) -> None:
-    """Each result of the world reaches RLlib once, although RLlib's episodes may end earlier."""
+def test_rllib_gets_the_results_of_the_world(mode: str) -> None:
+    """Compare with PettingZoo's environment. RLlib's episodes may end earlier; then it resets."""
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
-    # An agent enters when the trip of the previous one has ended.
+    # In the mode "open" with one agent, an agent enters when the trip of the last one has ended.
     chosen = config(mode) | ({"agents": 1} if mode == "open" else {})
     env, twin = CavRllibEnv(chosen), parallel_env(**chosen)
     sampled = env.get_action_space("car_0")
@@ -87,7 +87,7 @@ def test_rllib_gets_the_agents_of_the_world(mode: str) -> None:
     assert (handed_on > 0) == (mode == "open")
 
 
-def test_a_truncation_is_no_termination() -> None:
+def test_the_horizon_truncates_and_does_not_terminate() -> None:
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
     env = CavRllibEnv(config("closed"))
@@ -100,7 +100,7 @@ def test_a_truncation_is_no_termination() -> None:
 
 
 def train(flat: bool = True, **runners: Any) -> dict[str, Any]:
-    """Run one update of PPO; return what its runners report about the episodes."""
+    """Run one update of PPO; return the results of its environment runners."""
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.connectors.env_to_module import FlattenObservations
 
@@ -127,7 +127,7 @@ def train(flat: bool = True, **runners: Any) -> dict[str, Any]:
 
 @pytest.mark.usefixtures("cluster")
 @pytest.mark.parametrize("mode", MODES)
-def test_every_population_trains(mode: str) -> None:
+def test_ppo_trains_in_every_population_mode(mode: str) -> None:
     found = train(mode=mode, num_env_runners=0)
     assert found["num_episodes"] > 0
     seen = set(found["agent_episode_returns_mean"])
@@ -135,7 +135,7 @@ def test_every_population_trains(mode: str) -> None:
 
 
 @pytest.mark.usefixtures("cluster")
-def test_two_worlds_train_side_by_side() -> None:
+def test_two_worlds_of_one_runner_train() -> None:
     assert train(num_env_runners=0, num_envs_per_env_runner=2)["num_episodes"] > 0
 
 
@@ -145,11 +145,11 @@ def test_a_remote_runner_trains() -> None:
 
 
 @pytest.mark.usefixtures("cluster")
-def test_observations_named_by_sensor_train_through_a_connector() -> None:
+def test_dict_observations_train_with_a_connector_that_flattens() -> None:
     assert train(flat=False, num_env_runners=0)["num_episodes"] > 0
 
 
-def test_wrong_settings_are_refused() -> None:
+def test_a_world_without_agents_is_refused() -> None:
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
     with pytest.raises(ConfigError, match=r"population\.agents = 0"):
@@ -162,15 +162,15 @@ TOWN = {"signals.agents": "all", "clock.ctrl_dt_s": 1.0, "signals.decide_s": 2.0
 
 
 def town(agents: int, mode: str) -> dict[str, Any]:
-    """A world whose signals differ in their lanes and greens."""
+    """Return settings of a world whose signals differ in their numbers of lanes and greens."""
     keys = TOWN | {"population.mode": mode, "population.budget": 4}
     return {"env": "town", "agents": agents, "background": 20, "overrides": keys}
 
 
 @pytest.mark.parametrize("agents", [0, 2])
 @pytest.mark.parametrize("mode", MODES)
-def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
-    """The results equal those of the world; between two decisions, signals have no results."""
+def test_signals_observe_and_act_only_at_their_decisions(mode: str, agents: int) -> None:
+    """The results at decisions equal those of the world; between decisions, signals have none."""
     from cavmarl.adapters.rllib_env import CavRllibEnv, policy_of
 
     env, twin = CavRllibEnv(town(agents, mode)), parallel_env(**town(agents, mode))
@@ -228,10 +228,10 @@ def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
         assert ended == {agent: over[agent] for agent in expected}
         assert cut == {agent: left[agent] for agent in expected}
         assert env.agents == twin.agents
-    for agent in signals.agents:  # later steps do not overwrite observations that RLlib keeps
+    for agent in signals.agents:  # later steps must not overwrite earlier observations
         np.testing.assert_equal(first[agent], kept[agent])
     assert beyond > 0
-    assert decisions == 9 * 5  # one every 2 s, in 9 s
+    assert decisions == 9 * 5  # each of 9 signals decides every 2 s of the 9 s
     if not agents:
         assert calls == 5
     elif mode == "respawn":  # vehicles act in each step
@@ -240,8 +240,8 @@ def test_signals_act_when_they_decide(mode: str, agents: int) -> None:
 
 @pytest.mark.usefixtures("cluster")
 @pytest.mark.parametrize("agents", [0, 2])
-def test_each_kind_of_agents_trains_its_policy(agents: int) -> None:
-    """RLlib's own module masks actions; every choice that it makes is allowed."""
+def test_vehicles_and_signals_train_separate_policies(agents: int) -> None:
+    """Signals use the masking module of RLlib, so they choose only greens that are allowed."""
     from ray.rllib.algorithms.ppo import PPOConfig
     from ray.rllib.core.rl_module.multi_rl_module import MultiRLModuleSpec
     from ray.rllib.core.rl_module.rl_module import RLModuleSpec
@@ -262,7 +262,7 @@ def test_each_kind_of_agents_trains_its_policy(agents: int) -> None:
     }
     algorithm = (
         PPOConfig()
-        # RLlib's check of an environment acts at random.
+        # The check of environments is off, because it acts at random, without masks.
         .environment(CavRllibEnv, env_config=world, disable_env_checking=True)
         .env_runners(num_env_runners=0, rollout_fragment_length=64)
         .multi_agent(policies=set(modules), policy_mapping_fn=policy_of)
@@ -279,5 +279,5 @@ def test_each_kind_of_agents_trains_its_policy(agents: int) -> None:
     assert found["env_runners"]["num_episodes"] > 0
     for policy in modules:
         changes = [(after[policy][name] != each).any() for name, each in before[policy].items()]
-        assert any(changes), f"{policy} learns"
+        assert any(changes), f"{policy} does not learn"
         assert np.isfinite(found["learners"][policy]["total_loss"])

@@ -1,4 +1,4 @@
-"""Signals as rows for stable-baselines3, compared with their worlds."""
+"""Signals as rows for stable-baselines3: equality with their worlds, and training."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def make(env: str = "grid4x4", **more: Any) -> Any:
     return CavSb3SignalEnv(env, num_worlds=2, **keys)
 
 
-def test_a_step_lasts_from_decision_to_decision() -> None:
+def test_a_step_lasts_until_the_next_decision() -> None:
     vec = make_vec(
         "grid4x4",
         num_envs=2,
@@ -45,7 +45,7 @@ def test_a_step_lasts_from_decision_to_decision() -> None:
             seen, rewards, done, infos = rows.step(actions)
             total = np.zeros((2, 16), np.float32)
             over = np.zeros((2, 16), np.bool_)
-            for _ in range(2):  # 5 s between decisions
+            for _ in range(2):  # a decision every 5 s lasts two steps of the worlds
                 expected, gained, _, truncated, _ = vec.step({"signals": actions.reshape(2, 16)})
                 total += gained["signals"]
                 over |= truncated["signals"]
@@ -60,7 +60,7 @@ def test_a_step_lasts_from_decision_to_decision() -> None:
         assert ends == 2 * 32
 
 
-def test_an_action_beyond_the_greens_keeps_the_green() -> None:
+def test_an_action_beyond_the_number_of_greens_keeps_the_green() -> None:
     beyond, kept = make(), make()
     with closing(beyond), closing(kept):
         for rows in (beyond, kept):
@@ -79,7 +79,7 @@ def test_ppo_learns_from_the_rows() -> None:
         assert model.num_timesteps == 8 * 32
 
 
-def test_with_features_of_greens_rows_differ_in_size_and_worlds_in_their_start() -> None:
+def test_features_of_greens_have_sizes_and_spread_worlds_start_at_different_times() -> None:
     with pytest.raises(ConfigError, match="features"):
         make(features="cars")
     with closing(make()) as rows, pytest.raises(ConfigError, match="sizes"):

@@ -1,4 +1,4 @@
-"""Agents as rows for stable-baselines3: its own checks, and equality with the worlds."""
+"""Agents as rows for stable-baselines3: checks of the library, equality with worlds, training."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def rows() -> Any:
 
 
 def wild(rows: Any, seed: int) -> list[Any]:
-    """Return 80 actions with random steering: trips end off the road or at the horizon."""
+    """Reset and take 80 steps of full throttle and random steering; return all results."""
     rows.seed(seed)
     found = [rows.reset()]
     random = np.random.default_rng(0)
@@ -80,7 +80,7 @@ def test_sb3_learns_saves_and_loads(rows: Any, tmp_path: Any) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_rows_are_the_worlds_agents(mode: str) -> None:
+def test_results_of_rows_equal_those_of_the_agents(mode: str) -> None:
     rows = make(mode)
     vec = make_vec(
         "merge",
@@ -121,7 +121,7 @@ def test_rows_are_the_worlds_agents(mode: str) -> None:
 
 @pytest.mark.parametrize("kind", ["flat", "dict"])
 @pytest.mark.parametrize("mode", MODES)
-def test_every_population_trains(mode: str, kind: str) -> None:
+def test_ppo_trains_in_every_population_mode(mode: str, kind: str) -> None:
     from stable_baselines3.common.vec_env import VecMonitor, VecNormalize
 
     watched = VecNormalize(VecMonitor(make(mode, kind)))
@@ -183,14 +183,14 @@ def test_sb3_records_a_video_of_the_worlds(tmp_path: Any, recorded: Any) -> None
     assert video.fps == 5
 
 
-def test_rows_have_the_spec_of_their_entry(rows: Any) -> None:
+def test_rows_have_the_spec_of_their_environment(rows: Any) -> None:
     from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
     assert rows.spec.id == "cavmarl/mergeAgents-v6"
     assert rows.get_attr("spec", 0) == [rows.spec]
     assert rows.spec.max_episode_steps == 20
     folder = Path(__file__).parents[2] / "envs" / "ring"
-    assert CavSb3VecEnv(folder).spec is None, "no id creates this environment"
+    assert CavSb3VecEnv(folder).spec is None, "an environment without an id has a spec"
 
 
 def test_wrong_use_is_refused(rows: Any) -> None:

@@ -47,7 +47,7 @@ NAMED = re.compile("We recommend agents to be named")
 
 @pytest.fixture(scope="module")
 def routes(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """Write a file with a vehicle every 6 s on each of some routes through the grid."""
+    """Write demand with a vehicle every 6 s on each of ROUTES; return its path."""
     flows = [
         f'<flow id="f{k}" begin="0" end="3600" period="6" from="{start}" to="{end}"/>'
         for k, (start, end) in enumerate(ROUTES)
@@ -62,7 +62,7 @@ def grid(routes: str, **more: Any) -> SumoEnvironment:
 
 
 def drive(env: SumoEnvironment, steps: int, every: int = 4) -> list[Any]:
-    """Step with one green for all signals, and with the next green after some steps."""
+    """Step with the same green for all signals; change to the next green every `every` steps."""
     return [
         env.step({ts: k // every % env.action_spaces(ts).n for ts in env.ts_ids})
         for k in range(steps)
@@ -99,7 +99,7 @@ def test_signals_lanes_and_phases_equal_those_of_the_map_file(routes: str) -> No
 
 
 def test_greens_are_counted_as_in_sumo_rl(routes: str, tmp_path: Path) -> None:
-    """In sumo-rl's API, equal phases and phases with `Y` are greens; elsewhere, they are not."""
+    """sumo-rl counts repeated phases and phases with `Y` as greens; cavmarl's own API does not."""
     with closing(grid(routes)) as env:
         first, second = (phase.state for phase in env.traffic_signals["A0"].green_phases)
         size = len(first)
@@ -153,7 +153,7 @@ def test_greens_change_at_the_times_of_sumo_rl(routes: str) -> None:
                 assert signal.next_action_time == env.sim_step
 
 
-def test_max_green_is_enforced_only_on_request(routes: str) -> None:
+def test_the_longest_green_is_enforced_only_on_request(routes: str) -> None:
     def last_green(**more: Any) -> int:
         with closing(grid(routes, max_green=20, **more)) as env:
             env.reset()
@@ -185,8 +185,8 @@ def on_lanes(env: SumoEnvironment, lanes: list[str]) -> NDArray[np.void]:
     return rows[np.isin(names, lanes)]
 
 
-def test_observations_and_rewards_follow_sumo_rls_formulas(routes: str) -> None:
-    """Compare with formulas over all vehicles, and with the signal agents of the engine."""
+def test_observations_and_rewards_follow_the_formulas_of_sumo_rl(routes: str) -> None:
+    """Compare with formulas over all vehicles, and with the signal agents of the world."""
     names = ["average-speed", "queue", "pressure", "diff-waiting-time"]
     with closing(grid(routes, num_seconds=400, reward_fn=names)) as env:
         env.reset()
@@ -225,7 +225,7 @@ def test_observations_and_rewards_follow_sumo_rls_formulas(routes: str) -> None:
         assert seen > 100
 
 
-def test_infos_have_sumo_rls_values(routes: str) -> None:
+def test_infos_have_the_values_of_sumo_rl(routes: str) -> None:
     with closing(grid(routes)) as env:
         env.reset()
         info = drive(env, 20)[-1][3]
@@ -363,7 +363,7 @@ def test_a_seed_repeats_an_episode(routes: str) -> None:
         assert run(env, seed=8) != first
         assert run(env, seed=7) == first
         env.close()
-        assert run(env) == first  # created again
+        assert run(env) == first  # a closed environment makes a new world
     with closing(grid(routes, sumo_seed="random")) as env:
         assert run(env) != run(env)
         assert run(env, seed=7) == first
@@ -395,7 +395,7 @@ def test_an_episode_ends_after_its_seconds(routes: str) -> None:
         env.step({})
 
 
-def test_options_of_sumo_reach_the_demand(routes: str, tmp_path: Path) -> None:
+def test_options_of_sumo_are_applied_to_the_demand(routes: str, tmp_path: Path) -> None:
     def departed(options: str | None) -> int:
         with closing(grid(routes, additional_sumo_cmd=options)) as env:
             env.reset()
@@ -438,12 +438,12 @@ def test_dqn_learns_on_one_signal(routes: str) -> None:
         assert env.world.simulation.traffic_stats().departed > 0
 
 
-def test_ppo_learns_with_one_policy_for_all_signals(routes: str) -> None:
+def test_ppo_learns_one_policy_for_all_signals(routes: str) -> None:
     pytest.importorskip("torch", reason="needs the extra: train")
     library = pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     supersuit = pytest.importorskip("supersuit", reason="needs the extra: bench")
     env = sumo_rl.parallel_env(net_file=str(NET), route_file=routes, num_seconds=50)
-    # Agents at the edge of the grid have fewer lanes.
+    # Signals at the edge of the grid have fewer lanes, so their spaces are padded.
     env = supersuit.pad_action_space_v0(supersuit.pad_observations_v0(env))
     env = supersuit.pettingzoo_env_to_vec_env_v1(env)
     env = supersuit.concat_vec_envs_v1(env, 2, num_cpus=1, base_class="stable_baselines3")
@@ -453,7 +453,7 @@ def test_ppo_learns_with_one_policy_for_all_signals(routes: str) -> None:
     assert model.num_timesteps == 320
 
 
-def test_q_learning_with_a_table_for_each_signal(routes: str) -> None:
+def test_q_learning_runs_with_a_table_for_each_signal(routes: str) -> None:
     with closing(grid(routes, num_seconds=200)) as env:
         states = env.reset()
         agents = {
@@ -501,7 +501,7 @@ def test_q_learning_follows_its_update_rule_and_explores() -> None:
 
 
 @pytest.mark.filterwarnings(f"ignore:{NAMED.pattern}")
-def test_both_forms_for_pettingzoo_keep_its_rules(routes: str) -> None:
+def test_both_environments_for_pettingzoo_pass_its_api_tests(routes: str) -> None:
     arguments = {"net_file": str(NET), "route_file": routes, "num_seconds": 50}
     with closing(sumo_rl.env(**arguments)) as env:
         api_test(env, num_cycles=200)
@@ -509,7 +509,7 @@ def test_both_forms_for_pettingzoo_keep_its_rules(routes: str) -> None:
         parallel_api_test(env, num_cycles=30)
 
 
-def test_both_forms_for_pettingzoo_give_the_results_of_the_environment(routes: str) -> None:
+def test_both_environments_for_pettingzoo_give_equal_results(routes: str) -> None:
     arguments: dict[str, Any] = {"net_file": str(NET), "route_file": routes, "num_seconds": 100}
     with (
         closing(grid(routes, sumo_seed=5)) as env,
@@ -537,10 +537,10 @@ def test_both_forms_for_pettingzoo_give_the_results_of_the_environment(routes: s
         assert not parallel.agents
 
 
-# RESCO's environments
+# Environments of RESCO
 
 
-def test_named_environments_read_a_folder_of_the_user(
+def test_environments_of_resco_are_read_from_a_folder_of_the_user(
     routes: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name, file in (("grid4x4", "grid4x4_1"), ("cologne1", "cologne1")):
@@ -566,7 +566,7 @@ def test_named_environments_read_a_folder_of_the_user(
         sumo_rl.ingolstadt1, sumo_rl.ingolstadt7, sumo_rl.ingolstadt21,
     ],
 )  # fmt: skip
-def test_a_missing_folder_of_maps_is_named(
+def test_the_error_for_missing_maps_names_the_argument_and_the_file(
     make: Callable[..., Any], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.delenv("SUMO_RL_NETS", raising=False)
@@ -590,7 +590,7 @@ def test_a_missing_folder_of_maps_is_named(
         ("sumo_warnings", False),
     ],
 )
-def test_arguments_without_an_effect_warn_once(routes: str, name: str, value: Any) -> None:
+def test_each_argument_without_an_effect_warns_once(routes: str, name: str, value: Any) -> None:
     with pytest.warns(UserWarning, match=rf"{name} = .* is ignored: ") as caught:
         grid(routes, **{name: value}).close()
     assert len(caught) == 1
@@ -616,7 +616,7 @@ def test_arguments_without_an_effect_warn_once(routes: str, name: str, value: An
         ({"overrides": {"signals.sensing": "loops"}}, ConfigError, "must be truth: sumo-rl's"),
     ],
 )
-def test_impossible_arguments_are_refused(
+def test_invalid_arguments_are_refused(
     routes: str, more: dict[str, Any], error: type[CavmarlError], message: str
 ) -> None:
     given = {"net_file": str(NET), "route_file": routes, **more}
@@ -624,7 +624,7 @@ def test_impossible_arguments_are_refused(
         SumoEnvironment(**given)
 
 
-def test_actions_that_do_not_exist_are_refused(routes: str) -> None:
+def test_invalid_actions_are_refused(routes: str) -> None:
     with closing(grid(routes)) as env:
         env.reset()
         for actions, message in (
@@ -640,7 +640,7 @@ def test_actions_that_do_not_exist_are_refused(routes: str) -> None:
         env.step({"A0": np.int64(1), "A1": np.array([1])})
 
 
-def test_there_is_no_connection_to_sumo(routes: str) -> None:
+def test_access_to_traci_is_refused(routes: str) -> None:
     with closing(grid(routes)) as env:
         for owner in (env, env.traffic_signals["A0"]):
             assert not hasattr(owner, "sumo")
@@ -650,7 +650,7 @@ def test_there_is_no_connection_to_sumo(routes: str) -> None:
             _ = env.wings
 
 
-def test_a_picture_is_drawn(routes: str) -> None:
+def test_the_world_can_be_drawn(routes: str) -> None:
     pytest.importorskip("pygame", reason="needs the extra: render")
     with closing(grid(routes, render_mode="rgb_array")) as env:
         env.reset()

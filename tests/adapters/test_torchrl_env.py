@@ -1,4 +1,4 @@
-"""Worlds as tensors of TorchRL: its own checks, and equality with the arrays."""
+"""Worlds as tensors of TorchRL: checks of the library, equality with arrays, training."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytestmark = [
 
 @pytest.fixture(autouse=True)
 def torchrl() -> Any:
-    """Return the library; importing it takes seconds, so this file does it only for its tests."""
+    """Return the library. It is imported here, because the import takes seconds."""
     return pytest.importorskip("torchrl", reason="needs the extra: torchrl")
 
 
@@ -50,7 +50,7 @@ def make(mode: str = "respawn", **overrides: Any) -> Any:
 
 
 def wild(tensordict: Any) -> Any:
-    """Return a policy of full throttle: vehicles leave the road, or their trips are truncated."""
+    """Set actions of full throttle and random steering, which soon end most trips."""
     random = torch.Generator().manual_seed(
         int(tensordict[VEHICLES, "observation"].sum() * 1e3) % 2**31
     )
@@ -62,7 +62,7 @@ def wild(tensordict: Any) -> Any:
 @pytest.mark.parametrize("action", ["continuous", "discrete", "grid"])
 @pytest.mark.parametrize("kind", ["flat", "dict"])
 @pytest.mark.parametrize("mode", MODES)
-def test_torchrls_own_check_passes(mode: str, kind: str, action: str) -> None:
+def test_the_check_of_torchrl_passes(mode: str, kind: str, action: str) -> None:
     from torchrl.envs.utils import check_env_specs
 
     env = make(mode, **{"observation.kind": kind, "action.kind": action})
@@ -72,8 +72,8 @@ def test_torchrls_own_check_passes(mode: str, kind: str, action: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_tensors_are_the_worlds_arrays(mode: str) -> None:
-    """TorchRL resets a world between two steps; the arrays reset themselves."""
+def test_tensors_equal_the_arrays_of_the_worlds(mode: str) -> None:
+    """TorchRL resets finished worlds between two steps; the arrays reset in the same step."""
     env = make(mode)
     env.set_seed(7)
     rollout = env.rollout(80, wild, break_when_any_done=False)
@@ -146,7 +146,7 @@ def test_a_world_can_be_reset_before_it_is_over(torchrl: Any) -> None:
     assert rollout["step_count"].max() == 4
 
 
-def test_kept_tensors_are_not_overwritten() -> None:
+def test_later_steps_do_not_change_earlier_tensors() -> None:
     env = make()
     state = env.reset()
     kept = [state.clone(), state]
@@ -155,7 +155,7 @@ def test_kept_tensors_are_not_overwritten() -> None:
     assert (kept[0] == kept[1].select(*kept[0].keys(True, True))).all()
 
 
-def test_observations_may_be_named_by_sensor() -> None:
+def test_observations_can_be_named_by_sensor() -> None:
     named, flat = make(**{"observation.kind": "dict"}), make()
     for env in (named, flat):
         env.set_seed(1)
@@ -166,7 +166,7 @@ def test_observations_may_be_named_by_sensor() -> None:
     np.testing.assert_array_equal(flat_observation(parts, one, stack=1), wanted[1, 2])
 
 
-def test_torchrls_collector_gathers_whole_batches() -> None:
+def test_the_collector_of_torchrl_returns_whole_batches() -> None:
     from torchrl.collectors import Collector
 
     collector = Collector(make, wild, frames_per_batch=20, total_frames=40)
@@ -196,7 +196,7 @@ TOWN = {"signals.agents": "all", "clock.ctrl_dt_s": 1.0, "signals.decide_s": 2.0
 
 
 def town(agents: int = 2, **overrides: Any) -> Any:
-    """Worlds whose signals differ in their lanes and greens."""
+    """Return worlds whose signals differ in their numbers of lanes and greens."""
     from cavmarl.adapters.torchrl_env import CavTorchRLEnv
 
     keys = TOWN | overrides
@@ -204,7 +204,7 @@ def town(agents: int = 2, **overrides: Any) -> Any:
 
 
 @pytest.mark.parametrize("action", ["continuous", "discrete"])
-def test_vehicles_and_signals_are_two_groups(action: str) -> None:
+def test_vehicles_and_signals_are_groups(action: str) -> None:
     from torchrl.envs.utils import check_env_specs
 
     env = town(**{"action.kind": action, "observation.kind": "dict"})
@@ -224,8 +224,8 @@ def test_vehicles_and_signals_are_two_groups(action: str) -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_the_tensors_of_signals_are_the_worlds_arrays(mode: str) -> None:
-    """A choice that a signal does not have keeps its green; other choices reach the world."""
+def test_tensors_of_signals_equal_the_arrays_of_the_worlds(mode: str) -> None:
+    """A signal keeps its green if the chosen green does not exist at this signal."""
     keys = {"population.mode": mode, "population.budget": 4}
     env = town(**keys)
     vec = make_vec("town", num_envs=WORLDS, agents=2, background=20, overrides=TOWN | keys)
@@ -275,7 +275,7 @@ def test_the_tensors_of_signals_are_the_worlds_arrays(mode: str) -> None:
     assert env.vec.state_hash() == vec.state_hash()
 
 
-def test_torchrls_action_mask_leaves_the_choices_that_are_allowed() -> None:
+def test_the_action_mask_of_torchrl_leaves_only_allowed_greens() -> None:
     from torchrl.envs import ActionMask, TransformedEnv
 
     env = town(agents=0, **{"signals.forbidden": "error", "signals.max_green_s": 10.0})
@@ -287,9 +287,11 @@ def test_torchrls_action_mask_leaves_the_choices_that_are_allowed() -> None:
         env.rollout(40, break_when_any_done=False)
 
 
-@pytest.mark.filterwarnings("ignore:size_average and reduce args")  # of TorchRL 0.11 itself
-def test_ppo_learns_to_open_the_longest_queues() -> None:
-    """One network for all signals, by TorchRL's masked distribution, advantages and loss."""
+@pytest.mark.filterwarnings(
+    "ignore:size_average and reduce args"
+)  # a warning about code of TorchRL 0.11
+def test_ppo_learns_to_give_green_to_the_longest_queues() -> None:
+    """All signals share one network; distribution, advantages and loss come from TorchRL."""
     from tensordict import TensorDict
     from tensordict.nn import TensorDictModule
     from torchrl.envs import ExplorationType, set_exploration_type

@@ -1,4 +1,4 @@
-"""The comparison of signal control with sumo-rl: measured figures and refused arguments."""
+"""The benchmark that compares signal control with sumo-rl."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def config_in(folder: Path) -> Path:
 def test_rates_are_decisions_of_all_worlds_per_second(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A script takes the place of sumo-rl; it reports half a second for each turn."""
+    """A script in the place of sumo-rl reports half a second for each turn."""
     program = tmp_path / "python"
     program.write_text(SIDE)
     program.chmod(program.stat().st_mode | stat.S_IXUSR)
@@ -49,12 +49,14 @@ def test_rates_are_decisions_of_all_worlds_per_second(
         assert rates.low > 0.0
 
 
-def test_a_python_without_sumo_rl_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_for_a_python_without_sumo_rl_names_the_setting(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv(PYTHON, sys.executable)
     with pytest.raises(ConfigError, match=f"sumo-rl ended: .*sumo_rl.*\nCure: .* {PYTHON}"):
         measure_signal_speed(config_in(tmp_path), worlds=(1,), after_s=5, turn=1, repeats=1)
 
 
-def test_a_network_alone_is_refused() -> None:
+def test_a_map_without_demand_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"map\.net\.xml"):
         measure_signal_speed(NET)

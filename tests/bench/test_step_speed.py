@@ -1,4 +1,4 @@
-"""The comparison with highway-env at a small size: both sides run on the same road."""
+"""The benchmark that compares steps with highway-env, with few agents."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cavmarl.core.errors import ConfigError, MissingExtraError
 from cavmarl.maps.check import check_map
 
 
-def test_every_row_is_measured_in_each_turn() -> None:
+def test_all_sides_and_sensors_are_measured() -> None:
     pytest.importorskip("highway_env")
     told: list[str] = []
     found = measure_step_speed(agents=3, worlds=2, repeats=2, progress=told.append)
@@ -41,7 +41,7 @@ def test_every_row_is_measured_in_each_turn() -> None:
     ]
 
 
-def test_both_sides_have_equal_vehicles_time_steps_and_observations(tmp_path: Path) -> None:
+def test_cavmarl_and_highway_env_have_equal_vehicles_time_steps_and_sensors(tmp_path: Path) -> None:
     pytest.importorskip("highway_env")
     theirs = {seen["type"]: highway_env(5, seen) for seen in (THEIR_LIDAR, THEIR_KINEMATICS)}
     road_m = max(map(length_m, theirs.values()))
@@ -70,8 +70,8 @@ def test_both_sides_have_equal_vehicles_time_steps_and_observations(tmp_path: Pa
     assert lidar.range_m == THEIR_LIDAR["maximum_range"]
 
 
-class Clocked:
-    """Worlds with a fake clock: a reset takes 100 s, a step 0.5 s, for 2 worlds of 3 agents."""
+class FakeWorlds:
+    """Two fake worlds of three agents: a reset advances a fake clock by 100 s, a step by 0.5 s."""
 
     num_envs, num_agents = 2, 3
 
@@ -93,14 +93,14 @@ class Clocked:
 
 
 def test_rates_are_agent_steps_per_second_without_resets(monkeypatch: pytest.MonkeyPatch) -> None:
-    world: Any = Clocked(monkeypatch)
+    world: Any = FakeWorlds(monkeypatch)
     assert step_speed.their_rate(world, agents=3) == 3 / 0.5
     assert step_speed.dicts_rate(world) == 3 / 0.5
     assert step_speed.batched_rate(world) == 2 * 3 / 0.5
     assert world.steps == step_speed.THEIR_STEPS + 2 * step_speed.OUR_STEPS
 
 
-def test_ratios_are_ours_over_theirs() -> None:
+def test_ratios_are_rates_of_cavmarl_over_rates_of_highway_env() -> None:
     medians = {
         ("lidar", "batched"): 600.0, ("lidar", "highway_env"): 20.0,
         ("kinematics", "batched"): 1000.0, ("kinematics", "single"): 500.0,
@@ -114,14 +114,14 @@ def test_ratios_are_ours_over_theirs() -> None:
     assert found.dict_us == pytest.approx(2000.0)
 
 
-def test_the_road_can_be_driven(tmp_path: Path) -> None:
+def test_the_road_of_the_benchmark_can_be_driven(tmp_path: Path) -> None:
     report = check_map(straight_road(tmp_path, 500.0))
     assert report.drivable
     assert report.road_km == pytest.approx((500.0 + RUN_OUT_M) / 1000.0)
 
 
 @pytest.mark.skipif(not hasattr(os, "sched_getaffinity"), reason="no affinity on this system")
-def test_the_cores_are_given_back() -> None:
+def test_the_use_of_one_core_is_undone() -> None:
     before = os.sched_getaffinity(0)
     with step_speed.one_core():
         assert len(os.sched_getaffinity(0)) == 1

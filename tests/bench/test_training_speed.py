@@ -1,4 +1,4 @@
-"""The comparison of PPO with that of stable-baselines3, and its report."""
+"""The benchmark that compares PPO of cavmarl with PPO of stable-baselines3."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.cli.test_main import run
 pytestmark = pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
 
 
-def test_both_sides_learn_from_equal_numbers_of_steps(
+def test_both_programs_learn_from_equal_numbers_of_steps(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     for module in ("torch", "highway_env", "stable_baselines3"):
@@ -63,7 +63,7 @@ def test_invalid_numbers_are_refused(wrong: dict[str, int], said: str) -> None:
         measure_training(**wrong)
 
 
-def test_missing_packages_are_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_highway_env_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "highway_env", None)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[bench\]"):
         measure_training()

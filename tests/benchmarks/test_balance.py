@@ -1,4 +1,4 @@
-"""Replays of load traces with known results."""
+"""Replays of load traces whose results are known, and recorded traces."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def network() -> RoadNetwork:
     return load_network(find_map("grid4x4"))
 
 
-def still(
+def constant_trace(
     network: RoadNetwork, counts: list[int], snapshot: LoadSnapshot, rounds: int = 8
 ) -> LoadTrace:
-    """Return a trace with equal numbers of vehicles in all zones of a grid, at 1 µs per vehicle."""
+    """Return a trace in which zone k always has counts[k] vehicles, which cost 1 µs each."""
     partition = cut_map(network, "grid", len(counts))
     middles = 0.5 * (partition.rects[:, :2] + partition.rects[:, 2:])
     places = np.repeat(middles, counts, axis=0)
@@ -51,12 +51,13 @@ def row_of(found: BalanceReplay, name: str) -> StrategyResult:
     return row
 
 
-def test_static_and_perfect_times_of_constant_loads(
+def test_balanced_placements_of_constant_loads_reach_the_perfect_time(
     network: RoadNetwork,
 ) -> None:
-    found = replay_traces([still(network, [30, 30, 10, 10], idle_snapshot(2))], FREE)
+    found = replay_traces([constant_trace(network, [30, 30, 10, 10], idle_snapshot(2))], FREE)
     assert [row.name for row in found.rows] == [*STRATEGIES, "perfect"]
-    # Neighbours in a row: 60 and 20 vehicles, then 40 and 40.
+    # The static placement puts zones in their order on two workers, with 60 and 20 vehicles. The
+    # perfect placement has 40 and 40.
     assert row_of(found, "static").imbalance == pytest.approx(1.5)
     for name in ("balanced", "predicted", "perfect"):
         assert row_of(found, name).ratio == pytest.approx(40.0 / 60.0)
@@ -64,23 +65,23 @@ def test_static_and_perfect_times_of_constant_loads(
     assert row_of(found, "balanced").verdict == "one trace tells nothing"
 
 
-def test_without_a_possible_gain_nothing_moves(network: RoadNetwork) -> None:
-    trace = still(network, [20, 20, 20, 20], idle_snapshot(2))
+def test_no_zone_moves_if_no_move_has_a_gain(network: RoadNetwork) -> None:
+    trace = constant_trace(network, [20, 20, 20, 20], idle_snapshot(2))
     found = replay_traces([trace, trace], BalanceRule())
     for row in found.rows:
         assert (row.ratio, row.imbalance, row.moves) == pytest.approx((1.0, 1.0, 0.0))
     assert row_of(found, "balanced").verdict == "within noise of static"
 
 
-def test_moves_that_do_not_pay_back_are_not_made(network: RoadNetwork) -> None:
-    trace = still(network, [30, 30, 10, 10], idle_snapshot(2))
+def test_no_zone_moves_if_the_move_costs_more_than_its_gain(network: RoadNetwork) -> None:
+    trace = constant_trace(network, [30, 30, 10, 10], idle_snapshot(2))
     dear = replay_traces([trace], BalanceRule(move_s=1e3))
     assert row_of(dear, "balanced").ratio == 1.0
     assert row_of(dear, "balanced").moves == 0.0
 
 
-def test_a_giant_zone_is_divided_if_moving_zones_does_not_help(network: RoadNetwork) -> None:
-    trace = still(network, [4, 4, 4, 400], idle_snapshot(4), rounds=24)
+def test_a_large_zone_is_divided_if_moving_zones_does_not_help(network: RoadNetwork) -> None:
+    trace = constant_trace(network, [4, 4, 4, 400], idle_snapshot(4), rounds=24)
     places = trace.rounds[0].places.copy()
     low, high = trace.partition.rects[3][:2], trace.partition.rects[3][2:]
     places[12:] = np.random.default_rng(0).uniform(low + 1.0, high - 1.0, (400, 2))
@@ -91,19 +92,21 @@ def test_a_giant_zone_is_divided_if_moving_zones_does_not_help(network: RoadNetw
     assert row_of(found, "repartitioned").handoffs > 0.0
 
 
-def test_calibration_gives_the_weight_to_the_resource_that_slows_workers_down(
+def test_calibration_gives_all_weight_to_the_resource_that_slows_workers(
     network: RoadNetwork,
 ) -> None:
     uses = [Utilisation(0.8, 0.1, 0.1), Utilisation(0.1, 0.8, 0.1), Utilisation(0.1, 0.1, 0.9)]
     workers = tuple(Candidate(n, use) for n, use in enumerate(uses))
-    trace = still(network, [20] * 9, LoadSnapshot(workers, "simulated", "generated"), rounds=12)
+    trace = constant_trace(
+        network, [20] * 9, LoadSnapshot(workers, "simulated", "generated"), rounds=12
+    )
     found = replay_traces([trace], FREE)
     assert row_of(found, "calibrated").weights == pytest.approx((1.0, 0.0, 0.0), abs=1e-9)
     assert row_of(found, "balanced").weights == (0.6, 0.2, 0.2)
     assert row_of(found, "calibrated").ratio < row_of(found, "balanced").ratio
 
 
-def test_a_crowd_is_a_function_of_its_seed(network: RoadNetwork) -> None:
+def test_equal_seeds_generate_equal_traces(network: RoadNetwork) -> None:
     partition = cut_map(network, "bisection", 4)
 
     def trace(seed: int) -> LoadTrace:
@@ -117,7 +120,7 @@ def test_a_crowd_is_a_function_of_its_seed(network: RoadNetwork) -> None:
     assert one.rounds[0].snapshot.gpu_source == "simulated"
 
 
-def test_the_cost_of_a_zone_is_the_cost_of_its_vehicles(network: RoadNetwork) -> None:
+def test_the_cost_of_a_zone_is_the_sum_of_the_costs_of_its_vehicles(network: RoadNetwork) -> None:
     crowd = Crowd(vehicles=50, vehicle_s=1.0, agent_s=10.0, migration_s=0.0, noise=0.0)
     partition = cut_map(network, "bisection", 3)
     trace = generated_trace(network, partition, rounds=3, workers=2, seed=0, crowd=crowd)
@@ -134,7 +137,7 @@ def test_the_cost_of_a_zone_is_the_cost_of_its_vehicles(network: RoadNetwork) ->
     ]
 
 
-def test_an_environment_can_be_recorded() -> None:
+def test_traces_of_an_environment_can_be_recorded_and_replayed() -> None:
     traces = list(
         recorded_traces(
             "ring",
@@ -162,9 +165,9 @@ def test_recordings_that_cannot_be_replayed_are_refused(network: RoadNetwork) ->
     with pytest.raises(ConfigError, match="at least one"):
         replay_traces([], FREE)
     with pytest.raises(ConfigError, match="rounds = 3"):
-        replay_traces([still(network, [1, 1], idle_snapshot(2), rounds=3)], FREE)
+        replay_traces([constant_trace(network, [1, 1], idle_snapshot(2), rounds=3)], FREE)
     with pytest.raises(ConfigError, match="3 workers for 2 shards"):
-        replay_traces([still(network, [1, 1], idle_snapshot(3))], FREE)
+        replay_traces([constant_trace(network, [1, 1], idle_snapshot(3))], FREE)
     crowd = {"layout": "bisection", "workers": 2, "rounds": 4, "seeds": [0], "overrides": {}}
     with pytest.raises(ConfigError):
         list(generated_traces("ring", zones=1000, **crowd))  # type: ignore[arg-type]

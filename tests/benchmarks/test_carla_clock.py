@@ -1,4 +1,4 @@
-"""Table II with SUMO's traffic, cavmarl in place of CARLA, and two official CARLA clients."""
+"""Clock drift of an official CARLA client: Table II of the co-simulation paper."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ SPEC = WorldSpec.of("grid4x4", agents=2, background=0, seed=0)
 
 
 @pytest.mark.parametrize("other_ticks", ["obey", "refuse", "follow"])
-def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
+def test_own_ticks_of_a_client_are_counted_and_can_be_refused(
     other_ticks: OtherTicks, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv(PYTHON, client_python("0.9.16"))
@@ -27,7 +27,9 @@ def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
     if other_ticks == "obey":
         assert row.delta_s == pytest.approx(4.6)
         assert row.ratio == 1.92
-        assert found.drift_events == 91  # no step follows the last own tick
+        assert (
+            found.drift_events == 91
+        )  # the drift after the last own tick is not seen, because no step follows
         assert found.noticed_ticks == 1
     else:
         assert (row.delta_s, row.ratio) == (0.0, 1.0)
@@ -35,7 +37,7 @@ def test_own_ticks_of_a_client_are_noticed_and_can_be_held(
     assert found.holds
 
 
-def test_a_client_that_only_follows_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_client_without_own_ticks_does_not_drift(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv(PYTHON, client_python("0.9.16"))
     found = measure_client_drift(SPEC, steps=60, sumo=20)
     assert (found.own_ticks, found.counted, found.drift_events) == (0, 0, 0)

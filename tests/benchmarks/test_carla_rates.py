@@ -1,4 +1,4 @@
-"""Ten sensors of one vehicle, through CARLA's own client: each tick has a frame of each sensor."""
+"""CARLA's own client gets a frame of each of ten sensors in each tick."""
 
 from __future__ import annotations
 

@@ -17,7 +17,7 @@ NODES = """<nodes><node id="C" x="0" y="0" type="{kind}"/>
 
 
 def crossroads(folder: Path, kind: str = "priority", **priorities: int) -> Path:
-    """Write a crossing whose four arms have different priorities."""
+    """Build a crossing whose arms have these priorities; return its map."""
     roads = "".join(
         f'<edge id="{arm}C" from="{arm}" to="C" priority="{priority}"/>'
         f'<edge id="C{arm}" from="C" to="{arm}" priority="{priority}"/>'
@@ -29,15 +29,19 @@ def crossroads(folder: Path, kind: str = "priority", **priorities: int) -> Path:
     return netconvert(folder, "cross")
 
 
-def test_with_four_priorities_three_movements_yield_in_a_circle(tmp_path: Path) -> None:
+def test_three_movements_of_a_crossing_with_different_priorities_yield_in_a_circle(
+    tmp_path: Path,
+) -> None:
     network = read_network(crossroads(tmp_path, N=3, S=3, W=4, E=1))
     found = circular_priority(network)
     ways = network.links[["from_lane", "to_lane"]][found].tolist()
     names = {tuple(network.lane_ids[lane][:2] for lane in way) for way in ways}
-    # Straight on from the south yields to straight on from the east, which yields to the left turn
-    # from the north, which yields to the south.
+    # The straight link from the south yields to the straight link from the east, which yields to
+    # the left turn from the north, which yields to the straight link from the south.
     assert {("SC", "CN"), ("EC", "CW"), ("NC", "CE")} <= names
-    assert not any(way[0] == "WC" for way in names), "the first road gives way to no other"
+    assert not any(way[0] == "WC" for way in names), (
+        "a link of the road with the highest priority is in a circle"
+    )
     assert map_features(network) == ("circular_priority",)
 
 
@@ -47,7 +51,7 @@ def test_priority_roads_equal_roads_and_signals_have_no_circle(tmp_path: Path, k
     assert not circular_priority(network).size
 
 
-def test_random_priorities_of_netgenerate_make_circles(tmp_path: Path) -> None:
+def test_maps_with_random_priorities_have_circles(tmp_path: Path) -> None:
     options = ("--random-priority=true", "--default.priority=4", "--grid", "--grid.number=4")
     network = read_network(netgenerate(tmp_path / "random.net.xml", *options))
     assert circular_priority(network).size

@@ -1,4 +1,4 @@
-"""Table II: a follower in another process, and a follower that ticks the world itself."""
+"""Clock drift of followers, as in Table II of the paper in docs/explanation/papers.md."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.cosim.time_master import OwnTicks
 
 
-def test_the_table_of_the_paper_from_raw_ticks() -> None:
+def test_the_table_of_the_paper_is_computed_from_raw_ticks() -> None:
     share = Fraction("0.92")
     master = list(range(5001))
     follower = [40 + step + int(step * share) for step in master]
@@ -28,7 +28,7 @@ def test_the_table_of_the_paper_from_raw_ticks() -> None:
     assert rows[-1].follower_s == pytest.approx(482.0)
 
 
-def test_the_last_step_has_one_row() -> None:
+def test_rows_are_those_of_the_paper_or_the_last_step() -> None:
     random = np.random.default_rng(0)
     master, follower = (np.cumsum(random.integers(1, 9, 1001)).tolist() for _ in range(2))
     for last, steps in ((100, [100]), (101, [100, 101]), (7, [7]), (1000, [100, 500, 1000])):
@@ -42,7 +42,7 @@ def test_the_last_step_has_one_row() -> None:
             assert row.ratio == pytest.approx(seen / master[row.step])
 
 
-def test_a_measurement_holds_only_if_own_ticks_are_noticed_or_change_nothing() -> None:
+def test_a_measurement_holds_only_if_own_ticks_are_noticed_or_cause_no_drift() -> None:
     even = rows_of([0, 1, 2], [5, 6, 7], 0.1)
     found = ClockDrift("ring", 0.1, 0.5, "obey", None, even, 4, 4, 4, 0)
     assert found.holds
@@ -56,7 +56,7 @@ def test_a_measurement_holds_only_if_own_ticks_are_noticed_or_change_nothing() -
 
 
 @pytest.mark.parametrize("share", ["0", "0.3", "0.92", "1"])
-def test_own_ticks_are_spread_evenly(share: str) -> None:
+def test_own_ticks_are_evenly_distributed_over_steps(share: str) -> None:
     steps = [is_due(step, Fraction(share)) for step in range(1, 101)]
     assert all(sum(steps[:n]) == int(n * Fraction(share)) for n in range(101))
 
@@ -83,10 +83,10 @@ def test_own_ticks_of_a_follower_are_counted(answer: OwnTicks, tmp_path: Path) -
     assert float(read["ratio"]) == row.ratio
 
 
-def test_the_own_clock_of_a_follower_is_compared_with_the_masters() -> None:
+def test_the_own_clock_of_a_follower_is_compared_with_the_clock_of_the_master() -> None:
     rows = rows_of([0, 1, 2, 3], [7, 8, 9, 10], 0.5, [0.0, 0.4, 1.2, 1.75])
     assert [row.own_delta_s for row in rows] == [0.25]
-    found = measure_drift("ring", steps=20, pace=1e6)  # the pace is faster than any machine
+    found = measure_drift("ring", steps=20, pace=1e6)  # no machine reaches this pace
     (row,) = found.rows
     assert (row.delta_s, found.holds) == (0.0, True)
     assert row.own_delta_s is not None
@@ -102,6 +102,6 @@ def test_a_follower_without_own_ticks_does_not_drift() -> None:
 
 
 @pytest.mark.parametrize(("steps", "rogue"), [(0, 0.0), (10, 1.5), (10, -0.1), (10, float("nan"))])
-def test_impossible_measurements_are_refused(steps: int, rogue: float) -> None:
+def test_invalid_numbers_of_steps_and_shares_are_refused(steps: int, rogue: float) -> None:
     with pytest.raises(ConfigError):
         measure_drift("ring", steps=steps, rogue=rogue)

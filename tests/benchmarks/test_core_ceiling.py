@@ -1,4 +1,4 @@
-"""The speed of workers compared with that of independent programs on the same cores."""
+"""The speed of workers, compared with the speed of independent programs on the same cores."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl import ConfigError
 from cavmarl.core.errors import WorkerError
 
 
-def test_all_programs_step_and_end() -> None:
+def test_all_independent_programs_step_and_end() -> None:
     before = {*multiprocessing.active_children()}
     found = measure_ceiling("ring", worlds=3, programs=2, steps=2, repeats=2, agents=2, alike=True)
     assert found.programs == 2
@@ -25,7 +25,7 @@ def test_all_programs_step_and_end() -> None:
     assert found.facts()["ratio"] == found.ratio
 
 
-def test_the_ratio_comes_from_the_median_turn() -> None:
+def test_the_ratio_is_that_of_the_median_turn() -> None:
     assert CoreCeiling(2, (4.0, 8.0, 6.0), (2.0, 5.0, 6.0)).ratio == 1.6
 
 
@@ -42,7 +42,9 @@ def test_a_program_that_cannot_start_is_an_error(capfd: pytest.CaptureFixture[st
     assert {*multiprocessing.active_children()} <= before
 
 
-def test_the_program_compares_workers(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_benchmark_compares_workers_with_independent_programs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     path = tmp_path / "speed.json"
     words = ["ring", "--agents", "3", "--background", "4", "--worlds", "2", "--steps", "2"]
     words += ["--repeats", "2", "--json", str(path), "--at-least", "100"]

@@ -1,4 +1,4 @@
-"""The cost of the adapters: each installed library is measured on the same world."""
+"""The cost of adapters: the benchmark measures each installed library on the same world."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from benchmarks import libraries
 from benchmarks.libraries import measure
 
 
-def test_every_view_is_measured_or_its_extra_is_named() -> None:
+def test_every_adapter_is_measured_or_its_missing_extra_is_named() -> None:
     found = measure("merge", agents=3, steps=2, at_most=1e-9)
     assert [row["view"] for row in found.rows] == list(libraries.VIEWS)
     for row in found.rows:
@@ -18,8 +18,8 @@ def test_every_view_is_measured_or_its_extra_is_named() -> None:
     assert not found.holds
 
 
-def test_all_views_step_the_same_world() -> None:
-    """Seeds and actions are equal, so the rewards must be equal."""
+def test_all_adapters_step_the_same_world() -> None:
+    """All adapters get equal seeds and actions, so their rewards must be equal."""
     settings = {
         "agents": 3,
         "background": 0,

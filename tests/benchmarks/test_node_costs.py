@@ -1,4 +1,4 @@
-"""The cost model of nodes recovers the parameters that generated its samples."""
+"""The cost model of nodes finds the parameters from which its samples were generated."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def sample(vehicles: int, nodes: int, latency_s: float = 0.0) -> NodeSample:
     )
 
 
-def test_the_parameters_are_found() -> None:
+def test_the_parameters_of_generated_samples_are_found() -> None:
     samples = [sample(size, nodes) for size in (1_000, 5_000, 20_000) for nodes in (0, 1, 2)]
     costs = fitted(samples, KNOWN.caches)
     found, known = ({**asdict(one), "caches": 0.0} for one in (costs, KNOWN))
@@ -66,8 +66,8 @@ def test_negative_estimates_become_zero() -> None:
     assert fitted(cheap, KNOWN.caches).caller_node_s == 0.0
 
 
-def test_latency_counts_once_for_each_hop() -> None:
-    """A step of two ticks has five hops: command, two exchanges, exchange of agents, report."""
+def test_the_cost_of_latency_is_proportional_to_the_hops_of_a_step() -> None:
+    """A step of two ticks has five hops: a command, three exchanges and a report."""
     for vehicles, offers in ((100, 0.0), (10**10, 1.0)):
         near, far = (KNOWN.tick(vehicles, 4, latency_s, 64) for latency_s in (0.0, 1e-3))
         assert far - near == pytest.approx(1e-3 * (5.0 + offers) / 2.0, rel=0.05)
@@ -75,7 +75,7 @@ def test_latency_counts_once_for_each_hop() -> None:
     assert alone == pytest.approx(1e-3)
 
 
-def test_rows_beyond_the_caches_cost_more() -> None:
+def test_rows_beyond_the_capacity_of_caches_cost_more() -> None:
     def work(vehicles: float, ghosts: float = 0.0, busy: int = 1) -> float:
         return KNOWN.work(vehicles, ghosts, busy)
 
@@ -98,12 +98,12 @@ def test_the_capacity_of_caches_in_rows_is_read_from_the_system(
     assert caches_here()[:2] == ((1 << 19) / row, (16 << 20) / row)
 
 
-def test_nodes_beyond_the_cores_take_turns() -> None:
+def test_a_tick_takes_longer_if_there_are_more_nodes_than_cores() -> None:
     assert KNOWN.tick(10**6, 4, 0.0, 2) > 1.5 * KNOWN.tick(10**6, 4, 0.0, 4)
 
 
 @pytest.mark.parametrize("side", [2, 3, 4])
-def test_the_mean_number_of_borders_in_a_square_of_zones(side: int) -> None:
+def test_the_mean_number_of_borders_of_a_zone_in_a_square_is_exact(side: int) -> None:
     inner = 2 * side * (side - 1)
     assert borders(side * side) == pytest.approx(2 * inner / side**2)
     assert borders(1) == 0.0
@@ -112,7 +112,7 @@ def test_the_mean_number_of_borders_in_a_square_of_zones(side: int) -> None:
     )
 
 
-def test_too_few_runs_are_refused() -> None:
+def test_too_few_samples_are_refused() -> None:
     with pytest.raises(ValueError, match="undivided runs of two sizes"):
         fitted([sample(1_000, nodes) for nodes in (0, 1, 2)], KNOWN.caches)
 
@@ -121,6 +121,6 @@ def test_too_few_runs_are_refused() -> None:
     ("vehicles", "nodes"),
     [("2500", "1,2"), ("2500,2500", "1,2"), ("100,2500", "1,2"), ("2500,9000", "2")],
 )
-def test_too_few_runs_are_refused_before_any_run(vehicles: str, nodes: str) -> None:
+def test_too_few_requested_runs_are_refused_before_the_first_run(vehicles: str, nodes: str) -> None:
     with pytest.raises(ConfigError, match="two sizes of at least 400, and the nodes 1 and 2"):
         benchmark.measure(vehicles, nodes)

@@ -1,4 +1,4 @@
-"""Benchmark programs: the list, the options, the table, the JSON, and refused arguments."""
+"""Benchmark programs: their list, options, tables, JSON files and refused arguments."""
 
 from __future__ import annotations
 
@@ -76,7 +76,7 @@ def test_driver_networks_are_compared_with_torch() -> None:
     assert inference.measure(rows=20, inputs=9, hidden=16, repeats=1).holds
 
 
-def test_actors_of_clients_are_there_after_one_step_and_change_no_other_vehicle(
+def test_actors_of_clients_enter_in_one_step_and_do_not_change_other_vehicles(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "actors.json"
@@ -109,7 +109,7 @@ def test_an_error_prints_one_line_and_gives_exit_code_2(capsys: pytest.CaptureFi
     assert "workers = 0: must be at least 1" in capsys.readouterr().err
 
 
-def test_every_claim_of_the_scope_holds_and_is_on_the_page() -> None:
+def test_every_claim_of_the_benchmark_scope_holds_and_is_on_the_page() -> None:
     found = scope.measure(steps=25, seed=0)
     assert [row["what"] for row in found.rows if not row["holds"]] == []
     page = Path(__file__).parents[2] / "docs/explanation/papers.md"
@@ -153,7 +153,7 @@ def test_a_ratio_of_pairs_has_a_confidence_interval() -> None:
     draws = random.Random(0)
     within = 0
     for _ in range(200):
-        # One effect on both values of a pair.
+        # Both values of a pair have the same random factor.
         others = [math.exp(draws.gauss(0.0, 1.0)) for _ in range(40)]
         ones = [1.3 * x * math.exp(draws.gauss(0.0, 0.2)) for x in others]
         ratio, interval = paired_interval(ones, others)
@@ -161,7 +161,7 @@ def test_a_ratio_of_pairs_has_a_confidence_interval() -> None:
     assert within > 180
 
 
-def test_channels_are_measured_on_the_same_vehicles() -> None:
+def test_channels_of_v2x_are_measured_with_the_same_vehicles() -> None:
     found = v2x.measure("grid4x4", vehicles=40, ticks=10, warmup=10, at_most=1e-9)
     rows = {row["name"]: row for row in found.rows[1:]}
     assert list(rows) == list(v2x.CHANNELS)
@@ -173,7 +173,7 @@ def test_channels_are_measured_on_the_same_vehicles() -> None:
     assert not found.holds
 
 
-def test_frames_of_the_viewer_are_small_and_reach_clients() -> None:
+def test_frames_of_the_viewer_have_at_most_100_kb_and_reach_clients() -> None:
     found = viewer.measure("ring", vehicles=10_000, clients=2, seconds=1.0, rate_hz=5.0)
     assert found.row("publishing")["kb"] <= 100.0
     assert found.row("2 clients, 5 Hz")["fps"] > 2.0
@@ -190,7 +190,7 @@ def test_the_times_of_phases_sum_to_the_step() -> None:
     assert found.facts["plain_ns"] > 0.0
 
 
-def test_worlds_over_several_zones_are_measured() -> None:
+def test_undivided_and_divided_worlds_are_compared() -> None:
     found = splits.measure("ring", "9,12", agents=3, steps=2, repeats=2)
     assert [row["vehicles"] for row in found.rows] == [9, 12]
     assert all(len(row["split_ms"]) == 2 for row in found.rows)
@@ -252,7 +252,7 @@ def test_every_sensor_of_the_rig_is_measured() -> None:
         (selection.measure, {"choices": 0}, "choices = 0"),
     ],
 )  # fmt: skip
-def test_unmeasurable_settings_are_refused(
+def test_invalid_settings_are_refused(
     measure: Callable[..., BenchmarkReport], arguments: dict[str, Any], told: str
 ) -> None:
     with pytest.raises(ConfigError, match=told):

@@ -1,4 +1,4 @@
-"""A rig with a requested load is written, and can be read again."""
+"""A rig with a requested load is found, is valid, and can be read after it was written."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from cavmarl.core.errors import ConfigError
 LIDAR = {"type": "lidar", "rate_hz": 10, "rays": 30, "z_m": 1.6}
 
 
-def test_a_load_is_found_despite_a_jump_of_the_cost(
+def test_a_rig_is_found_although_no_rig_has_the_requested_load(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Beyond the cache, sensors take 2.4 times as long, so no load lies between 10 and 24 ms."""
+    """With over 1000 rays, sensors take 2.4 times as long, so no load is between 10 and 24 ms."""
 
     def costs_ms(rig: Mapping[str, Any]) -> float:
         rays = rig["lidar"]["rays"]
@@ -41,8 +41,8 @@ def test_a_load_is_found_despite_a_jump_of_the_cost(
     loaded = rig_load.loaded(job, 20.0, said.append)
     assert 24.0 <= costs_ms(loaded.spec.overrides["rig"]) <= 30.0
     tries = [float(text.split()[-2]) for text in said[2:]]
-    assert min(tries) < 20.0, "one try was too light,"
-    assert max(tries) > 30.0, "another try was too heavy"
+    assert min(tries) < 20.0, "no try was too light"
+    assert max(tries) > 30.0, "no try was too heavy"
 
 
 @pytest.mark.parametrize("factor", [0.1, 1.0, 3.0, 1e3, 1e6])
@@ -57,7 +57,7 @@ def test_rigs_of_any_load_are_valid(factor: float) -> None:
         assert all(grows)
 
 
-def test_a_loaded_rig_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_the_found_rig_is_written(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setattr(rig_load, "loaded", lambda job, load_ms, say: job)
     out = tmp_path / "rig.yaml"
     found = rig_load.measure("grid4x4", 5.0, out)

@@ -1,4 +1,4 @@
-"""Table II with a node of ROS 2: real `rclpy`, in lock step with a world through the bridge."""
+"""Clock drift of a node of ROS 2 with real `rclpy`, as in Table II of the co-simulation paper."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ SPEC = WorldSpec.of("grid4x4", agents=1, background=0, seed=0)
 DOMAIN = 10 + os.getpid() % 80
 
 
-def test_a_python_with_rclpy_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_the_path_of_a_python_with_rclpy_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv(PYTHON, raising=False)
     with pytest.raises(ConfigError, match=f"{PYTHON}: name a Python with rclpy; `make ros2`"):
         measure_ros_drift(SPEC, steps=5, rogue=0.0, own_ticks="refuse", domain=DOMAIN)

@@ -1,4 +1,4 @@
-"""A stand-in for Autoware drives by topics and a map folder alone."""
+"""A substitute for Autoware drives with only the topics and the map folder of Autoware."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RED, GREEN = frozenset({1}), frozenset({3})
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The map folder of grid4x4, as `cavmarl map export grid4x4 --autoware` has written it."""
+    """Return a stored map folder that `cavmarl map export grid4x4 --autoware` has written."""
     place = tmp_path_factory.mktemp("map")
     (place / "lanelet2_map.osm").write_bytes(lzma.decompress(EXPORTED.read_bytes()))
     (place / "map_projector_info.yaml").write_text("projector_type: Local\n")
@@ -42,7 +42,7 @@ def grid(folder: Path) -> VectorMap:
     return VectorMap(folder)
 
 
-def test_the_kept_export_is_that_of_the_present_map(folder: Path, tmp_path: Path) -> None:
+def test_the_stored_map_folder_equals_a_new_export(folder: Path, tmp_path: Path) -> None:
     pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
     write_map_folder(load_network(find_map("grid4x4")), tmp_path)
     for name in ("lanelet2_map.osm", "map_projector_info.yaml"):
@@ -55,7 +55,7 @@ def test_all_roads_of_the_map_are_connected(grid: VectorMap) -> None:
     assert sum(len(one.after) for one in grid.lanelets) == 576
     lights = sorted(light for one in grid.lanelets for light in one.lights)
     assert lights == [FIRST_LIGHT + link for link in range(len(network.links))]
-    # a way leads from every road but those that leave the grid
+    # the goal can be reached from all roads except those that lead out of the grid
     leaving = [one for one in grid.lanelets if not one.after]
     assert len(leaving) == 32
     goal = next(one for one in leaving if one.centre[-1][0] > 599.0)
@@ -66,7 +66,7 @@ def test_all_roads_of_the_map_are_connected(grid: VectorMap) -> None:
 
 
 def ahead_of_light(grid: VectorMap) -> tuple[MapDriver, EgoPose, MapLanelet]:
-    """Return a driver, a pose 16 m before a light at 8 m/s, and the lanelet behind the light."""
+    """Return a driver, its pose 16 m before a light at 8 m/s, and the lanelet behind the light."""
     turn = next(
         one
         for one in grid.lanelets
@@ -92,11 +92,11 @@ def test_the_driver_stops_at_red_and_goes_at_green(grid: VectorMap) -> None:
     accel, steering = driver.drive(pose, [], {light: GREEN})
     assert accel > 0.3
     assert abs(steering) < 0.05
-    # a light without a message counts as red
+    # the driver treats a light without a message as red
     assert driver.drive(pose, [], {})[0] < 0.0
 
 
-def test_the_driver_keeps_its_distance(grid: VectorMap) -> None:
+def test_the_driver_brakes_for_a_vehicle_ahead_and_not_for_one_beside(grid: VectorMap) -> None:
     driver, pose, turn = ahead_of_light(grid)
     lights = {turn.lights[0]: GREEN}
     ahead = np.array([np.cos(pose.heading_rad), np.sin(pose.heading_rad)])
@@ -110,14 +110,14 @@ def test_the_driver_keeps_its_distance(grid: VectorMap) -> None:
     assert driver.reason != "gap"
 
 
-def test_another_projector_is_refused(folder: Path, tmp_path: Path) -> None:
+def test_a_map_with_another_projector_is_refused(folder: Path, tmp_path: Path) -> None:
     (tmp_path / "map_projector_info.yaml").write_text("projector_type: MGRS\n")
     with pytest.raises(MapError, match="must be of type Local"):
         VectorMap(tmp_path)
 
 
 @pytest.mark.integration
-def test_the_stand_in_arrives_without_an_incident(folder: Path) -> None:
+def test_the_substitute_arrives_without_an_incident(folder: Path) -> None:
     spec = WorldSpec.of("grid4x4", background=16, seed=4, overrides={"traffic.max_trip_m": 300})
     found = drive_by_topics(spec, folder, episodes=1, step_s=0.1, domain=DOMAIN)
     (row,) = found["rows"]

@@ -1,4 +1,4 @@
-"""Large and frequent messages reach a node of real `rclpy` without a loss."""
+"""Large and frequent messages all reach a node of real `rclpy`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,9 @@ SPEC = WorldSpec.of("grid4x4", agents=1, background=4, seed=0)
 DOMAIN = 10 + os.getpid() % 80
 
 
-def test_a_python_with_rclpy_must_be_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_run_without_the_path_of_a_python_with_rclpy_is_refused(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.delenv(PYTHON, raising=False)
     with pytest.raises(ConfigError, match=f"{PYTHON}: name a Python with rclpy; `make ros2`"):
         send(SPEC, steps=5, pace=1.0, domain=DOMAIN)
@@ -27,7 +29,7 @@ def test_a_python_with_rclpy_must_be_named(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.integration
 @pytest.mark.skipif(not os.environ.get(PYTHON), reason=f"rclpy is not installed: set {PYTHON}")
-def test_clouds_pictures_and_inertial_samples_arrive() -> None:
+def test_no_cloud_picture_or_inertial_sample_is_lost() -> None:
     rows, _ = send(SPEC, steps=60, pace=1.0, domain=DOMAIN)
     found = {row["topic"]: row for row in rows}
     assert {topic: row["lost"] for topic, row in found.items()} == {CLOUD: 0, PICTURE: 0, IMU: 0}

@@ -1,4 +1,4 @@
-"""The benchmark of sensor workers: new processes per run, equal results, and parts of a step."""
+"""The benchmark of sensor workers: runs, parts of a step, resources and files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RIG: dict[str, dict[str, Any]] = {
 
 @pytest.fixture(scope="module")
 def found() -> SensorBench:
-    """Return a result of new processes, which cost 8 s of processor time: its tests are slow."""
+    """Return a result. It takes 8 s of processor time, so the tests that use it are slow."""
     return measure_sensor_workers(
         "grid4x4", RIG, workers=(1, 2), warmup=2, steps=6, repeats=1, background=3
     )
@@ -45,7 +45,7 @@ def test_the_result_contains_every_run(found: SensorBench) -> None:
 
 
 @pytest.mark.slow
-def test_the_ceiling_of_the_machine_is_measured_with_the_workers(found: SensorBench) -> None:
+def test_the_speed_of_independent_programs_is_measured_with_the_workers(found: SensorBench) -> None:
     if len(usable_cores()) < 2:
         assert found.ceiling is None
         return
@@ -56,7 +56,7 @@ def test_the_ceiling_of_the_machine_is_measured_with_the_workers(found: SensorBe
 
 @pytest.mark.slow
 def test_the_parts_of_a_step_sum_to_at_most_the_step(found: SensorBench) -> None:
-    # Their share is not tested here, because other programs disturb the measurement.
+    # No lower bound of the sum is checked, because other programs disturb the measurement.
     for row in found.rows:
         parts = found.parts_ms(row.workers)
         assert tuple(parts) == PARTS
@@ -66,8 +66,8 @@ def test_the_parts_of_a_step_sum_to_at_most_the_step(found: SensorBench) -> None
 
 
 @pytest.mark.slow
-def test_the_time_of_sumo_is_listed_separately(found: SensorBench, tmp_path: Path) -> None:
-    """SUMO's step and the wait for it are listed for both kinds of coupling, and only there."""
+def test_the_time_of_sumo_is_a_separate_part(found: SensorBench, tmp_path: Path) -> None:
+    """The part exists for both kinds of coupling, and is 0 in worlds without SUMO."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     assert found.parts_ms(1)["SUMO"] == 0.0
     for source in MODES:
@@ -92,12 +92,12 @@ def test_resources_of_all_processes_are_reported(found: SensorBench) -> None:
         (window,) = found.windows(number)
         assert window.steps == 6
         assert len(window.worker_cpu_s) == len(window.worker_rss_mb) == number
-        assert window.messages == 2 * number * ticks  # messages in both directions
+        assert window.messages == 2 * number * ticks  # one message in each direction
         assert window.got_bytes > 6 * 32 * 18 * 3
 
 
 @pytest.mark.slow
-def test_both_placements_are_reported(found: SensorBench) -> None:
+def test_the_placement_by_cost_and_the_placement_in_turn_are_reported(found: SensorBench) -> None:
     shares = found.shares(2)
     assert shares["in_turn"].homes == (0, 1, 0, 1)
     assert max(shares["cost"].loads_s) <= max(shares["in_turn"].loads_s)
@@ -123,14 +123,14 @@ def test_the_description_of_the_rig_lists_ten_sensors() -> None:
     )
 
 
-def test_the_default_map_is_that_of_the_papers() -> None:
+def test_the_default_map_is_the_map_of_the_papers() -> None:
     network = load_network(Path(sensors.TOWN))
     roads = network.edges[~network.edges["internal"]]
     assert len(roads) == 46
     assert 1500.0 < roads["length_m"].sum() < 1700.0
 
 
-def test_the_program_writes_every_step_and_a_figure(
+def test_the_benchmark_writes_every_step_and_a_figure(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rig = tmp_path / "small.yaml"

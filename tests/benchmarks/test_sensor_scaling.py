@@ -1,4 +1,4 @@
-"""Derived figures of a scaling table, compared with a published table and their definitions."""
+"""Derived figures of a scaling table equal those of a published table and their definitions."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from benchmarks.sensor_scaling import (
 from cavmarl.core.errors import ConfigError
 from cavmarl.evaluate.statistics import student_quantile
 
-# Raw values of a published benchmark of ten sensors over one to four processors.
+# Measured values of a published benchmark of ten sensors on one to four processors.
 STEP_MS = (227.08, 122.63, 103.14, 115.55)
 SD_MS = (12.07, 8.72, 11.01, 15.71)
 WAIT_MS = (223.56, 119.46, 99.88, 111.94)
@@ -44,11 +44,11 @@ def printed() -> list[ScalingRow]:
 
 
 @pytest.mark.parametrize("name", PRINTED)
-def test_the_printed_table_is_reproduced(printed: list[ScalingRow], name: str) -> None:
+def test_the_published_table_is_reproduced(printed: list[ScalingRow], name: str) -> None:
     assert tuple(getattr(row, name) for row in printed) == PRINTED[name]
 
 
-def test_the_printed_gains_are_reproduced(printed: list[ScalingRow]) -> None:
+def test_the_published_gains_are_reproduced(printed: list[ScalingRow]) -> None:
     assert [row.fps_gain_pct for row in printed[:3]] == [0.0, 85.23, 120.45]
     assert [row.step_gain_pct for row in printed[:3]] == [0.0, -46.00, -54.58]
 
@@ -58,7 +58,7 @@ def test_figures_are_rounded_only_on_request() -> None:
     assert efficiencies == [100.0, 92.59, 73.39, 49.13]
 
 
-def test_the_best_row_is_marked_and_need_not_be_the_last(printed: list[ScalingRow]) -> None:
+def test_the_fastest_row_is_marked_although_it_is_not_the_last(printed: list[ScalingRow]) -> None:
     assert [row.is_best for row in printed] == [False, False, True, False]
 
 
@@ -67,7 +67,7 @@ def test_the_table_has_only_measured_numbers_of_workers(printed: list[ScalingRow
 
 
 @given(st.lists(st.tuples(times, times), min_size=1, max_size=6))
-def test_figures_of_a_row_agree_with_each_other(drawn: list[tuple[float, float]]) -> None:
+def test_figures_of_a_row_are_consistent(drawn: list[tuple[float, float]]) -> None:
     measured = [
         Measured(n, max(pair), 0.1 * max(pair), min(pair)) for n, pair in enumerate(drawn, 1)
     ]
@@ -86,13 +86,15 @@ def test_figures_of_a_row_agree_with_each_other(drawn: list[tuple[float, float]]
 
 
 @given(st.lists(st.lists(times, min_size=3, max_size=3), min_size=1, max_size=MIN_RUNS + 2))
-def test_spreads_within_runs_and_between_runs(drawn: list[list[float]]) -> None:
+def test_deviations_within_runs_and_intervals_between_runs_are_computed(
+    drawn: list[list[float]],
+) -> None:
     (row,) = summarize({2: [Series(run, [0.5 * step for step in run]) for run in drawn]})
     means = [statistics.fmean(run) for run in drawn]
     variances = [statistics.variance(run) for run in drawn]
     assert row.step_ms == pytest.approx(statistics.fmean(means))
     assert row.wait_ms == pytest.approx(0.5 * row.step_ms)
-    rounding = 1e-12 * row.step_ms  # rounding error of the mean of equal times
+    rounding = 1e-12 * row.step_ms  # error of the mean of equal times, by rounding
     assert row.sd_within_run == pytest.approx(statistics.fmean(variances) ** 0.5, abs=rounding)
     if len(drawn) < MIN_RUNS:
         assert row.ci95_between_runs is None
@@ -103,7 +105,7 @@ def test_spreads_within_runs_and_between_runs(drawn: list[list[float]]) -> None:
     assert row.ci95_between_runs.low == pytest.approx(row.step_ms - half, abs=1e-9 * half)
 
 
-def test_different_means_of_runs_do_not_change_the_spread_within_runs() -> None:
+def test_different_means_of_runs_do_not_change_the_deviation_within_runs() -> None:
     (row,) = summarize({1: [Series([10.0, 12.0], [1.0, 1.0]), Series([90.0, 92.0], [1.0, 1.0])]})
     assert row.sd_within_run == pytest.approx(2.0**0.5)
 

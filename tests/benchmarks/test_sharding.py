@@ -1,4 +1,7 @@
-"""The cost of dividing a world: parts of a tick, and refused comparisons. No test checks a time."""
+"""The cost of dividing a world: parts of a tick, and refused comparisons.
+
+No test checks a duration.
+"""
 
 from __future__ import annotations
 
@@ -45,8 +48,8 @@ def test_the_times_of_phases_sum_to_the_tick(make: Callable[[int], Simulation]) 
 def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulation]) -> None:
     one, four = measure_sharding(make, [4], after_s=20, repeats=2).rows
     alone = {"ghosts": 0.0, "imbalance": 1.0, "largest_share": 1.0, "ratio": 1.0}
-    alone_too = {"migrations": 0.0, "migration_us": None}
-    assert one.items() >= (alone | alone_too).items()
+    undivided = {"migrations": 0.0, "migration_us": None}
+    assert one.items() >= (alone | undivided).items()
     assert one["side_m"] == pytest.approx(2.0 * four["side_m"])
     assert 0.0 < four["ghosts"] <= 3.0 * four["vehicles"]
     assert four["imbalance"] > 1.0
@@ -58,7 +61,7 @@ def test_vehicles_and_ghosts_of_zones_are_counted(make: Callable[[int], Simulati
     assert four["migration_us"] is not None
 
 
-def test_agents_are_driven_and_their_policy_is_not_a_phase() -> None:
+def test_agents_drive_and_their_policy_is_not_counted_as_a_phase() -> None:
     make = world_maker("ring", agents=3, background=2, seconds=60)
     (found,) = measure_sharding(make, [1], after_s=1, repeats=1).rows
     assert found["vehicles"] == 5.0
@@ -78,7 +81,9 @@ def test_the_cost_of_the_monitor_is_measured_on_request(
     assert two["checked_ratio"] > 0.0
 
 
-def test_different_worlds_are_not_compared(make: Callable[[int], Simulation], demand: Path) -> None:
+def test_a_comparison_of_worlds_with_different_states_is_refused(
+    make: Callable[[int], Simulation], demand: Path
+) -> None:
     other = world_maker("grid4x4", [demand], seconds=60, seed=2)
     with pytest.raises(EvaluationError, match="after 100 ticks: 2 zones have the state"):
         measure_sharding(lambda k: other(k) if k == 2 else make(k), [2], after_s=10, repeats=1)
@@ -112,7 +117,7 @@ def test_more_zones_than_the_map_can_hold_are_refused() -> None:
         measure_sharding(make, [200], after_s=1, repeats=1)
 
 
-def test_the_command_shows_and_writes(
+def test_the_command_prints_the_phases_and_writes_json(
     capsys: pytest.CaptureFixture[str], demand: Path, tmp_path: Path
 ) -> None:
     path = tmp_path / "cost.json"
@@ -124,7 +129,7 @@ def test_the_command_shows_and_writes(
     assert [row["zones"] for row in json.loads(path.read_text())["rows"]] == [1, 4]
 
 
-def test_the_command_reports_worlds_that_differ(
+def test_the_command_refuses_to_compare_worlds_that_differ(
     capsys: pytest.CaptureFixture[str], demand: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Simulation, "state_hash", lambda self: hex(id(self)))

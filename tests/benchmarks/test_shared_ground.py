@@ -1,4 +1,4 @@
-"""Detection of maps with overlapping roads, or with lanes too short for a lane change."""
+"""Detection of maps with overlapping roads or with lanes too short for a lane change."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from tests.support.netgenerate import netconvert, netgenerate
 GRID = ("--grid", "--grid.number=3", "--grid.length=80")
 
 
-def test_a_plain_grid_falls_under_no_rule(tmp_path: Path) -> None:
+def test_a_plain_grid_has_no_unusual_feature(tmp_path: Path) -> None:
     network = read_network(netgenerate(tmp_path / "grid.net.xml", *GRID, "-L", "2"))
     assert map_features(network) == ()
 
 
-def test_both_directions_on_one_lane_share_their_ground(
+def test_directions_on_the_same_strip_share_their_ground(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader of networks moves such lanes apart, so the map is built without that repair."""
+    """The test disables the repair by which the reader of networks moves such lanes apart."""
     monkeypatch.setattr(reader, "find_strips", lambda *_: [])
     spread = "--default.spreadtype=center"
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *GRID, spread))
@@ -39,7 +39,7 @@ def test_both_directions_on_one_lane_share_their_ground(
 def test_close_junctions_share_the_ground_of_their_internal_lanes(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
-    """Two bends lie back to back: from west to south, and from east to north."""
+    """One bend leads from west to south, the other one, close to it, from east to north."""
     far = 60.0 + apart_m
     nodes = {"b": (apart_m, apart_m), "e": (far, apart_m), "n": (apart_m, far)}
     network = bend_beside(tmp_path, nodes, ("eb", "be", "bn", "nb"))
@@ -50,10 +50,10 @@ def test_close_junctions_share_the_ground_of_their_internal_lanes(
 
 
 @pytest.mark.parametrize(("apart_m", "meet"), [(0.0, True), (12.0, False)])
-def test_a_road_over_another_junction_shares_ground_with_it(
+def test_a_road_over_a_junction_shares_ground_with_the_junction(
     tmp_path: Path, apart_m: float, meet: bool
 ) -> None:
-    """The road passes the outer side of a bend."""
+    """The road passes a bend, at its outer side."""
     nodes = {"b": (20.0 + apart_m, -20.0 + apart_m), "e": (-20.0 + apart_m, 20.0 + apart_m)}
     network = bend_beside(tmp_path, nodes, ("be",))
     inside = network.lanes["internal"]
@@ -66,7 +66,7 @@ def test_a_road_over_another_junction_shares_ground_with_it(
 def bend_beside(
     tmp_path: Path, nodes: dict[str, tuple[float, float]], others: tuple[str, ...]
 ) -> RoadNetwork:
-    """Build a bend from west to south around the origin, and other roads between nodes."""
+    """Build a bend from west to south at the origin, and the roads `others` between nodes."""
     nodes = {"a": (0.0, 0.0), "w": (-60.0, 0.0), "s": (0.0, -60.0), **nodes}
     roads = ("wa", "aw", "as", "sa", *others)
     points = "".join(f'<node id="{name}" x="{x}" y="{y}"/>' for name, (x, y) in nodes.items())

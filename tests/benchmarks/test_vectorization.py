@@ -8,7 +8,7 @@ import pytest
 
 from benchmarks.vectorization import LIBRARIES, measure
 
-pytestmark = pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
+pytestmark = pytest.mark.filterwarnings("ignore")  # warnings of the libraries about their own code
 
 
 def test_each_library_steps_the_same_agents() -> None:
@@ -22,7 +22,7 @@ def test_each_library_steps_the_same_agents() -> None:
     assert gymnasium["order_ratio"] == gymnasium["step_us"][0] / order["step_us"][0]
 
 
-def test_a_library_that_is_missing_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_result_names_a_missing_library_and_its_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "supersuit", None)
     found = measure(agents=2, workers=2, repeats=1)
     assert "'.[bench]'" in found.facts["missing"]["supersuit"]

@@ -1,4 +1,4 @@
-"""Randomly drawn worlds are functions of their seeds, and their files have the drawn features."""
+"""Randomly drawn worlds depend only on their seeds, and their files have the drawn features."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def first_with(*features: str) -> WorldDraw:
     return next(draw for draw in draw_all() if set(features) <= set(draw.features))
 
 
-def test_a_world_is_a_function_of_its_seed_and_its_excluded_features() -> None:
+def test_a_drawn_world_depends_only_on_its_seed_and_the_excluded_features() -> None:
     assert draw_world(7) == draw_world(7)
     assert draw_world(7, ("lefthand",)) == draw_world(7, ("lefthand",))
     assert len({draw_world(seed).net.options for seed in range(50)}) > 40
 
 
-def test_every_feature_is_drawn_and_can_be_left_out() -> None:
+def test_every_feature_is_drawn_and_features_can_be_excluded() -> None:
     drawn = {name for draw in draw_all() for name in draw.features}
     assert drawn == FEATURES
     without = ("lefthand", "grid", "actuated", "all", "everywhere")
@@ -53,7 +53,7 @@ def test_every_feature_is_drawn_and_can_be_left_out() -> None:
 
 
 @pytest.mark.parametrize("without", [("rightward",), tuple(KINDS), tuple(SIGNALS)])
-def test_features_that_cannot_be_left_out_are_refused(without: tuple[str, ...]) -> None:
+def test_excluding_all_or_unknown_features_is_refused(without: tuple[str, ...]) -> None:
     with pytest.raises(ConfigError, match="--without"):
         draw_all(without)
 
@@ -68,7 +68,7 @@ def test_a_world_has_one_of_each_kind_of_feature() -> None:
         assert not plain or not set(features) & set(SHARES)
 
 
-def test_leaving_out_narrow_places_does_not_change_other_worlds() -> None:
+def test_excluding_narrow_roads_does_not_change_other_worlds() -> None:
     narrow = [draw for draw in draw_all() if draw.net.kind in NARROW]
     assert 0.05 < len(narrow) / len(SEEDS) < 0.15
     others = {draw.seed: draw for draw in draw_all(tuple(NARROW))}
@@ -76,7 +76,7 @@ def test_leaving_out_narrow_places_does_not_change_other_worlds() -> None:
         assert draw.net.kind in NARROW or draw == others[draw.seed]
 
 
-def test_zippers_and_pairs_of_signals_are_on_the_map(tmp_path: Path) -> None:
+def test_maps_have_the_drawn_zippers_and_pairs_of_signals(tmp_path: Path) -> None:
     net, _ = make_files(first_with("zipper"), tmp_path / "zipper", SECONDS, ())
     links = load_network(net).links
     zippers = links[links["state"] == ord("Z")]
@@ -112,7 +112,7 @@ def test_equal_draws_make_equal_traffic(tmp_path: Path, features: tuple[str, ...
     assert 0.0 <= departs[0] <= departs[-1] < SECONDS
 
 
-def test_the_flow_follows_the_level(tmp_path: Path) -> None:
+def test_a_higher_level_of_traffic_has_more_vehicles_per_km(tmp_path: Path) -> None:
     counts = []
     for level in ("free", "near_capacity"):
         draw = first_with("grid", level, "everywhere")
@@ -123,11 +123,11 @@ def test_the_flow_follows_the_level(tmp_path: Path) -> None:
     assert counts[1] > 1.5 * counts[0]
 
 
-def test_a_cut_is_a_piece_of_a_real_map(tmp_path: Path) -> None:
+def test_a_cut_is_a_part_of_a_real_map(tmp_path: Path) -> None:
     draw = first_with("cut")
     net, routes = make_files(draw, tmp_path, SECONDS, cut_maps(None))
     west, south, east, north = load_network(net).extent_m
-    # An edge that begins inside the cut may end outside of it.
+    # Edges that begin inside the cut may end outside, so the map may be larger than the cut.
     reach = 2.0 * draw.net.length_m + 600.0
     assert east - west < reach
     assert north - south < reach

@@ -1,4 +1,4 @@
-"""Runs of many worlds: rows, their summary, and runs that continue after an interruption."""
+"""Runs of many worlds: rows, their summary, and continuation after an interruption."""
 
 from __future__ import annotations
 
@@ -48,18 +48,18 @@ def a_row(seed: int = 0, **ours: Any) -> Row:
     return own | {"ours": FIGURES | ours, "sumo": FIGURES, "sumo_spread": SPREAD}
 
 
-def test_a_deviation_is_relative_to_the_mean_of_sumos_seeds() -> None:
+def test_a_deviation_is_relative_to_the_mean_over_seeds_of_sumo() -> None:
     assert deviation(a_row(mean_speed_mps=11.5), "mean_speed_mps") == pytest.approx(0.15)
     assert deviation(a_row(arrived=60), "arrived") == pytest.approx(-0.25)
     assert deviation(a_row(mean_delay_s=None), "mean_delay_s") is None
 
 
-def test_worlds_that_differ_by_design_are_not_comparable() -> None:
+def test_worlds_with_features_that_cavmarl_treats_differently_are_not_comparable() -> None:
     rows = [a_row() | {"features": ["grid", name]} for name in ("priority_stop", "stub_lanes")]
     assert comparable(rows) == rows[:1]
 
 
-def test_a_metric_is_near_within_a_share_or_within_sumos_spread() -> None:
+def test_a_metric_is_near_within_a_share_or_between_the_seeds_of_sumo() -> None:
     assert in_spread(a_row(mean_speed_mps=9.0), "mean_speed_mps")
     assert not in_spread(a_row(mean_speed_mps=8.9), "mean_speed_mps")
     assert is_near(a_row(mean_speed_mps=8.9), "mean_speed_mps", 0.15)
@@ -74,14 +74,14 @@ def test_a_delay_is_near_within_a_share_or_some_seconds(delay_s: float | None, n
     assert is_delay_near(a_row(mean_delay_s=delay_s)) == near
 
 
-def test_a_deadlock_counts_if_sumo_has_none() -> None:
+def test_a_deadlock_counts_if_no_seed_of_sumo_has_one() -> None:
     assert has_own_lock(a_row(longest_lock_s=121.0))
     assert not has_own_lock(a_row(longest_lock_s=120.0))
     both = a_row(longest_lock_s=200.0) | {"sumo_spread": SPREAD | {"longest_lock_s": [9.0, 121.0]}}
     assert not has_own_lock(both)
 
 
-def test_each_seed_of_sumo_is_compared_with_the_others_as_our_seeds_are() -> None:
+def test_each_seed_of_sumo_is_compared_with_the_other_seeds_like_a_run_of_cavmarl() -> None:
     row = a_row() | {"sumo_spread": SPREAD | {"arrived": [100, 104, 120]}}
     peers = sumo_beside_itself(row)
     assert [peer["ours"]["arrived"] for peer in peers] == [100, 104, 120]
@@ -94,13 +94,13 @@ def test_each_seed_of_sumo_is_compared_with_the_others_as_our_seeds_are() -> Non
     assert summary([row])["arrived"]["sumo_near"] == pytest.approx(1 / 3)
 
 
-def test_the_summary_of_hand_made_rows() -> None:
+def test_the_summary_counts_deviations_contacts_and_failures() -> None:
     rows = [a_row(k, mean_speed_mps=10.0 + k) for k in range(5)]
     rows.append(a_row(5, contacts=3, arrived=70, longest_lock_s=150.0))
     failed = {"seed": 6, "features": ["cut"], "error": "MapError: no roads"}
     found = summary([*rows, failed])
     assert (found["worlds"], found["failed"]) == (7, 1)
-    # Deviations of 0, 10, 20, 30, 40 and 0 per cent.
+    # The deviations of speed are 0, 10, 20, 30, 40 and 0 per cent.
     assert found["mean_speed"]["median"] == pytest.approx(0.15)
     assert found["mean_speed"]["size_90"] == pytest.approx(0.35)
     assert found["mean_speed"]["share_near"] == pytest.approx(3 / 6)
@@ -110,13 +110,13 @@ def test_the_summary_of_hand_made_rows() -> None:
     assert summary([failed]) == {"worlds": 1, "failed": 1}
 
 
-def test_the_worst_worlds_are_failures_then_contacts_then_speed_deviations() -> None:
+def test_the_worst_worlds_are_sorted_by_failure_contacts_and_deviation_of_speed() -> None:
     rows = [a_row(0), a_row(1, mean_speed_mps=6.0), a_row(2, contacts=1)]
     rows.append({"seed": 3, "features": [], "error": "x"})
     assert [row["seed"] for row in worst(rows, 3)] == [3, 2, 1]
 
 
-def test_the_table_of_the_worst_breaks_no_word_on_a_narrow_terminal(tmp_path: Path) -> None:
+def test_the_table_of_the_worst_worlds_breaks_no_word_on_a_narrow_terminal(tmp_path: Path) -> None:
     features = ["grid", "right_before_left", "turn_lanes", "random_priority", "near_capacity"]
     row = a_row(7, mean_speed_mps=9.0, contacts=3) | {"features": features}
     console = Console(width=80, record=True)
@@ -135,7 +135,7 @@ def test_the_table_of_the_worst_breaks_no_word_on_a_narrow_terminal(tmp_path: Pa
 
 @pytest.fixture
 def stubbed(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Replace runs by a folder and a row per world; return the requested seeds."""
+    """Replace each run by a folder and a row; return the list of requested seeds."""
     ran: list[int] = []
 
     def run_world(job: WorldSeries, seed: int) -> Row:
@@ -161,14 +161,14 @@ def test_a_run_resumes_and_keeps_the_files_of_the_worst_worlds(
     assert kept == {f"world_{seed:06d}" for seed in range(5, KEPT + 5)}
 
 
-def test_rows_of_other_settings_are_not_mixed(tmp_path: Path, stubbed: list[int]) -> None:
+def test_rows_with_other_settings_are_refused(tmp_path: Path, stubbed: list[int]) -> None:
     run_worlds(WorldSeries(tmp_path, 1, 0))
     with pytest.raises(ConfigError, match="rows with other settings"):
         run_worlds(WorldSeries(tmp_path, 1, 0, seconds=200))
     assert stubbed == [0]
 
 
-def test_a_broken_row_is_named(tmp_path: Path) -> None:
+def test_the_error_for_a_broken_row_names_its_line(tmp_path: Path) -> None:
     (tmp_path / ROWS_FILE).write_text('{"seed": 1}\n{"seed"\n')
     with pytest.raises(ConfigError, match="line 2: not a valid row"):
         list(read_rows(tmp_path / ROWS_FILE))
@@ -194,7 +194,9 @@ def test_errors_of_bad_input_have_one_line(
     assert says in " ".join(capsys.readouterr().err.split())
 
 
-def test_without_sumo_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_sumo_names_the_extra(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     def absent(module: str) -> None:
         raise ModuleNotFoundError(name=module)
 
@@ -204,7 +206,7 @@ def test_without_sumo_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.Mon
 
 
 @pytest.mark.slow
-def test_the_program_runs_and_shows_two_worlds(
+def test_the_benchmark_runs_and_prints_two_worlds(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     document = tmp_path / "all.json"

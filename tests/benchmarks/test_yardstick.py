@@ -1,4 +1,4 @@
-"""The benchmark `yardstick`: its counts, its bound, and vehicles that stand without a cause."""
+"""The benchmark `yardstick`: its counts, its bound, and the causes for which vehicles stand."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.roads.sumo_net.reader import read_network
 from tests.support.netgenerate import netgenerate
 
 
-def test_the_bound_holds_on_a_good_map() -> None:
+def test_the_bound_holds_on_a_correct_map() -> None:
     found = yardstick.measure(["merge"], agents="2", models="IDM", seconds=30)
     assert found.holds
     (own, total) = found.rows
@@ -53,7 +53,7 @@ def test_the_table_has_room_for_all_columns_on_a_narrow_terminal(
 def test_contacts_on_shared_ground_are_counted_separately(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The reader of networks moves such lanes apart, so the map is built without that repair."""
+    """The test disables the repair by which the reader of networks moves such lanes apart."""
     monkeypatch.setattr(reader, "find_strips", lambda *_: [])
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default.spreadtype=center")
     network = read_network(netgenerate(tmp_path / "bidi.net.xml", *options))
@@ -63,23 +63,26 @@ def test_contacts_on_shared_ground_are_counted_separately(
     rows["id"], rows["lane"], rows["x"] = [0, 1, 2], [one, other, one], [0.0, 4.0, 50.0]
     assert ground.holds(rows[0], rows, 0.1)
     assert ground.holds(rows[1], rows, 0.1)
-    rows["x"] = [0.0, 50.0, 4.0]  # two vehicles on one lane, one behind the other
+    rows["x"] = [0.0, 50.0, 4.0]  # the near vehicle is on the same lane
     assert not ground.holds(rows[0], rows, 0.1)
-    rows["x"], rows["z"] = [0.0, 2.0, 4.0], [0.0, 5.0, 0.0]  # a vehicle on a bridge
+    rows["x"], rows["z"] = (
+        [0.0, 2.0, 4.0],
+        [0.0, 5.0, 0.0],
+    )  # the near vehicle on the other lane is on a bridge
     assert not ground.holds(rows[0], rows, 0.1)
-    rows["x"] = [0.0, 50.0, 50.0]  # a vehicle that has departed in the meantime
+    rows["x"] = [0.0, 50.0, 50.0]  # no other vehicle is near
     assert ground.holds(rows[0], rows, 0.1)
-    # The vehicle behind has the nearer centre, and the approaching vehicle touches it.
+    # The centre of the vehicle behind is nearer, but the contact is with the oncoming vehicle.
     rows["z"], rows["length"], rows["width"] = 0.0, 5.0, 2.0
     rows["x"], rows["speed"] = [0.0, 8.0, -6.0], [15.0, 15.0, 0.0]
     rows["heading"][1] = np.pi
     assert ground.holds(rows[0], rows, 0.1)
 
 
-def test_a_broken_bound_is_reported() -> None:
+def test_the_bound_allows_few_vehicles_off_the_road_and_none_on_the_wrong_way() -> None:
     one = yardstick.Drive(trips=2000)
     one.counts["off_road"] = 1
-    assert one.holds, "0.05 % are allowed"
+    assert one.holds, "0.05 % of the trips off the road are not allowed"
     one.counts["off_road"] = 2
     assert not one.holds
     one.counts["off_road"] = 0
@@ -87,7 +90,7 @@ def test_a_broken_bound_is_reported() -> None:
     assert not one.holds
 
 
-def test_vehicles_that_stand_at_red_or_behind_another_vehicle_have_a_cause() -> None:
+def test_red_and_a_vehicle_ahead_are_causes_to_stand() -> None:
     world = load_world("grid4x4", agents=2, background=0)
     vec = CavVectorEnv(LocalWorlds(world, 1))
     vec.reset(seed=1)
@@ -122,7 +125,7 @@ def test_priority_and_a_full_road_are_causes_to_stand() -> None:
     assert waits(foe["from_lane"], network.lanes["length_m"][foe["from_lane"]] - 5.0)
     assert waits(foe["next_lane"], 0.5)
     others["length"] = 5.0
-    assert waits(foe["to_lane"], 2.0), "its rear is still in the junction"
+    assert waits(foe["to_lane"], 2.0), "a vehicle with its rear in the junction is no cause"
     assert not waits(foe["to_lane"], 3.0)
     behind = network.links["to_lane"][link]
     assert waits(behind, 5.0)
@@ -144,6 +147,6 @@ def test_a_vehicle_inside_a_junction_waits_for_room_and_not_for_a_signal() -> No
     assert not watch.has_cause(rows, 0, red)
 
 
-def test_no_map_is_refused() -> None:
+def test_a_call_without_a_map_is_refused() -> None:
     with pytest.raises(ConfigError, match="no map: give maps"):
         yardstick.measure()

@@ -1,4 +1,4 @@
-"""`cavmarl carla` listens until it is interrupted."""
+"""`cavmarl carla`: it listens until it is interrupted, and refuses wrong options."""
 
 from __future__ import annotations
 
@@ -16,23 +16,23 @@ COMMAND = [sys.executable, "-m", "cavmarl", "carla", "grid4x4", "--agents", "2",
 
 
 def test_the_server_listens_until_it_is_interrupted() -> None:
-    # In the background of a shell, SIGINT is ignored, here and in children.
+    # Background processes of a shell ignore SIGINT, and children inherit this.
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     process = subprocess.Popen(COMMAND, stdout=subprocess.PIPE, text=True)
     signal.signal(signal.SIGINT, before)
     with process:
         try:
             assert process.stdout is not None
-            told = process.stdout.readline()
+            line = process.stdout.readline()
             found = re.search(
-                r"Carla/Maps/grid4x4 at 127\.0\.0\.1:(\d+), for client 0\.9\.16", told
+                r"Carla/Maps/grid4x4 at 127\.0\.0\.1:(\d+), for client 0\.9\.16", line
             )
-            assert found, told
+            assert found, line
             with socket.create_connection(("127.0.0.1", int(found[1])), 10.0):
                 process.send_signal(signal.SIGINT)
                 assert process.wait(30.0) == 130
         finally:
-            process.kill()  # after a failure, do not wait for the process
+            process.kill()  # after a failed assertion, the process would not end
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_the_server_listens_until_it_is_interrupted() -> None:
         (["--set", "action.kind=discrete"], "set action.kind = continuous"),
     ],
 )
-def test_wrong_options_are_errors(
+def test_wrong_options_are_refused(
     words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:

@@ -1,4 +1,4 @@
-"""`cavmarl demo`: refused arguments, its files, and its page."""
+"""`cavmarl demo`: its output, its files, its page, and missing packages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROOT = Path(__file__).resolve().parents[2]
 TRAINED = ROOT / "agents" / "merge_careful_ippo"
 RUN = subprocess.run
 # Packages of other extras, which the demo does not need.
-APART = (
+UNNEEDED = (
     "libsumo",
     "sumo",
     "tensorboard",
@@ -39,8 +39,8 @@ def run(*words: str) -> int:
     return int(ended.value.code or 0)
 
 
-def trains_at_once(command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
-    """Replace the training program: copy a trained driver to its output; run other programs."""
+def run_without_training(command: list[str], **options: Any) -> subprocess.CompletedProcess[Any]:
+    """Run a program; in place of the training program, copy a trained driver to its output."""
     if Path(command[1]).name != "ppo.py":
         return RUN(command, **options)
     words = dict(zip(command[2::2], command[3::2], strict=True))
@@ -53,14 +53,14 @@ def trains_at_once(command: list[str], **options: Any) -> subprocess.CompletedPr
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], str]:
+def finished_demo(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any], str]:
     """Return the folder, the JSON file and the output of a demo with one episode per driver."""
     pytest.importorskip("matplotlib")
     pytest.importorskip("pygame")
     folder = tmp_path_factory.mktemp("demo")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(subprocess, "run", trains_at_once)
-        for module in APART:
+        patch.setattr(subprocess, "run", run_without_training)
+        for module in UNNEEDED:
             patch.setitem(sys.modules, module, None)
         patch.setattr(demo, "EPISODES", 1)
         patch.setattr("rich.console.Console.print", printed := Printed())
@@ -70,7 +70,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict[str, Any]
 
 
 class Printed:
-    """A console that stores its output."""
+    """A replacement of `Console.print` that stores the text."""
 
     def __init__(self) -> None:
         self.text = ""
@@ -80,9 +80,9 @@ class Printed:
 
 
 def test_the_demo_estimates_its_duration_before_it_trains(
-    made: tuple[Path, dict[str, Any], str],
+    finished_demo: tuple[Path, dict[str, Any], str],
 ) -> None:
-    _, document, text = made
+    _, document, text = finished_demo
     assert document["decisions_per_s"] == 1000.0
     estimate, training = text.index("training takes about 5 min"), text.index("2. train")
     assert estimate < training
@@ -90,19 +90,19 @@ def test_the_demo_estimates_its_duration_before_it_trains(
 
 
 def test_the_demo_compares_four_drivers_in_the_same_episodes(
-    made: tuple[Path, dict[str, Any], str],
+    finished_demo: tuple[Path, dict[str, Any], str],
 ) -> None:
-    folder, document, _ = made
+    folder, document, _ = finished_demo
     assert list(document["report"]["policies"]) == [
         "adapted", "cities_ippo", "idm", "random_actions",
     ]  # fmt: skip
     assert (next(folder.glob("evaluation-*")) / "failures.html").is_file()
 
 
-def test_the_page_has_the_story_the_pictures_and_the_commands(
-    made: tuple[Path, dict[str, Any], str],
+def test_the_page_contains_pictures_plots_tables_and_commands(
+    finished_demo: tuple[Path, dict[str, Any], str],
 ) -> None:
-    folder, document, _ = made
+    folder, document, _ = finished_demo
     page = (folder / "demo.html").read_text("utf-8")
     assert page.count('src="data:image/webp;base64,') == 2
     assert 'id="plot-learning"' in page
@@ -112,7 +112,7 @@ def test_the_page_has_the_story_the_pictures_and_the_commands(
     assert page.index('id="compared"') < page.index('id="results"')
 
 
-def test_the_demo_names_all_missing_packages(
+def test_the_error_of_the_demo_names_all_missing_packages(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     monkeypatch.setattr("cavmarl.core.errors.find_spec", lambda _: None)
@@ -133,7 +133,7 @@ def test_the_demo_names_all_missing_packages(
         ((0.94, 0.95), (None, 12.0), "cannot be compared"),
     ],
 )
-def test_the_story_has_the_measured_figures(
+def test_the_comparison_says_in_which_measures_the_adapted_driver_is_better(
     success: tuple[float, float], delay: tuple[float | None, float], words: str
 ) -> None:
     found: Any = {
@@ -147,7 +147,7 @@ def test_the_story_has_the_measured_figures(
     assert words in demo.compared(found)
 
 
-def test_the_environment_of_the_demo_is_in_the_package() -> None:
+def test_the_map_and_the_initial_driver_of_the_demo_exist() -> None:
     settings: Any = read_yaml(find_settings("train", "demo"))
     assert (ROOT / "envs" / settings["env"] / "map" / "map.net.xml").is_file()
     assert (ROOT / "agents" / settings["start"] / "model.safetensors").is_file()

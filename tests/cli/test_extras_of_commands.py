@@ -1,4 +1,4 @@
-"""Commands name all modules that they lack at once, before any work."""
+"""Commands name all missing modules in one error, before any work."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from cavmarl.core.errors import MissingExtraError
 
 
 @pytest.fixture
-def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
-    """An installation without extras, and a working directory with a model file."""
+def without_extras(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+    """Hide the modules of all extras, and return a working directory with a model file."""
     monkeypatch.setattr(errors, "find_spec", lambda name: None)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "model.zip").write_bytes(b"")
@@ -40,14 +40,16 @@ def bare(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
         ("scenario run cut_in --picture a.png", "'pygame' is", "render"),
     ],
 )  # fmt: skip
-def test_a_command_names_all_its_missing_modules(
-    bare: Path, words: str, modules: str, extras: str
+def test_the_error_of_a_command_names_all_missing_modules(
+    without_extras: Path, words: str, modules: str, extras: str
 ) -> None:
     with pytest.raises(MissingExtraError) as refusal:
         CliRunner().invoke(app, words.split(), catch_exceptions=False)
     assert modules in str(refusal.value)
     assert f"[{extras}]'" in str(refusal.value)
-    assert [path.name for path in bare.iterdir()] == ["model.zip"], "nothing was made before"
+    assert [path.name for path in without_extras.iterdir()] == ["model.zip"], (
+        "files were written before the error"
+    )
 
 
 def test_each_training_program_needs_torch() -> None:

@@ -27,7 +27,7 @@ def run(*words: str) -> str:
 
 
 @pytest.mark.parametrize("path", [*entries().values(), *agent_entries().values()], ids=str)
-def test_each_entry_has_a_sentence(path: Path) -> None:
+def test_each_entry_is_described_by_a_sentence(path: Path) -> None:
     found = sentence_about(path)
     assert found != str(path)
     assert len(found.split()) > 3
@@ -75,7 +75,7 @@ def report(**means: float | None) -> PolicyReport:
     return PolicyReport(3, found, {}, ())
 
 
-def test_kilometres_without_an_infraction_are_a_lower_bound() -> None:
+def test_kilometres_without_an_infraction_are_shown_as_a_lower_bound() -> None:
     metric = next(one for one in METRICS if one.name == KM_PER_INFRACTION)
     assert driver_cell(metric, report(km_per_infraction=12.3)) == "> 12.3"
     assert driver_cell(metric, report(km_per_infraction=12.3, red_light=0.1)) == "12.3"

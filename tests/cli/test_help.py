@@ -11,7 +11,7 @@ from tests.support.command_lines import check_command, whole_command
 
 
 def commands(group: Any = None, words: str = "cavmarl") -> Iterator[tuple[str, Any]]:
-    """Yield each command with the words that call it."""
+    """Yield the words that call each command, and the command."""
     group = group or whole_command()
     context = group.make_context(words, [], resilient_parsing=True)
     for name in group.list_commands(context):
@@ -35,8 +35,8 @@ def test_help_ends_with_valid_examples(words: str) -> None:
         check_command(line[line.index("cavmarl") :])
 
 
-def test_the_help_of_submit_offers_no_modules_and_says_what_is_uploaded() -> None:
-    """A service takes the data of its callers, but no modules."""
+def test_the_help_of_submit_has_no_import_option_and_says_what_is_uploaded() -> None:
+    """A service does not import modules of its callers."""
     command = COMMANDS["cavmarl submit"]
     options = {word for one in command.params for word in one.opts}
     assert "--import" not in options
@@ -53,16 +53,16 @@ def test_help_describes_the_value_of_each_option(words: str) -> None:
         text = parameter.help or ""
         assert text.endswith("."), f"{parameter.name}: {text}"
         assert text[:1].isupper() or text[:1].isdigit(), f"{parameter.name}: {text}"
-        assert "[default" not in text, f"{parameter.name}: the markup hides it"
+        assert "[default" not in text, f"{parameter.name}: '[default' is hidden as markup"
         if parameter.param_type_name == "option":
             value = parameter.display_type_rich(context)
             assert not value or "|" in value or not value.startswith("<"), (
-                f"{parameter.name}: name the value"
+                f"{parameter.name}: the value has no name"
             )
 
 
 @pytest.mark.parametrize("words", COMMANDS)
-def test_flags_have_no_value_and_optional_arguments_one_pair_of_brackets(
+def test_help_shows_no_value_for_flags_and_no_double_brackets(
     words: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit):
@@ -81,4 +81,4 @@ def test_the_commands_are_grouped_by_task(capsys: pytest.CaptureFixture[str]) ->
     places = [shown.index(panel) for panel in panels]
     assert places[0] == min(places)
     assert shown.index(" demo ") < shown.index(" evaluate ") < shown.index(" serve ")
-    assert "Commands" not in shown, "each command belongs to a group"
+    assert "Commands" not in shown, "a command belongs to no group"

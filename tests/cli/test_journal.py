@@ -20,7 +20,7 @@ def written(tmp_path: Path) -> Path:
     return path
 
 
-def words(capsys: pytest.CaptureFixture[str]) -> str:
+def printed_words(capsys: pytest.CaptureFixture[str]) -> str:
     return " ".join(capsys.readouterr().out.split())
 
 
@@ -28,7 +28,7 @@ def test_the_command_counts_events_and_names_the_owners(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert run("journal", str(written)) == 0
-    said = words(capsys)
+    said = printed_words(capsys)
     for part in (
         f"run {bytes(range(16)).hex()}",
         "ticks 6, 1 to 6",
@@ -46,7 +46,7 @@ def test_the_command_prints_the_owners_of_a_tick(
 ) -> None:
     out = tmp_path / "owners.json"
     assert run("journal", str(written), "--at", "4", "--json", str(out)) == 0
-    assert "7 1 1 0 8 1 0 2" in words(capsys)
+    assert "7 1 1 0 8 1 0 2" in printed_words(capsys)
     assert json.loads(out.read_text()) == {
         "kind": "journal",
         "tick": 4,
@@ -54,12 +54,12 @@ def test_the_command_prints_the_owners_of_a_tick(
     }
 
 
-def test_a_dropped_incomplete_line_is_named(
+def test_a_dropped_incomplete_line_is_reported(
     written: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     written.write_bytes(written.read_bytes()[:-5])
     assert run("journal", str(written)) == 0
-    said = words(capsys)
+    said = printed_words(capsys)
     assert "tick 6 was started but not committed" in said
     assert "is cut short" in said
 
@@ -73,4 +73,4 @@ def test_errors_of_damage_and_unknown_ticks_have_one_line(
     said = refusal(capsys, "journal", str(written))
     assert f"error: {written}: line 3 of the log has number 3, so lines are missing" in said
     said = refusal(capsys, "journal", str(written.parent / "none.journal"))
-    assert "none.journal" in "".join(said.replace("│", "").split()), "wrapped in a box"
+    assert "none.journal" in "".join(said.replace("│", "").split()), "the missing file is not named"

@@ -1,4 +1,4 @@
-"""`cavmarl lead` continues for any bytes that a follower sends."""
+"""`cavmarl lead`: faults of followers, traces, recordings, and refused options."""
 
 from __future__ import annotations
 
@@ -20,30 +20,30 @@ from cavmarl.cosim.followers.follower_messages import Control, Say
 STEPS = 6
 
 
-def answering(address: str, controls: Any, name: str = "bad") -> None:
+def follow_with(address: str, controls: Any, name: str = "bad") -> None:
     with Follower(address, ["car_0"], name) as follower:
         for sight in follower:
             if not sight.snapshot.is_over:
                 follower.answer(controls)
 
 
-def dying(address: str) -> None:
+def disconnect(address: str) -> None:
     Follower(address, ["car_0"]).__dict__["_line"].close()
 
 
-def silent(address: str) -> None:
+def send_nothing(address: str) -> None:
     with Follower(address, ["car_0"]):
         time.sleep(2.0)
 
 
-def babbling(address: str) -> None:
+def answer_a_future_frame(address: str) -> None:
     with Follower(address, ["car_0"]) as follower:
         follower.wait()
         follower.__dict__["_line"].say(Say.CONTROL, Control(99, {}))
         time.sleep(1.0)
 
 
-def shouting(address: str) -> None:
+def send_other_bytes(address: str) -> None:
     """Join, and then send bytes that are not a frame."""
     with Follower(address, ["car_0"]) as follower:
         os.write(follower.__dict__["_line"].fileno(), b"\x00" * 64)
@@ -51,23 +51,23 @@ def shouting(address: str) -> None:
 
 
 FAULTS: dict[str, Callable[[str], None]] = {
-    "not a number": lambda address: answering(address, {"car_0": [float("nan"), 0.0]}),
-    "out of range": lambda address: answering(address, {"car_0": [7.0, 0.0]}),
-    "another agent": lambda address: answering(address, {"car_9": [0.0, 0.0]}),
-    "an odd name": lambda address: answering(address, {"car_0": [2.0, 0.0]}, "[/x]"),
-    "dying": dying,
-    "silent": silent,
-    "a frame to come": babbling,
-    "no frame": shouting,
+    "not a number": lambda address: follow_with(address, {"car_0": [float("nan"), 0.0]}),
+    "out of range": lambda address: follow_with(address, {"car_0": [7.0, 0.0]}),
+    "another agent": lambda address: follow_with(address, {"car_9": [0.0, 0.0]}),
+    "a name with markup": lambda address: follow_with(address, {"car_0": [2.0, 0.0]}, "[/x]"),
+    "disconnected": disconnect,
+    "silent": send_nothing,
+    "a future frame": answer_a_future_frame,
+    "no frame": send_other_bytes,
 }
 
 
-def led(address: Path, fault: Callable[[str], None], *words: str) -> int:
+def lead_with(address: Path, fault: Callable[[str], None], *words: str) -> int:
     def follow() -> None:
         while True:
             try:
                 return fault(str(address))
-            except Exception as error:  # the world refused the follower, or did not listen yet
+            except Exception as error:  # the world does not listen yet, or refused the follower
                 if "does not answer (" not in str(error):
                     return None
             time.sleep(0.01)
@@ -85,34 +85,34 @@ def led(address: Path, fault: Callable[[str], None], *words: str) -> int:
 
 
 @pytest.mark.parametrize("fault", FAULTS.values(), ids=FAULTS)
-def test_a_followers_fault_ends_that_follower(
+def test_a_fault_of_a_follower_ends_only_that_follower(
     tmp_path: Path, fault: Callable[[str], None], capsys: pytest.CaptureFixture[str]
 ) -> None:
     found = tmp_path / "found.json"
-    assert led(tmp_path / "s", fault, "--json", str(found)) == 0
+    assert lead_with(tmp_path / "s", fault, "--json", str(found)) == 0
     result = json.loads(found.read_text())
     assert result["steps"] == STEPS
     assert len(result["lost"]) == 1
     assert "built-in driver" in capsys.readouterr().err
 
 
-def test_a_followers_fault_can_end_the_run(
+def test_a_fault_of_a_follower_can_end_the_run(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert led(tmp_path / "s", FAULTS["dying"], "--on-lost", "end") == 2
+    assert lead_with(tmp_path / "s", FAULTS["disconnected"], "--on-lost", "end") == 2
     assert "error" in capsys.readouterr().err
 
 
-def test_a_name_with_markup_is_shown_as_it_is(
+def test_a_name_with_markup_is_shown_unchanged(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    fault = lambda address: answering(address, {"car_0": [0.1, 0.0]}, "[/x]")  # noqa: E731
-    assert led(tmp_path / "s", fault, "--json", str(tmp_path / "found.json")) == 0
+    fault = lambda address: follow_with(address, {"car_0": [0.1, 0.0]}, "[/x]")  # noqa: E731
+    assert lead_with(tmp_path / "s", fault, "--json", str(tmp_path / "found.json")) == 0
     assert "[/x]" in capsys.readouterr().out
     assert json.loads((tmp_path / "found.json").read_text())["lost"] == []
 
 
-def test_a_port_needs_a_file_with_a_secret(
+def test_a_port_without_a_file_for_the_secret_is_refused(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     words = ["lead", "ring", "--at", "0", "--followers", "0", "--steps", "1"]
@@ -138,7 +138,7 @@ def exit_code(words: list[str]) -> int:
 
 
 @pytest.mark.integration
-def test_a_trace_is_played_with_a_deadline_and_recorded(
+def test_a_run_with_a_trace_and_a_deadline_is_recorded(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     trace = tmp_path / "van.csv"
@@ -165,12 +165,12 @@ def test_a_trace_is_played_with_a_deadline_and_recorded(
     assert f"equal: 30 steps in 1 episodes; state {found['state_hash']}" in capsys.readouterr().out
 
 
-def test_a_deadline_needs_a_pace(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_deadline_without_a_pace_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert exit_code(["lead", "ring", "--deadline", "0.1"]) == 2
     assert "--deadline 0.1: goes with --pace" in capsys.readouterr().err
 
 
-def test_a_wrong_pace_leaves_no_open_world(
+def test_the_recording_is_closed_after_a_wrong_pace(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     run = tmp_path / "run"

@@ -60,7 +60,7 @@ def test_help_names_every_command(capsys: pytest.CaptureFixture[str]) -> None:
     assert all(command in shown for command in COMMANDS)
 
 
-def test_help_loads_nothing_heavy() -> None:
+def test_help_imports_no_optional_package() -> None:
     code = (
         "import sys; from cavmarl.cli import main\n"
         "try: main(['--help'])\n"
@@ -70,7 +70,7 @@ def test_help_loads_nothing_heavy() -> None:
     assert out.stdout.strip().endswith("set()")
 
 
-def test_an_unknown_command_is_wrong_use(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_unknown_command_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert "No such command" in refusal(capsys, "evalute")
 
 
@@ -103,7 +103,7 @@ def test_evaluate_shows_a_table_and_writes_json(
     assert capsys.readouterr().out.strip() == shown.strip()
 
 
-def test_evaluate_compares_in_repeated_runs_and_writes_a_page(
+def test_evaluate_compares_drivers_in_repeated_runs_and_writes_a_page(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("matplotlib")
@@ -163,7 +163,7 @@ def test_verify_takes_the_zones_of_a_file(
     assert "has 3 zones; use 3" in refusal(capsys, *words, "--zones", "4")
 
 
-def test_verify_fails_and_names_the_first_difference_of_each_division(
+def test_verify_fails_and_names_the_first_difference_of_the_divided_world(
     capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 1.0)
@@ -344,7 +344,7 @@ def test_a_window_without_a_display_is_refused(
     assert "use --video FILE" in refusal(capsys, "view", "ring", "--seconds", "0.1")
 
 
-def test_a_window_opens_with_the_video_driver_of_sdl(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_window_opens_with_the_dummy_video_driver_of_sdl(monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("pygame")
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     assert run("view", "merge", "--seconds", "0.1", *QUICK) == 0
@@ -381,7 +381,7 @@ def test_view_writes_a_video(tmp_path: Path) -> None:
     assert json.loads(stats.read_text())["traffic"]["departed"] >= 1
 
 
-def test_bench_compares_and_reports_whether_bounds_hold(
+def test_bench_compares_speeds_and_fails_below_the_required_ratio(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("highway_env")
@@ -406,7 +406,7 @@ def test_train_lists_its_programs(capsys: pytest.CaptureFixture[str]) -> None:
 def test_train_runs_a_program_with_its_own_options(
     config: list[str], monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    """The program is found outside of the checkout, for any content of the working directory."""
+    """A file of the same name in the working directory is not run."""
     ran: list[str] = []
     monkeypatch.setattr("os.execv", lambda _, words: ran.extend(words))
     (tmp_path / "train").mkdir()

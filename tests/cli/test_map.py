@@ -53,7 +53,7 @@ def test_build_lists_dropped_elements(shared_maps: Path, tmp_path: Path) -> None
     assert "dropped: Attribute 'connectingRoad' is missing" in tolerated.output
 
 
-def test_a_mended_network_that_cannot_be_written_is_refused_at_once(tmp_path: Path) -> None:
+def test_an_unwritable_path_for_the_repaired_network_is_refused(tmp_path: Path) -> None:
     place = tmp_path / "none" / "out.net.xml"
     refused = runner.invoke(app, ["check", "ring", "--fix", str(place)])
     assert isinstance(refused.exception, ConfigError)
@@ -61,7 +61,9 @@ def test_a_mended_network_that_cannot_be_written_is_refused_at_once(tmp_path: Pa
 
 
 @pytest.mark.parametrize("name", ["net/mcity/mcity.net.xml", "osm/berlin_siegessaeule.osm.gz"])
-def test_check_takes_networks_and_sources(shared_maps: Path, tmp_path: Path, name: str) -> None:
+def test_check_accepts_networks_and_their_sources(
+    shared_maps: Path, tmp_path: Path, name: str
+) -> None:
     report = tmp_path / "report.json"
 
     result = runner.invoke(app, ["check", str(shared_maps / name), "--json", str(report)])
@@ -97,9 +99,7 @@ def test_a_malformed_box_is_refused(shared_maps: Path, tmp_path: Path, box: str)
 
 
 @pytest.mark.parametrize("name", ["x.txt", "x.xml", "x", "x.net.xml.bz2"])
-def test_a_network_file_without_the_suffix_of_networks_is_refused(
-    tmp_path: Path, name: str
-) -> None:
+def test_a_network_file_with_another_suffix_is_refused(tmp_path: Path, name: str) -> None:
     source, out = tmp_path / "source.osm", tmp_path / name
     source.write_text("<osm/>")
     result = runner.invoke(app, ["build", str(source), "-o", str(out)])
@@ -109,7 +109,9 @@ def test_a_network_file_without_the_suffix_of_networks_is_refused(
 
 
 @pytest.mark.parametrize("command", ["build", "check"])
-def test_the_error_for_a_file_that_is_no_map_names_map_files(tmp_path: Path, command: str) -> None:
+def test_the_error_for_a_file_that_is_no_map_names_the_suffixes_of_maps(
+    tmp_path: Path, command: str
+) -> None:
     path = tmp_path / "README.md"
     path.write_text("# A text\n")
     error = runner.invoke(app, [command, str(path)]).exception
@@ -124,7 +126,9 @@ def test_the_error_for_a_file_that_is_no_map_names_map_files(tmp_path: Path, com
         ('<net version="new"></net>', "version='new'"),
     ],
 )
-def test_a_network_has_a_version(tmp_path: Path, text: str, message: str) -> None:
+def test_a_network_without_a_valid_version_is_refused(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "empty.net.xml"
     path.write_text(text)
     error = runner.invoke(app, ["check", str(path)]).exception
@@ -133,7 +137,7 @@ def test_a_network_has_a_version(tmp_path: Path, text: str, message: str) -> Non
     assert "KeyError" not in str(error)
 
 
-def test_missing_files_and_unknown_options_are_wrong_use(tmp_path: Path) -> None:
+def test_missing_files_and_unknown_options_are_refused(tmp_path: Path) -> None:
     missing = runner.invoke(app, ["check", str(tmp_path / "none.net.xml")]).exception
     assert isinstance(missing, UnknownEnvironmentError)
     assert "none.net.xml" in str(missing)

@@ -1,4 +1,4 @@
-"""`cavmarl plan`."""
+"""`cavmarl plan`: assignments of zones to workers, and zones cut by measured costs."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def test_an_impossible_plan_is_refused(capsys: pytest.CaptureFixture[str], tmp_p
     assert "no schema" in refusal(capsys, "plan", "ring", "--snapshot", str(path))
 
 
-def test_the_error_without_admissible_workers_is_printed(
+def test_the_error_names_the_exceeded_limit_of_each_worker(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     path = tmp_path / "plan.json"

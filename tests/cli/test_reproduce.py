@@ -1,4 +1,4 @@
-"""`cavmarl reproduce`: chooses lines, shows verdicts, and exits with 1 if a number is wrong."""
+"""`cavmarl reproduce`: measures published numbers again, and exits with 1 if one is wrong."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import pytest
 
 from cavmarl.cli import main
 
-pytestmark = pytest.mark.integration  # commands are processes
+pytestmark = pytest.mark.integration  # each command of a published line is a process
 
 LINES = """
 lines:
@@ -60,20 +60,24 @@ def called(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[object, str
     return ended.value.code, " ".join(found.out.split()), " ".join(found.err.split())
 
 
-def test_all_lines_are_repeated(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    told = checkout / "told.json"
-    code, out, _ = called(capsys, "--all", "--json", str(told))
+def test_all_published_lines_are_measured_again(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    report = checkout / "report.json"
+    code, out, _ = called(capsys, "--all", "--json", str(report))
     assert code == 0
     assert "rate 12 12 exact same" in out
     assert "rows 6 numbers same" in out
     assert "by hand: It takes a week." in out
     assert "2 same, 1 by hand" in out
-    lines = json.loads(told.read_text())["lines"]
+    lines = json.loads(report.read_text())["lines"]
     assert [line["verdict"] for line in lines] == ["same", "same", "by hand"]
     assert lines[0]["comparisons"][0]["measured"] == 12
 
 
-def test_some_lines_are_repeated(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_selected_published_lines_are_measured_again(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     code, out, _ = called(capsys, "--quick")
     assert (code, out.count("same")) == (0, 2)
     assert "1 same" in out
@@ -81,7 +85,9 @@ def test_some_lines_are_repeated(checkout: Path, capsys: pytest.CaptureFixture[s
     assert (code, "rows 6 numbers same" in out) == (0, True)
 
 
-def test_a_wrong_number_is_shown(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_published_number_is_shown(
+    checkout: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (checkout / "page.md").write_text(PAGE.replace("| 3 | 30 |", "| 3 | 31 |"))
     code, out, err = called(capsys, "--all")
     assert code == 1
@@ -90,20 +96,20 @@ def test_a_wrong_number_is_shown(checkout: Path, capsys: pytest.CaptureFixture[s
     assert "error: rows: measured numbers are not those of the page; correct the page, or" in err
 
 
-def test_results_before_an_interrupt_are_shown(
+def test_results_before_an_error_are_shown(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    told = checkout / "told.json"
+    report = checkout / "report.json"
     (checkout / "page.md").write_text(PAGE.replace("| n | x |", "| m | x |"))
-    code, out, err = called(capsys, "--all", "--json", str(told))
+    code, out, err = called(capsys, "--all", "--json", str(report))
     assert code == 2
     assert "rate 12 12 exact same" in out
     assert "1 same, 2 not repeated" in out
     assert "has 0 tables" in err
-    assert len(json.loads(told.read_text())["lines"]) == 1
+    assert len(json.loads(report.read_text())["lines"]) == 1
 
 
-def test_lines_are_listed(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_published_lines_are_listed(checkout: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, out, _ = called(capsys, "--list")
     assert code == 0
     assert "rate page.md 1 quick python -m benchmarks speed" in out
@@ -131,7 +137,7 @@ def test_wrong_use_is_refused(
     assert message in err
 
 
-def test_a_line_without_its_number_is_refused(
+def test_a_published_line_without_its_number_is_refused(
     checkout: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     (checkout / "page.md").write_text(PAGE.replace("12", "many"))

@@ -1,4 +1,4 @@
-"""Each file of `--json` names the command that wrote it."""
+"""Each result file (`--json`) names the command that wrote it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The command `cavmarl scenario`."""
+"""`cavmarl scenario`: the list, single runs, and sweeps over maps."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_a_run_prints_its_outcome(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "collided" in capsys.readouterr().out
 
 
-def test_a_run_in_which_actors_touch_one_another_has_failed(
+def test_a_run_fails_if_actors_touch_each_other(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     # Cars of 5 m follow each other at 4.9 m/s and 1 s between their centres, so they overlap.
@@ -80,7 +80,7 @@ def test_a_scenario_runs_for_several_agents(capsys: pytest.CaptureFixture[str]) 
 
 
 @pytest.mark.parametrize(
-    ("words", "says"),
+    ("words", "message"),
     [
         (["nothing"], "Choose one of: failed_u_turn"),
         (["pedestrian_crossing", "--param", "walk_mps"], "must be KEY=VALUE"),
@@ -92,8 +92,8 @@ def test_a_scenario_runs_for_several_agents(capsys: pytest.CaptureFixture[str]) 
         (["pedestrian_crossing", "--picture", "crossing.jpg"], "must end in .png"),
     ],
 )
-def test_wrong_use_is_reported(
-    words: list[str], says: str, capsys: pytest.CaptureFixture[str]
+def test_wrong_arguments_are_refused(
+    words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert code("scenario", "run", *words) == 2
-    assert says in " ".join(capsys.readouterr().err.split())
+    assert message in " ".join(capsys.readouterr().err.split())

@@ -1,4 +1,4 @@
-"""`--sensors-of`, and worlds that get the sensors of their drivers without that option."""
+"""Worlds with the sensors of their drivers, with and without the option `--sensors-of`."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ pytest.importorskip("torch")
 pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
-def test_a_trained_driver_drives_a_real_map_without_a_setting(
+def test_a_world_gets_the_sensors_of_a_trained_driver(
     capsys: pytest.CaptureFixture[str], shared_maps: Path, tmp_path: Path
 ) -> None:
     city = str(shared_maps / "net" / "Town10HD.net.xml")
     out = tmp_path / "out"
     drivers = ("-p", "cities_residual", "-p", "idm")
     assert run("evaluate", city, *drivers, "-n", "1", *QUICK, "--out", str(out)) == 0
-    told = [line for line in capsys.readouterr().err.splitlines() if "sensors" in line]
-    assert told == [
+    notes = [line for line in capsys.readouterr().err.splitlines() if "sensors" in line]
+    assert notes == [
         f"cavmarl: {city} gets the sensors and actions of cities_residual (10 keys, as with "
         "--sensors-of cities_residual)"
     ]
@@ -53,7 +53,7 @@ def test_settings_that_contradict_the_driver_are_refused(
     assert "did you mean idm" in refusal(capsys, "evaluate", "merge", "--sensors-of", "idn")
 
 
-def test_an_entry_of_the_zoo_with_foreign_sensors_is_verified(
+def test_the_result_of_a_driver_with_its_own_sensors_is_verified(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     entry = shutil.copytree(agent_entries()["cities_residual"], tmp_path / "mine")
@@ -68,7 +68,7 @@ def test_an_entry_of_the_zoo_with_foreign_sensors_is_verified(
         shutil.rmtree(entry / "result")
 
 
-def test_a_recording_with_foreign_sensors_is_replayed(
+def test_a_recording_with_the_sensors_of_a_driver_is_replayed(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("pyarrow")
@@ -80,7 +80,7 @@ def test_a_recording_with_foreign_sensors_is_replayed(
     assert len(lines.read_text().splitlines()) > 1
 
 
-def test_a_view_over_workers_takes_the_sensors_of_a_driver(
+def test_a_view_of_a_world_on_workers_uses_the_sensors_of_the_driver(
     capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
     pytest.importorskip("imageio_ffmpeg")

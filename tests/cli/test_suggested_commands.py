@@ -1,4 +1,4 @@
-"""Each command and option of cavmarl that an error message suggests exists."""
+"""Error messages suggest only commands and options that exist."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ COMMANDS = dict(_commands(typer.main.get_command(app)))
 
 @pytest.fixture(scope="module")
 def errors() -> list[tuple[str, str]]:
-    """Yield place and message of each error of the package, with `{}` for inserted values."""
+    """Return the place and the message of each error, with `{}` for inserted values."""
     return [
         (f"{path.relative_to(PACKAGE)}:{node.lineno}", _text(node.exc))
         for path in sorted(PACKAGE.rglob("*.py"))

@@ -1,4 +1,4 @@
-"""`cavmarl verify`: its checks, their refused arguments, and repeating a run of a campaign."""
+"""`cavmarl verify`: its checks, refused arguments, and campaigns of faults."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ FEW = (
         ("verify", "--replay", "tick.json"),
     ],
 )
-def test_without_a_check_the_checks_are_named(
+def test_the_error_for_a_missing_check_names_all_checks(
     words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = refusal(capsys, *words)
@@ -43,7 +43,7 @@ def test_a_former_command_name_is_refused_with_its_replacement(
 
 
 @pytest.mark.parametrize("check", ["zones", "nodes", "workers", "determinism"])
-def test_each_check_has_the_options_that_apply(
+def test_each_check_has_only_the_options_that_apply_to_it(
     check: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("COLUMNS", "200")

@@ -15,7 +15,7 @@ from tests.cli.test_main import refusal, run
 SMALL = ("ring", "--agents", "3", "--background", "4", "--worlds", "2")
 
 
-def test_killed_workers_change_no_result(
+def test_killing_workers_changes_no_result(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     path = tmp_path / "kills.json"
@@ -33,14 +33,16 @@ def test_a_successor_without_the_state_is_detected(
 ) -> None:
     replace = WorkerProcesses.replace
 
-    def without_memory(
+    def replace_without_the_state(
         processes: WorkerProcesses, k: int, mail: bytes | None, ordered: tuple[int, ...]
     ) -> str:
         processes.orders[k, COMMITTED] = -1
         return replace(processes, k, mail, ordered)
 
-    monkeypatch.setattr(WorkerProcesses, "replace", without_memory)
-    monkeypatch.setattr(worker_kills, "same_bytes", lambda *_: True)  # only states differ
+    monkeypatch.setattr(WorkerProcesses, "replace", replace_without_the_state)
+    monkeypatch.setattr(
+        worker_kills, "same_bytes", lambda *_: True
+    )  # all results count as equal, so only states can differ
     assert run("verify", "workers", *SMALL, "--kill", "5") == 1
     assert "different after step" in capsys.readouterr().out
 
@@ -54,14 +56,16 @@ def test_different_results_of_equal_states_are_detected(
     assert "different after step 2" in capsys.readouterr().out
 
 
-def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str]) -> None:
+def test_killing_workers_of_one_divided_world_changes_no_result(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     town = ("town", "--agents", "4", "--background", "30", "--worlds", "1", "--zones", "4")
     assert run("verify", "workers", *town, "--kill", "12", "--workers", "2") == 0
     assert "equal in all 46 steps" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize(
-    ("words", "told"),
+    ("words", "words_of_the_error"),
     [
         (
             ("verify", "workers", "ring", "--kill", "1", "--backend", "slurm"),
@@ -95,7 +99,7 @@ def test_the_workers_of_one_world_are_killed(capsys: pytest.CaptureFixture[str])
     ],
 )
 def test_invalid_arguments_are_refused(
-    words: tuple[str, ...], told: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+    words: tuple[str, ...], words_of_the_error: tuple[str, ...], capsys: pytest.CaptureFixture[str]
 ) -> None:
     said = refusal(capsys, *words)
-    assert all(word in said for word in told), said
+    assert all(word in said for word in words_of_the_error), said

@@ -1,4 +1,4 @@
-"""`cavmarl zoo`."""
+"""`cavmarl zoo`: the list of trained drivers, their verification, and mixed traffic."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from cavmarl.evaluate.evaluation import run_seeds
 pytestmark = pytest.mark.integration  # a manifest reads the commit from git
 
 
-def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_list_contains_the_environment_of_each_driver(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "zoo.json"
     with pytest.raises(SystemExit) as ended:
         main(["zoo", "list", "--json", str(out)])
@@ -26,7 +28,7 @@ def test_the_list_has_the_figures(tmp_path: Path, capsys: pytest.CaptureFixture[
     assert "merge_ippo" in capsys.readouterr().out
 
 
-def test_a_difference_names_both_hashes_and_both_processors(
+def test_the_error_for_a_difference_names_both_hashes_and_both_processors(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     entry = Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "merge_ippo"))
@@ -51,7 +53,7 @@ def test_a_difference_names_both_hashes_and_both_processors(
     assert f"found on {here['cpu']} ({here['architecture']})" in said.err
 
 
-def test_an_old_result_hides_no_other(
+def test_the_list_shows_the_other_drivers_if_one_result_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     old = Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "agents" / "old"))
@@ -70,7 +72,9 @@ def test_an_old_result_hides_no_other(
     assert "evaluate again" in " ".join(said.err.split())
 
 
-def test_a_matrix_is_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cross_prints_the_results_of_each_driver_among_vehicles_of_each_other(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     out = tmp_path / "cross.json"
     words = ["zoo", "cross", "ring", "-p", "idm", "-p", "random_actions", "-n", "1"]
     with pytest.raises(SystemExit) as ended:

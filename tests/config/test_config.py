@@ -1,4 +1,4 @@
-"""Each kind of mistake in `env.yaml` is an error with the place, the value and the remedy."""
+"""The error for each kind of mistake in `env.yaml` has the place, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def load(folder: Path, text: str | bytes) -> EnvConfig:
 
 
 def refusal(folder: Path, text: str | bytes) -> str:
-    """Return the message with which the file is refused; it begins with the file's path."""
+    """Return the error message of a refused file; check that it begins with the file's path."""
     with pytest.raises(ConfigError) as caught:
         load(folder, text)
     message = str(caught.value)
@@ -53,7 +53,7 @@ terms: {weights: {progress: 1}, team_share: 1}
     assert config.terms.weights == {"progress": 1.0}
 
 
-def test_reading_again_returns_the_present_content(tmp_path: Path) -> None:
+def test_reading_a_changed_file_again_returns_the_new_content(tmp_path: Path) -> None:
     path = tmp_path / "x.yaml"
     path.write_text("a: [1, 2]")
     first = read_yaml(path)
@@ -111,7 +111,9 @@ def test_the_error_for_a_wrong_unit_names_the_right_unit(tmp_path: Path, key: st
         ("population: {mode: ajar}", r"population\.mode = 'ajar': must be 'closed', 'open' or"),
     ],
 )
-def test_a_wrong_type_is_named(tmp_path: Path, text: str, expected: str) -> None:
+def test_the_error_for_a_wrong_type_names_the_right_type(
+    tmp_path: Path, text: str, expected: str
+) -> None:
     assert re.search(expected, refusal(tmp_path, MINIMAL + text))
 
 
@@ -216,7 +218,7 @@ def test_the_error_for_an_invalid_sensor_gives_the_reason(
     assert re.search(expected, refusal(tmp_path, f"{MINIMAL}sensors: {text}"))
 
 
-def test_a_missing_key_is_named(tmp_path: Path) -> None:
+def test_the_error_for_a_missing_key_names_the_key(tmp_path: Path) -> None:
     assert "map: missing; this key has no default" in refusal(tmp_path, "name: mine\n")
     assert "map.source = '': must name a map" in refusal(tmp_path, "name: a\nmap: {source: ''}")
 
@@ -268,7 +270,7 @@ def test_the_error_for_an_unreadable_file_gives_the_reason(tmp_path: Path) -> No
 
 
 @pytest.mark.parametrize("key", dotted_keys(EnvConfig))
-def test_every_key_can_be_reached_by_overrides(key: str) -> None:
+def test_every_key_can_be_overridden(key: str) -> None:
     with pytest.raises(ConfigError, match=rf"{re.escape(key)}.*( = |unknown key)"):
         load_config("ring", overrides={key: [{"no": "such value"}]})
 
@@ -285,7 +287,7 @@ def test_overrides_are_checked_like_the_file() -> None:
 
 
 @pytest.mark.parametrize("layout", ["grid", "strips", "bisection", "zones.json", "mine/zones.yaml"])
-def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) -> None:
+def test_the_layout_of_zones_is_a_name_or_a_file(tmp_path: Path, layout: str) -> None:
     config = load(tmp_path, f"name: a\nmap: {{source: m.net.xml}}\nzones: {{layout: {layout}}}")
     assert config.zones.layout == layout
 
@@ -309,12 +311,12 @@ def test_zones_are_laid_out_by_name_or_by_a_file(tmp_path: Path, layout: str) ->
         ("journal", 3),
     ],
 )
-def test_settings_of_zones_are_checked(key: str, value: object) -> None:
+def test_invalid_settings_of_zones_are_refused(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"zones\.{key} = "):
         load_config("ring", overrides={f"zones.{key}": value})
 
 
-def test_signal_programs_are_files_beside_the_map_and_choices(tmp_path: Path) -> None:
+def test_signal_programs_can_be_set_and_missing_files_are_refused(tmp_path: Path) -> None:
     config = load(
         tmp_path, "name: a\nmap: {source: m.net.xml, programs: [p.add.xml], program: {j: night}}"
     )

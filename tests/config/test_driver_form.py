@@ -1,4 +1,4 @@
-"""The form of a trained driver (its sensors and actions): its keys, and contradictions to it."""
+"""The form of a trained driver: its settings of sensors and actions."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def plain(value: Any) -> Any:
 
 
 @pytest.mark.parametrize("name", TRAINED)
-def test_the_form_of_a_trained_driver_comes_from_its_file(name: str) -> None:
+def test_the_form_of_a_trained_driver_equals_its_file(name: str) -> None:
     raw = json.loads((TRAINED[name] / "config.json").read_text())
     defaults = {"sensors": asdict(SensorsConfig()), "action": asdict(ActionConfig())}
     form = form_of_driver(name)
@@ -52,7 +52,7 @@ def test_the_form_of_a_trained_driver_comes_from_its_file(name: str) -> None:
         if section in switches and not any(
             form[f"sensors.{section}.{s}"] for s in switches[section]
         ):
-            continue  # the keys of a sensor that is off have no effect
+            continue  # the sensor is off, so this key has no effect
         found: Any = raw
         default: Any = defaults
         for part in key.split("."):
@@ -70,7 +70,7 @@ def test_an_environment_with_the_form_of_a_driver_differs_in_no_key(name: str) -
     assert form_of(config.sensors, config.action) == form
 
 
-def test_actions_have_the_keys_of_their_kind() -> None:
+def test_a_form_has_the_keys_of_its_kind_of_action() -> None:
     sensors = SensorsConfig()
     kinds = {
         kind: {
@@ -86,13 +86,13 @@ def test_actions_have_the_keys_of_their_kind() -> None:
     assert kinds["grid"] == {"kind", *scales, "grid_throttle", "grid_steering"}
 
 
-def test_drivers_of_shared_and_shielded_policies_are_listed() -> None:
+def test_the_form_of_a_shared_or_shielded_policy_is_that_of_its_driver() -> None:
     assert drivers_in("merge_ippo+shielded:idm+blind") == ["merge_ippo", "idm", "blind"]
     assert list(forms_in(["idm+merge_ippo", "shielded:merge_ippo"])) == ["merge_ippo"]
     assert form_of_driver("shielded:merge_ippo+idm") == form_of_driver("merge_ippo")
 
 
-def test_drivers_with_one_form_have_a_common_one() -> None:
+def test_drivers_with_equal_forms_have_a_common_form() -> None:
     forms = forms_in(["cities_ippo", "cities_residual", "idm"])
     assert common_form(forms) == form_of_driver("cities_ippo")
 
@@ -122,7 +122,9 @@ def test_the_error_for_an_unknown_driver_names_the_nearest() -> None:
 
 
 @pytest.mark.parametrize("text", [None, "", "[]", "{}", '{"sensors": 3, "action": {}}'])
-def test_a_broken_file_is_named(tmp_path: Path, text: str | None) -> None:
+def test_the_error_for_an_incomplete_driver_names_the_file(
+    tmp_path: Path, text: str | None
+) -> None:
     with pytest.raises(PolicyError, match=r"no model\.safetensors in"):
         read_form(tmp_path)
     (tmp_path / "model.safetensors").touch()
@@ -176,13 +178,13 @@ def test_overrides_that_contradict_a_form_are_refused(overrides: dict[str, Any])
         {"action.out_of_range": "clip"},
     ],
 )
-def test_overrides_of_other_keys_are_kept(overrides: dict[str, Any] | None) -> None:
+def test_overrides_that_agree_with_a_form_are_kept(overrides: dict[str, Any] | None) -> None:
     before = None if overrides is None else dict(overrides)
     assert with_form(overrides, FORM, "mine") == {**(overrides or {}), **FORM}
     assert overrides == before
 
 
-def test_a_section_that_is_overridden_still_gets_the_form() -> None:
+def test_the_form_is_added_to_an_overridden_section() -> None:
     overrides = {"sensors": {"lidar": {"range_m": 60.0}}}
     given = with_sensors_of(overrides, "merge_ippo")
     config, _ = load_config("ring", overrides=given)
@@ -191,18 +193,18 @@ def test_a_section_that_is_overridden_still_gets_the_form() -> None:
 
 
 @pytest.mark.parametrize("overrides", [3, "sensors.lidar.rays=3"])
-def test_overrides_are_a_mapping(overrides: Any) -> None:
+def test_overrides_that_are_no_mapping_are_refused(overrides: Any) -> None:
     with pytest.raises(ConfigError, match="must map dotted keys to values"):
         with_sensors_of(overrides, "merge_ippo")
 
 
-def test_a_spec_keeps_the_sensors_as_overrides() -> None:
+def test_a_world_spec_stores_the_form_of_a_driver_as_overrides() -> None:
     spec = WorldSpec.of("ring", sensors_of="cities_residual", overrides={"horizon_s": 3.0})
     assert spec.overrides == {"horizon_s": 3.0, **form_of_driver("cities_residual")}
     assert WorldSpec(**json.loads(json.dumps(asdict(spec)))).env == "ring"
 
 
-def test_a_world_gets_the_sensors_of_the_drivers_and_logs_them(
+def test_a_world_gets_and_logs_the_sensors_of_its_drivers(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     spec = WorldSpec.of("ring", agents=2)

@@ -1,4 +1,4 @@
-"""Plugins: modules of users that commands, environments and installed packages name."""
+"""Plugins: modules of users, named by a command, an environment or an installed package."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ WEIGHTS = {"progress": 0.1, "plugged": -0.5}
 
 @pytest.fixture(autouse=True)
 def _alone(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
-    """Change to a folder with the module `my_plugin`; unload it after the test."""
+    """Change to a folder with the module `my_plugin`; unload the module after the test."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", list(sys.path))
     (tmp_path / "my_plugin.py").write_text(PLUGIN, encoding="utf-8")
@@ -88,7 +88,7 @@ def test_a_command_uses_a_term_and_a_sensor_of_the_working_directory() -> None:
         ("zoo", "cross", "ring", "-p", "idm", "-p", "idm"),
     ],
 )
-def test_all_commands_that_make_worlds_import_plugins(words: tuple[str, ...]) -> None:
+def test_all_commands_that_make_worlds_have_the_option_import(words: tuple[str, ...]) -> None:
     code, said = run(*words, "--import", "absent")
     assert (code, said.count("there is no module 'absent'")) == (2, 1), said
 
@@ -102,7 +102,7 @@ def test_processes_of_a_suite_import_plugins() -> None:
     assert world["plugins"].keys() == {"my_plugin"}
 
 
-def test_an_environment_names_its_plugins() -> None:
+def test_an_environment_can_list_its_plugins() -> None:
     folder = folder_with("[my_plugin]")
     with pytest.raises(ConfigError, match=r"env\.yaml: plugin 'my_plugin': there is no module"):
         load_config(folder)
@@ -125,7 +125,7 @@ def test_overrides_add_to_the_plugins_of_an_environment() -> None:
 
 
 def install(module: str) -> None:
-    """Install a package that declares a module as a plugin."""
+    """Write the metadata of an installed package that declares a module as a plugin."""
     folder = Path("mine-1.0.dist-info")
     folder.mkdir()
     (folder / "METADATA").write_text("Metadata-Version: 2.1\nName: mine\nVersion: 1.0\n")
@@ -134,7 +134,7 @@ def install(module: str) -> None:
     extensions.pending_entry_points.cache_clear()
 
 
-def test_an_installed_package_is_loaded_when_its_name_is_needed() -> None:
+def test_an_installed_plugin_is_loaded_when_its_term_is_needed() -> None:
     install("my_plugin")
     load_config("ring")
     assert "my_plugin" not in sys.modules
@@ -142,7 +142,7 @@ def test_an_installed_package_is_loaded_when_its_name_is_needed() -> None:
     assert config.terms.registered == ("plugged",)
 
 
-def test_a_broken_package_is_named() -> None:
+def test_the_error_for_a_broken_package_names_the_package() -> None:
     install("no_such_module")
     for _ in range(2):
         with pytest.raises(ConfigError, match=r"plugged of the package mine .*no_such_module'"):
@@ -158,7 +158,9 @@ def test_a_broken_package_is_named() -> None:
         ("lacking", "import absent", r"lacking\.py, line 1: ModuleNotFoundError"),
     ],
 )
-def test_a_plugin_that_cannot_be_imported(module: str, text: str | None, message: str) -> None:
+def test_the_error_for_a_plugin_that_cannot_be_imported_has_the_reason(
+    module: str, text: str | None, message: str
+) -> None:
     if text is not None:
         Path(f"{module}.py").write_text(text, encoding="utf-8")
     with pytest.raises(CavmarlError, match=message):
@@ -181,7 +183,7 @@ def test_a_second_function_for_a_registered_name_is_refused() -> None:
         cavmarl.register_term("plugged", lambda view: 0.0)
 
 
-def test_a_notebook_can_redefine_its_function() -> None:
+def test_a_notebook_can_register_a_redefined_function() -> None:
     for weight in (1.0, 2.0):
         names: dict[str, object] = {"__name__": "notebook"}
         exec(f"def constant(view):\n    return {weight}", names)

@@ -1,4 +1,4 @@
-"""Finding environments by name, path or map file: precedence, and the folders of maps."""
+"""Search for environments by name, path or map file, and for their maps."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def make_entry(folder: Path, text: str = "name: mine\nmap: {source: m.net.xml}\n
     return folder
 
 
-def test_the_registry_is_the_folder(here: Path) -> None:
+def test_the_registry_has_the_folders_of_envs(here: Path) -> None:
     on_disk = {path.parent.name: path.parent for path in sorted(ENVS.glob("*/env.yaml"))}
     assert entries() == on_disk
     assert {"ring", "merge", "grid4x4", "town"} <= on_disk.keys()
@@ -50,7 +50,9 @@ def test_an_entry_of_the_working_directory_is_found_and_comes_first(here: Path) 
     assert find_entry("town") == ENVS / "town"
 
 
-def test_a_wheel_carries_its_own_entries(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_installed_package_finds_only_its_own_entries(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     packaged = make_entry(here / "site" / "cavmarl" / "data" / "envs" / "packaged")
     make_entry(here / "site" / "envs" / "beside")
     monkeypatch.setattr(registry, "PACKAGE", here / "site" / "cavmarl")
@@ -92,7 +94,7 @@ def test_the_error_for_a_folder_without_an_entry_names_the_missing_file(here: Pa
         load_config("empty")
 
 
-def test_keywords_and_overrides_shadow_the_entry() -> None:
+def test_keywords_and_overrides_replace_values_of_the_entry() -> None:
     plain, _ = load_config("ring")
     config, _ = load_config(
         "ring", zones=1, agents=3, background=0, overrides={"sensors.lidar.rays": 16}
@@ -102,7 +104,7 @@ def test_keywords_and_overrides_shadow_the_entry() -> None:
     assert config.sensors.lidar.range_m == plain.sensors.lidar.range_m
 
 
-def test_an_override_of_one_weight_leaves_the_others() -> None:
+def test_an_override_of_one_weight_keeps_the_other_weights() -> None:
     plain, _ = load_config("ring")
     config, _ = load_config("ring", overrides={"terms.weights.collision": -3})
     assert config.terms.weights == {**plain.terms.weights, "collision": -3.0}
@@ -110,19 +112,19 @@ def test_an_override_of_one_weight_leaves_the_others() -> None:
 
 @pytest.mark.parametrize("ctrl_dt_s", [0.05, 0.1, 0.15, 0.7])
 @pytest.mark.parametrize("max_cycles", [1, 7, 333])
-def test_max_cycles_is_exactly_that_many_steps(ctrl_dt_s: float, max_cycles: int) -> None:
+def test_an_episode_has_exactly_max_cycles_steps(ctrl_dt_s: float, max_cycles: int) -> None:
     overrides = {"clock.ctrl_dt_s": ctrl_dt_s}
     config, _ = load_config("ring", max_cycles=max_cycles, overrides=overrides)
     assert config.max_steps == max_cycles
 
 
 @pytest.mark.parametrize("max_cycles", [0, -1, True, 2.0, "3"])
-def test_max_cycles_must_be_a_count(max_cycles: object) -> None:
+def test_max_cycles_that_is_no_positive_integer_is_refused(max_cycles: object) -> None:
     with pytest.raises(ConfigError, match=r"max_cycles = .*whole number, at least 1"):
         load_config("ring", max_cycles=max_cycles)  # type: ignore[arg-type]
 
 
-def test_a_key_cannot_be_given_twice() -> None:
+def test_a_key_that_is_given_twice_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"population\.agents is given in overrides"):
         load_config("ring", agents=3, overrides={"population.agents": 4})
     with pytest.raises(ConfigError, match=r"horizon_s is given in overrides"):
@@ -134,37 +136,37 @@ def test_an_override_of_a_key_inside_a_value_is_refused() -> None:
         load_config("ring", overrides={"horizon_s.minutes": 1})
 
 
-def test_a_relative_map_starts_from_the_entry(here: Path) -> None:
+def test_a_relative_path_of_a_map_is_relative_to_the_entry(here: Path) -> None:
     shutil.copytree(ENVS / "ring", here / "copied")
     assert resolve_map(*load_config("copied")).samefile(here / "copied" / "map" / "map.net.xml")
 
 
-def test_an_absolute_map_stays_where_it_is(here: Path) -> None:
+def test_an_absolute_path_of_a_map_does_not_depend_on_the_entry(here: Path) -> None:
     source = str(ENVS / "ring" / "map" / "map.net.xml")
     config, base_dir = load_config("ring", overrides={"map.source": source})
     assert resolve_map(config, base_dir / "elsewhere") == Path(source)
 
 
 @pytest.mark.parametrize("source", ["nowhere.net.xml", "/nowhere.net.xml"])
-def test_a_map_that_is_not_there_is_named(source: str) -> None:
+def test_the_error_for_a_missing_map_names_the_map(source: str) -> None:
     config, base_dir = load_config("ring", overrides={"map.source": source})
     with pytest.raises(MapError, match=rf"map\.source = '{source}': no file"):
         resolve_map(config, base_dir)
 
 
 @pytest.mark.parametrize("source", ["sumo:tools/game/nowhere.net.xml", "sumo:../pip/__init__.py"])
-def test_a_map_that_is_not_in_the_wheel_is_named(source: str) -> None:
+def test_the_error_for_a_map_that_sumos_wheel_does_not_have_names_the_map(source: str) -> None:
     pytest.importorskip("sumo")
     config, base_dir = load_config("town", overrides={"map.source": source})
     with pytest.raises(MapError, match=r"map\.source = 'sumo:"):
         resolve_map(config, base_dir)
 
 
-def test_the_error_without_the_maps_wheel_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_sumos_wheel_names_the_extra(monkeypatch: pytest.MonkeyPatch) -> None:
     def absent(module: str) -> None:
         raise ModuleNotFoundError(name=module)
 
-    town = load_config("town")  # pydantic imports in the same way
+    town = load_config("town")  # before imports fail
     monkeypatch.setattr("cavmarl.core.errors.importlib.import_module", absent)
     with pytest.raises(MissingExtraError, match=r"pip install .*\[sumo\]'"):
         resolve_map(*town)
@@ -176,12 +178,12 @@ def test_agents_are_single_files_and_folders_with_weights(here: Path) -> None:
         (place / name).parent.mkdir(parents=True, exist_ok=True)
         (place / name).touch()
     found = {name: path for name, path in agent_entries().items() if path.is_relative_to(here)}
-    assert found == {"mine": place / "mine"}, "scripts of the working directory have no name"
+    assert found == {"mine": place / "mine"}, "a script of the working directory is listed"
     assert {"idm", "merge_ippo"} <= agent_entries().keys()
 
 
 @pytest.mark.parametrize("written", ["play.py", "play.py/", "play.py/.", "./play.py//"])
-def test_an_env_file_cannot_name_code_to_run(here: Path, written: str) -> None:
+def test_an_env_yaml_that_names_code_is_refused(here: Path, written: str) -> None:
     name = f"cool/{written}"
     entry = make_entry(
         here / "mine", f"name: mine\nmap: {{source: m.net.xml}}\nscenario: {{name: {name}}}\n"
@@ -189,10 +191,10 @@ def test_an_env_file_cannot_name_code_to_run(here: Path, written: str) -> None:
     with pytest.raises(ConfigError, match=r"mine/env\.yaml: scenario\.name.*is code.*overrides"):
         load_config(entry)
     config, _ = load_config("ring", overrides={"scenario.name": "cool/play.py"})
-    assert config.scenario.name == "cool/play.py", "the caller has named it"
+    assert config.scenario.name == "cool/play.py", "an override may name code"
 
 
-def test_the_finder_does_not_load_pydantic() -> None:
+def test_searching_environments_does_not_import_pydantic() -> None:
     code = "import sys; from cavmarl.config.registry import *"
     code += "; entries(); print('pydantic' in sys.modules)"
     out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

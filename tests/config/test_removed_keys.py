@@ -1,4 +1,4 @@
-"""Removed keys and options are refused with one line that names their replacement."""
+"""The error for a removed key or option has one line and names the replacement."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ def test_a_removed_key_is_refused_with_its_replacement(key: str, replacement: st
     assert line.endswith(f"{key} was removed: {replacement}")
 
 
-def test_a_key_inside_a_removed_one_is_refused_by_the_name_of_the_outer_one() -> None:
+def test_the_error_for_a_key_in_a_removed_section_names_the_section() -> None:
     with pytest.raises(ConfigError, match=r"sensors\.roadgraph was removed: use sensors\.lanes"):
         load_config("ring", overrides={"sensors.roadgraph.points": 20})
 
 
-def test_a_removed_key_in_a_file_is_refused_with_the_file(tmp_path: Path) -> None:
+def test_the_error_for_a_removed_key_in_a_file_names_the_file(tmp_path: Path) -> None:
     text = (load_config("ring")[1] / "env.yaml").read_text()
     (tmp_path / "env.yaml").write_text(f"{text}\nzones:\n  check: true\n")
     with pytest.raises(ConfigError, match=r"env\.yaml: zones\.check was removed: use"):
         load_config(tmp_path)
 
 
-def test_no_removed_key_is_a_key() -> None:
+def test_no_removed_key_exists() -> None:
     assert not any(
         known == key or known.startswith(f"{key}.") for key in REMOVED_KEYS for known in KNOWN
     )
 
 
-def test_each_replacement_names_keys_that_exist() -> None:
+def test_each_replacement_names_existing_keys() -> None:
     sections = {known.rpartition(".")[0] for known in KNOWN}
     for replacement in REMOVED_KEYS.values():
         named = [word.rstrip(",.") for word in replacement.split() if word.count(".") > 0]

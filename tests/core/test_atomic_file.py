@@ -1,4 +1,4 @@
-"""Drafts are removed at the end of the block; the next draft removes those of killed processes."""
+"""Folders of drafts are removed at the end of their block, or after a kill by the next draft."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ def test_a_locked_draft_of_the_same_process_is_not_removed(tmp_path: Path) -> No
     assert not _drafts(tmp_path)
 
 
-def test_drafts_begun_at_once_do_not_remove_each_other(tmp_path: Path) -> None:
+def test_drafts_of_concurrent_threads_do_not_remove_each_other(tmp_path: Path) -> None:
     def make(number: int) -> None:
         try:
             for turn in range(40):
@@ -85,31 +85,31 @@ def test_drafts_begun_at_once_do_not_remove_each_other(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 6 * 40
 
 
-def test_a_draft_that_is_removed_before_its_lock_is_made_again(
+def test_a_draft_that_is_removed_before_it_is_locked_is_made_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     make, made = atomic_file.tempfile.mkdtemp, []
 
-    def robbed(*args: object, **options: object) -> str:
+    def make_and_remove_the_first(*args: object, **options: object) -> str:
         name: str = make(*args, **options)  # type: ignore[call-overload]
         made.append(name)
         if len(made) == 1:
             os.rmdir(name)
         return name
 
-    monkeypatch.setattr(atomic_file.tempfile, "mkdtemp", robbed)
+    monkeypatch.setattr(atomic_file.tempfile, "mkdtemp", make_and_remove_the_first)
     with draft_folder(tmp_path) as folder:
         assert [str(folder)] == made[1:]
         assert folder.is_dir()
 
 
-def test_without_locks_files_are_written_and_no_draft_is_removed(
+def test_if_locks_fail_files_are_written_and_no_draft_is_removed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def none(*_: object) -> None:
+    def refuse_the_lock(*_: object) -> None:
         raise OSError(errno.ENOLCK, os.strerror(errno.ENOLCK))
 
-    monkeypatch.setattr(fcntl, "flock", none)
+    monkeypatch.setattr(fcntl, "flock", refuse_the_lock)
     other = tmp_path / ".build-other"
     other.mkdir()
     write_whole(tmp_path / "file", b"content")
@@ -117,22 +117,22 @@ def test_without_locks_files_are_written_and_no_draft_is_removed(
     assert _drafts(tmp_path) == {other}
 
 
-def test_a_write_that_fails_leaves_the_older_file_and_no_draft(
+def test_a_failed_write_keeps_the_older_file_and_leaves_no_draft(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def full(_: int) -> None:
+    def report_a_full_disk(_: int) -> None:
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     path = tmp_path / "file"
     write_whole(path, b"old")
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", report_a_full_disk)
     with pytest.raises(OSError, match="No space left"):
         write_whole(path, b"new")
     assert path.read_bytes() == b"old"
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_all_drafts_of_the_package_use_this_module() -> None:
+def test_only_this_module_makes_temporary_files_beside_their_targets() -> None:
     package = Path(atomic_file.__file__).parents[1]
     beside = re.compile(r"(TemporaryDirectory|NamedTemporaryFile|mkdtemp|mkstemp)\([^)]*dir=")
     found = [path for path in package.rglob("*.py") if beside.search(path.read_text("utf-8"))]

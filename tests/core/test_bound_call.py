@@ -1,4 +1,4 @@
-"""Bound calls, and sequences of them, have the results of the same calls from Python."""
+"""Bound calls and their sequences compute the same as ordinary calls from Python."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def test_a_bound_call_sees_changes_of_its_arrays_and_takes_arguments_by_name() -
 
 
 class _Numbers:
-    """Numbers with a call that adds to them."""
+    """An object whose bound call adds `amount` to `numbers`."""
 
     def __init__(self) -> None:
         self.numbers, self.amount = np.arange(3), 5
@@ -51,22 +51,22 @@ class _Numbers:
     add = bound(add)
 
 
-def test_a_call_takes_the_values_of_its_object_by_the_names_of_parameters() -> None:
+def test_a_bound_call_of_an_object_takes_its_values_by_parameter_name() -> None:
     one = _Numbers()
     one.amount = 7
     one.add()
     assert one.numbers.tolist() == [7, 8, 9]
     one.add()
     assert one.numbers.tolist() == [14, 15, 16]
-    assert one.add is one.add, "it is bound once"
+    assert one.add is one.add, "the call was bound again"
 
 
-def test_a_parameter_without_a_value_is_named() -> None:
+def test_the_error_for_a_missing_value_names_the_parameter() -> None:
     with pytest.raises(KeyError, match="amount"):
         bind_by_name(add, {"numbers": np.arange(3)})
 
 
-def test_an_argument_of_a_kind_that_kernels_do_not_take_is_refused() -> None:
+def test_an_argument_that_kernels_cannot_take_is_refused() -> None:
     if not bind(is_even, np.zeros(1, dtype=np.int64)).is_compiled:
         pytest.skip("without the compiler any argument is taken")
     with pytest.raises(TypeError, match="pass NumPy arrays"):
@@ -74,7 +74,7 @@ def test_an_argument_of_a_kind_that_kernels_do_not_take_is_refused() -> None:
 
 
 @pytest.mark.parametrize("start", range(6))
-def test_a_sequence_makes_the_calls_whose_conditions_hold(start: int) -> None:
+def test_a_sequence_makes_only_the_calls_whose_conditions_hold(start: int) -> None:
     numbers, expected = np.array([start]), np.array([start])
     test, parity = bind(compare, numbers, 3), bind(is_even, numbers)
     sequence = CallSequence()

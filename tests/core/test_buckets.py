@@ -10,7 +10,7 @@ from tests.naive import buckets as naive
 
 @kernel
 def add_one(lists: Lists, k: int) -> None:
-    """Call `add`, which exists only inside compiled callers."""
+    """Call `add`, which only kernels can call."""
     add(lists, k)
 
 
@@ -33,7 +33,7 @@ def test_lists_equal_twin_after_any_earlier_content(case: tuple[int, list[list[i
         assert lay_out(lists) == len(keys)
         for k, place in enumerate(naive.laid_out(number, keys)):
             start, end = lists.bounds[k].tolist()
-            assert start == end, "the list is empty before it is filled"
+            assert start == end, "a list has items before it is filled"
             assert start == place.start or not place
         # Write the items at the returned places, as callers do.
         for k in keys:

@@ -7,20 +7,22 @@ from cavmarl.core.math.counters import begins_second, count_tick, occasions, tot
 
 
 @pytest.mark.parametrize(("ticks", "expected"), [([3, 7], False), ([3, 20], True), ([0, 1], True)])
-def test_a_second_begins_in_some_world(ticks: list[int], expected: bool) -> None:
+def test_begins_second_is_true_if_a_second_begins_in_any_world(
+    ticks: list[int], expected: bool
+) -> None:
     assert begins_second(np.array(ticks), 10) == expected
 
 
 @pytest.mark.parametrize("tick", [4, 20])
 @pytest.mark.parametrize("through", [[[0, 0], [0, 0]], [[0, 0], [3, 0]]])
-def test_begun_seconds_and_arrived_vehicles_are_noticed(
+def test_occasions_report_begun_seconds_and_arrived_vehicles(
     tick: int, through: list[list[int]]
 ) -> None:
     found = occasions(np.array([tick, 7]), 10, np.array(through))
     assert found == (tick == 20, bool(np.any(through)))
 
 
-def test_ticks_are_counted() -> None:
+def test_count_tick_adds_one_in_each_world() -> None:
     ticks = np.array([0, 41])
     count_tick(ticks)
     assert ticks.tolist() == [1, 42]

@@ -1,4 +1,4 @@
-"""Bundles of arrays that a kernel creates: passed to other kernels, read and chosen in loops."""
+"""Bundles of arrays that a kernel creates in a loop, reads, and passes to other kernels."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def _first_end(lists: Lists) -> int:
 def _ends(
     lists: Lists, bounds: NDArray[np.int32], own: NDArray[np.bool_], ends: NDArray[np.int64]
 ) -> None:
-    """Write the first end of each choice, as a called kernel and as this kernel read it."""
+    """Write the first end of each chosen bundle, read by a called kernel and by this kernel."""
     for k in range(own.size):
         here = _with_bounds(lists, bounds[k]) if own[k] else lists
         ends[k, 0] = _first_end(here)
@@ -34,7 +34,7 @@ def _ends(
         ends[k, 4] = here.used.size
 
 
-def test_each_turn_of_a_loop_reads_its_own_bundle() -> None:
+def test_each_iteration_of_a_loop_reads_its_own_bundle() -> None:
     lists = make_lists(64)
     lists.bounds[0, 1] = 7
     bounds = np.zeros((4, 64, 2), dtype=np.int32)

@@ -40,7 +40,7 @@ FUNCTIONS: dict[str, Function] = {
     "sin": sine, "cos": cosine, "tan": tangent, "atan": atan, "asin": asin, "acos": acos,
     "log": log, "log1p": log1p, "log10": log10, "exp": exp, "erf": erf,
 }  # fmt: skip
-# The errors that the docstrings state, in ULP.
+# The largest errors according to the docstrings of the functions, in ULP.
 MOST_ULP = {
     "sin": 0.8, "cos": 0.8, "tan": 2.5, "atan": 1.0, "asin": 2.5, "acos": 2.5,
     "log": 1.0, "log1p": 1.0, "log10": 2.5, "exp": 1.0, "erf": 3.5, "atan2": 1.4,
@@ -56,7 +56,7 @@ floats = st.floats() | st.floats(-10.0, 10.0) | st.sampled_from(EDGES)
 
 @kernel
 def fill(x: Numbers, y: Numbers, out: Numbers) -> None:
-    """Write all functions of each x (n,), and of each pair x, y, to the rows of `out` (n, 16)."""
+    """Write the values of all functions to `out` (n, 16): one row per x and y (n,)."""
     for i in range(x.shape[0]):
         out[i, 0] = sine(x[i])
         out[i, 1] = cosine(x[i])
@@ -92,7 +92,7 @@ def plain(x: float, y: float) -> list[float]:
 
 
 def bits(numbers: Any) -> list[int]:
-    """Return the bits of numbers; every NaN has the same bits."""
+    """Return the bits of numbers, with equal bits for all NaNs."""
     values = np.array(numbers, np.float64)
     values[np.isnan(values)] = np.nan
     return values.view(np.int64).tolist()  # type: ignore[no-any-return]
@@ -100,7 +100,9 @@ def bits(numbers: Any) -> list[int]:
 
 @given(st.lists(st.tuples(floats, floats), min_size=1))
 @example([(x, y) for x in EDGES for y in EDGES])
-def test_python_and_kernels_get_the_same_bits(pairs: list[tuple[float, float]]) -> None:
+def test_functions_return_the_same_bits_in_python_and_in_kernels(
+    pairs: list[tuple[float, float]],
+) -> None:
     x, y = np.array(pairs).T.copy()
     found = compiled(x, y)
     for row, pair in zip(found, pairs, strict=True):
@@ -109,7 +111,7 @@ def test_python_and_kernels_get_the_same_bits(pairs: list[tuple[float, float]]) 
 
 @given(st.lists(floats))
 @example([*EDGES])
-def test_arrays_get_the_same_bits_as_numbers(values: list[float]) -> None:
+def test_functions_of_arrays_return_the_same_bits_as_of_numbers(values: list[float]) -> None:
     x = np.array(values, np.float64)
     for of_all, of_one in (
         (arrays.sin_all, sine),
@@ -123,7 +125,7 @@ def test_arrays_get_the_same_bits_as_numbers(values: list[float]) -> None:
         assert bits(arrays.hypot_all(x, x[::-1])) == bits(list(map(hypot, values, values[::-1])))
 
 
-def test_arrays_keep_their_shape_and_their_content() -> None:
+def test_functions_of_arrays_keep_the_shape_and_do_not_change_the_argument() -> None:
     angles = np.arange(6.0).reshape(2, 3).T
     sines = arrays.sin_all(angles)
     assert sines.shape == (3, 2)
@@ -142,7 +144,7 @@ def test_arrays_keep_their_shape_and_their_content() -> None:
 @example(value=math.inf)
 @example(value=-math.inf)
 @example(value=math.nan)
-def test_results_equal_the_c_librarys_except_for_rounding(name: str, value: float) -> None:
+def test_results_equal_those_of_numpy_except_for_rounding(name: str, value: float) -> None:
     with np.errstate(all="ignore"):
         expected = math.erf(value) if name == "erf" else float(getattr(np, _NUMPY[name])(value))
     found = FUNCTIONS[name](value)
@@ -162,7 +164,7 @@ _NUMPY = {
 
 
 @pytest.mark.parametrize("y", EDGES)
-def test_atan2_has_the_signs_of_cs(y: float) -> None:
+def test_atan2_has_the_same_sign_as_in_the_math_module(y: float) -> None:
     for x in EDGES:
         found, expected = atan2(y, x), math.atan2(y, x)
         assert found == pytest.approx(expected, rel=4e-16, abs=TINY, nan_ok=True)
@@ -170,7 +172,7 @@ def test_atan2_has_the_signs_of_cs(y: float) -> None:
             assert math.copysign(1.0, found) == math.copysign(1.0, expected)
 
 
-def test_no_argument_warns() -> None:
+def test_no_argument_causes_a_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         for x in EDGES:
@@ -180,14 +182,14 @@ def test_no_argument_warns() -> None:
 
 
 def spread(low: float, high: float, count: int, seed: int) -> Numbers:
-    """Draw numbers of both signs whose sizes are spread evenly over the powers of two."""
+    """Draw numbers of both signs, whose logarithms are uniform."""
     draws = np.random.default_rng(seed)
     sizes = np.exp2(draws.uniform(np.log2(low), np.log2(high), count))
     return sizes * draws.choice([-1.0, 1.0], count)
 
 
 def arguments(name: str, count: int = 1500) -> Numbers:
-    """Return numbers of the range in which the bound of a function holds."""
+    """Return arguments in the range in which the error bound of the function holds."""
     draws = np.random.default_rng(1)
     if name in ("sin", "cos", "tan"):
         zeros = 0.5 * math.pi * draws.integers(-60_000, 60_000, count)
@@ -209,7 +211,7 @@ def arguments(name: str, count: int = 1500) -> Numbers:
 
 
 @pytest.mark.parametrize("name", MOST_ULP)
-def test_the_error_is_below_its_bound(name: str) -> None:
+def test_the_error_of_each_function_is_below_its_bound(name: str) -> None:
     mpmath = pytest.importorskip("mpmath", reason="exact values need mpmath, which torch brings")
     with mpmath.workprec(160):
         exact = {
@@ -231,4 +233,4 @@ def test_the_error_is_below_its_bound(name: str) -> None:
             for value, found in cases
         ]
     assert max(errors) < MOST_ULP[name]
-    assert max(errors) > 0.4  # the measurement sees the rounding of the result
+    assert max(errors) > 0.4  # a smaller value would show that rounding is not measured

@@ -25,7 +25,7 @@ def test_wrap_angle_equals_twin(angle: float) -> None:
     assert abs(naive.wrap_angle(wrapped - naive.wrap_angle(angle))) < 1e-12
 
 
-def test_wrap_angle_at_the_cut() -> None:
+def test_wrap_angle_returns_pi_for_minus_pi() -> None:
     assert geometry.wrap_angle(-math.pi) == math.pi
     assert geometry.wrap_angle(math.pi) == math.pi
     assert geometry.wrap_angle(math.nextafter(math.pi, 4.0)) == pytest.approx(-math.pi)
@@ -35,13 +35,13 @@ def test_wrap_angle_at_the_cut() -> None:
 def test_lane_pose_equals_twin(corners: NDArray[np.float64], share: float) -> None:
     points = points_of(corners)
     s = share * float(points["s"][-1])
-    # At a corner, rounding decides to which of the two segments a place belongs.
+    # At a corner, rounding decides which of the two segments is found.
     assume(np.min(np.abs(points["s"][1:-1] - s), initial=np.inf) > 1e-9)
     pose = geometry.lane_pose(points, 0, len(points), s)
     assert pose == pytest.approx(naive.lane_pose(corners, s), abs=1e-9)
 
 
-def test_at_a_corner_the_segment_that_begins_there_counts() -> None:
+def test_at_a_corner_the_next_segment_is_found() -> None:
     points = points_of(U_TURN)
     found = [geometry.segment_at(points, 0, 4, s) for s in (-1.0, 0.0, 99.0, 100.0, 110.0, 300.0)]
     assert found == [0, 0, 0, 1, 2, 2]
@@ -73,7 +73,7 @@ def test_project_equals_twin(corners: NDArray[np.float64], x: float, y: float) -
 
 
 @given(polylines(), coordinates(80.0), coordinates(80.0))
-def test_project_near_with_the_whole_window_is_project(
+def test_project_near_equals_project_if_the_nearest_place_is_in_the_window(
     corners: NDArray[np.float64], x: float, y: float
 ) -> None:
     points = points_of(corners)
@@ -83,12 +83,12 @@ def test_project_near_with_the_whole_window_is_project(
     assert geometry.project_near(points, 0, num, x, y, whole[0], 5.0) == whole
 
 
-def test_project_ties_go_to_the_smaller_s() -> None:
+def test_project_returns_the_smaller_s_of_two_equally_near_places() -> None:
     points = points_of(U_TURN)
     assert geometry.project(points, 0, 4, 40.0, 5.0) == (40.0, 5.0, 1.0, 0.0)
 
 
-def test_project_near_a_given_s_stays_on_the_same_side_of_a_u_turn() -> None:
+def test_project_near_finds_only_the_part_of_a_u_turn_near_the_given_s() -> None:
     points = points_of(U_TURN)
     s, d, cos, _ = geometry.project_near(points, 0, 4, 40.0, 4.0, 160.0, 20.0)
     assert (s, d, cos) == (170.0, 6.0, -1.0)
@@ -96,14 +96,14 @@ def test_project_near_a_given_s_stays_on_the_same_side_of_a_u_turn() -> None:
 
 @pytest.mark.parametrize("turn", [1.0, -1.0])
 @pytest.mark.parametrize("y", [1.5, -1.5])
-def test_project_beyond_a_hairpin_is_on_its_outer_side(turn: float, y: float) -> None:
-    # The line goes east and returns a little to the left (turn 1) or to the right of itself.
+def test_project_of_a_point_beyond_a_hairpin_has_d_on_the_outer_side(turn: float, y: float) -> None:
+    # The line goes east and returns, with its end 1 m to the left (turn 1) or right of its start.
     points = points_of(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, turn, 0.0]]))
     s, d, _, _ = geometry.project(points, 0, 3, 52.0, y)
     assert (s, d) == (50.0, -turn * 2.5)
 
 
-def test_project_before_a_hairpin_is_on_its_outer_side() -> None:
+def test_project_near_after_a_hairpin_has_d_on_the_outer_side() -> None:
     points = points_of(np.array([[0.0, 0.0, 0.0], [50.0, 0.0, 0.0], [0.0, 1.0, 0.0]]))
     s, d, _, _ = geometry.project_near(points, 0, 3, 52.0, -1.5, 60.0, 1.0)
     assert (s, d) == pytest.approx((50.0, -2.5))

@@ -16,7 +16,7 @@ RECORD = np.dtype([("x", np.float64), ("on", np.bool_)], align=True)
 
 @pytest.mark.parametrize("size", [1, LEAST // 8 - 1, LEAST // 8, PAGE // 8, 3 * PAGE // 8 + 5])
 def test_huge_arrays_are_zero_and_share_no_byte(size: int) -> None:
-    """A value that is written to one array does not appear in another array of any size."""
+    """A value that is written to one array does not appear in another array."""
     first, second = huge_zeros(size), huge_zeros((size, 1), dtype=np.int64)
     assert first.shape == (size,)
     assert second.shape == (size, 1)
@@ -47,7 +47,7 @@ def test_a_copy_has_every_byte_and_the_same_write_protection() -> None:
 
 @pytest.mark.skipif(not hasattr(mmap, "MADV_HUGEPAGE"), reason="there are no huge pages")
 def test_arrays_in_huge_pages_are_not_copied() -> None:
-    """A copy of a map with one changed table shares all other tables."""
+    """This lets copies of a map share the tables that are equal."""
     array = huge_zeros(2 * LEAST // 8)
     assert huge_copy(array) is array
     part = array[1:]
@@ -55,7 +55,7 @@ def test_arrays_in_huge_pages_are_not_copied() -> None:
 
 
 def test_memory_is_freed_with_its_arrays() -> None:
-    """Only the arrays keep their pages alive."""
+    """No reference to the pages remains after the last array is deleted."""
     array = huge_zeros(4 * PAGE // 8)
     memory = array
     while isinstance(memory, np.ndarray):
@@ -63,13 +63,13 @@ def test_memory_is_freed_with_its_arrays() -> None:
         memory = memory.base
     gone = weakref.ref(_mapping(memory))
     del memory, array
-    huge_zeros(4 * PAGE // 8)  # the process keeps only the rest of the last pages
+    huge_zeros(4 * PAGE // 8)  # the module refers to the unused rest of the newest pages
     gc.collect()
     assert gone() is None
 
 
 def test_arrays_work_without_huge_pages(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The arrays are then ordinary arrays of NumPy."""
+    """Without huge pages, NumPy allocates the arrays."""
     monkeypatch.delattr(mmap, "MADV_HUGEPAGE")
     assert huge_zeros(PAGE).base is None
 
@@ -82,7 +82,7 @@ def _mapping(memory: object) -> mmap.mmap:
 
 
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
-def test_the_heap_is_in_huge_pages_unless_the_user_sets_otherwise(
+def test_the_heap_is_in_huge_pages_unless_the_environment_sets_otherwise(
     monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", own)

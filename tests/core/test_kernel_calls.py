@@ -1,4 +1,4 @@
-"""Calls of compiled kernels: arguments of any type, results, and released arguments."""
+"""Calls of compiled kernels: arguments of each type, results, and released references."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_kernels_return_numbers(number: Any) -> None:
         assert type(found) is type(number.item() if isinstance(number, np.generic) else number)
 
 
-def test_a_record_is_read_in_place() -> None:
+def test_records_of_an_array_are_arguments() -> None:
     records = np.zeros(3, dtype=[("x", np.float64), ("at", np.int64)])
     records["x"], records["at"] = [0.5, 1.5, 2.5], [10, 20, 30]
     assert [read_record(record) for record in records] == [10.5, 21.5, 32.5]
@@ -110,7 +110,7 @@ def test_arguments_can_be_named_or_have_defaults() -> None:
 
 
 @compiled_only
-def test_unsupported_arguments_are_type_errors() -> None:
+def test_unsupported_arguments_raise_type_errors() -> None:
     with pytest.raises(TypeError, match=r"is a builtins\.str; pass NumPy arrays"):
         same_number("word")
     with pytest.raises(TypeError, match=r"is a builtins\.list"):
@@ -118,7 +118,7 @@ def test_unsupported_arguments_are_type_errors() -> None:
 
 
 @pytest.mark.parametrize("call", [total_of, unchecked(total_of)])
-def test_a_call_refers_to_no_array_afterwards(call: Any) -> None:
+def test_no_reference_to_an_array_remains_after_a_call(call: Any) -> None:
     values = np.ones(3)
     assert call(values) == 3.0
     gone = weakref.ref(values)
@@ -198,7 +198,7 @@ ARGUMENTS = [
 ]
 
 
-def test_arguments_have_the_same_type_exactly_if_numba_agrees() -> None:
+def test_arguments_have_equal_types_exactly_if_their_types_in_numba_are_equal() -> None:
     for one in ARGUMENTS:
         for other in ARGUMENTS:
             is_same = _typeof(one) == _typeof(other)

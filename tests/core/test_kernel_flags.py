@@ -14,17 +14,17 @@ from numba.core.errors import NumbaError
 from cavmarl.core.compiled import IS_PLAIN, kernel
 
 
-def _has_no_room() -> float:
+def _allocates() -> float:
     return float(np.ones(3)[0])
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
 def test_a_kernel_cannot_allocate() -> None:
     with pytest.raises(NumbaError, match="array passed into the function"):
-        kernel(_has_no_room)()
+        kernel(_allocates)()
 
 
-LOOKS = """
+PROGRAM = """
 import numpy as np
 from cavmarl.core.compiled import kernel
 
@@ -43,15 +43,15 @@ print(kernel(last)(np.arange(3.0)))
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-def test_only_literal_negative_indices_count_from_the_end(
+def test_only_constant_negative_indices_count_from_the_end(
     tmp_path: Path,
 ) -> None:
-    script = tmp_path / "looks.py"
-    script.write_text(LOOKS)
-    # With bounds checks: otherwise, a negative index reads memory before the array.
+    script = tmp_path / "program.py"
+    script.write_text(PROGRAM)
+    # Without bounds checks, a negative index would read memory before the array.
     checked = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "CAVMARL_CACHE_DIR": str(tmp_path)}
     checked["PYTHONPATH"] = str(Path(__file__).parents[2])
-    told = subprocess.run(
+    done = subprocess.run(
         [sys.executable, str(script)], env=checked, check=True, capture_output=True, text=True
     )
-    assert told.stdout.split() == ["IndexError", "2.0"]
+    assert done.stdout.split() == ["IndexError", "2.0"]

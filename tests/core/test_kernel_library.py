@@ -1,4 +1,4 @@
-"""The library of compiled kernels in a wheel is used if it fits, else refused with a reason."""
+"""The library of compiled kernels in a wheel: used if it suits the machine, else refused."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from cavmarl.prebuild.kernel_list import called_kernels
 from cavmarl.prebuild.linking import link
 
 compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
-pytestmark = pytest.mark.integration  # building starts the linker as a process
+pytestmark = pytest.mark.integration  # the linker is a process
 
 NAME = "cavmarl.core.math.bearings.rough_atan2"
 TYPES = "float64;float64"
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built_library(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Build a library of one kernel."""
     folder = tmp_path_factory.mktemp("built")
     link([compile_call(KernelCall(NAME, json.dumps(signature_of((1.0, 2.0)))))], folder)
@@ -49,13 +49,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def copied(built: Path, tmp_path: Path) -> Path:
-    return Path(shutil.copytree(built, tmp_path / "prebuilt"))
+def copied_library(built_library: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(built_library, tmp_path / "prebuilt"))
 
 
 @pytest.fixture
-def anew(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Clear the cached sources of kernels in this process, before and after the test."""
+def uncached(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
+    """Clear what this process has cached about kernels, before and after the test."""
     for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch
@@ -69,8 +69,8 @@ def _digest() -> str:
 
 
 @compiled_only
-def test_a_kernel_of_the_library_gives_the_results_of_numba(built: Path) -> None:
-    found = Library(built).find(NAME, TYPES, _digest())
+def test_a_kernel_of_the_library_returns_the_same_as_a_compiled_kernel(built_library: Path) -> None:
+    found = Library(built_library).find(NAME, TYPES, _digest())
     assert found is not None
     words = Words(3)
     words.floats[0], words.floats[1] = 1.0, -2.5
@@ -80,15 +80,15 @@ def test_a_kernel_of_the_library_gives_the_results_of_numba(built: Path) -> None
 
 
 @compiled_only
-def test_a_kernel_with_other_types_or_sources_is_not_found(built: Path) -> None:
-    opened = Library(built)
+def test_a_kernel_with_other_types_or_sources_is_not_found(built_library: Path) -> None:
+    opened = Library(built_library)
     assert opened.find(NAME, "float64;int64", _digest()) is None
     assert opened.find(NAME, TYPES, "0" * 16) is None
     assert opened.find("cavmarl.core.math.rng.below", TYPES, _digest()) is None
 
 
 @compiled_only
-def test_kernels_that_other_code_serves_are_not_compiled() -> None:
+def test_calls_that_more_general_code_serves_are_not_compiled() -> None:
     rows = np.zeros((4, 2))
     wide, narrow, other = (
         KernelCall(
@@ -113,25 +113,25 @@ def _flip(path: Path, place: int) -> None:
 @compiled_only
 @pytest.mark.parametrize("name", [LIBRARY_FILE, INDEX_FILE])
 @pytest.mark.parametrize("harm", ["flipped", "truncated", "empty"])
-def test_a_damaged_file_is_refused(copied: Path, name: str, harm: str) -> None:
-    path = copied / name
+def test_a_damaged_file_is_refused(copied_library: Path, name: str, harm: str) -> None:
+    path = copied_library / name
     size = path.stat().st_size
     if harm == "flipped":
         _flip(path, size // 2)
     else:
         path.write_bytes(path.read_bytes()[: size // 2 if harm == "truncated" else 0])
     with pytest.raises(UnusableLibraryError, match="is damaged: install cavmarl again"):
-        Library(copied)
+        Library(copied_library)
 
 
 @compiled_only
-def test_a_missing_library_is_refused(copied: Path) -> None:
-    (copied / LIBRARY_FILE).unlink()
+def test_a_missing_library_is_refused(copied_library: Path) -> None:
+    (copied_library / LIBRARY_FILE).unlink()
     with pytest.raises(UnusableLibraryError, match="cannot be read"):
-        Library(copied)
-    (copied / INDEX_FILE).unlink()
+        Library(copied_library)
+    (copied_library / INDEX_FILE).unlink()
     with pytest.raises(UnusableLibraryError, match="this installation contains no library"):
-        Library(copied)
+        Library(copied_library)
 
 
 def _change_index(folder: Path, **changes: Any) -> None:
@@ -143,43 +143,49 @@ def _change_index(folder: Path, **changes: Any) -> None:
 
 
 @compiled_only
-def test_a_library_for_another_interpreter_or_of_another_format_is_refused(copied: Path) -> None:
-    _change_index(copied, python="cpython-399-x86_64-linux-gnu")
+def test_a_library_for_another_interpreter_or_of_another_format_is_refused(
+    copied_library: Path,
+) -> None:
+    _change_index(copied_library, python="cpython-399-x86_64-linux-gnu")
     with pytest.raises(UnusableLibraryError, match="is for cpython-399"):
-        Library(copied)
-    _change_index(copied, format=0)
+        Library(copied_library)
+    _change_index(copied_library, format=0)
     with pytest.raises(UnusableLibraryError, match="has format 0, must be 1"):
-        Library(copied)
+        Library(copied_library)
 
 
 @compiled_only
 def test_the_error_for_a_processor_without_avx2_names_the_feature(
-    built: Path, monkeypatch: pytest.MonkeyPatch
+    built_library: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    opened = ctypes.CDLL(str(built / LIBRARY_FILE))
+    opened = ctypes.CDLL(str(built_library / LIBRARY_FILE))
     flags = Path("/proc/cpuinfo").read_text()
     assert (library.missing_features(opened, "x86-64-v3") == []) == (" avx2 " in flags)
     monkeypatch.setattr(library, "LEVEL_WORDS", ({}, {"AVX2": 5, "no such feature": 60}, {}, {}))
     with pytest.raises(UnusableLibraryError, match="this processor lacks no such feature"):
-        Library(built)
+        Library(built_library)
 
 
 @compiled_only
-def test_without_a_library_kernels_are_compiled_or_refused(
-    copied: Path, anew: pytest.MonkeyPatch, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+def test_if_the_library_is_damaged_kernels_are_compiled_or_refused(
+    copied_library: Path,
+    uncached: pytest.MonkeyPatch,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
 ) -> None:
-    anew.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
-    anew.setattr(library, "FOLDER", copied)
-    anew.setattr(Library.__init__, "__defaults__", (copied,))
+    uncached.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
+    uncached.setattr(library, "FOLDER", copied_library)
+    uncached.setattr(Library.__init__, "__defaults__", (copied_library,))
     function: Any = rough_atan2
     expected = rough_atan2(1.0, 2.0)
     again: Any = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
-    assert not (tmp_path / "cache").exists(), "it came from the library"
-    damaged = Path(shutil.copytree(copied, tmp_path / "damaged"))  # the other library is in use
+    assert not (tmp_path / "cache").exists(), "a kernel of the library was compiled"
+    # A second copy, because the first file is loaded and must not change.
+    damaged = Path(shutil.copytree(copied_library, tmp_path / "damaged"))
     _flip(damaged / LIBRARY_FILE, 1000)
-    anew.setattr(Library.__init__, "__defaults__", (damaged,))
-    anew.setattr(library, "FOLDER", damaged)
+    uncached.setattr(Library.__init__, "__defaults__", (damaged,))
+    uncached.setattr(library, "FOLDER", damaged)
     machine_code.kernel_source.cache_clear()
     again = kernel(function.py_func)
     assert again(1.0, 2.0) == expected
@@ -187,18 +193,18 @@ def test_without_a_library_kernels_are_compiled_or_refused(
     said = capsys.readouterr().err
     assert said.count("a kernel is compiled on this machine, as ") == 1
     assert "is damaged: install cavmarl again" in said
-    anew.setenv("CAVMARL_KERNELS", "prebuilt")
+    uncached.setenv("CAVMARL_KERNELS", "prebuilt")
     machine_code.kernel_source.cache_clear()
     with pytest.raises(KernelError, match=r"no compiled kernels to use, as .* is damaged"):
         kernel(function.py_func)(1.0, 2.0)
 
 
 @compiled_only
-def test_in_mode_prebuilt_a_missing_kernel_is_refused(
-    copied: Path, anew: pytest.MonkeyPatch
+def test_a_missing_kernel_is_refused_if_only_prebuilt_kernels_are_allowed(
+    copied_library: Path, uncached: pytest.MonkeyPatch
 ) -> None:
-    anew.setattr(Library.__init__, "__defaults__", (copied,))
-    anew.setenv("CAVMARL_KERNELS", "prebuilt")
+    uncached.setattr(Library.__init__, "__defaults__", (copied_library,))
+    uncached.setenv("CAVMARL_KERNELS", "prebuilt")
     function: Any = rough_atan2
     with pytest.raises(KernelError, match=r"types int64;float64; set CAVMARL_KERNELS=auto"):
         kernel(function.py_func)(1, 2.0)
@@ -206,44 +212,46 @@ def test_in_mode_prebuilt_a_missing_kernel_is_refused(
 
 @compiled_only
 def test_wrong_settings_and_a_missing_compiler_are_errors(
-    anew: pytest.MonkeyPatch, tmp_path: Path
+    uncached: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     function: Any = rough_atan2
-    anew.setenv("CAVMARL_KERNELS", "fastest")
+    uncached.setenv("CAVMARL_KERNELS", "fastest")
     with pytest.raises(KernelError, match="fastest: must be one of auto, prebuilt, native"):
         kernel(function.py_func)(1.0, 2.0)
-    anew.setenv("CAVMARL_KERNELS", "native")
+    uncached.setenv("CAVMARL_KERNELS", "native")
     machine_code.kernel_source.cache_clear()
-    anew.setattr(machine_code, "numba_version", lambda: "")
+    uncached.setattr(machine_code, "numba_version", lambda: "")
     with pytest.raises(KernelError, match=r"rough_atan2 has to be compiled, as .*\[compile\]"):
         kernel(function.py_func)(1.0, 2.0)
 
 
 @compiled_only
-def test_registered_driver_models_reach_the_library(built: Path) -> None:
+def test_a_registered_driver_model_is_entered_in_the_table_of_the_library(
+    built_library: Path,
+) -> None:
     def hold(
         speed: float, allowed: float, gap: float, front_speed: float, min_gap: float,
         tau: float, accel: float, decel: float,
     ) -> float:  # fmt: skip
         return 0.0
 
-    Library(built)
+    Library(built_library)
     register_driver_model("hold_of_the_library_test", hold)
     try:
         row = REGISTERED_MODELS["hold_of_the_library_test"] - 16
-        opened = ctypes.CDLL(str(built / LIBRARY_FILE))
+        opened = ctypes.CDLL(str(built_library / LIBRARY_FILE))
         copy = (ctypes.c_int64 * 64).in_dll(opened, "cavmarl_driver_models")
         assert copy[row] != 0
     finally:
         REGISTERED_MODELS.remove("hold_of_the_library_test")
 
 
-def test_each_kernel_that_python_calls_is_in_the_list() -> None:
+def test_the_list_contains_exactly_the_kernels_that_python_calls() -> None:
     assert called_kernels() == {call.name for call in read_manifest()}
 
 
 @compiled_only
-def test_each_call_of_the_list_can_be_made_again() -> None:
+def test_the_types_of_each_call_of_the_list_suit_the_present_kernel() -> None:
     calls = read_manifest()
     assert [call.name for call in calls if not can_be_made(call)] == []
     by_name = {call.name.rpartition(".")[2]: call for call in calls}
@@ -252,18 +260,20 @@ def test_each_call_of_the_list_can_be_made_again() -> None:
     name = by_name["call_orders"].name
     assert can_be_made(KernelCall(name, json.dumps([departures, ticks])))
     assert not can_be_made(KernelCall(name, json.dumps([departures, ticks, keys]))), (
-        "another parameter"
+        "a call with an added parameter was accepted"
     )
-    assert not can_be_made(KernelCall(name, json.dumps([departures, worlds]))), "another bundle"
+    assert not can_be_made(KernelCall(name, json.dumps([departures, worlds]))), (
+        "a call with the wrong bundle was accepted"
+    )
 
 
-def test_kernels_of_a_plain_world_are_marked_in_the_list() -> None:
+def test_kernels_that_a_plain_world_calls_are_marked_in_the_list() -> None:
     names = {call.name.rpartition(".")[2] for call in read_manifest() if call.is_plain}
     assert {"advance_each", "sense_each", "populate"} <= names
     assert "mirror" not in names
 
 
-def test_the_list_is_written_as_it_is_read(tmp_path: Path) -> None:
+def test_a_written_list_is_read_unchanged(tmp_path: Path) -> None:
     calls = read_manifest()
     write_manifest(reversed(calls), tmp_path / "list.json")
     assert read_manifest(tmp_path / "list.json") == calls
@@ -272,7 +282,7 @@ def test_the_list_is_written_as_it_is_read(tmp_path: Path) -> None:
 
 
 @compiled_only
-def test_calls_from_the_package_are_recorded_but_not_calls_from_tests(
+def test_calls_from_the_package_are_recorded_and_calls_from_tests_are_not(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from cavmarl.core.math import rng
@@ -303,13 +313,13 @@ def test_calls_from_the_package_are_recorded_but_not_calls_from_tests(
         ("<f8[1C]", "<f8[1C unaligned]", False),
     ],
 )
-def test_code_accepts_arrays_that_satisfy_its_assumptions(
+def test_code_accepts_arrays_with_at_least_the_properties_it_relies_on(
     compiled: str, called: str, fits: bool
 ) -> None:
     assert accepts(compiled, called) == fits
 
 
-def test_calls_that_differ_in_read_only_arrays_are_compiled_once() -> None:
+def test_calls_that_differ_only_in_write_protection_are_compiled_once() -> None:
     def call(*layouts: str) -> KernelCall:
         return KernelCall("k", json.dumps([{"array": "<f8", "layout": text} for text in layouts]))
 

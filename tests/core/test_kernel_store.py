@@ -23,14 +23,14 @@ compiled_only = pytest.mark.skipif(IS_PLAIN, reason="nothing is compiled")
 
 
 def _digests(monkeypatch: pytest.MonkeyPatch, changed: str = "") -> dict[str, str]:
-    """Return the digest of each file of kernels after a line was added to one of them."""
+    """Return the digest of each source file, after the file `changed` gets another line."""
     content = {**SOURCES, **({changed: SOURCES[changed] + b"\n"} if changed else {})}
     monkeypatch.setattr(sources, "kernel_sources", lambda: content)
     return {name: sources.module_digest.__wrapped__(f"cavmarl.{name}") for name in SOURCES}
 
 
 class Compiled(CompileListener):
-    """A list of the kernels that are compiled within the block."""
+    """A context that lists the kernels that are compiled within it."""
 
     def __init__(self) -> None:
         self.names: list[str] = []
@@ -46,7 +46,7 @@ class Compiled(CompileListener):
         self.names.append(name.rpartition(".")[2])
 
 
-def test_every_folder_of_kernels_is_read() -> None:
+def test_the_sources_include_every_folder_of_kernels() -> None:
     folders = {path.parent for path in PACKAGE.rglob("kernels/**/*.py")}
     assert len(folders) > 8
     for folder in folders:
@@ -75,17 +75,17 @@ def test_a_change_of_the_compiler_affects_all_kernels(
 
 
 @pytest.mark.parametrize("name", sorted(set(SOURCES) - set(sources.COMPILER_FILES)))
-def test_every_import_of_another_file_is_seen(name: str) -> None:
+def test_every_import_of_another_source_file_is_found(name: str) -> None:
     found = {other.decode() for other in sources.IMPORT_LINE.findall(SOURCES[name])}
     imported = set()
     for node in ast.walk(ast.parse(SOURCES[name])):
         if isinstance(node, ast.ImportFrom):
-            assert node.level == 0, f"{name}: imports by the full name are those looked for"
+            assert node.level == 0, f"{name}: a relative import is not found"
             module = node.module or ""
-            # Code that is called there is part of the compiler and not of a kernel.
+            # Files of `core.compiled` belong to the compiler, whose changes affect all kernels.
             if module.startswith("cavmarl.") and not module.startswith("cavmarl.core.compiled"):
                 imported.add(module.removeprefix("cavmarl."))
-                # An import of a module from its folder would be missed.
+                # `from folder import module` would not be found.
                 assert not {f"{module[8:]}.{alias.name}" for alias in node.names} & set(SOURCES)
         elif isinstance(node, ast.Import):
             assert not any(alias.name.startswith("cavmarl") for alias in node.names)
@@ -115,10 +115,10 @@ def test_a_damaged_file_is_compiled_again(
         assert kernel(function)(1.0, 2.0) == first
     assert names == ([] if harm is None else ["rough_atan2"])
     assert unpack(file.read_bytes()) is not None
-    assert sorted(tmp_path.rglob("*.*")) == [file], "no other file remains"
+    assert sorted(tmp_path.rglob("*.*")) == [file], "temporary files remain"
 
 
-def test_no_flipped_or_missing_byte_of_a_file_is_an_error() -> None:
+def test_a_file_with_a_changed_or_missing_byte_is_not_read() -> None:
     content = pack(CompiledKernel("module.name", "float64", "float", "symbol", b"machine code"))
     assert unpack(content) is not None
     for place, byte in enumerate(content):
@@ -135,7 +135,7 @@ def _adder(step: Any) -> Any:
 
 
 @compiled_only
-def test_values_that_a_function_closes_over_are_part_of_the_cache_key(
+def test_the_cache_distinguishes_functions_with_other_captured_values(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path))
@@ -143,7 +143,7 @@ def test_values_that_a_function_closes_over_are_part_of_the_cache_key(
     assert len(list(tmp_path.rglob("*.kernel"))) == 2
 
 
-def test_a_function_that_closes_over_an_object_is_not_cached() -> None:
+def test_a_function_that_captures_an_object_is_not_cached() -> None:
     file = KernelFile(_adder(object()), "int64")
     assert file.load() is None
     with file.locked():
@@ -151,7 +151,7 @@ def test_a_function_that_closes_over_an_object_is_not_cached() -> None:
     assert file.load() is None
 
 
-AT_ONCE = """
+COMPILE_AND_PRINT = """
 import sys
 from cavmarl.core.compiled.machine_code import CompileListener, listeners
 from cavmarl.core.math.bearings import rough_atan2
@@ -173,7 +173,7 @@ def test_if_several_processes_need_a_kernel_only_one_compiles_it(tmp_path: Path)
         "CAVMARL_KERNELS": "native",
         "PYTHONPATH": str(PACKAGE.parent),
     }
-    command = [sys.executable, "-c", AT_ONCE]
+    command = [sys.executable, "-c", COMPILE_AND_PRINT]
     running = [
         subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True)
         for _ in range(3)
@@ -196,7 +196,7 @@ print(rough_atan2(1.0, 2.0), wrap_angle(7.0))
 
 @compiled_only
 @pytest.mark.parametrize("how", ["no folder", "a file"])
-def test_a_folder_that_cannot_be_written_is_named_once(tmp_path: Path, how: str) -> None:
+def test_a_cache_folder_that_cannot_be_written_is_reported_once(tmp_path: Path, how: str) -> None:
     place = tmp_path / "cache" if how == "a file" else Path("/proc/cavmarl")
     if how == "a file":
         place.touch()
@@ -217,10 +217,10 @@ def test_a_folder_that_cannot_be_written_is_named_once(tmp_path: Path, how: str)
     )
     assert told.stderr.count(f"{place} cannot be written") == 1
     assert "CAVMARL_CACHE_DIR" in told.stderr
-    assert not list(PACKAGE.rglob("*.kernel")), "no file is written beside the sources"
+    assert not list(PACKAGE.rglob("*.kernel")), "a file was written beside the sources"
 
 
-def test_the_cache_folder_follows_the_environment_variables(
+def test_environment_variables_select_the_cache_folder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     for name in ("CAVMARL_CACHE_DIR", "XDG_CACHE_HOME"):

@@ -1,4 +1,4 @@
-"""Files that are mapped into memory."""
+"""Files that are mapped into memory: arrays over them, and released memory."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_arrays_that_are_not_mapped_belong_to_no_file() -> None:
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
-def test_released_files_take_no_memory(tmp_path: Path) -> None:
+def test_mapped_files_take_no_memory_after_their_release(tmp_path: Path) -> None:
     path = tmp_path / "numbers"
     write_whole(path, NUMBERS.tobytes())
     file = mapped(path)

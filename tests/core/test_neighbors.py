@@ -12,7 +12,7 @@ from tests.support.builders import crowds, vehicles
 
 
 def grid_of(rows: NDArray[np.void], cell_m: float = 10.0) -> Grid:
-    # Smaller than the crowds, so some vehicles lie outside.
+    # Vehicles are drawn in a larger area than the grid, so some of them lie outside.
     grid = make_grid((-20.0, -15.0, 25.0, 20.0), cell_m, len(rows))
     fill_grid(rows, len(rows), grid)
     return grid
@@ -55,7 +55,7 @@ def test_each_row_has_one_body_in_its_cell(rows: NDArray[np.void], cell_m: float
     crowds(), st.integers(0, 11), st.sampled_from([1.0, 10.0, 25.0, 200.0]), st.integers(1, 6),
     st.sampled_from([4.0, 10.0, 100.0]),
 )  # fmt: skip
-def test_the_nearest_equal_the_twin(
+def test_nearest_bodies_equals_twin(
     rows: NDArray[np.void], row: int, radius_m: float, k: int, cell_m: float
 ) -> None:
     row %= len(rows)
@@ -65,7 +65,9 @@ def test_the_nearest_equal_the_twin(
 
 
 @given(crowds(), st.randoms(use_true_random=False))
-def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: object) -> None:
+def test_the_order_of_rows_does_not_change_the_neighbours(
+    rows: NDArray[np.void], random: object
+) -> None:
     order = list(range(len(rows)))
     random.shuffle(order)  # type: ignore[attr-defined]
     shuffled = rows[order]
@@ -90,10 +92,10 @@ def test_a_search_works_at_a_place_without_a_vehicle() -> None:
     assert nearest_bodies(grid_of(rows), -1, 0.0, 0.0, 0.0, 5.0, 4, out_body, out_squared) == 1
 
 
-def test_the_grid_works_at_all_coordinates() -> None:
+def test_the_grid_takes_huge_and_undefined_coordinates() -> None:
     rows = vehicles([(np.nan, 0.0, 0.0), (1e100, -1e100, 0.0), (0.0, np.nan, 0.0), (1.0, 1.0, 0.0)])
     assert nearest(rows, 3, 50.0, 4) == []
 
 
-def test_bodies_are_small() -> None:
+def test_a_body_takes_at_most_96_bytes() -> None:
     assert BODY.itemsize <= 96

@@ -13,15 +13,15 @@ FOLDERS = """
     core roads maps driving zones traffic v2x rewards sensors ownership shards handoff engine
     env policies config
 """.split()
-# These files do not build worlds: they compare maps with scans, and write files for other
-# programs. The last two drive CARLA and read its frames; such zones have a tolerance.
+# These files do not compute worlds. The folders compare maps with scans and write files for other
+# programs. The two files exchange frames with CARLA, whose states are compared with a tolerance.
 OTHER = (
     "maps/fidelity/",
     "maps/exports/",
     "handoff/simulators/carla_zone_client.py",
     "handoff/simulators/carla_frames.py",
 )
-# These files make tables of results, or are drivers.
+# These files are in other folders. They compute tables of results, or are drivers.
 FILES = ("evaluate/*.py", "evaluate/scenarios/criticality.py", "../agents/*.py")
 
 # Functions of the C library or NumPy whose rounding depends on the processor.
@@ -47,7 +47,7 @@ EXCEPTIONS = {
 
 
 def unsafe_calls(tree: ast.AST) -> Iterator[str]:
-    """Yield the functions, matrix products and powers in a file that may differ."""
+    """Yield the functions, matrix products and powers whose results depend on the processor."""
     for node in ast.walk(tree):
         match node:
             case ast.Attribute(value=ast.Name(id=module), attr=name) if module in MODULES:
@@ -79,12 +79,12 @@ def found_calls() -> set[str]:
     }
 
 
-def test_worlds_are_computed_with_portable_functions() -> None:
+def test_worlds_are_computed_with_functions_that_are_equal_on_all_processors() -> None:
     new = found_calls() - set(EXCEPTIONS)
     assert not new, f"use cavmarl.core.math.elementary or elementary_arrays: {sorted(new)}"
 
 
-def test_every_exception_is_needed() -> None:
+def test_every_exception_names_a_call_that_exists() -> None:
     assert set(EXCEPTIONS) <= found_calls()
 
 
@@ -101,7 +101,7 @@ def test_every_exception_is_needed() -> None:
         ("a.dot(b)", ".dot"),
     ],
 )
-def test_unsafe_calls_are_seen(text: str, call: str) -> None:
+def test_unsafe_calls_are_found(text: str, call: str) -> None:
     assert list(unsafe_calls(ast.parse(text))) == [call]
 
 

@@ -46,7 +46,7 @@ def test_the_compiled_code_has_prefetch_instructions() -> None:
         pytest.skip("without the compiler there is no such instruction")
     njit: Any = numba.njit
     function: Any = total
-    compiled = njit(function.py_func)  # the kernel may be loaded from the cache
+    compiled = njit(function.py_func)  # a kernel from the cache has no assembly text
     compiled(np.zeros(4, dtype=RECORD), np.arange(4, dtype=np.int64), 1)
     (code,) = compiled.inspect_asm().values()
     assert re.search(r"^\s+(prefetcht0|prfm)\s", code, re.MULTILINE)

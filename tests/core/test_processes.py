@@ -1,4 +1,4 @@
-"""Processes that end with their caller, and leave Ctrl-C to it."""
+"""Started processes: they ignore Ctrl-C and end with the process that started them."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.evaluate.subprocess_calls import call_in_fresh_process
 READY = "print('ready', flush=True); input(); print('heard nothing', flush=True)"
 
 
-def test_an_interrupt_is_left_to_the_caller() -> None:
+def test_a_started_process_ignores_an_interrupt() -> None:
     process = start_dying_with_process(
         [sys.executable, "-c", READY], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     )
@@ -31,7 +31,7 @@ def test_an_interrupt_is_left_to_the_caller() -> None:
 
 
 @pytest.mark.usefixtures("fresh_processes")
-def test_code_of_the_working_directory_is_not_run(
+def test_modules_of_the_working_directory_are_not_imported(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for name in ("cavmarl", "numba", "json"):
@@ -43,7 +43,7 @@ def test_code_of_the_working_directory_is_not_run(
     assert call_in_fresh_process("a length", len, [1, 2]) == 2
 
 
-def test_a_process_ends_with_its_caller_while_it_still_starts() -> None:
+def test_a_process_ends_even_if_its_caller_is_killed_during_the_start() -> None:
     caller = (
         "import os, signal, sys\n"
         "from cavmarl.core.processes import start_dying_with_process as start\n"
@@ -54,7 +54,7 @@ def test_a_process_ends_with_its_caller_while_it_still_starts() -> None:
     done = subprocess.run([sys.executable, "-c", caller], stdout=subprocess.PIPE, text=True)
     try:
         pidfd = os.pidfd_open(int(done.stdout))
-    except ProcessLookupError:  # ended already
+    except ProcessLookupError:  # the process has ended
         return
     try:
         assert select.select([pidfd], [], [], 10.0)[0]

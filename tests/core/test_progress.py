@@ -1,4 +1,4 @@
-"""Progress bars show stage, speed and time left; without a terminal, nothing is printed."""
+"""Progress bars: their contents, and no output without a terminal."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ from rich.console import Console
 from cavmarl.core.progress import counting, in_stages
 
 
-def test_a_bar_names_the_stage_and_the_time_left() -> None:
+def test_a_bar_shows_the_stage_and_the_remaining_time() -> None:
     console = Console(file=io.StringIO(), force_terminal=True, width=120, color_system=None)
-    with in_stages(console, ["reading", "netconvert", "checks"]) as told:
-        told("reading")
-        told("checks")
+    with in_stages(console, ["reading", "netconvert", "checks"]) as report:
+        report("reading")
+        report("checks")
     shown = console.file.getvalue()
     assert "checks" in shown
     assert "2/3" in shown
@@ -22,15 +22,15 @@ def test_a_bar_names_the_stage_and_the_time_left() -> None:
 
 
 def test_an_unknown_stage_is_an_error() -> None:
-    with in_stages(Console(file=io.StringIO()), ["reading"]) as told:
+    with in_stages(Console(file=io.StringIO()), ["reading"]) as report:
         with pytest.raises(ValueError, match="writing"):
-            told("writing")
+            report("writing")
 
 
 def test_without_a_terminal_nothing_is_written() -> None:
     console = Console(file=io.StringIO(), width=120)
-    with in_stages(console, ["reading", "checks"]) as told:
-        told("checks")
+    with in_stages(console, ["reading", "checks"]) as report:
+        report("checks")
     with counting(console, "steps") as count:
         count(1, 2)
     assert console.file.getvalue() == ""

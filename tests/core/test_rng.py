@@ -13,10 +13,10 @@ NUMBERS = st.integers(0, 2**48 - 1)
 STREAMS = st.integers(0, 2**32 - 1)
 
 # SplitMix64 computes modulo 2**64. Without the compiler, NumPy warns of the overflow.
-wraps_around = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
+allows_overflow = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 
-# Random123's known answers, kat_vectors, "philox4x32 10".
+# Source: the file `kat_vectors` of Random123, lines "philox4x32 10".
 @pytest.mark.parametrize(
     ("counter", "key", "answer"),
     [
@@ -55,7 +55,7 @@ def test_world_key_equals_twin(seed: int, world: int, episode: int) -> None:
     assert rng.world_key(np.uint64(seed), world, episode) == naive.world_key(seed, world, episode)
 
 
-def test_each_argument_changes_the_number() -> None:
+def test_a_change_of_any_argument_changes_the_number() -> None:
     base = (np.uint64(7), 3, 5, rng.STREAM_ROUTE)
     numbers = {
         rng.uniform(*base),
@@ -69,12 +69,12 @@ def test_each_argument_changes_the_number() -> None:
     assert len(numbers) == 7
 
 
-def test_streams_do_not_share_draws() -> None:
+def test_the_draws_of_two_streams_do_not_overlap() -> None:
     streams = sorted(getattr(rng, name) for name in vars(rng) if name.startswith("STREAM_"))
     assert np.all(np.diff(streams) >= rng.DRAWS_PER_STREAM)
 
 
-def test_numbers_are_spread_evenly() -> None:
+def test_numbers_are_uniform() -> None:
     key = np.uint64(rng.world_key(1, 2, 3))
     numbers = [rng.uniform(key, vehicle, 9, rng.STREAM_PLACE) for vehicle in range(4000)]
     counts, _ = np.histogram(numbers, bins=16, range=(0.0, 1.0))
@@ -82,7 +82,7 @@ def test_numbers_are_spread_evenly() -> None:
     assert chi_squared < 37.7  # the 99.9 % quantile for 15 degrees of freedom
 
 
-@wraps_around
+@allows_overflow
 @given(KEYS, NUMBERS, st.integers(0, 2**32 - 1), STREAMS)
 def test_quick_uniform_equals_twin(key: int, vehicle: int, tick: int, stream: int) -> None:
     number = rng.quick_uniform(np.uint64(key), vehicle, tick, stream)
@@ -95,11 +95,9 @@ def quick_numbers(vehicles: range, ticks: range) -> list[float]:
     return [rng.quick_uniform(key, v, t, rng.STREAM_DRIVER) for v in vehicles for t in ticks]
 
 
-@wraps_around
+@allows_overflow
 @pytest.mark.parametrize(("vehicles", "ticks"), [(range(4000), range(1)), (range(1), range(4000))])
-def test_quick_numbers_are_uniform_and_neighbours_are_independent(
-    vehicles: range, ticks: range
-) -> None:
+def test_quick_numbers_are_uniform_and_uncorrelated(vehicles: range, ticks: range) -> None:
     numbers = np.array(quick_numbers(vehicles, ticks))
     counts, _ = np.histogram(numbers, bins=16, range=(0.0, 1.0))
     # The 99.9 % quantile for 15 degrees of freedom.
@@ -110,8 +108,8 @@ def test_quick_numbers_are_uniform_and_neighbours_are_independent(
         assert abs(np.corrcoef(numbers[:-lag], numbers[lag:])[0, 1]) < 0.06
 
 
-@wraps_around
-def test_quick_numbers_depend_on_each_argument_and_on_nothing_else() -> None:
+@allows_overflow
+def test_quick_numbers_depend_on_each_argument_and_not_on_earlier_calls() -> None:
     asked = [(v, t) for v in range(30) for t in range(30)]
     key = np.uint64(rng.world_key(1, 2, 3))
     forward = {a: rng.quick_uniform(key, *a, rng.STREAM_DRIVER) for a in asked}

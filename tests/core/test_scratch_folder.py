@@ -1,4 +1,4 @@
-"""Temporary files of processes end with them, at the latest when the next process begins."""
+"""Temporary files are deleted when their process ends, or else when the next process begins."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def base(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def test_temporary_files_end_with_the_block(base: Path) -> None:
+def test_temporary_files_are_deleted_at_the_end_of_the_block(base: Path) -> None:
     with scratch_folder() as folder:
         assert Path(tempfile.mkdtemp()).parent == folder
         assert os.environ["TMPDIR"] == str(folder)
@@ -38,12 +38,12 @@ def test_temporary_files_end_with_the_block(base: Path) -> None:
     assert not list(base.iterdir())
 
 
-def test_the_folder_of_a_killed_process_is_deleted_by_the_next(base: Path) -> None:
+def test_the_next_process_deletes_the_folder_of_a_killed_process(base: Path) -> None:
     process = subprocess.Popen([sys.executable, "-c", PROGRAM], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
     files = Path(process.stdout.readline().strip())
     with scratch_folder():
-        assert files.is_dir()  # its process lives
+        assert files.is_dir()  # the process that owns the files still runs
     process.kill()
     process.wait()
     process.stdout.close()
@@ -52,7 +52,7 @@ def test_the_folder_of_a_killed_process_is_deleted_by_the_next(base: Path) -> No
         assert list(base.iterdir()) == [folder]
 
 
-def test_links_and_other_folders_stay(base: Path) -> None:
+def test_links_files_and_other_folders_are_not_deleted(base: Path) -> None:
     (base / "kept").mkdir()
     (base / f"{PREFIX}link").symlink_to(base / "kept")
     (base / f"{PREFIX}file").touch()

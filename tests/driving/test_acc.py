@@ -1,4 +1,4 @@
-"""Adaptive cruise control compared with SUMO's: a leader with a speed profile, five followers."""
+"""Adaptive cruise control of five followers behind one leader, compared with SUMO's."""
 
 from __future__ import annotations
 
@@ -19,10 +19,10 @@ from cavmarl.driving.vehicle_types import CLASS_DEFAULTS, VTYPE, set_model
 
 DT, STEPS, FOLLOWERS = 0.1, 1000, 5
 START_MPS, START_GAP_M, LIMIT_MPS = 20.0, 22.5, 30.0
-SPEED_MPS, GAP_M = 0.2, 0.3  # largest differences of any vehicle in any step
-MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # mean differences
+SPEED_MPS, GAP_M = 0.2, 0.3  # largest accepted differences from SUMO, of any vehicle in any step
+MEAN_SPEED_MPS, MEAN_GAP_M = 0.02, 0.05  # largest accepted mean differences
 
-# Run in a child process: a process can load libsumo only once.
+# This program runs in a child process, because a process can load libsumo only once.
 RUN = """
 import json, sys
 import libsumo
@@ -54,7 +54,7 @@ TYPES = """<additional><vType id="acc" carFollowModel="ACC" tau="1.0" sigma="0" 
 
 
 def profile() -> list[float]:
-    """Return the leader's speed: steady, down to 8 m/s, steady, up to 24 m/s, a gentle wave."""
+    """Return the leader's speeds: constant, down to 8 m/s, constant, up to 24 m/s, then a wave."""
     speeds = []
     speed = START_MPS
     for step in range(STEPS):
@@ -81,7 +81,7 @@ def car() -> np.void:
 
 
 def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
-    """Return (steps, vehicles, 2) positions and speeds, from SUMO's initial state."""
+    """Drive from the given initial state; return positions and speeds (steps, vehicles, 2)."""
     kind, rows = car(), []
     places, speeds = places.copy(), speeds.copy()
     for lead in profile()[1:]:
@@ -101,7 +101,7 @@ def driven(places: np.ndarray, speeds: np.ndarray) -> np.ndarray:
 
 @pytest.fixture(scope="module")
 def theirs(tmp_path_factory: pytest.TempPathFactory) -> np.ndarray:
-    """Return positions and speeds (steps, vehicles, 2) in SUMO."""
+    """Return the positions and speeds (steps, vehicles, 2) that SUMO computes."""
     sumo: Any = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     folder = tmp_path_factory.mktemp("acc")
@@ -135,19 +135,21 @@ def test_a_platoon_with_acc_drives_as_in_sumo(theirs: np.ndarray) -> None:
     assert gap_off.max() < GAP_M
     assert speed_off.mean() < MEAN_SPEED_MPS
     assert gap_off.mean() < MEAN_GAP_M
-    assert (np.diff(ours[:, :, 0], axis=1) < -5.0).all(), "no car touches its leader"
+    assert (np.diff(ours[:, :, 0], axis=1) < -5.0).all(), "a car touches its leader"
 
 
 @pytest.mark.parametrize(
     ("room", "front_mps", "expected"),
     [
-        (math.inf, 0.0, 0.4 * 5.0),  # a free road: towards the allowed speed
-        (60.0, 20.0, 0.4 * 5.0),  # more than two seconds away: the leader is ignored
+        (math.inf, 0.0, 0.4 * 5.0),  # free road: accelerate to the allowed speed
+        (60.0, 20.0, 0.4 * 5.0),  # the leader is over 2 s away and ignored
         (20.1, 20.05, 0.23 * 0.1 + 0.07 * 0.05),  # close to the desired gap
         (25.0, 21.0, 0.04 * 5.0 + 0.8 * 1.0),  # the gap is too large
         (17.0, 19.0, -0.8 * 3.0 - 0.23 * 1.0),  # the gap is too small
     ],
 )
-def test_acc_has_four_modes(room: float, front_mps: float, expected: float) -> None:
+def test_acc_has_the_acceleration_of_each_of_its_four_modes(
+    room: float, front_mps: float, expected: float
+) -> None:
     asked = acc_acceleration(20.0, 25.0, room, front_mps, 4.5, 1.0, 2.6, 4.5)
     assert asked == pytest.approx(expected, abs=1e-9)

@@ -36,7 +36,7 @@ def test_types_are_assigned_in_turn_to_agents_and_their_successors() -> None:
     }
     rng = np.random.default_rng(0)
     followed = 0
-    for _ in range(120):  # these vehicles leave the road and are replaced
+    for _ in range(120):  # random actions make vehicles leave the road, so that others replace them
         actions = rng.uniform(-1.0, 1.0, (1, 6, 2)).astype(np.float32)
         _, _, terminated, _, _ = vec.step(actions)
         followed += int(terminated.sum())
@@ -78,8 +78,8 @@ def test_accelerating_braking_and_turning_are_limited_by_the_type() -> None:
             assert row["steering"] == pytest.approx(most, abs=1e-6)
 
 
-def test_the_turning_circle_follows_from_the_wheelbase() -> None:
-    """For a given steering angle, the yaw rate of a bus follows from its wheelbase of 6 m."""
+def test_the_yaw_rate_follows_from_the_wheelbase() -> None:
+    """A bus has a wheelbase of 6 m."""
     vec = make("highway", types=["bus"])
     vec.reset(seed=1)
     action = np.zeros((1, 6, 2), dtype=np.float32)
@@ -92,7 +92,7 @@ def test_the_turning_circle_follows_from_the_wheelbase() -> None:
             assert row["yaw_rate"] == pytest.approx(row["speed"] * np.sin(slip) / 3.0, rel=0.02)
 
 
-def test_krauss_keeps_the_limit_if_a_decision_holds_for_several_ticks() -> None:
+def test_a_krauss_driver_keeps_the_speed_limit_if_it_decides_every_few_ticks() -> None:
     vec = make("highway", types=["car"], overrides={"traffic.model": "Krauss"})
     assert vec.config.clock.ticks_per_step > 1
     vec.reset(seed=2)
@@ -106,7 +106,7 @@ def test_krauss_keeps_the_limit_if_a_decision_holds_for_several_ticks() -> None:
     assert np.median(accels) < 0.5
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     def drive(**keywords: Any) -> list[bytes]:
         vec = make("grid4x4", **keywords)
         vec.reset(seed=3)

@@ -20,7 +20,7 @@ CROWDS = {"merge": 30, "grid4x4": 40, "ring": 20, "blocks": 60}
 
 @pytest.fixture(params=CROWDS, scope="module")
 def world(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory) -> Simulation:
-    """Return traffic some seconds after its start, on short streets with signs."""
+    """Return a world whose traffic has driven for 8 s."""
     env = request.param
     if env == "blocks":
         env = netgenerate(
@@ -44,7 +44,7 @@ def listed(simulation: Simulation, rows: NDArray[np.void]) -> Scratch:
 
 
 def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
-    """Return (id, dist, speed, half) of the vehicles at a link, by id."""
+    """Return (id, dist, speed, half) of the vehicles that a link lists, sorted by id."""
     found = room.approach[room.link_start[link] : room.link_end[link]]
     assert (found["link"] == link).all()
     return sorted((int(e["id"]), float(e["dist"]), e["speed"], e["half"]) for e in found)
@@ -54,7 +54,7 @@ def entries(room: Scratch, link: int) -> list[tuple[int, float, float, float]]:
 def test_every_link_lists_the_vehicles_on_the_link_and_before_its_line(
     world: Simulation, stand: bool
 ) -> None:
-    """Vehicles that cannot move are listed as well."""
+    """With `stand`, no vehicle can move; the links must list all of them as well."""
     travel, roads = world.travel, world.network
     for step in range(0, 12, 2):
         for _ in range(step):

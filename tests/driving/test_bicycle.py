@@ -29,7 +29,7 @@ def test_bicycle_step_equals_twin(
     assert abs(wrap_angle(turned - twin[2])) < 1e-12
 
 
-def test_a_circle_closes() -> None:
+def test_a_car_with_constant_steering_returns_after_one_circle() -> None:
     # tan(slip) = tan(steering) / 2 and radius = (length / 2) / sin(slip).
     slip = math.atan(math.tan(0.3) / 2.0)
     radius = 2.5 / math.sin(slip)

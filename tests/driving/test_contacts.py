@@ -24,7 +24,7 @@ def contacts(rows: NDArray[np.void], cell_m: float = 10.0) -> list[int]:
 @given(crowds(), st.sampled_from([4.0, 25.0]))
 def test_contacts_equal_twin(rows: NDArray[np.void], cell_m: float) -> None:
     hits = contacts(rows, cell_m)
-    # For boxes that touch without a common area, rounding decides.
+    # If two boxes only touch at their edges, rounding decides, so skip such cases.
     if naive.find_contacts(rows, 1e-6) == naive.find_contacts(rows, -1e-6):
         assert hits == naive.find_contacts(rows)
 
@@ -40,9 +40,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
 @pytest.mark.parametrize(
     ("heading", "reach_m"), [(0.0, 2.0), (0.3, 2.69), (-0.3, 2.69), (7.0, 3.396)]
 )
-def test_vehicles_side_by_side_touch_by_their_widths_and_angle(
-    heading: float, reach_m: float
-) -> None:
+def test_contact_side_by_side_depends_on_widths_and_angle(heading: float, reach_m: float) -> None:
     for apart_m, touch in ((reach_m - 0.02, [1, 0]), (reach_m + 0.02, [-1, -1])):
         for sign in (1.0, -1.0):
             rows = vehicles([(0.0, 0.0, 0.0), (0.0, sign * apart_m, heading)])
@@ -57,12 +55,12 @@ def test_vehicles_on_and_under_a_bridge_do_not_touch() -> None:
     assert contacts(vehicles(places, z=[0.0, 1.4])) == [1, 0]
 
 
-def test_the_smallest_id_is_written() -> None:
+def test_a_vehicle_with_several_contacts_records_the_smallest_id() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (4.0, 0.0, 0.0), (-4.0, 0.0, 0.0)], id=[5, 3, 8])
     assert contacts(rows) == [3, 5, 5]
 
 
-def test_long_trucks_are_found_across_cells() -> None:
+def test_contacts_of_trucks_longer_than_a_cell_are_found() -> None:
     rows = vehicles([(-9.0, 0.0, 0.0), (8.9, 0.0, 0.0)], length=18.0)
     assert contacts(rows, 2.0) == [1, 0]
     rows["x"][1] = 9.0

@@ -17,7 +17,7 @@ FREE = 2.0  # m/s², acceleration without cooperative braking
 
 
 def crossing() -> tuple[int, int, list[int]]:
-    """Find a lane, its left neighbour, and the lanes that lead over a junction to the neighbour."""
+    """Return a lane, its left neighbour, and the lanes that lead to this neighbour."""
     roads = network(NAME)
     for lane, row in enumerate(roads.lanes):
         left = int(row["left"])
@@ -28,7 +28,7 @@ def crossing() -> tuple[int, int, list[int]]:
 
 
 def merged(rows: NDArray[np.void]) -> Scratch:
-    """Return the accelerations of all rows after cooperative braking for row 0."""
+    """Return the scratch arrays after cooperative braking for row 0, with each row's `accel`."""
     roads, ways = network(NAME), travel(NAME)
     room = scratch(roads, len(rows))
     room.accel[: len(rows)] = FREE
@@ -38,7 +38,7 @@ def merged(rows: NDArray[np.void]) -> Scratch:
 
 
 def rows_on(places: list[tuple[int, float]], speed: float = 10.0) -> NDArray[np.void]:
-    """Put cars on lanes; the blinker of the first one is set to the left."""
+    """Return cars at (lane, s); the first car signals a change to the left."""
     rows = np.zeros(len(places), VEHICLE)
     rows["id"], rows["side_lane"] = np.arange(len(places)), -1
     rows["lane"], rows["s"] = zip(*places, strict=True)
@@ -54,7 +54,7 @@ def test_followers_on_all_incoming_lanes_brake(id_: int) -> None:
     assert (merged(rows).accel[1:3] < FREE).all()
 
 
-def test_a_follower_on_the_lane_itself_is_the_only_one_that_brakes() -> None:
+def test_only_the_follower_on_the_target_lane_brakes_if_there_is_one() -> None:
     lane, left, before = crossing()
     rows = rows_on([(lane, 20.0), (left, 8.0), (before[0], 1.0)])
     accel = merged(rows).accel
@@ -62,7 +62,7 @@ def test_a_follower_on_the_lane_itself_is_the_only_one_that_brakes() -> None:
     assert accel[2] == FREE
 
 
-def test_the_first_vehicle_on_a_lane_brakes_also_for_vehicles_behind_it() -> None:
+def test_only_the_first_vehicle_of_an_incoming_lane_brakes() -> None:
     lane, _, before = crossing()
     length = float(network(NAME).lanes["length_m"][before[0]])
     rows = rows_on([(lane, 12.0), (before[0], 0.0), (before[0], length - 1.0)])

@@ -1,4 +1,4 @@
-"""The built-in driver does not go at red if the car was steered a little over the line."""
+"""The built-in driver waits for green even if the car's front is slightly over the line."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ HALF_M = 2.5
 OVER_M = 1.5
 
 
-def test_a_car_that_creeps_over_a_red_line_waits_for_green() -> None:
-    """All cars creep at lines instead of standing, until their fronts are well beyond the lines."""
+def test_a_car_that_has_crept_over_a_stop_line_waits_for_green() -> None:
+    """The test lets cars that stand at a line creep on until the front is 1.5 m beyond the line."""
     vec = cavmarl.make_vec(
         "grid4x4",
         agents=12,
@@ -43,4 +43,4 @@ def test_a_car_that_creeps_over_a_red_line_waits_for_green() -> None:
         vec.close()
     assert crept > 0
     assert red == 0
-    assert arrived > 12, "the cars go on at green"
+    assert arrived > 12, "few cars went on at green"

@@ -1,4 +1,4 @@
-"""Deadlocks on equal roads: cycles of vehicles that wait for one another, and their resolution."""
+"""Deadlocks of vehicles that wait for one another in a circle, and how drivers resolve them."""
 
 from __future__ import annotations
 
@@ -39,12 +39,12 @@ TICKS = 2000
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Return the map of a crossing with this SUMO type of its node."""
+    """Return a function that builds a crossing with the given SUMO type of junction."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
 class Queue(NamedTuple):
-    """Vehicles on some arms of a crossing, each standing at its line and yielding."""
+    """Vehicles that stand and yield at the stop lines of a crossing."""
 
     network: RoadNetwork
     links: list[int]
@@ -93,19 +93,19 @@ def queue(crossing: Callable[[str], Path]) -> Callable[..., Queue]:
     [
         ("WSEN", AHEAD, True),
         ("WS", AHEAD, False),
-        ("WSE", AHEAD, False),  # the vehicle from the east yields to none
+        ("WSE", AHEAD, False),  # the vehicle from the east yields to no other vehicle
         ("WE", LEFT, False),
         ("WSE", LEFT, True),  # a left turn from the east yields to the vehicle from the west
     ],
 )
-def test_a_chain_of_waiting_vehicles_is_a_deadlock_if_it_returns_to_the_own_lane(
+def test_a_chain_of_waiting_vehicles_is_a_deadlock_if_it_is_closed(
     queue: Callable[..., Queue], arms: str, goals: dict[str, str], circle: bool
 ) -> None:
     assert queue(arms, goals).is_circle() == circle
 
 
 @pytest.mark.parametrize(("goals", "share"), [(AHEAD, 0.25), (LEFT, 0.75)])
-def test_in_a_deadlock_a_vehicle_yields_in_ticks_that_all_drivers_know(
+def test_all_drivers_compute_the_same_ticks_in_which_a_vehicle_of_a_deadlock_yields(
     queue: Callable[..., Queue], goals: dict[str, str], share: float
 ) -> None:
     here = queue("WSEN", goals)
@@ -113,7 +113,7 @@ def test_in_a_deadlock_a_vehicle_yields_in_ticks_that_all_drivers_know(
     assert np.mean(drawn) == pytest.approx(share, abs=0.03)
     assert [here.yields(tick, asking=3) for tick in range(TICKS)] == drawn
     assert [here.yields(tick, i=1) for tick in range(TICKS)] != drawn, (
-        "each vehicle draws its own numbers"
+        "two vehicles yield in the same ticks"
     )
 
 
@@ -137,7 +137,7 @@ def test_a_vehicle_that_does_not_wait_does_not_yield_in_a_deadlock(
         ("priority", DRIVER_BACKGROUND, MODEL_KRAUSS, False),
     ],
 )
-def test_only_drivers_as_in_sumo_resolve_deadlocks_on_equal_roads(
+def test_only_background_drivers_with_krauss_on_equal_roads_resolve_deadlocks(
     crossing: Callable[[str], Path], kind: str, driver: int, model: int, breaks: bool
 ) -> None:
     network = read_network(crossing(kind))

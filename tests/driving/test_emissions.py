@@ -42,7 +42,7 @@ def sumo_run(program: str, *arguments: str | Path) -> None:
 
 
 def driving_cycle(folder: Path, emission_class: str, rows: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return (n, 11) what SUMO's tool prints: mg/s, and Wh for electricity."""
+    """Return the table (n, 11) of SUMO's tool for these rows, in mg/s, and Wh for electricity."""
     cycle, found = folder / "cycle.csv", folder / "found.csv"
     slopes = np.degrees(rows["pitch"])
     columns = zip(rows["speed"].tolist(), rows["accel"].tolist(), slopes.tolist(), strict=True)
@@ -57,7 +57,7 @@ def driving_cycle(folder: Path, emission_class: str, rows: NDArray[np.void]) -> 
 
 
 def cycle_rows(seed: int) -> NDArray[np.void]:
-    """Return VEHICLE (n,), second by second: speeds that change, and hills."""
+    """Return VEHICLE (n,), a row per second, with random accelerations and slopes."""
     numbers = np.random.default_rng(seed)
     rows = np.zeros(COUNT, VEHICLE)
     speed = 0.0
@@ -79,7 +79,8 @@ def test_co2_and_fuel_of_each_class_equal_those_of_sumo(name: str, tmp_path: Pat
     rows = cycle_rows(1)
     expected = driving_cycle(tmp_path, SUMO_CLASSES[name], rows)
     co2_mg = 1e3 * our(rows, name)[:, 1]
-    # SUMO prints six digits. At the limit of coasting, rounding may choose the other side.
+    # SUMO prints six digits. Rounding may decide whether a vehicle counts as coasting, so a few
+    # rows may differ.
     near = np.abs(co2_mg - expected[:, CO2]) > 1e-5 * expected[:, CO2] + 0.01
     assert np.count_nonzero(near) <= 3
     assert np.count_nonzero(co2_mg[~near]) > COUNT // 3
@@ -88,7 +89,7 @@ def test_co2_and_fuel_of_each_class_equal_those_of_sumo(name: str, tmp_path: Pat
     np.testing.assert_allclose(fuel_mg[~near], expected[~near, FUEL], rtol=3e-4, atol=3.0)
 
 
-def test_energy_equals_that_of_sumos_electric_car(tmp_path: Path) -> None:
+def test_energy_equals_the_energy_of_sumos_electric_car(tmp_path: Path) -> None:
     rows = cycle_rows(2)
     expected = driving_cycle(tmp_path, "Energy/unknown", rows)[:, ELECTRICITY]
     energy_wh = our(rows)[:, 0]
@@ -96,8 +97,8 @@ def test_energy_equals_that_of_sumos_electric_car(tmp_path: Path) -> None:
     assert expected.min() < -1.0 < 1.0 < expected.max()
 
 
-def test_a_drive_in_sumo_takes_the_same_energy_but_for_curves(tmp_path: Path) -> None:
-    """On a drive with turns, SUMO adds the friction of curves: 3.5 % of the energy."""
+def test_energy_of_a_drive_equals_sumos_except_for_friction_in_curves(tmp_path: Path) -> None:
+    """SUMO adds friction in curves, which is 3.5 % of the energy of this drive."""
     edges = "left0A0 A0B0 B0B1 B1C1 C1C0 C0D0 D0D1 D1C1"
     (tmp_path / "rou.xml").write_text(
         '<routes><vType id="electric" emissionClass="Energy/unknown"/>'
@@ -141,7 +142,7 @@ def test_trams_bicycles_and_pedestrians_have_no_engine() -> None:
     assert len(FUEL_PER_CO2) == CLASS_PEDESTRIAN + 1
 
 
-def test_backwards_counts_as_forwards() -> None:
+def test_driving_backwards_takes_the_same_energy_as_forwards() -> None:
     rows = cycle_rows(4)
     rows = rows[rows["speed"] > 0.0]  # a vehicle that stands has no direction
     back = rows.copy()
@@ -151,7 +152,7 @@ def test_backwards_counts_as_forwards() -> None:
 
 
 def test_energy_of_a_drive_does_not_depend_on_the_length_of_a_step() -> None:
-    """At constant acceleration, ten short steps draw what a long one draws, within the air drag."""
+    """At constant acceleration, ten steps of 0.1 s and one of 1 s differ only by the air drag."""
     short = np.zeros(10, VEHICLE)
     short["speed"], short["accel"] = 10.0 + 0.2 * np.arange(1, 11), 2.0
     long = short[-1:]

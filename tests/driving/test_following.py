@@ -30,7 +30,7 @@ SHARES = st.floats(0.0, 1.0, exclude_max=True)
 
 
 def passenger_car(model: int, sigma: float = 0.0) -> np.void:
-    """Return SUMO's passenger car with a model, MODEL_*."""
+    """Return SUMO's passenger car with the car-following model MODEL_*."""
     car = np.zeros(1, VTYPE)[0]
     for field, value in CLASS_DEFAULTS["passenger"]._asdict().items():
         if field in (VTYPE.names or ()):
@@ -40,11 +40,10 @@ def passenger_car(model: int, sigma: float = 0.0) -> np.void:
     return car
 
 
-# A car for each model of the package.
 KINDS = {model.name: passenger_car(model.code) for model in MODELS} | {"IDM": IDM}
 
 
-def test_each_model_has_a_code_of_its_own() -> None:
+def test_each_model_has_a_different_code() -> None:
     codes = {model.code for model in MODELS}
     assert len(codes) == len(MODELS)
     assert max(codes) < FIRST_REGISTERED
@@ -95,12 +94,12 @@ def test_krauss_never_brakes_to_a_negative_speed(
 
 @pytest.mark.parametrize("name", ["IDM", "Krauss"])
 @given(speed=SPEEDS, gap=GAPS, more=st.floats(0.1, 50.0), front=SPEEDS)
-def test_a_nearer_leader_constrains_no_less(
+def test_a_nearer_leader_constrains_at_least_as_much_as_a_farther_one(
     name: str, speed: float, gap: float, more: float, front: float
 ) -> None:
     kind = KINDS[name]
     near, far = (behind(kind, speed, at, front, kind["decel"]) for at in (gap, gap + more))
-    # IDM's desired gap may be negative behind a leader that drives away: its square still counts.
+    # IDM squares its desired gap, which may be negative behind a faster leader; skip those cases.
     desired = kind["tau"] * speed + speed * (speed - front) / 7.8
     if kind["model"] == MODEL_KRAUSS or desired > -kind["min_gap"]:
         assert near >= far
@@ -109,7 +108,7 @@ def test_a_nearer_leader_constrains_no_less(
 
 @pytest.mark.parametrize("name", ["IDM", "Krauss"])
 @given(gap=st.floats(-5.0, 150.0), front=SPEEDS, front_decel=DECELS)
-def test_speed_behind_is_the_speed_at_which_a_gap_is_wanted(
+def test_speed_behind_returns_the_speed_whose_desired_gap_is_the_given_gap(
     name: str, gap: float, front: float, front_decel: float
 ) -> None:
     kind = KINDS[name]
@@ -119,14 +118,14 @@ def test_speed_behind_is_the_speed_at_which_a_gap_is_wanted(
         return
     constraint = behind(kind, speed, gap, front, front_decel)
     if kind["model"] == MODEL_IDM:
-        # The interaction at the desired gap is the largest acceleration.
+        # At the desired gap, the interaction term equals the largest acceleration.
         assert constraint == pytest.approx(kind["accel"], rel=1e-6)
     else:
         assert -constraint == pytest.approx(speed)
 
 
 @pytest.mark.parametrize("name", KINDS)
-def test_accel_behind_is_the_wish_for_the_constraint_of_the_leader(name: str) -> None:
+def test_accel_behind_equals_the_wish_for_the_constraint_of_the_leader(name: str) -> None:
     kind = KINDS[name]
     constraint = behind(kind, 12.0, 20.0, 9.0, 4.0)
     assert accel_behind(kind, 12.0, 15.0, 20.0, 9.0, 4.0) == wish(kind, 12.0, 15.0, constraint)
@@ -146,7 +145,9 @@ def test_a_driver_stops_just_before_a_line(name: str, dt: float, speed: float) -
         gap -= speed * dt
     assert speed < 0.1
     assert 0.0 < gap < 2.0 * LINE_MARGIN_M
-    assert hardest < 1.25 * kind["decel"], "the line is visible early enough"
+    assert hardest < 1.25 * kind["decel"], (
+        "the driver braked too hard before a line that it saw early"
+    )
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -167,10 +168,10 @@ def test_a_follower_stops_behind_a_leader_that_brakes_hard(name: str) -> None:
 
 
 @given(allowed=SPEEDS, further=st.floats(-40.0, 40.0), gap=st.floats(-2.0, 2.4), share=SHARES)
-def test_close_behind_a_standing_leader_a_driver_ignores_other_constraints(
+def test_a_driver_close_behind_a_standing_leader_ignores_other_constraints(
     allowed: float, further: float, gap: float, share: float
 ) -> None:
-    # For this reason, `drivers` does not look further ahead.
+    # Therefore, the kernel in `drivers` may stop its search for constraints at such a leader.
     car = passenger_car(MODEL_KRAUSS, 0.5)
     constraint = behind(car, 0.0, gap, 0.0, 4.5)
     assert constraint == 0.0

@@ -1,4 +1,4 @@
-"""Gap acceptance at junctions: the limits of accepted gaps in seconds."""
+"""Gap acceptance at junctions: which gaps before and after a foe a driver accepts."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ __all__ = ["crossing"]
 
 SPEED_MPS = 10.0  # speed of both vehicles, and the speed limit
 HALF_M = 2.5
-FROM_WEST, FROM_SOUTH = 0, 1  # LINK rows
+FROM_WEST, FROM_SOUTH = 0, 1  # rows of the links
 
 CARS = travel("merge")
 Blocks = Callable[..., int]
@@ -49,7 +49,7 @@ def network(crossing: Callable[..., Path]) -> RoadNetwork:
 
 @pytest.fixture
 def blocks(network: RoadNetwork) -> Blocks:
-    """Return whether a car from the west blocks a yielding car from the south (HOLD_*)."""
+    """Return a function that tells how a foe from the west blocks a yielding car from the south."""
     link = network.links[FROM_SOUTH]
     first = int(link["first_conflict"])
     conflicts = network.conflicts[first : first + int(link["num_conflicts"])]
@@ -66,12 +66,19 @@ def blocks(network: RoadNetwork) -> Blocks:
         travel: TripTables = CARS,
         **foe_fields: float,
     ) -> int:
-        """Return whether the foe blocks, for times and distances to the shared area.
+        """Return HOLD_NONE if the foe does not block, or the reason to stop.
 
-        `own_s` is the time until the own front enters the shared area (`end` = "enter") or reaches
-        its line ("line"), or the own rear leaves the junction ("out"). `foe_m` is the distance of
-        the foe's front to its line or, if negative, of its rear to the end of the shared area.
-        `own` and `foe_fields` are fields of the records.
+        Args:
+            own_s: Time until the own car is at `end`.
+            end: "enter": its front enters the shared area; "line": its front is at its line; "out":
+                its rear leaves the junction.
+            foe_m: Distance of the foe's front to its line. If negative, the foe is on the junction,
+                and -foe_m is the distance of its rear to the end of the shared area.
+            wait_s: Waiting time of both cars.
+            own: Fields of the own row of VEHICLE.
+            near: Whether the paths come close in the shared area.
+            travel: Tables with the vehicle types.
+            foe_fields: Fields of the foe's row of VEHICLE.
         """
         foe, asked = np.zeros(1, APPROACH), np.array([shared])
         foe["link"], foe["row"], foe["half"] = FROM_WEST, 1, HALF_M
@@ -80,7 +87,7 @@ def blocks(network: RoadNetwork) -> Blocks:
         foe["dist"] = -shared["foe_leave_m"] - HALF_M - foe_m if inside else foe_m + HALF_M
         ahead = {"enter": shared["enter_m"] - HALF_M, "line": -HALF_M}
         ahead["out"] = link["length_m"] + HALF_M
-        row["wait_s"] = wait_s  # of both vehicles
+        row["wait_s"] = wait_s
         rows = np.concatenate([row, row])
         for k, fields in enumerate((own or {}, foe_fields)):
             for name, value in fields.items():
@@ -96,7 +103,7 @@ def blocks(network: RoadNetwork) -> Blocks:
 
 
 @pytest.mark.parametrize(("driver", "behind_s"), [(DRIVER_BACKGROUND, 0.0), (DRIVER_AGENT, 0.5)])
-def test_a_moving_vehicle_enters_an_area_that_has_just_been_cleared(
+def test_a_moving_vehicle_may_enter_an_area_as_soon_as_the_foe_has_left_it(
     blocks: Blocks, driver: int, behind_s: float
 ) -> None:
     # The foe's rear leaves the shared area in 0.6 s.
@@ -108,7 +115,7 @@ def test_a_moving_vehicle_enters_an_area_that_has_just_been_cleared(
 def test_a_foe_that_brakes_on_the_junction_is_not_assumed_to_accelerate(
     blocks: Blocks, accel: float, waits: bool
 ) -> None:
-    """The foe clears the area in 6 m: in 0.6 s, or in 1 s at the 6 m/s of a foe that brakes."""
+    """The foe leaves the area after 6 m: in 1 s at constant 6 m/s, sooner if it accelerates."""
     blocked = blocks(0.93, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
     assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -117,7 +124,7 @@ def test_a_foe_that_brakes_on_the_junction_is_not_assumed_to_accelerate(
 def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
     blocks: Blocks, accel: float, waits: bool
 ) -> None:
-    """The foe clears the area in 6 m; it stops within 6.2 m or within 5.8 m."""
+    """The foe leaves the area after 6 m. Its braking distance is 6.2 m or 5.8 m."""
     blocked = blocks(9.0, "enter", -6.0, own={"speed": SPEED_MPS}, speed=6.0, accel=accel)
     assert blocked == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -129,7 +136,7 @@ def test_a_foe_that_stops_on_the_junction_blocks_distant_vehicles(
 def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
     blocks: Blocks, out_s: float, hold: int, waits: bool
 ) -> None:
-    # The vehicle needs over a second to the area. A vehicle that has started continues.
+    # The vehicle is over one second away from the area. A vehicle that moves does not stop.
     own = {"speed": 0.0, "hold": hold, "stopped_at": FROM_SOUTH}
     assert blocks(0.2, "line", -out_s * SPEED_MPS, 2.0, own) == (HOLD_YIELD if waits else HOLD_NONE)
 
@@ -137,14 +144,14 @@ def test_a_standing_vehicle_starts_half_a_second_before_the_area_is_clear(
 @pytest.mark.parametrize(
     ("speed", "wait_s", "foe_hold", "hold"),
     [
-        (SPEED_MPS, 0.0, HOLD_NONE, HOLD_NONE),  # the foe will have left
+        (SPEED_MPS, 0.0, HOLD_NONE, HOLD_NONE),  # the foe will have left by then
         (
             SPEED_MPS,
             0.0,
             HOLD_EXIT_BLOCKED,
             HOLD_EXIT_BLOCKED,
-        ),  # another vehicle keeps the foe there
-        (0.0, 2.9, HOLD_NONE, HOLD_YIELD),  # the foe may go on at once
+        ),  # another vehicle blocks the foe
+        (0.0, 2.9, HOLD_NONE, HOLD_YIELD),  # the foe may start at any time
         (0.0, 3.1, HOLD_NONE, HOLD_EXIT_BLOCKED),
     ],
 )
@@ -153,32 +160,32 @@ def test_a_foe_that_stays_on_the_junction_blocks_others(
 ) -> None:
     assert blocks(9.0, "enter", -3.0, speed=speed, wait_s=wait_s, hold=foe_hold) == hold
     assert blocks(9.0, "enter", -40.0, speed=0.0, wait_s=9.0) == HOLD_NONE, (
-        "the foe stands before the area"
+        "a foe that stands before the area blocks"
     )
 
 
-def test_a_foe_on_a_separate_path_blocks_only_before_its_line(
+def test_a_foe_whose_path_is_not_near_blocks_only_before_its_line(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
     assert blocks(0.2, "enter", -6.0)
     assert blocks(0.2, "line", 20.0)
     assert not blocks(0.2, "enter", -6.0, near=False)
     assert blocks(0.2, "line", 20.0, near=False), (
-        "before its line, the right of way of the map counts"
+        "a foe before its line does not block despite its right of way"
     )
 
 
-def test_an_approaching_foe_is_given_the_whole_junction(
+def test_an_approaching_foe_blocks_until_its_rear_has_left_the_junction(
     blocks: Blocks, network: RoadNetwork
 ) -> None:
-    # The front has 20 m to its line; the rear leaves the junction 5 m later.
+    # The front is 20 m before its line, and the rear is 5 m behind the front.
     over_s = (25.0 + float(network.links["length_m"][FROM_WEST])) / SPEED_MPS
     assert blocks(over_s - 0.05, "line", 20.0)
     assert not blocks(over_s + 0.05, "line", 20.0)
 
 
 @pytest.mark.parametrize(("driver", "ahead_s"), [(DRIVER_BACKGROUND, 1.0), (DRIVER_AGENT, 3.0)])
-def test_the_time_gap_is_one_second_or_three_if_steered(
+def test_the_time_gap_is_one_second_or_three_seconds_if_a_car_is_an_agent(
     blocks: Blocks, driver: int, ahead_s: float
 ) -> None:
     # The foe's front reaches its line in 5 s.
@@ -190,7 +197,7 @@ def test_the_time_gap_is_one_second_or_three_if_steered(
 def test_a_foe_whose_trip_ends_before_its_line_is_ignored(
     blocks: Blocks, to_go_m: float, waits: bool
 ) -> None:
-    """The foe's centre is 52.5 m before its line; `to_go` of 0 means an unknown end of the trip."""
+    """The foe's centre is 52.5 m before its line. If `to_go` is 0, its way to go is unknown."""
     assert bool(blocks(4.5, "out", 50.0, to_go=to_go_m)) == waits
 
 
@@ -198,7 +205,9 @@ def test_a_foe_that_accelerates_arrives_earlier(blocks: Blocks) -> None:
     # From 4 m/s with 2 m/s², the foe reaches the limit of 10 m/s after 21 m, and 50 m in 5.9 s.
     assert blocks(4.95, "out", 50.0, speed=4.0, accel=2.0)
     assert not blocks(4.85, "out", 50.0, speed=4.0, accel=2.0)
-    assert not blocks(4.95, "out", 50.0, speed=4.0), "at its present speed, the foe needs 12.5 s"
+    assert not blocks(4.95, "out", 50.0, speed=4.0), (
+        "a foe at constant 4 m/s, which needs 12.5 s, blocks"
+    )
 
 
 @pytest.mark.parametrize("wait_s", [0.0, 90.0, 180.0, 900.0])
@@ -206,8 +215,8 @@ def test_a_crossing_driver_never_expects_foes_to_brake(
     blocks: Blocks, network: RoadNetwork, wait_s: float
 ) -> None:
     over_s = (float(network.links["length_m"][FROM_SOUTH]) + 2.0 * HALF_M) / SPEED_MPS
-    assert over_s == 1.5, "the front is at its line"
-    # The junction is clear after 1.5 s, and the time gap is 1.0 s.
+    assert over_s == 1.5, "the path over the junction is not 10 m long"
+    # The own car has left the junction after 1.5 s, and the time gap is 1.0 s.
     assert blocks(over_s, "out", 24.8, wait_s)
     assert not blocks(over_s, "out", 25.2, wait_s)
 
@@ -216,7 +225,7 @@ def test_a_crossing_driver_never_expects_foes_to_brake(
 def test_a_vehicle_that_accelerates_slowly_needs_a_longer_gap(
     blocks: Blocks, network: RoadNetwork, accel: float
 ) -> None:
-    """From a standstill, with at most 2.5 m/s², and a time gap of 1 s."""
+    """The car starts with at most 2.5 m/s². The time gap is 1 s."""
     types = CARS.types.copy()
     types["accel"] = accel
     length_m = float(network.links["length_m"][FROM_SOUTH])
@@ -227,8 +236,8 @@ def test_a_vehicle_that_accelerates_slowly_needs_a_longer_gap(
     assert not asked((out_s + 1.05) * SPEED_MPS)
 
 
-def test_a_vehicle_that_stands_before_its_line_counts_as_being_at_it(blocks: Blocks) -> None:
-    """With 1.8 m/s², the metre before the line takes 1.05 s, which would be too long."""
+def test_a_vehicle_that_stands_a_metre_before_its_line_needs_no_longer_gap(blocks: Blocks) -> None:
+    """Driving this metre takes 1.05 s at 1.8 m/s², so counting it would make the gap too long."""
     own = {"speed": 0.0}
     at_line = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.0, "line", m, own=own))
     before = next(m for m in np.arange(1.0, 99.0, 0.1) if not blocks(0.1, "line", m, own=own))
@@ -238,9 +247,10 @@ def test_a_vehicle_that_stands_before_its_line_counts_as_being_at_it(blocks: Blo
 
 
 def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
-    """Return the smallest accepted distance of a merging foe to its line, and the own path, in m.
+    """Return the smallest accepted distance of a merging foe to its line, and the own way, in m.
 
-    The own vehicle has 5 m/s, which is its limit, and its front is 2.5 m before its line.
+    The own vehicle drives at its limit of 5 m/s, with its front 2.5 m before its line. Its way ends
+    when its rear has left the junction.
     """
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
@@ -253,7 +263,7 @@ def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float
     length_m = float(rows["length"][0])
     over_m = 5.0 + 0.5 * length_m + float(network.links["length_m"][link])
     assert conflict["enter_m"] > network.links["wait_m"][link] - 1.0, (
-        "the area is beyond the waiting position"
+        "the shared area begins well before the waiting position"
     )
 
     def waits(front_m: float) -> int:
@@ -285,14 +295,14 @@ def test_a_vehicle_merges_before_a_foe_that_can_brake(
 def test_a_driver_that_has_waited_merges_before_a_foe_that_brakes_gently(
     network: RoadNetwork, wait_s: float, brakes_m: float
 ) -> None:
-    # The foe brakes from 10 to 5 m/s with 4.5 m/s², times the waiting time divided by 180 s. It
-    # begins when the own vehicle is 1 m before its line, in 0.3 s.
+    # The foe may have to brake from 10 to 5 m/s with 4.5 m/s² · waiting time / 180 s. It begins
+    # to brake in 0.3 s, when the own vehicle is 1 m before its line.
     least_m, _ = least_ahead(network, DRIVER_BACKGROUND, wait_s, 10.0)
     assert least_m == pytest.approx(brakes_m + 0.3 * 10.0, abs=0.1)
 
 
 def waiting_pair(**fields: Any) -> Any:
-    """Return a vehicle and its foe at link 1: both stand and yield."""
+    """Return two vehicles that yield; the second one, the foe, has stopped at link 1."""
     return vehicles([(0.0, 0.0, 0.0)] * 2, hold=HOLD_YIELD, stopped_at=[-1, 1], **fields)
 
 
@@ -300,11 +310,11 @@ def waiting_pair(**fields: Any) -> Any:
     ("own_wait_s", "foe_wait_s", "own_id", "speed", "goes"),
     [
         (0.6, 0.2, 5, 0.0, True),
-        (0.4, 0.2, 5, 0.0, False),  # it has stood for less than half a second
+        (0.4, 0.2, 5, 0.0, False),  # the vehicle has stood for less than half a second
         (0.6, 0.7, 0, 0.0, False),
         (0.6, 0.6, 0, 0.0, True),
         (0.6, 0.6, 5, 0.0, False),
-        (0.6, 0.2, 5, 1.0, False),  # it moves
+        (0.6, 0.2, 5, 1.0, False),  # the vehicle moves
     ],
 )
 def test_at_an_all_way_stop_the_longest_waiting_vehicle_goes_first(
@@ -324,16 +334,16 @@ def test_at_an_all_way_stop_a_foe_that_has_not_stopped_is_ignored(
     )
     assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, ALLWAY_STOP, ALLWAY_STOP, STUCK_S) == goes
     assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, STOP, STOP, STUCK_S), (
-        "a stop sign of a side road"
+        "at a stop sign of a side road, the foe is ignored"
     )
 
 
-def test_waiting_vehicles_on_equal_roads_do_not_block_each_other() -> None:
+def test_a_vehicle_on_equal_roads_ignores_a_waiting_foe_after_three_seconds() -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[3.1, 9.0], speed=0.0)
     assert may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S)
     row["wait_s"] = 2.9
     assert not may_ignore(row, foe, 0, 1, SIGNAL_NONE, EQUAL, EQUAL, STUCK_S), (
-        "the foe has waited longer"
+        "a foe that has waited longer is ignored too early"
     )
 
 
@@ -346,10 +356,10 @@ def test_waiting_vehicles_on_equal_roads_do_not_block_each_other() -> None:
     ],
 )
 @pytest.mark.parametrize(("later_s", "goes"), [(-1.0, False), (1.0, True)])
-def test_a_waiting_road_keeps_its_right_of_way_for_a_limited_time(
+def test_a_driver_gives_way_to_a_waiting_foe_for_a_limited_time(
     blocks: Blocks, model: int, driver: int, most_s: float, later_s: float, goes: bool
 ) -> None:
-    """Drivers as in SUMO wait as long as there, other drivers wait less."""
+    """Background drivers with Krauss's model wait 300 s, as in SUMO; other drivers wait 90 s."""
     cars = CARS._replace(types=generated_types(model))
     own = {"wait_s": most_s + later_s, "hold": HOLD_YIELD, "stopped_at": -1, "driver": driver}
     foe = {"speed": 0.0, "wait_s": 9.0, "hold": HOLD_YIELD, "stopped_at": FROM_WEST}
@@ -365,12 +375,14 @@ def test_at_blinking_signals_the_longest_waiting_vehicle_goes_first(
     own_wait_s: float, foe_hold: int, goes: bool
 ) -> None:
     row, foe = waiting_pair(id=[5, 3], wait_s=[own_wait_s, 2.0], speed=0.0)
-    foe["hold"] = foe_hold  # HOLD_NONE: the foe is about to go
+    foe["hold"] = foe_hold  # HOLD_NONE means that the foe is about to start
     assert may_ignore(row, foe, 0, 1, SIGNAL_OFF_BLINKING, MINOR, MINOR, STUCK_S) == goes
 
 
 @pytest.mark.parametrize(("stopped_at", "goes"), [(1, True), (2, False)])
-def test_an_agent_that_stands_at_its_stop_line_yields(stopped_at: int, goes: bool) -> None:
+def test_an_agent_that_stands_at_its_stop_line_is_assumed_to_yield(
+    stopped_at: int, goes: bool
+) -> None:
     row, foe = vehicles(
         [(0.0, 0.0, 0.0)] * 2,
         id=[5, 3],

@@ -17,13 +17,13 @@ from tests.support.builders import angles
 def test_steering_control_equals_twin(
     speed: float, d: float, heading_error: float, length: float
 ) -> None:
-    # If the car faces backwards, rounding decides the direction of the turn.
+    # Skip cars that face exactly backwards, because rounding decides the direction of their turn.
     approach = math.asin(max(-1.0, min(1.0, -d / 0.6 / not_zero(speed))))
     approach = max(-math.pi / 4, min(math.pi / 4, approach))
     assume(abs(abs(heading_error + approach) - math.pi) > 1e-9)
     steering = control.steering_control(speed, d, heading_error, length)
     twin = naive.steering_control(speed, d, heading_error, length)
-    # The twin's asin loses half of the digits where its slope is infinite.
+    # The twin uses asin, which loses half of the digits near ±1, where its slope is infinite.
     assert steering == pytest.approx(twin, abs=1e-7)
     assert abs(steering) <= control.MAX_STEERING_RAD
 

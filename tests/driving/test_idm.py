@@ -13,7 +13,7 @@ DEFAULTS = (idm.ACCEL_MAX, idm.DECEL_COMFORT, idm.JAM_DISTANCE_M, idm.TIME_HEADW
 
 
 def acceleration(speed: float, target_speed: float, *leader: float) -> float:
-    """Return the acceleration behind one leader."""
+    """Return IDM's acceleration behind one leader."""
     _, _, accel_max, *_ = leader
     return idm.idm_free(speed, target_speed, accel_max) - idm.idm_interaction(speed, *leader)
 
@@ -45,7 +45,7 @@ def test_the_acceleration_is_zero_at_target_speed_and_at_jam_distance() -> None:
 
 
 @given(SPEEDS, st.lists(st.tuples(st.floats(1.0, 100.0), SPEEDS), min_size=1, max_size=4))
-def test_the_most_restrictive_leader_rules(
+def test_the_most_restrictive_leader_determines_the_acceleration(
     speed: float, leaders: list[tuple[float, float]]
 ) -> None:
     interactions = [idm.idm_interaction(speed, *leader, *DEFAULTS) for leader in leaders]

@@ -17,7 +17,7 @@ Make = Callable[[str], Scene]
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Return the map of a crossing with this SUMO type of its node."""
+    """Return a function that builds a crossing with the given SUMO type of junction."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
@@ -27,7 +27,7 @@ def scene(crossing: Callable[[str], Path]) -> Make:
 
 
 @pytest.mark.parametrize(("speed", "left_m", "straight_m"), [(0.0, 1.0, 3.0), (8.0, 10.0, 20.0)])
-def test_no_car_brakes_for_a_left_turn_that_drives_to_its_waiting_position(
+def test_oncoming_cars_do_not_brake_for_a_left_turn_on_its_way_to_its_waiting_position(
     scene: Make, speed: float, left_m: float, straight_m: float
 ) -> None:
     here = scene("traffic_light")
@@ -42,13 +42,13 @@ def test_no_car_brakes_for_a_left_turn_that_drives_to_its_waiting_position(
                 hardest = min(hardest, float(car["accel"]))
             elif here.simulation.network.lanes[car["lane"]]["internal"]:
                 waited = waited or car["speed"] < 0.1
-    assert waited, "the left turn waits inside the junction"
+    assert waited, "the left turn did not wait inside the junction"
     assert hardest > -0.5
 
 
-def test_at_an_all_way_stop_no_car_starts_too_early_and_brakes_inside(scene: Make) -> None:
+def test_cars_at_an_all_way_stop_do_not_brake_inside_the_junction(scene: Make) -> None:
     here = scene("allway_stop")
-    ways = {"W": "N", "S": "W", "E": "S", "N": "E"}  # left turns that cross one another
+    ways = {"W": "N", "S": "W", "E": "S", "N": "E"}  # left turns whose paths cross
     for k, (arm, goal) in enumerate(ways.items()):
         here.put(arm, f"{arm}_in_0", 30.0 + 8.0 * k, f"{goal}_out", speed=10.0)
     hardest: dict[str, float] = defaultdict(float)
@@ -65,7 +65,7 @@ def test_at_an_all_way_stop_no_car_starts_too_early_and_brakes_inside(scene: Mak
     assert min(hardest.values()) > -1.0
     times = sorted(out.values())
     gaps = [later - time for time, later in pairwise(times)]
-    assert max(gaps) < 3.5, "in SUMO, cars follow at 2.8 s"
+    assert max(gaps) < 3.5, "the time between two cars is far above SUMO's 2.8 s"
 
 
 def test_a_car_that_has_stopped_at_a_stop_sign_goes_in_the_next_tick(scene: Make) -> None:

@@ -1,4 +1,4 @@
-"""Right of way in simulation: which of a few cars on the arms of a crossing goes first."""
+"""Right of way in simulations of a crossing with a few cars: which car goes first."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.traffic import on_lane, scratch, travel
 
 @pytest.fixture(scope="module")
 def crossing(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Path]:
-    """Return the map of a crossing with this SUMO type of its node."""
+    """Return a function that builds a crossing with the given SUMO type of junction."""
     return partial(build_crossing, tmp_path_factory.mktemp("crossings"))
 
 
@@ -51,7 +51,7 @@ def test_the_side_road_yields_to_the_main_road(scene: Make) -> None:
     here.put("main", "W_in_0", 45.0, "E_out", speed=14.0)
     times = here.entries(12.0)
     assert times["main"] < times["side"]
-    assert times["main"] < 4.5, "the car with the right of way need not brake"
+    assert times["main"] < 4.5, "the car with the right of way braked"
 
 
 def test_the_side_road_goes_first_if_the_gap_is_large(scene: Make) -> None:
@@ -63,7 +63,7 @@ def test_the_side_road_goes_first_if_the_gap_is_large(scene: Make) -> None:
     assert times["side"] < times["main"]
 
 
-def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> None:
+def test_the_side_road_waits_until_a_column_has_passed(scene: Make) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 20.0, "N_out", speed=8.0)
     for k in range(5):
@@ -73,10 +73,10 @@ def test_the_side_road_waits_for_a_whole_column_and_then_goes(scene: Make) -> No
 
 
 @pytest.mark.parametrize("waited_s", [0.0, 170.0])
-def test_a_crossing_car_yields_however_long_it_has_waited(scene: Make, waited_s: float) -> None:
+def test_a_crossing_car_yields_even_after_a_long_wait(scene: Make, waited_s: float) -> None:
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=waited_s)
-    here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)  # at its line in 5.5 s
+    here.put("main", "W_in_0", 60.0, "E_out", speed=11.0)  # reaches its line in 5.5 s
     times = here.entries(25.0)
     assert set(times) == {"side", "main"}
     assert times["main"] < times["side"]
@@ -86,7 +86,7 @@ def test_an_impatient_driver_does_not_enter_before_a_foe_that_cannot_brake(scene
     here = scene("priority")
     here.put("side", "S_in_0", 1.0, "N_out", wait_s=10_000.0)
     here.put("main", "W_in_0", 12.0, "E_out", speed=13.0)
-    times = here.entries(10.0)  # fails if cars touch
+    times = here.entries(10.0)
     assert times["main"] < times["side"]
 
 
@@ -98,15 +98,15 @@ def test_a_left_turn_yields_to_oncoming_traffic(scene: Make) -> None:
     assert times["straight"] < times["left"]
 
 
-def test_right_comes_before_left_on_equal_roads(scene: Make) -> None:
+def test_the_car_from_the_right_goes_first_on_equal_roads(scene: Make) -> None:
     here = scene("right_before_left")
     here.put("west", "W_in_0", 30.0, "E_out", speed=10.0)
     here.put("south", "S_in_0", 30.0, "N_out", speed=10.0)
     times = here.entries(15.0)
-    assert times["south"] < times["west"], "the car from the right goes first"
+    assert times["south"] < times["west"], "the car from the left went first"
 
 
-def test_four_cars_at_once_on_equal_roads_get_through(scene: Make) -> None:
+def test_four_cars_that_arrive_at_once_on_equal_roads_all_pass(scene: Make) -> None:
     here = scene("right_before_left")
     ways = {"W": "E", "E": "W", "S": "N", "N": "S"}
     for arm, goal in ways.items():
@@ -124,10 +124,10 @@ def test_a_car_stops_at_a_stop_sign_without_other_traffic(scene: Make) -> None:
         if lane == "S_in_0":
             slowest = min(slowest, float(here["side"]["speed"]))
             stood = max(stood, float(here["side"]["wait_s"]))
-    assert slowest < 0.1, "the car stands by SUMO's definition"
+    assert slowest < 0.1, "the car did not stop (below 0.1 m/s, as in SUMO)"
     assert stood >= 0.1
     assert here.simulation.network.lane_ids[here["side"]["lane"]] != "S_in_0", (
-        "then the car goes on"
+        "the car did not go on"
     )
 
 
@@ -147,11 +147,11 @@ def test_an_all_way_stop_lets_cars_through_one_by_one(scene: Make) -> None:
             else:
                 passed.add(arm)
     assert passed == set(ways)
-    assert max(slowest.values()) < 0.1, "every car stopped"
+    assert max(slowest.values()) < 0.1, "a car did not stop"
 
 
 def shown(here: Scene, link: int) -> str:
-    """Return the state of a link's signal."""
+    """Return the letter that the signal shows for a link."""
     network = here.simulation.network
     row = network.links[link]
     phase = network.phases[here.simulation.signal_phases()[row["signal"]]]
@@ -179,7 +179,7 @@ def test_a_car_stops_at_red_before_the_line_and_goes_at_green(scene: Make) -> No
                     assert 0.0 < front < 3.0
             elif arm not in crossed:
                 crossed[arm] = shown(here, links[arm])
-    assert stood, "one of the cars stopped at red"
+    assert stood, "no car stopped at red"
     assert set(crossed) == {"W", "S"}
     assert set(crossed.values()) <= set("gG")
 
@@ -192,7 +192,7 @@ def test_a_car_goes_on_at_yellow_only_if_a_stop_would_be_hard(
     network = here.simulation.network
     here.put("probe", "W_in_0", 140.0, "E_out")
     link = int(here.simulation.plans[here["probe"]["goal"], here["probe"]["lane"]]["link"])
-    # Step to the first tick of yellow, then put the car where it has to decide.
+    # Run to the first tick of yellow, then place the car before the line.
     here.clear()
     for _ in here.run(200.0):
         if shown(here, link) == "y":
@@ -214,7 +214,7 @@ def test_no_car_enters_without_room_beyond_the_junction(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
-    # A car stands for ever right behind the junction, because its route ends there.
+    # The car `block` always stands right behind the junction.
     here.put("block", "E_out_0", length - 9.0, "E_out", agent=0)
     here.simulation.vehicles()["driver"] = DRIVER_AGENT
     here.put("next", "W_in_0", 40.0, "E_out", speed=12.0)
@@ -224,10 +224,10 @@ def test_no_car_enters_without_room_beyond_the_junction(scene: Make) -> None:
     for _ in here.run(25.0):
         vehicles = here.simulation.vehicles()
         vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
-        assert lanes[here["next"]["lane"]] == "W_in_0", "the car keeps the junction clear"
+        assert lanes[here["next"]["lane"]] == "W_in_0", "the car entered the junction"
         crossing = vehicles[vehicles["id"] == here.names.index("cross")]
         seen_cross |= bool(len(crossing) and lanes[crossing[0]["lane"]] == "N_out_0")
-    assert seen_cross, "others can cross"
+    assert seen_cross, "the crossing car did not pass"
 
 
 def test_a_left_turn_waits_inside_until_oncoming_traffic_has_passed(scene: Make) -> None:
@@ -237,7 +237,7 @@ def test_a_left_turn_waits_inside_until_oncoming_traffic_has_passed(scene: Make)
     step = here.simulation.plans[here["probe"]["goal"], here["probe"]["lane"]]
     link = int(step["link"])
     wait_m = float(network.links[link]["wait_m"])
-    assert np.isfinite(wait_m), "this turn has a waiting position"
+    assert np.isfinite(wait_m), "this turn has no waiting position"
     here.clear()
     for _ in here.run(200.0):
         if shown(here, link) == "g":
@@ -263,15 +263,15 @@ def test_a_left_turn_waits_inside_until_oncoming_traffic_has_passed(scene: Make)
                 through_at = time
         if left_at < np.inf:
             break
-    assert waited > 1.0, "the car waits on the junction, not before it"
+    assert waited > 1.0, "the car did not wait inside the junction"
     assert through_at < left_at < through_at + 8.0
 
 
-def test_moving_cars_on_the_junction_need_room_beyond_it(scene: Make) -> None:
+def test_a_car_does_not_take_the_room_that_a_car_on_the_junction_needs(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     length = float(network.lanes[network.lane_ids.index("E_out_0")]["length_m"])
-    # There is room for one car behind the car that stands for ever.
+    # Behind the car `block`, which always stands, there is room for one car.
     here.put("block", "E_out_0", length - 16.0, "E_out", agent=0)
     here.simulation.vehicles()["driver"] = DRIVER_AGENT
     here.put("first", "W_in_0", 15.0, "E_out", speed=10.0)
@@ -281,13 +281,13 @@ def test_moving_cars_on_the_junction_need_room_beyond_it(scene: Make) -> None:
         vehicles = here.simulation.vehicles()
         vehicles["speed"][vehicles["id"] == here.names.index("block")] = 0.0
         assert lanes[here["second"]["lane"]] == "W_in_0"
-    assert lanes[here["first"]["lane"]] == "E_out_0", "there was room for the first car"
+    assert lanes[here["first"]["lane"]] == "E_out_0", "the first car did not use the room"
 
 
-def test_a_vehicle_inside_goes_before_a_blocked_foe_and_ends_a_deadlock(
+def test_a_left_turn_inside_a_junction_ends_a_deadlock_by_going_before_a_blocked_foe(
     crossing: Callable[..., Path],
 ) -> None:
-    """The left turn yields to a car that is blocked by a car that the left turn blocks."""
+    """`left` yields to `cross`. `main` blocks `cross`, and `left` blocks `main`."""
     here = Scene(crossing("priority", side_lanes=2))
     network = here.simulation.network
     ends = {"left": ("W_in_0", "N_out_1"), "cross": ("N_in_0", "S_out_0")}
@@ -303,7 +303,9 @@ def test_a_vehicle_inside_goes_before_a_blocked_foe_and_ends_a_deadlock(
     conflicts = network.conflicts[left["first_conflict"] :][: left["num_conflicts"]]
     (shared,) = conflicts[conflicts["foe"] == link["cross"]]
     wait_m = float(left["wait_m"])
-    assert shared["enter_m"] < wait_m - 1.0 < shared["leave_m"], "the car waits in the shared area"
+    assert shared["enter_m"] < wait_m - 1.0 < shared["leave_m"], (
+        "the waiting position is not in the shared area"
+    )
     fronts = {"left": wait_m - 1.0, "cross": float(shared["foe_enter_m"]) - 1.0}
     for name, row in (("left", left), ("cross", cross)):
         lane = network.lanes[row["first_internal"]]
@@ -321,7 +323,7 @@ def test_a_vehicle_inside_goes_before_a_blocked_foe_and_ends_a_deadlock(
     assert through["left"] < 10.0
 
 
-def test_no_car_hits_a_vehicle_at_the_very_start_of_the_junction(scene: Make) -> None:
+def test_a_car_stops_before_a_vehicle_at_the_start_of_another_link(scene: Make) -> None:
     here = scene("priority")
     network = here.simulation.network
     link = next(
@@ -339,7 +341,7 @@ def test_no_car_hits_a_vehicle_at_the_very_start_of_the_junction(scene: Make) ->
     for _ in here.run(6.0):
         vehicles = here.simulation.vehicles()
         left = vehicles["id"] == here.names.index("left")
-        vehicles["speed"][left] = vehicles["s"][left] = 0.0  # the car stands there for ever
+        vehicles["speed"][left] = vehicles["s"][left] = 0.0  # the car always stands there
     assert here["straight"]["speed"] < 1.0
 
 
@@ -357,7 +359,9 @@ def test_links_from_one_lane_share_their_path_up_to_the_fork(
             others = np.concatenate([paths[k][:, 1:] for k in links if k != link])
             s, xy = paths[link][:, 0], paths[link][:, 1:]
             apart = np.hypot(*(xy[:, None] - others[None]).transpose(2, 0, 1)).min(axis=1)
-            assert (apart[s < fork - 0.6] < 2.7).all(), "closer than two cars side by side"
+            assert (apart[s < fork - 0.6] < 2.7).all(), (
+                "paths before the fork are farther apart than two cars side by side"
+            )
             beyond = apart[s > fork + 0.6]
             assert beyond[0] > 2.5
 
@@ -369,7 +373,7 @@ def test_vehicles_from_one_lane_do_not_touch_where_their_paths_meet_again(tmp_pa
     (first, second), (one, other) = network.links["fork_m"], network.conflicts
     assert not one["must_yield"]
     assert not other["must_yield"]
-    assert one["enter_m"] > first + 10.0, "the fork is no shared area"
+    assert one["enter_m"] > first + 10.0, "the shared area begins at the fork"
     assert other["enter_m"] > second + 5.0
     for _ in range(3200):
         world.step(commands)
@@ -380,7 +384,7 @@ def test_vehicles_from_one_lane_do_not_touch_where_their_paths_meet_again(tmp_pa
 
 
 def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
-    """Return s, x and y (n, 3) of a link's path over its junction, every 0.1 m."""
+    """Return points (s, x, y) of a link's path over its junction, 0.1 m apart."""
     rows, lane = [], int(network.links[link]["first_internal"])
     while network.lanes[lane]["internal"]:
         here = network.lanes[lane]
@@ -392,7 +396,7 @@ def path_of(network: RoadNetwork, link: int) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("kind", ["priority", "right_before_left", "traffic_light"])
-def test_vehicles_that_cross_touch_no_vehicle_at_a_stop_line(
+def test_crossing_vehicles_do_not_touch_vehicles_at_stop_lines(
     crossing: Callable[[str], Path], kind: str
 ) -> None:
     network = read_network(crossing(kind))
@@ -423,14 +427,16 @@ def test_a_yielding_driver_follows_a_faster_foe_and_waits_for_a_slower_one(
     here.put("main", "W_in_0", -3.0, "E_out", speed=pace)
     here.put("side", "N_in_0", 8.0, "E_out", speed=6.0)
     slowest = min(float(here["side"]["speed"]) for _ in here.run(3.0))
-    assert (slowest < 5.0) == brakes, "the car slows down more to wait than to follow"
+    assert (slowest < 5.0) == brakes, (
+        "the yielding car slowed down for the faster foe, or not for the slower one"
+    )
 
 
 @pytest.mark.parametrize(("place_m", "blocked"), [(74.0, True), (76.0, False)])
-def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
+def test_a_vehicle_that_stands_far_beyond_the_junction_does_not_block_the_exit(
     place_m: float, blocked: bool
 ) -> None:
-    # A slow queue fills the road up to the standing car, so no place on it is free.
+    # A slow queue fills the road between the junction and the standing car.
     roads, ways = network_of("merge"), travel("merge")
     link = next(
         k
@@ -453,7 +459,7 @@ def test_vehicles_that_stand_far_beyond_the_junction_do_not_count(
 
 
 def _beyond(roads: RoadNetwork, lane: int) -> int:
-    """Return the first lane from here on that is not part of a junction."""
+    """Return the first lane from `lane` on that is not inside a junction."""
     while roads.lanes["internal"][lane]:
         lane = int(roads.lanes["successor"][lane])
     return lane

@@ -31,7 +31,9 @@ from tests.support.traffic import on_lane, scratch, travel_by
 
 
 @pytest.mark.parametrize("apart_m", [18.0, 24.0, 32.0])
-def test_opposing_left_turns_on_a_short_road_do_not_lock(tmp_path: Path, apart_m: float) -> None:
+def test_opposing_left_turns_on_a_short_road_do_not_block_each_other(
+    tmp_path: Path, apart_m: float
+) -> None:
     net, routes = signal_pair(tmp_path, apart_m)
     world = make_world(net, [routes], 450, 1, 0.1)
     lanes, commands = world.network.lanes, idle_commands(world)
@@ -46,7 +48,7 @@ def test_opposing_left_turns_on_a_short_road_do_not_lock(tmp_path: Path, apart_m
 
 
 class Ahead(NamedTuple):
-    """A vehicle before the first of two signals that turns left at the second."""
+    """A vehicle that stands before the first of two signals and will turn left at the second."""
 
     network: RoadNetwork
     left_turns_from: int  # the lane between both signals
@@ -84,9 +86,12 @@ def ahead(
 
 
 def is_blocked(scene: Ahead, *others: tuple[float, float, int], turns: bool = False) -> bool:
-    """Return whether cars (place, speed, reason to stop) between the signals block the way.
+    """Return whether the vehicle must not enter the first junction.
 
-    `turns`: whether another car turns left inside the second junction.
+    Args:
+        scene: The vehicle and the junctions.
+        others: Cars between the signals as (place, speed, reason to stop).
+        turns: Whether another car turns left inside the second junction.
     """
     network = scene.network
     goal = network.edge_ids.index("jw2")
@@ -111,18 +116,19 @@ def is_blocked(scene: Ahead, *others: tuple[float, float, int], turns: bool = Fa
 MOVING, WAITING = (8.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_YIELD)
 
 
-def test_a_full_road_before_a_line_at_which_its_vehicles_wait_is_blocked(tmp_path: Path) -> None:
+def test_a_full_road_is_blocked_if_its_vehicles_wait_at_the_next_line(tmp_path: Path) -> None:
     scene = ahead(tmp_path, SIGNAL_GREEN_MINOR)
     assert not is_blocked(scene)
     assert not is_blocked(scene, WAITING)
     assert is_blocked(scene, MOVING, WAITING)
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
-    # The vehicles move on, but the own one has to expect to yield at that line.
+    # These cars move on, but the own vehicle has to expect that it must yield at the next line.
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
 
 
-def test_a_free_waiting_position_in_the_next_junction_is_room(tmp_path: Path) -> None:
-    # A road of 14 m, and 2.4 m inside the junction: two cars of 5 m with 3 m behind each need 16 m.
+def test_a_free_waiting_position_in_the_next_junction_counts_as_room(tmp_path: Path) -> None:
+    # Two cars of 5 m, each with 3 m behind it, need 16 m. The road has 14 m, and the next waiting
+    # position is 2.4 m inside the junction.
     for light, taken, blocked in (
         (SIGNAL_GREEN_MINOR, False, False),
         (SIGNAL_GREEN_MINOR, True, True),
@@ -133,8 +139,8 @@ def test_a_free_waiting_position_in_the_next_junction_is_room(tmp_path: Path) ->
         assert is_blocked(scene, (8.0, 8.0, HOLD_NONE), turns=taken) == blocked
 
 
-def test_a_driver_does_not_expect_to_wait_where_no_signal_can_stop_it(tmp_path: Path) -> None:
-    """As in SUMO, it follows vehicles to a line at which all of them yield, if none waits there."""
+def test_a_driver_follows_moving_vehicles_to_a_line_without_a_signal(tmp_path: Path) -> None:
+    """All vehicles yield at that line. As in SUMO, the driver does not enter if one waits there."""
     scene = ahead(tmp_path, SIGNAL_NONE, second="priority")
     turn = scene.network.links[scene.network.lanes[scene.left_turns_from]["first_link"]]
     assert chr(turn["state"]) == "m"
@@ -142,8 +148,8 @@ def test_a_driver_does_not_expect_to_wait_where_no_signal_can_stop_it(tmp_path: 
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), WAITING)
 
 
-def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_path: Path) -> None:
-    """There is room for one vehicle in each direction; the U-turns change from one to the other."""
+def test_u_turns_at_both_ends_of_a_short_road_do_not_block_each_other(tmp_path: Path) -> None:
+    """Each direction of the road has room for one vehicle; the U-turns lead to the other one."""
     net, routes = turning_pair(tmp_path)
     world = make_world(net, [routes], 1000, 1, 0.1)
     commands = idle_commands(world)
@@ -159,10 +165,10 @@ def test_vehicles_that_turn_round_at_both_ends_of_a_short_road_do_not_lock(tmp_p
     ("light", "blocked"),
     [(SIGNAL_RED, True), (SIGNAL_YELLOW_MINOR, True), (SIGNAL_GREEN_MINOR, False)],
 )
-def test_on_a_road_shorter_than_a_vehicle_red_and_yellow_block(
+def test_a_vehicle_does_not_enter_a_too_short_road_at_red_or_yellow(
     tmp_path: Path, light: int, blocked: bool
 ) -> None:
-    # At green, a vehicle that is too long to wait on that road need not wait before it either.
+    # The vehicle is too long to wait on that road. At green, it does not have to wait there.
     assert is_blocked(ahead(tmp_path, light, apart_m=14.0)) == blocked
 
 

@@ -40,7 +40,7 @@ def test_imperfection_equals_twin(
 
 @pytest.mark.parametrize(
     ("speed", "left"),
-    # 0.5 · 0.5 · 2.6 m/s² · 0.1 s; below 2.6 m/s proportional to the speed.
+    # The loss is 0.5 · 0.5 · 2.6 m/s² · 0.1 s; below 2.6 m/s it is proportional to the speed.
     [(10.0, 9.935), (2.6, 2.535), (1.0, 0.975), (0.0, 0.0)],
 )
 def test_imperfection_is_smaller_at_low_speed(speed: float, left: float) -> None:
@@ -60,7 +60,8 @@ def test_a_follower_at_the_safe_speed_never_touches_its_leader(
         mine = speed * min(time, reaction_s) + speed * braked - 0.5 * decel * braked**2
         front = min(time, front_speed / hardest)
         other = front_speed * front - 0.5 * hardest * front**2
-        # A driver that brakes harder than its leader may be closer before the end than at the end.
+        # A driver that brakes harder than its leader may be closer during braking than at the end,
+        # so check such a driver only at the end.
         if decel <= front_decel or time >= stop_s:
             assert mine <= gap + other + 1e-6
 
@@ -73,7 +74,7 @@ CASES = [
     )
 ]
 
-# Run in a child process: a process can load libsumo only once.
+# This program runs in a child process, because a process can load libsumo only once.
 ASK = """
 import json, sys
 import libsumo
@@ -101,9 +102,9 @@ print(json.dumps(answers))
 def ours(case: dict[str, float]) -> tuple[float, float]:
     """Return the safe speeds behind the leader and before a line, for SUMO's discrete motion.
 
-    SUMO moves with the new speed for a whole step, so a vehicle that brakes to a stop drives less
-    far, by half a step, than in continuous time. Therefore the reaction time and the leader's
-    distance are half a step shorter.
+    SUMO drives a whole step at the new speed. A braking vehicle therefore drives half a step less
+    far than in continuous time. So subtract half a step from the reaction time, and the leader's
+    way in half a step from the gap.
     """
     gap = case["gap"] - 0.5 * DT * case["front"]
     follow = safe_speed(gap, case["front"], case["decel"], case["front_decel"], TAU - 0.5 * DT)
@@ -114,7 +115,10 @@ def ours(case: dict[str, float]) -> tuple[float, float]:
 
 @pytest.fixture(scope="module")
 def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
-    """Return the cases and SUMO's results; own speeds are chosen so that no other limit applies."""
+    """Return the cases and SUMO's results.
+
+    The own speed of each case is the safe speed, so that SUMO applies no other limit.
+    """
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     pytest.importorskip("sumo", reason="needs the extra 'sumo'")
     cases = []
@@ -131,13 +135,13 @@ def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
     return list(zip(cases, lines, strict=True))
 
 
-def test_the_safe_speed_equals_sumos(
+def test_the_safe_speed_equals_sumos_safe_speed(
     answers: list[tuple[dict[str, float], dict[str, float]]],
 ) -> None:
     for case, theirs in answers:
         # SUMO interpolates braking distances linearly between whole numbers of steps. The error is
-        # at most decel · dt² / 8 in metres of gap for each of both cars; divided by the slope of
-        # the braking distance, it is an error of speed. SUMO also subtracts 1 mm from every gap.
+        # at most decel · dt² / 8 in metres of gap per car. Divided by the slope of the braking
+        # distance, this is an error of speed. SUMO also subtracts 1 mm from every gap.
         decel = case["decel"]
         error = decel * DT * DT / 8.0 + 1e-3
         follow, stop = ours(case)
@@ -147,11 +151,11 @@ def test_the_safe_speed_equals_sumos(
         assert theirs["stop"] == pytest.approx(stop, abs=error / steep), case
 
 
-def test_the_safe_gap_equals_sumos(
+def test_the_safe_gap_equals_sumos_safe_gap(
     answers: list[tuple[dict[str, float], dict[str, float]]],
 ) -> None:
     for case, theirs in answers:
-        # Here the errors of both interpolations are in metres. SUMO returns no negative gap.
+        # This error is that of both cars' interpolations, in metres. SUMO returns no negative gap.
         hardest = max(case["decel"], case["front_decel"])
         error = (case["decel"] + hardest) * DT * DT / 8.0
         if theirs["secure"] > 0.0:

@@ -21,7 +21,7 @@ def test_mobil_equals_twin(
     assert accepted == naive.mobil_accepts(own, new_follower, old_follower, mandatory)
 
 
-def test_a_mandatory_change_needs_no_gain_but_safety() -> None:
+def test_a_mandatory_change_needs_safety_but_no_gain() -> None:
     assert mobil_accepts(1.0, -1.5, 0.0, -2.0, 0.0, 0.0, True)
     assert not mobil_accepts(1.0, -1.5, 0.0, -2.0, 0.0, 0.0, False)
     assert not mobil_accepts(1.0, -2.1, 0.0, -2.0, 0.0, 0.0, True)
@@ -34,6 +34,6 @@ def test_the_largest_imposed_braking_is_a_parameter() -> None:
     assert not mobil_accepts(1.0, -3.9, 0.0, -4.1, 0.0, 0.0, True, 4.0)
 
 
-def test_the_thresholds_themselves_are_accepted() -> None:
+def test_changes_exactly_at_the_thresholds_are_accepted() -> None:
     assert mobil_accepts(0.0, 0.2, 0.0, -2.0, 0.0, 0.0, False)
     assert mobil_accepts(0.0, -2.0, 0.0, -2.0, 0.0, 0.0, True)

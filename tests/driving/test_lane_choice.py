@@ -1,4 +1,4 @@
-"""Lane changes that a route needs, or that make a vehicle faster, and where they are possible."""
+"""Where lane changes are possible and safe, and which vehicles they depend on."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ from tests.support.traffic import network, on_lane, scratch, travel
         (1, 100.0, 0.0),
         (2, 100.0, 5.0 + SWAP_ROOM_M),
         (3, 100.0, 2.0 * (5.0 + SWAP_ROOM_M)),
-        (3, 40.0, 0.25 * 40.0 - MERGE_ROOM_M),  # limited to a share of the lane
+        (3, 40.0, 0.25 * 40.0 - MERGE_ROOM_M),  # limited to a quarter of the lane
         (3, 4.0, 0.0),
     ],
 )
-def test_each_further_lane_change_has_its_own_room(
+def test_each_further_lane_change_needs_more_room(
     changes: int, length_m: float, room_m: float
 ) -> None:
     lane, step = np.zeros(1, LANE)[0], np.zeros(1, PLAN)[0]
@@ -43,8 +43,8 @@ def test_each_further_lane_change_has_its_own_room(
 
 
 @pytest.mark.parametrize(("view_m", "minds"), [(100.0, True), (60.0, False)])
-def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> None:
-    """Whether a driver knows of such a leader depends on the division into zones."""
+def test_a_leader_beyond_the_view_is_ignored(view_m: float, minds: bool) -> None:
+    """A zone may not know a leader that is so far away, so drivers must ignore it in any world."""
     roads = network("merge")
     tables = travel("merge")._replace(view_m=view_m)
     lane = int(roads.lanes["length_m"].argmax())
@@ -73,10 +73,10 @@ def test_a_leader_beyond_the_view_does_not_count(view_m: float, minds: bool) -> 
         (DRIVER_AGENT, 13.1, True),
     ],
 )
-def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
+def test_a_vehicle_with_its_rear_in_the_junction_keeps_its_lane_unless_the_lane_is_short(
     driver: int, length_m: float, waits: bool
 ) -> None:
-    """On lanes too short for two cars, a vehicle changes lanes at the place where it waits."""
+    """On a lane that is too short for two cars, the vehicle changes lanes where it waits."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"] = driver
     lane["length_m"], row["length"], row["s"] = length_m, 5.0, 2.4
@@ -86,7 +86,7 @@ def test_a_vehicle_changes_lanes_when_its_rear_is_out_of_the_junction(
 
 
 @pytest.mark.parametrize(("length_m", "near_m"), [(16.4, 0.0), (18.5, 2.0), (100.0, 5.0)])
-def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
+def test_a_vehicle_keeps_its_lane_near_the_junction_behind_it(
     length_m: float, near_m: float
 ) -> None:
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
@@ -103,7 +103,7 @@ def test_a_vehicle_keeps_its_lane_where_long_vehicles_turn_in(
 def test_a_slow_steered_vehicle_may_change_lanes_close_to_a_junction(
     driver: int, speed: float, stays: bool
 ) -> None:
-    """On a lane of 20 m, a vehicle that waits for a lane change stands close to the junction."""
+    """The vehicle is 3 m behind a junction, on a lane of 20 m."""
     lane, row = np.zeros(1, LANE)[0], blank_vehicle()[0]
     row["driver"], row["length"], lane["length_m"] = driver, 5.0, 20.0
     row["s"], row["speed"] = 2.5 + 3.0, speed
@@ -114,7 +114,7 @@ def test_a_slow_steered_vehicle_may_change_lanes_close_to_a_junction(
 def test_a_lane_change_considers_followers_on_every_incoming_lane(
     far_mps: float, asks: bool
 ) -> None:
-    """A near vehicle that stands before another line does not hide a fast one."""
+    """A fast vehicle counts although a standing vehicle on another incoming lane is nearer."""
     roads, tables = network("grid4x4"), travel("grid4x4")
     lane = int(roads.lanes["num_into"].argmax())
     first = int(roads.lanes["first_into"][lane])
@@ -132,7 +132,7 @@ def test_a_lane_change_considers_followers_on_every_incoming_lane(
 
 @pytest.mark.parametrize(("gap_m", "safe"), [(1.2, False), (2.0, True)])
 def test_no_lane_change_ends_too_close_to_a_leader_at_low_speed(gap_m: float, safe: bool) -> None:
-    """Krauss's model brakes to its safe speed within a reaction time, for any gap: -3.5 m/s²."""
+    """Krauss's model demands only -3.5 m/s² for any gap, because it brakes for a reaction time."""
     roads, types = network("merge"), generated_types().copy()
     set_model(types, MODEL_KRAUSS)
     types["tau"] = 1.0

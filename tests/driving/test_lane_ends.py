@@ -1,4 +1,4 @@
-"""Constraints of lane ends on steered vehicles, and bodies that are still over a line."""
+"""How steered cars approach lane ends, and leaders whose bodies are still over a line."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ from tests.support.driving import suggested
 from tests.support.traffic import network, on_lane, scratch, travel
 
 
-def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_take(
+def test_a_steered_car_that_must_still_change_lanes_brakes_before_the_lane_end(
     tmp_path: Path,
 ) -> None:
     world, right, left, goal = before_dead_end(tmp_path, length_m=200.0)
     roads, plans, tables = world.network, world.plans, world.travel
     way = goal * len(roads.lanes)
     assert plans["change"][goal, right] == 1
-    assert plans["link"][goal, right] >= 0, "the lane of the car continues as well"
+    assert plans["link"][goal, right] >= 0, "the lane of the car has no link"
     assert [misses_last_change(roads.arrays, tables, lane, way) for lane in (right, left)] == [1, 0]
     inside = int(roads.links["first_internal"][plans["link"][goal, right]])
     assert not misses_last_change(roads.arrays, tables, inside, way)
@@ -53,7 +53,7 @@ def test_a_steered_car_stops_before_the_end_of_a_lane_to_a_turn_that_it_cannot_t
 
 
 @pytest.mark.parametrize("speed", [0.0, 0.5])
-def test_a_steered_car_stops_at_its_lane_end_until_its_front_has_left(
+def test_a_steered_car_waits_at_the_lane_end_until_its_front_is_on_the_adjacent_lane(
     tmp_path: Path, speed: float
 ) -> None:
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
@@ -71,7 +71,7 @@ def test_a_steered_car_stops_at_its_lane_end_until_its_front_has_left(
 
 
 def test_a_steered_car_changes_lanes_slowly_near_the_end_of_its_lane(tmp_path: Path) -> None:
-    """At a higher speed, the car would be too late for the change, brake, and start again."""
+    """A faster car would not complete the change before the end of the lane."""
     world, right, _, goal = before_dead_end(tmp_path, length_m=200.0)
     rows = world.vehicles(0)
     end = float(world.network.lanes["length_m"][right])
@@ -84,7 +84,9 @@ def test_a_steered_car_changes_lanes_slowly_near_the_end_of_its_lane(tmp_path: P
 
 
 @pytest.mark.parametrize("over_m", [0.5, -0.5])
-def test_a_rear_before_the_line_beyond_a_short_lane_is_a_leader(over_m: float) -> None:
+def test_a_vehicle_beyond_a_short_lane_is_a_leader_if_its_rear_is_before_the_line(
+    over_m: float,
+) -> None:
     roads, tables = network("grid4x4"), travel("grid4x4")
     inside = np.where(roads.lanes["internal"], roads.lanes["length_m"], np.inf)
     first = int(inside.argmin())
@@ -107,7 +109,7 @@ def test_a_rear_before_the_line_beyond_a_short_lane_is_a_leader(over_m: float) -
 
 
 @pytest.mark.parametrize("over_m", [0.5, -0.5])
-def test_a_vehicle_that_stops_at_a_line_stays_behind_a_rear_over_it(over_m: float) -> None:
+def test_a_vehicle_that_stops_at_a_line_keeps_a_gap_to_a_rear_over_the_line(over_m: float) -> None:
     roads, tables = network("grid4x4"), travel("grid4x4")
     inside = np.where(roads.lanes["internal"], roads.lanes["length_m"], np.inf)
     first = int(inside.argmin())
@@ -139,10 +141,10 @@ def test_a_vehicle_that_stops_at_a_line_stays_behind_a_rear_over_it(over_m: floa
 @pytest.mark.parametrize(("length_m", "over_m", "minds"), [
     (12.0, 2.0, True), (12.0, -1.0, False), (12.0, 13.0, False), (5.0, 2.0, False),
 ])  # fmt: skip
-def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
+def test_a_long_vehicle_that_turns_from_the_adjacent_lane_is_a_leader_on_an_ending_lane(
     length_m: float, over_m: float, minds: bool
 ) -> None:
-    """`over_m`: distance of the front beyond its line; the rear swings out over the ending lane."""
+    """`over_m` is the distance of its front beyond the line. Its rear swings out over the lane."""
     roads, tables = network("merge"), travel("merge")
     lanes = roads.lanes.copy()
     leads = (lanes["num_links"] > 0) & (lanes["left"] >= 0)
@@ -162,10 +164,10 @@ def test_a_long_vehicle_that_turns_beside_a_lane_without_a_link_is_a_leader(
 
 
 @pytest.mark.parametrize(("askew", "hidden"), [(0.5, False), (0.5, True), (0.0, False)])
-def test_a_car_that_reaches_over_the_border_of_a_lane_is_a_leader(
+def test_a_car_askew_that_reaches_over_from_the_adjacent_lane_is_a_leader(
     askew: float, hidden: bool
 ) -> None:
-    """`hidden`: another car stands straight behind it on its lane."""
+    """With `hidden`, another car stands behind that car, straight on the adjacent lane."""
     roads, tables = network("merge"), travel("merge")
     lane = roads.lane_ids.index("weave_1")
     before = int(roads.arrays.into[roads.lanes["first_into"][lane]])

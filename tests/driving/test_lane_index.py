@@ -35,7 +35,7 @@ def indexed(name: str, rows: NDArray[np.void]) -> Scratch:
 
 
 def looked_for(roads: RoadNetwork, rows: NDArray[np.void]) -> list[tuple[int, int, float]]:
-    """Yield row, lane and position of each search: the lane of each vehicle, and its neighbours."""
+    """Return (row, lane, s) of searches on the lane of each vehicle and on its neighbour lanes."""
     asked = []
     for i, row in enumerate(rows):
         here = roads.lanes[row["lane"]]
@@ -72,19 +72,21 @@ def nearest_behind(
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
-    """Return the nearest of all followers; at equal distances, the one with the smallest id."""
+    """Return the nearest follower on any incoming lane; of equally near ones, the smallest id."""
     asked = range(max(1, int(roads.lanes[lane]["num_into"])))
     found = [behind_by(roads.arrays, room, lane, s, own_id, n, reach_m, view_m) for n in asked]
     return min(found, key=lambda one: (one[1], room.entries[one[0]]["id"]))
 
 
 def seen(room: Scratch, k: int) -> tuple[int, float]:
-    """Return row and position of an entry, as the twin does."""
+    """Return row and position of an entry, in the form that the twin returns."""
     return (int(room.entries[k]["row"]), float(room.entries[k]["s"])) if k >= 0 else (-1, np.inf)
 
 
 @given(maps_with_crowds, st.sampled_from([5.0, 60.0, 400.0]))
-def test_neighbours_equal_twin(case: tuple[str, NDArray[np.void]], reach_m: float) -> None:
+def test_found_leaders_and_followers_equal_twin(
+    case: tuple[str, NDArray[np.void]], reach_m: float
+) -> None:
     name, rows = case
     roads = network(name)
     room = indexed(name, rows)
@@ -130,7 +132,7 @@ def test_the_order_of_rows_does_not_matter(
         assert one == other
 
 
-def test_no_search_exceeds_the_view() -> None:
+def test_searches_end_at_the_view_distance() -> None:
     roads = network("ring")
     lane = int(np.argmax(roads.lanes["length_m"]))
     view_m = 40.0
@@ -147,7 +149,7 @@ def test_no_search_exceeds_the_view() -> None:
         assert (last_on(room, lane, 9, 15.0, view_m) >= 0) == sees
 
 
-def test_at_one_place_the_vehicle_with_the_larger_id_leads() -> None:
+def test_of_two_vehicles_at_the_same_place_the_larger_id_is_the_leader() -> None:
     roads = network("ring")
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
@@ -158,7 +160,7 @@ def test_at_one_place_the_vehicle_with_the_larger_id_leads() -> None:
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 
-def test_a_vehicle_that_stands_far_behind_a_border_is_skipped() -> None:
+def test_a_vehicle_that_stands_over_30_m_behind_on_an_incoming_lane_is_no_follower() -> None:
     roads = network("grid4x4")
     lane = int(np.flatnonzero(roads.lanes["internal"])[0])
     link = roads.links[roads.lanes["link"][lane]]
@@ -199,7 +201,7 @@ def test_places_on_neighbour_lanes_equal_twin_and_are_close(name: str) -> None:
                     )
                 )
                 other_x, other_y = place(roads, beside, there)
-                # No point of the neighbour lane is much closer than the mapped one.
+                # No point of the neighbour lane is over 1 m closer than the returned position.
                 assert np.hypot(x - other_x, y - other_y) < nearest + 1.0
                 asked += 1
     assert asked > 0

@@ -1,4 +1,4 @@
-"""A vehicle before a junction, and a vehicle that turns into its lane."""
+"""Vehicles before a junction brake in time for a vehicle that turns into their lane."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], Scene]:
 def test_a_fast_vehicle_brakes_early_for_a_vehicle_that_turns_into_its_lane(
     merging: bool, front_m: float
 ) -> None:
-    # If only the shared area counted, the vehicle would brake too late.
+    # If the vehicle looked only at the shared area, it would brake too late.
     roads, kind = network("intersection"), generated_types()[0]
     own = np.repeat(np.arange(len(roads.links)), roads.links["num_conflicts"])
     picked = int(np.flatnonzero(roads.conflicts["merging"] == merging)[0])
@@ -48,7 +48,7 @@ def test_a_fast_vehicle_brakes_early_for_a_vehicle_that_turns_into_its_lane(
 def test_a_fast_background_driver_slows_down_for_a_merging_vehicle(
     scene: Callable[[str], Scene], speed: float, minds: bool
 ) -> None:
-    """The merging vehicle clears the shared area in time, but it is much slower."""
+    """The merging vehicle leaves the shared area in time, but is much slower."""
     accels = []
     for others in (False, True):
         here = scene("priority")

@@ -1,4 +1,4 @@
-"""Rules of background drivers on small nets: yellow, minor roads, lane changes at a standstill."""
+"""Background drivers at yellow, on minor roads, in slow lane changes and at the end of a trip."""
 
 from __future__ import annotations
 
@@ -56,14 +56,14 @@ def test_krauss_stops_for_yellow_if_its_deceleration_suffices() -> None:
 
 
 def only(path: Path, routes: Path) -> Simulation:
-    """Return a world with the only vehicle of a file."""
+    """Return a started world with the demand of a file that has a single vehicle."""
     world = make(path, [routes], overrides=CLOCK)
     start(world, 1)
     return world
 
 
 @pytest.mark.parametrize(("junctions", "slows"), [("priority", False), ("right_before_left", True)])
-def test_a_yielding_driver_can_stop_until_it_sees_its_foes(
+def test_a_yielding_driver_approaches_slowly_enough_to_stop(
     tmp_path: Path, junctions: str, slows: bool
 ) -> None:
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", junctions)
@@ -81,11 +81,11 @@ def test_a_yielding_driver_can_stop_until_it_sees_its_foes(
     limit = float(network.lanes["speed_mps"].max())
     assert minor == slows or junctions == "priority"
     assert (slowest < 0.75 * limit) == minor
-    assert slowest > 1.0, "without a foe, the car need not stop"
+    assert slowest > 1.0, "the car stopped without a foe"
 
 
-def test_a_left_turn_approaches_its_waiting_position_ready_to_stop(tmp_path: Path) -> None:
-    """As in SUMO, the car is slowest 4.5 m before the position, where it sees that no foe comes."""
+def test_a_left_turn_is_slow_before_its_waiting_position(tmp_path: Path) -> None:
+    """As in SUMO, the car is slowest 4.5 m before the position. There it sees that no foe comes."""
     path = netgenerate(tmp_path / "net.net.xml", *GRID, "-j", "traffic_light")
     network = read_network(path)
     links = network.links
@@ -126,7 +126,7 @@ def test_a_lane_change_continues_at_a_standstill(speed: float, sideways_mps: flo
 
 
 @pytest.mark.parametrize("length", [5.0, 12.0])
-def test_a_background_trip_ends_with_the_front_before_swept_areas(
+def test_a_trip_of_a_background_vehicle_ends_5_m_before_the_end_of_the_road(
     length: float,
 ) -> None:
     tables, roads = travel("grid4x4"), entry_network("grid4x4")

@@ -1,4 +1,4 @@
-"""Rows that follow scripts: their motion, their entries in the indices, and their cues."""
+"""Rows that follow scripts: motion, entries in the indices of lanes and links, and cues."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ WALK_MPS = 1.25
 
 
 def crossing() -> Actor:
-    """Cross the road 40 m from the start of a lane."""
+    """Return a pedestrian who waits for cue 0, then crosses the road 40 m from a lane's start."""
     right, left = STREETS.kerbs_m(LANE, 40.0)
     ends = np.array(
         [STREETS.point(LANE, 40.0, -right - 1.4), STREETS.point(LANE, 40.0, left + 1.4)]
@@ -50,7 +50,7 @@ def crossing() -> Actor:
 def scripted(
     *actors: Actor, goals: dict[int, int] | None = None
 ) -> tuple[TripTables, NDArray[np.void]]:
-    """Return the arguments of kernels, and VEHICLE (n,) of the actors in their first positions."""
+    """Return tables with the actors' scripts, and VEHICLE (n,) at the actors' first positions."""
     scripts, firsts = compile_scripts(ROADS, actors, [Cue(0.0, 0.0, 5.0)], goals or {}, DT)
     base = travel("grid4x4")
     types = np.concatenate([base.types, actor_types()])
@@ -85,7 +85,7 @@ def test_an_actor_waits_for_its_cue_and_then_walks() -> None:
     assert row["wait_s"] == pytest.approx(30 * DT)
     places = follow(tables, row, True, 60)
     way_m = math.dist(start, places[-1])
-    # It accelerates with 2.5 m/s² to its speed, then the speed is constant.
+    # The pedestrian accelerates with 2.5 m/s², then walks at a constant speed.
     ramp_s = WALK_MPS / 2.5
     assert way_m == pytest.approx(WALK_MPS * (60 * DT - 0.5 * ramp_s), abs=0.1)
     assert row["speed"] == WALK_MPS
@@ -97,7 +97,7 @@ def test_an_actor_waits_for_its_cue_and_then_walks() -> None:
 
 
 def covered(row: np.void, at: tuple[float, float]) -> dict[int, tuple[float, float]]:
-    """Return the range of each lane that a body covers, by a fine grid of points of the body."""
+    """Return the range of each lane that a body covers, computed from a fine grid of points."""
     found: dict[int, list[float]] = {}
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])
     lanes, room_m = ROADS.lanes, 3.0 + row["length"]
@@ -152,8 +152,8 @@ def test_drivers_see_a_body_on_every_lane_that_it_covers_now_or_soon() -> None:
                 assert (start, end) == pytest.approx(expected[lane], abs=0.15)
 
 
-def test_scripted_entries_are_sorted_among_others() -> None:
-    """It is the leader of drivers behind it, by its position and not by its id."""
+def test_entries_of_scripted_bodies_are_sorted_among_vehicles() -> None:
+    """An entry of a scripted body is sorted by position, although its id is the largest."""
     tables, rows = scripted(crossing())
     follow(tables, rows[0], True, 60)
     cars = [on_lane(ROADS, LANE, s, tables, id=k) for k, s in enumerate((30.0, 50.0))]
@@ -176,9 +176,9 @@ def riding() -> Actor:
 
 
 def test_a_scripted_vehicle_registers_at_junctions_like_a_driver() -> None:
-    """The twin is a background car at the same position, with a route over the same link.
+    """Compare with a background car at the same position, with a route over the same link.
 
-    Unlike the script, its trip ends on the lane behind that link.
+    The trip of the background car ends on the lane behind that link; the script goes on.
     """
     actor = riding()
     ride = actor.acts[0]
@@ -213,9 +213,9 @@ def announced(tables: TripTables, rows: NDArray[np.void]) -> list[tuple[int, flo
     ]
 
 
-def test_cues_come_at_their_time_or_when_an_agent_is_near() -> None:
+def test_a_cue_comes_at_its_tick_or_when_an_agent_is_near() -> None:
     cues = np.array([(0.0, 0.0, 5.0, -1), (0.0, 0.0, 0.0, 7)], CUE)
-    rows = np.zeros((2, 1, 3), VEHICLE)  # two zones, one world
+    rows = np.zeros((2, 1, 3), VEHICLE)  # two zones of one world
     rows["driver"] = DRIVER_BACKGROUND
     num = np.array([[2], [1]])
     came = np.full((1, 2), -1)
@@ -224,7 +224,7 @@ def test_cues_come_at_their_time_or_when_an_agent_is_near() -> None:
         note_cues(cues, rows, num, np.array([tick]), came)
         return [int(tick) for tick in came[0]]
 
-    assert told(3) == [-1, -1]  # only agents count
+    assert told(3) == [-1, -1]  # a background vehicle triggers no cue
     rows["driver"][1, 0, 0] = DRIVER_AGENT
     rows["x"][1, 0, 0] = 5.1
     assert told(6) == [-1, -1]
@@ -232,12 +232,12 @@ def test_cues_come_at_their_time_or_when_an_agent_is_near() -> None:
     assert told(7) == [7, 7]
     rows["x"][1, 0, 0] = 50.0
     assert told(8) == [7, 7]
-    rows["driver"][0, 0, 2] = DRIVER_AGENT  # the row of a ghost
+    rows["driver"][0, 0, 2] = DRIVER_AGENT  # row 2 of this zone is a ghost
     came[:] = -1
     assert told(2) == [-1, -1]
 
 
-def test_arcs_turn_about_one_centre() -> None:
+def test_an_arc_has_the_given_radius_turn_and_direction() -> None:
     for turn, backwards in ((1.0, False), (-0.7, False), (1.2, True), (-2.0, True)):
         line = arc((3.0, 4.0, 0.4), 5.0, turn, backwards=backwards)
         assert line[0] == pytest.approx([3.0, 4.0, 0.4])
@@ -250,7 +250,7 @@ def test_arcs_turn_about_one_centre() -> None:
         assert np.abs(moved).sum() == pytest.approx(5.0 * abs(turn), rel=1e-3)
 
 
-def test_waits_take_their_time_and_reversing_has_a_negative_speed() -> None:
+def test_a_wait_lasts_its_time_and_a_backward_move_has_a_negative_speed() -> None:
     start = np.array([[0.0, 0.0, 0.0]])
     back = np.array([[0.0, 0.0, 0.0], [-2.0, 0.0, 0.0]])
     last: Pose | None = None
@@ -266,7 +266,7 @@ def test_waits_take_their_time_and_reversing_has_a_negative_speed() -> None:
     assert (last.x, last.speed) == (-2.0, 0.0)
 
 
-def test_the_place_of_a_frame_is_on_its_lane() -> None:
+def test_lane_coordinates_and_xy_of_a_frame_agree() -> None:
     tables, _ = scripted(riding(), crossing(), goals={riding().released_to or 0: 0})
     for frame in tables.scripts.frames[::7]:
         lane = ROADS.lanes[frame["lane"]]

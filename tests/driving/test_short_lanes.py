@@ -1,4 +1,4 @@
-"""A vehicle that has to change to the left on a lane that is not much longer than itself."""
+"""A vehicle has to change to the left on a lane that is hardly longer than the vehicle."""
 
 from __future__ import annotations
 
@@ -27,8 +27,10 @@ DEMAND = """<routes><vType id="car" sigma="0"/>
 
 
 @pytest.mark.parametrize("length_m", [9.0, 11.0, 13.4, 14.4, 14.6, 15.9, 16.1, 20.0])
-def test_on_a_short_lane_a_vehicle_changes_when_it_can(tmp_path: Path, length_m: float) -> None:
-    """On lanes of 13 to 16 m, the vehicle may wait with its rear in the junction."""
+def test_a_vehicle_on_a_short_lane_changes_lanes_when_the_adjacent_lane_is_free(
+    tmp_path: Path, length_m: float
+) -> None:
+    """On lanes of 13 to 16 m, the vehicle may have to wait with its rear in the junction."""
     x = length_m + JUNCTION_M
     files = {"nod": NODES.format(x=x, east=x + 100.0), "edg": EDGES, "con": CONNECTIONS}
     for end, text in files.items():
@@ -45,5 +47,5 @@ def test_on_a_short_lane_a_vehicle_changes_when_it_can(tmp_path: Path, length_m:
         for row in world.vehicles():
             if row["lane"] == lane:
                 stood = max(stood, float(row["wait_s"]))
-    assert stood > 5.0, "at first, the adjacent lane was occupied"
-    assert len(world.vehicles()) == 0, "both vehicles have arrived"
+    assert stood > 5.0, "the vehicle did not wait for the adjacent lane"
+    assert len(world.vehicles()) == 0, "a vehicle has not arrived"

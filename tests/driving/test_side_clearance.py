@@ -1,4 +1,4 @@
-"""A slow vehicle that changes lanes beside a vehicle that stands askew."""
+"""A slow vehicle changes lanes beside a vehicle that stands askew."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ def lanes() -> list[int]:
     ("beyond", "askew_rad", "speed", "room"),
     [(1, 0.3, 0.0, False), (1, 0.0, 0.0, True), (1, 0.3, 1.0, True), (0, 0.3, 0.0, True)],
 )
-def test_a_corner_over_the_adjacent_lane_leaves_no_room(
+def test_a_corner_of_a_standing_bus_over_the_target_lane_leaves_no_room(
     beyond: int, askew_rad: float, speed: float, room: bool
 ) -> None:
-    """A bus stands on the lane beyond the target lane of a car, or on the car's own lane."""
+    """If `beyond` is 1, the bus is on the lane beyond the target lane, else on the car's lane."""
     roads, tables = network("merge"), travel("merge")
     right, middle, left = lanes()
     own = on_lane(roads, right, 40.0, tables, id=0, length=5.0, width=1.8)
@@ -58,10 +58,10 @@ def test_a_corner_over_the_adjacent_lane_leaves_no_room(
         (0.0, 0.0, False),
     ],
 )
-def test_a_vehicle_between_lanes_moves_until_it_would_touch(
+def test_a_vehicle_between_lanes_stops_moving_sideways_before_it_touches_a_corner(
     d: float, speed: float, stays: bool
 ) -> None:
-    """The car comes from the right. The bus on the left lane has a corner over the middle lane."""
+    """The car moves from the right lane to the middle one; a corner of a bus is over that lane."""
     roads, tables = network("merge"), travel("merge")
     _, middle, left = lanes()
     own = on_lane(roads, middle, 40.0, tables, id=0, length=5.0, width=1.8, d=d, speed=speed,

@@ -23,9 +23,9 @@ DT = 0.5
 def watch(
     roads: RoadNetwork, seconds: float, busy: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return (ticks, links with a signal): the state, and the predicted time to its change.
+    """Return two arrays (ticks, links with a signal): states, and predicted times to their change.
 
-    Each detector is occupied in a share `busy` of the ticks.
+    Each detector is occupied in the share `busy` of the ticks.
     """
     random = np.random.default_rng(1)
     links = [k for k, link in enumerate(roads.links) if link["signal"] >= 0]
@@ -82,5 +82,5 @@ def test_actuated_signals_change_no_earlier_than_predicted(tmp_path: Path) -> No
     true = true_times(shown)
     known = np.isfinite(true)
     assert (told[known] <= true[known] + 1e-9).all()
-    assert (told[known] < true[known] - 5.0).any()  # greens were extended
+    assert (told[known] < true[known] - 5.0).any()  # some greens were extended by over 5 s
     assert (told[known] > 3.0).any()

@@ -1,4 +1,4 @@
-"""Swept areas of steered cars in bends, and the drivers that wait for them."""
+"""Areas that steered cars sweep in bends, and drivers that wait before these areas."""
 
 from __future__ import annotations
 
@@ -41,7 +41,9 @@ def rows_of(network: RoadNetwork, link: int) -> np.ndarray:
     return network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
 
 
-def test_rows_of_background_vehicles_stay_unchanged(path: Path, network: RoadNetwork) -> None:
+def test_rows_of_steered_cars_are_added_behind_unchanged_rows_of_background_vehicles(
+    path: Path, network: RoadNetwork
+) -> None:
     plain = read_network(path)
     for link in range(len(plain.links)):
         found, before = rows_of(network, link), rows_of(plain, link)
@@ -50,7 +52,7 @@ def test_rows_of_background_vehicles_stay_unchanged(path: Path, network: RoadNet
     assert len(network.sweeps) > len(plain.sweeps)
     for name in ("swept_m", "fork_m", "num_conflicts", "wait_m"):
         np.testing.assert_array_equal(network.links[name], plain.links[name])
-    again = load_steered(path)  # read from the cache
+    again = load_steered(path)  # the second call reads the cache
     assert again.sweeps.tobytes() == network.sweeps.tobytes()
 
 
@@ -67,15 +69,13 @@ def test_each_area_of_two_steered_cars_has_a_row_on_both_links(network: RoadNetw
 
 
 @pytest.mark.parametrize("agents", [0, 1])
-def test_maps_of_worlds_without_agents_have_no_rows_of_steered_cars(
-    path: Path, agents: int
-) -> None:
+def test_only_maps_of_worlds_with_agents_have_rows_of_steered_cars(path: Path, agents: int) -> None:
     roads = load_world(str(path), agents=agents, background=4).network
     assert (roads.sweeps["own"] == STEERED).any() == (agents > 0)
 
 
 def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
-    """Return a link, and its SWEEP row, on which only steered cars would touch."""
+    """Return a link and its row of SWEEP for an area in which only steered cars would touch."""
     for link in range(len(network.links)):
         rows = rows_of(network, link)
         cars = set(rows["foe"][(rows["own"] == CAR) & (rows["other"] == CAR)])
@@ -93,7 +93,7 @@ def side_by_side(network: RoadNetwork) -> tuple[int, np.void]:
         (DRIVER_BACKGROUND, DRIVER_BACKGROUND, False),
     ],
 )
-def test_a_driver_in_an_agents_seat_waits_before_an_occupied_area(
+def test_the_built_in_driver_of_an_agent_waits_before_an_area_occupied_by_an_agent(
     network: RoadNetwork, asks: int, other: int, waits: bool
 ) -> None:
     link, sweep = side_by_side(network)
@@ -116,7 +116,7 @@ def test_a_driver_in_an_agents_seat_waits_before_an_occupied_area(
 
 
 @pytest.mark.parametrize(("driver", "back"), [(DRIVER_AGENT, True), (DRIVER_BACKGROUND, False)])
-def test_a_steered_car_waits_before_its_line_where_foes_will_sweep(
+def test_a_steered_car_with_red_waits_further_before_a_line_that_foes_sweep_over(
     network: RoadNetwork, driver: int, back: bool
 ) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
@@ -157,14 +157,14 @@ def test_a_slow_car_askew_on_an_adjacent_lane_is_a_leader(
     assert (found > no_constraint(kind)) == minds
 
 
-def test_a_map_without_junctions_has_no_rows() -> None:
+def test_a_map_without_junctions_has_no_swept_areas() -> None:
     assert len(with_steered_sweeps(network_of("ring")).sweeps) == 0
 
 
-def stop_for_a_fast_one(
+def stop_for_a_fast_foe(
     network: RoadNetwork, link: int, sweep: np.void, place: float, front_m: float, speed: float
 ) -> float:
-    """Return where a car at `place` of a link stops for a foe at a distance before its line."""
+    """Return where a car at `place` of a link stops for a foe whose front is before its line."""
     lanes = [int(network.links[k]["from_lane"]) for k in (link, int(sweep["foe"]))]
     rows = np.concatenate([on_lane(network, lane, 30.0, id=k) for k, lane in enumerate(lanes)])
     rows["driver"], rows["hold"] = DRIVER_AGENT, HOLD_NONE
@@ -181,7 +181,7 @@ def stop_for_a_fast_one(
 def test_a_car_in_the_path_of_a_fast_foe_does_not_stop_for_it(
     network: RoadNetwork, beyond_m: float, goes_on: bool
 ) -> None:
-    # The car has the right of way: the fast foe has to brake for it anyway.
+    # The car has the right of way, so the fast foe has to brake in any case.
     found = None
     for link, row in enumerate(network.links):
         own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -193,10 +193,10 @@ def test_a_car_in_the_path_of_a_fast_foe_does_not_stop_for_it(
                 steered = sweep["own"] == sweep["other"] == STEERED
                 if yields and steered and 0.0 < conflict["enter_m"] + 1.0 < sweep["enter_m"]:
                     found = link, sweep, conflict
-    assert found is not None, "no link pair has a sweep beyond the area of the right of way"
+    assert found is not None, "no pair of links has a swept area beyond the shared area"
     link, sweep, conflict = found
     place = float(conflict["enter_m"]) + beyond_m
-    stop = stop_for_a_fast_one(network, link, sweep, place, front_m=20.0, speed=15.0)
+    stop = stop_for_a_fast_foe(network, link, sweep, place, front_m=20.0, speed=15.0)
     assert (stop == np.inf) == goes_on
 
 
@@ -204,7 +204,7 @@ def test_a_car_in_the_path_of_a_fast_foe_does_not_stop_for_it(
 def test_a_yielding_car_does_not_stop_in_the_path_of_a_fast_foe(
     network: RoadNetwork, place: float, goes_on: bool
 ) -> None:
-    # The car turns before a foe with the right of way, and would stop in the foe's path.
+    # The car turns before a foe with the right of way. If it stopped, it would block the foe.
     found = None
     for link, row in enumerate(network.links):
         own = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -214,7 +214,7 @@ def test_a_yielding_car_does_not_stop_in_the_path_of_a_fast_foe(
                 over = conflict["enter_m"] < sweep["enter_m"] < conflict["leave_m"] + 5.0
                 if steered and over and sweep["enter_m"] > 5.0:
                     found = link, sweep
-    assert found is not None, "no link pair has a sweep of a car that yields beyond the middle"
+    assert found is not None, "no pair of links has a swept area in the middle of the yielding link"
     link, sweep = found
-    stop = stop_for_a_fast_one(network, link, sweep, place, front_m=60.0, speed=25.0)
+    stop = stop_for_a_fast_foe(network, link, sweep, place, front_m=60.0, speed=25.0)
     assert (stop == np.inf) == goes_on

@@ -28,7 +28,7 @@ def test_nearest_speed_finds_the_nearest_target_speed(targets: list[float], spee
 
 
 @given(speeds, st.floats(0.0, 40.0), st.sampled_from([FASTER, SLOWER, IDLE]))
-def test_faster_and_slower_go_one_step_and_stay_in_the_list(
+def test_faster_and_slower_select_the_next_target_speed_of_the_list(
     targets: list[float], present: float, action: int
 ) -> None:
     roads = network("merge")
@@ -53,7 +53,7 @@ def test_a_lane_change_selects_the_neighbour_lane_if_there_is_one(name: str) -> 
             assert row[0]["target_lane"] == expected
 
 
-def test_in_the_middle_of_a_straight_lane_the_wheels_are_straight() -> None:
+def test_the_controller_steers_straight_in_the_middle_of_a_lane_and_towards_it_elsewhere() -> None:
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     row = on_lane(roads, lane, 50.0, speed=10.0)
@@ -70,7 +70,7 @@ def test_in_the_middle_of_a_straight_lane_the_wheels_are_straight() -> None:
     assert left > 0.0
 
 
-def test_a_target_that_is_no_neighbour_counts_as_the_own_lane() -> None:
+def test_a_target_lane_that_is_no_neighbour_is_treated_as_the_own_lane() -> None:
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     far = roads.lane_ids.index("main_out_1")
@@ -114,7 +114,7 @@ def test_the_controller_brings_a_car_to_the_middle_and_keeps_it_there(
 @pytest.mark.parametrize(
     ("speed", "d", "askew", "straightens"),
     [
-        (0.3, -0.5, 0.6, True),  # the front would be beyond the far side of the lane
+        (0.3, -0.5, 0.6, True),  # otherwise the front would cross the far side of the lane
         (0.3, -0.5, 0.4, False),  # the car has room to reach the middle
         (0.3, -1.5, 0.5, False),
         (8.0, -0.5, 0.6, True),  # at this speed, the controller straightens the car anyway
@@ -132,10 +132,10 @@ def test_a_slow_car_that_changes_lanes_keeps_its_front_on_the_lane(
 
 
 @pytest.mark.parametrize(("place", "as_fast"), [(5.0, True), (50.0, False)])
-def test_behind_a_junction_a_slow_car_steers_as_at_turning_speed(
+def test_a_slow_car_right_behind_a_junction_steers_as_at_turning_speed(
     place: float, as_fast: bool
 ) -> None:
-    # The car has cut the corner, and would swing out over the other road.
+    # The car has cut the corner. If it steered more, it would swing out over the other direction.
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     row = on_lane(roads, lane, place, speed=1.0, d=-0.2)

@@ -1,4 +1,4 @@
-"""Registration of approaching vehicles, and registered vehicles that can be ignored."""
+"""Which approaching vehicles are registered at links, and which registered ones are ignored."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from tests.support.traffic import on_lane, scratch, travel_by
 
 
 @pytest.mark.parametrize(("speed", "expected"), [(0.0, 30.0), (5.0, 70.0), (20.0, 150.0)])
-def test_vehicles_register_by_travel_time(speed: float, expected: float) -> None:
+def test_the_registration_distance_grows_with_speed(speed: float, expected: float) -> None:
     assert registration_distance_m(speed) == expected
 
 
@@ -47,7 +47,7 @@ def test_vehicles_register_by_travel_time(speed: float, expected: float) -> None
         (HOLD_NONE, 3.1, 0.6, False),
     ],
 )
-def test_a_vehicle_that_stands_without_a_reason_is_ignored(
+def test_a_vehicle_that_stands_at_a_signal_or_without_a_reason_is_ignored(
     hold: int, wait_s: float, speed: float, expected: bool
 ) -> None:
     (row,) = vehicles([(0.0, 0.0, 0.0)], hold=hold, wait_s=wait_s, speed=speed)
@@ -56,12 +56,12 @@ def test_a_vehicle_that_stands_without_a_reason_is_ignored(
 
 @pytest.mark.parametrize("turn", ["s", "r"])
 @pytest.mark.parametrize(("more_m", "hold"), [(-0.1, HOLD_EXIT_BLOCKED), (0.2, HOLD_YIELD)])
-def test_a_yielding_vehicle_behind_a_standing_leader_is_ignored(
+def test_a_vehicle_without_room_behind_a_standing_leader_does_not_count_as_yielding(
     tmp_path: Path, more_m: float, hold: int, turn: str
 ) -> None:
-    """The gap at the line of a side road is slightly less or more than the driver keeps anyway.
+    """The gap to the leader beyond the line is slightly below or above the driver's minimum gap.
 
-    The leader takes the same link as the vehicle, or another one.
+    The leader takes the same link as the vehicle (`turn` = "s") or another link.
     """
     roads = read_network(build_crossing(tmp_path, "priority"))
     ways = [

@@ -1,4 +1,4 @@
-"""Stop signs and agents: the built-in driver in an agent's seat stops and then goes on."""
+"""At stop signs, the built-in driver of an agent stops and then goes on."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ ARRIVAL = TERMS.index("arrival")
 
 @pytest.fixture(scope="module")
 def maps(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
-    """Return a grid of three by three roads with this SUMO type of its junctions."""
+    """Return grids of three by three junctions, by the SUMO type of the junctions."""
     folder = tmp_path_factory.mktemp("stops")
     options = ("--grid", "--grid.number=3", "--grid.length=80", "--default-junction-type")
     return {
@@ -61,7 +61,7 @@ def drive(
 def test_the_built_in_driver_passes_stop_signs(maps: dict[str, Path], kind: str) -> None:
     arrivals, longest, _ = drive(maps[kind], agents=1, steps=1500)
     assert arrivals >= 1
-    assert 0.5 <= longest < 1.5, "without other traffic, it stops and goes on at once"
+    assert 0.5 <= longest < 1.5, "the agent did not stop, or waited long without other traffic"
 
 
 def test_agents_and_background_vehicles_pass_stop_signs_in_turn(maps: dict[str, Path]) -> None:
@@ -70,7 +70,7 @@ def test_agents_and_background_vehicles_pass_stop_signs_in_turn(maps: dict[str, 
     assert hashes == drive(maps["allway_stop"], 6, 1200, zones=4, background=10)[2]
 
 
-def test_without_stop_signs_no_stop_is_noted(maps: dict[str, Path]) -> None:
+def test_no_stop_is_recorded_without_stop_signs(maps: dict[str, Path]) -> None:
     assert drive(maps["priority"], agents=6, steps=200, background=10)[1] == 0.0
 
 
@@ -79,10 +79,11 @@ def test_without_stop_signs_no_stop_is_noted(maps: dict[str, Path]) -> None:
     [(False, 6.5, 1.0, True), (False, 6.5, 0.1, False), (False, 8.0, 1.0, False),
      (True, 3.0, 1.0, True), (True, 8.0, 1.0, False)],
 )  # fmt: skip
-def test_a_vehicle_that_waits_before_a_stop_sign_has_stopped_there(
+def test_a_vehicle_that_waits_close_before_a_stop_sign_has_stopped_at_the_sign(
     maps: dict[str, Path], stub: bool, to_line_m: float, wait_s: float, notes: bool
 ) -> None:
-    # It waits well before its line, over which vehicles sweep; its lane may be short.
+    # The vehicle waits some metres before its line, because others sweep over the line. If `stub`,
+    # its lane is very short, and it waits on the preceding lane.
     roads = read_network(maps["allway_stop"])
     link = next(
         k
@@ -105,7 +106,9 @@ def test_a_vehicle_that_waits_before_a_stop_sign_has_stopped_there(
     assert row["stopped_at"][0] == (link if notes else -1)
     row["wait_s"] = 0.0
     note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
-    assert row["stopped_at"][0] == (link if notes else -1), "it goes on, and its stop is recorded"
+    assert row["stopped_at"][0] == (link if notes else -1), (
+        "the stop is forgotten when the vehicle goes on"
+    )
     row["lane"] = int(roads.links["first_internal"][link])
     note_stop(arrays, steps, row[0], np.zeros(0, np.int32))
     assert row["stopped_at"][0] == -1

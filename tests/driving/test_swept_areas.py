@@ -1,4 +1,4 @@
-"""Swept areas of long vehicles in bends, and the vehicles that wait for them."""
+"""Areas that long vehicles sweep in bends, and vehicles that wait before these areas."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def network(path: Path) -> RoadNetwork:
 
 
 def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
-    """Return a link, and its SWEEP row, on which a bus sweeps over cars at another link's line."""
+    """Return a link and its row of SWEEP for a bus that sweeps over another link's stop line."""
     for link, row in enumerate(network.links):
         for sweep in network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]:
             over = sweep["own"] == BUS and sweep["other"] == CAR and sweep["foe_enter_m"] < -1.5
@@ -72,7 +72,7 @@ def bus_over_a_line(network: RoadNetwork) -> tuple[int, np.void]:
     raise AssertionError("no bus sweeps over a line")
 
 
-def test_each_sweep_has_a_row_on_both_links(network: RoadNetwork) -> None:
+def test_each_swept_area_has_a_row_on_both_links(network: RoadNetwork) -> None:
     own = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
     rows = {
         (int(link), *(row[name].item() for name in network.sweeps.dtype.names or ()))
@@ -83,7 +83,9 @@ def test_each_sweep_has_a_row_on_both_links(network: RoadNetwork) -> None:
         assert (foe, link, other, size, foe_enter, foe_leave, enter, leave) in rows
 
 
-def test_each_link_has_the_smallest_size_that_sweeps_over_its_cars(network: RoadNetwork) -> None:
+def test_each_link_records_the_smallest_size_class_that_sweeps_over_its_cars(
+    network: RoadNetwork,
+) -> None:
     found = set()
     for row in network.links:
         sweeps = network.sweeps[row["first_sweep"] :][: row["num_sweeps"]]
@@ -93,14 +95,17 @@ def test_each_link_has_the_smallest_size_that_sweeps_over_its_cars(network: Road
     assert found >= {BUS, STEERED}
 
 
-def test_stop_lines_are_clear_of_cars_but_not_of_buses(network: RoadNetwork) -> None:
+def test_buses_but_not_cars_sweep_over_stop_lines(network: RoadNetwork) -> None:
     over = network.sweeps[network.sweeps["foe_enter_m"] < -1.0]
     assert not ((over["own"] == CAR) & (over["other"] == CAR)).any()
     assert ((over["own"] == BUS) & (over["other"] == CAR)).any()
 
 
-class Meeting:
-    """A bus before a link, and a car before the line over which the bus sweeps."""
+class BusAndCar:
+    """A bus before a link, and a car before the stop line that the bus sweeps over.
+
+    Vehicle 0 is the bus, vehicle 1 the car.
+    """
 
     def __init__(self, network: RoadNetwork) -> None:
         self.network = network
@@ -112,7 +117,7 @@ class Meeting:
         )  # fmt: skip
 
     def _announced(self, asks: int, places: tuple[float, float]) -> Scratch:
-        """Register the other vehicle; `places`: both fronts, in m beyond their lines."""
+        """Register the vehicle that does not ask; `places` are the fronts in m beyond the lines."""
         room = scratch(self.network, 2)
         other = 1 - asks
         links = (self.link, int(self.sweep["foe"]))
@@ -126,7 +131,7 @@ class Meeting:
         return room
 
     def stop(self, asks: int, places: tuple[float, float], room_m: float = -np.inf) -> float:
-        """Return where the front of a vehicle has to stop."""
+        """Return where the front of the vehicle that asks has to stop, or inf."""
         room, roads = self._announced(asks, places), self.network.arrays
         link = (self.link, int(self.sweep["foe"]))[asks]
         return float(
@@ -134,7 +139,7 @@ class Meeting:
         )
 
     def car_is_swept(self, places: tuple[float, float]) -> bool:
-        """Return whether the bus would sweep over the car if the car entered at its place."""
+        """Return whether the bus would sweep over a car that enters the road at the car's place."""
         room, roads, link = self._announced(1, places), self.network.arrays, self.sweep["foe"]
         return bool(foe_would_sweep_over(roads, self.rows[1], link, places[1], room))
 
@@ -142,33 +147,37 @@ class Meeting:
 def test_a_bus_waits_before_the_junction_for_a_car_that_stands_at_the_line(
     network: RoadNetwork,
 ) -> None:
-    meeting = Meeting(network)
+    meeting = BusAndCar(network)
     assert meeting.stop(0, (-2.0, -1.0)) == 0.0
-    meeting.rows["speed"][1] = 3.0  # the bus drives, so the car stops before the area of the bus
+    meeting.rows["speed"][1] = 3.0  # the car drives, so the bus may wait at the area
     assert meeting.stop(0, (-2.0, -1.0)) == meeting.sweep["enter_m"]
     assert meeting.stop(0, (-2.0, 30.0)) == np.inf
 
 
 def test_a_car_that_has_to_stop_anyway_leaves_room_for_a_bus(network: RoadNetwork) -> None:
-    meeting = Meeting(network)
+    meeting = BusAndCar(network)
     enter_m = meeting.sweep["foe_enter_m"]
     meeting.rows["hold"][0] = HOLD_SIGNAL  # the bus waits for green
     red, inside = room_m(HOLD_SIGNAL, HOLD_NONE), room_m(HOLD_NONE, HOLD_YIELD)
     assert meeting.stop(1, (-20.0, -12.0), red) == enter_m
     assert meeting.stop(1, (-40.0, -12.0), red) == np.inf
-    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, "inside, the car cannot move back"
+    assert meeting.stop(1, (-40.0, -12.0), inside) == enter_m, (
+        "a car inside the junction blocks the bus"
+    )
     meeting.rows["speed"][0] = 15.0  # a fast bus arrives soon from the same distance
     assert meeting.stop(1, (-40.0, -12.0), red) == enter_m
     meeting.rows["speed"][0] = 0.0
-    assert meeting.stop(1, (-2.0, -12.0)) == np.inf, "the car drives on if nothing else stops it"
+    assert meeting.stop(1, (-2.0, -12.0)) == np.inf, (
+        "a car that nothing else stops waits for the bus"
+    )
 
 
 @pytest.mark.parametrize(("over_m", "goes"), [(0.0, False), (1e-9, False), (0.1, True)])
-def test_a_vehicle_that_stands_right_before_the_area_is_outside(
+def test_a_vehicle_that_stands_at_the_border_of_an_area_is_outside(
     network: RoadNetwork, over_m: float, goes: bool
 ) -> None:
-    """The other vehicle is in the area; rounding does not matter."""
-    meeting = Meeting(network)
+    """The other vehicle is in the area. Rounding of the front's position must not matter."""
+    meeting = BusAndCar(network)
     enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
     stop_m = meeting.stop(0, (enter_m + over_m, car_m + 0.5))
     assert (stop_m == np.inf) == goes
@@ -182,11 +191,11 @@ def test_a_vehicle_that_stands_right_before_the_area_is_outside(
         (HOLD_SIGNAL, GIVE_UP_S + 0.1, False),
     ],
 )
-def test_a_bus_passes_a_car_that_has_waited_long_for_it(
+def test_a_bus_passes_a_car_that_has_waited_long_for_the_bus(
     network: RoadNetwork, hold: int, wait_s: float, goes: bool
 ) -> None:
-    """The wait of the bus ends when it begins to move, that of the car does not."""
-    meeting = Meeting(network)
+    """The bus, which begins to move, has a waiting time of 0; the car's waiting time goes on."""
+    meeting = BusAndCar(network)
     enter_m, car_m = (float(meeting.sweep[name]) for name in ("enter_m", "foe_enter_m"))
     meeting.rows["speed"], meeting.rows["wait_s"] = (0.1, 0.0), (0.0, wait_s)
     meeting.rows["hold"] = (HOLD_NONE, hold)
@@ -194,7 +203,7 @@ def test_a_bus_passes_a_car_that_has_waited_long_for_it(
 
 
 def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> None:
-    """A bus waits before every area that begins close to the waiting position of the map."""
+    """A bus also waits before areas that begin up to 3 m before the map's waiting position."""
     earlier = 0
     for link in np.flatnonzero(network.links["wait_m"] < np.inf).tolist():
         row = network.links[link]
@@ -208,10 +217,10 @@ def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> N
     assert earlier > 0
 
 
-def test_a_car_that_stops_for_a_bus_is_ready_to_stop_inside(
+def test_a_car_approaches_a_bus_inside_at_least_as_cautiously_as_an_empty_junction(
     network: RoadNetwork,
 ) -> None:
-    """The bus sweeps beyond the waiting position, and may have left when the car arrives."""
+    """The bus sweeps an area beyond the waiting position. It may have left when the car arrives."""
     links, sweeps, conflicts = network.links, network.sweeps.copy(), network.conflicts.copy()
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     picked = (sweeps["own"] == CAR) & (sweeps["other"] == BUS)
@@ -251,21 +260,21 @@ def test_a_car_that_stops_for_a_bus_is_ready_to_stop_inside(
     assert held(bus=True) >= held(bus=False)
 
 
-def test_before_an_area_the_vehicle_further_along_goes_first(network: RoadNetwork) -> None:
-    meeting = Meeting(network)
+def test_the_vehicle_nearer_to_an_area_goes_first(network: RoadNetwork) -> None:
+    meeting = BusAndCar(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     places = (bus_enter_m - 1.0, enter_m - 1.0)
     assert meeting.stop(1, places) == enter_m
     assert meeting.stop(0, places) == np.inf
-    meeting.rows["speed"][1] = 15.0  # the vehicle can no longer stop
+    meeting.rows["speed"][1] = 15.0  # the car can no longer stop
     assert meeting.stop(0, (bus_enter_m - 9.0, enter_m - 6.0)) == bus_enter_m
 
 
-def test_if_both_are_late_the_vehicle_that_brakes_less_waits(
+def test_the_vehicle_that_has_to_brake_less_waits_if_neither_can_stop_in_time(
     network: RoadNetwork,
 ) -> None:
-    """Neither would stop in time if both tried, or if one changed its decision."""
-    meeting = Meeting(network)
+    """Each driver computes both decisions, so that exactly one vehicle waits."""
+    meeting = BusAndCar(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["speed"] = 4.0, 12.0
     for bus_m, car_m, car_waits in ((1.0, 15.0, True), (1.8, 15.0, False), (1.0, 8.0, False)):
@@ -277,25 +286,29 @@ def test_if_both_are_late_the_vehicle_that_brakes_less_waits(
 def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
     network: RoadNetwork,
 ) -> None:
-    """The foe's leader may wait for the own vehicle: otherwise, none of the three would go."""
-    meeting = Meeting(network)
+    """The foe may stand behind a leader that waits for the car; then none of the three would go."""
+    meeting = BusAndCar(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["wait_s"][0] = 4.0
     assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == np.inf
-    assert meeting.stop(1, (bus_enter_m + 1.0, enter_m - 1.0)) == enter_m, "the bus is in the area"
+    assert meeting.stop(1, (bus_enter_m + 1.0, enter_m - 1.0)) == enter_m, (
+        "the car ignores a bus in the area"
+    )
     meeting.rows["speed"][0] = 1.0
-    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, "the bus drives on"
+    assert meeting.stop(1, (bus_enter_m - 1.0, enter_m - 1.0)) == enter_m, (
+        "the car ignores a bus that drives"
+    )
 
 
 @pytest.mark.parametrize(
     ("front_m", "bus_m", "brakes"),
     [(-2.0, 1.0, True), (-2.0, 80.0, False), (0.5, 40.0, False)],
 )
-def test_a_vehicle_behind_the_junction_waits_before_an_area_there(
+def test_a_vehicle_behind_the_junction_waits_before_a_swept_area(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
 ) -> None:
-    """`front_m`, `bus_m`: positions of the fronts of car and bus beyond the area's start."""
-    meeting = Meeting(network)
+    """`front_m` and `bus_m` are the ways of the fronts of car and bus beyond the area's start."""
+    meeting = BusAndCar(network)
     link, bus_link = int(meeting.sweep["foe"]), meeting.link
     row, sweeps = network.links[link], network.sweeps.copy()
     owner = np.repeat(np.arange(len(network.links)), network.links["num_sweeps"])
@@ -330,10 +343,10 @@ def test_a_vehicle_behind_the_junction_waits_before_an_area_there(
 
 
 @pytest.mark.parametrize(("bus_m", "brakes"), [(1.0, True), (40.0, False)])
-def test_a_vehicle_at_its_goal_waits_for_vehicles_that_sweep_over_the_lane_end(
+def test_a_vehicle_that_arrives_waits_for_a_bus_that_sweeps_over_the_lane_end(
     network: RoadNetwork, bus_m: float, brakes: bool
 ) -> None:
-    meeting = Meeting(network)
+    meeting = BusAndCar(network)
     link, other = meeting.sweep["foe"], meeting.link
     lane = int(network.links["from_lane"][link])
     length_m = float(network.lanes["length_m"][lane])
@@ -358,21 +371,29 @@ def test_a_vehicle_at_its_goal_waits_for_vehicles_that_sweep_over_the_lane_end(
     assert (room.accel[0] < -1.0) == brakes
 
 
-def test_no_car_enters_the_road_where_a_bus_sweeps(
+def test_a_car_must_not_enter_the_road_where_a_bus_sweeps(
     network: RoadNetwork,
 ) -> None:
-    meeting = Meeting(network)
+    meeting = BusAndCar(network)
     enter_m, leave_m = (float(meeting.sweep[name]) for name in ("enter_m", "leave_m"))
     at_line, far = -0.5, float(meeting.sweep["foe_enter_m"]) - 1.0
     assert meeting.car_is_swept((enter_m + 1.0, at_line))
-    assert not meeting.car_is_swept((leave_m + BUS_M + 1.0, at_line)), "the bus has passed"
-    assert not meeting.car_is_swept((enter_m + 1.0, far)), "the car enters before the area"
-    assert not meeting.car_is_swept((enter_m - 5.0, at_line)), "the bus stands"
+    assert not meeting.car_is_swept((leave_m + BUS_M + 1.0, at_line)), (
+        "a bus that has passed counts"
+    )
+    assert not meeting.car_is_swept((enter_m + 1.0, far)), (
+        "a car that enters before the area is swept"
+    )
+    assert not meeting.car_is_swept((enter_m - 5.0, at_line)), "a standing bus counts"
     meeting.rows["speed"][0] = 6.0
-    assert meeting.car_is_swept((enter_m - 5.0, at_line)), "the bus would have to brake hard"
+    assert meeting.car_is_swept((enter_m - 5.0, at_line)), (
+        "a bus that would have to brake hard does not count"
+    )
     assert not meeting.car_is_swept((enter_m - 15.0, at_line))
     meeting.rows["speed"] = 6.0, 4.0
-    assert meeting.car_is_swept((enter_m + 1.0, far)), "the car could not stop before the area"
+    assert meeting.car_is_swept((enter_m + 1.0, far)), (
+        "a car that cannot stop before the area is not swept"
+    )
 
 
 def test_no_vehicle_touches_a_turning_bus(path: Path, tmp_path: Path) -> None:
@@ -390,10 +411,10 @@ def test_no_vehicle_touches_a_turning_bus(path: Path, tmp_path: Path) -> None:
     assert stats.arrived > 40
 
 
-def test_a_rear_over_a_lane_end_counts_for_a_vehicle_that_has_to_change(
+def test_a_vehicle_that_has_to_change_lanes_stops_behind_a_rear_over_the_lane_end(
     network: RoadNetwork,
 ) -> None:
-    """The rear of a bus is on the lane, so a follower must stop there for any route of the bus."""
+    """The rear of a bus is on the lane, so a follower stops behind it, wherever the bus turns."""
     link = int(np.flatnonzero(network.links["num_sweeps"] > 0)[0])
     lane = int(network.links[link]["from_lane"])
     length_m = float(network.lanes[lane]["length_m"])

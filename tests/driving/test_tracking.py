@@ -1,4 +1,4 @@
-"""Tracking of steered vehicles that are moved by hand on simple maps."""
+"""`locate` finds the lanes of steered vehicles that the tests move on simple maps."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ GRIDS: dict[str, LaneGrid] = {}
 def find(
     name: str, row: NDArray[np.void], table: NDArray[np.void] | None = None
 ) -> tuple[str, float, float, int]:
-    """Return (lane, s, d, events) after `locate`."""
+    """Call `locate` and return (lane, s, d, events)."""
     roads = network(name)
     grid = GRIDS.setdefault(name, lane_grid(roads))
     events = locate(roads.arrays, plans(name) if table is None else table, grid, row[0])
@@ -32,7 +32,7 @@ def find(
 
 
 def shift(row: NDArray[np.void], forward: float, left: float) -> None:
-    """Move a vehicle in its own frame, and keep its old lane."""
+    """Move a vehicle by distances in its own frame, without changing the lane of its row."""
     cos, sin = math.cos(row[0]["heading"]), math.sin(row[0]["heading"])
     row["x"] += forward * cos - left * sin
     row["y"] += forward * sin + left * cos
@@ -51,17 +51,17 @@ def test_a_vehicle_on_a_lane_is_located_there(name: str, data: st.DataObject) ->
     s = data.draw(st.floats(0.5, float(here["length_m"]) - 0.5))
     d = data.draw(st.floats(-0.45, 0.45)) * float(here["width_m"])
     row = on_lane(roads, lane, s, d=d)
-    row["s"] += data.draw(st.floats(-3.0, 3.0))  # the search starts at the old position
+    row["s"] += data.draw(st.floats(-3.0, 3.0))  # give `locate` an old position up to 3 m away
     row["d"] = 0.0
     found, found_s, found_d, events = find(name, row)
-    # In a bend, the nearest point may be another one close by.
+    # In a bend, the nearest point may be slightly different from the drawn one.
     assert found == roads.lane_ids[lane]
     assert found_s == pytest.approx(s, abs=1.0)
     assert found_d == pytest.approx(d, abs=0.3)
     assert events == 0
 
 
-def test_beyond_half_a_lane_the_vehicle_is_on_the_neighbour_lane() -> None:
+def test_a_vehicle_over_half_a_lane_aside_is_on_the_neighbour_lane() -> None:
     roads = network("merge")
     right, left = lane_of(roads, "main_in_0"), lane_of(roads, "main_in_1")
     half = 0.5 * float(roads.lanes[right]["width_m"])
@@ -79,8 +79,10 @@ def test_beyond_half_a_lane_the_vehicle_is_on_the_neighbour_lane() -> None:
 
 
 @pytest.mark.parametrize(("apart_m", "expected"), [(0.01, 0), (0.9, 0), (1.5, EVENT_OFF_ROAD)])
-def test_a_seam_between_neighbour_lanes_is_road(apart_m: float, expected: int) -> None:
-    """Bends and rounding leave a seam between lanes; an island is wider than a seam."""
+def test_a_narrow_seam_between_neighbour_lanes_counts_as_road(
+    apart_m: float, expected: int
+) -> None:
+    """Bends and rounding leave seams between lanes. A traffic island is wider than a seam."""
     roads = network("merge")
     right, left = (roads.lanes[lane_of(roads, f"main_in_{k}")] for k in (0, 1))
     points = roads.points.copy()
@@ -94,7 +96,7 @@ def test_a_seam_between_neighbour_lanes_is_road(apart_m: float, expected: int) -
     assert locate(arrays, plans("merge"), grid, row[0]) == expected
 
 
-def test_beyond_the_end_of_a_lane_the_planned_lane_follows() -> None:
+def test_a_vehicle_beyond_the_end_of_a_lane_is_on_the_planned_next_lane() -> None:
     roads = network("grid4x4")
     junction_ways = set()
     lane = lane_of(roads, "A1B1_0")
@@ -113,7 +115,7 @@ def test_beyond_the_end_of_a_lane_the_planned_lane_follows() -> None:
     assert len(junction_ways) == roads.lanes[lane]["num_links"] > 1
 
 
-def test_off_the_road_is_an_event() -> None:
+def test_a_vehicle_off_the_road_has_an_event() -> None:
     roads = network("merge")
     row = on_lane(roads, lane_of(roads, "main_in_0"), 100.0)
     shift(row, 0.0, -1.5)
@@ -125,7 +127,7 @@ def test_off_the_road_is_an_event() -> None:
     assert find("merge", row)[3] & EVENT_OFF_ROAD
 
 
-def test_against_the_lane_is_the_wrong_way() -> None:
+def test_a_vehicle_against_the_lane_has_the_event_wrong_way() -> None:
     roads = network("grid4x4")
     lane = lane_of(roads, "A1B1_0")
     row = on_lane(roads, lane, 40.0)
@@ -137,21 +139,21 @@ def test_against_the_lane_is_the_wrong_way() -> None:
     assert find("grid4x4", row)[3] == 0
 
 
-def test_on_the_lanes_of_the_other_direction_is_the_wrong_way() -> None:
+def test_a_vehicle_on_the_lanes_of_the_other_direction_has_the_event_wrong_way() -> None:
     roads = network("grid4x4")
     outermost = lane_of(roads, "A1B1_1")
     row = on_lane(roads, outermost, 40.0)
     shift(row, 0.0, 3.2)
     found, _, _, events = find("grid4x4", row)
     assert events == EVENT_WRONG_WAY
-    # In the opposite direction it is on the correct side.
+    # Once it faces the opposite direction, the vehicle is on the correct side.
     row["heading"] += math.pi
     found, _, _, events = find("grid4x4", row)
     assert events == 0
     assert found.startswith("B1A1")
 
 
-def test_a_vehicle_on_no_lane_has_the_distance_to_its_last_lane() -> None:
+def test_a_vehicle_on_no_lane_is_measured_from_its_last_lane() -> None:
     roads = network("grid4x4")
     row = on_lane(roads, lane_of(roads, "A1B1_0"), 2.0)
     row["heading"] += math.pi
@@ -173,7 +175,9 @@ def test_a_vehicle_that_crosses_to_another_road_is_located_there() -> None:
 
 
 @given(st.sampled_from(NAMES), st.integers(0, 10_000), st.floats(-3.0, 3.0))
-def test_a_body_covers_the_side_lane_that_it_reaches_into(name: str, lane: int, d: float) -> None:
+def test_the_side_lane_is_the_adjacent_lane_that_the_body_reaches_into(
+    name: str, lane: int, d: float
+) -> None:
     roads = network(name)
     lane %= len(roads.lanes)
     here = roads.lanes[lane]

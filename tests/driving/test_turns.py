@@ -1,4 +1,4 @@
-"""Turns and bends: steered cars stay on the road, and trips avoid turns that are too tight."""
+"""Steered cars stay on the road in turns and bends; trips avoid turns that are too tight."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.traffic import network
 from tests.support.world import traffic_of
 
 STEERING_RAD = math.pi / 4.0
-# A road that bends by 100° to the right, its first lane within 3 m.
+# A road that bends by 100° to the right; its first lane does so within 3 m.
 CORNER = {
     "nod": """<nodes><node id="z" x="-20" y="400"/>
         <node id="a" x="-10" y="200"/><node id="b" x="0" y="0"/>
@@ -49,11 +49,13 @@ def test_a_car_can_take_each_corner_of_a_grid() -> None:
     roads = network("grid4x4")
     links = with_tight_turns(roads, STEERING_RAD).links
     assert links["direction"].tolist() == roads.links["direction"].tolist()
-    blunt = with_tight_turns(roads, 0.3).links  # impossible with this steering angle
-    assert (blunt["direction"] != roads.links["direction"]).any()
+    small_steering = with_tight_turns(
+        roads, 0.3
+    ).links  # 0.3 rad of steering are too little for some turns
+    assert (small_steering["direction"] != roads.links["direction"]).any()
 
 
-def test_turns_that_are_too_tight_are_sharp_and_in_no_trip(tmp_path: Path) -> None:
+def test_only_sharp_turns_are_too_tight_and_no_trip_uses_them(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM)
     world = make_simulation(path, mode="respawn", agents=4, background=0)
     roads = world.network
@@ -70,7 +72,7 @@ def test_turns_that_are_too_tight_are_sharp_and_in_no_trip(tmp_path: Path) -> No
 
 
 def test_a_turn_is_too_tight_if_a_steered_car_leaves_its_road(tmp_path: Path) -> None:
-    # With the aim distance of a straight link, the car would stay on its road.
+    # The bend is too tight although a car that aims as far as on a straight link would stay on it.
     for kind, text in CORNER.items():
         (tmp_path / f"m.{kind}.xml").write_text(text)
     roads = read_network(netconvert(tmp_path, "m"))
@@ -83,7 +85,7 @@ def test_a_turn_is_too_tight_if_a_steered_car_leaves_its_road(tmp_path: Path) ->
     assert corners == {"bc_0": True}
 
 
-def test_turning_in_a_junction_is_not_the_wrong_way() -> None:
+def test_a_vehicle_that_turns_in_a_junction_does_not_drive_the_wrong_way() -> None:
     roads = network("grid4x4")
     grid, sharp = lane_grid(roads), 0
     for link in roads.links[roads.links["first_internal"] >= 0]:
@@ -110,7 +112,7 @@ def test_turning_in_a_junction_is_not_the_wrong_way() -> None:
     assert sharp > 20
 
 
-def test_a_corner_between_two_lanes_is_a_bend(tmp_path: Path) -> None:
+def test_a_corner_between_two_lanes_limits_the_speed_like_a_bend(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM)
     roads = read_network(path)
     link = roads.links[int(np.argmax([_turn_rad(roads, link) for link in roads.links]))]
@@ -121,9 +123,9 @@ def test_a_corner_between_two_lanes_is_a_bend(tmp_path: Path) -> None:
     assert bend_speed(roads.arrays, first, first, -20.0) == math.inf
 
 
-@pytest.mark.slow  # 900 steps
+@pytest.mark.slow
 def test_a_single_agent_on_two_lanes_keeps_its_lane(tmp_path: Path) -> None:
-    """Bends, lines and limits ahead are the same on both lanes."""
+    """Both lanes have the same bends, stop lines and speed limits ahead."""
     path = netgenerate(tmp_path / "random.net.xml", *RANDOM, "-L", "2", "-j", "traffic_light")
     world = make_simulation(path, mode="respawn", agents=1, background=0)
     start(world, 2)
@@ -156,8 +158,8 @@ def test_agents_on_a_random_map_stay_on_their_side(tmp_path: Path, seed: int) ->
         drive(world)
 
 
-def test_all_links_into_one_lane_are_foes(tmp_path: Path) -> None:
-    """For nodes with very many arms, netconvert does not list all merging links as foes."""
+def test_all_links_that_lead_into_one_lane_are_foes(tmp_path: Path) -> None:
+    """netconvert does not list all merging links as foes if a junction has very many arms."""
     arms = ["--spider", "--spider.arm-number", "13", "--spider.circle-number", "1"]
     roads = read_network(netgenerate(tmp_path / "spider.net.xml", *arms))
     pairs = 0
@@ -172,13 +174,13 @@ def test_all_links_into_one_lane_are_foes(tmp_path: Path) -> None:
     assert pairs > 100
 
 
-def test_a_steered_car_does_not_overtake_towards_a_turn_that_is_too_tight(
+def test_a_steered_car_does_not_overtake_on_a_lane_to_a_turn_that_is_too_tight(
     tmp_path: Path,
 ) -> None:
     world, right, left, goal = before_dead_end(tmp_path, length_m=30.0)
     plans = world.plans
     assert plans["turnarounds"][goal, [right, left]].tolist() == [1, 0]
-    assert plans["change"][goal, right] == 0, "the route continues from the right lane"
+    assert plans["change"][goal, right] == 0, "the route does not continue from the right lane"
 
     def wants(lane: int) -> int:
         rows = world.vehicles(0)
@@ -187,4 +189,4 @@ def test_a_steered_car_does_not_overtake_towards_a_turn_that_is_too_tight(
         return int(suggested(world)[0, int(rows["agent"][0]), 1] * 1000.0)
 
     assert wants(left) == 0
-    assert wants(right) > 0, "from the other lane, it overtakes"
+    assert wants(right) > 0, "the car does not overtake from the other lane"

@@ -24,7 +24,7 @@ from tests.support.netgenerate import netgenerate
 from tests.support.traffic import on_lane, scratch, travel_by
 
 STRAIGHT, U_TURN = map(ord, "st")
-BUS = 2  # a size class
+BUS = 2  # size class of buses
 BUS_M = 12.0
 
 
@@ -36,7 +36,7 @@ def network(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
 
 
 def beside(network: RoadNetwork) -> tuple[int, int]:
-    """Find a straight link, and a U-turn from the adjacent lane."""
+    """Return a straight link and the link of a U-turn from the adjacent lane."""
     for link, row in enumerate(network.links):
         lane = network.lanes[row["from_lane"]]
         if row["direction"] == STRAIGHT and lane["left"] >= 0:
@@ -55,7 +55,7 @@ def sweeps_of(network: RoadNetwork, link: int) -> NDArray[np.void]:
 def test_a_u_turn_does_not_conflict_with_the_adjacent_lane(
     network: RoadNetwork,
 ) -> None:
-    """The rear is still on its own lane, which is straight up to the junction."""
+    """While a vehicle turns, its rear is still on its own lane, which is straight."""
     link, turn = beside(network)
     row = network.links[link]
     foes = network.conflicts["foe"][row["first_conflict"] :][: row["num_conflicts"]]
@@ -67,7 +67,7 @@ def test_a_u_turn_does_not_conflict_with_the_adjacent_lane(
 def test_only_long_vehicles_wait_in_a_u_turn_for_adjacent_vehicles(
     network: RoadNetwork, size: int, reaches: bool
 ) -> None:
-    """A long vehicle drives back next to these vehicles, on the adjacent target lane."""
+    """After the turn, a long vehicle drives back on the target lane, next to these vehicles."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -79,7 +79,7 @@ def test_only_long_vehicles_wait_in_a_u_turn_for_adjacent_vehicles(
 
 
 def test_a_bus_in_a_u_turn_reaches_far_over_the_adjacent_lane(network: RoadNetwork) -> None:
-    """A vehicle whose rear is up to 5 m behind the junction is still registered for the bus."""
+    """Vehicles up to 5 m behind the junction are registered, so the bus knows them."""
     links, beyond_m = network.links, []
     for turn in np.flatnonzero(links["direction"] == U_TURN):
         sweeps = sweeps_of(network, turn)
@@ -91,10 +91,10 @@ def test_a_bus_in_a_u_turn_reaches_far_over_the_adjacent_lane(network: RoadNetwo
 
 
 @pytest.mark.parametrize(("bus_m", "brakes"), [(6.0, True), (40.0, False)])
-def test_a_vehicle_waits_for_a_lane_end_while_its_body_covers_the_lane(
+def test_a_vehicle_between_two_lanes_waits_before_an_area_of_the_lane_that_it_leaves(
     network: RoadNetwork, bus_m: float, brakes: bool
 ) -> None:
-    """A car between two lanes, and a bus that sweeps over the end of the lane that it leaves."""
+    """A bus in a U-turn sweeps over the end of the lane that the car leaves."""
     link, turn = beside(network)
     row, sweeps = network.links[link], sweeps_of(network, link)
     picked = (sweeps["foe"] == turn) & (sweeps["own"] == 0) & (sweeps["other"] == BUS)
@@ -118,7 +118,7 @@ def test_a_vehicle_waits_for_a_lane_end_while_its_body_covers_the_lane(
 
 
 @pytest.mark.parametrize(("foe_m", "waits"), [(-20.0, False), (2.0, True)])
-def test_a_bus_leaves_room_for_a_u_turn_ahead_but_not_behind(
+def test_a_bus_leaves_room_for_a_bus_in_a_u_turn_ahead_but_not_for_one_behind(
     network: RoadNetwork, foe_m: float, waits: bool
 ) -> None:
     _, turn = beside(network)
@@ -141,18 +141,18 @@ def test_a_bus_leaves_room_for_a_u_turn_ahead_but_not_behind(
     assert stop == (sweep["enter_m"] if waits else np.inf)
 
 
-def test_a_rear_that_moves_back_reaches_followers_on_its_lane(
+def test_the_rear_of_a_bus_in_a_u_turn_reaches_followers_on_its_lane(
     network: RoadNetwork,
 ) -> None:
-    """A car's rear does not move back, because the car's chord is hardly shorter than its path."""
+    """The rear of a bus moves back in the turn; the rear of a car does not."""
     _, turn = beside(network)
     sweeps = sweeps_of(network, turn)
     behind = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == 0)]
     (bus,) = behind[behind["other"] == BUS]
     assert not (behind["other"] == 0).any()
-    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "the rear of the bus is still before the line"
+    assert 0.0 < bus["foe_enter_m"] < BUS_M - 3.0, "the rear of the bus is beyond the line"
     assert bus["enter_m"] < bus["foe_enter_m"] - BUS_M + 1.0, (
-        "the area extends to the previous position of the rear"
+        "the area does not extend back to the position of the rear"
     )
 
 
@@ -167,7 +167,7 @@ def test_the_gap_to_a_bus_in_a_u_turn_is_larger(network: RoadNetwork, turns: boo
     kind = generated_types()[0]
 
     def stands_m(length: float) -> float:
-        """Return the gap, to 0.25 m, below which a vehicle at rest does not start."""
+        """Return the smallest gap, in steps of 0.25 m, at which a standing vehicle starts."""
         for gap_m in np.arange(0.25, 9.0, 0.25):
             rear_m = length_m - 1.0 - length
             places = [(rear_m - gap_m - 2.5, 5.0), (rear_m + 0.5 * length, length)]
@@ -192,7 +192,7 @@ def test_the_gap_to_a_bus_in_a_u_turn_is_larger(network: RoadNetwork, turns: boo
 def test_no_vehicle_enters_beside_a_bus_in_a_u_turn(
     network: RoadNetwork, bus_m: float | None, swept: bool
 ) -> None:
-    """`bus_m`: distance of the front beyond its line; the bus covers the adjacent lane's start."""
+    """`bus_m` is the distance of the front of the bus beyond its line, or None without a bus."""
     links, sweeps = network.links, network.sweeps
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     reaches = (sweeps["own"] == 0) & (sweeps["other"] == BUS)
@@ -215,23 +215,25 @@ def test_no_vehicle_enters_beside_a_bus_in_a_u_turn(
     assert bus_m is None or may_entry_be_swept(network.arrays, travel, row, room)
     assert is_entry_swept(network.arrays, travel, row, room) == swept
     row["s"] = 30.0
-    assert not is_entry_swept(network.arrays, travel, row, room), "the vehicle enters further on"
+    assert not is_entry_swept(network.arrays, travel, row, room), (
+        "a vehicle that enters 30 m further on is swept"
+    )
 
 
-def dead_end(network: RoadNetwork) -> tuple[int, int]:
-    """Find a U-turn, and a lane without incoming links beside its target lane."""
+def u_turn_without_other_links(network: RoadNetwork) -> tuple[int, int]:
+    """Return a U-turn and the lane beside its target lane, to which no link leads."""
     for turn in np.flatnonzero(network.links["direction"] == U_TURN).tolist():
         right = int(network.lanes["right"][network.links["to_lane"][turn]])
         if right >= 0 and network.lanes["num_into"][right] == 0:
             return turn, right
-    raise AssertionError("no U-turn leads to a road of two lanes alone")
+    raise AssertionError("no U-turn is the only link to a road of two lanes")
 
 
 @pytest.mark.parametrize(("s", "listed"), [(3.0, True), (30.0, False)])
-def test_a_vehicle_on_a_lane_without_a_link_is_listed_at_the_adjacent_one(
+def test_a_vehicle_on_a_lane_without_a_link_is_listed_at_the_link_of_the_adjacent_lane(
     network: RoadNetwork, s: float, listed: bool
 ) -> None:
-    turn, lane = dead_end(network)
+    turn, lane = u_turn_without_other_links(network)
     nowhere = np.zeros(len(network.lanes), PLAN)
     nowhere["next"], nowhere["link"] = -1, -1
     travel = travel_by(nowhere)
@@ -245,11 +247,11 @@ def test_a_vehicle_on_a_lane_without_a_link_is_listed_at_the_adjacent_one(
 
 
 @pytest.mark.parametrize("size", [0, BUS])
-def test_a_bus_in_a_u_turn_waits_for_vehicles_that_have_entered_beside_it(
+def test_a_bus_before_a_u_turn_waits_for_vehicles_that_have_entered_beside_its_target_lane(
     network: RoadNetwork, size: int
 ) -> None:
-    """Vehicles enter only where no bus turns: both links have a row for the area."""
-    turn, lane = dead_end(network)
+    """Vehicles beside the target lane are registered at the U-turn itself, as its own foe."""
+    turn, lane = u_turn_without_other_links(network)
     length_m = float(network.links["length_m"][turn])
     sweeps = sweeps_of(network, turn)
     own = sweeps[(sweeps["foe"] == turn) & (sweeps["own"] == BUS) & (sweeps["other"] == size)]
@@ -271,7 +273,7 @@ def test_a_bus_in_a_u_turn_waits_for_vehicles_that_have_entered_beside_it(
 
 
 @pytest.mark.parametrize(("place_m", "stands_at_sign"), [(-9.5, True), (-16.0, False)])
-def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
+def test_a_bus_that_leaves_room_before_a_stop_sign_waits_at_the_sign_if_it_is_near(
     network: RoadNetwork, place_m: float, stands_at_sign: bool
 ) -> None:
     link, turn = beside(network)
@@ -298,7 +300,7 @@ def test_a_bus_that_leaves_room_far_before_a_stop_sign_stands_at_it(
 
 
 @pytest.mark.parametrize(("turned_rad", "nearer"), [(1.6, True), (-1.6, True), (0.5, False)])
-def test_a_leader_around_a_corner_is_half_its_width_closer(
+def test_the_gap_to_a_leader_turned_by_90_degrees_is_smaller_by_half_its_width(
     network: RoadNetwork, turned_rad: float, nearer: bool
 ) -> None:
     link, _ = beside(network)
@@ -328,10 +330,10 @@ def test_a_leader_around_a_corner_is_half_its_width_closer(
 
 
 @pytest.mark.parametrize(("rest_m", "announced"), [(6.0, True), (20.0, False)])
-def test_a_vehicle_that_changes_lanes_at_the_line_is_listed_on_both(
+def test_a_vehicle_that_changes_lanes_near_the_line_is_listed_for_both_lanes(
     network: RoadNetwork, rest_m: float, announced: bool
 ) -> None:
-    """Otherwise a bus in a U-turn from the lane that the vehicle has left would sweep over it."""
+    """Otherwise, a bus in a U-turn from the lane that the vehicle leaves would sweep over it."""
     link, turn = beside(network)
     lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
     plan = np.zeros(len(network.lanes), PLAN)
@@ -349,10 +351,10 @@ def test_a_vehicle_that_changes_lanes_at_the_line_is_listed_on_both(
 @pytest.mark.parametrize(("gap_m", "over_m", "safe"), [
     (1.5, -8.0, True), (1.5, 1.0, False), (1.5, 4.0, False), (3.0, 1.0, True), (3.0, 4.0, True),
 ])  # fmt: skip
-def test_no_lane_change_ends_close_behind_a_vehicle_over_the_line(
+def test_a_lane_change_close_behind_a_vehicle_in_a_u_turn_is_unsafe(
     network: RoadNetwork, gap_m: float, over_m: float, safe: bool
 ) -> None:
-    """In a U-turn, its body extends further back than its rear position on the path."""
+    """The body of that vehicle extends further back than its rear on the path."""
     link, turn = beside(network)
     lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
     plan = np.zeros(len(network.lanes), PLAN)

@@ -1,4 +1,4 @@
-"""Zipper merging: two lanes become one, vehicles take turns, and none of them stops."""
+"""Zipper merging of two lanes: vehicles take turns, and no vehicle stops."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def roads(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
 
 
 @pytest.mark.parametrize(("per_h", "kind"), [(500, "car"), (900, "car"), (550, "mix")])
-def test_no_vehicle_stops(tmp_path: Path, per_h: int, kind: str) -> None:
+def test_no_vehicle_stops_at_a_zipper(tmp_path: Path, per_h: int, kind: str) -> None:
     world = make_world(*_files(tmp_path, per_h, kind), 300, 1, 0.1)
     commands, slowest = idle_commands(world), np.inf
     for _ in range(3000):
@@ -70,18 +70,18 @@ def _files(folder: Path, per_h: int, kind: str) -> tuple[Path, list[Path]]:
     return net, [routes]
 
 
-def test_the_flow_equals_sumos(tmp_path: Path) -> None:
+def test_the_flow_at_a_zipper_equals_sumos_flow(tmp_path: Path) -> None:
     net, routes = _files(tmp_path, 500, "car")
     found = compare_traffic(net, routes, seconds=300, seed=1)
     assert found.ours.figures.contacts == 0
     assert found.ratio("arrived") == pytest.approx(1.0, abs=0.1)
     assert found.ratio("mean_speed_mps") == pytest.approx(1.0, abs=0.15)
     assert found.ours.figures.mean_delay_s is not None
-    assert found.ours.figures.mean_delay_s < 2.5, "SUMO: 2.0 s"
+    assert found.ours.figures.mean_delay_s < 2.5, "the delay is far above SUMO's 2.0 s"
 
 
 class Pair(NamedTuple):
-    """Two vehicles on both lanes before a zipper, with the APPROACH of each."""
+    """Two vehicles before a zipper, one per lane, with the row of APPROACH of each."""
 
     rows: NDArray[np.void]
     links: list[int]
@@ -117,7 +117,7 @@ def first(roads: RoadNetwork, two: Pair) -> list[bool]:
     to_line=st.tuples(st.floats(0.01, 120.0), st.floats(0.01, 120.0)),
     speeds=st.tuples(st.floats(0.0, 30.0), st.floats(0.0, 30.0)),
 )
-def test_both_drivers_know_the_same_order(
+def test_both_drivers_at_a_zipper_compute_the_same_order(
     roads: RoadNetwork, to_line: tuple[float, float], speeds: tuple[float, float]
 ) -> None:
     assert sorted(first(roads, pair(roads, to_line, speeds))) == [False, True]
@@ -137,10 +137,10 @@ def test_the_vehicle_ahead_goes_first_then_the_faster_then_the_smaller_id(
         ({"hold": (HOLD_EXIT_BLOCKED, HOLD_NONE)}, False),
         ({"hold": (HOLD_YIELD, HOLD_NONE)}, True),
         ({"wait_s": (4.0, 0.0)}, False),  # the vehicle stands without a reason
-        ({"to_go": (2.0, np.inf)}, False),  # the vehicle ends its trip before the line
+        ({"to_go": (2.0, np.inf)}, False),  # the trip of the vehicle ends before the line
     ],
 )
-def test_no_driver_waits_for_a_vehicle_that_does_not_drive(
+def test_a_driver_at_a_zipper_ignores_a_vehicle_that_cannot_go_on(
     roads: RoadNetwork, fields: dict[str, object], goes: bool
 ) -> None:
     two = pair(roads, (1.0, 6.0), (0.0, 3.0), **fields)
@@ -153,7 +153,7 @@ def test_a_driver_approaches_a_zipper_without_being_ready_to_stop(roads: RoadNet
         assert not is_minor(roads.arrays, link, NO_PHASE)
 
 
-def test_where_zipper_links_cross_no_vehicle_waits_for_ever(tmp_path: Path) -> None:
+def test_no_vehicle_waits_for_ever_where_zipper_links_cross(tmp_path: Path) -> None:
     options = ("--grid", "--grid.number=2", "--grid.length=80", "--grid.attach-length=120", "-L=2")
     net = netgenerate(tmp_path / "grid.net.xml", *options, "-j=zipper")
     assert (read_network(net).links["state"] == ord("Z")).any()

@@ -1,4 +1,4 @@
-"""Actuated signals switch as in SUMO, for any order of rows and any number of worlds."""
+"""Actuated signals switch in the same ticks as in SUMO."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def grid(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def demand(path: Path, headway_s: float) -> Path:
-    """Write routes straight on and around a corner, with a different headway on each side."""
+    """Write flows that go straight or turn; each flow has its own headway."""
     ways = [("left0A0", "B0right0"), ("bottom0A0", "A1top0"), ("right1B1", "A1left1")]
     ways += [("top1B1", "B0bottom1"), ("left1A1", "B0right0"), ("bottom1B0", "A1left1")]
     flows = "".join(
@@ -74,7 +74,7 @@ def run_sumo(net: Path, routes: Path, step_s: float, seconds: float) -> Any:
 def place(
     network: RoadNetwork, worlds: Worlds, vehicles: list[tuple[str, float, float, float]]
 ) -> None:
-    """Put SUMO's vehicles, whose positions are those of their fronts, into the rows of world 0."""
+    """Put SUMO's vehicles into the rows of world 0; SUMO's positions are those of the fronts."""
     rows = worlds.rows[0]
     for row, (lane_id, front, speed, length) in zip(rows, vehicles, strict=False):
         row["lane"] = network.lane_ids.index(lane_id)
@@ -109,7 +109,7 @@ def shown(network: RoadNetwork, worlds: Worlds, world: int = 0) -> dict[str, str
 
 
 @pytest.mark.parametrize(("headway_s", "step_s"), [(4.0, 0.5), (15.0, 0.5), (6.0, 0.1)])
-def test_same_vehicles_make_the_signals_switch_at_sumos_ticks(
+def test_signals_switch_in_the_same_ticks_as_in_sumo(
     grid: Path, tmp_path: Path, headway_s: float, step_s: float
 ) -> None:
     seconds = 300.0 if step_s > 0.2 else 100.0
@@ -120,14 +120,14 @@ def test_same_vehicles_make_the_signals_switch_at_sumos_ticks(
     for tick, sumo_tick in enumerate(theirs["ticks"]):
         worlds.ticks[0] = tick
         look_and_switch(network, worlds, step_s)
-        # The state that SUMO reports after a step applied during the step.
+        # SUMO reports after a step the signal state that applied during the step.
         assert shown(network, worlds) == sumo_tick["states"], f"at {tick * step_s} s"
         seen.add(tuple(sumo_tick["states"].values()))
         place(network, worlds, sumo_tick["vehicles"])
     assert len(seen) > 10
 
 
-def test_detectors_lie_where_sumos_lie(grid: Path, tmp_path: Path) -> None:
+def test_detectors_have_the_positions_of_sumos_detectors(grid: Path, tmp_path: Path) -> None:
     theirs = run_sumo(grid, demand(tmp_path / "d.rou.xml", 9.0), 1.0, 1.0)["detectors"]
     network = read_network(grid)
     ours = sorted((network.lane_ids[row["lane"]], float(row["s_m"])) for row in network.detectors)
@@ -135,7 +135,7 @@ def test_detectors_lie_where_sumos_lie(grid: Path, tmp_path: Path) -> None:
     np.testing.assert_allclose([s for _, s in ours], [s for _, s in theirs], atol=0.02)
 
 
-def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
+def test_signals_do_not_depend_on_the_order_of_rows_or_on_other_worlds(grid: Path) -> None:
     network = read_network(grid)
     rng = np.random.default_rng(0)
     one, many = make_worlds(1, 40, network), make_worlds(2, 40, network)
@@ -155,7 +155,7 @@ def test_order_of_rows_and_other_worlds_change_nothing(grid: Path) -> None:
         for name in ("signal_phase", "controllers", "detected_s"):
             assert getattr(one, name)[0].tobytes() == getattr(many, name)[1].tobytes()
     assert shown(network, many, 0) != shown(network, many, 1), (
-        "the empty world switches at other times"
+        "the empty world and the full world show the same letters"
     )
 
 

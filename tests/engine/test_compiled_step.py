@@ -1,4 +1,4 @@
-"""A step as one compiled call has the same bytes as a step that is run phase by phase."""
+"""A step in one compiled call gives the same bytes as a step that runs phase by phase."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ def compare(compiled: Simulation, plain: Simulation, steps: int = STEPS) -> None
 
 
 @pytest.mark.parametrize("name", WORLDS)
-def test_worlds_are_the_same(name: str) -> None:
+def test_compiled_steps_equal_steps_by_phase(name: str) -> None:
     env, mode, overrides = WORLDS[name]
     made = [
         make_simulation(env, mode=mode, agents=5, background=20, num_worlds=2, overrides=overrides)
@@ -69,14 +69,16 @@ def test_worlds_are_the_same(name: str) -> None:
     compare(*made)
 
 
-def test_actuated_signals_and_ordered_departures_are_the_same(tmp_path: Path) -> None:
+def test_compiled_steps_with_actuated_signals_and_demand_equal_steps_by_phase(
+    tmp_path: Path,
+) -> None:
     env = actuated_grid(tmp_path)
     made = [make_simulation(env, mode="respawn", agents=4, num_worlds=2) for _ in range(2)]
     assert made[0].config.traffic.source != "sumo-traffic"
     compare(*made)
 
 
-def test_changed_lanes_are_the_same() -> None:
+def test_compiled_steps_with_changed_lanes_equal_steps_by_phase() -> None:
     compiled, plain = (
         make_simulation("grid4x4", mode="respawn", agents=4, overrides={"map.changed_lanes": 3})
         for _ in range(2)
@@ -102,7 +104,7 @@ def test_changed_lanes_are_the_same() -> None:
     [{"zones.count": 4}, {"v2x.enabled": True}, {"scenario.name": "pedestrian_crossing"}],
     ids=["zones", "messages", "scenario"],
 )
-def test_other_worlds_run_phase_by_phase(overrides: dict[str, Any]) -> None:
+def test_worlds_with_unsupported_settings_run_phase_by_phase(overrides: dict[str, Any]) -> None:
     simulation = make_simulation("grid4x4", mode="respawn", agents=2, overrides=overrides)
     start(simulation, seed=0)
     simulation.step(idle(simulation))

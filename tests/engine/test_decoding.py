@@ -1,4 +1,4 @@
-"""The fast path of decoding actions has the results of the general path."""
+"""Decoding of actions: the fast path gives the same results as the general path."""
 
 from __future__ import annotations
 
@@ -16,37 +16,37 @@ AGENTS = ("car_0", "car_1", "car_2")
 MASK = np.array([[True, False, True], [True, True, False]])
 
 
-def slowly(actions: NDArray[Any]) -> NDArray[Any]:
-    """Return the same numbers in an array that takes the general path."""
+def for_general_path(actions: NDArray[Any]) -> NDArray[Any]:
+    """Return a read-only copy, which the decoder handles in the general path."""
     actions = actions.copy()
     actions.flags.writeable = False
     return actions
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_pairs_are_decoded(dtype: type) -> None:
+def test_both_paths_decode_continuous_actions_equally(dtype: type) -> None:
     actions = np.random.default_rng(0).uniform(-1.0, 1.0, (2, 3, 2)).astype(dtype)
-    actions[~MASK] = np.nan  # actions of agents without a vehicle are not read
+    actions[~MASK] = np.nan  # must not be read: these agents have no vehicle
     config = ActionConfig(kind="continuous")
     found = ActionDecoder(config, 2, AGENTS).from_array(actions, MASK)
-    expected = ActionDecoder(config, 2, AGENTS).from_array(slowly(actions), MASK)
+    expected = ActionDecoder(config, 2, AGENTS).from_array(for_general_path(actions), MASK)
     assert found.controls.tobytes() == expected.controls.tobytes()
     assert found.meta_actions.tobytes() == expected.meta_actions.tobytes()
     assert found.controls[~MASK].tolist() == [[0.0, 0.0]] * 2
 
 
-def test_choices_are_copied() -> None:
+def test_both_paths_decode_discrete_actions_equally() -> None:
     actions = np.random.default_rng(0).integers(0, 5, (2, 3))
     actions[~MASK] = 99
     config = ActionConfig(kind="discrete")
     found = ActionDecoder(config, 2, AGENTS).from_array(actions, MASK)
-    expected = ActionDecoder(config, 2, AGENTS).from_array(slowly(actions), MASK)
+    expected = ActionDecoder(config, 2, AGENTS).from_array(for_general_path(actions), MASK)
     assert found.meta_actions.tobytes() == expected.meta_actions.tobytes()
     assert found.meta_actions[MASK].tolist() == actions[MASK].tolist()
 
 
 @pytest.mark.parametrize("wrong", [1.001, -np.inf, np.nan])
-def test_a_wrong_pair_changes_nothing(wrong: float) -> None:
+def test_a_refused_continuous_action_changes_no_control(wrong: float) -> None:
     decoder = ActionDecoder(ActionConfig(kind="continuous", out_of_range="error"), 2, AGENTS)
     actions = np.full((2, 3, 2), 0.5)
     before = decoder.from_array(actions, MASK).controls.copy()
@@ -60,7 +60,7 @@ def test_a_wrong_pair_changes_nothing(wrong: float) -> None:
     assert (decoder.from_array(actions, MASK).controls == before).all()
 
 
-def test_a_wrong_choice_is_refused() -> None:
+def test_an_invalid_discrete_action_is_refused() -> None:
     decoder = ActionDecoder(ActionConfig(kind="discrete"), 2, AGENTS)
     actions = np.zeros((2, 3), dtype=np.int64)
     actions[0, 2] = 5

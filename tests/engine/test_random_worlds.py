@@ -1,7 +1,7 @@
-"""Random worlds: maps, drivers, clocks and zones are drawn; divided worlds stay equal.
+"""Worlds with random maps, populations, clocks and zones: divided worlds equal undivided ones.
 
-Agents use the actions of the built-in driver, or random ones: they leave their lanes, turn
-round, block others and drive against the traffic.
+Agents take the actions of the built-in driver with noise, or random actions. With random actions,
+they leave their lanes, turn round, block other vehicles and drive against the traffic.
 """
 
 from __future__ import annotations
@@ -34,22 +34,22 @@ def pick(rng: np.random.Generator, *choices: Any) -> Any:
     return choices[rng.integers(len(choices))]
 
 
-def drawn_map(rng: np.random.Generator, path: Path) -> Path:
+def random_map(rng: np.random.Generator, path: Path) -> Path:
     options = [
         *SHAPES[pick(rng, *SHAPES)],
         *("--default-junction-type", pick(rng, *JUNCTIONS)),
         *("-L", str(rng.integers(1, 4)), "--seed", str(rng.integers(1 << 20))),
         *("--default.speed", pick(rng, "8.3", "13.9", "25", "33")),
         *pick(rng, (), ("--no-turnarounds",)),
-        *pick(rng, (), ("--no-internal-links",)),  # vehicles jump over such junctions
+        *pick(rng, (), ("--no-internal-links",)),  # then vehicles jump over junctions
         *pick(rng, (), ("--tls.default-type", "actuated")),
     ]
     return netgenerate(path, *options)
 
 
-def drawn_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Simulation]:
-    """Return a world, undivided and divided, at the start of an episode."""
-    path = drawn_map(rng, folder / "drawn.net.xml")
+def random_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Simulation]:
+    """Return an undivided world and the same world with zones, at the start of an episode."""
+    path = random_map(rng, folder / "drawn.net.xml")
     tick_s = pick(rng, 0.05, 0.1, 0.2)
     world = {
         "clock.sim_dt_s": tick_s,
@@ -77,7 +77,7 @@ def drawn_world(rng: np.random.Generator, folder: Path) -> tuple[Simulation, Sim
 
 
 def acts(rng: np.random.Generator, whole: Simulation) -> Iterator[Commands]:
-    """Return random actions, or suggested actions with errors."""
+    """Yield random actions, or suggested actions with noise."""
     shape = whole.outputs.present.shape
     wild = bool(rng.random() < 0.5)
     drift = np.zeros((*shape, 2))
@@ -96,7 +96,7 @@ def acts(rng: np.random.Generator, whole: Simulation) -> Iterator[Commands]:
 def check(seed: int, steps: int, folder: Path) -> None:
     rng = np.random.default_rng(seed)
     try:
-        whole, divided = drawn_world(rng, folder)
+        whole, divided = random_world(rng, folder)
     except CapacityError as error:
         pytest.skip(f"the map that was drawn is too small: {error}")
     for commands, _ in zip(acts(rng, whole), range(steps), strict=False):
@@ -111,11 +111,11 @@ def check(seed: int, steps: int, folder: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_random_worlds_give_equal_results_divided_or_not(seed: int, tmp_path: Path) -> None:
+def test_random_divided_worlds_equal_undivided_worlds(seed: int, tmp_path: Path) -> None:
     check(seed, 120, tmp_path)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(12, 400))
-def test_many_random_worlds_give_equal_results_divided_or_not(seed: int, tmp_path: Path) -> None:
+def test_many_random_divided_worlds_equal_undivided_worlds(seed: int, tmp_path: Path) -> None:
     check(seed, 400, tmp_path)

@@ -1,4 +1,4 @@
-"""The order of rows in the arrays does not matter: shuffled worlds have the same bytes."""
+"""Results do not depend on the order of rows: a world with shuffled rows has the same bytes."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ STEPS = 150
 
 
 def shuffle_rows(simulation: Simulation, rng: np.random.Generator) -> int:
-    """Shuffle the committed rows of each world; return how many of them changed places."""
+    """Shuffle the committed rows of each world; return how many rows changed their place."""
     worlds = simulation.shards[0].worlds
     moved = 0
     for w, num in enumerate(worlds.num_owned):
@@ -54,8 +54,8 @@ def test_shuffled_rows_give_the_same_bytes(
     for simulation in (tidy, shuffled):
         start(simulation, seed=5)
     rng = np.random.default_rng(0)
-    # Every second agent steers to the left, more than its driver can correct: some vehicles
-    # collide or leave the road, and successors enter.
+    # Every second agent steers to the left more than its driver can correct, so some vehicles
+    # collide or leave the road, and new vehicles enter.
     pull = np.zeros((1, tidy.outputs.present.shape[1], 2))
     pull[0, ::2, 1] = 1.6
     moved = 0
@@ -68,5 +68,5 @@ def test_shuffled_rows_give_the_same_bytes(
         assert shuffled.traffic_stats() == tidy.traffic_stats()
         for mine, other in zip(shuffled.outputs, tidy.outputs, strict=True):
             np.testing.assert_array_equal(mine, other)
-    assert moved > 10 * STEPS, "hardly anything shuffled"
+    assert moved > 10 * STEPS, "too few rows changed their place"
     assert agents == 1 or tidy.traffic_stats().removed > 0

@@ -1,4 +1,4 @@
-"""Signals follow the programs of the map, which the test reads from the XML itself."""
+"""Signals follow the programs in the map's XML."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def letters(simulation: Simulation) -> dict[str, str]:
     return shown
 
 
-Program = tuple[Fraction, list[tuple[Fraction, str]]]  # offset; duration and state of each phase
+Program = tuple[Fraction, list[tuple[Fraction, str]]]  # offset; (duration, state) of each phase
 
 
 def programs(source: Path) -> dict[str, Program]:
@@ -40,7 +40,7 @@ def programs(source: Path) -> dict[str, Program]:
 
 
 def planned(program: Program, time: Fraction) -> str:
-    """Return the state of a program as SUMO runs it: at time - offset in its cycle."""
+    """Return the state of a program at a time; its cycle begins at the offset, as in SUMO."""
     offset, phases = program
     left = (time - offset) % sum(duration for duration, _ in phases)
     ends = accumulate(duration for duration, _ in phases)

@@ -1,4 +1,4 @@
-"""Traffic without agents: no vehicle is lost, crashes, breaks a rule, or stands forever."""
+"""Traffic of built-in drivers: no vehicle is lost, collides, breaks a rule or stands forever."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ from cavmarl.driving.kernels.junctions.gaps import link_signal
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import drive, make_simulation, make_traffic, start
 
-# Environments, with a number of background vehicles that flows freely.
+# Environments, and a number of background vehicles that does not cause a jam.
 FREE_FLOW = {"ring": 12, "merge": 14, "grid4x4": 40, "town": 40}
 PER_TICK = {"clock.ctrl_dt_s": 0.05}
 
 
 def minutes(simulation: Simulation, many: float) -> Iterator[int]:
-    """Step the worlds for some minutes; yield the number of each step."""
+    """Step the worlds for this number of minutes; yield the number of each step."""
     for step in range(round(many * 60.0 / simulation.config.clock.ctrl_dt_s)):
         drive(simulation)
         yield step
@@ -48,18 +48,18 @@ def test_no_vehicle_is_lost(env: str, mode: str) -> None:
                 assert here + np.count_nonzero(waiting["agent"] < 0) == background
 
 
-def test_departures_without_room_wait_and_enter_later() -> None:
+def test_departures_without_room_enter_later() -> None:
     simulation = make_traffic("merge", background=120)
     start(simulation, seed=0)
     first = set(simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"].tolist())
     assert len(first) > 20
     for _ in minutes(simulation, 1.0):
         queue = simulation.departures.queue[0, : simulation.departures.num_queue[0]]["id"]
-        assert (np.diff(queue) > 0).all(), "the queue is in the order of ids"
+        assert (np.diff(queue) > 0).all(), "the queue is not in the order of ids"
     assert len(first & set(queue.tolist())) < 0.75 * len(first)
 
 
-def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
+def test_a_closed_world_without_room_for_its_agents_is_refused() -> None:
     simulation = make_simulation("ring", mode="closed", agents=90, background=0)
     with pytest.raises(CapacityError, match=r"population\.agents = 90.*free places for \d+"):
         start(simulation, seed=0)
@@ -74,7 +74,7 @@ def test_a_closed_world_too_full_for_its_agents_is_refused() -> None:
         (100, 0, r"--agents N\) to \d+ or less$"),
     ],
 )
-def test_a_population_without_room_names_the_keys_to_change(
+def test_the_error_for_a_full_map_names_the_keys_to_change(
     agents: int, background: int, words: str
 ) -> None:
     with pytest.raises(CapacityError, match=words):
@@ -85,7 +85,9 @@ def test_a_population_without_room_names_the_keys_to_change(
     ("env", "agents", "background"),
     [("ring22", 100, 20), ("ring22", 1, 60), ("ring22", 12, 0), ("ring", 90, 20), ("ring", 90, 0)],
 )
-def test_the_advice_for_a_full_map_works(env: str, agents: int, background: int) -> None:
+def test_a_population_with_the_numbers_of_the_error_has_room(
+    env: str, agents: int, background: int
+) -> None:
     with pytest.raises(CapacityError) as caught:
         start(make_simulation(env, mode="closed", agents=agents, background=background), seed=1)
     advised = dict(re.findall(r"\((agents|background)=N, --\w+ N\) to (\d+)", str(caught.value)))
@@ -121,7 +123,7 @@ def test_drivers_do_not_collide_or_stand_forever(
 
 
 @pytest.mark.parametrize("env", FREE_FLOW)
-def test_drivers_keep_the_limit_times_their_speed_factor(env: str) -> None:
+def test_drivers_drive_at_most_the_speed_limit_times_their_speed_factor(env: str) -> None:
     simulation = make_traffic(env, background=FREE_FLOW[env], num_worlds=2)
     start(simulation, seed=7)
     lanes = simulation.network.lanes
@@ -134,7 +136,7 @@ def test_drivers_keep_the_limit_times_their_speed_factor(env: str) -> None:
             ratios.append(ratio)
             roads.append(~lane["internal"])
     ratio = np.concatenate(ratios)
-    # The model approaches a lower limit from above, so the speed stays some per cent higher.
+    # After a lower limit begins, the speed decays towards it and stays a few per cent above it.
     assert ratio.max() < 1.05
     assert np.mean(ratio[np.concatenate(roads)] > 1.001) < 0.02
     assert ratio.max() > 0.9, "no vehicle drives at the limit on a free road"

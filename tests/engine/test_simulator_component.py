@@ -1,4 +1,4 @@
-"""Zones in other simulators: exact simulators change no bit, faulty ones cause typed errors."""
+"""Zones that other simulators run: an exact one changes no bit, a faulty one causes an error."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ SEEN: dict[str, Any] = {"agents": 4, "background": 40, "seed": 3}
 def hosted(
     name: str, *zones: int, overrides: Mapping[str, Any] | None = None, **keys: Any
 ) -> cavmarl.CavVectorEnv:
-    """Create worlds of four zones, some of which a simulator runs."""
+    """Create worlds of four zones; the simulator `name` runs the given zones."""
     chosen = dict.fromkeys(zones or (1, 2), name)
     keys = {**SEEN, **keys}
     return cavmarl.make_vec(
@@ -40,7 +40,7 @@ def counts_of(vec: cavmarl.CavVectorEnv, world: int = 0) -> dict[str, int]:
     return dict(vec.simulation.transfers[world].counts)
 
 
-def test_an_exact_simulator_gives_the_undivided_world(tmp_path: Path) -> None:
+def test_a_world_with_an_exact_simulator_equals_the_undivided_world(tmp_path: Path) -> None:
     journal = tmp_path / "run.jsonl"
     settings = {"zones.check_invariants": True, "zones.journal": str(journal)}
     whole = cavmarl.make_vec(ENV, **SEEN)
@@ -52,7 +52,7 @@ def test_an_exact_simulator_gives_the_undivided_world(tmp_path: Path) -> None:
         assert divided.simulation.migrations > 10
         for one in (first, second):
             assert one.counts["spawned"] > one.counts["dropped"] > 0
-            assert one.counts["driven"] > 50, "agents have driven there"
+            assert one.counts["driven"] > 50, "agents rarely drove in the zone"
         divided.close()
         assert first.is_closed
         assert second.is_closed
@@ -64,7 +64,7 @@ def test_an_exact_simulator_gives_the_undivided_world(tmp_path: Path) -> None:
     assert hosts == [(0, 0), (1, 2), (2, 3), (3, 0)]
 
 
-def test_sensors_messages_and_several_worlds_work_in_hosted_zones() -> None:
+def test_hosted_zones_support_sensors_messages_and_several_worlds() -> None:
     settings = {
         "v2x.enabled": True,
         "rig": {
@@ -83,11 +83,11 @@ def test_sensors_messages_and_several_worlds_work_in_hosted_zones() -> None:
             assert np.array_equal(frames.data, divided.frames()[sensor].data)
         whole.reset(), divided.reset()
         steps_alike(whole, divided, 10)
-        assert len(OwnKinematics.made) == 8, "a reset uses the same simulators again"
+        assert len(OwnKinematics.made) == 8, "a reset made new simulators"
         divided.close()
 
 
-def test_simulators_are_shown_ghosts_and_signals() -> None:
+def test_simulators_get_the_ghosts_and_signal_states_of_their_zone() -> None:
     compared = 0
     with registered(OwnKinematics) as name:
         vec = hosted(name, 1, overrides={"clock.ctrl_dt_s": 0.05})
@@ -110,7 +110,7 @@ def test_simulators_are_shown_ghosts_and_signals() -> None:
 
 
 class Hesitant(OwnKinematics):
-    """A simulator that refuses each vehicle at first."""
+    """A simulator that refuses each vehicle in the first `times` calls."""
 
     times = 2
 
@@ -130,7 +130,7 @@ class Hesitant(OwnKinematics):
             del self.counts[f"asked for {vehicle}"]
 
 
-def test_refused_vehicles_stay_with_their_zone_and_enter_later() -> None:
+def test_a_refused_vehicle_stays_in_its_zone_and_is_transferred_later() -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {
         "zones.check_invariants": True,
@@ -154,7 +154,7 @@ class Unwilling(Hesitant):
     times = 10**6
 
 
-def test_a_vehicle_that_is_refused_for_too_long_is_an_error() -> None:
+def test_a_simulator_that_refuses_a_vehicle_for_too_long_is_an_error() -> None:
     with registered(Unwilling) as name:
         vec = hosted(name)
         vec.reset()
@@ -170,7 +170,7 @@ def test_a_vehicle_that_is_refused_for_too_long_is_an_error() -> None:
         assert all(one.is_closed for one in OwnKinematics.made)
 
 
-def test_cavmarl_takes_back_a_zone_whose_simulator_refuses_vehicles_for_too_long() -> None:
+def test_cavmarl_takes_over_a_zone_whose_simulator_refuses_vehicles_for_too_long() -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {"zones.simulator_failure": "return", "zones.check_invariants": True}
     with registered(Unwilling) as name:
@@ -183,7 +183,7 @@ def test_cavmarl_takes_back_a_zone_whose_simulator_refuses_vehicles_for_too_long
 
 
 class Mortal(OwnKinematics):
-    """A simulator that fails in one of its calls; the next simulator of the zone does not fail."""
+    """The first simulator of a zone fails in call number `at` of its method `call`."""
 
     call = "read"
     at = 60
@@ -220,7 +220,7 @@ class Mortal(OwnKinematics):
         ("prepare", 2, "answer"),
     ],
 )
-def test_a_simulator_that_fails_is_an_error_or_gives_its_zone_back(
+def test_after_a_failed_call_an_error_is_raised_or_cavmarl_takes_over_the_zone(
     call: str, at: int, what: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(Mortal, "call", call)
@@ -254,7 +254,7 @@ def test_a_simulator_that_fails_is_an_error_or_gives_its_zone_back(
         vec.reset(seed=3)
         whole.reset(seed=3)
         steps_alike(whole, vec, 5)
-        assert len(OwnKinematics.made) == 2, "a reset gives the zone to a new simulator"
+        assert len(OwnKinematics.made) == 2, "the reset did not make a new simulator"
         vec.close()
     lines = [json.loads(line) for line in journal.read_text().splitlines()]
     of_zone = [(line["kind"], line.get("worker")) for line in lines if line.get("zone") == 1]
@@ -263,7 +263,7 @@ def test_a_simulator_that_fails_is_an_error_or_gives_its_zone_back(
 
 
 class Wrong(OwnKinematics):
-    """A simulator that reports wrong data from a tick on."""
+    """A simulator that reports wrong data from its tenth tick on."""
 
     fault = "absent"
 
@@ -309,7 +309,7 @@ def test_wrong_reports_are_refused(
 
 
 class Drifting(OwnKinematics):
-    """A simulator that moves vehicles a little aside and back."""
+    """A simulator that moves vehicles sideways by up to 5 cm."""
 
     def moved(self, row: np.void, wanted: np.void) -> np.void:
         wanted = super().moved(row, wanted)
@@ -320,7 +320,7 @@ class Drifting(OwnKinematics):
         return wanted
 
 
-def test_rows_follow_a_simulator_that_is_not_exact() -> None:
+def test_rows_have_the_positions_that_an_inexact_simulator_reports() -> None:
     with registered(Drifting, tolerance_m=0.1) as name:
         vec = hosted(name, 0, 1, 2, 3, overrides={"zones.check_invariants": True})
         vec.reset()
@@ -367,7 +367,9 @@ def test_rows_follow_a_simulator_that_is_not_exact() -> None:
         ),
     ],
 )
-def test_unsupported_features_are_refused_by_name(keys: dict[str, Any], message: str) -> None:
+def test_the_error_for_an_unsupported_setting_names_the_setting(
+    keys: dict[str, Any], message: str
+) -> None:
     with registered(OwnKinematics) as name:
         simulators = keys.pop("zone_simulators", {1: name})
         named = {zone: name if text == "NAME" else text for zone, text in simulators.items()}
@@ -384,7 +386,7 @@ def test_hosted_worlds_cannot_be_copied() -> None:
         vec.close()
 
 
-def test_folders_of_data_cannot_name_simulators(tmp_path: Path) -> None:
+def test_an_env_yaml_cannot_name_simulators(tmp_path: Path) -> None:
     (tmp_path / "env.yaml").write_text(
         "name: mine\nmap: {source: ring}\nzones: {simulators: {0: 'carla://a:1'}}\n"
     )
@@ -417,7 +419,7 @@ def test_the_simulator_of_the_guide_is_exact() -> None:
         REGISTERED_ZONE_SIMULATORS.remove("echo")
 
 
-def test_verify_reports_that_a_simulator_is_not_exact() -> None:
+def test_verify_zones_reports_the_tolerance_of_a_simulator() -> None:
     with registered(Drifting, tolerance_m=0.1) as name:
         found = verify_zones(
             ENV, [4], steps=5, agents=2, background=10, overrides={"zones.simulators": {1: name}}

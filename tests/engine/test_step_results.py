@@ -64,7 +64,7 @@ def results_of() -> Results:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_the_report_equals_the_array_by_array_twin(seed: int, network: RoadNetwork) -> None:
+def test_the_step_results_equal_those_of_the_slow_twin(seed: int, network: RoadNetwork) -> None:
     rng = np.random.default_rng(seed)
     has_signals = seed % 2 == 1
     outputs, departures = outputs_of(rng), gate_of(rng, network)

@@ -1,4 +1,4 @@
-"""A configuration of SUMO as an environment, as a map, and as demand."""
+"""SUMO's configuration file as an environment, as a map and as demand."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ INPUT = '<net value="m.net.xml"/><r value="a%20b.xml"/><additional value="night.
 
 @pytest.fixture
 def config(tmp_path: Path) -> Path:
-    """Write a configuration of a crossing to a file without a suffix."""
+    """Write SUMO's configuration of a crossing to a file without a suffix."""
     (tmp_path / "m.net.xml").write_text(CROSSING, encoding="utf-8")
     (tmp_path / "a b.xml").write_text(TRIPS, encoding="utf-8")
     (tmp_path / "night.add.xml").write_text(NIGHT, encoding="utf-8")
@@ -30,7 +30,7 @@ def config(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_configuration_is_an_environment(config: Path) -> None:
+def test_a_sumo_configuration_is_accepted_as_an_environment(config: Path) -> None:
     world = load_world(config, agents=1)
     assert (world.network.name, world.config.name) == ("m", "run")
     assert world.network.program_ids == ("0", "night")
@@ -41,7 +41,7 @@ def test_a_configuration_is_an_environment(config: Path) -> None:
     assert find_map(config) == config.parent / "m.net.xml"
 
 
-def test_a_configuration_is_a_map(config: Path, tmp_path: Path) -> None:
+def test_a_sumo_configuration_is_accepted_as_a_map(config: Path, tmp_path: Path) -> None:
     folder = tmp_path / "mine"
     folder.mkdir()
     (folder / "env.yaml").write_text("name: mine\nmap: {source: ../run}\n", encoding="utf-8")
@@ -53,7 +53,7 @@ def test_a_configuration_is_a_map(config: Path, tmp_path: Path) -> None:
     assert again.network.program_ids == ("0", "night")
 
 
-def test_a_configuration_is_demand(config: Path) -> None:
+def test_a_sumo_configuration_is_accepted_as_demand(config: Path) -> None:
     world = load_world(
         config.parent / "m.net.xml", agents=1, overrides={"traffic.demand": [str(config)]}
     )
@@ -61,7 +61,7 @@ def test_a_configuration_is_demand(config: Path) -> None:
     assert any("<tlLogic>" in what for what in world.demand.report.tolerated)
 
 
-def test_a_configuration_may_name_a_map_alone(config: Path) -> None:
+def test_a_sumo_configuration_needs_no_demand(config: Path) -> None:
     config.write_text('<configuration><n value="m.net.xml"/></configuration>', encoding="utf-8")
     world = load_world(config, agents=1)
     assert world.demand is None
@@ -75,7 +75,7 @@ def test_files_that_are_no_maps_are_refused(config: Path) -> None:
         load_world(config)
 
 
-def test_a_configuration_with_programs_is_the_only_map(config: Path) -> None:
+def test_a_sumo_configuration_with_signal_programs_must_be_the_only_map(config: Path) -> None:
     both = {"map.source": ["run", "m.net.xml"], "traffic.demand": []}
     with pytest.raises(ConfigError, match="must be the only map"):
         load_world(config, agents=1, overrides=both)

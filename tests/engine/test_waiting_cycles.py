@@ -1,4 +1,4 @@
-"""Deadlocks are found and named by their vehicles."""
+"""Search for deadlocks, which are lists of vehicle ids."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ LEFT = ord("l")
 
 
 def block(roads: RoadNetwork) -> tuple[list[int], NDArray[np.void]]:
-    """Return the lanes around a block that is driven around to the left, and their steps."""
+    """Return the lanes of left turns around a block, and the route steps from lane to lane."""
     left = roads.links[roads.links["direction"] == LEFT]
     onward = dict(zip(left["from_lane"].tolist(), left["to_lane"].tolist(), strict=True))
     for first in sorted(onward):
@@ -40,7 +40,7 @@ def block(roads: RoadNetwork) -> tuple[list[int], NDArray[np.void]]:
 
 
 def queues(roads: RoadNetwork, lanes: list[int]) -> NDArray[np.void]:
-    """Return standing vehicles bumper to bumper on these lanes, with ids in their order."""
+    """Return queues of standing vehicles that fill these lanes; ids rise along the lanes."""
     rows = []
     for lane in lanes:
         for s in np.arange(3.0, roads.lanes["length_m"][lane] - 3.0, 7.0).tolist():
@@ -61,7 +61,7 @@ def test_a_full_block_is_a_deadlock_of_all_its_vehicles() -> None:
     assert find_deadlocks(roads, steps, shuffled) == (cycle,)
 
 
-def test_a_queue_that_will_move_is_none() -> None:
+def test_a_queue_that_will_move_is_no_deadlock() -> None:
     roads = network("grid4x4")
     lanes, steps = block(roads)
     rows = queues(roads, lanes)
@@ -95,7 +95,7 @@ def test_vehicles_that_yield_to_each_other_are_a_deadlock() -> None:
     assert find_deadlocks(roads, steps, rows) == ((one, other),)
 
 
-def test_an_environment_names_its_deadlocks() -> None:
+def test_an_environment_returns_its_deadlocks() -> None:
     with closing(parallel_env("grid4x4", agents=1, background=5)) as env:
         with pytest.raises(EpisodeError, match="before reset"):
             env.deadlocks()

@@ -28,7 +28,9 @@ def _frames(zones: int, workers: int, steps: int = 25) -> list[WorldFrame]:
 
 
 @pytest.mark.parametrize(("zones", "workers"), [(4, 0), (4, 2), (1, 1)])
-def test_frames_equal_those_of_the_undivided_world(zones: int, workers: int) -> None:
+def test_frames_of_divided_worlds_equal_those_of_the_undivided_world(
+    zones: int, workers: int
+) -> None:
     for whole, divided in zip(_frames(1, 0), _frames(zones, workers), strict=True):
         assert (whole.tick, whole.time_s) == (divided.tick, divided.time_s)
         np.testing.assert_array_equal(whole.vehicles[_WHAT], divided.vehicles[_WHAT])
@@ -38,7 +40,7 @@ def test_frames_equal_those_of_the_undivided_world(zones: int, workers: int) -> 
             assert len(set(divided.vehicles["zone"])) > 1
 
 
-def test_a_frame_equals_the_world_and_does_not_change() -> None:
+def test_a_frame_is_a_copy_of_the_state_of_the_world() -> None:
     world = parallel_env("grid4x4", zones=4)
     world.reset(seed=1)
     for _ in range(10):
@@ -57,7 +59,7 @@ def test_a_frame_equals_the_world_and_does_not_change() -> None:
     np.testing.assert_array_equal(frame.vehicles, kept)
 
 
-def test_events_name_the_causes_of_ended_agents() -> None:
+def test_events_have_the_causes_of_ended_trips() -> None:
     world = parallel_env("ring")
     world.reset(seed=1)
     (before,) = world.world_frames()
@@ -104,7 +106,7 @@ def _frame(
     return WorldFrame(0, tick, tick * 0.1, vehicles, signals, ended=np.array(ended, dtype=ENDED))
 
 
-def test_events_between_two_frames() -> None:
+def test_events_are_derived_from_two_frames() -> None:
     before = _frame(4, [{"id": 1}, {"id": 2, "agent": 0}, {"id": 3}, {"id": 4, "zone": 1}], [])
     after = _frame(
         5,

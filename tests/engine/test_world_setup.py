@@ -1,4 +1,4 @@
-"""From a configuration to the parts of its world."""
+"""Loading of the parts of a world from its configuration."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def ring(layout: str) -> tuple[EnvConfig, Path]:
     return replace(config, zones=ZonesConfig(layout=layout)), folder
 
 
-def test_zones_are_cut_by_name() -> None:
+def test_zones_are_cut_by_the_named_layout() -> None:
     config, folder = ring("bisection")
     network = load_roads(config, folder)
     assert load_zones(config, folder, network).count == 1
@@ -57,7 +57,7 @@ def test_zones_are_read_from_a_file_beside_the_entry(tmp_path: Path) -> None:
 def test_worlds_of_the_same_files_share_their_map(tmp_path: Path) -> None:
     network, other = (load_roads(*load_config("merge")) for _ in range(2))
     assert other is network
-    # The name and the content of a file count, not its place.
+    # Maps are equal if name and content of their files are equal, in any folder.
     source = load_config("merge")[1] / "map" / "map.net.xml"
     copied, renamed = tmp_path / source.name, tmp_path / "other.net.xml"
     copied.write_bytes(source.read_bytes())
@@ -70,15 +70,15 @@ def test_worlds_of_the_same_files_share_their_map(tmp_path: Path) -> None:
     assert (load_world("merge").network, load_world(renamed).network.name) == (network, "other")
 
 
-def test_a_bare_maps_horizon_follows_its_size(grid: Path) -> None:
-    # 4 · 200 m in both directions, at SUMO's 13.89 m/s: 115.2 s across, times three.
+def test_the_horizon_of_a_bare_map_depends_on_its_size(grid: Path) -> None:
+    # The map is 800 m wide and high: 1600 m take 115.2 s at SUMO's 13.89 m/s. Use three times this.
     worlds = [load_world(grid, agents=2, background=3, zones=zones) for zones in (1, 4)]
     assert [world.config.horizon_s for world in worlds] == [350.0, 350.0]
     assert check_map(grid).horizon_s == 350.0
     assert load_world(grid, overrides={"clock.ctrl_dt_s": 0.15}).config.max_steps == 2333
 
 
-def test_a_stated_horizon_overrides_that_of_the_map(grid: Path) -> None:
+def test_a_configured_horizon_overrides_the_horizon_of_the_map(grid: Path) -> None:
     assert load_world(grid, overrides={"horizon_s": 42.0}).config.horizon_s == 42.0
     assert load_world(grid, max_cycles=30).config.max_steps == 30
     named = {"map.source": str(grid)}
@@ -87,7 +87,7 @@ def test_a_stated_horizon_overrides_that_of_the_map(grid: Path) -> None:
     assert followed.horizon_s == 350.0
 
 
-def test_a_horizon_by_the_map_is_from_one_to_fifteen_minutes(grid: Path) -> None:
+def test_the_horizon_of_a_map_is_from_one_to_fifteen_minutes(grid: Path) -> None:
     network = load_network(grid)
     for side_m, horizon_s in ((50.0, 60.0), (9e3, 900.0)):
         lanes = network.lanes.copy()
@@ -101,7 +101,9 @@ def test_a_horizon_by_the_map_is_from_one_to_fifteen_minutes(grid: Path) -> None
 @pytest.mark.parametrize(
     "number", [*range(3), *(pytest.param(k, marks=pytest.mark.slow) for k in range(3, 30))]
 )
-def test_on_a_bare_map_trips_connect_and_fit_the_horizon_twice(tmp_path: Path, number: int) -> None:
+def test_trips_on_a_bare_map_take_less_than_half_of_the_horizon(
+    tmp_path: Path, number: int
+) -> None:
     world = make_simulation(random_map(tmp_path, number), mode="respawn", agents=20)
     roads = world.network
     slowest_mps = float(roads.lanes["speed_mps"][~roads.lanes["internal"]].min())

@@ -1,4 +1,4 @@
-"""Actions from a grid of accelerations and steering angles, compared with continuous actions."""
+"""Discrete actions from a grid of accelerations and steering angles."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def worlds(**overrides: object) -> CavVectorEnv:
     return make_vec("merge", num_envs=2, agents=4, background=4, overrides=keys)
 
 
-def test_each_choice_is_a_pair() -> None:
+def test_each_choice_is_a_pair_of_acceleration_and_steering() -> None:
     choices = np.arange(35).reshape(5, 7)
     decoder = ActionDecoder(GRID, 5, [f"car_{k}" for k in range(7)])
     everyone = np.ones((5, 7), dtype=np.bool_)
     found = decoder.from_array(choices, everyone)
     assert [tuple(pair) for pair in found.controls.reshape(35, 2)] == MEANINGS
     read_only = choices.copy()
-    read_only.flags.writeable = False  # takes the general path of decoding
+    read_only.flags.writeable = False  # arrays that are not writeable are decoded by other code
     again = decoder.from_array(read_only, everyone)
     assert [tuple(pair) for pair in again.controls.reshape(35, 2)] == MEANINGS
     assert (decoder.encode(again.controls) == choices).all()
@@ -43,7 +43,7 @@ def test_each_choice_is_a_pair() -> None:
     assert (nobody.controls == 0.0).all()
 
 
-def test_a_suggestion_is_the_nearest_pair() -> None:
+def test_a_continuous_action_is_encoded_as_the_nearest_pair() -> None:
     decoder = ActionDecoder(GRID, 1, ["car_0"])
     for wanted, pair in (
         ((0.4, 0.01), (0.0, 0.0)),
@@ -61,7 +61,7 @@ def test_an_invalid_choice_is_refused(wrong: int) -> None:
         decoder.from_array(np.array([[0, wrong]]), np.ones((1, 2), dtype=np.bool_))
 
 
-def test_every_view_has_a_space_of_choices() -> None:
+def test_every_kind_of_environment_has_the_discrete_action_space() -> None:
     chosen = {"action.kind": "grid"}
     assert worlds().single_action_space == SPACE
     assert parallel_env("merge", overrides=chosen).action_space("car_0") == SPACE
@@ -84,7 +84,7 @@ def test_a_choice_has_the_effect_of_its_continuous_action() -> None:
         assert [grid.state_hash(w) for w in (0, 1)] == [fine.state_hash(w) for w in (0, 1)]
 
 
-def test_the_built_in_driver_arrives_on_the_grid() -> None:
+def test_the_built_in_driver_arrives_with_actions_from_the_grid() -> None:
     vec = worlds()
     observations, infos = vec.reset(seed=0)
     driver = load_policy("idm", vec)
@@ -100,7 +100,7 @@ def test_the_built_in_driver_arrives_on_the_grid() -> None:
     assert arrived >= 0.9 * left
 
 
-def test_a_network_drives_on_its_own_grid_only(tmp_path: Path) -> None:
+def test_a_network_trained_on_another_grid_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("torch", reason="needs the extra: train")
     from cavmarl.learning.actor_critic import ActorCritic, save_network
     from cavmarl.networks.network_files import NetworkConfig

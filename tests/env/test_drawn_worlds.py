@@ -18,7 +18,9 @@ SMALL: dict[str, Any] = {"agents": 3, "background": 10, "render_mode": "rgb_arra
     [{"zones": 2, "nodes": 2}, {"workers": 1}, {"zones": 2, "workers": 2, "num_envs": 1}],
 )
 @pytest.mark.filterwarnings("ignore:workers = ")
-def test_pictures_equal_those_of_one_process(elsewhere: dict[str, Any]) -> None:
+def test_pictures_of_several_processes_equal_those_of_one_process(
+    elsewhere: dict[str, Any],
+) -> None:
     num_envs, zones = elsewhere.get("num_envs", 2), elsewhere.get("zones", 1)
     pictures = []
     for more in ({"zones": zones}, elsewhere):
@@ -39,7 +41,7 @@ def test_pictures_equal_those_of_one_process(elsewhere: dict[str, Any]) -> None:
         assert np.array_equal(one, other)
 
 
-def test_one_world_of_nodes_is_drawn() -> None:
+def test_a_world_over_nodes_is_drawn() -> None:
     env = parallel_env("grid4x4", zones=2, nodes=2, **SMALL)
     env.reset(seed=1)
     picture = env.render()

@@ -1,4 +1,4 @@
-"""External vehicles that observe: agents of PettingZoo, and their sensors."""
+"""External vehicles with `observes=True` are agents of PettingZoo and have sensors."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ import pytest
 from cavmarl import ActionError, CavEnv, ConfigError, parallel_env
 from tests.env.test_external_commands import place_on
 
-with warnings.catch_warnings():  # PettingZoo's tests import its own environments
+with warnings.catch_warnings():  # PettingZoo's test module imports deprecated environments
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import parallel_api_test
 
@@ -66,7 +66,7 @@ def test_an_observing_vehicle_is_an_agent_while_it_is_in_the_world() -> None:
         assert "external_1" not in advance(env)[0]
 
 
-def test_its_sensors_see_the_traffic_and_the_traffic_does_not_depend_on_them() -> None:
+def test_sensors_of_an_observing_vehicle_see_the_traffic_and_do_not_change_it() -> None:
     ranges, states = [], []
     for observes in (True, False):
         with closing(ring()) as env:
@@ -80,12 +80,12 @@ def test_its_sensors_see_the_traffic_and_the_traffic_does_not_depend_on_them() -
             rows = env.simulation.vehicles(0)
             states.append(np.sort(rows, order="id").tobytes())
             assert env.agents == (["car_0", f"external_{slot}"] if observes else ["car_0"])
-    assert min(ranges) < 10.0 < max(ranges)  # vehicles drive past
+    assert min(ranges) < 10.0 < max(ranges)  # vehicles pass close to the sensor
     assert states[0] == states[1]
 
 
-def test_samples_measure_the_vehicle_and_what_is_around_it() -> None:
-    """A car stands 12 m ahead of the sensor on another car, so its rear is 9.5 m away."""
+def test_samples_measure_the_distance_to_another_car_and_the_own_speed() -> None:
+    """The centres of both cars are 12 m apart, so the rear of the car ahead is 9.5 m away."""
     rig = {"roof": RIG["roof"] | {"rate_hz": 20}, "wheels": {"type": "odometry", "rate_hz": 20}}
     with closing(ring(background=0, overrides={"rig": rig})) as env:
         min_x, min_y, _, _ = env.network.extent_m
@@ -125,7 +125,7 @@ def test_samples_do_not_depend_on_zones_or_workers() -> None:
     assert run(zones=4, workers=2) == undivided
 
 
-def test_an_action_drives_it_and_without_one_it_keeps_the_last_command() -> None:
+def test_an_observing_vehicle_keeps_its_last_action_and_refuses_invalid_actions() -> None:
     with closing(ring()) as env:
         slot = env.external.spawn(*place_on(env, 0), observes=True)
         advance(env)
@@ -170,7 +170,7 @@ def test_a_copy_continues_with_equal_samples() -> None:
                     assert one.tobytes() == two.tobytes()
 
 
-def test_a_reset_ends_the_visits() -> None:
+def test_a_reset_removes_observing_vehicles() -> None:
     with closing(ring()) as env:
         env.external.spawn(*place_on(env, 0), observes=True)
         advance(env)
@@ -178,9 +178,9 @@ def test_a_reset_ends_the_visits() -> None:
         assert list(observations) == env.agents == ["car_0"]
 
 
-# Most slots are never used, which PettingZoo's test does not expect.
+# PettingZoo's test warns about agents that never enter, and most slots stay unused.
 @pytest.mark.filterwarnings("ignore:No agents present but not all possible_agents")
-def test_the_api_is_pettingzoos() -> None:
+def test_observing_vehicles_conform_to_the_api_of_pettingzoo() -> None:
     with closing(ring()) as env:
         parallel_api_test(env, num_cycles=20)
 
@@ -200,7 +200,7 @@ def test_worlds_that_cannot_have_observing_vehicles_are_refused(
         ring(overrides=overrides)
 
 
-def test_without_the_key_no_external_vehicle_observes() -> None:
+def test_an_observing_vehicle_needs_the_key_external_agents() -> None:
     with closing(ring(overrides={"population.external_agents": False})) as env:
         with pytest.raises(ConfigError, match=r"set population\.external_agents = true"):
             env.external.spawn(*place_on(env, 0), observes=True)

@@ -24,7 +24,10 @@ ROOM = {"population.external": 4}
 
 
 def place_on(env: Any, k: int, along_m: float = 0.0) -> tuple[float, float, float]:
-    """Return x, y and heading of a place on the k-th road lane, measured along its longest part."""
+    """Return x, y and heading of a place on the k-th long lane.
+
+    `along_m` is measured from the start of the longest straight part of the lane.
+    """
     roads = np.flatnonzero(~env.network.lanes["internal"] & (env.network.lanes["length_m"] > 40.0))
     line = env.network.lane_polyline(int(roads[k]))[:, :2]
     parts = np.diff(line, axis=0)
@@ -46,7 +49,10 @@ def advance(env: Any, steps: int = 1) -> None:
 
 
 def act(env: Any, step: int) -> None:
-    """Command one vehicle that is driven, and one that is posed along a line and with jumps."""
+    """Spawn, drive, pose or remove vehicles if this is planned for the step.
+
+    Vehicle 1 is posed along a line, later with jumps, and then driven.
+    """
     min_x, min_y, max_x, max_y = env.network.extent_m
     middle_x, middle_y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)
     if step == 1:
@@ -96,7 +102,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=3, nodes=2, kill_at=(24,)) == undivided
 
 
-def test_unused_slots_for_external_vehicles_change_nothing() -> None:
+def test_unused_slots_for_external_vehicles_change_no_result() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("ring", agents=1, background=8, overrides=overrides)) as env:
@@ -156,7 +162,7 @@ def test_a_posed_vehicle_reaches_its_pose_at_the_end_of_the_step() -> None:
         assert (row_of(env, slot)["x"], row_of(env, slot)["y"]) == ahead
 
 
-def test_a_jump_is_a_new_vehicle_and_no_trip() -> None:
+def test_a_vehicle_that_jumps_gets_a_new_id_and_counts_as_no_trip() -> None:
     with closing(ring()) as env:
         before = env.traffic_stats()
         slot = env.external.spawn(*place_on(env, 0))
@@ -203,7 +209,7 @@ def test_a_contact_counts_for_both_vehicles() -> None:
         assert row_of(env, slot)["hit"] == agent["id"]
 
 
-def test_invalid_commands_are_refused_with_a_fix() -> None:
+def test_invalid_commands_are_refused_with_a_remedy() -> None:
     with closing(parallel_env("ring", agents=1, background=8)) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=r"set population\.external"):
@@ -235,7 +241,7 @@ def test_invalid_commands_are_refused_with_a_fix() -> None:
             env.external.spawn(x + 0.5, y, heading)
         with pytest.raises(ActionError, match="must be a finite number"):
             env.external.drive(slot, math.inf, 0.0)
-        for name in ("z", "pitch"):  # a state with such a number could not be loaded
+        for name in ("z", "pitch"):  # a saved state with such a number would be refused
             with pytest.raises(
                 ActionError, match=rf"{name} = 1e\+300: must be a finite number from"
             ):
@@ -267,7 +273,7 @@ def test_saved_states_include_external_vehicles_and_waiting_commands() -> None:
     check_resumed(act, ROOM, at=24, steps=40)
 
 
-def test_sensors_messages_and_moving_borders_change_nothing() -> None:
+def test_sensors_messages_and_moving_borders_change_no_result() -> None:
     more = {"v2x.enabled": True, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
     undivided = hashes(overrides=ROOM | more)
     moving = {**more, "zones.repartition_steps": 6, "zones.check_invariants": True}

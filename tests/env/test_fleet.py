@@ -1,4 +1,4 @@
-"""`population.fleet`: agents with types, sensors and drivers of their own."""
+"""`population.fleet`: parts of the agents have different types, sensors and drivers."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ FLEET = [
     {"type": "car", "rig": ["roof", "gnss"], "share": 2.0},
     {"type": "van", "rig": ["gnss", "front", "imu", "touch"], "driver": "never_yield"},
 ]
-# Agents 0, 1, 2, …: the first part has two thirds of them.
+# The part of each agent 0 to 5; the first part has two thirds of the agents.
 PARTS = [0, 1, 0, 0, 1, 0]
 SMALL: dict[str, Any] = {"agents": 6, "background": 12}
 
@@ -42,7 +42,7 @@ def overrides(**more: Any) -> dict[str, Any]:
     }
 
 
-def test_parts_have_their_shares_at_any_number_of_agents() -> None:
+def test_parts_have_their_shares_of_any_number_of_agents() -> None:
     parts = [FleetPart(share=2.0), FleetPart(share=1.0)]
     assert parts_in_turn(parts, 6).tolist() == PARTS
     parts = [FleetPart(share=0.5), FleetPart(share=0.3), FleetPart(share=0.2)]
@@ -61,15 +61,15 @@ def test_agents_have_the_types_of_their_parts() -> None:
         kind = types[row["vtype"]]
         if PARTS[row["agent"]]:
             assert (kind["length"], kind["width"], kind["max_speed"]) == (6.4, 2.1, 36.0)
-            assert kind["accel"] == kind["most_accel"] == 1.5  # of a truck
+            assert kind["accel"] == kind["most_accel"] == 1.5  # the value of a truck
             assert kind["wheelbase"] == 4.8
         else:
             assert kind["length"] == 5.0
 
 
-def test_only_carriers_get_samples_and_these_do_not_depend_on_the_others() -> None:
+def test_only_agents_that_carry_a_sensor_get_its_samples() -> None:
     env = cavmarl.parallel_env("grid4x4", overrides=overrides(), **SMALL)
-    # Everybody carries everything; types, and therefore trips, are equal.
+    # For comparison, all agents carry all sensors. Their types, and so their trips, are equal.
     whole = [{**part, "rig": None} for part in FLEET]
     everything = cavmarl.parallel_env(
         "grid4x4", overrides=overrides(**{"population.fleet": whole}), **SMALL
@@ -89,7 +89,7 @@ def test_only_carriers_get_samples_and_these_do_not_depend_on_the_others() -> No
     everything.close()
 
 
-def test_a_batch_is_padded_with_zeros_and_has_a_mask_of_carriers() -> None:
+def test_a_batch_has_zeros_for_agents_without_the_sensor_and_a_mask_of_carriers() -> None:
     vec = cavmarl.make_vec("grid4x4", num_envs=2, overrides=overrides(), **SMALL)
     observations, _ = vec.reset(seed=3)
     for _ in range(3):
@@ -110,7 +110,7 @@ def test_a_batch_is_padded_with_zeros_and_has_a_mask_of_carriers() -> None:
 
 @pytest.mark.parametrize("backend", ["local", "processes:2", "nodes:2"])
 def test_scans_of_a_fleet_do_not_depend_on_zones(backend: str) -> None:
-    """A lidar at 10 Hz neither fires twice nor skips a scan where its vehicle changes the zone."""
+    """A lidar at 10 Hz scans exactly every 0.1 s, even if its vehicle changes the zone."""
     one = cavmarl.make_vec("grid4x4", overrides=overrides(), **SMALL)
     many = cavmarl.make_vec("grid4x4", zones=4, backend=backend, overrides=overrides(), **SMALL)
     try:
@@ -135,7 +135,7 @@ def test_scans_of_a_fleet_do_not_depend_on_zones(backend: str) -> None:
         many.close()
 
 
-def test_sensor_workers_sense_for_carriers_only() -> None:
+def test_sensor_workers_compute_the_same_samples_of_a_fleet() -> None:
     here = cavmarl.make_vec("grid4x4", overrides=overrides(), **SMALL)
     there = cavmarl.make_vec("grid4x4", sensor_workers=1, overrides=overrides(), **SMALL)
     try:
@@ -174,7 +174,7 @@ DRIVEN = [{"share": 2.0}, {"driver": "never_yield"}]
 
 def test_a_policy_acts_on_dicts_with_different_sensors() -> None:
     class Seen(cavmarl.Policy):
-        """Keeps the flat observations that it gets."""
+        """A policy that keeps its last batch of flat observations."""
 
         def act_batch(self, observations: Any, mask: Any) -> Any:
             self.observations = observations.copy()
@@ -192,7 +192,7 @@ def test_a_policy_acts_on_dicts_with_different_sensors() -> None:
         observations, padded = env.step(actions)[0], batch.step(np.zeros((1, 6, 2)))[0]
 
 
-def test_bad_fleets_are_refused() -> None:
+def test_invalid_fleets_are_refused() -> None:
     def refused(match: str, **keys: Any) -> None:
         with pytest.raises(ConfigError, match=match):
             cavmarl.make_vec("grid4x4", overrides=overrides(**keys), **SMALL)

@@ -1,4 +1,4 @@
-"""Vehicles put into running worlds: equal in all divisions, and recorded."""
+"""Vehicles that the caller inserts into running worlds are equal in all divisions and recorded."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ ROOM = {"population.insertions": 12}
 
 
 def edge_of(env: CavEnv, k: int = 0) -> str:
-    """Return the k-th road with cars on it."""
+    """Return the id of the k-th road that has vehicles."""
     rows = env.simulation.vehicles(0)
     lanes = env.network.lanes[rows["lane"]]
     edges = np.unique(lanes["edge"][~lanes["internal"]])
@@ -26,7 +26,7 @@ def edge_of(env: CavEnv, k: int = 0) -> str:
 
 
 def act(env: Any, step: int) -> None:
-    """Request insertions as a page does, at some steps."""
+    """Insert a vehicle if an insertion is planned for this step."""
     network = env.network
     roads = np.flatnonzero(~network.lanes["internal"] & (network.lanes["length_m"] > 60.0))
     if step in (4, 5, 30):
@@ -47,7 +47,7 @@ def test_worlds_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_unused_slots_for_insertions_change_nothing() -> None:
+def test_unused_slots_for_insertions_change_no_result() -> None:
     found = []
     for overrides in ({}, ROOM):
         with closing(parallel_env("grid4x4", agents=3, overrides=overrides)) as env:
@@ -58,7 +58,7 @@ def test_unused_slots_for_insertions_change_nothing() -> None:
     assert found[0] == found[1]
 
 
-def test_a_run_follows_from_its_recording(tmp_path: Path) -> None:
+def test_a_run_can_be_repeated_from_the_recorded_insertions(tmp_path: Path) -> None:
     with closing(
         parallel_env("grid4x4", agents=3, background=40, overrides=ROOM, record=tmp_path / "run")
     ) as env:
@@ -132,7 +132,7 @@ def interrupted(commands: Any) -> None:
     raise KeyboardInterrupt
 
 
-def test_invalid_insertions_are_refused_with_a_fix() -> None:
+def test_invalid_insertions_are_refused_with_a_remedy() -> None:
     with closing(parallel_env("grid4x4")) as env:
         env.reset(seed=0)
         with pytest.raises(ConfigError, match=r"set population\.insertions"):

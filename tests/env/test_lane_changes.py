@@ -1,4 +1,4 @@
-"""Roads that the caller closes or damages: equal in all divisions, saved, recorded, observed."""
+"""Worlds with roads that the caller closes or damages: divisions, saved states, recordings."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROOM = {"map.changed_lanes": 40}
 
 
 def damage(env: Any, step: int) -> None:
-    """Damage and repair roads at some steps."""
+    """Damage or repair roads if this is planned for the step."""
     if step == 3:
         for edge in ("B1B2", "B2B1", "B1C1", "C1B1"):
             env.damage_road(edge, 3.0)
@@ -33,7 +33,7 @@ def damage(env: Any, step: int) -> None:
 hashes = partial(hashes_of, act=damage, overrides=ROOM, agents=3, background=40, steps=40, every=5)
 
 
-def test_a_divided_world_with_limits_equals_the_undivided_one() -> None:
+def test_a_divided_world_with_speed_limits_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=4) == undivided
     assert hashes(zones=4, workers=2) == undivided
@@ -41,15 +41,15 @@ def test_a_divided_world_with_limits_equals_the_undivided_one() -> None:
 
 
 @pytest.mark.slow
-def test_worlds_with_limits_over_nodes_are_equal() -> None:
+def test_worlds_with_speed_limits_over_nodes_are_equal() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_saved_states_include_limits() -> None:
+def test_saved_states_include_speed_limits() -> None:
     check_resumed(damage, ROOM, at=12, steps=30)
 
 
-def test_drivers_and_sensors_have_the_limit_of_their_world() -> None:
+def test_drivers_and_sensors_use_the_speed_limit_of_their_world() -> None:
     room = {"map.changed_lanes": 480}
     with closing(make_vec("grid4x4", num_envs=2, background=30, overrides=room)) as vec:
         vec.reset(seed=1)
@@ -69,7 +69,7 @@ def test_drivers_and_sensors_have_the_limit_of_their_world() -> None:
         assert vec.simulation.vehicles(0)["speed"].max() > 6.0
 
 
-def test_impossible_limits_are_refused_with_a_fix() -> None:
+def test_invalid_speed_limits_are_refused_with_a_remedy() -> None:
     with closing(parallel_env("grid4x4", overrides={"map.changed_lanes": 3})) as env:
         env.reset(seed=1)
         with pytest.raises(ActionError, match="edge 'Z9': the map has no such road; give the id"):
@@ -100,7 +100,7 @@ CLOSED = ("B1B2", "B2B1", "B1C1", "C1B1")
 
 
 def close(env: Any, step: int) -> None:
-    """Close, damage and open roads at some steps."""
+    """Close, damage or open roads if this is planned for the step."""
     if step == 3:
         for edge in CLOSED:
             env.close_road(edge)
@@ -130,7 +130,7 @@ def test_saved_states_include_closed_roads() -> None:
     check_resumed(close, ROOM, at=12, steps=40)
 
 
-def test_the_state_of_a_world_does_not_depend_on_its_place() -> None:
+def test_the_state_of_a_world_does_not_depend_on_the_process_that_runs_it() -> None:
     def found(**more: Any) -> list[str]:
         with closing(make_vec("grid4x4", num_envs=2, background=40, overrides=ROOM, **more)) as vec:
             vec.reset(seed=2)
@@ -147,7 +147,12 @@ def test_the_state_of_a_world_does_not_depend_on_its_place() -> None:
 
 
 def drive_past(reroute: str, steps: int = 400) -> tuple[dict[str, float], int, int]:
-    """Return traffic, vehicles that entered closed roads after 10 s, and vehicles there at last."""
+    """Drive with closed roads and return what happened.
+
+    Returns:
+        The traffic statistics, the number of steps after 10 s in which a vehicle entered a closed
+        road, and the number of vehicles on closed roads at the end.
+    """
     overrides = {**ROOM, "population.reroute": reroute, "population.mode": "respawn"}
     with closing(parallel_env("grid4x4", agents=4, background=60, overrides=overrides)) as env:
         env.reset(seed=3)
@@ -167,7 +172,7 @@ def drive_past(reroute: str, steps: int = 400) -> tuple[dict[str, float], int, i
         return env.traffic_stats(), entered, len(before)
 
 
-def test_vehicles_leave_closed_roads_and_take_other_ways() -> None:
+def test_vehicles_leave_closed_roads_and_take_other_routes() -> None:
     waits, entered, left = drive_past("never")
     assert (entered, left, waits["rerouted"]) == (0, 0, 0)
     takes, entered, left = drive_past("blocked")
@@ -178,7 +183,7 @@ def test_vehicles_leave_closed_roads_and_take_other_ways() -> None:
     assert takes["contacts"] == waits["contacts"] == 0
 
 
-def test_a_closed_lane_is_left_to_the_side() -> None:
+def test_vehicles_leave_a_closed_lane_to_the_adjacent_lane() -> None:
     with closing(parallel_env("grid4x4", agents=1, background=60, overrides=ROOM)) as env:
         env.reset(seed=3)
         network = env.network
@@ -198,7 +203,7 @@ def test_a_closed_lane_is_left_to_the_side() -> None:
 
 
 def ahead(env: Any, agent: int) -> str:
-    """Return the road after the next junction on an agent's way."""
+    """Return the road behind the next junction on an agent's route."""
     network, steps = env.network, env.simulation.travel.steps
     rows = env.simulation.vehicles(0)
     row = rows[rows["agent"] == agent][0]
@@ -213,7 +218,7 @@ def ahead(env: Any, agent: int) -> str:
     return str(network.edge_ids[network.lanes["edge"][beyond]])
 
 
-def test_a_detour_costs_an_agent_no_progress_and_no_time() -> None:
+def test_a_detour_gives_an_agent_no_large_negative_reward_and_a_later_time_limit() -> None:
     overrides = {**ROOM, "terms.weights": {"progress": 1.0}, "traffic.trip_horizon": 3.0}
     with closing(parallel_env("grid4x4", agents=6, background=0, overrides=overrides)) as env:
         env.reset(seed=3)
@@ -233,7 +238,7 @@ def test_a_detour_costs_an_agent_no_progress_and_no_time() -> None:
         assert least > -2.0
 
 
-def test_a_run_with_closed_roads_follows_from_its_recording(tmp_path: Path) -> None:
+def test_a_run_with_closed_roads_can_be_repeated_from_its_recording(tmp_path: Path) -> None:
     with closing(parallel_env("grid4x4", agents=3, overrides=ROOM, record=tmp_path / "run")) as env:
         env.reset(seed=2)
         for step in range(40):
@@ -260,7 +265,7 @@ def test_a_run_with_closed_roads_follows_from_its_recording(tmp_path: Path) -> N
         assert env.state_hash() == wanted
 
 
-def test_impossible_closures_are_refused_with_a_fix() -> None:
+def test_invalid_closures_are_refused_with_a_remedy() -> None:
     with closing(parallel_env("grid4x4", overrides={"map.changed_lanes": 9})) as env:
         env.reset(seed=1)
         with pytest.raises(ActionError, match="edge 'Z9': the map has no such road; give the id"):

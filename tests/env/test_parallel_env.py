@@ -16,7 +16,7 @@ ENDS = ("arrival", "collision", "off_road")
 
 
 def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> Any:
-    """Make a small environment; typed Any, because observations are arrays or dicts."""
+    """Make a small environment. Its type is Any, because observations may be arrays or dicts."""
     overrides: Mapping[str, Any] = arguments.pop("overrides", {})
     return parallel_env(
         env,
@@ -26,14 +26,14 @@ def make(env: str = "merge", mode: str = "closed", **arguments: Any) -> Any:
 
 
 def wild(env: CavEnv, rng: np.random.Generator) -> dict[str, Any]:
-    """Return full throttle and random steering: most vehicles soon leave the road or collide."""
+    """Return full throttle and random steering, with which most vehicles soon end their trips."""
     return {agent: np.array([1.0, rng.uniform(-1.0, 1.0)]) for agent in env.agents}
 
 
 # Populations
 
 
-def test_a_closed_world_starts_with_all_agents_and_gets_no_others() -> None:
+def test_a_closed_world_starts_with_all_agents_and_no_agent_enters_later() -> None:
     env = make("ring", "closed")
     observations, _ = env.reset()
     assert list(observations) == env.agents == env.possible_agents
@@ -41,7 +41,7 @@ def test_a_closed_world_starts_with_all_agents_and_gets_no_others() -> None:
     before = set(env.agents)
     while env.agents:
         _, _, terminations, truncations, _ = env.step(wild(env, rng))
-        assert set(terminations) == before, "exactly the agents that acted get a result"
+        assert set(terminations) == before, "other agents than those that acted get a result"
         gone = {agent for agent in before if terminations[agent] or truncations[agent]}
         before -= gone
         assert set(env.agents) == before
@@ -56,7 +56,7 @@ def test_each_declared_agent_enters_at_most_once() -> None:
     vehicles: dict[str, int] = {}
     rng = np.random.default_rng(1)
     while env.agents:
-        assert not gone & set(env.agents), "an id came back"
+        assert not gone & set(env.agents), "an agent that had left entered again"
         assert len(env.agents) <= 3
         before = set(env.agents)
         for agent in env.agents:
@@ -64,12 +64,12 @@ def test_each_declared_agent_enters_at_most_once() -> None:
         observations, rewards, terminations, truncations, infos = env.step(wild(env, rng))
         for agent in set(env.agents) - before:
             seen.append(agent)
-            assert observations[agent].any(), "an entering agent gets a first observation"
+            assert observations[agent].any(), "an entering agent gets no first observation"
             assert rewards[agent] == 0.0
             assert not terminations[agent]
             assert not truncations[agent]
         gone |= {agent for agent in before if terminations[agent] or truncations[agent]}
-    assert sorted(seen) == env.possible_agents, "all declared agents entered"
+    assert sorted(seen) == env.possible_agents, "a declared agent did not enter"
     assert len(set(vehicles.values())) == 9
 
 
@@ -86,11 +86,11 @@ def test_an_empty_world_continues_until_the_next_agent_enters() -> None:
         follower = set(observations) - {agent}
         assert follower == set(env.agents)
         assert all(rewards[other] == 0.0 and infos[other]["active"] for other in follower)
-    assert not env.agents, "no agent is left to enter"
+    assert not env.agents, "an agent enters beyond the budget"
 
 
-def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
-    # A full ring: no vehicle can enter when the only agent has left.
+def test_an_empty_world_waits_for_agents_at_most_until_the_horizon() -> None:
+    # The ring is so full that no agent can enter after the only agent has left.
     env = make("ring", "open", agents=1, background=60, max_cycles=200)
     env.reset()
     rng = np.random.default_rng(0)
@@ -99,7 +99,7 @@ def test_an_empty_world_waits_no_longer_than_the_horizon() -> None:
     assert env.simulation.ticks()[0] <= 200 * env.config.clock.ticks_per_step
 
 
-def test_in_respawn_mode_agents_remain_and_get_new_vehicles() -> None:
+def test_agents_remain_and_get_new_vehicles_in_respawn_mode() -> None:
     env = make("merge", "respawn")
     _, infos = env.reset()
     rng = np.random.default_rng(2)
@@ -136,7 +136,7 @@ def test_in_respawn_mode_agents_remain_and_get_new_vehicles() -> None:
 
 
 @pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
-def test_the_horizon_cuts_after_exactly_max_cycles(mode: str) -> None:
+def test_episodes_are_truncated_after_exactly_max_cycles_steps(mode: str) -> None:
     env = make("grid4x4", mode, max_cycles=7)
     assert env.max_cycles == 7
     env.reset()
@@ -150,7 +150,7 @@ def test_the_horizon_cuts_after_exactly_max_cycles(mode: str) -> None:
     assert env.step({}) == ({}, {}, {}, {}, {})
 
 
-def test_vehicles_end_by_arrival_collision_and_off_road_alone() -> None:
+def test_trips_terminate_only_by_arrival_collision_or_leaving_the_road() -> None:
     seen = set()
     for driver in ("suggested", "straight", "wild"):
         env = make("ring", "closed", agents=6, background=12, max_cycles=800)
@@ -194,7 +194,7 @@ def test_the_reward_is_the_weighted_sum_of_the_terms(mode: str, share: float) ->
     assert paid > 0.0
 
 
-def test_terms_that_are_not_named_weigh_nothing() -> None:
+def test_terms_without_a_weight_do_not_count() -> None:
     env = make("ring", overrides={"terms.weights": {"delay": 2.0}})
     env.reset()
     for _ in range(5):
@@ -204,7 +204,7 @@ def test_terms_that_are_not_named_weigh_nothing() -> None:
 
 
 @pytest.mark.parametrize("mode", ["closed", "open", "respawn"])
-def test_infos_are_plain_numbers_under_constant_names(mode: str) -> None:
+def test_infos_have_constant_names_and_plain_numbers(mode: str) -> None:
     env = make("merge", mode)
     _, infos = env.reset()
     names = {*TERMS, "active", "vehicle_done", "vehicle_id"}
@@ -236,7 +236,7 @@ def test_observations_stay_within_the_space(env_name: str) -> None:
         observations, *_ = env.step(wild(env, rng))
 
 
-def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
+def test_dict_observations_contain_the_slices_of_flat_observations() -> None:
     flat = make("grid4x4", "respawn")
     parts = make("grid4x4", "respawn", overrides={"observation.kind": "dict"})
     places = layout(flat.config.sensors)
@@ -263,7 +263,7 @@ def test_the_dict_form_holds_the_slices_of_the_flat_one() -> None:
         ("sensors.lanes.range_m", "lanes"),
     ],
 )
-def test_switching_a_sensor_off_does_not_change_other_sensors(key: str, sensor: str) -> None:
+def test_other_sensors_do_not_change_if_a_sensor_is_switched_off(key: str, sensor: str) -> None:
     on = {"sensors.lidar.rays": 16}
     full, reduced = make("merge", overrides=on), make("merge", overrides={**on, key: 0})
     places = layout(full.config.sensors)
@@ -367,7 +367,7 @@ def test_a_change_to_a_missing_lane_has_no_effect() -> None:
     assert env.simulation.vehicles()[0]["target_lane"] == lane
 
 
-def test_meta_actions_step_through_the_target_speeds() -> None:
+def test_the_actions_faster_and_slower_select_the_next_target_speed() -> None:
     speeds = [0.0, 4.0, 8.0, 12.0]
     overrides = {"action.kind": "discrete", "action.target_speeds_mps": speeds}
     env = make("ring", agents=1, background=0, overrides=overrides, max_cycles=1000)
@@ -387,7 +387,7 @@ def test_meta_actions_step_through_the_target_speeds() -> None:
 
 @pytest.mark.parametrize("env_name", ["ring", "merge", "grid4x4", "town"])
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_suggested_actions_are_valid_and_lead_to_the_goal(env_name: str, kind: str) -> None:
+def test_suggested_actions_are_valid_and_lead_to_the_goals(env_name: str, kind: str) -> None:
     env = make(env_name, background=0, max_cycles=2500, overrides={"action.kind": kind})
     env.reset()
     fate = dict.fromkeys(env.agents, "cut")

@@ -1,4 +1,4 @@
-"""Calls that a closed or new environment refuses, and arguments that do not exist."""
+"""Calls that environments refuse: after close, before reset, and with wrong values."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAKERS: dict[str, Any] = {"parallel_env": cavmarl.parallel_env, "make_vec": cavm
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_closed_environment_refuses(name: str) -> None:
+def test_a_closed_environment_refuses_all_calls(name: str) -> None:
     env: Any = MAKERS[name]("ring", agents=2)
     env.reset(seed=0)
     actions = env.suggest_actions()
@@ -36,7 +36,7 @@ def test_a_closed_environment_refuses(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_a_new_environment_has_no_state(name: str) -> None:
+def test_an_environment_before_its_first_reset_refuses_to_return_a_state(name: str) -> None:
     env: Any = MAKERS[name]("ring", agents=2)
     for call in (env.state, env.suggest_actions):
         with pytest.raises(EpisodeError, match=r"before reset\(\): call reset\(seed=…\) first"):
@@ -45,7 +45,7 @@ def test_a_new_environment_has_no_state(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", MAKERS)
-def test_the_error_for_an_unknown_argument_names_the_nearest(name: str) -> None:
+def test_the_error_for_an_unknown_argument_names_the_most_similar_argument(name: str) -> None:
     with pytest.raises(UnknownArgumentError, match=r"'num_agents': did you mean agents\?") as told:
         MAKERS[name]("ring", num_agents=3)
     assert isinstance(told.value, CavmarlError)
@@ -54,7 +54,7 @@ def test_the_error_for_an_unknown_argument_names_the_nearest(name: str) -> None:
 
 
 @pytest.mark.parametrize("agent", ["x", 3, ["car_0"]])
-def test_an_unknown_agent_has_no_space(agent: Any) -> None:
+def test_the_spaces_of_an_unknown_agent_are_refused(agent: Any) -> None:
     env = cavmarl.parallel_env("ring", agents=2)
     for space in (env.action_space, env.observation_space):
         with pytest.raises(ActionError, match=re.escape(f"no agent {agent!r}: the ids are car_0")):
@@ -85,7 +85,7 @@ def drive(vec: cavmarl.CavVectorEnv) -> None:
 
 
 @pytest.mark.parametrize("answer", ["fast", None, [1.0, "a"], [[1.0], [1.0, 2.0]]])
-def test_a_registered_function_that_returns_no_numbers_is_refused(answer: Any) -> None:
+def test_a_registered_term_that_returns_no_finite_number_is_refused(answer: Any) -> None:
     def text(view: cavmarl.AgentView) -> Any:
         return answer
 

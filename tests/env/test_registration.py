@@ -1,4 +1,4 @@
-"""The ids of environments in Gymnasium and PettingZoo, and the environments that they create."""
+"""Ids of environments in Gymnasium and PettingZoo, and arguments of their environments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ALL = sorted(entries())
 
 
 @pytest.mark.parametrize("name", ALL)
-def test_every_entry_has_its_ids(name: str) -> None:
+def test_every_environment_is_registered_under_its_ids(name: str) -> None:
     version = load_config(name)[0].version
     assert f"cavmarl/{name}-v{version}" in gymnasium.registry
     assert f"cavmarl/{name}Agents-v{version}" in gymnasium.registry
@@ -36,8 +36,8 @@ def test_every_entry_has_its_ids(name: str) -> None:
         assert world.agents
 
 
-def test_the_discrete_ids_always_have_meta_actions() -> None:
-    """Programs such as CleanRL's take an id and nothing else."""
+def test_ids_with_discrete_always_make_environments_with_meta_actions() -> None:
+    """Programs such as those of CleanRL take an id only, so the id must select the actions."""
     five = gymnasium.spaces.Discrete(5)
     assert gymnasium.make("cavmarl/ringDiscrete-v5").action_space == five
     assert gymnasium.make("cavmarl/ring-v5").action_space != five
@@ -47,7 +47,7 @@ def test_the_discrete_ids_always_have_meta_actions() -> None:
     assert rows.single_action_space == five
 
 
-def test_the_aec_form_refuses_a_wrong_action_and_continues() -> None:
+def test_an_aec_environment_refuses_a_wrong_action_and_continues() -> None:
     world = cavmarl.env("ring", agents=2, background=0)
     world.reset(seed=0)
     before = world.agent_selection
@@ -67,7 +67,7 @@ def test_a_wrong_seed_is_refused_when_the_world_is_made(seed: object) -> None:
         cavmarl.make_vec("ring", seed=seed)
 
 
-def test_without_a_seed_no_two_first_resets_agree() -> None:
+def test_first_resets_without_a_seed_use_different_seeds() -> None:
     assert first_seed(None, None) != first_seed(None, None)
     assert first_seed(None, 5) == 5
     assert first_seed(7, 5) == 7
@@ -94,17 +94,17 @@ def test_invalid_names_are_refused(env: object) -> None:
 
 
 @pytest.mark.parametrize("overrides", [[1, 2], "sensors", 3])
-def test_overrides_are_a_mapping(overrides: object) -> None:
+def test_overrides_that_are_no_mapping_are_refused(overrides: object) -> None:
     with pytest.raises(cavmarl.ConfigError, match="must map dotted keys"):
         cavmarl.parallel_env("ring", overrides=overrides)
 
 
-def test_keys_of_overrides_are_text() -> None:
+def test_keys_of_overrides_that_are_no_text_are_refused() -> None:
     with pytest.raises(cavmarl.ConfigError, match="3 is not a key"):
         cavmarl.parallel_env("ring", overrides={3: 3})
 
 
-def test_a_horizon_is_a_whole_number_of_steps() -> None:
+def test_a_horizon_that_is_no_whole_number_of_steps_is_refused() -> None:
     with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 1\.04.*try 1$"):
         cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})
 
@@ -112,7 +112,7 @@ def test_a_horizon_is_a_whole_number_of_steps() -> None:
 def test_unusual_folders_do_not_break_the_import(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The user's `envs` has such folders; each can be used, and has an id if its name allows it."""
+    """Folders with unusual names in the user's `envs` can be used, and have an id if possible."""
     odd = [b"a space", b"not\xffutf8", b"two\nlines", b"-dash", b"latin", b"fine"]
     for name in odd:
         folder = Path(os.fsdecode(bytes(tmp_path) + b"/envs/" + name))

@@ -1,4 +1,4 @@
-"""Roads that are reversed, and events of `map.events`: equal in all divisions, saved, refused."""
+"""Reversed roads and the events of `map.events`: divisions, saved states and refusals."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ ROOM: dict[str, Any] = {
 
 
 def reverse(env: Any, step: int) -> None:
-    """Reverse two roads, and turn one of them back."""
+    """Reverse two roads in step 3, and open one of them again in step 70."""
     if step == 3:
         env.close_road("B1B2", contraflow=True)
         env.close_road("C1B1", contraflow=True)
@@ -53,11 +53,11 @@ def test_worlds_with_reversed_roads_over_nodes_are_equal() -> None:
 
 
 def test_saved_states_include_reversed_roads() -> None:
-    # The state is saved while the roads are being cleared.
+    # The state is saved while vehicles still leave the roads that will be reversed.
     check_resumed(reverse, ROOM, at=30, steps=120)
 
 
-def test_a_reversed_road_opens_when_it_is_empty_and_turns_back() -> None:
+def test_a_reversed_road_is_used_only_when_the_original_direction_is_empty() -> None:
     with closing(parallel_env("grid4x4", agents=1, background=80, overrides=ROOM)) as env:
         env.reset(seed=2)
         network = env.network
@@ -92,7 +92,7 @@ EVACUEES = (
 
 
 def chain(folder: Path) -> Path:
-    """Write a world in which one road after another is reversed, with vehicles both ways."""
+    """Write a world with a chain of roads that can be reversed, and vehicles in both directions."""
     words = ["-n", str(folder / "chain.nod.xml"), "-e", str(folder / "chain.edg.xml")]
     ends = [
         (a, b) for one in ("WA", "AM", "MN", "NB", "BX") for a, b in (tuple(one), tuple(one[::-1]))
@@ -120,7 +120,7 @@ def chain(folder: Path) -> Path:
 
 
 @pytest.mark.parametrize("order", [BRIDGE, BRIDGE[::-1]])
-def test_vehicles_leave_roads_that_are_reversed_one_after_another(
+def test_a_chain_of_roads_is_reversed_one_after_the_other_so_that_vehicles_can_leave(
     tmp_path: Path, order: tuple[str, ...]
 ) -> None:
     with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
@@ -132,7 +132,7 @@ def test_vehicles_leave_roads_that_are_reversed_one_after_another(
             if step == 60:
                 for road in order:
                     vec.close_road(road, shuts_in=True, contraflow=True)
-                # Vehicles on the other roads can still leave over these two.
+                # NM and MA stay open for now, because vehicles have to leave over them.
                 assert vec.closed_roads() == ("BN",)
             if step == 250:
                 for road in order:
@@ -150,7 +150,9 @@ def test_vehicles_leave_roads_that_are_reversed_one_after_another(
         assert (stats["arrived"], stats["contacts"]) == (120, 0)
 
 
-def test_a_divided_world_equals_the_undivided_one_while_roads_wait(tmp_path: Path) -> None:
+def test_a_divided_world_equals_the_undivided_one_while_roads_wait_for_their_reversal(
+    tmp_path: Path,
+) -> None:
     keys = {"map.events": [{"at_s": 40, "action": "reverse", "edges": [*BRIDGE], "shuts_in": True}]}
 
     def found(**more: Any) -> list[str]:
@@ -169,7 +171,7 @@ def test_a_divided_world_equals_the_undivided_one_while_roads_wait(tmp_path: Pat
     assert found(zones=2, workers=2) == undivided
 
 
-def test_a_road_that_is_closed_while_it_returns_stays_closed(tmp_path: Path) -> None:
+def test_a_road_that_is_closed_during_its_return_stays_closed(tmp_path: Path) -> None:
     with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
 
         def drive(steps: int) -> tuple[str, ...]:
@@ -180,7 +182,9 @@ def test_a_road_that_is_closed_while_it_returns_stays_closed(tmp_path: Path) -> 
         vec.reset(seed=1)
         vec.close_road("MA", shuts_in=True, contraflow=True)
         assert drive(90) == ("MA",)
-        vec.close_road("MA", shuts_in=True, contraflow=True)  # it is reversed already
+        vec.close_road(
+            "MA", shuts_in=True, contraflow=True
+        )  # has no effect, because the road is already reversed
         vec.open_road("MA")
         assert drive(2) == ("MA",)
         vec.close_road("MA", shuts_in=True)
@@ -189,7 +193,7 @@ def test_a_road_that_is_closed_while_it_returns_stays_closed(tmp_path: Path) -> 
         assert drive(1) == ()
 
 
-def test_reversals_in_damaged_states_are_refused(tmp_path: Path) -> None:
+def test_saved_states_with_invalid_reversals_are_refused(tmp_path: Path) -> None:
     with closing(make_vec(chain(tmp_path), num_envs=1)) as vec:
         vec.reset(seed=1)
         vec.close_road("BN", shuts_in=True, contraflow=True)
@@ -221,7 +225,7 @@ def test_reversals_in_damaged_states_are_refused(tmp_path: Path) -> None:
         assert "is not reversed are open" in changes.wrong((opened, states))
 
 
-def test_impossible_reversals_are_refused_with_a_fix() -> None:
+def test_invalid_reversals_are_refused_with_a_remedy() -> None:
     keys = {**ROOM, "map.changed_lanes": 5}
     with closing(parallel_env("grid4x4", overrides=keys)) as env:
         env.reset(seed=1)
@@ -237,7 +241,7 @@ def test_impossible_reversals_are_refused_with_a_fix() -> None:
         with pytest.raises(ActionError, match="is reversed with all its lanes; leave lanes out"):
             env.close_road("B1B2", lanes=[0], contraflow=True)
         env.close_road("B1B2", contraflow=True)
-        # Four lanes will have changed then, so two more do not fit.
+        # This reversal needs four of the five lanes, so there is no room for another one.
         with pytest.raises(CapacityError, match=r"map\.changed_lanes = 5; set it higher"):
             env.close_road("C1B1", contraflow=True)
         assert env.closed_roads() == ("B1B2",)
@@ -260,7 +264,7 @@ EVENTS = {
 
 
 def by_hand(env: Any, step: int) -> None:
-    """Do what the events say."""
+    """Make the changes of EVENTS by calls at the same times."""
     if step == 2:
         env.close_road("B1B2")
         env.close_road("B2B1")
@@ -271,7 +275,7 @@ def by_hand(env: Any, step: int) -> None:
         env.open_road("B1B2")
 
 
-def test_events_are_what_a_caller_would_do() -> None:
+def test_events_have_the_same_effect_as_calls() -> None:
     def nothing(env: Any, step: int) -> None:
         pass
 
@@ -291,12 +295,12 @@ def test_events_happen_in_each_episode_of_each_world() -> None:
             closed.append([vec.closed_roads(world) for world in range(2)])
         assert closed[1] == [(), ()]
         assert closed[3] == [("B1B2", "B2B1")] * 2
-        over = closed.index([(), ()], 4)  # the episodes have ended
+        over = closed.index([(), ()], 4)  # the next episodes have begun
         again = closed[over:]
         assert again[again.index([("B1B2", "B2B1")] * 2) - 1] == [(), ()]
 
 
-def test_a_run_with_events_is_recorded(tmp_path: Path) -> None:
+def test_events_are_recorded(tmp_path: Path) -> None:
     keys = {"agents": 2, "overrides": EVENTS, "record": tmp_path / "run"}
     with closing(parallel_env("grid4x4", **keys)) as env:  # type: ignore[arg-type]
         env.reset(seed=2)
@@ -332,12 +336,12 @@ def test_a_run_with_events_is_recorded(tmp_path: Path) -> None:
         ({"at_s": 1, "action": "close", "edges": ["B1B2"], "lanes": [7]}, "has the lanes 0 to 1"),
     ],
 )
-def test_impossible_events_are_refused(event: dict[str, Any], message: str) -> None:
+def test_invalid_events_are_refused(event: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         parallel_env("grid4x4", overrides={**EVENTS, "map.events": [event]})
 
 
-def test_events_that_need_too_many_lanes_or_close_the_last_way_are_refused() -> None:
+def test_events_that_need_too_many_lanes_or_close_the_last_exit_are_refused() -> None:
     with pytest.raises(ConfigError, match=r"map\.events\.0: world 0: .* map\.changed_lanes = 3"):
         parallel_env("grid4x4", overrides={**EVENTS, "map.changed_lanes": 3})
     last = {"at_s": 1, "action": "close", "edges": ["main_out"]}
@@ -353,7 +357,7 @@ def test_events_that_need_too_many_lanes_or_close_the_last_way_are_refused() -> 
         assert env.closed_roads() == ("main_out",)
 
 
-def test_the_rows_of_vehicles_are_the_same_wherever_the_world_runs() -> None:
+def test_the_rows_of_vehicles_do_not_depend_on_zones_and_workers() -> None:
     def rows(**more: Any) -> np.ndarray[Any, Any]:
         with closing(make_vec("grid4x4", num_envs=1, background=20, **more)) as vec:
             vec.reset(seed=1)

@@ -1,4 +1,4 @@
-"""A vector environment resumes from bytes bit for bit, with any zones and workers."""
+"""A vectorized environment resumes from saved bytes bit for bit, with any zones and workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def make(mode: str = "SameStep", num_envs: int = WORLDS, **arguments: Any) -> Ca
 
 
 def drive(vec: CavVectorEnv, steps: range) -> list[bytes]:
-    """Return all results of steps; the numbers of the steps are seeds of the actions."""
+    """Drive the steps, whose numbers are the seeds of the actions, and return all results."""
     found = []
     for step in steps:
         actions = np.random.default_rng(step).uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2))
@@ -85,7 +85,7 @@ def test_invalid_saves_and_loads_are_refused() -> None:
 
 
 def forged(vec: CavVectorEnv, saved: bytes, place: int, value: float, item: int = 0) -> bytes:
-    """Return a saved state with a changed item in one of its first arrays, and a new checksum."""
+    """Return a saved state with one changed item in array `place`, and with a valid checksum."""
     arrays = [array.copy() for array in saved_arrays(vec, saved)]
     arrays[place].flat[item] = value
     content = to_bytes(arrays)
@@ -122,7 +122,7 @@ SIZES = -2
         (SIZES, 0, -1, "a world has a negative size"),
     ],
 )
-def test_invalid_values_outside_of_the_worlds_are_refused(
+def test_invalid_values_of_the_session_are_refused(
     place: int, at: int, value: float, message: str
 ) -> None:
     vec = make(overrides={"population.insertions": 3})
@@ -140,7 +140,7 @@ EXTERNAL_COMMANDS, EXTERNAL_USED = 9, 10
 
 
 def with_external(**arguments: Any) -> tuple[CavVectorEnv, bytes]:
-    """Return worlds in which a vehicle of the caller waits to enter, and their saved state."""
+    """Return worlds in which an external vehicle waits to enter, and their saved state."""
     vec = make(overrides={"population.external": 3}, **arguments)
     vec.reset(seed=0)
     min_x, min_y, _, _ = vec.network.extent_m
@@ -170,7 +170,7 @@ def test_invalid_waiting_commands_to_external_vehicles_are_refused(
     assert vec.save_state() == saved
 
 
-def test_a_command_to_a_vehicle_that_is_only_in_the_session_is_refused() -> None:
+def test_a_command_to_a_vehicle_that_does_not_exist_in_the_world_is_refused() -> None:
     vec, saved = with_external()
     vec.load_state(forged(vec, saved, EXTERNAL_USED, True, item=2))
     vec.external.drive(2, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""`sensors_of`: environments with the sensors and actions of a trained driver."""
+"""`sensors_of` makes environments with the sensors and actions of a trained driver."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def test_overrides_that_contradict_the_driver_are_refused(make: Any) -> None:
         make("merge", sensors_of="idm")
 
 
-def test_adapters_pass_sensors_of_on() -> None:
+def test_adapters_accept_sensors_of() -> None:
     ego = CavEgoEnv("ring", sensors_of="merge_ippo")
     lenient = parallel_env("ring", sensors_of="merge_ippo", lenient=True, **SMALL)
     (size,) = make_vec("merge").single_observation_space.shape
@@ -61,7 +61,7 @@ def test_adapters_pass_sensors_of_on() -> None:
     assert lenient.config.action.out_of_range == "clip"
 
 
-def test_workers_have_the_same_sensors() -> None:
+def test_observations_with_sensors_of_do_not_depend_on_workers() -> None:
     def rows(vec: CavVectorEnv) -> list[bytes]:
         found = [vec.reset(seed=3)[0].tobytes()]
         for _ in range(3):
@@ -77,7 +77,7 @@ def test_workers_have_the_same_sensors() -> None:
     assert here == there
 
 
-def test_taking_sensors_loads_no_torch(tmp_path: Path) -> None:
+def test_sensors_of_loads_no_torch(tmp_path: Path) -> None:
     code = (
         "import sys; from cavmarl import make_vec; "
         "make_vec('merge', sensors_of='cities_residual'); print('torch' in sys.modules)"

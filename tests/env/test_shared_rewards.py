@@ -1,4 +1,4 @@
-"""Rewards that are shared with nearby agents, as in CoPO's local coordination."""
+"""Rewards shared with nearby agents, as in the local coordination of CoPO."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.config.terms import TERMS
 SHARE, RANGE_M = 0.3, 40.0
 
 
-def test_a_share_of_the_reward_comes_from_nearby_agents() -> None:
+def test_a_share_of_the_reward_is_the_mean_of_nearby_agents() -> None:
     near = {"terms.team_share": SHARE, "terms.team_range_m": RANGE_M}
     vec = make_vec("merge", num_envs=2, overrides={"terms.weights": {"delay": 1.0}, **near})
     vec.reset(seed=0)

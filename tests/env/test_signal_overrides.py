@@ -36,7 +36,7 @@ TALKATIVE = {
 
 
 def act(env: Any, step: int) -> None:
-    """Show and release states of signals at some steps."""
+    """Show or release states of signals if this is planned for the step."""
     if step == 1:
         for index in range(8):
             env.signal_overrides.show("B1", index, "G" if index < 4 else "r")
@@ -61,7 +61,7 @@ def test_a_divided_world_equals_the_undivided_one() -> None:
     assert hashes(overrides=ROOM | {"signals.overrides": 41}) == undivided
 
 
-def test_messages_and_sensors_change_nothing() -> None:
+def test_a_divided_world_with_messages_and_sensors_equals_the_undivided_one() -> None:
     more = {**TALKATIVE, "rig": {"lidar": {"type": "lidar", "rate_hz": 5, "rays": 24}}}
     assert hashes(overrides=ROOM | more, zones=3) == hashes(overrides=ROOM | more)
 
@@ -80,12 +80,12 @@ def test_saved_states_include_overridden_signals() -> None:
     check_resumed(act, ROOM, at=15, steps=30)
 
 
-def test_a_signal_shows_letters_until_it_is_released() -> None:
+def test_a_signal_shows_the_given_letter_until_it_is_released_or_reset() -> None:
     env = parallel_env("grid4x4", overrides=ROOM)
     env.reset(seed=1)
     before = env.signal_overrides.letters("B1")
     env.signal_overrides.show("B1", 4, "Y")
-    assert env.signal_overrides.letters("B1") == before, "the signal changes in the next step"
+    assert env.signal_overrides.letters("B1") == before, "the signal changes before the next step"
     env.step(env.suggest_actions())
     assert env.signal_overrides.letters("B1") == before[:4] + "Y" + before[5:]
     env.signal_overrides.release("B1", 4)
@@ -95,7 +95,7 @@ def test_a_signal_shows_letters_until_it_is_released() -> None:
     env.step(env.suggest_actions())
     env.reset(seed=1)
     env.step(env.suggest_actions())
-    assert env.signal_overrides.letters("B1") == before, "a reset releases all signals"
+    assert env.signal_overrides.letters("B1") == before, "a reset does not release the signal"
 
 
 def test_drivers_wait_while_all_signals_are_red() -> None:
@@ -113,7 +113,7 @@ def test_drivers_wait_while_all_signals_are_red() -> None:
             before = {int(row["id"]): int(row["lane"]) for row in env.simulation.vehicles(0)}
             env.step(env.suggest_actions())
             if step < 60:
-                continue  # vehicles that could not stop before the line are over it
+                continue  # first let vehicles pass that cannot stop before the line
             for row in env.simulation.vehicles(0):
                 lane = before.get(int(row["id"]), -1)
                 found += lane >= 0 and not internal[lane] and bool(internal[row["lane"]])
@@ -141,7 +141,7 @@ def test_agents_observe_overridden_states_of_signals() -> None:
     assert (seen[0] != seen[1]).any(axis=1).sum() > 2
 
 
-def test_messages_have_the_states_that_are_shown() -> None:
+def test_messages_contain_overridden_states_of_signals() -> None:
     overrides = {"signals.overrides": 400, **TALKATIVE, "v2x.roadside.rate_hz": 10.0}
     env = parallel_env("grid4x4", agents=8, background=0, overrides=overrides)
     env.reset(seed=5)
@@ -191,7 +191,7 @@ def test_recordings_and_drawings_show_overridden_signals(tmp_path: Path) -> None
     assert told == [f"link {link}: shows Y", f"link {link}: shows its program"]
 
 
-def test_wrong_commands_are_refused_with_a_fix() -> None:
+def test_wrong_commands_are_refused_with_a_remedy() -> None:
     env = parallel_env("grid4x4", overrides={"signals.overrides": 2})
     with pytest.raises(EpisodeError, match="before reset"):
         env.signal_overrides.show("A0", 0, "G")

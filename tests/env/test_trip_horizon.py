@@ -1,4 +1,4 @@
-"""Trips of agents with a time limit of their own."""
+"""Trips of agents with a time limit that depends on the trip."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cavmarl.core.errors import ConfigError
 STEPS = 320
 
 
-def standing(zones: int) -> tuple[list[tuple[int, int]], str]:
-    """Return when which braking agents are truncated, and the state after the horizon."""
+def truncations_of_standing_agents(zones: int) -> tuple[list[tuple[int, int]], str]:
+    """Let agents brake; return each truncation (step, agent), and the state at the end."""
     vec = cavmarl.make_vec(
         "merge",
         zones=zones,
@@ -35,14 +35,14 @@ def standing(zones: int) -> tuple[list[tuple[int, int]], str]:
     return cuts, vec.state_hash()
 
 
-def test_a_trip_that_takes_too_long_is_truncated_the_same_in_any_division() -> None:
-    cuts, state = standing(zones=1)
+def test_trips_that_take_too_long_are_truncated_equally_in_all_divisions() -> None:
+    cuts, state = truncations_of_standing_agents(zones=1)
     assert cuts
-    assert max(step for step, _ in cuts) < STEPS - 1  # not the episode's horizon
-    assert standing(zones=2) == (cuts, state)
+    assert max(step for step, _ in cuts) < STEPS - 1  # earlier than the horizon of the episode
+    assert truncations_of_standing_agents(zones=2) == (cuts, state)
 
 
-def test_a_trip_has_its_free_time_and_a_cycle_of_each_signal() -> None:
+def test_the_time_limit_is_a_multiple_of_the_free_time_plus_a_cycle_of_each_signal() -> None:
     vec = cavmarl.make_vec(
         "grid4x4", agents=6, background=0, overrides={"traffic.trip_horizon": 2.0}
     )
@@ -70,6 +70,6 @@ def test_a_trip_has_its_free_time_and_a_cycle_of_each_signal() -> None:
         assert due_s == pytest.approx(2.0 * free_s + signals_s, abs=0.2)
 
 
-def test_a_horizon_that_no_vehicle_can_keep_is_refused() -> None:
+def test_a_trip_horizon_below_the_free_time_is_refused() -> None:
     with pytest.raises(ConfigError, match="at least 1: no vehicle"):
         cavmarl.make_vec("grid4x4", overrides={"traffic.trip_horizon": 0.5})

@@ -27,7 +27,7 @@ def make(
 
 
 def wild(rng: np.random.Generator, vec: CavVectorEnv) -> NDArray[np.float32]:
-    """Return (W, A, 2) full throttle and random steering: most trips soon end."""
+    """Return actions (W, A, 2) of full throttle and random steering, which soon end most trips."""
     actions = rng.uniform(-1.0, 1.0, (vec.num_envs, vec.num_agents, 2)).astype(np.float32)
     actions[..., 0] = 1.0
     return actions
@@ -71,7 +71,7 @@ def test_a_vectorized_world_equals_the_parallel_environment(mode: str) -> None:
         for agent in active:
             np.testing.assert_array_equal(arrays[0, int(agent[4:])], dicts[agent])
         if not active:
-            break  # a step of the parallel environment lasts until the next agent enters
+            break  # here, a step of the parallel environment lasts until an agent enters
         actions = wild(rng, vec)
         arrays, rewards, terminations, truncations, infos = vec.step(actions)
         dicts, paid, ended, cut, told = env.step({a: actions[0, int(a[4:])] for a in active})
@@ -96,7 +96,7 @@ def test_a_vectorized_world_equals_the_parallel_environment(mode: str) -> None:
         np.testing.assert_array_equal(vec.state()[0], env.state())
 
 
-def test_worlds_do_not_touch_each_other() -> None:
+def test_actions_in_one_world_do_not_change_other_worlds() -> None:
     calm, shaken = make(3), make(3)
     calm.reset(seed=2)
     shaken.reset(seed=2)
@@ -112,7 +112,7 @@ def test_worlds_do_not_touch_each_other() -> None:
     assert len({calm.state_hash(w) for w in range(3)}) == 3
 
 
-def test_a_seed_repeats_episodes_and_no_seed_continues() -> None:
+def test_a_reset_with_a_seed_repeats_the_episode_and_a_reset_without_a_seed_continues() -> None:
     vec, again = make(2), make(2)
     hashes = []
     for seed in (3, None, 3, None):
@@ -149,9 +149,9 @@ def test_a_world_can_reset_in_the_same_step(mode: str) -> None:
             shown = np.where(infos["mask"][world][:, None], first, 0.0)
             np.testing.assert_array_equal(observations[world], shown)
             assert vec.simulation.ticks()[world] == 0
-            # In entering mode, no agent may act in the last step: all others wait to enter.
+            # In the mode "open", the last step may have no acting agent, because all wait to enter.
             shows = infos["final_observations"][world].any(axis=1)
-            # An agent that entered in this step is present, but has not acted and did not have to.
+            # An agent that entered in this step has a final observation although it has not acted.
             assert shows[infos["acted"][world]].all()
             assert not (shows & ~infos["acted"][world] & acting[world]).any()
             assert not np.array_equal(observations[world], infos["final_observations"][world])
@@ -166,7 +166,7 @@ def test_a_world_can_reset_in_the_same_step(mode: str) -> None:
 @pytest.mark.parametrize("copy", [True, False])
 @pytest.mark.parametrize("mode", MODES)
 def test_a_world_can_reset_in_the_next_step(mode: str, copy: bool) -> None:
-    """The steps equal those of `SAME_STEP`, except for one more step between two episodes."""
+    """Steps equal those of `SAME_STEP`, except that a reset takes one more step."""
     late, now = make(1, mode, autoreset_mode="NextStep", copy=copy), make(1, mode)
     assert late.metadata["autoreset_mode"] is AutoresetMode.NEXT_STEP
     rng = np.random.default_rng(4)
@@ -186,7 +186,7 @@ def test_a_world_can_reset_in_the_next_step(mode: str, copy: bool) -> None:
             continue
         episodes += 1
         assert not told["mask"].any()
-        first, rewards, ended, cut, told = late.step(np.full_like(actions, np.nan))  # not read
+        first, rewards, ended, cut, told = late.step(np.full_like(actions, np.nan))  # ignored
         np.testing.assert_array_equal(first, wanted[0])
         np.testing.assert_array_equal(told["mask"], infos["mask"])
         assert not rewards.any()
@@ -241,8 +241,8 @@ def test_a_wrong_autoreset_mode_is_refused(mode: Any) -> None:
         make(1, autoreset_mode=mode)
 
 
-def test_without_autoreset_a_world_that_is_over_waits_for_a_reset() -> None:
-    """Up to its end, steps equal those of `NEXT_STEP`; the reset begins the same next episode."""
+def test_a_world_without_autoreset_waits_for_a_reset_after_its_episode() -> None:
+    """Steps equal those of `NEXT_STEP`, and the reset begins the same next episode."""
     waits, late = make(2, autoreset_mode="Disabled"), make(2, autoreset_mode="NextStep")
     assert waits.metadata["autoreset_mode"] is AutoresetMode.DISABLED
     waits.reset(seed=4)
@@ -267,10 +267,12 @@ def test_the_mask_marks_acting_agents(mode: str) -> None:
     rng = np.random.default_rng(0)
     for _ in range(100):
         mask = infos["mask"]
-        assert not observations[~mask].any(), "an agent without a vehicle observes zeros"
+        assert not observations[~mask].any(), (
+            "an agent without a vehicle observes other values than 0"
+        )
         assert observations[mask].any(axis=-1).all()
         actions = wild(rng, vec)
-        actions[~mask] = np.nan  # not read
+        actions[~mask] = np.nan  # ignored
         observations, rewards, terminations, _, infos = vec.step(actions)
         assert not rewards[~mask].any()
         assert not infos["terms"][~mask].any()
@@ -305,7 +307,7 @@ def test_the_arrays_have_the_shapes_and_dtypes_of_the_spaces() -> None:
 
 
 @pytest.mark.parametrize("mode", MODES)
-def test_without_copies_the_results_are_the_same(mode: str) -> None:
+def test_results_without_copies_are_equal_read_only_views(mode: str) -> None:
     stack = {"sensors.stack": 2}
     kept, shown = (make(3, mode, overrides=stack, copy=copy) for copy in (True, False))
     rng = np.random.default_rng(1)
@@ -325,7 +327,7 @@ def test_without_copies_the_results_are_the_same(mode: str) -> None:
     assert np.shares_memory(other[0], shown.simulation.outputs.observations)
 
 
-def test_results_are_the_callers_to_keep() -> None:
+def test_later_steps_do_not_change_earlier_results() -> None:
     vec = make(2)
     vec.reset(seed=0)
     kept = vec.step(vec.suggest_actions())[:4]
@@ -336,7 +338,7 @@ def test_results_are_the_callers_to_keep() -> None:
         np.testing.assert_array_equal(array, copy)
 
 
-def test_discrete_actions_are_whole_numbers() -> None:
+def test_suggested_discrete_actions_are_integers() -> None:
     vec = make(2, overrides={"action.kind": "discrete"})
     vec.reset(seed=0)
     for _ in range(10):

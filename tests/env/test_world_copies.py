@@ -1,4 +1,4 @@
-"""A copy or a pickle of an environment is independent, and continues bit for bit."""
+"""A copy or pickle of an environment is independent of it and continues bit for bit."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def actions_of(env: cavmarl.CavEnv, step: int) -> dict[str, np.ndarray]:
 
 
 def flat(value: Any) -> Any:
-    """Convert the result of a call so that `==` compares it: arrays become bytes."""
+    """Convert arrays in a result to bytes, so that `==` can compare results."""
     if isinstance(value, dict):
         return [(key, flat(item)) for key, item in value.items()]
     if isinstance(value, tuple):
@@ -47,7 +47,7 @@ def flat(value: Any) -> Any:
 
 
 def drive(env: cavmarl.CavEnv, first: int, steps: int) -> list[Any]:
-    """Drive some steps; return all results, and the state at the end."""
+    """Drive some steps; return all results and the final state."""
     seen: list[Any] = []
     for step in range(first, first + steps):
         if not env.agents:
@@ -67,7 +67,7 @@ def test_a_copy_continues_like_the_original(name: str, how: str) -> None:
     assert other.agents == env.agents
     first = drive(env, 15, 12)
     assert drive(other, 15, 12) == first
-    assert flat(other.reset()) == flat(env.reset()), "the next episode is equal, too"
+    assert flat(other.reset()) == flat(env.reset()), "the next episodes differ"
 
 
 @pytest.mark.parametrize("how", COPIES)
@@ -112,12 +112,12 @@ def test_a_copied_batch_of_worlds_continues_like_the_original(how: str, copied: 
 
 @pytest.mark.parametrize("how", COPIES)
 def test_a_copy_of_an_aec_environment_continues(how: str) -> None:
-    turns = cavmarl.env("ring", agents=2)
-    turns.reset(seed=4)
-    turns.step(np.zeros(2))
-    later = COPIES[how](turns)
+    aec = cavmarl.env("ring", agents=2)
+    aec.reset(seed=4)
+    aec.step(np.zeros(2))
+    later = COPIES[how](aec)
     seen = []
-    for env in (turns, later):
+    for env in (aec, later):
         for _ in range(5):
             env.step(np.full(2, 0.3))
             seen.append((env.agent_selection, flat(env.last())))
@@ -147,14 +147,14 @@ def test_a_world_that_is_sent_to_another_process_continues() -> None:
 
 
 @pytest.mark.parametrize("how", COPIES)
-def test_worlds_with_processes_are_refused(how: str) -> None:
+def test_copies_of_worlds_with_processes_are_refused(how: str) -> None:
     env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, workers=2)
     with pytest.raises(cavmarl.ConfigError, match="backend='local'"):
         COPIES[how](env)
     env.close()
 
 
-def test_a_copy_continues_without_the_journal(tmp_path: Any) -> None:
+def test_a_copy_does_not_write_to_the_journal(tmp_path: Any) -> None:
     path = tmp_path / "journal"
     journal = {"zones.journal": str(path), "zones.check_invariants": True}
     env = cavmarl.parallel_env("grid4x4", agents=2, zones=2, overrides=journal)
@@ -168,14 +168,14 @@ def test_a_copy_continues_without_the_journal(tmp_path: Any) -> None:
 
 
 class Named(cavmarl.CavEnv):
-    """A user's own class, with another constructor."""
+    """A class of a user, with a different constructor."""
 
     def __init__(self, name: str) -> None:
         super().__init__(cavmarl.parallel_env("ring").worlds)
         self.name = name
 
 
-def test_an_instance_of_a_users_own_class_is_copied() -> None:
+def test_an_instance_of_a_users_class_can_be_copied() -> None:
     env = Named("first")
     env.reset(seed=0)
     other = copy.deepcopy(env)

@@ -1,4 +1,4 @@
-"""An evaluation gives the same results wherever its worlds run, and lists what processes used."""
+"""Results of an evaluation do not depend on the backend; the resources of processes are listed."""
 
 from __future__ import annotations
 
@@ -21,7 +21,9 @@ from tests.support.sumo_worlds import tiny_file
 
 WORLD: dict[str, Any] = {"agents": 4, "background": 30, "max_cycles": 30, "seed": 5}
 FILES = ("trips.csv", "tracks.csv", "places.json")
-OWNERSHIP = "zone_imbalance"  # nodes change owners between steps only
+OWNERSHIP = (
+    "zone_imbalance"  # depends on the backend, because nodes change owners only between steps
+)
 
 
 def run(folder: Path, backend: str, **more: Any) -> EvaluationReport:
@@ -36,14 +38,14 @@ def episodes_of(folder: Path) -> list[dict[str, str]]:
 
 @pytest.fixture(scope="module")
 def local(tmp_path_factory: pytest.TempPathFactory) -> dict[int, Path]:
-    """Return the results of worlds of this process, by number of episodes."""
+    """Return folders of results with the backend `local`, by number of episodes."""
     folders = {episodes: tmp_path_factory.mktemp("local") for episodes in (1, 2)}
     for episodes, folder in folders.items():
         run(folder, "local", episodes=episodes, overrides={"v2x.enabled": True})
     return folders
 
 
-# More processes than worlds share the zones of a world; otherwise they have whole worlds.
+# With one episode, two processes share the zones of one world; with two, each runs a world.
 @pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
 @pytest.mark.parametrize("episodes", [1, 2])
 def test_results_do_not_depend_on_the_backend(
@@ -61,7 +63,7 @@ def test_results_do_not_depend_on_the_backend(
     assert all(row["memory_mb"] > 10.0 for row in report.resources["idm"])
 
 
-def test_nodes_report_waits_traffic_and_changes_of_owner(tmp_path: Path) -> None:
+def test_nodes_report_waits_bytes_and_ownership_changes(tmp_path: Path) -> None:
     report = run(tmp_path, "nodes:2", episodes=1)
     caller, *nodes = report.resources["random_actions"]
     changes = report["random_actions"].transfers
@@ -86,12 +88,12 @@ def test_the_manifest_describes_the_nodes_and_their_connections(tmp_path: Path) 
             assert node["machine"] == socket.gethostname()
             assert {link["to"] for link in node["links"]} == {"caller", 1 - node["node"]}
             for link in node["links"]:
-                assert not link["is_encrypted"]  # the connections stay on this machine
+                assert not link["is_encrypted"]  # connections within one machine are not encrypted
                 assert 0.0 < link["least_rtt_ms"] <= 1e3
                 assert link["rtt_ms"] > 0.0 < link["delivered_mbit_s"]
 
 
-def test_worlds_of_this_process_leave_no_table_of_processes(local: dict[int, Path]) -> None:
+def test_the_local_backend_writes_no_table_of_resources(local: dict[int, Path]) -> None:
     assert not (local[1] / "resources.csv").exists()
     assert not load_resources(local[1])
 
@@ -107,7 +109,7 @@ def test_recordings_and_failed_trips_do_not_depend_on_the_backend(tmp_path: Path
     assert pages["local"] == pages["processes:2"]
 
 
-def test_each_of_several_runs_has_processes_of_its_own(tmp_path: Path) -> None:
+def test_each_run_has_its_own_processes(tmp_path: Path) -> None:
     one, two = tmp_path / "one", tmp_path / "two"
     few = {**WORLD, "max_cycles": 8}
     here = evaluate("grid4x4", "idm", episodes=1, repeats=2, out=one, **few)

@@ -1,4 +1,4 @@
-"""The board: verified entries are shown, and each failure is marked with its reason."""
+"""The board shows verified entries, and marks each failed entry with the reason."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ ENTRIES = {path.name: path for path in entries_in([ROOT / "board"])}
 
 @pytest.mark.parametrize("name", ENTRIES)
 def test_an_entry_of_the_board_is_verified(name: str) -> None:
-    """The entries of `agents/` are verified by the tests of the zoo."""
+    """This test omits the entries of `agents/`, which the tests of the zoo verify."""
     path = ENTRIES[name]
     is_script = name in agent_entries()
     assert entry_driver(path) == (agent_entries()[name] if is_script else path)
@@ -106,7 +106,7 @@ def test_a_model_of_another_library_is_shown_as_not_verified(
     assert found.state == "failed"
 
 
-def test_entries_are_the_drivers_of_the_zoo() -> None:
+def test_the_folder_of_agents_has_an_entry_for_each_trained_driver() -> None:
     names = [path.name for path in entries_in([agent_entries()["merge_ippo"].parent])]
     assert names == sorted(name for name, path in agent_entries().items() if path.is_dir())
 
@@ -194,7 +194,9 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
 
 
 @pytest.mark.parametrize("spoilt", SPOILT)
-def test_a_spoilt_entry_is_refused_and_marked(spoilt: str, entry: Path, tmp_path: Path) -> None:
+def test_a_damaged_entry_is_refused_and_marked_as_failed(
+    spoilt: str, entry: Path, tmp_path: Path
+) -> None:
     spoil, kind, message = SPOILT[spoilt]
     spoil(entry)
     with pytest.raises(kind, match=message):
@@ -208,7 +210,7 @@ def test_a_spoilt_entry_is_refused_and_marked(spoilt: str, entry: Path, tmp_path
     assert "✓ verified" not in page
 
 
-def test_other_bytes_of_driving_again_are_refused(entry: Path) -> None:
+def test_results_that_differ_from_a_repeated_evaluation_are_refused(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     job = document["job"] | {"episodes": 1, "seed": 3}
@@ -218,7 +220,7 @@ def test_other_bytes_of_driving_again_are_refused(entry: Path) -> None:
         check_entry(entry)
 
 
-def test_a_board_shows_good_and_bad_entries(entry: Path, tmp_path: Path) -> None:
+def test_a_board_shows_verified_and_failed_entries(entry: Path, tmp_path: Path) -> None:
     folder = entry.parent
     script_entry(folder)
     clock = SCRIPT.replace("-0.5,", "-0.5 * (time.time_ns() % 1000 / 1000.0),")
@@ -265,7 +267,7 @@ def test_wrong_folders_and_names_are_refused(entry: Path, tmp_path: Path) -> Non
         check_entry(tmp_path / "nowhere")
 
 
-def test_the_commands_build_and_check(
+def test_the_commands_check_an_entry_and_build_the_board(
     entry: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     out, told = tmp_path / "page.html", tmp_path / "told.json"
@@ -298,7 +300,7 @@ def test_the_commands_build_and_check(
         ({"seeds": 3}, "seeds"),
     ],
 )
-def test_a_damaged_manifest_does_not_end_the_board(
+def test_a_damaged_manifest_does_not_stop_the_board(
     keys: dict[str, Any], wrong: str, entry: Path, tmp_path: Path
 ) -> None:
     change_manifest(entry, **keys)
@@ -306,19 +308,19 @@ def test_a_damaged_manifest_does_not_end_the_board(
     assert re.search(rf"manifest\.json: {wrong} is missing or damaged; evaluate", found.failure)
 
 
-def test_a_damaged_job_does_not_end_the_board(entry: Path, tmp_path: Path) -> None:
+def test_a_manifest_with_a_damaged_job_does_not_stop_the_board(entry: Path, tmp_path: Path) -> None:
     job = json.loads((entry / "result" / "manifest.json").read_text())["job"]
     change_manifest(entry, job=job | {"overrides": 3})
     (found,) = build_board([entry], tmp_path / "board.html")
     assert "does not say what was driven" in found.failure
 
 
-def test_an_entry_is_checked_from_its_own_folder(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_entry_can_be_checked_from_inside_its_folder(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(ROOT / "board" / "idm")
     assert not check_entry(Path()).differing
 
 
-def test_a_script_cannot_end_the_check(tmp_path: Path) -> None:
+def test_a_script_that_exits_does_not_end_the_check(tmp_path: Path) -> None:
     own = script_entry(tmp_path / "entries")
     script = own / "brake.py"
     script.write_text(script.read_text() + "\n\nraise SystemExit(0)\n")

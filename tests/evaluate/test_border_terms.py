@@ -1,4 +1,4 @@
-"""Reward terms near borders and inside of zones: each step of an agent counts once."""
+"""Reward terms near borders and inside zones count each step of an agent once."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ HALVES = ZonePartition(
 )
 
 
-def test_only_borders_to_other_zones_are_borders() -> None:
+def test_the_edge_of_the_map_is_no_border() -> None:
     record = BorderTerms(HALVES, step_s=0.5)
     places = np.array([[[1.0, 1.0], [100.0 - NEAR_M, 50.0], [99.0, 99.0], [100.0, 5.0]]])
     terms = np.zeros((1, 4, len(TERMS)), dtype=np.float32)
@@ -50,6 +50,6 @@ def test_an_evaluation_of_a_divided_world_counts_each_event_once(tmp_path: Path)
     assert all(row["agent_hours"] > 0.0 for row in every)
 
 
-def test_an_undivided_world_has_no_borders(tmp_path: Path) -> None:
+def test_an_undivided_world_has_no_table_of_borders(tmp_path: Path) -> None:
     evaluate("ring", "idm", episodes=1, max_cycles=10, out=tmp_path / "out")
     assert load_places(tmp_path / "out") == {}

@@ -1,4 +1,4 @@
-"""Energy and CO₂ of agents and of background vehicles: in rewards, trips and episodes."""
+"""Energy and CO₂ of agents and background vehicles in rewards, trips and episodes."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ NAMES = ("energy_wh_per_km", "co2_g_per_km")
 WEIGHTS = {"terms.weights": {"energy": -0.1, "co2": -0.05}}
 
 
-def test_agents_and_others_take_what_cars_take_and_zones_change_nothing() -> None:
+def test_energy_and_co2_have_the_size_of_real_cars_and_do_not_depend_on_zones() -> None:
     told = evaluate("grid4x4", "idm", seed=3, overrides=WEIGHTS, **SMALL)["idm"]
     for prefix in ("", "background_"):
         energy, co2 = (told[prefix + name].mean for name in NAMES)
@@ -34,7 +34,7 @@ def test_agents_and_others_take_what_cars_take_and_zones_change_nothing() -> Non
         assert divided[name].mean == told[name].mean
 
 
-def test_without_others_there_is_no_energy_of_others() -> None:
+def test_a_world_without_background_vehicles_has_no_background_energy() -> None:
     told = evaluate("grid4x4", "idm", seed=3, **{**SMALL, "background": 0, "max_cycles": 20})
     assert told["idm"]["background_energy_wh_per_km"].mean is None
     assert told["idm"]["energy_wh_per_km"].mean is not None
@@ -59,7 +59,7 @@ def rewards(**more: Any) -> NDArray[np.float32]:
         return np.array(found)
 
 
-def test_rewards_for_energy_are_the_same_bytes_in_each_division() -> None:
+def test_energy_rewards_are_equal_in_all_divisions() -> None:
     undivided = rewards()
     assert np.count_nonzero(undivided) > 100
     np.testing.assert_array_equal(rewards(zones=4), undivided)

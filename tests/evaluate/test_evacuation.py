@@ -1,4 +1,4 @@
-"""Evacuations: plans, vehicles, runs and pages."""
+"""Evacuations: their plans, vehicles, runs and result pages."""
 
 from __future__ import annotations
 
@@ -62,7 +62,9 @@ def undivided(tmp_path_factory: pytest.TempPathFactory) -> EvacuationResult:
     return run_evacuation(prepared(PLAN, tmp_path_factory.mktemp("evacuation")))
 
 
-def test_all_leave_and_clearance_times_follow_from_arrivals(undivided: EvacuationResult) -> None:
+def test_all_vehicles_leave_and_clearance_times_follow_from_arrivals(
+    undivided: EvacuationResult,
+) -> None:
     found = undivided.all
     assert found.vehicles == sum(area.vehicles for area in undivided.areas.values())
     assert (found.arrived, found.departed, found.unserved) == (found.vehicles, found.vehicles, 0)
@@ -89,13 +91,13 @@ def test_a_divided_evacuation_equals_the_undivided_one(
 
 
 @pytest.mark.slow
-def test_an_evacuation_over_nodes_is_equal(undivided: EvacuationResult, tmp_path: Path) -> None:
+def test_an_evacuation_over_nodes_equals_the_undivided_one(
+    undivided: EvacuationResult, tmp_path: Path
+) -> None:
     assert run_evacuation(prepared(PLAN, tmp_path), zones=2, backend="nodes:2") == undivided
 
 
-def test_the_vehicles_begin_on_their_roads_in_the_order_of_trips(
-    network: RoadNetwork, tmp_path: Path
-) -> None:
+def test_each_vehicle_begins_on_the_road_of_its_trip(network: RoadNetwork, tmp_path: Path) -> None:
     from cavmarl import make_vec
 
     here = prepared(PLAN, tmp_path)
@@ -127,7 +129,7 @@ def test_contraflow_lanes_shorten_an_evacuation_over_a_bridge(tmp_path: Path) ->
     net = tmp_path / "bridge.net.xml"
     words = ["-n", str(tmp_path / "bridge.nod.xml"), "-e", str(tmp_path / "bridge.edg.xml")]
     run_netconvert([*words, "-o", str(net)], net, None)
-    # Two lanes lead to the bridge, and one over it.
+    # Two lanes lead to the bridge AB, which has one lane per direction.
     plan = EvacuationPlan(
         map=str(net),
         areas={"west": Area(edges=("WA",), vehicles=200)},
@@ -160,7 +162,7 @@ def test_traffic_recovers_after_roads_open_again(tmp_path: Path) -> None:
     assert found.series["standing"][200] > found.series["standing"][30]
 
 
-def test_vehicles_that_cannot_leave_are_unserved(tmp_path: Path) -> None:
+def test_vehicles_that_do_not_leave_in_time_are_unserved(tmp_path: Path) -> None:
     found = run_evacuation(prepared(replace(PLAN, horizon_s=90.0), tmp_path))
     assert found.all.unserved > 0
     assert found.all.clearance_s is None
@@ -178,7 +180,9 @@ def test_vehicles_are_shared_among_exits(network: RoadNetwork) -> None:
     assert (find_evacuees(PLAN, PLAN.exits, network, seed=4).edge != found.edge).any()
 
 
-def test_areas_are_polygons_or_lists_of_roads(network: RoadNetwork) -> None:
+def test_an_area_is_a_polygon_or_a_list_of_roads_and_default_exits_are_outside(
+    network: RoadNetwork,
+) -> None:
     x, y, radius_m = middle_of(network)
     inside = roads_of(circle(x, y, radius_m, 1), "area", network)
     more = roads_of(circle(x, y, 10.0 * radius_m, 1), "area", network)
@@ -266,12 +270,12 @@ def test_wrong_plan_files_are_refused(text: str, message: str, tmp_path: Path) -
         ),
     ],
 )
-def test_values_that_would_be_ignored_are_refused(change: dict[str, Any], message: str) -> None:
+def test_values_without_a_meaning_are_refused(change: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         replace(PLAN, **change)
 
 
-def test_an_area_with_the_name_of_the_sum_has_a_row_of_its_own(
+def test_an_area_named_like_the_total_has_a_separate_row(
     undivided: EvacuationResult,
 ) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra 'report'")
@@ -286,10 +290,10 @@ def test_an_area_with_the_name_of_the_sum_has_a_row_of_its_own(
     ]
 
 
-def code(*words: str) -> int:
+def exit_code(*words: str) -> int:
     with pytest.raises(SystemExit) as end:
         main(words)
-    return int(end.value.code or 0)
+    return int(end.value.exit_code or 0)
 
 
 def test_the_command_writes_a_page_and_an_environment(
@@ -299,7 +303,7 @@ def test_the_command_writes_a_page_and_an_environment(
     out = tmp_path / "out"
     words = ["evacuate", "grid4x4", "--vehicles", "20", "--within-s", "20", "--seconds", "400"]
     kept = tmp_path / "found.json"
-    assert code(*words, "--close", "B1B2", "--out", str(out), "--json", str(kept)) == 0
+    assert exit_code(*words, "--close", "B1B2", "--out", str(out), "--json", str(kept)) == 0
     said = capsys.readouterr().out
     assert "exits, chosen:" in said
     assert "all cleared, s" in said
@@ -310,7 +314,7 @@ def test_the_command_writes_a_page_and_an_environment(
     assert found["runs"][0]["all"]["vehicles"] == 20
     assert json.loads(kept.read_text(encoding="utf-8"))["runs"] == found["runs"]
     assert load_world(out / "seed-0").config.map.events[0].edges == ("B1B2",)
-    assert code(*words, "--out", str(out)) == 2
+    assert exit_code(*words, "--out", str(out)) == 2
     assert "the folder is not empty" in capsys.readouterr().err
 
 
@@ -318,10 +322,10 @@ def test_a_refused_evacuation_leaves_no_folder(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra 'report'")
     out = tmp_path / "out"
     for words in (("--exit", "Z9"), ("--contraflow", "Z9"), ("--close", "Z9")):
-        assert code("evacuate", "grid4x4", *words, "--out", str(out)) == 2
+        assert exit_code("evacuate", "grid4x4", *words, "--out", str(out)) == 2
         assert not out.exists()
     out.mkdir()
-    assert code("evacuate", "grid4x4", "--exit", "Z9", "--out", str(out)) == 2
+    assert exit_code("evacuate", "grid4x4", "--exit", "Z9", "--out", str(out)) == 2
     assert not any(out.iterdir())
 
 
@@ -335,10 +339,10 @@ def test_the_command_runs_a_plan_and_refuses_options_of_maps(
         "within_s: 10\nhorizon_s: 300\n",
         encoding="utf-8",
     )
-    assert code("evacuate", str(path), "--out", str(tmp_path / "out"), "--repeats", "2") == 0
+    assert exit_code("evacuate", str(path), "--out", str(tmp_path / "out"), "--repeats", "2") == 0
     assert (tmp_path / "out" / "seed-1" / "env.yaml").is_file()
     capsys.readouterr()
-    assert code("evacuate", str(path), "--vehicles", "3") == 2
+    assert exit_code("evacuate", str(path), "--vehicles", "3") == 2
     assert "a plan has its own areas" in capsys.readouterr().err
-    assert code("evacuate", "grid4x4", "--around", "here") == 2
+    assert exit_code("evacuate", "grid4x4", "--around", "here") == 2
     assert "must be X,Y in m" in capsys.readouterr().err

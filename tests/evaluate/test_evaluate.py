@@ -1,4 +1,4 @@
-"""Evaluation: metrics, repeatability, and refused arguments."""
+"""Evaluation: its metrics, its repeatability, and the arguments that it refuses."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SMALL: dict[str, Any] = {"episodes": 3, "agents": 3, "background": 3, "max_cycle
 
 
 def results(report: EvaluationReport) -> list[Any]:
-    """Return the repeatable part of a report."""
+    """Return the parts of a report that do not depend on time and machine."""
     return [(policy.trips, policy.metrics) for policy in report.policies.values()]
 
 
@@ -33,11 +33,13 @@ def by_chance() -> EvaluationReport:
 
 @pytest.fixture(scope="module")
 def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Return the folder of two policies in three runs, each in a new interpreter."""
+    """Return the results folder of two policies and three runs, each run in a new interpreter."""
     folder = tmp_path_factory.mktemp("compared")
     policies = {"driver": "idm", "chance": "random_actions"}
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(subprocess_calls, "start_python", start_python)  # other tests fork
+        patch.setattr(
+            subprocess_calls, "start_python", start_python
+        )  # other tests fork from a warm process instead
         evaluate("merge", policies, seed=4, repeats=3, out=folder, **SMALL)
     return folder
 
@@ -77,7 +79,7 @@ def test_one_run_has_no_interval_between_runs(by_chance: EvaluationReport) -> No
     assert "not available" in by_chance.to_dict()["between_run_ci95"]
 
 
-def test_the_built_in_driver_arrives_where_random_actions_do_not(
+def test_the_built_in_driver_arrives_and_random_actions_do_not(
     by_chance: EvaluationReport,
 ) -> None:
     report = evaluate("merge", "idm", episodes=2, agents=3, background=3, seed=4)
@@ -108,14 +110,14 @@ def test_episodes_do_not_depend_on_how_many_worlds_run_together(
     assert results(apart) == results(together)
 
 
-def test_memory_does_not_grow_with_the_number_of_episodes() -> None:
+def test_the_number_of_worlds_at_once_is_limited() -> None:
     most = max(worlds_at_once(count, 20) for count in range(1, 2000))
     assert worlds_at_once(100_000, 20) <= most == episodes.MAX_WORLDS
     assert worlds_at_once(100_000, 1_000_000) == 1
     assert worlds_at_once(3, 20) == 3
 
 
-def test_each_run_has_its_own_seed_and_the_first_is_the_callers() -> None:
+def test_each_run_has_its_own_seed_and_the_first_run_has_the_given_seed() -> None:
     seeds = run_seeds(4, 5)
     assert seeds[0] == 4
     assert len(set(seeds)) == 5
@@ -123,7 +125,7 @@ def test_each_run_has_its_own_seed_and_the_first_is_the_callers() -> None:
     assert not set(run_seeds(5, 5)) & set(seeds)
 
 
-def test_a_run_in_a_fresh_process_is_the_run_in_this_one(
+def test_a_run_in_a_new_process_equals_a_run_in_this_process(
     compared: Path, by_chance: EvaluationReport
 ) -> None:
     found = load_report(compared)["chance"]["episode_return"].within_run[0]
@@ -154,7 +156,7 @@ def test_intervals_of_bounded_metrics_stay_in_bounds_and_have_a_width(compared: 
                 assert 0.0 <= interval.low < interval.high <= 1.0
 
 
-def test_policies_are_compared_run_by_run(compared: Path) -> None:
+def test_policies_are_compared_within_each_run(compared: Path) -> None:
     report = load_report(compared)
     assert report["driver"].minus_first == {}
     found = report["chance"].minus_first["episode_return"]
@@ -169,7 +171,7 @@ def test_policies_are_compared_run_by_run(compared: Path) -> None:
     assert found.distinct
 
 
-def test_raw_tables_hold_every_trip_and_episode(compared: Path) -> None:
+def test_the_tables_contain_every_trip_and_episode(compared: Path) -> None:
     tables = load_tables(compared)
     for trips, rows in tables.values():
         assert rows["run"].tolist() == [0] * 3 + [1] * 3 + [2] * 3

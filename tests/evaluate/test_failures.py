@@ -1,4 +1,4 @@
-"""Failed trips: causes, ranking, clips, and the page in a browser."""
+"""Failed trips: their causes, ranking and clips, and their page in a browser."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return room
 
 
-def told(page: Path) -> Any:
+def data_of(page: Path) -> Any:
     text = page.read_text(encoding="utf-8")
     found = re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.DOTALL)
     assert found is not None
@@ -53,7 +53,7 @@ def told(page: Path) -> Any:
 
 
 def test_the_page_has_the_worst_trips_with_clips_of_ten_seconds(folder: Path) -> None:
-    data = told(folder / "out" / "failures.html")
+    data = data_of(folder / "out" / "failures.html")
     tables = load_tables(folder / "out")
     assert len(data["failures"]) == 6
     for failure in data["failures"]:
@@ -79,7 +79,7 @@ def test_the_page_has_the_worst_trips_with_clips_of_ten_seconds(folder: Path) ->
 
 
 def test_a_clip_equals_the_recording(folder: Path) -> None:
-    failure = told(folder / "out" / "failures.html")["failures"][0]
+    failure = data_of(folder / "out" / "failures.html")["failures"][0]
     path = folder / "recordings" / failure["policy"] / "run-0"
     recording = Recording.open(path)
     assert recording.manifest["policy"] == failure["policy"]
@@ -92,7 +92,7 @@ def test_a_clip_equals_the_recording(folder: Path) -> None:
 
 
 def test_a_clip_has_the_observations_of_the_vehicle(folder: Path) -> None:
-    failure = told(folder / "out" / "failures.html")["failures"][0]
+    failure = data_of(folder / "out" / "failures.html")["failures"][0]
     recording = Recording.open(folder / "recordings" / failure["policy"] / "run-0")
     config = validate(EnvConfig, recording.manifest["world"]["config"], "manifest")
     clip, seen = failure["clip"], 0
@@ -142,7 +142,7 @@ def test_a_browser_shows_the_page(folder: Path) -> None:
     )
     assert 'data-ready="yes"' in done.stdout
     body = done.stdout[done.stdout.index('<tbody id="rows">') : done.stdout.index("</tbody>")]
-    assert body.count("<tr ") == len(told(page)["failures"])
+    assert body.count("<tr ") == len(data_of(page)["failures"])
     shown = re.search(r'<canvas[^>]*data-tick="(\d+)" data-shown="(\d+)"', done.stdout)
     assert shown is not None
     assert int(shown[2]) > 0
@@ -166,7 +166,7 @@ def test_the_replay_shows_the_observations_of_the_vehicle(folder: Path) -> None:
         assert not problems
 
 
-def test_names_of_files_cannot_end_the_script(tmp_path: Path) -> None:
+def test_names_with_markup_cannot_end_the_script_of_the_page(tmp_path: Path) -> None:
     name = "</script><script>alert(1)</script>"
     trip = {"policy": name, "center_m": (0.0, 0.0), "agent": 0, "run": 0, "episode": 0}
     failure = Failure(
@@ -179,10 +179,10 @@ def test_names_of_files_cannot_end_the_script(tmp_path: Path) -> None:
     write_failures(tmp_path / "page.html", [failure], 5, 1, network, name)
     text = (tmp_path / "page.html").read_text(encoding="utf-8")
     assert "alert(1)</script>" not in text
-    assert told(tmp_path / "page.html")["failures"][0]["policy"] == name
+    assert data_of(tmp_path / "page.html")["failures"][0]["policy"] == name
 
 
-def test_each_cause_has_its_share_of_the_worst() -> None:
+def test_the_worst_trips_are_shared_among_the_causes() -> None:
     failures = [
         Failure(cause, float(k), {}, {}) for cause in ("collision", "slow") for k in range(10)
     ]
@@ -213,7 +213,7 @@ def test_each_cause_has_its_share_of_the_worst() -> None:
         (["arrived"], "slow"),
     ],
 )
-def test_failed_trips_have_the_right_cause(marks: list[str], cause: str) -> None:
+def test_a_failed_trip_has_the_most_important_of_its_causes(marks: list[str], cause: str) -> None:
     trip = np.zeros(1, dtype=TRIP)
     for mark in marks:
         trip[mark] = True
@@ -221,7 +221,7 @@ def test_failed_trips_have_the_right_cause(marks: list[str], cause: str) -> None
     assert cause in CAUSES
 
 
-def test_an_existing_recording_folder_is_refused_before_anything_runs(tmp_path: Path) -> None:
+def test_an_existing_recording_folder_is_refused_before_the_first_run(tmp_path: Path) -> None:
     (tmp_path / "there").mkdir()
     (tmp_path / "there" / "file").write_text("kept")
     with pytest.raises(RecordingError, match="name a new folder"):

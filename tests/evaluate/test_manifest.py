@@ -1,4 +1,4 @@
-"""The manifest: its content, written before results, and results that are refused without it."""
+"""The manifest is written before the results; results without a valid manifest are refused."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def manifest(env: str = "merge", **changed: Any) -> dict[str, Any]:
     return dict(evaluate(env, "random_actions", **{**SMALL, **changed}).manifest)
 
 
-def test_a_manifest_has_everything_that_a_result_depends_on() -> None:
+def test_a_manifest_is_repeatable_and_changes_with_the_world_and_the_seed() -> None:
     first, again = manifest(), manifest()
     varying = ("started", "ended", "results_sha256")
     assert {k: v for k, v in first.items() if k not in varying} == {
@@ -49,7 +49,7 @@ def test_a_manifest_has_everything_that_a_result_depends_on() -> None:
     assert manifest(seed=3)["seeds"] == [3]
 
 
-def test_demand_is_identified_by_its_content(tmp_path: Path) -> None:
+def test_a_manifest_identifies_demand_by_its_content(tmp_path: Path) -> None:
     found = []
     for period in (5, 5, 4):
         path = tmp_path / f"{len(found)}.rou.xml"
@@ -69,7 +69,7 @@ PERSON = (
 )
 
 
-def test_tolerated_demand_is_reported_once_and_recorded(
+def test_ignored_parts_of_demand_are_reported_once_and_recorded(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     path = tmp_path / "x.rou.xml"
@@ -89,7 +89,7 @@ def test_tolerated_demand_is_reported_once_and_recorded(
     assert manifest()["world"]["demand_tolerated"] == []
 
 
-def test_hardware_and_versions_are_never_empty() -> None:
+def test_a_manifest_names_hardware_versions_and_commit() -> None:
     found = manifest()
     hardware = found["hardware"]
     assert hardware["cpu"]
@@ -101,7 +101,7 @@ def test_hardware_and_versions_are_never_empty() -> None:
     assert found["command"]
 
 
-def test_a_closed_manifest_lists_its_results(folder: Path) -> None:
+def test_a_closed_manifest_lists_its_result_files_with_their_hashes(folder: Path) -> None:
     document = read_closed(folder)
     assert document["status"] == "closed"
     assert document["ended"] >= document["started"]
@@ -157,7 +157,7 @@ def test_a_killed_run_leaves_an_open_manifest(tmp_path: Path, repeats: int) -> N
     )
     with ForkedProcess(["-c", code, str(out)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
-        process.stdout.readline()  # the first step is done
+        process.stdout.readline()  # wait for the first step
         process.send_signal(signal.SIGKILL)
     document = json.loads((out / MANIFEST_FILE).read_text())
     assert document["status"] == "open"
@@ -166,7 +166,7 @@ def test_a_killed_run_leaves_an_open_manifest(tmp_path: Path, repeats: int) -> N
         load_report(out)
 
 
-def test_no_run_outlives_its_caller(tmp_path: Path) -> None:
+def test_runs_end_when_their_caller_dies(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path; from cavmarl.evaluate import evaluate\n"
         "evaluate('merge', 'idm', episodes=100_000, repeats=2, out=Path(sys.argv[1]), "
@@ -181,7 +181,7 @@ def test_no_run_outlives_its_caller(tmp_path: Path) -> None:
     assert children
     deadline = time.monotonic() + 20.0
     while any(Path(f"/proc/{pid}").exists() for pid in children):
-        assert time.monotonic() < deadline, "a run goes on without its caller"
+        assert time.monotonic() < deadline, "a run continues after the death of its caller"
         time.sleep(0.05)
 
 

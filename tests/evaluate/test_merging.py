@@ -1,4 +1,4 @@
-"""Runs that were evaluated one by one are merged into one evaluation."""
+"""Evaluations of single runs are merged into one evaluation."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ def test_merged_runs_equal_the_runs_of_one_evaluation(parts: list[Path], tmp_pat
     assert [part["seeds"] for part in report.manifest["parts"]] == [[s] for s in report.seeds]
 
 
-def test_parts_that_do_not_belong_together_are_refused(parts: list[Path], tmp_path: Path) -> None:
+def test_runs_of_different_evaluations_are_not_merged(parts: list[Path], tmp_path: Path) -> None:
     other, divided = tmp_path / "other", tmp_path / "divided"
     evaluate("ring", "idm", out=other, seed=SEED, **WORLD)
     evaluate("ring", ["idm", "random_actions"], out=divided, seed=SEED, zones=2, **WORLD)
@@ -56,7 +56,7 @@ def test_parts_that_do_not_belong_together_are_refused(parts: list[Path], tmp_pa
         merge_runs(parts, parts[0])
 
 
-def test_an_evaluation_of_several_runs_is_no_part(tmp_path: Path) -> None:
+def test_an_evaluation_of_several_runs_is_not_merged(tmp_path: Path) -> None:
     evaluate("ring", "idm", out=tmp_path, repeats=2, **WORLD | {"max_cycles": 2})
     with pytest.raises(ManifestError, match="has 2 runs; merge single runs"):
         merge_runs([tmp_path], tmp_path)

@@ -1,4 +1,4 @@
-"""Metrics of messages in evaluations."""
+"""Metrics of V2X messages in evaluations."""
 
 from __future__ import annotations
 

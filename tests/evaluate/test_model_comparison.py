@@ -1,4 +1,4 @@
-"""`cavmarl bench traffic --model`: generated traffic of several drivers beside SUMO's."""
+"""`cavmarl bench traffic --model` compares generated traffic of several drivers with SUMO's."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def test_wrong_arguments_are_refused() -> None:
             compare_models("grid4x4", models, **({"vehicles": 5, "seconds": 5} | keys))
 
 
-def test_a_demand_and_generated_vehicles_exclude_each_other(
+def test_a_demand_with_generated_vehicles_is_refused(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     words = ("bench", "traffic", "grid4x4", "--model", "IDM")

@@ -1,4 +1,4 @@
-"""Post-encroachment times compared with their closed form, and positions of agents."""
+"""Post-encroachment times equal their closed form; positions of agents are found."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ ROADS = network("grid4x4")
 MIRROR = mirrored_conflicts(ROADS)
 STEP_S = 0.1
 STEPS = 150
-# The links of a junction with crossing traffic in all directions.
+# The links of the junction with the most links.
 JUNCTION = int(np.bincount(ROADS.links["junction"]).argmax())
 LINKS = np.flatnonzero(ROADS.links["junction"] == JUNCTION).tolist()
 
 
 def place(row: np.void, passage: Passage, centre_m: float) -> None:
-    """Put a vehicle on the path of its link, `centre_m` behind the stop line."""
+    """Place a vehicle on the path of its link, with its centre `centre_m` beyond the stop line."""
     link = ROADS.links[passage.link]
     row["speed"], row["length"] = passage.speed_mps, passage.length_m
     row["link"] = passage.link if centre_m >= 0.0 else -1
@@ -39,7 +39,7 @@ def place(row: np.void, passage: Passage, centre_m: float) -> None:
 
 
 def watch(passages: list[Passage], order: list[int] | None = None) -> NDArray[np.float64]:
-    """Return the least time of each agent; agent k drives passages[k]."""
+    """Return the least post-encroachment time in s of each agent k, which drives passages[k]."""
     count = len(passages)
     rows = np.zeros((1, count), VEHICLE)
     shape = (1, len(MIRROR))
@@ -71,7 +71,7 @@ def watch(passages: list[Passage], order: list[int] | None = None) -> NDArray[np
 
 @st.composite
 def passages(draw: st.DrawFn) -> list[Passage]:
-    """Draw vehicles on different links; all start before the junction and leave it in time."""
+    """Draw vehicles on different links that start before the junction and leave it within STEPS."""
     links = draw(st.lists(st.sampled_from(LINKS), min_size=2, max_size=6, unique=True))
     return [
         Passage(
@@ -86,20 +86,20 @@ def passages(draw: st.DrawFn) -> list[Passage]:
 
 @settings(max_examples=60, deadline=None)
 @given(passages())
-def test_encroachment_equals_its_closed_form(those: list[Passage]) -> None:
-    expected = least_encroachments(ROADS, those)
-    np.testing.assert_allclose(watch(those), expected, atol=1e-6)
+def test_encroachment_equals_its_closed_form(drawn: list[Passage]) -> None:
+    expected = least_encroachments(ROADS, drawn)
+    np.testing.assert_allclose(watch(drawn), expected, atol=1e-6)
 
 
 @settings(max_examples=20, deadline=None)
 @given(passages(), st.data())
-def test_the_order_of_rows_does_not_matter(those: list[Passage], data: st.DataObject) -> None:
-    order = data.draw(st.permutations(range(len(those))))
-    np.testing.assert_array_equal(watch(those), watch(those, order))
+def test_the_order_of_rows_does_not_matter(drawn: list[Passage], data: st.DataObject) -> None:
+    order = data.draw(st.permutations(range(len(drawn))))
+    np.testing.assert_array_equal(watch(drawn), watch(drawn, order))
 
 
 def crossing() -> tuple[int, np.void]:
-    """Return a link of the junction, and its conflict with a crossing link."""
+    """Return a link of the junction and its conflict with a crossing link."""
     for link in LINKS:
         first = int(ROADS.links[link]["first_conflict"])
         for c in range(first, first + int(ROADS.links[link]["num_conflicts"])):
@@ -108,7 +108,7 @@ def crossing() -> tuple[int, np.void]:
     raise AssertionError("no links that cross")
 
 
-def test_only_the_last_vehicle_that_has_passed_counts() -> None:
+def test_the_time_is_measured_to_the_last_vehicle_that_has_passed() -> None:
     one, conflict = crossing()
     other = int(conflict["foe"])
     platoon = [Passage(one, start, 10.0, 5.0) for start in (-5.0, -20.0)]
@@ -119,7 +119,7 @@ def test_only_the_last_vehicle_that_has_passed_counts() -> None:
     assert (second, third) == pytest.approx(alone, abs=1e-6)
 
 
-def test_vehicles_that_share_an_area_at_once_have_no_post_encroachment_time() -> None:
+def test_vehicles_in_an_area_at_the_same_time_have_the_post_encroachment_time_0() -> None:
     one, conflict = crossing()
     middle = 0.5 * (conflict["enter_m"] + conflict["leave_m"])
     foe_middle = 0.5 * (conflict["foe_enter_m"] + conflict["foe_leave_m"])
@@ -130,7 +130,7 @@ def test_vehicles_that_share_an_area_at_once_have_no_post_encroachment_time() ->
     assert watch(both).tolist() == [0.0, 0.0]
 
 
-def test_areas_mirror_each_other_except_where_paths_merge() -> None:
+def test_each_crossing_conflict_has_its_mirror_and_merging_conflicts_have_none() -> None:
     link = np.repeat(np.arange(len(ROADS.links)), ROADS.links["num_conflicts"])
     watched = np.flatnonzero(MIRROR >= 0)
     assert watched.size
@@ -141,7 +141,7 @@ def test_areas_mirror_each_other_except_where_paths_merge() -> None:
     assert (MIRROR[merging] == -1).all()
 
 
-def test_positions_equal_those_of_the_agents_vehicles() -> None:
+def test_each_agent_has_the_position_of_its_vehicle() -> None:
     rows = np.zeros((2, 3), VEHICLE)
     rows["agent"] = [[1, -1, 0], [0, 1, -1]]
     rows["x"] = [[1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]

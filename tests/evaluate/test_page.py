@@ -1,4 +1,4 @@
-"""The HTML page in a real browser."""
+"""The HTML page of results, in a real browser."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ QUIET = (
     "--disable-background-networking", "--disable-component-update", "--disable-sync",
     "--hide-scrollbars",
 )  # fmt: skip
-# This script runs after the page, and writes the state of the browser into the page.
+# When the page is loaded, this script writes the state of the browser into the page.
 PROBE = """<script>
 window.addEventListener("load", () => {
   const size = element => {
@@ -59,7 +59,7 @@ Browse = Callable[..., str]
 
 @pytest.fixture(scope="session")
 def browse(tmp_path_factory: pytest.TempPathFactory) -> Browse:
-    """Run the browser on a page: `browse(path, *switches)` returns its standard output."""
+    """Return `browse(path, *switches)`, which opens a page and returns the browser's output."""
     program = shutil.which("chromium") or shutil.which("google-chrome")
     if program is None:
         pytest.skip("no chromium: apt-get install chromium")
@@ -99,12 +99,14 @@ def told(page: Path, browse: Browse) -> dict[str, Any]:
         encoding="utf-8",
     )
     found = re.search(r'<pre id="told">(.*?)</pre>', browse(probed, "--dump-dom"), re.DOTALL)
-    assert found, "the browser did not come to the end of the page"
+    assert found, "the browser did not reach the end of the page"
     document: dict[str, Any] = json.loads(found[1])
     return document
 
 
-def test_a_browser_shows_the_page_without_errors_and_other_files(told: dict[str, Any]) -> None:
+def test_a_browser_shows_the_page_without_errors_and_loads_no_other_file(
+    told: dict[str, Any],
+) -> None:
     assert told["errors"] == []
     assert told["loaded"] == []
 
@@ -182,7 +184,9 @@ def test_a_divided_world_shows_the_changes_of_zone(page: Path, tmp_path: Path) -
         cell = " / ".join(f"{value:.2f}" for value in spread if value is not None)
         assert shown[f"depth at {name} <small>m</small>"] == cell
     assert "zone imbalance" in text
-    assert 'id="transfers"' not in page.read_text(encoding="utf-8"), "the other world is undivided"
+    assert 'id="transfers"' not in page.read_text(encoding="utf-8"), (
+        "the page shows transfers of the undivided world"
+    )
 
 
 def test_a_page_of_results_without_a_manifest_is_refused(tmp_path: Path) -> None:

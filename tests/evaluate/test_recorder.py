@@ -1,4 +1,4 @@
-"""Records of hand-made trips and episodes."""
+"""Records of trips and episodes from steps with known terms."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ WEIGHTS = np.array([2.0 if term == "progress" else 0.0 for term in TERMS])
 
 
 class Worlds:
-    """One agent in each of two worlds, with terms by name."""
+    """Two worlds with one agent each; `add` records a step with the given terms."""
 
     def __init__(self, max_steps: int = 8) -> None:
         self.recorder = Recorder(2, 1, max_steps, STEP_S, WEIGHTS)
@@ -49,7 +49,7 @@ class Worlds:
         return self.recorder.trips()
 
 
-def test_a_trip_is_the_sum_of_its_steps() -> None:
+def test_a_trip_sums_and_averages_its_steps() -> None:
     worlds = Worlds()
     worlds.add(progress=(2.0, 1.0), jerk=(0.1, 0.0), ttc_risk=(0.5, 0.0), energy=(-0.5, 0.0))
     worlds.add(
@@ -77,7 +77,8 @@ def test_a_trip_is_the_sum_of_its_steps() -> None:
     assert trips["mean_speeding"] == pytest.approx([0.1, 0.0])
     assert trips["mean_jerk_mps3"] == pytest.approx([4.0 / 3.0, 0.0])
     assert trips["least_ttc_s"] == pytest.approx([1.2, 4.0])
-    # 0.7 is 1.2 s and 0.5 is 2 s: one step of three lies below 1.5 s.
+    # A risk of 0.7 is a time to collision of 1.2 s, and 0.5 is 2 s. So one step of three is below
+    # 1.5 s.
     assert trips["short_ttc_share"] == pytest.approx([1.0 / 3.0, 0.0])
     assert np.isnan(trips["least_pet_s"]).all()
 
@@ -90,7 +91,7 @@ def test_the_terms_of_a_step_without_an_agent_do_not_count() -> None:
     assert worlds.trips["began_s"].tolist() == [0.0, STEP_S]
 
 
-def test_a_seat_has_several_trips_in_sequence() -> None:
+def test_an_agent_has_several_trips_one_after_the_other() -> None:
     worlds = Worlds()
     worlds.recorder.least_pet_s[0] = 1.5
     worlds.add(done=(True, False), arrival=(1.0, 0.0), progress=(5.0, 1.0))
@@ -104,7 +105,7 @@ def test_a_seat_has_several_trips_in_sequence() -> None:
     assert np.isnan(trips["least_pet_s"][1:]).all()
 
 
-def test_trips_below_a_metre_do_not_count_for_the_evenness_of_delays() -> None:
+def test_trips_below_a_metre_do_not_count_for_the_gini_coefficient_of_delays() -> None:
     worlds = Worlds()
     worlds.add(done=(True, True), delay=(1.0, 1.0), progress=(10.0, 10.0))
     worlds.add(done=(True, True), over=(True, True), delay=(1.0, 1.0), progress=(0.9, 1.1))
@@ -113,7 +114,7 @@ def test_trips_below_a_metre_do_not_count_for_the_evenness_of_delays() -> None:
     assert uneven > 0.1
 
 
-def test_vehicles_that_were_driven_back_have_speed_0_in_jains_index() -> None:
+def test_vehicles_with_negative_distance_have_speed_0_in_jains_index() -> None:
     worlds = Worlds()
     worlds.add(done=(True, True), progress=(4.0, 4.0))
     worlds.add(done=(True, True), over=(True, True), progress=(-4.0, 4.0))
@@ -137,7 +138,7 @@ def test_collided_and_off_road_vehicles_do_not_arrive() -> None:
     assert not (trips["success"] | trips["arrived"] | trips["unfinished"]).any()
 
 
-def test_a_trip_that_the_horizon_truncates_has_neither_arrived_nor_failed() -> None:
+def test_a_trip_truncated_by_the_horizon_is_unfinished() -> None:
     worlds = Worlds(max_steps=2)
     worlds.add()
     worlds.add(over=(True, True))
@@ -147,7 +148,7 @@ def test_a_trip_that_the_horizon_truncates_has_neither_arrived_nor_failed() -> N
 
 
 @pytest.mark.parametrize("fault", ["red_light", "wrong_way"])
-def test_a_trip_that_breaks_a_rule_is_no_success(fault: str) -> None:
+def test_a_trip_that_breaks_a_rule_has_no_success(fault: str) -> None:
     worlds = Worlds()
     worlds.add(**{fault: (1.0, 0.0)})
     worlds.add(done=(True, True), arrival=(1.0, 1.0))
@@ -155,17 +156,17 @@ def test_a_trip_that_breaks_a_rule_is_no_success(fault: str) -> None:
     assert worlds.trips["success"].tolist() == [False, True]
 
 
-def test_a_success_takes_three_times_the_free_time_at_most() -> None:
+def test_a_trip_over_three_times_the_free_time_has_no_success() -> None:
     worlds = Worlds()
     worlds.add(delay=(STEP_S, STEP_S))
     worlds.add(delay=(STEP_S, STEP_S))
     worlds.add(done=(True, True), arrival=(1.0, 1.0), delay=(0.0, 0.01 * STEP_S))
     assert worlds.trips["arrived"].tolist() == [True, True]
-    # Free times: 1 and 0.99 steps.
+    # The trips take 3 steps. Their free times are 1 and 0.99 steps.
     assert worlds.trips["success"].tolist() == [True, False]
 
 
-def test_trips_that_begin_in_the_second_half_do_not_count() -> None:
+def test_trips_that_begin_in_the_second_half_of_an_episode_do_not_count() -> None:
     worlds = Worlds(max_steps=4)
     for _ in range(2):
         worlds.add(acted=(False, True))
@@ -174,7 +175,7 @@ def test_trips_that_begin_in_the_second_half_do_not_count() -> None:
     assert worlds.trips["counted"].tolist() == [False, True]
 
 
-def test_an_episode_has_its_return_in_parts_and_its_arrivals_by_the_hour() -> None:
+def test_an_episode_has_the_parts_of_its_return_and_its_arrivals_per_hour() -> None:
     worlds = Worlds(max_steps=4)
     worlds.add(progress=(2.0, 1.0))
     worlds.add(progress=(3.0, 1.0), done=(True, False), arrival=(1.0, 0.0))

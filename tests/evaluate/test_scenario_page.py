@@ -1,4 +1,4 @@
-"""The examples on the page of scenarios work."""
+"""The examples in the guide to scenarios work."""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Costs of shards: attribution to zones, and measuring changes no result. No test checks a time."""
+"""Measured costs of shards belong to their zones, and measuring them changes no result.
+
+No test checks a duration.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +23,7 @@ def simulation() -> Simulation:
     return world_maker("grid4x4", seconds=60, agents=4, background=20, seed=1)(4)
 
 
-def test_a_clock_on_each_zone_changes_nothing(simulation: Simulation) -> None:
+def test_measuring_each_zone_changes_no_result(simulation: Simulation) -> None:
     plain = DrivenWorld(world_maker("grid4x4", seconds=60, agents=4, background=20, seed=1)(4))
     rounds = list(measure_rounds(simulation, 2, 5, before=5))
     for _ in range(15):
@@ -33,7 +36,7 @@ def test_a_clock_on_each_zone_changes_nothing(simulation: Simulation) -> None:
     assert rounds[-1].places.shape == (len(rounds[-1].ids), 2)
 
 
-def test_every_zone_takes_some_time(simulation: Simulation) -> None:
+def test_every_zone_has_a_positive_cost(simulation: Simulation) -> None:
     told: list[tuple[int, int]] = []
     found = measure_shards(
         simulation, 2, 1, steps=10, before=2, told=lambda *counts: told.append(counts)
@@ -50,13 +53,13 @@ def test_every_zone_takes_some_time(simulation: Simulation) -> None:
     assert len(found.places) > 24
 
 
-def test_a_cost_is_the_median_of_five_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    # Loading a kernel makes the first part of the first zone expensive.
-    parts_s = ([90.0, 1.0], [1.0, 1.0], [2.0, 5.0], [3.0, 1.0], [2.0, 1.0])
+def test_a_cost_is_the_median_of_five_rounds(monkeypatch: pytest.MonkeyPatch) -> None:
+    # The first round is expensive in the first zone, as if a kernel were loaded there.
+    round_costs_s = ([90.0, 1.0], [1.0, 1.0], [2.0, 5.0], [3.0, 1.0], [2.0, 1.0])
     none = np.zeros(0, np.int64)
     rounds = [
         MeasuredRound(np.array(costs_s), none, np.zeros((0, 2)), none.astype(np.bool_))
-        for costs_s in parts_s
+        for costs_s in round_costs_s
     ]
     monkeypatch.setattr(shard_costs, "measure_rounds", lambda *_, **__: iter(rounds))
     world: Any = SimpleNamespace(seed=lambda seed, number: None, reset=lambda: None)
@@ -70,7 +73,7 @@ def test_suggested_actions_are_not_part_of_the_cost(simulation: Simulation) -> N
     assert not clock.take_s().any()
 
 
-def test_numbers_are_checked(simulation: Simulation) -> None:
+def test_invalid_numbers_of_steps_are_refused(simulation: Simulation) -> None:
     with pytest.raises(ConfigError, match="steps = 4"):
         measure_shards(simulation, 1, 0, steps=4, before=1)
     with pytest.raises(ConfigError, match="before = 0"):

@@ -1,4 +1,4 @@
-"""Metrics of signal controllers, and the suite that compares them."""
+"""Metrics of signal controllers, and the suite that compares controllers."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ from cavmarl.traffic.sumo.sumo_input import read_input
 MAP = Path("envs/grid4x4/map/map.net.xml")
 
 
-def test_the_meter_counts_waiting_stops_and_red() -> None:
-    """One vehicle stands three seconds before a red line, drives, and stands again."""
+def test_the_meter_measures_waiting_time_stops_queues_and_red() -> None:
+    """One vehicle stands three seconds at red, drives, and stands again."""
     network = load_network(MAP)
     meter = SignalMeter(network, 0.5)
     link = int(np.flatnonzero(network.links["signal"] >= 0)[0])
@@ -51,28 +51,29 @@ def test_the_meter_counts_waiting_stops_and_red() -> None:
     assert figures.queue == pytest.approx(5 / 6)
     assert figures.never_departed == 1
     assert figures.delay_s is None
-    # Lost time: (20 - 8) / 2 - 0.25 s on the way and 2 s before it; 7 s of the waiting vehicle.
+    # The vehicle has lost (20 - 8) / 2 - 0.25 s on its way, and 2 s before its departure. The
+    # vehicle that has not departed has lost 7 s.
     assert figures.delay_of_all_s == pytest.approx((6.0 - 0.25 + 2.0 + 7.0) / 2)
 
 
 @pytest.mark.parametrize(
     ("arrived", "late", "seconds", "expected"),
     [
-        (600, 100, 3600, False),  # 500 vehicles in 50 minutes, and 100 in the last ten
-        (550, 50, 3600, False),  # half as many in the last ten minutes as before
+        (600, 100, 3600, False),  # 500 vehicles in the first 50 minutes, and 100 in the last ten
+        (550, 50, 3600, False),  # the rate in the last ten minutes is half the rate before
         (549, 49, 3600, True),
         (0, 0, 3600, False),
         (549, 49, 1199, None),
         (100, 20, 1200, True),
     ],
 )
-def test_a_run_jams_if_less_than_half_as_many_arrive_in_the_last_ten_minutes(
+def test_a_run_jams_if_the_rate_of_arrivals_falls_below_half_in_the_last_ten_minutes(
     arrived: int, late: int, seconds: int, expected: bool | None
 ) -> None:
     assert is_jammed(arrived, late, seconds) is expected
 
 
-def test_a_run_whose_exit_is_closed_jams(tmp_path: Path) -> None:
+def test_a_run_with_a_blocked_exit_jams_in_cavmarl_and_in_sumo(tmp_path: Path) -> None:
     demand = tmp_path / "closed.rou.xml"
     demand.write_text(
         '<routes><route id="r" edges="left0A0 A0B0 B0C0 C0D0 D0right0"/>'
@@ -110,7 +111,7 @@ def test_controllers_and_sumo_are_measured_in_the_same_way(tmp_path: Path) -> No
     assert chosen[0].switches_per_h is not None
     assert chosen[0].switches_per_h > 0.0
     assert sumo.queue is None
-    assert ours[0].jams is None  # the run is too short
+    assert ours[0].jams is None  # the run is too short to decide
 
 
 def test_a_step_of_another_length_and_an_unknown_controller_are_refused() -> None:
@@ -142,7 +143,7 @@ def test_the_suite_prints_a_table(tmp_path: Path) -> None:
     assert refused.exit_code != 0
 
 
-def test_a_suite_takes_further_keys(tmp_path: Path) -> None:
+def test_further_keys_change_the_worlds_of_a_suite(tmp_path: Path) -> None:
     suite = tmp_path / "small.yaml"
     suite.write_text(
         "maps: [grid4x4]\ncontrollers: [longest_queue]\nbackground: 90\nhorizon_s: 300\n"
@@ -157,7 +158,7 @@ def test_a_suite_takes_further_keys(tmp_path: Path) -> None:
         figures = json.loads(path.read_text())["grid4x4"]["longest_queue"]
         return float(figures[0]["delay_of_all_s"])
 
-    # A camera that misses every vehicle lets the first green stay.
+    # With a camera that misses every vehicle, the controller never ends the first green.
     blind = ("signals.sensing=camera", "signals.camera_misses=1", "signals.max_green_s=0")
     assert delay_s(*blind) > 2.0 * delay_s()
     refused = CliRunner().invoke(app, ["suite", str(suite), "--set", "horizon_s=9"])

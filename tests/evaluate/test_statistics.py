@@ -1,4 +1,4 @@
-"""Intervals, shares and evenness, compared with textbooks and slow twins."""
+"""Intervals, shares and evenness equal textbooks and plain computations."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cavmarl.evaluate.tables import TRIP
 
 @pytest.mark.parametrize(
     ("freedom", "quantile"),
-    # Abramowitz and Stegun 1964, table 26.10.
+    # Values of Abramowitz and Stegun 1964, table 26.10.
     [(1, 12.706), (2, 4.303), (3, 3.182), (4, 2.776), (9, 2.262), (30, 2.042), (120, 1.980)],
 )
 def test_students_quantile_equals_the_textbook(freedom: int, quantile: float) -> None:
@@ -48,15 +48,15 @@ def test_fewer_than_two_runs_have_no_interval(runs: int) -> None:
     assert mean_interval(np.ones(runs)) is None
 
 
-def test_the_spread_within_a_run_gives_no_interval() -> None:
+def test_the_standard_deviation_within_a_run_gives_no_interval() -> None:
     found = within_run(np.array([1.0, 2.0, np.nan, 6.0]), share=False)
     assert (found.n, found.mean, found.wilson95) == (3, 3.0, None)
     assert found.sd == pytest.approx(math.sqrt(7.0))
     assert within_run(np.array([np.nan]), share=True).mean is None
 
 
-def test_wilson_equals_the_textbook() -> None:
-    # Newcombe 1998, table I: 81 of 263 and 15 of 148.
+def test_wilson_intervals_equal_the_textbook() -> None:
+    # Examples of Newcombe 1998, table I.
     for hits, total, low, high in ((81, 263, 0.2553, 0.3662), (15, 148, 0.0624, 0.1605)):
         found = share_interval(hits, total)
         assert found is not None
@@ -72,20 +72,21 @@ def test_wilson_intervals_stay_between_0_and_1(hits: int) -> None:
 
 
 @pytest.mark.parametrize(("share", "ends"), [(0.0, (0.0, 0.0410)), (1.0, (0.9590, 1.0))])
-def test_runs_without_any_hit_or_miss_still_leave_room(
+def test_intervals_of_runs_without_a_hit_or_without_a_miss_have_a_width(
     share: float, ends: tuple[float, float]
 ) -> None:
-    # Wilson's of 0 of 90: z² / (90 + z²).
+    # The upper end of Wilson's interval for 0 of 90 is z² / (90 + z²).
     found = run_share_interval(np.full(3, share), 90)
     assert found is not None
     assert (found.low, found.high) == pytest.approx(ends, abs=1e-4)
     assert run_share_interval(np.full(1, share), 30) is None
 
 
-def test_equal_runs_have_the_interval_of_their_trips() -> None:
+def test_equal_runs_have_the_interval_of_a_single_run() -> None:
     found, trips = run_share_interval(np.full(2, 0.3), 20), share_interval(6, 20)
     assert found == trips
-    # 100 trips in all: nearly equal runs must not give an interval of one per cent around 30 %.
+    # There are 100 trips in all runs. Although the runs are nearly equal, an interval of ±1 % would
+    # be too narrow.
     found = run_share_interval(np.array([0.3, 0.3, 0.3, 0.3, 0.31]), 100)
     assert found is not None
     assert found.low < 0.23
@@ -106,10 +107,10 @@ def test_an_interval_of_shares_has_its_coverage_and_stays_between_0_and_1(
         assert found is not None
         assert 0.0 <= found.low < found.high <= 1.0
         hits += found.low <= share <= found.high
-    assert hits >= 900  # 950 expected; shares near 0 are far from normally distributed
+    assert hits >= 900  # fewer than 950, because shares near 0 are not normally distributed
 
 
-def test_an_interval_of_evenness_stays_within_its_bounds() -> None:
+def test_an_interval_of_a_bounded_metric_stays_within_its_bounds() -> None:
     for values in ([0.98, 1.0, 0.99], [0.99, 1.0], [0.26, 0.25], [0.3, 1.0]):
         means = np.array(values)
         found = bounded_interval(means, 0.25)
@@ -126,11 +127,13 @@ def test_equal_values_in_all_runs_give_no_interval() -> None:
     for value in (1.0, 0.25, 0.7):
         assert mean_interval(np.array([value, value, value * (1.0 + 1e-15)])) is None
         assert bounded_interval(np.full(3, value), 0.25) is None
-    assert bounded_interval(np.ones(3), 1.0) is None, "one vehicle is always even"
+    assert bounded_interval(np.ones(3), 1.0) is None, (
+        "a metric whose least value is 1 has an interval"
+    )
     assert mean_interval(np.zeros(3)) is None
 
 
-def test_evenness_is_at_least_one_over_the_trips_of_an_episode() -> None:
+def test_the_least_value_of_jains_index_is_one_over_the_trips_of_an_episode() -> None:
     trips = np.zeros(7, TRIP)
     trips["episode"] = [0, 0, 0, 1, 1, 1, 1]
     trips["run"] = [0, 1, 1, 0, 0, 0, 0]
@@ -154,9 +157,9 @@ def test_gini_equals_the_sum_over_all_pairs(values: np.ndarray) -> None:
     assert found == pytest.approx(pairs / (2.0 * values.size**2 * values.mean()), abs=1e-9)
 
 
-def test_jains_index_is_one_for_equal_values_and_one_over_n_for_a_single_value() -> None:
+def test_jains_index_is_k_over_n_if_k_of_n_values_are_equal_and_the_others_0() -> None:
     assert jain_index(np.full(5, 3.0)) == pytest.approx(1.0)
     assert jain_index(np.array([7.0, 0.0, 0.0, 0.0])) == pytest.approx(0.25)
-    # Jain, Chiu and Hawe 1984: if k of n users get equal shares, the index is k/n.
+    # Source: Jain, Chiu and Hawe 1984.
     assert jain_index(np.array([2.0] * 3 + [0.0] * 7)) == pytest.approx(0.3)
     assert math.isnan(jain_index(np.zeros(3)))

@@ -1,4 +1,4 @@
-"""How long and why agents stood, in hand-made worlds."""
+"""How long agents stood, and why, in worlds with given speeds."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ class Worlds:
             self.step += 1
 
     def cut(self) -> NDArray[np.void]:
-        """Truncate the trips at the horizon, and return them."""
+        """Truncate the trips as at the horizon, and return the trips."""
         agents = self.mask.shape[1]
         nothing = np.zeros((1, agents))
         return self.recorder.add(
@@ -65,17 +65,17 @@ class Worlds:
         )
 
 
-def test_a_vehicle_below_a_tenth_of_a_metre_per_second_counts_as_standing() -> None:
+def test_a_vehicle_below_0_1_mps_counts_as_standing() -> None:
     worlds = Worlds([0.0, 0.0, 0.0])
     worlds.drive(5, 0.0, 0.09, 0.11)
-    # The first sample has no earlier position.
+    # The first of the five steps does not count, because it has no earlier position.
     assert worlds.recorder.still_s[0].tolist() == [2.0, 2.0, 0.0]
     worlds.drive(1, 0.0, 1.0, 0.0)
     worlds.drive(1, 0.0, 0.0, 0.0)
     assert worlds.recorder.still_s[0].tolist() == [3.0, 0.0, 0.5]
 
 
-def test_an_agent_that_was_away_has_not_stood() -> None:
+def test_the_standing_time_of_an_agent_begins_anew_after_an_absence() -> None:
     worlds = Worlds([0.0])
     worlds.drive(5, 0.0)
     worlds.mask[:] = False
@@ -95,7 +95,7 @@ def test_an_agent_that_was_away_has_not_stood() -> None:
         ("discrete", ACTION_FASTER, ACTION_SLOWER),
     ],
 )
-def test_a_stop_of_ten_seconds_counts_as_blocked_or_stood(
+def test_a_stop_of_ten_seconds_counts_as_stood_or_as_blocked_if_the_driver_would_wait(
     kind: str, goes: float, waits: float
 ) -> None:
     worlds = Worlds([goes, waits, goes], kind)
@@ -104,11 +104,11 @@ def test_a_stop_of_ten_seconds_counts_as_blocked_or_stood(
     assert rows["stood"].tolist() == [True, False, False]
     assert rows["blocked"].tolist() == [False, True, False]
     assert rows["out_of_time"].tolist() == [False, False, True]
-    # The built-in driver is asked every 5 s, once an agent has stood for 5 s.
+    # As soon as an agent has stood for 5 s, the recorder asks the built-in driver every 5 s.
     assert worlds.asked == 2
 
 
-def test_a_stop_of_less_than_ten_seconds_does_not_count() -> None:
+def test_a_stop_below_ten_seconds_does_not_count_as_stood() -> None:
     worlds = Worlds([0.6])
     worlds.drive(20, 0.0)
     assert worlds.cut()["out_of_time"].tolist() == [True]

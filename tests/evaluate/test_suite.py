@@ -1,4 +1,4 @@
-"""Suites: their maps, their worlds, and refused files."""
+"""Suites: their maps and worlds, and the files that are refused."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def test_every_map_is_driven_with_every_number_of_agents(tmp_path: Path) -> None
         assert load_report(tmp_path / "out" / world.label) == reports[world.label]
 
 
-def test_two_maps_of_one_name_are_refused(tmp_path: Path) -> None:
+def test_two_maps_with_the_same_name_are_refused(tmp_path: Path) -> None:
     file = tmp_path / "mine.yaml"
     file.write_text("maps: [merge/map/map.net.xml, ring/map/map.net.xml]\nagents: [1]\n")
     with pytest.raises(ConfigError, match="two maps have the same name"):
@@ -76,14 +76,14 @@ def test_a_file_with_the_name_of_an_environment_keeps_its_suffix(tmp_path: Path)
         ("maps: ring", "maps"),
     ],
 )
-def test_a_suite_that_cannot_work_is_refused(tmp_path: Path, text: str, message: str) -> None:
+def test_an_invalid_suite_is_refused(tmp_path: Path, text: str, message: str) -> None:
     file = tmp_path / "bad.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=message):
         load_suite(file)
 
 
-def test_the_tasks_are_unchanged_environments() -> None:
+def test_the_suite_of_tasks_does_not_change_its_environments() -> None:
     suite = load_suite(find_settings("suite", "tasks"))
     worlds = worlds_of(suite, ROOT / "envs")
     assert [world.env for world in worlds] == list(suite.maps)

@@ -1,4 +1,4 @@
-"""Runs of real demand compared with SUMO's: no contacts, and metrics near SUMO's."""
+"""Runs of real demand have no contacts, and metrics near those of SUMO."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ sumo = pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
 GAME = Path(sumo.SUMO_HOME) / "tools" / "game"
-NEAR = 0.15  # relative to SUMO's figure
+NEAR = 0.15  # accepted difference, relative to SUMO's figure
 
 
 class Case(NamedTuple):
-    """A map, its demand, and the figures that are compared with SUMO's."""
+    """A map, its demand, and the names of the figures to compare."""
 
     roads: str
     demand: tuple[str, ...]
     near: tuple[str, ...] = ("arrived", "mean_speed_mps")
 
 
-# On Town10HD, only about twenty vehicles arrive, too few for a comparison.
+# The number of arrivals is not compared on Town10HD, where only about twenty vehicles arrive.
 REAL = {
     "bologna": Case(
         "net/bologna_acosta/acosta_buslanes.net.xml", ("net/bologna_acosta/run.sumocfg",)
@@ -54,16 +54,16 @@ def compare(folder: Path, case: Case, seconds: int = 900) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", REAL)
-def test_traffic_on_real_maps_agrees_with_sumos(shared_maps: Path, name: str) -> None:
+def test_traffic_on_real_maps_agrees_with_sumo(shared_maps: Path, name: str) -> None:
     compare(shared_maps, REAL[name])
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", WHEEL)
-def test_traffic_on_maps_of_the_wheel_agrees_with_sumos(name: str) -> None:
+def test_traffic_on_maps_of_sumos_wheel_agrees_with_sumo(name: str) -> None:
     compare(GAME, WHEEL[name])
 
 
-def test_traffic_of_three_minutes_agrees_with_sumos() -> None:
-    """The short variant, which is part of every run of the tests."""
+def test_traffic_of_three_minutes_agrees_with_sumo() -> None:
+    """This short variant is not slow, so it belongs to every run of the tests."""
     compare(GAME, WHEEL["kuehne"], 180)

@@ -1,4 +1,4 @@
-"""The SUMO side of the comparison, on SUMO's own small maps."""
+"""Runs of SUMO for comparisons, on small maps of SUMO."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def run_sumo(job: SumoJob) -> TrafficRun:
 
 
 def one_car(tmp_path: Path) -> SumoInput:
-    """Write a car that drives straight on from the first second, at the limit or faster."""
+    """Write a demand of one car that departs in the first second, at its maximum speed."""
     path = tmp_path / "one.rou.xml"
     path.write_text(
         '<routes><vType id="steady" sigma="0" speedDev="0" length="4"/>'
@@ -48,10 +48,10 @@ def one_car(tmp_path: Path) -> SumoInput:
 
 
 @pytest.mark.usefixtures("fresh_processes")
-def test_a_run_is_counted_and_measured() -> None:
+def test_a_run_of_sumo_has_counts_and_metrics() -> None:
     run = run_sumo(job(read_input([ROUTES]), seconds=120))
     figures = run.figures
-    # One flow every 2 s and one every 4 s, both from second 0.
+    # From second 0 on, one flow has a vehicle every 2 s, the other flow one every 4 s.
     assert figures.departed + figures.waiting == 90
     assert 0 < figures.arrived < figures.departed
     assert figures.mean_speed_mps is not None
@@ -70,7 +70,7 @@ def test_equal_seeds_give_equal_runs() -> None:
     assert first != other
 
 
-def test_metrics_of_one_car_alone(tmp_path: Path) -> None:
+def test_a_single_car_is_counted_and_passes_three_edges(tmp_path: Path) -> None:
     run = run_sumo(job(one_car(tmp_path), seconds=180))
     figures = run.figures
     assert (figures.departed, figures.waiting, figures.arrived) == (1, 0, 1)
@@ -78,9 +78,9 @@ def test_metrics_of_one_car_alone(tmp_path: Path) -> None:
     assert len(set(run.edge_minutes["edge"].tolist())) == 3
 
 
-def test_without_teleports_no_vehicle_jumps() -> None:
+def test_sumo_does_not_teleport_vehicles_if_teleports_are_off() -> None:
     cross = read_input([GAME / "cross.sumocfg"])
-    # The signals of this map wait for a player, so SUMO would teleport vehicles that wait long.
+    # The signals of this map wait for a player, so vehicles wait long enough to be teleported.
     eager = SumoInput(cross.route_files, cross.additional_files, options={"time-to-teleport": "20"})
     moved, stuck = (
         SumoJob(GAME / "cross" / "cross.net.xml", eager, 120, 0.5, 1, teleports)
@@ -90,7 +90,7 @@ def test_without_teleports_no_vehicle_jumps() -> None:
     assert run_sumo(stuck).figures.teleports == 0
 
 
-def test_demand_of_another_map_is_refused_in_sumos_words() -> None:
+def test_demand_of_another_map_is_refused_with_sumos_message() -> None:
     with pytest.raises(ConfigError, match=r"cross\.net\.xml: SUMO refuses this demand: .*edge"):
         run_sumo(job(read_input([ROUTES]), GAME / "cross" / "cross.net.xml"))
 
@@ -163,7 +163,7 @@ def test_missing_files_are_refused(tmp_path: Path) -> None:
         read_input([config])
 
 
-def test_detectors_write_nothing(tmp_path: Path) -> None:
+def test_files_that_detectors_would_write_are_replaced(tmp_path: Path) -> None:
     path = tmp_path / "detectors.add.xml"
     path.write_text(
         '<additional><vType id="a"/>\n<e1Detector id="d" lane="x" file="out.xml" freq="60"/>'
@@ -174,13 +174,15 @@ def test_detectors_write_nothing(tmp_path: Path) -> None:
     written = without_outputs(path, copies).read_text()
     assert 'file="NUL"' in written
     assert "out.xml" not in written
-    assert f'file="{tmp_path / "in.xml"}"' in written, "input files are found from the copy"
+    assert f'file="{tmp_path / "in.xml"}"' in written, "the copy does not refer to the input file"
     path.write_text("<additional/>")
     assert without_outputs(path, copies) == path
 
 
-def test_places_are_turned_from_front_bumper_and_compass(tmp_path: Path) -> None:
-    """The car drives to the east: heading 0, and its centre half a length behind its front."""
+def test_positions_are_converted_from_front_bumpers_and_headings_from_compass_angles(
+    tmp_path: Path,
+) -> None:
+    """The car drives east, so its heading is 0, and its centre is 2 m west of its front."""
     with sumo_process(job(one_car(tmp_path))) as process:
         x, y, heading, length, front = process.submit(
             _first_place, job(one_car(tmp_path)), tmp_path

@@ -1,4 +1,4 @@
-"""The comparison with SUMO: the table, the picture, and the speed."""
+"""The comparison with SUMO: table, picture, and speed of simulation."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def comparison(ours: TrafficRun, theirs: TrafficRun) -> TrafficComparison:
     return TrafficComparison("town", 900, 0.1, 1, ours, theirs, ("a", "b"))
 
 
-def test_a_ratio_is_cavmarls_figure_over_sumos_if_both_are_defined() -> None:
+def test_a_ratio_divides_cavmarls_figure_by_sumos_figure_if_both_are_defined() -> None:
     found = comparison(side(6, 3.0), side(8, None))
     assert found.ratio("arrived") == 0.75
     assert found.ratio("mean_speed_mps") is None
@@ -84,7 +84,7 @@ def test_the_command_prints_the_table_and_writes_both_files(
         assert set(written[side]["edge_minutes"]["edge"]) <= edges
 
 
-def test_our_world_has_the_signal_programs_of_the_demand() -> None:
+def test_the_world_has_the_signal_programs_of_the_demand() -> None:
     roads = GAME / "cross" / "cross.net.xml"
     plain = read_network(roads)
     world = make_world(roads, [GAME / "cross_demo.sumocfg"], 10, 0, 0.1)
@@ -93,7 +93,7 @@ def test_our_world_has_the_signal_programs_of_the_demand() -> None:
     assert world.network.program_ids[on] not in plain.program_ids
 
 
-def test_both_speeds_are_measured() -> None:
+def test_the_speeds_of_cavmarl_and_sumo_are_measured() -> None:
     found = measure_traffic_speed(MAP, [ROUTES], dt_s=0.2, after_s=10, repeats=2)
     for rates in (found.ours, found.sumo):
         assert 0.0 < rates.low <= rates.median <= rates.high
@@ -101,7 +101,7 @@ def test_both_speeds_are_measured() -> None:
 
 
 class StillSumo:
-    """A fake libsumo whose seven vehicles never move; it records its start options."""
+    """A fake libsumo with seven vehicles that never move; `words` are its start options."""
 
     TraCIException = RuntimeError
 
@@ -119,7 +119,7 @@ class StillSumo:
 
 @pytest.fixture
 def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
-    """Replace SUMO in this process."""
+    """Replace SUMO by a fake in this process, and return the fake."""
     found = StillSumo()
 
     @contextmanager
@@ -134,7 +134,7 @@ def still(monkeypatch: pytest.MonkeyPatch) -> StillSumo:
     return found
 
 
-def test_both_sides_run_the_same_demand_for_equal_times_and_write_nothing(
+def test_cavmarl_and_sumo_run_the_same_demand_for_equal_times_and_write_nothing(
     still: StillSumo, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     worlds: list[Simulation] = []
@@ -159,7 +159,7 @@ def test_both_sides_run_the_same_demand_for_equal_times_and_write_nothing(
     assert found.sumo_vehicles == 7.0
 
 
-def test_both_sides_count_each_vehicle_once_per_step(still: StillSumo) -> None:
+def test_cavmarl_and_sumo_count_each_vehicle_once_per_step(still: StillSumo) -> None:
     moved: list[None] = []
     world: Any = SimpleNamespace(
         outputs=SimpleNamespace(present=np.zeros((1, 2))),
@@ -202,7 +202,7 @@ def test_bad_input_is_reported_without_a_traceback(
     assert "Traceback" not in said
 
 
-def test_bins_join_their_values() -> None:
+def test_binned_means_average_the_values_of_a_bin() -> None:
     density = np.array([1.0, 3.0, 2.0, 5.0, 4.0, 11.0])
     means = binned_means(density, np.array([1.0, 1.0, 1.0, 1.0, 6.0, 100.0]))
     assert means[0].tolist() == [3.0]
@@ -217,8 +217,8 @@ def test_a_picture_that_cannot_be_written_is_refused(tmp_path: Path) -> None:
             plot_fundamental_diagram(found, tmp_path / name)
 
 
-def test_both_sides_drive_the_same_demand(tmp_path: Path) -> None:
-    """Bicycles on their own lanes and persons are not read; the SUMO side does not count them."""
+def test_cavmarl_and_sumo_drive_the_same_demand(tmp_path: Path) -> None:
+    """cavmarl does not read persons, nor bicycles on their own lanes; SUMO's figures omit them."""
     words = ("--grid", "--grid.number", "3", "--grid.length", "100", "--sidewalks.guess")
     network = netgenerate(tmp_path / "bikes.net.xml", *words, "--bikelanes.guess")
     demand = tmp_path / "mixed.rou.xml"

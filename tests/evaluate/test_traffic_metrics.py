@@ -1,4 +1,4 @@
-"""Traffic metrics of hand-made samples with known results."""
+"""Traffic metrics of samples whose results are known."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def network() -> RoadNetwork:
 
 @pytest.fixture(scope="module")
 def link(network: RoadNetwork) -> int:
-    """Find a link with a signal that goes straight on."""
+    """Return a straight link with a signal."""
     straight = (network.links["signal"] >= 0) & (network.links["direction"] == ord("s"))
     return int(np.flatnonzero(straight)[0])
 
@@ -37,7 +37,7 @@ def link(network: RoadNetwork) -> int:
 def car(
     network: RoadNetwork, number: int, lane: int, to_end_m: float = 1.0, speed: float = 0.0
 ) -> NDArray[np.void]:
-    """Create a car whose front is at this distance from its lane's end; cars do not overlap."""
+    """Return a car with its front `to_end_m` before the lane end. Its x avoids overlaps."""
     row = blank_vehicle()
     row["id"] = number
     row["lane"] = lane
@@ -68,11 +68,11 @@ def measure(
 
 
 def inside(network: RoadNetwork, link: int) -> int:
-    """Return the first lane of a link inside the junction."""
+    """Return the first lane of a link inside its junction."""
     return int(np.flatnonzero(network.lanes["internal"] & (network.lanes["link"] == link))[0])
 
 
-def test_counts_of_the_simulator_are_passed_on(network: RoadNetwork) -> None:
+def test_the_figures_contain_the_counts_of_the_simulator(network: RoadNetwork) -> None:
     figures = measure(network, []).figures
     assert (figures.departed, figures.waiting, figures.arrived) == (3, 2, 1)
     assert (figures.mean_delay_s, figures.teleports) == (4.5, 7)
@@ -80,14 +80,16 @@ def test_counts_of_the_simulator_are_passed_on(network: RoadNetwork) -> None:
     assert (figures.queue, figures.contacts, figures.longest_lock_s) == (0.0, 0, 0.0)
 
 
-def test_mean_speed_is_over_all_vehicles_of_all_samples(network: RoadNetwork, link: int) -> None:
+def test_the_mean_speed_averages_all_vehicles_of_all_samples(
+    network: RoadNetwork, link: int
+) -> None:
     lane = int(network.links["from_lane"][link])
     fast, slow = (car(network, k, lane, 50.0, speed) for k, speed in ((0, 9.0), (1, 3.0)))
     figures = measure(network, [rows(fast, slow), rows(fast)]).figures
     assert figures.mean_speed_mps == pytest.approx(7.0)
 
 
-def test_the_queue_has_the_vehicles_that_stand_on_lanes_to_a_signal(
+def test_the_queue_counts_vehicles_that_stand_on_lanes_to_a_signal(
     network: RoadNetwork, link: int
 ) -> None:
     lane = int(network.links["from_lane"][link])
@@ -101,7 +103,9 @@ def test_the_queue_has_the_vehicles_that_stand_on_lanes_to_a_signal(
     assert measure(network, [queued, rows()]).figures.queue == 1.0
 
 
-def test_a_pair_counts_when_it_begins_to_touch(network: RoadNetwork, link: int) -> None:
+def test_a_contact_counts_once_when_two_vehicles_begin_to_touch(
+    network: RoadNetwork, link: int
+) -> None:
     lane = int(network.links["from_lane"][link])
     apart = rows(car(network, 0, lane), car(network, 1, lane))
     touching = apart.copy()
@@ -112,7 +116,9 @@ def test_a_pair_counts_when_it_begins_to_touch(network: RoadNetwork, link: int) 
     assert measure(network, samples).figures.contacts == 2
 
 
-def test_a_lock_lasts_while_vehicles_wait_and_none_passes(network: RoadNetwork, link: int) -> None:
+def test_a_lock_lasts_while_vehicles_wait_and_no_vehicle_passes(
+    network: RoadNetwork, link: int
+) -> None:
     lane = int(network.links["from_lane"][link])
     into, way = inside(network, link), rows(car(network, 0, lane))
     junction = network.junction_ids[network.edges["to_junction"][network.lanes["edge"][lane]]]
@@ -121,7 +127,7 @@ def test_a_lock_lasts_while_vehicles_wait_and_none_passes(network: RoadNetwork, 
     assert (run.figures.longest_lock_s, run.figures.locked_junction) == (5.0, junction)
 
 
-def test_a_vehicle_inside_a_junction_locks_it_until_it_vanishes(
+def test_a_vehicle_that_stands_inside_a_junction_locks_the_junction_until_it_vanishes(
     network: RoadNetwork, link: int
 ) -> None:
     stuck = rows(car(network, 0, inside(network, link)))
@@ -142,7 +148,7 @@ def test_time_at_red_neither_counts_nor_ends_a_lock(network: RoadNetwork, link: 
 
 
 @pytest.mark.parametrize(("to_end_m", "speed"), [(STOP_LINE_M + 0.1, 0.0), (1.0, 0.2)])
-def test_moving_vehicles_and_vehicles_off_the_line_do_not_wait(
+def test_moving_vehicles_and_vehicles_far_from_the_line_do_not_wait(
     network: RoadNetwork, link: int, to_end_m: float, speed: float
 ) -> None:
     way = rows(car(network, 0, int(network.links["from_lane"][link]), to_end_m, speed))
@@ -172,7 +178,9 @@ def test_a_vehicle_off_the_map_counts_only_for_the_mean_speed(network: RoadNetwo
     assert len(run.edge_minutes) == 0
 
 
-def test_headways_are_between_the_front_bumpers_of_a_lane(network: RoadNetwork, link: int) -> None:
+def test_headways_are_measured_between_front_bumpers_on_one_lane(
+    network: RoadNetwork, link: int
+) -> None:
     lane = int(network.links["from_lane"][link])
     other = int(network.links["to_lane"][link])
     truck = car(network, 2, lane, 20.0, speed=5.0)
@@ -181,19 +189,19 @@ def test_headways_are_between_the_front_bumpers_of_a_lane(network: RoadNetwork, 
     found = headways_s(
         rows(
             car(network, 0, lane, 60.0, speed=10.0),  # 40 m behind the truck
-            car(network, 1, lane, 5.0, speed=5.0),  # the first of its lane
-            truck,  # 15 m behind the first
+            car(network, 1, lane, 5.0, speed=5.0),  # the first vehicle of its lane
+            truck,  # 15 m behind the first vehicle
             car(network, 3, lane, 70.0, speed=0.5),  # too slow to follow
-            car(network, 4, other, 50.0, speed=9.0),  # alone
+            car(network, 4, other, 50.0, speed=9.0),  # alone on its lane
         )
     )
     np.testing.assert_allclose(np.sort(found), [3.0, 4.0])
     assert len(headways_s(rows())) == 0
     far = rows(car(network, 0, lane, 80.0, speed=2.0), car(network, 1, lane, 5.0, speed=2.0))
-    assert len(headways_s(far)) == 0, "37.5 s behind is not following"
+    assert len(headways_s(far)) == 0, "a vehicle 37.5 s behind another one counts as following"
 
 
-def test_flow_and_contacts_refer_to_the_driven_distance(network: RoadNetwork, link: int) -> None:
+def test_flow_and_contact_rate_use_the_driven_distance(network: RoadNetwork, link: int) -> None:
     lane = int(network.links["from_lane"][link])
     cars = rows(car(network, 0, lane, 30.0, speed=8.0), car(network, 1, lane, 10.0, speed=12.0))
     figures = measure(network, [cars] * 50).figures

@@ -1,4 +1,4 @@
-"""Records of a training run about the placement of its worlds."""
+"""A training run records the placement of its worlds on workers."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from tests.cli.test_main import refusal, run
 @pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 @pytest.mark.parametrize(
     ("worlds", "zones", "sources"),
-    # In the first case, each world is on one worker.
+    # In the first case, no world is divided, so each world runs on one worker.
     [(5, 1, ["measured"]), (2, 4, ["length of lanes", "measured"])],
 )
 def test_plans_are_recomputed_from_the_manifest(

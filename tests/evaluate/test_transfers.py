@@ -1,4 +1,4 @@
-"""Evaluations of divided worlds record all transfers."""
+"""Evaluations of divided worlds record all transfers between zones."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_each_transfer_has_its_row(folder: Path) -> None:
+def test_each_transfer_has_a_row(folder: Path) -> None:
     rows = read_table(folder / TRANSFERS_FILE, TRANSFER)["idm"]
     assert len(rows) > 10
     assert set(rows["run"].tolist()) == {0, 1}
@@ -50,7 +50,7 @@ def test_each_transfer_has_its_row(folder: Path) -> None:
     assert (rows["ms"] > 0.0).all()
 
 
-def test_the_report_has_the_summary(folder: Path) -> None:
+def test_the_report_has_the_summary_of_transfers(folder: Path) -> None:
     found = load_report(folder)["idm"].transfers
     assert found is not None
     rows = read_table(folder / TRANSFERS_FILE, TRANSFER)["idm"]
@@ -70,7 +70,7 @@ def test_the_manifest_has_the_zones(folder: Path) -> None:
     assert world["config"]["zones"]["hysteresis_m"] == 2.0
 
 
-def test_zones_change_nothing_else(folder: Path) -> None:
+def test_zones_change_no_other_metric(folder: Path) -> None:
     whole = evaluate("grid4x4", "idm", seed=2, repeats=2, **SMALL)
     assert whole["idm"].transfers is None
     assert whole["idm"]["zone_imbalance"].mean is None
@@ -87,7 +87,7 @@ def test_each_episode_has_the_imbalance_of_its_zones(folder: Path, tmp_path: Pat
     assert len(set(rows["zone_imbalance"].tolist())) == 6
     found = load_report(folder)["idm"]["zone_imbalance"].mean
     assert found == pytest.approx(rows["zone_imbalance"].mean())
-    # Three narrow zones at the edge of the map, and one zone with all vehicles.
+    # This partition has three narrow zones at the edge of the map, and one zone with all vehicles.
     low_x, low_y, high_x, high_y = load_world("grid4x4").network.extent_m
     cuts = [low_x - 9.0, low_x - 8.0, low_x - 7.0, low_x - 6.0, high_x + 9.0]
     rects = [(a, low_y - 9.0, b, high_y + 9.0) for a, b in pairwise(cuts)]
@@ -102,20 +102,20 @@ def test_each_episode_has_the_imbalance_of_its_zones(folder: Path, tmp_path: Pat
     assert 1.3 < speed.zone_time_imbalance <= 4.0
 
 
-def test_an_undivided_world_leaves_no_file(tmp_path: Path) -> None:
+def test_an_undivided_world_writes_no_table_of_transfers(tmp_path: Path) -> None:
     report: EvaluationReport = evaluate("ring", "idm", out=tmp_path, **{**SMALL, "episodes": 1})
     assert not (tmp_path / TRANSFERS_FILE).exists()
     assert report.to_dict()["policies"]["idm"]["transfers"] is None
 
 
-def test_records_give_the_rows_back() -> None:
+def test_the_duration_of_a_transfer_is_none_if_it_is_unknown() -> None:
     rows = np.zeros(2, TRANSFER)
     rows["ms"] = [1.5, np.nan]
     first, second = transfers_of(rows)
     assert (first.ms, second.ms) == (1.5, None)
 
 
-def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
+def test_each_run_has_its_own_journals(tmp_path: Path) -> None:
     logged = ZONES | {"zones.journal": str(tmp_path / "run.jsonl")}
     few: dict[str, Any] = {**SMALL, "episodes": 2, "repeats": 2, "overrides": logged}
     found = evaluate("grid4x4", "idm", **few)["idm"].transfers
@@ -123,11 +123,11 @@ def test_each_run_has_journals_of_its_own(tmp_path: Path) -> None:
     names = {"run.0.jsonl", "run.1.jsonl", "run.run-1.0.jsonl", "run.run-1.1.jsonl"}
     assert {path.name for path in tmp_path.iterdir()} == names
     switches = sum(summarize(tmp_path / name)[0].switches for name in names)
-    # Transfers in the last step of an episode may be missing, because a reset follows.
+    # The table may lack transfers of the last step of an episode, because a reset follows.
     assert switches >= found.transfers > 0
     (tmp_path / "run.0.jsonl").unlink()
     (tmp_path / "run.1.jsonl").unlink()
     out = tmp_path / "out"
     with pytest.raises(JournalError, match=r"run\.run-1\.0\.jsonl: exists; move it away"):
         evaluate("grid4x4", "idm", out=out, **few)
-    assert not (out / "manifest.json").exists(), "it is refused before the first run"
+    assert not (out / "manifest.json").exists(), "the journal was refused after the first run"

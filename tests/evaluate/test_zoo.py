@@ -1,4 +1,4 @@
-"""The zoo: entries are verified by driving again; changed files are refused."""
+"""Trained drivers (the zoo) are verified by a repeated evaluation; changed files are refused."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def test_each_entry_equals_its_recorded_result(found) -> None:  # type: ignore[n
     assert found.weights_bytes <= 1_000_000
     assert found.trips >= 50
     config, *_ = load_config(found.environment.rpartition("-")[0])
-    if config.traffic.endless:  # on endless roads, no vehicle arrives
+    if config.traffic.endless:  # no vehicle arrives in endless traffic
         assert found.shares["collision"] == 0.0
     else:
         assert 0.5 < found.shares["success"] <= 1.0
@@ -58,7 +58,7 @@ def test_results_that_were_changed_are_refused(entry: Path) -> None:
         verify_entry(entry)
 
 
-def test_another_world_is_not_compared(entry: Path) -> None:
+def test_an_entry_of_a_different_world_is_refused(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["world"]["config"]["clock"]["sim_dt_s"] = 0.1
@@ -67,7 +67,7 @@ def test_another_world_is_not_compared(entry: Path) -> None:
         verify_entry(entry)
 
 
-def test_a_difference_is_reported_with_its_step(entry: Path) -> None:
+def test_the_tables_that_differ_are_reported(entry: Path) -> None:
     path = entry / "result" / "manifest.json"
     document = json.loads(path.read_text())
     document["job"] |= {"episodes": 1, "seed": 3}
@@ -108,7 +108,7 @@ def test_unknown_entries_are_refused(entry: Path, tmp_path: Path) -> None:
         verify_entry(entry)
 
 
-def test_a_matrix_has_the_trips_of_each_driver_among_each_other_driver() -> None:
+def test_a_matrix_has_the_trips_of_each_driver_among_vehicles_of_each_driver() -> None:
     found = cross("merge", ["idm", "random_actions"], episodes=1, seed=2)
     assert found.drivers == ("idm", "random_actions")
     for driver in found.drivers:
@@ -129,7 +129,7 @@ def test_a_matrix_needs_several_agents_and_different_drivers() -> None:
         cross("merge", ["idm", "idm"])
 
 
-def test_drivers_share_the_agents_by_turns() -> None:
+def test_two_drivers_of_one_policy_drive_alternate_agents() -> None:
     vec = make_vec("ring", num_envs=2)
     observations, infos = vec.reset(seed=1)
     together = load_policy("idm+random_actions", vec)

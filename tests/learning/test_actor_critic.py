@@ -1,4 +1,4 @@
-"""Probabilities, entropies and distances of actions, compared with values worked out by hand."""
+"""Probabilities, entropies and distances of actions, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def network(kind: str, *, residual: bool = False) -> ActorCritic:
     return ActorCritic(config, (0.5, 0.25))
 
 
-def test_continuous_actions_are_normal() -> None:
+def test_continuous_actions_have_a_normal_distribution() -> None:
     output, actions = torch.tensor([[0.1, -0.2]]), torch.tensor([[0.6, -0.2]])
     log_prob, entropy = network("continuous").judge(output, actions)
     # A normal distribution has the entropy ln(σ √(2πe)) and the density exp(-z² / 2) / (σ √(2π)).
@@ -29,7 +29,7 @@ def test_continuous_actions_are_normal() -> None:
     assert distance.item() == pytest.approx(0.3**2 + 0.4**2)
 
 
-def test_choices_have_the_probabilities_of_their_logits() -> None:
+def test_discrete_actions_have_the_probabilities_of_their_logits() -> None:
     odds = [1.0, 2.0, 3.0, 4.0]
     output = torch.tensor([[*odds, 0.0]]).log().clamp(min=-80.0)
     log_prob, entropy = network("discrete").judge(output, torch.tensor([2]))
@@ -40,7 +40,7 @@ def test_choices_have_the_probabilities_of_their_logits() -> None:
     assert distance.item() == pytest.approx(-math.log(0.4))
 
 
-def test_corrections_are_added_in_full_to_throttle_and_by_a_tenth_to_steering() -> None:
+def test_a_residual_network_adds_all_of_its_throttle_and_a_tenth_of_its_steering() -> None:
     observations = torch.tensor([[9.0, 9.0, 0.3, -0.5]])
     given = network("continuous", residual=True).given(torch.tensor([[0.2, 1.0]]), observations)
     assert given[0].tolist() == pytest.approx([0.5, -0.4])
@@ -48,7 +48,7 @@ def test_corrections_are_added_in_full_to_throttle_and_by_a_tenth_to_steering() 
     assert clipped[0].tolist() == [1.0, -1.0]
 
 
-def test_observations_are_clipped_at_five_deviations() -> None:
+def test_normalized_observations_are_clipped_at_five_deviations() -> None:
     observer = network("continuous")
     observer.mean += torch.tensor([1.0, 0.0, 0.0, 0.0])
     observer.deviation *= 2.0

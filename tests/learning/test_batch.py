@@ -1,4 +1,4 @@
-"""Advantages, compared with values worked out by hand."""
+"""Advantages, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -37,8 +37,8 @@ def batch_of_one_seat(
     )
 
 
-def test_advantages_by_hand() -> None:
-    # A vehicle ends after step 1; the seat waits in step 2; the next vehicle is cut after step 4.
+def test_advantages_equal_hand_computed_values() -> None:
+    # A trip ends after step 1, the seat is empty in step 2, the next trip is truncated in step 4.
     batch = batch_of_one_seat(
         rewards=[1.0, 2.0, 9.0, 3.0, 4.0],
         acted=[True, True, False, True, True],
@@ -53,8 +53,8 @@ def test_advantages_by_hand() -> None:
     assert found == pytest.approx([first, ends, 0.0, fourth, cut])
 
 
-def test_rewards_of_the_next_vehicle_are_not_credited_to_the_previous_one() -> None:
-    # Without a step between: one vehicle ends in step 0, the next has the seat from step 1 on.
+def test_advantages_of_a_trip_exclude_rewards_of_the_next_trip() -> None:
+    # The next vehicle has the seat directly after the end of the previous trip.
     batch = batch_of_one_seat(
         rewards=[1.0, 50.0, -7.0],
         acted=[True, True, True],
@@ -67,7 +67,7 @@ def test_rewards_of_the_next_vehicle_are_not_credited_to_the_previous_one() -> N
     assert found == pytest.approx([1.0 - 0.5, second, last])
 
 
-def test_seats_are_independent() -> None:
+def test_advantages_of_seats_are_independent() -> None:
     one, other = (
         batch_of_one_seat([r, 2.0 * r, 3.0], [True] * 3, [on, True, False], 1.0)
         for r, on in ((1.0, True), (4.0, False))

@@ -1,4 +1,4 @@
-"""Training as a job: on this machine, and in Slurm where it is installed."""
+"""Training as a job on this machine, and in Slurm if Slurm is installed."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 def submit(*words: str) -> dict[str, str]:
-    """Return what `cavmarl submit train` prints."""
+    """Return the printed `key: value` lines of `cavmarl submit train`."""
     done = CliRunner().invoke(app, ["submit", "train", *words], catch_exceptions=False)
     assert done.exit_code == 0, done.output
     return dict(line.split(": ", 1) for line in done.output.splitlines())  # type: ignore[misc]
@@ -53,7 +53,7 @@ def refusal(kind: type[CavmarlError], *words: str) -> str:
     return str(refused.value)
 
 
-def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
+def results_of(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
     with (folder / "progress.csv").open(newline="") as file:
         rows = [{key: row[key] for key in row.keys() - TIMES} for row in csv.DictReader(file)]
     return (folder / "model.safetensors").read_bytes(), rows
@@ -73,21 +73,21 @@ def rows(folder: Path) -> int:
 
 
 def check_resumed(folder: Path, *options: str) -> None:
-    """Compare the run of a job with a run that was not interrupted."""
+    """Compare the results of a job with those of an uninterrupted run."""
     assert load_program("ppo").main([*RUN[1:], *options, "--name", "whole"]) == 0
-    assert learnt(folder) == learnt(Path("runs/whole"))
+    assert results_of(folder) == results_of(Path("runs/whole"))
 
 
-# submitit forgets the process of the job, which goes on
+# submitit drops its handle of the running process.
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning")
-def test_a_preempted_job_is_queued_again_and_resumes(here: Path) -> None:
+def test_a_preempted_job_is_requeued_and_resumes(here: Path) -> None:
     pytest.importorskip("submitit", reason="needs the extra: cluster")
     told = submit(*RUN, "--to", "local", "--name", "job")
     folder, log = Path(told["run"]), Path(told["log"])
     assert folder == here / "runs/job"
     wait(lambda: rows(folder) > 2, log)
     assert read_checkpoint(folder).updates == 0
-    (trains,) = psutil.Process(int(told["job"])).children()  # the job's process watches this one
+    (trains,) = psutil.Process(int(told["job"])).children()  # the process that trains
     trains.send_signal(signal.SIGUSR2)
     wait(lambda: read_checkpoint(folder).updates, log)
     assert not is_trained(folder)
@@ -95,7 +95,7 @@ def test_a_preempted_job_is_queued_again_and_resumes(here: Path) -> None:
     check_resumed(folder)
 
 
-def test_a_failed_program_fails_its_job(here: Path) -> None:
+def test_a_job_fails_if_its_program_fails(here: Path) -> None:
     job = make_job("ppo", [*RUN[1:], "--name", "job"], 1)
     (here / "runs").mkdir()
     (here / "runs/job").touch()
@@ -103,13 +103,13 @@ def test_a_failed_program_fails_its_job(here: Path) -> None:
         job()
 
 
-def test_a_job_continues_its_own_run_and_no_other(here: Path) -> None:
+def test_a_job_resumes_only_its_own_run(here: Path) -> None:
     words = [*RUN[1:], "--total-agent-steps", "20", "--name", "job"]
     job = make_job("ppo", words, 1)
     assert job.command() == [sys.executable, str(TRAIN / "ppo.py"), *words]
     assert load_program("ppo").main(words) == 0
     assert job.command()[2:] == ["--resume", str(here / "runs/job")]
-    assert job() == str(here / "runs/job")  # which is complete
+    assert job() == str(here / "runs/job")  # already complete
     said = refusal(TrainingError, *RUN, "--name", "job", "--to", "local")
     assert "runs/job: contains a run, which is not overwritten; continue it (--resume" in said
     more = ["--resume", "runs/job", "--total-agent-steps", "90"]
@@ -133,7 +133,7 @@ def test_a_job_continues_its_own_run_and_no_other(here: Path) -> None:
         (["ppo_sb3", "--processes", "2"], "--processes 2: ppo_sb3 trains in one process; use pp"),
     ],
 )
-def test_wrong_jobs_are_refused_before_they_are_queued(
+def test_jobs_with_invalid_arguments_are_refused_before_they_are_queued(
     here: Path, words: list[str], said: str
 ) -> None:
     assert said in refusal(ConfigError, *words)
@@ -147,13 +147,15 @@ def test_a_machine_without_slurm_is_refused(here: Path, monkeypatch: pytest.Monk
     assert not list(here.rglob("*"))
 
 
-def test_missing_libraries_are_named(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_submitit_names_the_extra(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "submitit", None)
     assert "[cluster]" in refusal(MissingExtraError, *RUN, "--to", "local")
 
 
 @pytest.mark.slow
-def test_a_job_of_slurm_is_preempted_and_resumes(here: Path) -> None:
+def test_a_preempted_job_of_slurm_resumes(here: Path) -> None:
     pytest.importorskip("submitit", reason="needs the extra: cluster")
     if shutil.which("scontrol") is None or subprocess.call(["scontrol", "ping"]):
         pytest.skip("needs a Slurm cluster")

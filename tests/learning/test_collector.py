@@ -1,4 +1,4 @@
-"""Data collected from worlds, for a critic of single agents and a critic of whole worlds."""
+"""Collected training data, with and without a central critic."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def make_collector(
 
 
 @pytest.mark.parametrize("central", [False, True])
-def test_collected_trajectories_are_cut_at_ends_and_at_the_horizon(central: bool) -> None:
+def test_trajectories_end_with_trips_and_are_bootstrapped_at_the_horizon(central: bool) -> None:
     vec = make_worlds("NextStep" if central else "SameStep")
     batch = make_collector(vec, vec.state_size if central else 0).collect(with_suggested=False)
     boundary = batch.acted & ~batch.goes_on
@@ -54,11 +54,11 @@ def test_collected_trajectories_are_cut_at_ends_and_at_the_horizon(central: bool
     ended = boundary & ~bootstrapped
     assert ended.any()
     assert not (batch.goes_on & ~batch.acted).any()
-    # If the vehicle continues, the next decision belongs to the same vehicle.
+    # If a trip goes on, the agent acts in the next step.
     assert batch.acted[1:][batch.goes_on[:-1]].all()
 
 
-def test_values_use_the_state_of_their_step_also_at_the_horizon() -> None:
+def test_the_central_critic_evaluates_the_state_of_each_step() -> None:
     vec = make_worlds("NextStep")
     collector = make_collector(vec, vec.state_size)
     first = torch.from_numpy(vec.state())
@@ -68,7 +68,7 @@ def test_values_use_the_state_of_their_step_also_at_the_horizon() -> None:
         seen, state = batch.observations[step, world, agent], batch.states[step, world]
         value = collector.network.value(seen[None], state[None]).item()
         assert batch.values[step, world, agent].item() == pytest.approx(value, abs=1e-5)
-    # A world at its horizon has the value of its last state, not of the next episode's state.
+    # At the horizon, the next value is of the last state, not of the next episode's first state.
     step, world, agent = (batch.acted & ~batch.goes_on).nonzero()[-1].tolist()
     cut = batch.next_values[:HORIZON] != 0.0
     step, world, agent = (cut & ~batch.goes_on[:HORIZON]).nonzero()[0].tolist()
@@ -78,14 +78,14 @@ def test_values_use_the_state_of_their_step_also_at_the_horizon() -> None:
     assert batch.next_values[step, world, agent].item() == pytest.approx(value, abs=1e-5)
 
 
-def test_the_clock_accounts_for_all_time() -> None:
+def test_collecting_spends_time_in_all_phases_but_learning() -> None:
     collector = make_collector(make_worlds("SameStep"), 0)
     collector.collect(with_suggested=True)
     assert collector.times.spent_s["learning"] == 0.0
     assert all(collector.times.spent_s[phase] > 0.0 for phase in PPO.PHASES[:3])
 
 
-def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
+def test_seats_of_opponents_are_not_trained() -> None:
     vec = make_worlds("SameStep")
     size = vec.single_observation_space.shape[0]
     config = NetworkConfig("merge", size, vec.config.sensors, vec.config.action, (8,))
@@ -99,7 +99,7 @@ def test_seats_of_opponents_are_not_trained_and_drive_as_their_policy() -> None:
     assert batch.acted[:, ~theirs].float().mean() > 0.5
 
 
-def test_resumed_worlds_have_the_mask_of_the_saved_state(
+def test_a_resumed_collector_uses_the_saved_mask(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     one, other = (make_collector(make_worlds("SameStep"), 0) for _ in range(2))
@@ -124,7 +124,7 @@ def test_resumed_worlds_have_the_mask_of_the_saved_state(
     np.testing.assert_array_equal(given[0], masks[-1])
 
 
-def test_the_value_after_a_red_light_violation_is_zero() -> None:
+def test_with_end_at_red_the_value_after_a_red_light_violation_is_zero() -> None:
     found = {}
     for end_at_red in (False, True):
         vec = make_vec("grid4x4", num_envs=4, seed=0)
@@ -134,7 +134,7 @@ def test_the_value_after_a_red_light_violation_is_zero() -> None:
         args = PPO.Args(num_steps=100, end_at_red=end_at_red, opponents="")
         network = ActorCritic(config, (0.1, 0.01))
         with torch.no_grad():
-            network.actor[-1].bias[0] = 0.6  # full speed ahead
+            network.actor[-1].bias[0] = 0.6  # nearly full throttle
         found[end_at_red] = PPO.Collector(vec, network, args, seed=0).collect(False)
     calm, strict = found[False], found[True]
     assert torch.equal(calm.rewards, strict.rewards)
@@ -155,7 +155,7 @@ def test_a_residual_driver_observes_the_actions_of_the_built_in_driver() -> None
 
 
 @pytest.mark.parametrize("name", ["", "gentle"])
-def test_imitated_actions_equal_those_of_the_driver(name: str) -> None:
+def test_suggested_actions_equal_those_of_the_imitated_driver(name: str) -> None:
     vec = make_vec("ring22", num_envs=2)
     collector = make_collector(vec, 0, imitate=name)
     teacher = load_policy(name or "idm", vec)

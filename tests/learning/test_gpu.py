@@ -1,4 +1,4 @@
-"""Learning on a GPU; these tests are skipped if torch finds none."""
+"""Learning on a GPU; the tests are skipped if torch finds no GPU."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FEW = "--env merge --num-envs 4 --num-steps 16 --checkpoint-updates 1 --shared".
 @pytest.mark.parametrize(
     "words", [[], ["--imitation-weight", "1"], ["--keep", "0.35"], ["--residual"]]
 )
-def test_a_run_on_a_gpu_resumes_there_and_on_the_cpu(tmp_path: Path, words: list[str]) -> None:
+def test_a_run_on_a_gpu_resumes_on_the_gpu_and_on_the_cpu(tmp_path: Path, words: list[str]) -> None:
     run = tmp_path / "run"
     begun = [*FEW, *words, "--device", "cuda", "--runs", str(tmp_path), "--name", "run"]
     assert PPO.main([*begun, "--total-agent-steps", "200"]) == 0

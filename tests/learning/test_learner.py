@@ -1,4 +1,4 @@
-"""Weights and rates of PPO's updates over a run, compared with values worked out by hand."""
+"""PPO's updates, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -26,13 +26,15 @@ def learner(**settings: Any) -> Any:
 @pytest.mark.parametrize(
     ("left", "weight"), [(1.0, 2.0), (0.875, 1.0), (0.8, 0.4), (0.75, 0.0), (0.3, 0.0)]
 )
-def test_imitation_ends_after_its_share_of_the_run(left: float, weight: float) -> None:
+def test_the_weight_of_imitation_falls_to_zero_after_its_share_of_the_run(
+    left: float, weight: float
+) -> None:
     found = learner(imitation_weight=2.0, imitation_share=0.25)
     assert found.imitation_weight(left) == pytest.approx(weight)
 
 
 def batch(rewards: list[float]) -> Any:
-    """Create decisions that each end a trip; the observation is the number of the decision."""
+    """Create decisions that each end a trip; the first feature is the number of the decision."""
     steps = len(rewards)
     shape = (steps, 1, 1)
     observations = torch.zeros(*shape, 3)
@@ -57,7 +59,7 @@ def test_the_learning_rate_falls_with_the_remaining_updates(anneal: bool, rate: 
     assert [group["lr"] for group in found.optimizer.param_groups] == [rate]
 
 
-def test_learning_uses_decisions_with_large_positive_or_negative_advantages(
+def test_learning_uses_decisions_with_the_largest_absolute_advantages(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     found = learner(keep=0.5, epochs=1, minibatches=1)
@@ -73,7 +75,7 @@ def test_learning_uses_decisions_with_large_positive_or_negative_advantages(
 
 
 @pytest.mark.parametrize("kept", [0.0, 0.75])
-def test_the_driver_has_averaged_weights_and_the_latest_scales(kept: float) -> None:
+def test_the_driver_has_averaged_weights_and_the_latest_observation_scales(kept: float) -> None:
     found = learner(average=kept, learning_rate=0.1, epochs=1, minibatches=1)
     due = {name: tensor.clone() for name, tensor in found.network.state_dict().items()}
     for rewards in ([1.0, 2.0, 3.0], [3.0, -1.0, 2.0]):

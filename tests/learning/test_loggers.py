@@ -1,4 +1,4 @@
-"""Loggers of training runs: each gets the rows of the table, also after a run is resumed."""
+"""Loggers of training runs get all rows of the table, also after a run is resumed."""
 
 from __future__ import annotations
 
@@ -22,10 +22,10 @@ ROWS = [
 ]
 
 
-class Notes:
-    """A logger that keeps what it gets."""
+class StoringLogger:
+    """A logger that stores its arguments."""
 
-    made: list[Notes] = []  # noqa: RUF012 - emptied by each test
+    made: list[StoringLogger] = []  # noqa: RUF012 - emptied by each test
 
     def __init__(self, folder: Path, settings: Any, rows: Any) -> None:
         self.folder, self.settings, self.before = folder, dict(settings), list(rows)
@@ -44,19 +44,19 @@ class Notes:
 
 
 @pytest.fixture
-def notes(monkeypatch: pytest.MonkeyPatch) -> list[Notes]:
-    monkeypatch.setitem(LOGGERS, "notes", Notes)
-    monkeypatch.setattr(Notes, "made", [])
-    return Notes.made
+def notes(monkeypatch: pytest.MonkeyPatch) -> list[StoringLogger]:
+    monkeypatch.setitem(LOGGERS, "notes", StoringLogger)
+    monkeypatch.setattr(StoringLogger, "made", [])
+    return StoringLogger.made
 
 
-def test_a_logger_gets_settings_and_rows(notes: list[Notes], tmp_path: Path) -> None:
+def test_a_logger_gets_settings_and_rows(notes: list[StoringLogger], tmp_path: Path) -> None:
     log = Log(tmp_path, ["notes"], {"seed": 3})
     for row in ROWS:
         log.write(row)
     sizes = log.sync()
     log.close()
-    (logger,) = Notes.made
+    (logger,) = StoringLogger.made
     assert (logger.folder, logger.settings, logger.before) == (tmp_path, {"seed": 3}, [])
     assert [row["agent_steps"] for row in logger.rows] == [8, 16]
     assert logger.calls == ["flush", "close"]
@@ -64,16 +64,16 @@ def test_a_logger_gets_settings_and_rows(notes: list[Notes], tmp_path: Path) -> 
 
 
 def test_a_resumed_run_gives_a_logger_the_rows_before_the_checkpoint(
-    notes: list[Notes], tmp_path: Path
+    notes: list[StoringLogger], tmp_path: Path
 ) -> None:
     log = Log(tmp_path, ["notes"])
     log.write(ROWS[0])
     sizes = log.sync()
-    log.write(ROWS[1])  # after the checkpoint: is cut
+    log.write(ROWS[1])  # after the checkpoint, so it is removed
     log.close()
     cut_logs(tmp_path, sizes)
     Log(tmp_path, ["notes"]).close()
-    before = Notes.made[1].before
+    before = StoringLogger.made[1].before
     assert [row["agent_steps"] for row in before] == [8.0]
     assert math.isnan(before[0]["success"])
 
@@ -84,12 +84,12 @@ def test_a_damaged_table_is_refused(tmp_path: Path) -> None:
         read_rows(tmp_path)
 
 
-def test_names_are_checked_before_the_training(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_unknown_and_uninstalled_loggers_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     assert logger_names("") == ()
     assert logger_names(" tensorboard, tensorboard") == ("tensorboard",)
     with pytest.raises(ConfigError, match="no such logger; give some of tensorboard, wandb, ml"):
         logger_names("wandbb")
-    monkeypatch.setitem(loggers.LOGGERS, "wandb", Notes)
+    monkeypatch.setitem(loggers.LOGGERS, "wandb", StoringLogger)
     monkeypatch.setattr("cavmarl.core.errors.find_spec", lambda module: None)
     with pytest.raises(MissingExtraError, match=r"'wandb' .* not installed: .*\[trackers\]"):
         logger_names("wandb")
@@ -124,6 +124,6 @@ def test_wandb_writes_an_offline_run(tmp_path: Path) -> None:
         log.close()
     (file,) = tmp_path.glob("wandb/offline-run-*/run-*.wandb")
     until = time.monotonic() + 60.0
-    while file.read_bytes().count(b"trip_return") < 2:  # the library's process writes on
+    while file.read_bytes().count(b"trip_return") < 2:  # another process writes the file
         assert time.monotonic() < until
         time.sleep(0.1)

@@ -1,4 +1,4 @@
-"""Scales of observations, compared with means and deviations worked out by hand."""
+"""Running means and deviations of observations, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def network() -> ActorCritic:
     return ActorCritic(NetworkConfig("merge", 2, SensorsConfig(), ActionConfig(), (4,)))
 
 
-def test_batches_together_have_the_deviation_of_all_observations() -> None:
+def test_the_scales_of_two_batches_are_those_of_all_observations() -> None:
     observer = network()
     scales = Scales(observer)
     scales.add(torch.tensor([[0.0, 3.0], [2.0, 3.0]]))
@@ -30,13 +30,15 @@ def test_batches_together_have_the_deviation_of_all_observations() -> None:
     assert observer.deviation[0].item() == pytest.approx(1.0)
     scales.add(torch.zeros(0, 2))
     scales.add(torch.tensor([[10.0, 3.0], [12.0, 3.0], [14.0, 3.0]]))
-    # The mean of 0, 2, 10, 12, 14 is 7.6, and the squares about it sum up to 155.2.
+    # The mean of 0, 2, 10, 12, 14 is 7.6; the sum of squared differences from the mean is 155.2.
     assert observer.mean.tolist() == pytest.approx([7.6, 3.0])
     assert observer.deviation[0].item() == pytest.approx(math.sqrt(155.2 / 5.0))
-    assert observer.deviation[1].item() == pytest.approx(0.02), "a constant is not amplified"
+    assert observer.deviation[1].item() == pytest.approx(0.02), (
+        "the deviation of a constant has a lower bound"
+    )
 
 
-def test_the_weight_of_a_drivers_scales_is_its_number_of_decisions(
+def test_scales_of_a_start_driver_count_with_its_number_of_decisions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observer = network()
@@ -50,12 +52,13 @@ def test_the_weight_of_a_drivers_scales_is_its_number_of_decisions(
     scales = Scales(observer)
     scales.start(NetworkConfig("merge", 2, SensorsConfig(), ActionConfig(), (4,)), Path())
     scales.add(torch.tensor([[3.0, 0.0], [5.0, 0.0]]))
-    # Ten of 1 ± 2 and two of 4 ± 1: the mean is 1.5, the sum of squares 40 + 2 + 10 · 2 / 12 · 9.
+    # Ten values 1 ± 2 and two values 4 ± 1 have the mean 1.5. The sum of squared differences from
+    # the mean is 10 · 2² + 2 · 1² + 10 · 2 / 12 · 3² = 57.
     assert observer.mean[0].item() == pytest.approx(1.5)
     assert observer.deviation[0].item() == pytest.approx(math.sqrt(57.0 / 12.0))
 
 
-def test_saved_scales_continue() -> None:
+def test_loaded_scales_continue_with_the_same_numbers() -> None:
     first, second = torch.tensor([[0.0, 1.0], [2.0, 5.0]]), torch.tensor([[10.0, 9.0]])
     whole, cut = network(), network()
     scales = Scales(whole)
@@ -66,7 +69,7 @@ def test_saved_scales_continue() -> None:
     resumed = Scales(cut)
     resumed.load(saved)
     resumed.add(second)
-    # The mean of 0, 2, 10 is 4, and the squares about it sum up to 56.
+    # The mean of 0, 2, 10 is 4; the sum of squared differences from the mean is 56.
     assert cut.mean.tolist() == pytest.approx([4.0, 5.0])
     assert cut.deviation[0].item() == pytest.approx(math.sqrt(56.0 / 3.0))
     assert torch.equal(cut.deviation, whole.deviation)

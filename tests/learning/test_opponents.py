@@ -1,4 +1,4 @@
-"""The agents that opponents drive, counted with drivers whose actions are their names."""
+"""Assignment of agents to opponents, tested with drivers whose actions are their numbers."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from cavmarl.learning import opponents
 WORLDS, AGENTS = 200, 20
 
 
-class Named:
-    """A driver whose every action is its name."""
+class NumberedDriver:
+    """A driver named by a number; all its actions are that number."""
 
     def __init__(self, name: str) -> None:
         self.number = float(name)
@@ -27,12 +27,12 @@ class Named:
 
 
 @pytest.fixture
-def drivers(monkeypatch: pytest.MonkeyPatch) -> list[Named]:
-    """Return the drivers in the order in which they are loaded."""
-    loaded: list[Named] = []
+def drivers(monkeypatch: pytest.MonkeyPatch) -> list[NumberedDriver]:
+    """Return a list to which each loaded driver is appended."""
+    loaded: list[NumberedDriver] = []
 
-    def load(name: str, vec: object) -> Named:
-        loaded.append(Named(name))
+    def load(name: str, vec: object) -> NumberedDriver:
+        loaded.append(NumberedDriver(name))
         return loaded[-1]
 
     monkeypatch.setattr(opponents, "load_policy", load)
@@ -40,7 +40,7 @@ def drivers(monkeypatch: pytest.MonkeyPatch) -> list[Named]:
 
 
 def driven(names: str, share: float, mask: NDArray[np.bool_]) -> tuple[Any, NDArray[np.float32]]:
-    """Return the opponents, and the number of each agent's driver; 0: the learning driver."""
+    """Return the opponents, and the number of each agent's driver (0: the learning driver)."""
     vec: Any = SimpleNamespace(num_envs=WORLDS, num_agents=AGENTS)
     found = opponents.Opponents(names, vec, share, 7)
     actions = np.zeros((WORLDS, AGENTS, 2), np.float32)
@@ -48,7 +48,7 @@ def driven(names: str, share: float, mask: NDArray[np.bool_]) -> tuple[Any, NDAr
     return found, actions[..., 0]
 
 
-def test_each_opponent_drives_its_share_of_the_agents(drivers: list[Named]) -> None:
+def test_each_opponent_drives_its_share_of_the_agents(drivers: list[NumberedDriver]) -> None:
     mask = np.ones((WORLDS, AGENTS), np.bool_)
     found, by = driven("1,2,3", 0.2, mask)
     shares = [float((by == number).mean()) for number in range(4)]
@@ -58,7 +58,7 @@ def test_each_opponent_drives_its_share_of_the_agents(drivers: list[Named]) -> N
         np.testing.assert_array_equal(driver.masks[0], by == driver.number)
 
 
-def test_opponents_are_asked_for_agents_of_the_mask_alone(drivers: list[Named]) -> None:
+def test_opponents_act_only_for_agents_of_the_mask(drivers: list[NumberedDriver]) -> None:
     mask = np.zeros((WORLDS, AGENTS), np.bool_)
     mask[:, ::2] = True
     driven("1,2", 0.5, mask)
@@ -67,8 +67,8 @@ def test_opponents_are_asked_for_agents_of_the_mask_alone(drivers: list[Named]) 
 
 
 @pytest.mark.parametrize(("names", "share"), [("", 0.5), ("1", 0.0)])
-def test_without_names_or_share_the_learning_driver_drives_all(
-    drivers: list[Named], names: str, share: float
+def test_without_names_or_share_the_learning_driver_drives_all_agents(
+    drivers: list[NumberedDriver], names: str, share: float
 ) -> None:
     found, by = driven(names, share, np.ones((WORLDS, AGENTS), np.bool_))
     assert found.absent.all()

@@ -1,4 +1,4 @@
-"""Settings as options of a command line."""
+"""Settings of training programs as options and files."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.learning.options import (
 
 
 @dataclass(frozen=True)
-class Few:
+class SomeSettings:
     steps: Annotated[int, "of a run"] = 5
     rate: Annotated[float, "of learning"] = 0.5
     anneal: Annotated[bool, "the rate"] = True
@@ -37,41 +37,43 @@ class WithPlugins:
 def test_options_override_a_file_and_a_file_overrides_defaults(tmp_path: Path) -> None:
     file = tmp_path / "few.yaml"
     file.write_text("steps: 7\nrate: 0.25\n")
-    assert parse_settings(Few, [], "") == Few()
-    found = parse_settings(Few, ["--config", str(file), "--rate", "2", "--no-anneal"], "")
-    assert found == Few(steps=7, rate=2.0, anneal=False)
+    assert parse_settings(SomeSettings, [], "") == SomeSettings()
+    found = parse_settings(SomeSettings, ["--config", str(file), "--rate", "2", "--no-anneal"], "")
+    assert found == SomeSettings(steps=7, rate=2.0, anneal=False)
 
 
 @pytest.mark.parametrize(
     ("text", "said"), [("step: 1", "step: .*steps"), ("steps: 0", "--steps 0")]
 )
-def test_a_wrong_file_is_refused(tmp_path: Path, text: str, said: str) -> None:
+def test_an_invalid_file_of_settings_is_refused(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "few.yaml"
     file.write_text(text)
     with pytest.raises(ConfigError, match=said):
-        parse_settings(Few, ["--config", str(file)], "")
+        parse_settings(SomeSettings, ["--config", str(file)], "")
 
 
-def test_modules_to_import_can_be_repeated() -> None:
+def test_the_option_import_can_be_repeated() -> None:
     words = ["--import", "my_terms", "--import", "my_package.sensors"]
     assert parse_settings(WithPlugins, words, "").plugins == "my_terms,my_package.sensors"
 
 
-def test_the_first_line_of_the_text_is_the_help(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_help_has_the_first_line_of_the_docstring(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit, match="0"):
-        parse_settings(Few, ["--help"], "Learns little.\n\nMore.")
+        parse_settings(SomeSettings, ["--help"], "Learns little.\n\nMore.")
     shown = capsys.readouterr().out
     assert "Learns little." in shown
     assert "More." not in shown
     assert "of a run (default: 5)" in shown
 
 
-def test_the_name_of_a_run_is_its_folder() -> None:
+def test_the_folder_of_a_run_has_its_name() -> None:
     assert run_folder("runs", "mine", "merge", "ippo", 3) == Path("runs/mine")
     assert run_folder("runs", "", "maps/town.net.xml", "ippo", 3) == Path("runs/town_ippo_3")
 
 
-def test_wrong_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_errors_of_a_program_are_printed_without_a_traceback(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     def train() -> Path:
         raise ConfigError("no such world")
 

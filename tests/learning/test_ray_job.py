@@ -1,4 +1,4 @@
-"""Training as a job of a Ray cluster: the loss of a machine, and the queue of Ray."""
+"""Training as a job of a Ray cluster."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own cod
 
 @pytest.fixture
 def cluster(here: Path) -> Iterator[Any]:
-    """Yield a cluster whose head has no CPU, so that tasks wait for other nodes."""
+    """Yield a cluster whose head has no CPU, so tasks run only on added nodes."""
     from ray.cluster_utils import Cluster
 
     made = Cluster(initialize_head=True, head_node_args={"num_cpus": 0, "include_dashboard": False})
@@ -36,7 +36,7 @@ def cluster(here: Path) -> Iterator[Any]:
     made.shutdown()
 
 
-def test_a_job_continues_on_another_machine(here: Path, cluster: Any) -> None:
+def test_a_job_resumes_on_another_machine_after_a_loss(here: Path, cluster: Any) -> None:
     first = cluster.add_node(num_cpus=1)
     shorter = ["--total-agent-steps", "12000", "--checkpoint-updates", "20"]
     told = json.dumps(asdict(make_job("ppo", [*RUN[1:], *shorter, "--name", "job"], 1)))
@@ -62,7 +62,7 @@ def test_a_job_continues_on_another_machine(here: Path, cluster: Any) -> None:
 
 
 @pytest.mark.slow
-def test_a_failed_program_fails_its_job(here: Path, cluster: Any) -> None:
+def test_a_job_fails_if_its_program_fails(here: Path, cluster: Any) -> None:
     cluster.add_node(num_cpus=1)
     job = make_job("ppo", [*RUN[1:], "--name", "job"], 1)
     (here / "runs").mkdir()
@@ -78,14 +78,14 @@ def test_a_failed_program_fails_its_job(here: Path, cluster: Any) -> None:
     assert "runs/job: the program ended with exit code 2" in done.stderr.splitlines()[-1]
 
 
-def test_the_part_of_ray_for_jobs_is_named(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_error_without_the_job_server_of_ray_names_the_extra(
+    here: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setitem(sys.modules, "aiohttp_cors", None)
     assert "[cluster]" in refusal(MissingExtraError, *RUN, "--to", "ray")
 
 
-def test_a_cluster_that_is_not_there_is_refused(
-    here: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unreachable_cluster_is_an_error(here: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     pytest.importorskip("aiohttp_cors", reason="needs the extra: cluster")
     monkeypatch.setenv("RAY_API_SERVER_ADDRESS", "http://127.0.0.1:9")
     assert "--to ray: no job can be queued" in refusal(TrainingError, *RUN, "--to", "ray")

@@ -1,4 +1,4 @@
-"""Returns and ends of trips during a training, compared with values worked out by hand."""
+"""Returns and ends of trips during training, compared with hand-computed values."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.learning.log import Trips
 def step(
     trips: Trips, reward: tuple[float, float], ends: str = "", *, red: bool = False
 ) -> dict[str, float]:
-    """Add a step of two agents; letters of `ends`: `a` arrives, `c` is cut, `-` continues."""
+    """Add a step of two agents; in `ends`, a means arrival, c truncation and - no end."""
     terms = np.zeros((1, 2, len(TERMS)), np.float32)
     done, cut = np.zeros((2, 1, 2), np.bool_)
     for agent, letter in enumerate(ends):
@@ -23,7 +23,7 @@ def step(
     return trips.means()
 
 
-def test_a_trip_is_the_sum_of_its_steps_and_red_lights_are_remembered() -> None:
+def test_the_return_of_a_trip_is_the_sum_of_all_its_rewards() -> None:
     trips = Trips(1, 2)
     found = step(trips, (1.0, 10.0), red=True)
     assert found["trips"] == 0
@@ -33,7 +33,7 @@ def test_a_trip_is_the_sum_of_its_steps_and_red_lights_are_remembered() -> None:
     assert (found["trips"], found["trip_return"], found["success"]) == (1, 7.0, 1.0)
     assert found["red_light"] == 1.0
     found = step(trips, (8.0, 80.0), "aa")
-    # The next trip of the first agent has return 8 and no red light; the second agent's has 150.
+    # The second trip of the first agent has the return 8, the trip of the second agent has 150.
     assert found["trip_return"] == pytest.approx((7.0 + 8.0 + 150.0) / 3.0)
     assert found["red_light"] == pytest.approx(1.0 / 3.0)
 
@@ -46,7 +46,7 @@ def test_truncated_trips_do_not_count() -> None:
     assert (found["trips"], found["trip_return"], found["red_light"]) == (1, 3.0, 0.0)
 
 
-def test_saved_trips_continue() -> None:
+def test_loaded_trips_continue_with_their_returns() -> None:
     trips, again = Trips(1, 2), Trips(1, 2)
     step(trips, (1.0, 5.0), "-a")
     again.load(trips.save())

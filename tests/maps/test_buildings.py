@@ -35,7 +35,7 @@ def area(parts: np.ndarray) -> float:
 @pytest.mark.parametrize(
     ("rings", "expected"), [((SQUARE,), 80.0), ((SQUARE, HOLE), 72.0), ((BEND,), 45.0)]
 )
-def test_the_parts_of_a_footprint_have_its_area(
+def test_the_convex_parts_of_a_footprint_have_its_area(
     rings: tuple[np.ndarray, ...], expected: float
 ) -> None:
     turned = [ring @ np.array([[0.8, 0.6], [-0.6, 0.8]]) for ring in rings]
@@ -90,7 +90,8 @@ def test_heights_and_rings_are_read_from_openstreetmap(tmp_path: Path) -> None:
     (ring,) = found["way 10"].rings
     (joined,) = found["relation 20"].rings
     assert len(ring) == len(joined) == 4
-    # A degree of longitude is 111.32 km times the cosine of the latitude, one of latitude 111.2 km.
+    # A degree of longitude has 111.32 km times the cosine of the latitude; a degree of latitude has
+    # 111.2 km.
     assert np.ptp(ring[:, 0]) == pytest.approx(0.0002 * 111_320 * np.cos(np.radians(49.464)), 0.03)
     assert np.ptp(ring[:, 1]) == pytest.approx(0.0001 * 111_200, abs=0.6)
 
@@ -131,14 +132,14 @@ def test_polygons_of_sumo_are_read_in_the_frame_of_the_map(tmp_path: Path) -> No
         (OSM[:-20], GEO, "broken XML"),
     ],
 )
-def test_a_file_that_cannot_work_is_refused(
+def test_an_unusable_file_is_refused_with_its_cause(
     tmp_path: Path, text: str, geo: GeoReference | None, words: str
 ) -> None:
     with pytest.raises(MapError, match=words):
         read_footprints(written(tmp_path, text), geo)
 
 
-def test_buildings_of_another_place_are_refused(tmp_path: Path) -> None:
+def test_buildings_that_are_not_on_the_map_are_refused(tmp_path: Path) -> None:
     network = read_network(Path("envs/merge/map/map.net.xml"))
     far = tmp_path / "b.poly.xml"
     far.write_text(POLYGONS.replace("0,0 10,0 10,8 0,8 0,0", "9e4,0 9.1e4,0 9.1e4,8"))
@@ -159,7 +160,7 @@ def test_buildings_of_impossible_size_are_refused(tmp_path: Path, shape: str) ->
         with_buildings(network, path)
 
 
-def test_buildings_change_the_hash_and_nothing_else(tmp_path: Path) -> None:
+def test_buildings_change_the_hash_and_no_lane(tmp_path: Path) -> None:
     network = read_network(Path("envs/merge/map/map.net.xml"))
     built = with_buildings(network, written(tmp_path, POLYGONS, "a.poly.xml"))
     assert len(built.walls) == 4
@@ -179,13 +180,13 @@ def test_buildings_of_real_maps_do_not_stand_on_roads(
     source = shared_maps / "osm" / name
     network = load_world(source, overrides={"map.buildings": "osm"}).network
     assert len(set(network.walls["building"].tolist())) >= buildings
-    # Roads meet buildings only where they lead through or under them, which counts here as well; in
-    # a wrong frame, they meet them anywhere.
+    # Some roads lead through or under buildings. If the buildings were at wrong positions, many
+    # more points of roads would be inside of them.
     assert len(points_inside(network, network.roofs)) < 0.02 * len(network.points)
 
 
 def _tagged(tags: str) -> str:
-    """Return a map with a way over the square of way 10, which has these tags."""
+    """Return OSM in which the square building, way 10, has these tags."""
     words = "".join(
         f'<tag k="{k}" v="{v}"/>' for k, v in (pair.split("=") for pair in tags.split())
     )
@@ -198,14 +199,14 @@ def _tagged(tags: str) -> str:
         ("building=yes", True),
         ("building=yes layer=-1", False),
         ("building=yes location=underground", False),
-        ("building=yes layer=1", True),  # no road is known to lead under it
+        ("building=yes layer=1", True),  # below the building, no road is known
         ("building=yes layer=x", True),
         ("building=yes min_height=1.8", True),
         ("building=yes min_height=3", False),
         ("building=yes min_height=4.5 building:min_level=0", False),
         ("building=yes building:min_level=1", False),
         ("building=yes building:min_level=0", True),
-        ("building=yes building:min_level=-2", True),  # with cellars
+        ("building=yes building:min_level=-2", True),  # two levels are cellars
     ],
 )
 def test_buildings_that_do_not_stand_on_the_ground_are_left_out(

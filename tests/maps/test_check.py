@@ -20,8 +20,8 @@ from tests.support.kept_maps import network_of
 
 BuiltMap = Callable[[str], Path]
 
-# road km, lane km, junctions, signals, edges in the largest connected part, edges.
-# Two of Mcity's 37 junctions join only footpaths, and are not counted.
+# Road km, lane km, junctions, signals, edges in the largest connected part, all edges. Two of the
+# 37 junctions of Mcity join only footpaths and are not counted.
 FIGURES = {
     "osm/monaco.osm.gz": (76.81, 96.54, 265, 4, 591, 636),
     "osm/laufamholz.osm.xml": (6.96, 8.23, 15, 2, 51, 51),
@@ -38,7 +38,7 @@ FIGURES = {
     "xodr/soderleden_invalid.xodr": (1.86, 3.65, 1, 0, 1, 7),
 }
 
-# A ring of two one-way roads and a spur.
+# A ring of two one-way roads, and a spur, which is a dead end.
 RING = """<net version="1.20">
   <edge id="a" from="A" to="B">
     <lane id="a_0" index="0" speed="10" length="50" shape="0,0 50,0"/>
@@ -86,7 +86,7 @@ SIGNALLED = """<net version="1.20">
         ([(99999, "O")], False),
     ],
 )
-def test_signals_that_hold_red_are_named(
+def test_signals_with_a_long_red_phase_are_reported(
     tmp_path: Path,
     caplog: pytest.LogCaptureFixture,
     phases: list[tuple[int, str]],
@@ -119,7 +119,7 @@ def check(tmp_path: Path) -> Callable[..., MapReport]:
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_figures_of_real_maps(built_map: BuiltMap, name: str) -> None:
+def test_figures_of_real_maps_equal_known_values(built_map: BuiltMap, name: str) -> None:
     report = check_map(network_of(built_map(name)))
     road_km, lane_km, junctions, signals, connected, edges = FIGURES[name]
     assert report.drivable
@@ -130,7 +130,7 @@ def test_figures_of_real_maps(built_map: BuiltMap, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", FIGURES)
-def test_figures_equal_sumolib(built_map: BuiltMap, name: str) -> None:
+def test_figures_of_real_maps_equal_those_of_sumolib(built_map: BuiltMap, name: str) -> None:
     path = built_map(name)
     report = check_map(network_of(path))
     net = sumolib.net.readNet(str(path), withPrograms=True, withInternal=True)
@@ -153,14 +153,16 @@ def test_a_poorly_connected_map_is_drivable_and_reported(built_map: BuiltMap) ->
     assert any("only 26% of the edges" in note for note in report.notes)
 
 
-def test_steep_lanes_are_noted(built_map: BuiltMap) -> None:
+def test_steep_lanes_are_reported(built_map: BuiltMap) -> None:
     report = check_map(network_of(built_map("net/mcity/mcity.net.xml")))
     assert report.elevation_m == pytest.approx((266.0, 279.4), abs=0.05)
     assert report.max_grade == pytest.approx(0.346, abs=0.001)
     assert any("climbs 35%" in note for note in report.notes)
 
 
-def test_a_ring_with_a_spur(check: Callable[..., MapReport]) -> None:
+def test_the_report_of_a_ring_with_a_spur_names_its_dead_end(
+    check: Callable[..., MapReport],
+) -> None:
     report = check()
     assert report.drivable
     assert (report.connected_edges, report.edges) == (2, 3)
@@ -180,14 +182,14 @@ def test_a_map_without_connections_cannot_be_driven(check: Callable[..., MapRepo
     )
 
 
-def test_a_map_for_buses_cannot_be_driven(check: Callable[..., MapReport]) -> None:
+def test_a_map_that_is_open_to_buses_only_cannot_be_driven(check: Callable[..., MapReport]) -> None:
     report = check(("<lane ", '<lane allow="bus" '))
     assert not report.drivable
     assert (report.edges, report.road_km, report.connected_share) == (0, 0.0, 0.0)
     assert "no edge is open to passenger cars" in report.problems[0]
 
 
-def test_unusual_places_are_named(check: Callable[..., MapReport]) -> None:
+def test_unusual_lanes_and_edges_are_named(check: Callable[..., MapReport]) -> None:
     second = '<lane id="a_1" index="1" speed="500" length="50" shape="0,3 50,3"/>'
     report = check(
         ('</edge>\n  <edge id="b"', f'{second}</edge>\n  <edge id="b"'),
@@ -198,10 +200,10 @@ def test_unusual_places_are_named(check: Callable[..., MapReport]) -> None:
     assert report.lanes_without_successor == ("a_1",)
     assert report.self_loops == ("x",)
     assert report.speed_outliers == ("a_1", "x_0")
-    assert len(report.notes) == 6  # one note says that a_1 and b_0 share a strip
+    assert len(report.notes) == 6  # one of the notes says that the lanes a_1 and b_0 overlap
 
 
-def test_merging_without_a_rule_is_named(check: Callable[..., MapReport]) -> None:
+def test_a_junction_without_right_of_way_is_named(check: Callable[..., MapReport]) -> None:
     back = '<connection from="x" to="b" fromLane="0" toLane="0" dir="t" state="M"/>\n</net>'
     unruled = (
         ("</net>", back),
@@ -220,7 +222,7 @@ def test_merging_without_a_rule_is_named(check: Callable[..., MapReport]) -> Non
     assert report.junctions_without_right_of_way == ()
 
 
-def test_signals_that_never_open_or_control_nothing_are_named(
+def test_signals_that_are_never_green_or_control_no_lane_are_named(
     check: Callable[..., MapReport],
 ) -> None:
     programs = "".join(
@@ -244,7 +246,9 @@ def test_signals_that_never_open_or_control_nothing_are_named(
         )
     )
 )
-def test_components_equal_mutual_reach(graph: tuple[int, list[tuple[int, int]]]) -> None:
+def test_nodes_are_in_one_component_if_each_reaches_the_other(
+    graph: tuple[int, list[tuple[int, int]]],
+) -> None:
     size, arcs = graph
     component = strong_components(size, np.array(arcs, np.int32).reshape(-1, 2))
     reach = np.eye(size, dtype=bool)
@@ -256,6 +260,6 @@ def test_components_equal_mutual_reach(graph: tuple[int, list[tuple[int, int]]])
     assert set(component) == set(range(component.max() + 1))
 
 
-def test_components_of_a_long_road() -> None:
+def test_components_of_a_road_of_100000_edges_are_found() -> None:
     road = np.stack([np.arange(99_999), np.arange(1, 100_000)], axis=1).astype(np.int32)
     assert len(np.unique(strong_components(100_000, road))) == 100_000

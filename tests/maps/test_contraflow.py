@@ -1,4 +1,4 @@
-"""Networks with contraflow lanes."""
+"""Networks with contraflow lanes, which lead against the direction of a road."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.roads.sumo_net.reader import read_network
 ROADS = ("B1B2", "C1B1")
 
 
-def test_contraflow_lanes_lie_on_the_road_and_lead_back() -> None:
+def test_contraflow_lanes_lie_on_the_road_in_the_opposite_direction() -> None:
     path = contraflow_network(find_map("grid4x4"), ROADS)
     assert read_provenance(path)["contraflow"] == "B1B2 C1B1"
     network = read_network(path)
@@ -36,7 +36,7 @@ def test_contraflow_lanes_lie_on_the_road_and_lead_back() -> None:
             assert np.hypot(points["x"][first] - end["x"], points["y"][first] - end["y"]) < 0.1
 
 
-def test_contraflow_lanes_follow_the_signals_of_the_road_beside_them() -> None:
+def test_contraflow_lanes_obey_the_signals_of_the_adjacent_road() -> None:
     network = read_network(contraflow_network(find_map("grid4x4"), ROADS))
     ids = network.lane_ids
     ends = {(ids[row["from_lane"]], ids[row["to_lane"]]): row for row in network.links}
@@ -45,7 +45,7 @@ def test_contraflow_lanes_follow_the_signals_of_the_road_beside_them() -> None:
     assert back["signal_index"] == beside["signal_index"]
 
 
-def test_other_lanes_stay_as_they_are() -> None:
+def test_other_lanes_do_not_change() -> None:
     plain = read_network(find_map("grid4x4"))
     network = read_network(contraflow_network(find_map("grid4x4"), ROADS))
     rows = {name: row for row, name in enumerate(network.lane_ids)}
@@ -57,7 +57,7 @@ def test_other_lanes_stay_as_they_are() -> None:
     assert (plain.lanes["permissions"] & CARS != 0).any()
 
 
-def test_a_network_is_made_once() -> None:
+def test_a_network_with_contraflow_lanes_is_cached() -> None:
     path = contraflow_network(find_map("grid4x4"), ROADS)
     made = path.stat().st_mtime_ns
     assert contraflow_network(find_map("grid4x4"), ROADS[::-1]) == path

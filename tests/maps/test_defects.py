@@ -1,4 +1,4 @@
-"""Each kind of defect of a map is found at its place, and only there."""
+"""Each kind of defect of a map is found at its place, and nowhere else."""
 
 from __future__ import annotations
 
@@ -41,18 +41,18 @@ def changed(path: Path, pattern: str, new: str) -> Path:
     return path
 
 
-def test_a_sound_map_has_no_defects(town: Path) -> None:
+def test_a_correct_map_has_no_defects(town: Path) -> None:
     assert found(town) == []
 
 
-def test_narrow_lanes(town: Path) -> None:
+def test_narrow_lanes_are_found(town: Path) -> None:
     changed(town, r'(<lane id="10#1_0"[^>]*?) shape', r'\1 width="1.5" shape')
     (defect,) = found(town)
     assert (defect.kind, defect.name) == ("lane narrower than a car", "10#1_0")
     assert "1.50 m" in defect.about
 
 
-def test_steps_in_height(town: Path) -> None:
+def test_steps_in_height_are_found(town: Path) -> None:
     lane = re.search(r'<lane id="10#1_0"[^>]*? shape="([^"]*)"', town.read_text())
     assert lane
     raised = " ".join(f"{x},{y},2.0" for x, y, *_ in (one.split(",") for one in lane[1].split()))
@@ -61,7 +61,7 @@ def test_steps_in_height(town: Path) -> None:
     assert any(defect.name == "10#1_0" and "2.00 m" in defect.about for defect in steps)
 
 
-def test_signals_without_lanes(town: Path) -> None:
+def test_signals_without_lanes_are_found(town: Path) -> None:
     program = (
         '<tlLogic id="2" type="static" programID="0" offset="0"><phase duration="9" state="G"/>'
         "</tlLogic><junction "
@@ -73,7 +73,7 @@ def test_signals_without_lanes(town: Path) -> None:
     assert (defect.kind, defect.name, defect.x_m) == ("signal without lanes", "2", row["x"])
 
 
-def test_crossings_without_right_of_way(town: Path) -> None:
+def test_crossings_without_right_of_way_are_found(town: Path) -> None:
     text = town.read_text()
     for key in ("response", "foes"):
         text = re.sub(rf'{key}="([01]+)"', lambda word: word[0].replace("1", "0"), text)
@@ -82,7 +82,7 @@ def test_crossings_without_right_of_way(town: Path) -> None:
     assert kinds == {"crossing without right of way"}
 
 
-def test_stop_lines_inside_junctions(town: Path) -> None:
+def test_stop_lines_inside_junctions_are_found(town: Path) -> None:
     junction = re.search(r'<junction id="2"[^>]*? x="([^"]*)" y="([^"]*)"', town.read_text())
     assert junction
     x, y = float(junction[1]), float(junction[2])
@@ -92,7 +92,7 @@ def test_stop_lines_inside_junctions(town: Path) -> None:
     assert kinds == {"stop line inside a junction"}
 
 
-def test_buildings_on_roads(town: Path, tmp_path: Path) -> None:
+def test_buildings_on_roads_are_found(town: Path, tmp_path: Path) -> None:
     network = read_network(town)
     x, y = network.lane_polyline(network.lane_ids.index("10#1_0"))[-1, :2]
     for shift, count in ((0.0, 1), (300.0, 0)):
@@ -128,7 +128,7 @@ def test_roads_through_buildings_are_no_defects(tmp_path: Path, tags: str, is_fo
     )
     source = tmp_path / "covered.osm"
     way = '<way id="10"><nd ref="1"/><nd ref="2"/><nd ref="3"/>'
-    # A bend inside the building, since straight lanes have points at their ends alone.
+    # The road bends inside the building, because straight lanes have points only at their ends.
     bent = '<node id="95" lat="48.006" lon="11.0001"/>'
     text = TOWN.replace('<way id="10">', f'{bent}<way id="10">', 1)
     text = text.replace(way, way.replace('<nd ref="3"/>', '<nd ref="95"/><nd ref="3"/>') + words)
@@ -161,7 +161,7 @@ def two_parts(folder: Path) -> Path:
     return path
 
 
-def test_disconnected_roads_are_removed(tmp_path: Path) -> None:
+def test_the_command_finds_and_removes_disconnected_roads(tmp_path: Path) -> None:
     path = two_parts(tmp_path)
     fixed, page, report = (tmp_path / name for name in ("fixed.net.xml", "p.html", "r.json"))
     words = ["check", str(path), "--fix", str(fixed), "--page", str(page), "--json", str(report)]

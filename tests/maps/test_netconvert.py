@@ -48,7 +48,7 @@ def test_an_osm_file_becomes_a_network(town: Path, tmp_path: Path) -> None:
     assert list(result.path.parent.iterdir()) == [result.path]
 
 
-def test_builds_are_equal_byte_for_byte(town: Path, tmp_path: Path) -> None:
+def test_two_builds_have_equal_bytes(town: Path, tmp_path: Path) -> None:
     one = build_network(town, tmp_path / "one.net.xml").path.read_bytes()
     other = build_network(town, tmp_path / "other" / "town.net.xml").path.read_bytes()
     packed = build_network(town, tmp_path / "packed.net.xml.gz").path.read_bytes()
@@ -63,7 +63,9 @@ def test_the_kind_of_a_source_does_not_depend_on_its_extension(town: Path, tmp_p
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_errors_of_netconvert_are_shown(shared_maps: Path, tmp_path: Path, name: str) -> None:
+def test_errors_of_netconvert_are_part_of_the_message(
+    shared_maps: Path, tmp_path: Path, name: str
+) -> None:
     with pytest.raises(MapError) as caught:
         build_network(shared_maps / name, tmp_path / "out.net.xml")
     message = str(caught.value)
@@ -113,15 +115,15 @@ def test_corrections_and_warnings_are_counted_by_kind(
 
 
 def test_a_box_crops_the_map(shared_maps: Path, tmp_path: Path) -> None:
-    whole = shared_maps / "osm" / "laufamholz.osm.xml"  # 1,425 m by 692 m
+    whole = shared_maps / "osm" / "laufamholz.osm.xml"  # the whole map has 1,425 m by 692 m
     box = (11.153, 49.464, 11.159, 49.468)
     result = build_network(whole, tmp_path / "part.net.xml", bbox=box)
     min_x, min_y, max_x, max_y = read_network(result.path).extent_m
-    assert 700.0 < max_x - min_x < 1200.0  # a road that lies partly within the box is kept whole
+    assert 700.0 < max_x - min_x < 1200.0  # roads that lie partly within the box are not cut
     assert 300.0 < max_y - min_y < 600.0
 
 
-def test_a_box_elsewhere_is_refused(town: Path, tmp_path: Path) -> None:
+def test_a_box_without_roads_is_refused(town: Path, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="No edges loaded"):
         build_network(town, tmp_path / "out.net.xml", bbox=(1.0, 1.0, 2.0, 2.0))
     with pytest.raises(ConfigError, match="is empty"):
@@ -158,7 +160,7 @@ def test_useless_and_hostile_sources_are_refused(
     assert list(tmp_path.iterdir()) == [path]
 
 
-def test_broken_networks_do_not_pass_through(shared_maps: Path, tmp_path: Path) -> None:
+def test_invalid_networks_are_refused(shared_maps: Path, tmp_path: Path) -> None:
     text = (shared_maps / "net" / "Town10HD.net.xml").read_text()
     path = tmp_path / "town.net.xml"
     path.write_text(text.replace('speed="13.89" length', 'speed="nan" length', 1))
@@ -177,26 +179,26 @@ def test_a_network_is_copied_unchanged(shared_maps: Path, tmp_path: Path) -> Non
     assert build_network(source).path == source
 
 
-def test_the_source_is_never_overwritten(town: Path) -> None:
+def test_a_target_that_is_the_source_is_refused(town: Path) -> None:
     before = town.read_bytes()
     with pytest.raises(MapError, match="target is the source"):
         build_network(town, town)
     assert town.read_bytes() == before
 
 
-def test_an_unwritable_target_is_an_error(town: Path, tmp_path: Path) -> None:
+def test_a_target_that_cannot_be_written_is_refused(town: Path, tmp_path: Path) -> None:
     with pytest.raises(MapError, match="cannot be written"):
         build_network(town, town / "below" / "out.net.xml")
     with pytest.raises(MapError, match="cannot be written"):
         build_network(town, tmp_path)
 
 
-def test_netconvert_has_limited_time(town: Path, tmp_path: Path) -> None:
+def test_the_time_of_netconvert_is_limited(town: Path, tmp_path: Path) -> None:
     with pytest.raises(MapError, match=r"longer than 0\.0001 s"):
         build_network(town, tmp_path / "out.net.xml", timeout_s=0.0001)
 
 
-def test_the_environment_limits_the_time_of_a_map_that_is_driven(
+def test_an_environment_variable_limits_the_time_of_netconvert(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("CAVMARL_CACHE_DIR", str(tmp_path / "cache"))
@@ -231,7 +233,7 @@ def test_map_file_returns_networks_unchanged(tmp_path: Path) -> None:
     assert map_file(plain) == plain
 
 
-def test_without_sumo_the_extra_is_named(
+def test_the_error_without_sumo_names_the_extra(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(module: str, extra: str) -> None:
@@ -262,7 +264,7 @@ def test_a_terminated_command_leaves_no_partial_file(tmp_path: Path) -> None:
 
 
 def _end_in_netconvert(tmp_path: Path, call: str, how: signal.Signals) -> int:
-    """End a program while its netconvert runs; check that netconvert ends; return the exit code."""
+    """Kill a program during its netconvert, check that netconvert ends, return the exit code."""
     slow = tmp_path / "bin" / "netconvert"
     slow.parent.mkdir()
     slow.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/pid\nexec sleep 600\n")
@@ -308,7 +310,7 @@ def test_the_next_build_removes_files_of_a_killed_build(
     ring = find_entry("ring") / "map" / "map.net.xml"
     with draft_folder(place) as living:
         build_network(ring, place / "copy.net.xml")
-        assert living.exists(), "another process may use it"
+        assert living.exists(), "the build removed a folder that another process may use"
     assert [folder.exists() for folder in left] == [False, True]
     made = build_network(ring, options=["--no-turnarounds"]).path
     assert made.is_relative_to(cached)

@@ -1,4 +1,4 @@
-"""Attributes of roads in OpenDRIVE reach the lanes of the network."""
+"""Speed limits and lane types of OpenDRIVE are applied to the lanes of the network."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ MPH = 0.44704
 
 
 def limits(network: RoadNetwork) -> dict[str, float]:
-    """Return the limits in m/s of normal lanes, by id."""
+    """Return the speed limits in m/s of lanes outside of junctions, by id."""
     return {
         name: float(row["speed_mps"])
         for name, row in zip(network.lane_ids, network.lanes, strict=True)
@@ -40,7 +40,7 @@ def limits(network: RoadNetwork) -> dict[str, float]:
         ('max="0" unit="mph"', 13.89),
     ],
 )
-def test_limits_of_roads_hold_on_their_lanes(tmp_path: Path, speed: str, mps: float) -> None:
+def test_lanes_have_the_speed_limit_of_their_road(tmp_path: Path, speed: str, mps: float) -> None:
     text = road_file(ROAD.replace("<type/>", f'<type s="0" type="town"><speed {speed}/></type>'))
     assert limits(built_from(tmp_path, "map.xodr", text)) == {
         "1_0": pytest.approx(mps, abs=0.01),
@@ -48,7 +48,9 @@ def test_limits_of_roads_hold_on_their_lanes(tmp_path: Path, speed: str, mps: fl
     }
 
 
-def test_limits_change_along_a_road_and_limits_of_lanes_take_precedence(tmp_path: Path) -> None:
+def test_speed_limits_change_along_a_road_and_those_of_lanes_take_precedence(
+    tmp_path: Path,
+) -> None:
     types = (
         '<type s="0" type="town"><speed max="36" unit="km/h"/></type>'
         '<type s="120" type="rural"><speed max="72" unit="km/h"/></type>'
@@ -63,7 +65,7 @@ def test_limits_change_along_a_road_and_limits_of_lanes_take_precedence(tmp_path
         s = 0.5 * float(network.lanes["length_m"][lane])
         x = network.pose_on(lane, s)[0]
         by_place[name.startswith("-"), round(x)] = mps
-    # netconvert cuts both directions at each change; a limit for the last 0.5 m makes no edge.
+    # netconvert cuts both directions at each change of a limit, but not 0.5 m before the end.
     assert by_place == {
         (True, 30): 10.0,
         (True, 90): 5.0,
@@ -74,7 +76,7 @@ def test_limits_change_along_a_road_and_limits_of_lanes_take_precedence(tmp_path
     }
 
 
-def test_roads_without_a_limit_are_counted(
+def test_roads_without_a_speed_limit_are_counted_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     path = tmp_path / "map.xodr"
@@ -95,7 +97,7 @@ def test_roads_without_a_limit_are_counted(
     assert caplog.text.count("defaults: town maxspeed=13.89 (1 of 1 roads)") == 1
 
 
-def test_very_low_limits_are_counted(tmp_path: Path) -> None:
+def test_very_low_speed_limits_are_counted(tmp_path: Path) -> None:
     path = tmp_path / "map.xodr"
     speed = '<type s="0" type="town"><speed max="1.2"/></type>'
     path.write_text(road_file(ROAD.replace("<type/>", speed)))
@@ -104,7 +106,9 @@ def test_very_low_limits_are_counted(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("speed", ['max="-5"', 'max="fast"', 'max="nan"', 'max="5" unit="knots"'])
-def test_invalid_limits_are_refused_or_ignored(tmp_path: Path, speed: str) -> None:
+def test_invalid_speed_limits_are_refused_or_ignored_if_tolerant(
+    tmp_path: Path, speed: str
+) -> None:
     path = tmp_path / "map.xodr"
     entry = f'<type s="0" type="town"><speed {speed}/></type>'
     path.write_text(road_file(ROAD.replace("<type/>", entry)))
@@ -119,7 +123,7 @@ def test_invalid_limits_are_refused_or_ignored(tmp_path: Path, speed: str) -> No
     ("name", "mph"),
     [("Town01", {25}), ("Town04", {30, 35, 55, 65}), ("Town10HD", {40, 50})],
 )
-def test_towns_of_carla_have_their_limits(
+def test_towns_of_carla_have_their_speed_limits(
     shared_maps: Path, tmp_path: Path, name: str, mph: set[int]
 ) -> None:
     result = build_network(shared_maps / "xodr" / f"{name}.xodr", tmp_path / "town.net.xml")
@@ -144,7 +148,7 @@ def test_towns_of_carla_have_their_limits(
         ("cart", 1, ("1 lanes of type cart are unknown and left out",)),
     ],
 )
-def test_lane_types_are_read_or_counted(
+def test_lanes_are_built_by_their_type_and_other_types_are_counted(
     tmp_path: Path, kind: str, lanes: int, note: tuple[str, ...]
 ) -> None:
     path = tmp_path / "map.xodr"
@@ -162,9 +166,7 @@ def test_lane_types_are_read_or_counted(
 
 
 @pytest.mark.parametrize("text", ["1000000000", "1e9", "inf", "-200000"])
-def test_an_endless_geometry_is_named_before_netconvert_fills_the_memory(
-    tmp_path: Path, text: str
-) -> None:
+def test_a_too_long_geometry_is_refused_before_netconvert_starts(tmp_path: Path, text: str) -> None:
     line = '<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry>'
     spiral = line.replace("<line/>", '<spiral curvStart="0" curvEnd="0.1"/>')
     endless = ROAD.replace(line, line + "\n" + spiral.replace('length="200"', f'length="{text}"'))

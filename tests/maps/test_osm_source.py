@@ -1,4 +1,4 @@
-"""OSM tags of lanes and access reach the lanes of the network."""
+"""OSM tags of lanes and access are applied to the lanes of the network."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def built(
 
 
 def turns(network: RoadNetwork) -> dict[int, str]:
-    """Return the directions from each lane of the road from the north."""
+    """Return the directions in which each lane of the road from the north leads, by lane index."""
     found: dict[int, str] = {}
     for row in network.links:
         lane = network.lanes[row["from_lane"]]
@@ -55,7 +55,7 @@ def test_turn_lanes_lead_in_their_tagged_directions(
     assert result.notes == notes
 
 
-def test_turn_lanes_of_both_directions_lead_to_their_junctions(tmp_path: Path) -> None:
+def test_turn_lanes_of_both_directions_lead_in_their_tagged_directions(tmp_path: Path) -> None:
     tags = {
         "highway": "primary",
         "lanes": "4",
@@ -76,7 +76,9 @@ def test_turn_lanes_of_both_directions_lead_to_their_junctions(tmp_path: Path) -
 
 
 @pytest.mark.parametrize(("start", "end"), [(11, 14), (12, 11)])
-def test_restrictions_hold_on_ways_that_are_cut(tmp_path: Path, start: int, end: int) -> None:
+def test_turn_restrictions_are_kept_on_ways_that_are_cut(
+    tmp_path: Path, start: int, end: int
+) -> None:
     relation = (
         f'<relation id="7"><member type="way" ref="{start}" role="from"/>'
         f'<member type="node" ref="1" role="via"/><member type="way" ref="{end}" role="to"/>'
@@ -87,7 +89,7 @@ def test_restrictions_hold_on_ways_that_are_cut(tmp_path: Path, start: int, end:
     assert not [text for text in result.warnings if "restriction" in text]
 
 
-def test_lanes_for_buses_are_closed_to_cars(tmp_path: Path) -> None:
+def test_bus_lanes_are_closed_to_cars(tmp_path: Path) -> None:
     network, _ = built(
         tmp_path, {11: ([2, 1, 3], THREE | {"bus:lanes": "yes|yes|designated",
                                             "vehicle:lanes": "yes|yes|no"})}

@@ -1,4 +1,4 @@
-"""The side of the road: by place, by the rule of roads, and by option."""
+"""The side of traffic follows from the place, the rule of the roads, or an option."""
 
 from __future__ import annotations
 
@@ -41,14 +41,16 @@ RIGHT = {
 
 
 @pytest.mark.parametrize(("places", "side"), [(LEFT, "left"), (RIGHT, "right")])
-def test_countries_have_their_side(places: dict[str, tuple[float, float]], side: Side) -> None:
+def test_places_have_the_traffic_side_of_their_country(
+    places: dict[str, tuple[float, float]], side: Side
+) -> None:
     wrong = {
         name: found for name, place in places.items() if (found := sides_at([place])) != {side}
     }
     assert wrong == {}
 
 
-def test_places_at_a_border_do_not_determine_the_side() -> None:
+def test_places_near_a_border_do_not_determine_the_side() -> None:
     vientiane, south_of_it = (102.62, 17.965), (102.62, 17.80)
     assert sides_at([vientiane]) == set()
     assert sides_at([vientiane, south_of_it]) == {"left"}
@@ -65,7 +67,7 @@ def test_a_roundabout_in_london_is_driven_clockwise(
     assert result.provenance["traffic side"] == "left (by the place of its roads)"
     network = read_network(result.path)
     assert network.left_hand
-    # Vehicles on the ring never yield, and all others yield to them.
+    # Links from the four roads to the ring yield; links of the ring do not.
     yields = {
         network.lane_ids[row["from_lane"]].partition("_")[0].lstrip("-")
         for row in network.links
@@ -86,7 +88,7 @@ def test_a_roundabout_in_london_is_driven_clockwise(
     assert defaults.startswith("defaults: highway.secondary lanes=1 (12 of 12 edges)")
 
 
-def test_the_option_decides_against_the_place(tmp_path: Path) -> None:
+def test_the_option_takes_precedence_over_the_place(tmp_path: Path) -> None:
     path = tmp_path / "map.osm"
     path.write_text(osm_file(ROUNDABOUT, 48.0, 11.0))
     assert not read_network(build_network(path, tmp_path / "right.net.xml").path).left_hand
@@ -101,7 +103,7 @@ def test_the_option_decides_against_the_place(tmp_path: Path) -> None:
         build_network(tmp_path / "left.net.xml", tmp_path / "copy.net.xml", side="right")
 
 
-def test_a_map_across_a_border_is_refused(tmp_path: Path) -> None:
+def test_a_map_with_both_traffic_sides_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.osm"
     both = osm_file(ROUNDABOUT, 18.2, 102.62).replace(
         "</osm>",
@@ -131,7 +133,7 @@ RIGHT_HAND = road_file(
 
 
 def asymmetric(*, mirrored: bool) -> str:
-    """Return a bent road with three lanes one way and one the other, or its mirror image."""
+    """Return a bent road with three lanes in one direction and one back, or its mirror image."""
     sign = -1 if mirrored else 1
     lanes = {
         n: f'<lane id="{n}" type="driving"><link/>' + WIDTHS.format(3.0 + 0.2 * abs(n)) + "</lane>"
@@ -153,7 +155,7 @@ def asymmetric(*, mirrored: bool) -> str:
 
 
 def shapes(network: RoadNetwork, sign: float) -> list[list[tuple[float, float]]]:
-    """Return the centre lines of normal lanes, without the origin of the file."""
+    """Return the centre lines of lanes outside of junctions, relative to the lowest x and y."""
     lines = [
         network.lane_polyline(lane)[:, :2] * (1.0, sign)
         for lane in np.flatnonzero(~network.lanes["internal"])
@@ -168,10 +170,10 @@ def test_left_hand_opendrive_is_the_mirror_image_of_right_hand(tmp_path: Path) -
     assert (right.left_hand, left.left_hand) == (False, True)
     assert len(right.lanes) == len(left.lanes)
     for one, other in zip(shapes(right, 1.0), shapes(left, -1.0), strict=True):
-        assert np.abs(np.array(one) - np.array(other)).max() < 0.15  # netconvert rounds
+        assert np.abs(np.array(one) - np.array(other)).max() < 0.15  # netconvert rounds coordinates
 
 
-def test_rules_that_differ_are_refused(tmp_path: Path) -> None:
+def test_roads_with_different_rules_are_refused(tmp_path: Path) -> None:
     path = tmp_path / "map.xodr"
     second = re.sub(r' id="1" j', ' id="2" j', asymmetric(mirrored=True).split("header")[1])
     road = "<road" + second.split("<road", 1)[1].removesuffix("</OpenDRIVE>")

@@ -1,4 +1,4 @@
-"""Activation functions of driver networks: close to the exact ones, for every number."""
+"""Activation functions of driver networks, compared with exact functions."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from numpy.typing import NDArray
 
 from cavmarl.networks.kernels.activations import apply_clamp, apply_relu, apply_tanh, sigmoid
 
-INFINITY = 0x7F800000  # its bits; smaller bit patterns are finite numbers that are not negative
+INFINITY = 0x7F800000  # bit pattern of infinity; smaller patterns are the finite numbers from 0
 TANH_ULP = 7.0
 TANH_ERROR = 4e-7
 SIGMOID_ERROR = 3e-7
 
 
 def check_tanh(bits: NDArray[np.uint32]) -> None:
-    """Check the bounds that the docstring of `tanh` states, for numbers and for their negatives."""
+    """Check `tanh` of numbers and of their negatives for the error bounds in its docstring."""
     numbers = bits.view(np.float32)
     found, negative = numbers.copy(), -numbers
     apply_tanh(found)
@@ -26,7 +26,7 @@ def check_tanh(bits: NDArray[np.uint32]) -> None:
     exact = np.tanh(numbers.astype(np.float64))
     error = np.abs(found - exact)
     assert error.max() <= TANH_ERROR
-    # tanh(x) rounds to x below 1e-4, where float64's own result may be as far away as x is exact.
+    # The error in units of the last place of a float32.
     _, exponent = np.frexp(exact)
     unit = np.ldexp(1.0, np.maximum(exponent - 24, -149))
     assert (error / unit).max() <= TANH_ULP

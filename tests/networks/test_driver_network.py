@@ -1,4 +1,4 @@
-"""Trained drivers: the result of an observation does not depend on the rest of the batch."""
+"""Networks of trained drivers: batches, threads, and comparison with torch."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from tests.support.saved_drivers import save_driver, small_vec
 
 DRIVERS = {name: path for name, path in sorted(agent_entries().items()) if path.is_dir()}
 ROWS = 40
-ERROR = 2e-6  # largest error of an output, compared with torch
+ERROR = 2e-6  # largest difference of outputs to those of torch
 
 every_driver = pytest.mark.parametrize("name", DRIVERS)
 
 
-def likely(folder: Path, num_rows: int, seed: int = 0) -> NDArray[np.float32]:
-    """Return observations with the distribution that a driver was trained on."""
+def likely_observations(folder: Path, num_rows: int, seed: int = 0) -> NDArray[np.float32]:
+    """Draw observations with the mean of a driver's training and twice its deviation."""
     weights, config = read_network(folder)
     rng = np.random.default_rng(seed)
     noise = rng.normal(0.0, 2.0, (num_rows, config.observation_size))
@@ -31,9 +31,9 @@ def likely(folder: Path, num_rows: int, seed: int = 0) -> NDArray[np.float32]:
 
 
 @every_driver
-def test_rows_alone_equal_rows_in_a_batch(name: str) -> None:
+def test_the_action_for_a_row_does_not_depend_on_the_batch(name: str) -> None:
     network = load_driver_network(DRIVERS[name])
-    rows = likely(DRIVERS[name], ROWS)
+    rows = likely_observations(DRIVERS[name], ROWS)
     alone = np.concatenate([network.best(rows[k : k + 1]) for k in range(ROWS)])
     assert (np.abs(alone) < 1.0).any()
     for n in range(1, ROWS + 1):
@@ -41,9 +41,9 @@ def test_rows_alone_equal_rows_in_a_batch(name: str) -> None:
         assert network.best(rows[-n:]).tobytes() == alone[-n:].tobytes()
 
 
-def test_threads_that_share_a_network_do_not_disturb_each_other() -> None:
+def test_threads_can_share_a_network() -> None:
     network = load_driver_network(DRIVERS["cities_ippo"])
-    parts = np.array_split(likely(DRIVERS["cities_ippo"], 4000), 40)
+    parts = np.array_split(likely_observations(DRIVERS["cities_ippo"], 4000), 40)
     expected = [network.best(part).tobytes() for part in parts]
     with ThreadPoolExecutor(4) as pool:
         found = [best.tobytes() for best in pool.map(network.best, parts)]
@@ -51,12 +51,12 @@ def test_threads_that_share_a_network_do_not_disturb_each_other() -> None:
 
 
 @every_driver
-def test_outputs_are_close_to_torchs(name: str) -> None:
+def test_outputs_are_close_to_those_of_torch(name: str) -> None:
     torch: Any = pytest.importorskip("torch")
     from cavmarl.learning.actor_critic import load_network
 
     learned, _ = load_network(DRIVERS[name])
-    rows = likely(DRIVERS[name], 400)
+    rows = likely_observations(DRIVERS[name], 400)
     network = load_driver_network(DRIVERS[name])
     with torch.inference_mode():
         known = torch.from_numpy(rows)
@@ -65,12 +65,12 @@ def test_outputs_are_close_to_torchs(name: str) -> None:
     np.testing.assert_allclose(network.best(rows), best, rtol=0.0, atol=ERROR)
 
 
-def test_choices_are_those_of_torch(tmp_path: Path) -> None:
+def test_discrete_actions_equal_those_of_torch(tmp_path: Path) -> None:
     torch: Any = pytest.importorskip("torch")
     from cavmarl.learning.actor_critic import load_network
 
     folder = save_driver(tmp_path / "driver", small_vec(action__kind="discrete"), shared=True)
-    rows = likely(folder, 300)
+    rows = likely_observations(folder, 300)
     with torch.inference_mode():
         expected = load_network(folder)[0].best(torch.from_numpy(rows)).numpy()
     found = load_driver_network(folder).best(rows)

@@ -1,4 +1,4 @@
-"""Files of trained drivers: what cannot be read or does not fit is refused with a reason."""
+"""Files of trained drivers: the errors for damaged and inconsistent files."""
 
 from __future__ import annotations
 
@@ -30,7 +30,9 @@ def driver(tmp_path: Path) -> Path:
     return Path(shutil.copytree(agent_entries()["merge_ippo"], tmp_path / "driver"))
 
 
-def test_missing_and_broken_files_are_named(driver: Path, tmp_path: Path) -> None:
+def test_the_error_for_a_missing_or_broken_file_names_the_file(
+    driver: Path, tmp_path: Path
+) -> None:
     vec = small_vec()
     for name in (WEIGHTS_FILE, CONFIG_FILE):
         for text in (None, "", "{", "[]", "{}"):
@@ -43,7 +45,7 @@ def test_missing_and_broken_files_are_named(driver: Path, tmp_path: Path) -> Non
                 load_policy(broken, vec)
 
 
-def test_a_file_that_is_cut_off_is_refused(driver: Path) -> None:
+def test_a_truncated_file_of_weights_is_refused(driver: Path) -> None:
     path = driver / WEIGHTS_FILE
     whole = path.read_bytes()
     for size in (4, 200, len(whole) // 2, len(whole) - 1):
@@ -52,7 +54,7 @@ def test_a_file_that_is_cut_off_is_refused(driver: Path) -> None:
             read_network(driver)
 
 
-def test_sizes_that_no_file_has_are_refused_before_memory_is_taken(driver: Path) -> None:
+def test_sizes_beyond_the_file_are_refused_without_allocating_memory(driver: Path) -> None:
     size = 10**15
     header = {"mean": {"dtype": "F32", "shape": [size], "data_offsets": [0, 4 * size]}}
     text = json.dumps(header).encode()
@@ -116,7 +118,7 @@ def test_weights_that_do_not_fit_are_refused(driver: Path, message: str) -> None
     ],
 )
 @pytest.mark.parametrize("kind", ["continuous", "discrete"])
-def test_an_actor_critic_has_the_tensors_that_its_config_names(
+def test_an_actor_critic_has_the_shapes_of_its_config(
     tmp_path: Path, kind: str, form: dict[str, Any]
 ) -> None:
     pytest.importorskip("torch")

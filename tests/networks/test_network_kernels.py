@@ -1,4 +1,4 @@
-"""Layers of driver networks: equal to their twins, close to torch, the same on every processor."""
+"""Layers of driver networks, compared with slow twins, with torch and with recorded bytes."""
 
 from __future__ import annotations
 
@@ -29,20 +29,20 @@ from tests.naive.driver_networks import exact_actions, exact_outputs, layer_norm
 
 Floats = NDArray[np.float32]
 
-ERROR = 2e-6  # largest error of an output, compared with torch and with float64
-# Hash of the results of `run_all_kinds`. Its numbers are exact in float32, so every processor, and
-# Python without the compiler, computes the same bytes.
+ERROR = 2e-6  # largest difference to torch and to float64
+# Recorded hash of `run_all_kinds`. All of its numbers are exact in float32, so the bytes are equal
+# on every processor, and without the compiler.
 DIGEST = "1aa005700f35a94ad5d33de69c7121b7"
 
 
 def draw(seed: int, *shape: int) -> Floats:
-    """Return numbers in [-1, 1] that are exact in few bits."""
+    """Draw multiples of 1/64 in [-1, 1], which float32 represents exactly."""
     drawn = np.random.default_rng(seed).integers(-64, 65, shape)
     return (drawn / 64.0).astype(np.float32)
 
 
 def run(table: LayerTable, rows: Floats, states: Floats | None = None) -> Floats:
-    """Evaluate a network; the states of its GRU are overwritten."""
+    """Evaluate a network; write the new states of its GRU into `states`."""
     outputs = np.empty((len(rows), table.width), dtype=np.float32)
     none = np.empty(0, dtype=np.float32)
     buffers = table.new_buffers()
@@ -59,7 +59,7 @@ def run(table: LayerTable, rows: Floats, states: Floats | None = None) -> Floats
 
 
 def run_all_kinds() -> str:
-    """Evaluate a network of all kinds of layers twice; return a hash of outputs and states."""
+    """Evaluate a network with all kinds of layers twice; return a hash of outputs and states."""
     table = LayerTable(19)
     table.add(NORMALIZE, draw(1, 19), np.abs(draw(2, 19)) + 0.5)
     table.add(CLAMP, 1.25)
@@ -76,7 +76,7 @@ def run_all_kinds() -> str:
     return sha256(b"".join(array.tobytes() for array in (*found, states))).hexdigest()[:32]
 
 
-def test_bytes_are_the_same_on_every_processor_and_without_the_compiler() -> None:
+def test_the_results_of_all_layers_have_the_recorded_hash() -> None:
     assert run_all_kinds() == DIGEST
 
 
@@ -99,7 +99,7 @@ def test_layer_norm_equals_its_twin(width: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["merge_ippo", "cities_residual"])
-def test_outputs_are_close_to_those_of_a_plain_network(name: str) -> None:
+def test_outputs_are_close_to_those_of_the_slow_twin(name: str) -> None:
     weights, config = read_network(agent_entries()[name])
     noise = 2.0 * draw(1, 2, config.observation_size)
     rows = weights["mean"] + noise * weights["deviation"]
@@ -110,7 +110,7 @@ def test_outputs_are_close_to_those_of_a_plain_network(name: str) -> None:
     np.testing.assert_allclose(network.best(rows), best, rtol=0.0, atol=ERROR)
 
 
-def test_rows_alone_equal_rows_in_a_batch() -> None:
+def test_results_of_a_row_do_not_depend_on_the_batch() -> None:
     table = LayerTable(9)
     table.add(LINEAR, draw(1, 9, 12), draw(2, 12), width=12)
     table.add(GRU, draw(3, 12, 9), draw(4, 9), draw(5, 3, 9), draw(6, 9), width=3)
@@ -123,7 +123,7 @@ def test_rows_alone_equal_rows_in_a_batch() -> None:
         assert own.tobytes() == states[k].tobytes()
 
 
-def test_a_gru_is_close_to_torchs() -> None:
+def test_a_gru_is_close_to_that_of_torch() -> None:
     torch: Any = pytest.importorskip("torch")
     torch.manual_seed(0)
     cell = torch.nn.GRUCell(20, 24)
@@ -142,7 +142,7 @@ def test_a_gru_is_close_to_torchs() -> None:
         np.testing.assert_array_equal(outputs, states)
 
 
-def test_layer_norm_and_relu_are_close_to_torchs() -> None:
+def test_layer_norm_and_relu_are_close_to_those_of_torch() -> None:
     torch: Any = pytest.importorskip("torch")
     rows, scale, shift = draw(1, 30, 128), draw(2, 128), draw(3, 128)
     table = LayerTable(128)
@@ -154,7 +154,7 @@ def test_layer_norm_and_relu_are_close_to_torchs() -> None:
 
 
 @pytest.mark.parametrize("size", [1, 2, 5])
-def test_the_largest_number_is_chosen_as_numpy_does(size: int) -> None:
+def test_the_choice_of_the_largest_number_equals_numpys_argmax(size: int) -> None:
     rows = draw(1, 400, size).round(1)
     rows[::7, size - 1] = np.nan
     rows[::14, 0] = np.nan

@@ -1,4 +1,4 @@
-"""`ring22`: one agent among 21 human drivers, compared with 22 human drivers."""
+"""`ring22`: one agent among 21 simulated human drivers, compared with 22 such drivers."""
 
 from __future__ import annotations
 
@@ -10,14 +10,14 @@ from cavmarl.core.errors import PolicyError
 from cavmarl.policies.loading import load_policy
 
 
-def test_one_gentle_driver_raises_the_speed_of_all_by_more_than_flows_57_percent() -> None:
+def test_one_gentle_driver_raises_the_mean_speed_by_more_than_57_percent() -> None:
     human, gentle = ring22.measure(["gentle"], episodes=1).rows
     assert human["mean"] == pytest.approx(2.07, abs=0.01)
     assert gentle["gain"] > 57.0
     assert gentle["crashed"] == 0
 
 
-def test_a_trained_gentle_driver_needs_no_clock() -> None:
+def test_a_trained_driver_raises_the_mean_speed_by_more_than_57_percent() -> None:
     _, learnt = ring22.measure(["ring22_ippo"], episodes=4, seed=1000).rows
     assert learnt["gain"] > 57.0
     assert learnt["crashed"] == 0

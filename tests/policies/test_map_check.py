@@ -1,4 +1,4 @@
-"""Trained drivers on maps of kinds that they were not trained on: stop signs, the other side."""
+"""Trained drivers on maps with stop signs or a side of traffic that they were not trained on."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def left_hand(tmp_path: Path) -> Path:
         ("priority_stop", {"right_hand", "stop_signs"}),
     ],
 )
-def test_stop_signs_and_the_side_of_traffic_are_the_kinds_of_a_map(
+def test_the_kinds_of_a_map_are_its_side_of_traffic_and_stop_signs(
     tmp_path: Path, junctions: str, kinds: set[str]
 ) -> None:
     path = netgenerate(tmp_path / "grid.net.xml", *GRID, junctions)
@@ -67,7 +67,7 @@ def test_stop_signs_and_the_side_of_traffic_are_the_kinds_of_a_map(
 
 
 def success(path: Path, driver: str, out: Path, **keys: Any) -> float:
-    """Return the share of trips that arrive without an infraction."""
+    """Evaluate a driver; return the share of trips that arrive without an infraction."""
     traffic = {"traffic.min_trip_m": 150.0, "traffic.max_trip_m": 600.0, "traffic.trip_horizon": 3}
     form = {**form_of_driver(driver), **CLOCK, **traffic, "population.mode": "respawn"}
     with pytest.warns(UntrainedMapWarning) as warned:
@@ -75,7 +75,7 @@ def success(path: Path, driver: str, out: Path, **keys: Any) -> float:
             path, {driver: driver}, out=out, agents=8, background=4, seed=7, episodes=2,
             overrides={**form, "horizon_s": 120.0, **keys},
         )  # fmt: skip
-    assert len(warned) == 1, "one warning, where the drivers are checked"
+    assert len(warned) == 1, "must be one warning"
     trips = load_tables(out)[driver][0]
     trips = trips[trips["counted"]]
     assert len(trips) > 15
@@ -83,7 +83,7 @@ def success(path: Path, driver: str, out: Path, **keys: Any) -> float:
 
 
 @pytest.mark.slow
-def test_a_driver_that_sees_stop_signs_as_lights_stands_and_one_that_gives_way_arrives(
+def test_a_driver_that_gives_way_at_stop_signs_arrives(
     tmp_path: Path,
 ) -> None:
     path = netgenerate(tmp_path / "stops.net.xml", *GRID, "allway_stop")
@@ -102,13 +102,13 @@ def test_a_driver_of_right_hand_traffic_arrives_in_left_hand_traffic(
     assert success(left_hand, "cities_ippo", tmp_path / "mirrored") > 0.85
 
 
-def test_the_map_of_a_driver_is_met_without_a_warning() -> None:
+def test_a_driver_on_its_own_map_causes_no_warning() -> None:
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         load_policy("tollgate_ippo", cavmarl.make_vec("tollgate", num_envs=1))
 
 
-def test_each_new_kind_of_a_map_is_named_once(tmp_path: Path) -> None:
+def test_each_untrained_kind_of_a_map_is_named_once(tmp_path: Path) -> None:
     path = netgenerate(tmp_path / "stops.net.xml", *GRID, "allway_stop")
     mirror = mirror_net(path, tmp_path / "left.net.xml")
     with pytest.warns(UntrainedMapWarning) as warned:
@@ -119,7 +119,7 @@ def test_each_new_kind_of_a_map_is_named_once(tmp_path: Path) -> None:
     assert "trained on maps without stop signs, but this map has some" in said[1]
 
 
-def test_a_driver_of_left_hand_traffic_drives_there_without_an_exchange(
+def test_a_driver_of_left_hand_traffic_needs_no_mirroring_there(
     tmp_path: Path, left_hand: Path
 ) -> None:
     pytest.importorskip("torch")
@@ -129,7 +129,7 @@ def test_a_driver_of_left_hand_traffic_drives_there_without_an_exchange(
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         at_home = load_policy(folder, vec)
-    other = save_driver(tmp_path / "other", vec)  # the same weights, for right-hand traffic
+    other = save_driver(tmp_path / "other", vec)  # equal weights, trained in right-hand traffic
     with pytest.warns(UntrainedMapWarning, match="trained in right-hand traffic"):
         abroad = load_policy(other, vec)
     observations, infos = vec.reset(seed=2)
@@ -141,7 +141,9 @@ def test_a_driver_of_left_hand_traffic_drives_there_without_an_exchange(
 
 
 @pytest.mark.parametrize("kinds", [(), ("stop_signs",)])
-def test_a_driver_needs_a_side_of_traffic(tmp_path: Path, kinds: tuple[str, ...]) -> None:
+def test_a_driver_without_a_side_of_traffic_is_refused(
+    tmp_path: Path, kinds: tuple[str, ...]
+) -> None:
     pytest.importorskip("torch")
     vec = cavmarl.make_vec("merge", num_envs=1)
     with pytest.raises(ConfigError, match="must contain right_hand or left_hand"):
@@ -191,12 +193,14 @@ def config_of(sensors: SensorsConfig | None = None, **action: Any) -> EnvConfig:
         ),
     ],
 )
-def test_a_refusal_names_the_sensor_and_the_reason(sensors: SensorsConfig, said: str) -> None:
+def test_the_error_for_sensors_that_cannot_be_mirrored_gives_the_reason(
+    sensors: SensorsConfig, said: str
+) -> None:
     with pytest.raises(PolicyError, match=f"{said}.*; use a driver"):
         OtherSide(config_of(sensors))
 
 
-def test_choices_exchange_lane_changes_and_steerings() -> None:
+def test_mirrored_discrete_actions_exchange_left_and_right() -> None:
     discrete = OtherSide(config_of(kind="discrete"))
     np.testing.assert_array_equal(discrete.actions(np.arange(5)), [2, 1, 0, 3, 4])
     action = ActionConfig(kind="grid", grid_throttle=(-1.0, 0.0), grid_steering=(-0.5, 0.0, 0.5))

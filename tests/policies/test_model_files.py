@@ -1,4 +1,4 @@
-"""Drivers in model files of stable-baselines3, TorchScript and ONNX."""
+"""Drivers that are model files of stable-baselines3, TorchScript or ONNX."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from stable_baselines3.common.vec_env import VecNormalize
 
 from cavmarl.adapters.sb3_vec_env import CavSb3VecEnv
 
-SIZE = 105  # size of an observation of merge
+SIZE = 105  # observed numbers in `merge`
 
 
 def rows(**overrides: Any) -> CavSb3VecEnv:
@@ -36,7 +36,7 @@ def rows(**overrides: Any) -> CavSb3VecEnv:
 
 
 def act(policy: Any, vec: Any) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return observations of acting agents after some steps, and the policy's actions for them."""
+    """Drive some steps; return the observations and actions of acting agents, and their mask."""
     observations, infos = vec.reset(seed=2)
     for _ in range(3):
         actions = policy.act_batch(observations, infos["mask"])
@@ -119,7 +119,7 @@ def test_a_torch_script_gives_its_outputs_as_actions(tmp_path: Path) -> None:
     assert mask.any()
 
 
-def test_the_largest_logit_is_chosen(tmp_path: Path) -> None:
+def test_a_torch_script_with_logits_chooses_the_largest(tmp_path: Path) -> None:
     module = torch.nn.Linear(SIZE, 5)
     save_script(tmp_path / "model.ts", module)
     vec = small_vec(action__kind="discrete")
@@ -129,7 +129,7 @@ def test_the_largest_logit_is_chosen(tmp_path: Path) -> None:
         load_policy(tmp_path / "model.ts", small_vec())
 
 
-def test_a_model_of_other_sensors_is_refused(tmp_path: Path) -> None:
+def test_a_model_for_other_sensors_is_refused(tmp_path: Path) -> None:
     save_script(tmp_path / "model.pt", torch.nn.Linear(SIZE, 2))
     vec = make_vec("merge", agents=1, overrides={"sensors.stack": 2})
     with pytest.raises(PolicyError, match="210 numbers that an agent observes here"):
@@ -144,7 +144,7 @@ def test_a_model_of_other_sensors_is_refused(tmp_path: Path) -> None:
         ("model.txt", r"not a policy; .*\.onnx"),
     ],
 )
-def test_other_files_are_refused(tmp_path: Path, name: str, message: str) -> None:
+def test_files_that_are_no_models_are_refused(tmp_path: Path, name: str, message: str) -> None:
     path = tmp_path / name
     path.write_bytes(b"nothing")
     with pytest.raises(PolicyError, match=message):
@@ -164,8 +164,8 @@ def test_onnx_needs_its_extra(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         load_policy(tmp_path / "model.onnx", small_vec())
 
 
-class Session:
-    """An inference session of onnxruntime, for a model that brakes."""
+class FakeSession:
+    """A substitute for the inference session of onnxruntime; its model always brakes."""
 
     def __init__(self, path: str, providers: list[str]) -> None:
         if not Path(path).read_bytes():
@@ -181,9 +181,11 @@ class Session:
         return [np.full((len(feed["seen"]), 2), -0.5, dtype=np.float32)]
 
 
-def test_onnx_is_called_with_its_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_onnx_model_gets_observations_under_the_name_of_its_input(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "model.onnx"
-    monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(InferenceSession=Session))
+    monkeypatch.setitem(sys.modules, "onnxruntime", SimpleNamespace(InferenceSession=FakeSession))
     path.write_bytes(b"model")
     vec = small_vec()
     _, actions, _ = act(load_policy(path, vec), vec)

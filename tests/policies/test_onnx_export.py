@@ -1,4 +1,4 @@
-"""Trained drivers as ONNX models: the same actions, and a refusal of other sensors."""
+"""Export of trained drivers to ONNX models, which give the same actions."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.netgenerate import netgenerate
 onnxruntime = pytest.importorskip("onnxruntime")
 
 TRAINED = [name for name, path in agent_entries().items() if path.is_dir()]
-CLOSE = 2e-6  # as close as torch's outputs are to the kernel's
+CLOSE = 2e-6  # the tolerance between torch and the kernel
 
 
 def run(path: Path, observations: np.ndarray) -> np.ndarray:
@@ -34,7 +34,7 @@ def run(path: Path, observations: np.ndarray) -> np.ndarray:
 
 
 def observations_of(size: int, rows: int = 400) -> np.ndarray:
-    """Return observations of which some are beyond the limits of the normalisation."""
+    """Draw observations; normalisation clips some of them."""
     return np.random.default_rng(3).normal(0.0, 2.0, (rows, size)).astype(np.float32)
 
 
@@ -51,7 +51,9 @@ def test_the_model_of_each_driver_gives_its_actions(name: str, tmp_path: Path) -
 
 
 @pytest.mark.parametrize("shared", [False, True])
-def test_the_model_of_a_driver_with_choices_gives_its_logits(shared: bool, tmp_path: Path) -> None:
+def test_the_model_of_a_driver_with_discrete_actions_gives_its_logits(
+    shared: bool, tmp_path: Path
+) -> None:
     environment, _ = load_config("merge")
     action = ActionConfig(kind="discrete")
     config = NetworkConfig("merge", 30, environment.sensors, action, hidden=(24, 16), shared=shared)
@@ -85,7 +87,7 @@ def test_the_onnx_checker_accepts_the_model(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["cities_ippo", "cities_residual"])
-def test_a_world_is_driven_by_the_model_as_by_the_driver(name: str, tmp_path: Path) -> None:
+def test_the_model_and_the_driver_give_equal_actions_in_a_world(name: str, tmp_path: Path) -> None:
     path = tmp_path / "driver.onnx"
     export_onnx(name, path)
     vec = make_vec("grid4x4", num_envs=2, agents=4, background=6, sensors_of=name)
@@ -102,7 +104,9 @@ def test_a_world_is_driven_by_the_model_as_by_the_driver(name: str, tmp_path: Pa
 
 @pytest.mark.integration
 @pytest.mark.parametrize("name", ["cities_ippo", "cities_residual"])
-def test_a_model_drives_on_the_other_side_as_the_driver(name: str, tmp_path: Path) -> None:
+def test_the_model_and_the_driver_give_equal_actions_in_left_hand_traffic(
+    name: str, tmp_path: Path
+) -> None:
     path = tmp_path / "driver.onnx"
     export_onnx(name, path)
     right = netgenerate(tmp_path / "right.net.xml", "--grid", "--grid.number", "3")

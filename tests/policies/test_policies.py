@@ -1,4 +1,4 @@
-"""Policies: names and paths, fitting environments, and driving."""
+"""Policies: loading by name or path, checks of the environment, and driving."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ACTIONS = ("continuous", "discrete")
 
 @pytest.fixture
 def checkpoint(tmp_path: Path) -> Path:
-    """Return an untrained driver for `merge`."""
+    """Save an untrained driver for `merge`."""
     pytest.importorskip("torch")
     return save_driver(tmp_path / "driver", small_vec())
 
@@ -131,7 +131,7 @@ NEEDED = {
 }
 
 
-def test_each_bundled_driver_loads_in_its_environment() -> None:
+def test_each_driver_of_cavmarl_loads_in_its_environment() -> None:
     for name, path in agent_entries().items():
         config = path / "config.json"
         home = json.loads(config.read_text())["environment"] if path.is_dir() else "merge"
@@ -140,7 +140,7 @@ def test_each_bundled_driver_loads_in_its_environment() -> None:
         assert isinstance(policy, Policy)
 
 
-def test_a_wrapped_environment_is_unwrapped() -> None:
+def test_a_policy_for_a_wrapped_environment_uses_the_environment_inside() -> None:
     from pettingzoo.utils.wrappers import BaseParallelWrapper
 
     env = parallel_env("merge", agents=2, background=0)
@@ -167,7 +167,9 @@ def test_the_error_for_an_unknown_name_names_the_nearest_and_all() -> None:
         ("def make_policy(env): return 3", ": .*returned a int, not a"),
     ],
 )
-def test_a_broken_script_is_named(tmp_path: Path, text: str, message: str) -> None:
+def test_the_error_for_a_broken_script_names_the_line(
+    tmp_path: Path, text: str, message: str
+) -> None:
     path = tmp_path / "mine.py"
     path.write_text(text)
     with pytest.raises(PolicyError, match=rf"mine\.py{message}"):
@@ -175,7 +177,7 @@ def test_a_broken_script_is_named(tmp_path: Path, text: str, message: str) -> No
 
 
 @pytest.mark.parametrize("policy", [None, 3, ["idm"]])
-def test_a_policy_is_a_name_or_a_path(policy: Any) -> None:
+def test_a_policy_that_is_neither_a_name_nor_a_path_is_refused(policy: Any) -> None:
     with pytest.raises(PolicyError, match=r"policy = .*: must be"):
         load_policy(policy, small_vec())
 
@@ -209,7 +211,7 @@ def test_a_network_refuses_an_environment_with_other_sensors_or_actions(
     assert all(str(size) in str(caught.value) for size in sizes)
 
 
-def test_overrides_of_the_error_message_make_a_driver_fit(checkpoint: Path) -> None:
+def test_the_overrides_that_an_error_proposes_make_a_driver_fit(checkpoint: Path) -> None:
     changed = {"sensors.lidar.rays": 32, "action.kind": "discrete", "sensors.route.points": 2}
     with pytest.raises(PolicyError) as caught:
         load_policy(checkpoint, make_vec("merge", overrides=changed))
@@ -221,7 +223,7 @@ def test_overrides_of_the_error_message_make_a_driver_fit(checkpoint: Path) -> N
 
 
 @pytest.mark.parametrize("kind", ["batches", "dicts"])
-def test_a_shield_brakes_where_the_built_in_driver_would(kind: str) -> None:
+def test_a_shield_brakes_when_the_built_in_driver_brakes_harder(kind: str) -> None:
     name = "shielded:never_yield"
     vec = small_vec() if kind == "batches" else make_vec("merge", num_envs=1, agents=3)
     shielded, bare, idm = (load_policy(one, vec) for one in (name, "never_yield", "idm"))
@@ -258,11 +260,12 @@ class Fixed(Policy):
         return self.actions
 
 
-def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
+def test_a_shield_changes_actions_only_to_brake_harder(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     vec = make_vec("merge", num_envs=1, agents=5)
-    # The built-in driver accelerates less, coasts, or brakes: a little, equally hard, or harder.
+    # Compared with the driver's own throttle, the built-in driver accelerates less, coasts, brakes
+    # less, brakes equally or brakes harder.
     built_in = np.array([[(0.2, 0.5), (0.0, 0.5), (-0.3, 0.5), (-0.4, 0.5), (-0.9, 0.5)]])
     own = np.array([[(1.0, -0.1), (0.8, -0.1), (-0.6, -0.1), (-0.4, -0.1), (-0.2, -0.1)]])
     monkeypatch.setattr(shield, "built_in_actions", lambda env, mask: built_in)
@@ -270,10 +273,10 @@ def test_a_shield_leaves_a_driver_that_accelerates_more_or_brakes_harder_alone(
     found = ShieldedPolicy(vec, Fixed(vec, own)).act_batch(observations, infos["mask"])
     assert found[0, :4].tolist() == own[0, :4].tolist()
     assert found[0, 4].tolist() == [-0.9, 0.5]
-    assert own[0, 4].tolist() == [-0.2, -0.1], "the driver's own actions stay"
+    assert own[0, 4].tolist() == [-0.2, -0.1], "the shield changed the driver's own array"
 
 
-def test_corrections_are_added_to_the_actions_of_the_built_in_driver(tmp_path: Path) -> None:
+def test_a_residual_driver_adds_to_the_actions_of_the_built_in_driver(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     vec = make_vec("merge", num_envs=1, agents=3)
     folder = save_driver(tmp_path / "residual", vec, residual=True)
@@ -298,7 +301,7 @@ def test_corrections_are_added_to_the_actions_of_the_built_in_driver(tmp_path: P
         observations, _, _, _, infos = vec.step(policy.act_batch(observations, mask))
 
 
-def test_choices_cannot_be_corrected(tmp_path: Path) -> None:
+def test_a_residual_driver_with_discrete_actions_is_refused(tmp_path: Path) -> None:
     pytest.importorskip("torch")
     with pytest.raises(ConfigError, match=r"residual with action\.kind = discrete: choices cannot"):
         save_driver(tmp_path, small_vec(action__kind="discrete"), residual=True)
@@ -311,7 +314,7 @@ def test_a_shield_refuses_discrete_actions() -> None:
         load_policy("shielded:idm", vec).act_batch(observations, infos["mask"])
 
 
-def test_opponents_drive_badly_on_purpose() -> None:
+def test_the_opponents_blind_and_phantom_braking_drive_worse_than_idm() -> None:
     vec = make_vec("merge", num_envs=4, agents=8)
     rows = {}
     for name in ("blind", "phantom_braking", "idm"):
@@ -334,10 +337,10 @@ def test_opponents_drive_badly_on_purpose() -> None:
     assert hard["phantom_braking"] > hard["idm"] + 0.02
 
 
-def test_code_of_the_working_directory_runs_by_its_path_alone(
+def test_code_of_the_working_directory_runs_only_if_its_path_is_given(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A downloaded folder cannot replace a named driver."""
+    """A file of the working directory cannot replace a driver that is given by name."""
     trap = "raise SystemExit('it was run')\n"
     (tmp_path / "agents").mkdir()
     for name in ("idm.py", "mine.py"):
@@ -356,8 +359,8 @@ def test_code_of_the_working_directory_runs_by_its_path_alone(
         load_policy("merge_ippo", env)
 
 
-def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
-    """On 25 m of road, the change does not end before the road; the vehicle must not get stuck."""
+def test_idm_does_not_get_stuck_at_the_end_of_a_short_lane() -> None:
+    """The road of 25 m is too short to finish a lane change, but the vehicle must not get stuck."""
     vec = make_vec("cities_validation", num_envs=1, agents=1, background=0)
     driver = load_policy("idm", vec)
     observations, infos = vec.reset(seed=500, options={"first_world": 89})
@@ -367,4 +370,4 @@ def test_idm_changes_lanes_at_the_end_of_a_lane_that_is_short() -> None:
         observations, _, _, _, infos = vec.step(driver.act_batch(observations, infos["mask"]))
         stood_s = max(stood_s, *vec.simulation.vehicles(0)["wait_s"], 0.0)
     vec.close()
-    assert 0.0 < stood_s < 60.0  # the vehicle stood at a red light only
+    assert 0.0 < stood_s < 60.0  # only at a red light

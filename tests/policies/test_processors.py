@@ -1,4 +1,4 @@
-"""Driver networks with other instruction sets compute the same bytes as on this processor."""
+"""Driver networks compiled for other processors compute the same bytes."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_kernels_for_other_processors_give_the_same_bytes(
 ) -> None:
     environment = {**os.environ, "CAVMARL_CACHE_DIR": str(tmp_path), "CAVMARL_KERNELS": "native"}
     if processor != "host":
-        # Without the second setting, Numba takes the features of this processor for the other one.
+        # Without the second variable, Numba uses the features of this processor.
         environment |= {"NUMBA_CPU_NAME": processor, "NUMBA_CPU_FEATURES": ""}
     root = Path(__file__).resolve().parents[2]
     ran = subprocess.run(
@@ -39,7 +39,7 @@ def test_kernels_for_other_processors_give_the_same_bytes(
     )
     assert ran.stdout.split() == [DIGEST]
     if has_avx and shutil.which("objdump"):
-        assert str(_has_wide_registers(tmp_path)) == has_avx  # the compiled code differs
+        assert str(_has_wide_registers(tmp_path)) == has_avx  # AVX code has these registers
 
 
 def _has_wide_registers(cache: Path) -> bool:

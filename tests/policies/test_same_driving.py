@@ -1,4 +1,4 @@
-"""Trained drivers drive equally in any number of worlds, through each interface, without torch."""
+"""Actions of trained drivers do not depend on the number of worlds, the interface or torch."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 60
 
 
 @pytest.mark.parametrize("driver", ["merge_ippo", "merge_ippo+idm", "shielded:merge_ippo"])
-def test_an_episode_is_the_same_however_many_are_driven_together(
+def test_an_episode_does_not_depend_on_the_number_of_parallel_episodes(
     driver: str, tmp_path: Path
 ) -> None:
     first = []
@@ -32,7 +32,7 @@ def test_an_episode_is_the_same_however_many_are_driven_together(
 
 
 @pytest.mark.parametrize("driver", ["merge_ippo", "merge_ippo+merge_ippo", "shielded:merge_ippo"])
-def test_both_interfaces_give_the_same_actions(driver: str) -> None:
+def test_dicts_and_batches_give_the_same_actions(driver: str) -> None:
     world = {"agents": 5, "background": 4}
     env = parallel_env("merge", **world)  # type: ignore[arg-type]
     vec = make_vec("merge", num_envs=3, **world)  # type: ignore[arg-type]
@@ -51,7 +51,7 @@ def test_both_interfaces_give_the_same_actions(driver: str) -> None:
     vec.close()
 
 
-def test_drivers_that_share_the_agents_act_as_they_act_alone() -> None:
+def test_each_driver_of_a_shared_policy_acts_as_if_it_were_alone() -> None:
     vec = make_vec("merge", num_envs=3, agents=5, background=4)
     observations, infos = vec.reset(seed=5)
     names = ("merge_ippo+idm", "merge_ippo", "idm")
@@ -68,7 +68,7 @@ def test_drivers_that_share_the_agents_act_as_they_act_alone() -> None:
 
 
 def test_a_trained_driver_is_evaluated_without_torch() -> None:
-    """A scripted driver does not load safetensors, either."""
+    """Loading a scripted driver does not import safetensors."""
     code = (
         "import sys\n"
         "class NoTorch:\n"

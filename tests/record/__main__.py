@@ -8,10 +8,10 @@ golden: hashes of the results of worlds (tests.golden.worlds); names are rows.
 zoo: results of the zoo and the board (tests.golden.zoo); names are drivers.
 scores: tables of scores on pages (tests.record.score_tables); names are pages, or blocks as
     PAGE:BLOCK.
-blocks: what tests generate from the code; names are tests, as for pytest.
+blocks: blocks of pages that tests generate from the code; names are tests, as for pytest.
 
-Each part prints the files that it has changed, and its duration. The first part that fails ends the
-recording. Files are replaced whole, so an interrupted recording leaves none half-written.
+Each part prints the changed files and its duration. The first part that fails ends the recording.
+Each file is replaced as a whole, so an interrupted recording leaves no incomplete files.
 """
 
 from __future__ import annotations
@@ -42,16 +42,16 @@ OF_INSTALLATION = "tests/test_licences.py"  # its table depends on the installat
 
 
 class RecordError(CavmarlError):
-    """A part cannot be recorded, with the reason."""
+    """Raised if a part cannot be recorded."""
 
 
 def golden(names: Sequence[str], given: argparse.Namespace) -> None:
-    """Write golden rows."""
+    """Record the golden rows."""
     _run("-m", "tests.golden.worlds", *names)
 
 
 def zoo(names: Sequence[str], given: argparse.Namespace) -> None:
-    """Drive the results of drivers."""
+    """Record the results of drivers."""
     _run("-m", "tests.golden.zoo", *names)
 
 
@@ -66,7 +66,7 @@ def scores(names: Sequence[str], given: argparse.Namespace) -> None:
 
 
 def blocks(names: Sequence[str], given: argparse.Namespace) -> None:
-    """Run the tests that compare blocks, and let them write the blocks."""
+    """Run the tests that compare blocks in the mode in which they write the blocks."""
     tests = list(names) or block_tests()
     _run("-m", "pytest", "-q", "-n", "0", *tests, CAVMARL_REWRITE="1")
 
@@ -79,8 +79,8 @@ PARTS: dict[str, Callable[[Sequence[str], argparse.Namespace], None]] = {
 def block_tests() -> list[str]:
     """Return the tests that compare blocks of pages with the code, as FILE::TEST.
 
-    Other tests of these files may write golden files of formats, which no change of behaviour
-    alters.
+    Other tests in the same files are left out: they may write golden files of formats, which do not
+    depend on behaviour.
     """
     found = []
     for path in sorted((ROOT / "tests").rglob("test_*.py")):
@@ -97,7 +97,7 @@ def block_tests() -> list[str]:
 
 
 def tables_named(names: Sequence[str]) -> list[ScoreTable]:
-    """Return the tables of some pages or blocks; all tables without a name."""
+    """Return the tables of the named pages or blocks, or all tables if there are no names."""
     unknown = [name for name in names if not any(name in (t.page, t.name) for t in TABLES)]
     if unknown:
         known = "\n  ".join(table.name for table in TABLES)
@@ -119,7 +119,7 @@ def record(part: str, names: Sequence[str], given: argparse.Namespace) -> None:
 
 
 def main() -> int:
-    """Record what the command line names; return 1 if a part fails."""
+    """Record the parts of the command line; return 1 if a part fails."""
     parser = argparse.ArgumentParser(
         prog="python -m tests.record",
         description=__doc__,
@@ -149,7 +149,7 @@ def main() -> int:
 def _run(*words: str, **environment: str) -> None:
     """Run a Python program in the repository.
 
-    Raises RecordError: it has failed; its own output has the reason.
+    Raises RecordError if the program fails; its output has the reason.
     """
     command = [sys.executable, *words]
     if code := subprocess.run(command, cwd=ROOT, env=os.environ | environment).returncode:

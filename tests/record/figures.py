@@ -1,6 +1,6 @@
-"""Figures: how the cells of tables of scores are written.
+"""Figures: functions that write the cells of tables of scores.
 
-A figure takes the report of an evaluation of one driver, and returns the text of a cell.
+A figure takes the report on the evaluation of one driver and returns the text of a cell.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ def trips(report: EvaluationReport) -> str:
 def figure(
     name: str, unit: str = "", *, decimals: int = 1, interval: str = "", interval_decimals: int = 1
 ) -> Figure:
-    """Return the figure of a metric: its mean, and its 95 % interval in a given style.
+    """Return the figure of a metric, which writes its mean and its 95 % interval.
 
     Args:
-        name: of the metric.
+        name: the metric.
         unit: unit behind the mean, with a leading space; empty if the title has the unit.
-        decimals: of the mean.
-        interval: "[]" for its ends, "±" for half its width; empty for none.
-        interval_decimals: of the interval.
+        decimals: number of decimals of the mean.
+        interval: "[]" writes the ends, "±" half of the width, "" no interval.
+        interval_decimals: number of decimals of the interval.
     """
     scale = _METRICS[name].scale
 
@@ -54,24 +54,24 @@ def figure(
 
 
 def share(name: str, *, decimals: int = 1) -> Figure:
-    """Return the figure of a share: per cent, with the interval in brackets."""
+    """Return the figure of a share, which writes per cent with the interval in brackets."""
     return figure(name, " %", decimals=decimals, interval="[]")
 
 
 def way_per_infraction(report: EvaluationReport) -> str:
-    """Return the kilometres per infraction, with three digits or all digits before the point."""
+    """Return the kilometres per infraction, with one decimal below 100 km."""
     km = driver_report(report)["km_per_infraction"].mean
     return NONE if km is None else f"{km:,.1f} km" if km < 100.0 else f"{km:,.0f} km"
 
 
 def worst_map(report: EvaluationReport) -> str:
-    """Return the least success of a map, and the map."""
+    """Return the success on the map with the least success, and the name of that map."""
     ((row, *_),) = report.by_map.values()
     return f"{100.0 * row['success']:.1f} % (`{row['map']}`)"
 
 
 def by_map(report: EvaluationReport) -> dict[str, dict[str, str]]:
-    """Return the shares of each map in per cent, by map, the map with the least success first."""
+    """Return the shares of each map in per cent; the map with the least success is first."""
     (rows,) = report.by_map.values()
     shares = ("success", "collision", "red_light")
     return {
@@ -80,7 +80,7 @@ def by_map(report: EvaluationReport) -> dict[str, dict[str, str]]:
 
 
 def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
-    """Return the difference of a metric, first minus second, with its interval over paired runs."""
+    """Return the difference first - second of a metric, with the interval over paired runs."""
     scale = _METRICS[name].scale
     runs = zip(*map(_run_means, (first, second), (name, name)), strict=True)
     differences = np.array([scale * (a - b) for a, b in runs])
@@ -90,13 +90,13 @@ def minus(name: str, first: EvaluationReport, second: EvaluationReport) -> str:
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number with some decimals; with two if one would show a non-zero value as 0."""
+    """Return a number as text; a positive number has two decimals if one would show 0.0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 
 
 def driver_report(report: EvaluationReport) -> PolicyReport:
-    """Return the part of the one driver that was evaluated."""
+    """Return the part of a report on its only driver."""
     (found,) = report.policies.values()
     return found
 
@@ -110,6 +110,6 @@ def _interval_text(mean: float, scale: float, found: Interval, style: str, decim
     low, high = scale * found.low, scale * found.high
     if style == "±":
         return f" ± {high - mean:.{decimals}f}"
-    if f"{high:.{decimals}f}" == f"{0.0:.{decimals}f}":  # the mean has the same digits
+    if f"{high:.{decimals}f}" == f"{0.0:.{decimals}f}":  # then the mean is 0, too
         return ""
     return f" [{low:.{decimals}f}, {high:.{decimals}f}]"

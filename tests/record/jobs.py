@@ -1,8 +1,8 @@
-"""Jobs: the evaluations of the commands beside tables of scores, one driver at a time.
+"""Jobs: evaluations of one driver in one world, for the commands beside tables of scores.
 
-Several tables share drivers and worlds, so the unit is one driver in one world: it is driven once.
-Results stay in runs/record, under the hash of the sources that made them. An interrupted recording
-continues with the jobs that it has not finished.
+Several tables show the same driver in the same world, so each such job runs once. Results stay in
+runs/record, under the hash of the sources that made them. An interrupted recording continues with
+the jobs that it has not finished.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ class Job:
 
     @property
     def key(self) -> str:
-        """The name of its results: equal for equal jobs."""
+        """The name of the folder of results; equal jobs have equal names."""
         text = json.dumps(asdict(self), sort_keys=True)
         return f"{self.world.env}-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
     def drive(self, out: Path) -> None:
-        """Evaluate into the new folder `out`."""
+        """Evaluate the driver; write the results into the new folder `out`."""
         evaluate(self.world, self.driver, episodes=self.episodes, repeats=self.repeats, out=out)
 
     def load(self, folder: Path) -> EvaluationReport:
@@ -60,18 +60,18 @@ class Job:
 
 @dataclass(frozen=True)
 class RingJob:
-    """The benchmark `ring22`, which measures all drivers that it is given in one run."""
+    """A run of the benchmark `ring22`, which measures all given drivers."""
 
     options: Mapping[str, Any] = field(default_factory=dict)
 
     @property
     def key(self) -> str:
-        """The name of its results: equal for equal jobs."""
+        """The name of the folder of results; equal jobs have equal names."""
         text = json.dumps(self.options, sort_keys=True)
         return f"ring22-speed-{hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
     def drive(self, out: Path) -> None:
-        """Measure, and write the rows into the new folder `out`."""
+        """Run the benchmark; write its rows into the new folder `out`."""
         rows = ring22.measure(**self.options).to_dict()["rows"]
         out.mkdir()
         write_whole(out / "rows.json", json.dumps(rows).encode())
@@ -88,9 +88,9 @@ Tell = Callable[[str], None]
 
 @cache
 def options_of(command: str) -> dict[str, Any]:
-    """Return the options of a command, read and checked by the command itself.
+    """Return the options of a command; the command's own parser reads and checks them.
 
-    Raises typer's `UsageError`: the command has other options.
+    Raises typer's `UsageError` if the command does not have these options.
     """
     words = shlex.split(command)
     if command.startswith(RING22):
@@ -103,13 +103,13 @@ def options_of(command: str) -> dict[str, Any]:
 
 
 def drivers_of(command: str) -> list[str]:
-    """Return the drivers that a command names, in its order."""
+    """Return the drivers of a command in their order."""
     return list(options_of(command)["policy"] or ["idm"])
 
 
 @cache
 def jobs_of(command: str) -> dict[str, AnyJob]:
-    """Return the jobs of a command by driver. All drivers of an evaluation get the same world."""
+    """Return the job of each driver of a command; all drivers of an evaluation get one world."""
     options = options_of(command)
     drivers = drivers_of(command)
     if command.startswith(RING22):
@@ -128,7 +128,7 @@ def jobs_of(command: str) -> dict[str, AnyJob]:
 
 
 def results_folder() -> Path:
-    """Return the folder of results of today's sources: code, environments and drivers."""
+    """Return the folder for results of the present code, environments and drivers."""
     digest = hashlib.sha256()
     places = [*ROOT.glob("cavmarl/**/*.py"), *ROOT.glob("benchmarks/ring22.py")]
     places += [path for folder in ("agents", "envs") for path in ROOT.glob(f"{folder}/**/*")]
@@ -140,14 +140,14 @@ def results_folder() -> Path:
 
 
 def is_kept(path: Path) -> bool:
-    """Return whether this is a file of the repository: no bytecode, and not being made."""
+    """Return whether a path is a file, and neither bytecode nor an unfinished file."""
     parts = path.relative_to(ROOT).parts
     is_draft = any(part.startswith(".") for part in parts)
     return path.is_file() and not is_draft and "__pycache__" not in parts
 
 
 def finish(job: AnyJob, place: Path) -> float:
-    """Drive a job into a folder of `place`; return the seconds that it took."""
+    """Run a job and store its results in `place`; return the duration in seconds."""
     began_s = time.monotonic()
     place.mkdir(parents=True, exist_ok=True)
     with draft_folder(place) as draft:
@@ -157,10 +157,10 @@ def finish(job: AnyJob, place: Path) -> float:
 
 
 def finish_all(jobs: Iterable[AnyJob], processes: int, tell: Tell, place: Path) -> dict[str, Any]:
-    """Drive all jobs, each in a fresh process, and return what they have found, by key.
+    """Run each job in a fresh process; return the results of all jobs by key.
 
-    Jobs with results in `place` are not driven. The first error stops the recording, after the jobs
-    that are being driven.
+    Jobs with results in `place` do not run again. After the first error, no further job starts, and
+    the error is raised when the running jobs have ended.
     """
     chosen = {job.key: job for job in jobs}
     missing = {key: job for key, job in chosen.items() if not (place / key).is_dir()}

@@ -1,6 +1,7 @@
-"""The tables of scores: each block of a page, the commands beside it, and its cells.
+"""The tables of scores: their page and block, the commands beside them, and their cells.
 
-Commands are those of the page; a word of `PLACEHOLDERS` in a command stands for each name in turn.
+A command with a word of `PLACEHOLDERS` stands for several commands: the word is replaced by each
+name of the table.
 """
 
 from __future__ import annotations
@@ -37,25 +38,25 @@ Column = tuple[str, str, str]  # title, command, driver
 
 @dataclass(frozen=True)
 class Results:
-    """The results of the jobs of all commands."""
+    """The results of the jobs, by key."""
 
     by_key: Mapping[str, Any]
 
     def of(self, command: str, driver: str) -> Any:
-        """Return the report of a driver of a command."""
+        """Return the report on a driver that a command evaluates."""
         return self.by_key[jobs_of(command)[driver].key]
 
 
 @dataclass(frozen=True)
 class ScoreTable:
-    """A block of a page that shows results of commands.
+    """A block of a page with a table of results of commands.
 
     Attributes:
-        page: its path in the repository.
-        block: its name, between `<!--` and `-->`.
+        page: path of the page in the repository.
+        block: name of the block, which is between `<!--` and `-->`.
         shown: the commands as the page shows them.
-        write: makes the block from the results.
-        names: the names that replace the word in capitals in a command.
+        write: returns the text of the block for the results.
+        names: the names that replace the placeholder in a command.
     """
 
     page: str
@@ -66,13 +67,15 @@ class ScoreTable:
 
     @property
     def name(self) -> str:
-        """Page and block, as named on the command line of a recording."""
+        """Page and block, as given on the command line of a recording."""
         return f"{self.page}:{self.block}"
 
     @property
     def commands(self) -> list[str]:
-        """The commands that are run."""
-        return list(dict.fromkeys(filled(text, name) for text in self.shown for name in self.names))
+        """All commands, with names in the place of placeholders."""
+        return list(
+            dict.fromkeys(filled_in(text, name) for text in self.shown for name in self.names)
+        )
 
     @property
     def jobs(self) -> Iterator[AnyJob]:
@@ -81,10 +84,10 @@ class ScoreTable:
             yield from jobs_of(command).values()
 
 
-def filled(command: str, name: str) -> str:
-    """Return a command with a name in the place of the word in capitals.
+def filled_in(command: str, name: str) -> str:
+    """Return a command with a name in the place of the placeholder.
 
-    A driver has `_` where its environment has `-`.
+    A name of an environment with `-` becomes the name of a driver with `_`.
     """
     text = command.replace("NAME_ippo", f"{name.replace('-', '_')}_ippo")
     for word in PLACEHOLDERS:
@@ -100,7 +103,7 @@ def drivers_table(columns: Sequence[Column], rows: Rows, results: Results) -> st
 
 
 def columns_of(command: str, *more: Column) -> list[Column]:
-    """Return a column for each driver of a command, and further columns."""
+    """Return a column for each driver of a command, and the columns `more`."""
     return [*((driver, command, driver) for driver in drivers_of(command)), *more]
 
 
@@ -125,7 +128,7 @@ def names_table(
     """Return a table with a row for each name; columns are (title, command, driver, figure)."""
     lines = [
         (f"`{name}`", *(
-            write(results.of(filled(command, name), filled(driver, name)))
+            write(results.of(filled_in(command, name), filled_in(driver, name)))
             for _, command, driver, write in columns
         ))
         for name in names
@@ -140,7 +143,7 @@ WAY = ("way per infraction", way_per_infraction)
 
 
 def shares(*names: str, decimals: int = 1, **titles: str) -> Rows:
-    """Return a row for each share; titles are the names in words, or as given."""
+    """Return a row for each share; `titles` replace titles made from the names."""
     return [
         (titles.get(name, name.replace("_", " ")), share(name, decimals=decimals)) for name in names
     ]
@@ -148,7 +151,7 @@ def shares(*names: str, decimals: int = 1, **titles: str) -> Rows:
 
 def task_card(task: str) -> ScoreTable:
     """Return the table for the card of a driver that was trained on one task."""
-    driver = filled("NAME_ippo", task)
+    driver = filled_in("NAME_ippo", task)
     command = f"cavmarl evaluate {task} -p {driver} -p idm -n 32 --seed 1000"
     alone = f"cavmarl evaluate {task} -p idm {ALONE} -n 16 --seed 1000"
     more = ("wrong_way", "blocked") if task == "intersection" else ()
@@ -227,14 +230,14 @@ LOSSES["all"] = "1"
 
 
 def worlds_table(results: Results) -> str:
-    """Return the table of environments of the README, with pictures."""
+    """Return the README's table of environments, with pictures."""
     short = [figure(name, decimals=0) for name in ("arrived", "collision")]
     lines = []
     for name, text in WORLD_TEXTS.items():
         card = f"envs/{name}/README.md"
         picture = f'<img src="docs/images/{name}.png" width="150" alt="">'
         cells = (
-            " · ".join(write(results.of(filled(WORLDS, name), driver)) for write in short)
+            " · ".join(write(results.of(filled_in(WORLDS, name), driver)) for write in short)
             for driver in ("idm", "random_actions")
         )
         lines.append((f"[{picture}]({card})", f"[`{name}`]({card}): {text}", *cells))
@@ -245,7 +248,7 @@ def messages_table(results: Results) -> str:
     """Return the table of `gap_taker` at the blind junction with increasing loss of messages."""
     names = {"collision": "collision, %", "success": "success, %", "delay_s": "delay, s"}
     reports = {
-        title: results.of(filled(MESSAGES, loss), "gap_taker") for title, loss in LOSSES.items()
+        title: results.of(filled_in(MESSAGES, loss), "gap_taker") for title, loss in LOSSES.items()
     }
     lines = [
         (title, *(figure(name, interval="[]")(report) for name in names))
@@ -257,7 +260,7 @@ def messages_table(results: Results) -> str:
 
 
 def ring_rows(results: Results) -> dict[str, dict[str, Any]]:
-    """Return the rows of the benchmark `ring22` by driver."""
+    """Return the row of each driver in the benchmark `ring22`."""
     rows: dict[str, dict[str, Any]] = results.of(RING22, "idm")
     return rows
 
@@ -313,7 +316,7 @@ def _cards() -> Iterator[ScoreTable]:
     yield ScoreTable(
         page, "scores by map", (CITIES_CARD,), partial(maps_table, CITIES_CARD, [*ours, *idms])
     )
-    page, command = "agents/cities_residual/README.md", filled(RESIDUAL, SEEDS[0])
+    page, command = "agents/cities_residual/README.md", filled_in(RESIDUAL, SEEDS[0])
     speeding = ("mean speed above the limit", figure("mean_speeding", " %"))
     rows = [*CITIES_ROWS, speeding, JERK]
     yield ScoreTable(page, "scores", (command,), partial(drivers_table, columns_of(command), rows))
@@ -393,7 +396,7 @@ def _pages() -> Iterator[ScoreTable]:
     write = partial(drivers_table, heads, RESIDUAL_ROWS)
     yield ScoreTable(learning, "cities of seed 1000", (CITIES_1000,), write)
     heads = [
-        (title, filled(RESIDUAL, seed), driver)
+        (title, filled_in(RESIDUAL, seed), driver)
         for seed in SEEDS
         for title, driver in ((f"seed {seed}", "cities_residual"), (f"`idm`, seed {seed}", "idm"))
     ]

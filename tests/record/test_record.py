@@ -32,8 +32,8 @@ COMMAND = "cavmarl evaluate merge -p idm -p blind -n 2 --seed 7"
 each_table = pytest.mark.parametrize("table", TABLES, ids=lambda table: table.name)
 
 
-def made_up(runs: int = 1, collisions: int = 1) -> EvaluationReport:
-    """Return a report of 40 trips per run on two maps, of which 38 minus the collisions arrive."""
+def fake_report(runs: int = 1, collisions: int = 1) -> EvaluationReport:
+    """Return a report with 40 trips per run on two maps; 38 of them arrive if none collide."""
     rows, episodes = np.zeros(40 * runs, TRIP), np.zeros(2 * runs, EPISODE)
     number_in_run = np.arange(40 * runs) % 40
     rows["run"], episodes["run"] = np.arange(40 * runs) // 40, np.arange(2 * runs) // 2
@@ -62,7 +62,9 @@ def test_each_block_of_a_drivers_card_is_recorded() -> None:
         blocks = re.findall(r"<!-- (?!end )(.+?) -->", card.read_text("utf-8"))
         page = card.relative_to(ROOT).as_posix()
         recorded = [table.block for table in TABLES if table.page == page]
-        assert sorted(blocks) == sorted([*recorded, "reads"]), page  # test_cards.py checks `reads`
+        assert sorted(blocks) == sorted([*recorded, "reads"]), (
+            page
+        )  # for `reads`, see test_cards.py
 
 
 @each_table
@@ -74,7 +76,7 @@ def test_a_page_shows_the_commands_of_its_table(table: Any) -> None:
 
 
 @each_table
-def test_commands_of_a_table_have_jobs(table: Any) -> None:
+def test_each_command_of_a_table_has_jobs(table: Any) -> None:
     for command in table.commands:
         options = options_of(command)
         if command.startswith(EVALUATE):
@@ -84,7 +86,7 @@ def test_commands_of_a_table_have_jobs(table: Any) -> None:
     assert len({job.key for job in table.jobs}) >= len(table.commands)
 
 
-def test_a_driver_that_several_tables_show_is_driven_once() -> None:
+def test_tables_that_show_the_same_driver_share_its_jobs() -> None:
     (card,) = tables_named(["agents/exit_ippo/README.md"])
     (all_tasks,) = tables_named(["docs/figures/tasks.md:trained drivers"])
     assert {job.key for job in card.jobs} < {job.key for job in all_tasks.jobs}
@@ -92,7 +94,7 @@ def test_a_driver_that_several_tables_show_is_driven_once() -> None:
 
 def test_a_table_of_a_small_result() -> None:
     idm, blind = (job.key for job in jobs_of(COMMAND).values())
-    results = Results({idm: made_up(collisions=0), blind: made_up()})
+    results = Results({idm: fake_report(collisions=0), blind: fake_report()})
     columns = [("idm", COMMAND, "idm"), ("other", COMMAND, "blind")]
     rows = [("trips", trips), *shares("arrived", "off_road"), *shares("collision", decimals=2)]
     rows += [("way per infraction", way_per_infraction), DELAY]
@@ -110,21 +112,21 @@ def test_a_table_of_a_small_result() -> None:
     )
 
 
-def test_several_runs_have_intervals_between_runs() -> None:
-    report = made_up(runs=3)
+def test_figures_of_several_runs_have_intervals_between_runs() -> None:
+    report = fake_report(runs=3)
     assert DELAY[1](report) == "4.0 s ± 2.5"
     assert share("collision")(report) == "5.0 % [1.5, 15.2]"
-    assert minus("collision", report, made_up(runs=3, collisions=0)) == "2.5"
+    assert minus("collision", report, fake_report(runs=3, collisions=0)) == "2.5"
 
 
-def test_maps_come_in_the_order_of_success() -> None:
-    report = made_up()
+def test_maps_are_sorted_by_success() -> None:
+    report = fake_report()
     assert worst_map(report) == "90.0 % (`east`)"
     assert list(by_map(report)) == ["east", "west"]
     assert by_map(report)["east"]["collision"] == "5.0 %"
 
 
-def test_a_small_number_is_not_shown_as_0() -> None:
+def test_a_small_positive_number_is_not_shown_as_0() -> None:
     shown = [number(value, 1) for value in (0.0, 0.04, 0.06, 1234.56)]
     assert shown == ["0.0", "0.04", "0.1", "1,234.6"]
     assert number(0.04, 0) == "0"
@@ -142,14 +144,14 @@ class FailingJob:
         raise ConfigError("a world that cannot be made")
 
 
-def test_a_job_that_fails_stops_the_recording_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failed_job_stops_the_recording_and_leaves_no_files(tmp_path: Path) -> None:
     job: Any = FailingJob()
     with pytest.raises(ConfigError, match="cannot be made"):
         finish_all([job], 1, print, tmp_path)
     assert list(tmp_path.iterdir()) == []
 
 
-def test_results_that_are_there_are_not_driven_again(tmp_path: Path) -> None:
+def test_existing_results_are_not_computed_again(tmp_path: Path) -> None:
     (tmp_path / "failing").mkdir()
 
     @dataclass(frozen=True)
@@ -167,7 +169,7 @@ def test_the_error_for_a_page_without_scores_lists_pages_with_scores() -> None:
         tables_named([page])
 
 
-def test_a_block_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
+def test_writing_a_block_keeps_the_rest_of_the_page(tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text("before\n<!-- scores -->\n| old |\n<!-- end -->\nafter\n", "utf-8")
     write_block(page, "scores", "| ± |")
@@ -177,7 +179,7 @@ def test_a_block_is_replaced_and_the_rest_stays(tmp_path: Path) -> None:
 
 def test_the_tests_that_write_blocks_are_found() -> None:
     found = block_tests()
-    assert "tests/test_cards.py::test_a_card_has_the_observation_index_by_index" in found
+    assert "tests/test_cards.py::test_a_card_has_the_table_of_observations" in found
     assert all("::test_" in name for name in found)
 
 

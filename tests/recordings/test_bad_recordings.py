@@ -1,4 +1,4 @@
-"""Recordings that are truncated, damaged, of another version or without a map: typed errors."""
+"""The errors for damaged or incomplete recordings, and for recordings of another version."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ def replaced(name: str, old: str, new: str) -> Callable[[Path], object]:
     return change
 
 
-def flipped(name: str, place: float) -> Callable[[Path], object]:
+def with_flipped_byte(name: str, place: float) -> Callable[[Path], object]:
     def change(path: Path) -> None:
         content = bytearray((path / name).read_bytes())
         content[int(place * len(content))] ^= 0x55
@@ -66,7 +66,7 @@ def flipped(name: str, place: float) -> Callable[[Path], object]:
     return change
 
 
-def cut(name: str) -> Callable[[Path], object]:
+def truncated(name: str) -> Callable[[Path], object]:
     def change(path: Path) -> None:
         content = (path / name).read_bytes()
         (path / name).write_bytes(content[: len(content) // 2])
@@ -74,15 +74,15 @@ def cut(name: str) -> Callable[[Path], object]:
     return change
 
 
-def gone(name: str) -> Callable[[Path], object]:
+def removed(name: str) -> Callable[[Path], object]:
     return lambda path: (path / name).unlink()
 
 
 @pytest.mark.parametrize(
     ("damage", "words"),
     [
-        (gone("recording.json"), ["no recording.json", "give the path"]),
-        (cut("recording.json"), ["recording.json", "cannot be read", "record the run again"]),
+        (removed("recording.json"), ["no recording.json", "give the path"]),
+        (truncated("recording.json"), ["recording.json", "cannot be read", "record the run again"]),
         (
             replaced("recording.json", '"cavmarl_recording": 2', '"other": 1'),
             ["not the head of a recording"],
@@ -93,21 +93,33 @@ def gone(name: str) -> Callable[[Path], object]:
         ),
         (replaced("recording.json", '"sim_dt_s"', '"dt"'), ["recording.json", "is damaged"]),
         (replaced("recording.json", '"rects"', '"rects_"'), ["recording.json", "is damaged"]),
-        (gone("network.bin"), ["network.bin", "has no map", "put the file back"]),
-        (flipped("network.bin", 0.5), ["network.bin", "put the file back"]),
+        (removed("network.bin"), ["network.bin", "has no map", "put the file back"]),
+        (with_flipped_byte("network.bin", 0.5), ["network.bin", "put the file back"]),
         (
             replaced("recording.json", '"layout": "', '"layout": "x'),
             ["network.bin", "layout x", "use the version"],
         ),
-        (cut("world-0/frames/000001.parquet"), ["frames/000001.parquet", "damaged", "restore"]),
-        (cut("world-0/vehicles/000001.parquet"), ["vehicles/000001.parquet", "is damaged"]),
-        (flipped("world-0/vehicles/000001.parquet", 0.3), ["000001.parquet", "is damaged"]),
-        (cut("world-0/events/000001.parquet"), ["events/000001.parquet", "is damaged"]),
-        (gone("world-0/vehicles/000002.parquet"), ["000002.parquet", "is missing", "restore it"]),
-        (gone("world-0/frames/000001.parquet"), ["000001.parquet", "is missing, although later"]),
+        (
+            truncated("world-0/frames/000001.parquet"),
+            ["frames/000001.parquet", "damaged", "restore"],
+        ),
+        (truncated("world-0/vehicles/000001.parquet"), ["vehicles/000001.parquet", "is damaged"]),
+        (
+            with_flipped_byte("world-0/vehicles/000001.parquet", 0.3),
+            ["000001.parquet", "is damaged"],
+        ),
+        (truncated("world-0/events/000001.parquet"), ["events/000001.parquet", "is damaged"]),
+        (
+            removed("world-0/vehicles/000002.parquet"),
+            ["000002.parquet", "is missing", "restore it"],
+        ),
+        (
+            removed("world-0/frames/000001.parquet"),
+            ["000001.parquet", "is missing, although later"],
+        ),
     ],
 )
-def test_a_spoilt_recording_is_refused(
+def test_a_damaged_recording_is_refused(
     bad: Path, damage: Callable[[Path], object], words: list[str]
 ) -> None:
     damage(bad)
@@ -118,7 +130,7 @@ def test_a_spoilt_recording_is_refused(
 
 
 def test_parts_before_a_damaged_part_can_be_read_after_its_removal(good: Path, bad: Path) -> None:
-    cut("world-0/vehicles/000002.parquet")(bad)
+    truncated("world-0/vehicles/000002.parquet")(bad)
     with pytest.raises(RecordingError):
         read(bad)
     for table in ("vehicles", "events", "frames"):
@@ -132,15 +144,15 @@ def test_uncommitted_parts_are_ignored(good: Path, bad: Path) -> None:
     assert read(bad) == read(good)
 
 
-def test_vehicles_of_another_part_are_noticed(bad: Path) -> None:
+def test_a_table_of_another_part_is_refused(bad: Path) -> None:
     vehicles = bad / "world-0" / "vehicles"
     shutil.copy(vehicles / "000000.parquet", vehicles / "000001.parquet")
     # Parts end by the clock, so two of them may have equally many vehicles.
-    with pytest.raises(RecordingError, match="does not add up|its vehicles have other ticks"):
+    with pytest.raises(RecordingError, match=r"does not add up|its vehicles have other ticks"):
         read(bad)
 
 
-def test_an_empty_folder_a_file_and_nothing_are_no_recordings(tmp_path: Path) -> None:
+def test_an_empty_folder_a_file_and_a_missing_path_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("no")
     (tmp_path / "empty").mkdir()
     with pytest.raises(RecordingError, match="an empty folder"):
@@ -150,7 +162,9 @@ def test_an_empty_folder_a_file_and_nothing_are_no_recordings(tmp_path: Path) ->
             Recording.open(tmp_path / name)
 
 
-def test_a_recording_does_not_overwrite_another_one(good: Path, tmp_path: Path) -> None:
+def test_recording_into_an_existing_recording_or_file_is_refused(
+    good: Path, tmp_path: Path
+) -> None:
     before = json.loads((good / "recording.json").read_text())
     with pytest.raises(RecordingError, match="give a new folder"):
         parallel_env("ring", record=good)
@@ -164,7 +178,7 @@ def test_a_recording_does_not_overwrite_another_one(good: Path, tmp_path: Path) 
     env.close()
 
 
-def test_worlds_of_workers_with_a_journal_are_recorded(tmp_path: Path) -> None:
+def test_worlds_in_workers_can_be_recorded_with_a_journal(tmp_path: Path) -> None:
     settings = {"zones.journal": str(tmp_path / "journal.jsonl")}
     vec = make_vec("ring", workers=1, record=tmp_path / "run", overrides=settings)
     vec.reset(seed=0)
@@ -174,7 +188,7 @@ def test_worlds_of_workers_with_a_journal_are_recorded(tmp_path: Path) -> None:
     assert (tmp_path / "journal.jsonl").stat().st_size > 0
 
 
-def test_a_full_disk_is_reported_in_the_next_step(
+def test_a_full_disk_is_reported_at_the_end_of_a_recording(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(path: Path, content: bytes) -> None:

@@ -1,4 +1,4 @@
-"""Memory of frames is reused once nothing reads it any more, and never before."""
+"""Arrays of recorded frames are reused after they have been written."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ def test_rows_are_reused_only_after_they_are_returned() -> None:
     memory = FrameMemory()
     first, second = memory.take(10), memory.take(10)
     assert not np.shares_memory(first, second)
-    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # rows that do not come from this memory
+    memory.give_back(np.empty(10, dtype=SEEN)[:5])  # rows of another array
     assert not np.shares_memory(memory.take(10), second)
     memory.give_back(first)
     assert np.shares_memory(memory.take(12), first)
     memory.give_back(second)
-    assert len(memory.take(1000)) == 1000, "rows that are too small are freed"
+    assert len(memory.take(1000)) == 1000, "too few rows"
 
 
 def test_rows_that_are_returned_twice_are_reused_once() -> None:
@@ -35,7 +35,7 @@ def test_rows_that_are_returned_twice_are_reused_once() -> None:
     assert not np.shares_memory(memory.take(10), memory.take(10))
 
 
-def test_reusing_memory_does_not_change_recorded_frames(
+def test_frames_recorded_in_reused_memory_equal_the_frames_of_the_world(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 20_000)
@@ -47,11 +47,11 @@ def test_reusing_memory_does_not_change_recorded_frames(
         shown += env.world_frames()
     env.close()
     recorded = list(Recording.open(tmp_path / "run").frames(world=0))
-    assert len(list((tmp_path / "run/world-0/vehicles").iterdir())) > 3, "several parts"
+    assert len(list((tmp_path / "run/world-0/vehicles").iterdir())) > 3, "too few parts"
     assert [frame.vehicles.tobytes() for frame in recorded[: len(shown)]] == [
         frame.vehicles.tobytes() for frame in shown
     ]
     happened = [one for pair in pairwise(shown) for one in events_between(*pair)]
-    assert happened, "vehicles depart and leave"
+    assert happened, "no vehicle departed or left"
     told = [event for _, event in Recording.open(tmp_path / "run").events(world=0)]
     assert told[: len(happened)] == happened

@@ -1,4 +1,4 @@
-"""Forged recordings: an error of one line, and little memory."""
+"""Forged recordings are refused with a one-line error and without much memory."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def bad(good: Path, tmp_path: Path) -> Path:
 
 
 def changed(file: str, column: str, number: Any, row: int = 0) -> Forge:
-    """Replace a number of a table."""
+    """Replace one value in a column of a table."""
 
     def forge(path: Path) -> None:
         table = pq.read_table(path / file)
@@ -63,7 +63,7 @@ def columns_of(file: str, change: Callable[[pa.Table], pa.Table]) -> Forge:
     return lambda path: pq.write_table(change(pq.read_table(path / file)), path / file)
 
 
-def exchanged(one: str, other: str) -> Callable[[pa.Table], pa.Table]:
+def with_swapped_columns(one: str, other: str) -> Callable[[pa.Table], pa.Table]:
     def change(table: pa.Table) -> pa.Table:
         names = [{one: other, other: one}.get(name, name) for name in table.column_names]
         return table.rename_columns(names)
@@ -72,7 +72,7 @@ def exchanged(one: str, other: str) -> Callable[[pa.Table], pa.Table]:
 
 
 def text_of(file: str, old: bytes, new: bytes) -> Forge:
-    """Replace bytes of a table that is neither compressed nor has checksums."""
+    """Store a table uncompressed and without checksums, then replace bytes in its file."""
 
     def forge(path: Path) -> None:
         table = pq.read_table(path / file)
@@ -85,7 +85,7 @@ def text_of(file: str, old: bytes, new: bytes) -> Forge:
 
 
 def many_rows(file: str, num_groups: int, num_rows: int) -> Forge:
-    """Write many equal rows, which take a few bytes each."""
+    """Write many equal rows, which take little space."""
 
     def forge(path: Path) -> None:
         table = pq.read_table(path / file).slice(0, 1)
@@ -149,8 +149,8 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (columns_of(VEHICLES, lambda table: table.drop_columns(["x"])), "it has the columns"),
     (columns_of(FRAMES, lambda table: table.drop_columns(["asked"])), "no column"),
     (columns_of(EVENTS, lambda table: table.drop_columns(["tick"])), "it has the columns"),
-    (columns_of(VEHICLES, exchanged("x", "lane")), "it has the columns"),
-    (columns_of(VEHICLES, exchanged("x", "y")), "it has the columns"),
+    (columns_of(VEHICLES, with_swapped_columns("x", "lane")), "it has the columns"),
+    (columns_of(VEHICLES, with_swapped_columns("x", "y")), "it has the columns"),
     (text_of("world-0/handovers/000000.parquet", b"COMMIT", b"COMM\x80T"), "UTF8|UTF-8"),
     (many_rows(VEHICLES, 45, 100_000), "it has 4500000 rows"),
     (many_rows(VEHICLES, 1, 100_000), "100000 rows of"),
@@ -177,17 +177,17 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
 
 
 @pytest.mark.parametrize(("forge", "words"), FORGERIES)
-def test_a_forged_recording_is_refused_in_one_line(
+def test_the_error_for_a_forged_recording_has_one_line(
     bad: Path, tmp_path: Path, forge: Forge, words: str
 ) -> None:
     forge(bad)
     with limited_memory(1 << 30), pytest.raises(RecordingError, match=words) as caught:
         Use(pictures=True, page=True).read(bad, tmp_path)
     assert "\n" not in str(caught.value)
-    assert ";" in str(caught.value)  # the fault, and the remedy
+    assert ";" in str(caught.value)  # between fault and remedy
 
 
-def test_the_replay_command_reports_the_fault(bad: Path) -> None:
+def test_the_replay_command_reports_the_error_of_a_forged_recording(bad: Path) -> None:
     changed(VEHICLES, "x", 1e300)(bad)
     result = CliRunner().invoke(app, ["replay", str(bad), "--csv", str(bad / "rows.csv")])
     assert isinstance(result.exception, CavmarlError | SystemExit)
@@ -195,18 +195,18 @@ def test_the_replay_command_reports_the_fault(bad: Path) -> None:
 
 
 def test_a_page_with_more_values_than_its_column_is_refused(good: Path, bad: Path) -> None:
-    """One row whose list has 2³¹ empty values takes a few bytes, and Arrow would allocate them."""
+    """The head of the page claims more values than the column has; Arrow would allocate them."""
     table = pa.table({"numbers": pa.array([[None] * 1000], pa.list_(pa.int32()))})
     pq.write_table(table, bad / "rows", data_page_version="1.0", use_dictionary=False)
     content = (bad / "rows").read_bytes()
     assert parquet_size(memoryview(content)).columns[0].num_values == 1000
-    head = content.index(b"\x15\xd0\x0f")  # 1000 in the head of the page
+    head = content.index(b"\x15\xd0\x0f")  # number of values: 1000
     forged = content[:head] + b"\x15\xd2\x0f" + content[head + 3 :]
     with pytest.raises(ValueError, match="other values than its pages"):
         parquet_size(memoryview(forged))
 
 
-def test_all_maps_pass_the_check_of_networks() -> None:
+def test_the_maps_of_all_environments_pass_the_check_of_recorded_maps() -> None:
     maps = sorted((ROOT / "envs").rglob("*.net.xml*"))
     assert len(maps) > 10
     for path in maps:

@@ -1,4 +1,4 @@
-"""Recorded trips as offline data: each decision once, with what it was made from and led to."""
+"""Recorded trips as offline data: observation, action, reward and end of each decision."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from cavmarl.recordings.minari_export import write_minari
 from cavmarl.recordings.offline_data import RecordedTrip, recorded_trips
 from cavmarl.recordings.recording import Recording
 
-pytestmark = pytest.mark.integration  # a manifest reads the commit from git
+pytestmark = pytest.mark.integration  # the manifest calls git
 
 Step = tuple[bytes, bytes, float, bool, bool, bytes]
 
@@ -29,7 +29,7 @@ def options(path: Path) -> RecordOptions:
 
 
 def steps_of(trips: Iterator[RecordedTrip]) -> Mapping[tuple[int, int, int], list[Step]]:
-    """Return the decisions of each agent by (world, agent, tick after the decision)."""
+    """Return the decisions by (world, agent, tick after the decision)."""
     found: dict[tuple[int, int, int], list[Step]] = {}
     for trip in trips:
         last = len(trip.rewards) - 1
@@ -49,7 +49,7 @@ def steps_of(trips: Iterator[RecordedTrip]) -> Mapping[tuple[int, int, int], lis
 def drive(
     path: Path, mode: str, kind: str = "continuous", **more: Any
 ) -> list[tuple[tuple[int, int, int], Step]]:
-    """Record random driving; return each decision with its world, agent and tick."""
+    """Record random driving; return ((world, agent, tick), decision) for each decision."""
     seen: list[tuple[tuple[int, int, int], Step]] = []
     overrides = {"action.kind": kind, **more.pop("overrides", {})}
     with closing(
@@ -100,7 +100,7 @@ def test_each_decision_is_in_one_trip(
     trips = list(recorded_trips(Recording.open(tmp_path / "run")))
     found = steps_of(iter(trips))
     assert sum(map(len, found.values())) == len(seen) == sum(len(trip.rewards) for trip in trips)
-    last_moments = {key for key, _ in seen[-6:]}  # there, the recording cuts the trips
+    last_moments = {key for key, _ in seen[-6:]}  # the end of the recording cuts trips
     for key, expected in seen:
         options_here = found[key]
         if key in last_moments and not (expected[3] or expected[4]):
@@ -111,7 +111,7 @@ def test_each_decision_is_in_one_trip(
     assert all(trip.terminated != trip.truncated for trip in trips)
 
 
-def test_zones_and_workers_change_no_byte_of_the_data(tmp_path: Path) -> None:
+def test_offline_data_do_not_depend_on_zones_and_workers(tmp_path: Path) -> None:
     drive(tmp_path / "whole", "SameStep")
     drive(tmp_path / "divided", "SameStep", zones=3, workers=2)
     whole, divided = (
@@ -123,7 +123,7 @@ def test_zones_and_workers_change_no_byte_of_the_data(tmp_path: Path) -> None:
             assert np.asarray(mine).tobytes() == np.asarray(its).tobytes()
 
 
-def test_a_reset_in_the_middle_cuts_the_trips(tmp_path: Path) -> None:
+def test_a_reset_truncates_the_trips(tmp_path: Path) -> None:
     with closing(parallel_env("merge", agents=2, record=options(tmp_path / "run"))) as env:
         for seed in (1, 2):
             env.reset(seed=seed)
@@ -136,7 +136,7 @@ def test_a_reset_in_the_middle_cuts_the_trips(tmp_path: Path) -> None:
     assert all(trip.truncated for trip in trips)
 
 
-def test_an_evaluation_records_how_each_counted_trip_ended(tmp_path: Path) -> None:
+def test_recorded_trips_of_an_evaluation_equal_its_table(tmp_path: Path) -> None:
     evaluate(
         "merge", ["random_actions"], episodes=3, agents=3, background=4, max_cycles=60,
         seed=4, out=tmp_path / "out", record=options(tmp_path / "run"),
@@ -152,7 +152,7 @@ def test_an_evaluation_records_how_each_counted_trip_ended(tmp_path: Path) -> No
     np.testing.assert_allclose(returns, np.sort(rows["reward"]), rtol=1e-5, atol=1e-4)
 
 
-def test_recordings_without_actions_are_refused(tmp_path: Path) -> None:
+def test_recordings_without_observations_or_actions_are_refused(tmp_path: Path) -> None:
     with closing(parallel_env("merge", agents=2, record=tmp_path / "plain")) as env:
         env.reset(seed=1)
         env.step(env.suggest_actions())
@@ -190,7 +190,7 @@ def recorded(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_the_files_of_minari_hold_the_trips(recorded: Path, tmp_path: Path) -> None:
+def test_minari_files_have_the_recorded_trips(recorded: Path, tmp_path: Path) -> None:
     from pyarrow import ipc
 
     recording = Recording.open(recorded)
@@ -237,7 +237,7 @@ def test_minari_reads_the_data_set(recorded: Path, tmp_path: Path) -> None:
         assert episode.infos["tick"].tolist() == trip.ticks.tolist()
 
 
-def test_the_command_writes_to_a_new_folder(
+def test_the_command_writes_minari_files_only_to_a_new_folder(
     recorded: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     with pytest.raises(SystemExit) as ended:
@@ -251,7 +251,7 @@ def test_the_command_writes_to_a_new_folder(
 @pytest.mark.parametrize(
     ("section", "key", "value"), [("action", "kind", "discrete"), ("sensors", "stack", 2)]
 )
-def test_settings_of_other_data_are_refused(
+def test_settings_that_do_not_fit_the_recorded_data_are_refused(
     section: str, key: str, value: Any, tmp_path: Path
 ) -> None:
     drive(tmp_path / "run", "SameStep")

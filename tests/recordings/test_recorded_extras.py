@@ -1,4 +1,4 @@
-"""Observations, samples and messages in a recording: equal bit for bit, on request only."""
+"""Extra tables of a recording: observations, sensor samples and messages."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM, NUM_KINDS
 from tests.support.killed_recordings import killed_recording
 
-pytestmark = pytest.mark.integration  # a manifest reads the commit from git
+pytestmark = pytest.mark.integration  # the manifest calls git
 
 V2X = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.perception.rate_hz": 5.0}
 RIG = {
@@ -62,10 +62,10 @@ def test_recorded_observations_equal_those_of_each_step(tmp_path: Path, zones: i
         recording.extra("v2x")
 
 
-def test_rows_of_the_second_episode_are_found_by_its_own_ticks(
+def test_rows_are_found_by_episode_if_episodes_have_equal_ticks(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 1)  # a part for each step
+    monkeypatch.setattr(recording_writer, "MOST_WAITING_BYTES", 1)  # one part per step
     options = RecordOptions(tmp_path / "run", ("observations",))
     seen = []
     with closing(make_vec("merge", num_envs=1, agents=2, background=0, record=options)) as vec:
@@ -106,7 +106,7 @@ def test_recorded_samples_equal_those_of_the_rig(tmp_path: Path) -> None:
             assert rows["stamp_s"].tolist() == frames[name].stamp_s[-fresh:].tolist()
 
 
-def test_messages_are_all_that_were_sent(tmp_path: Path) -> None:
+def test_all_sent_messages_are_recorded(tmp_path: Path) -> None:
     options = RecordOptions(tmp_path / "run", ("messages",))
     with closing(
         parallel_env("grid4x4", zones=4, agents=3, background=30, record=options, overrides=V2X)
@@ -148,7 +148,7 @@ def test_messages_are_all_that_were_sent(tmp_path: Path) -> None:
         ),
     ],
 )
-def test_unavailable_extras_are_refused(
+def test_extras_that_a_world_does_not_have_are_refused(
     tmp_path: Path, include: tuple[str, ...], more: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
@@ -170,7 +170,7 @@ while True:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with SIGKILL")
-def test_a_killed_run_leaves_whole_tables(tmp_path: Path) -> None:
+def test_a_killed_run_leaves_complete_tables(tmp_path: Path) -> None:
     path = tmp_path / "run"
     recording = killed_recording(path, PROGRAM, parts=2)
     ticks = recording.ticks()
@@ -183,7 +183,7 @@ def test_a_killed_run_leaves_whole_tables(tmp_path: Path) -> None:
         Recording.open(path).extra("observations")
 
 
-def test_rows_of_the_frames_own_tick_are_of_its_episode() -> None:
+def test_rows_at_the_first_tick_of_an_episode_belong_to_that_episode() -> None:
     rows = np.array([(0, 1), (3, 2), (4, 3)], dtype=[("tick", np.int64), ("id", np.int64)])
     (_, before), (_, own) = take_rows({"messages": rows}, 2, 3)
     assert (before.episode, before.rows["id"].tolist()) == (1, [3])

@@ -1,4 +1,4 @@
-"""Recordings: frames that are read equal recorded frames, for each backend."""
+"""Recordings: the frames that are read equal the recorded frames, for each backend."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from tests.support.killed_recordings import killed_recording
 
 
 def drive(env: CavEnv, steps: int) -> list[WorldFrame]:
-    """Return the frames of a seeded episode, with its reset."""
+    """Run a seeded episode; return the frame of its reset and of each step."""
     env.reset(seed=5)
     found = env.world_frames(ghosts=True)
     for _ in range(steps):
@@ -48,7 +48,7 @@ def assert_same(one: WorldFrame, other: WorldFrame) -> None:
                 assert x == y, name
 
 
-def test_a_fork_adds_nothing_to_a_recording(tmp_path: Path) -> None:
+def test_a_forked_process_cannot_write_to_a_recording(tmp_path: Path) -> None:
     path = tmp_path / "run"
     env = parallel_env("merge", agents=3, background=0, record=path)
     with closing(env):
@@ -82,7 +82,7 @@ def test_replayed_frames_equal_the_recorded_ones(tmp_path: Path, zones: int, wor
     assert recording.manifest["software"]["packages"]["cavmarl"]
 
 
-def test_worlds_of_a_vector_have_folders_of_their_own_and_episodes_are_counted(
+def test_each_world_has_its_own_folder_and_numbered_episodes(
     tmp_path: Path,
 ) -> None:
     with closing(make_vec("ring", num_envs=2, record=tmp_path / "run", max_cycles=5)) as vec:
@@ -115,8 +115,8 @@ def test_an_episode_without_a_step_is_recorded(tmp_path: Path) -> None:
     assert [len(recording.ticks(0, episode)) for episode in (0, 1)] == [1, 2]
 
 
-def test_an_end_in_the_step_of_an_autoreset_is_an_event(tmp_path: Path) -> None:
-    """The last step before an autoreset has no frame, but the ends of trips in it are events."""
+def test_a_trip_that_ends_in_the_step_before_an_autoreset_has_an_event(tmp_path: Path) -> None:
+    """The last step before an autoreset has no frame, but trips that end in it have events."""
     arguments: dict[str, Any] = {"agents": 2, "background": 0, "max_cycles": 40}
     with closing(make_vec("ring", record=tmp_path / "run", **arguments)) as vec:
         vec.reset(seed=1)
@@ -128,7 +128,7 @@ def test_an_end_in_the_step_of_an_autoreset_is_an_event(tmp_path: Path) -> None:
 
 
 def test_events_of_the_last_frame_of_an_episode_are_recorded_once(tmp_path: Path) -> None:
-    """The vehicle stays in the last step, which has no frame; its events are of the step before."""
+    """The frame after the last frame of an episode is the first frame of the next episode."""
     world = load_world("ring", agents=1, background=1)
     with closing(parallel_env("ring", agents=1, background=1)) as env:
         first, second, third = drive(env, 2)
@@ -153,7 +153,7 @@ def test_events_of_the_last_frame_of_an_episode_are_recorded_once(tmp_path: Path
     assert [one.tick for one in found if one.kind == "red_light"] == [third.tick]
 
 
-def test_copies_do_not_record(tmp_path: Path) -> None:
+def test_copies_of_an_environment_do_not_record(tmp_path: Path) -> None:
     from copy import deepcopy
 
     with closing(parallel_env("ring", record=tmp_path / "run")) as env:
@@ -178,7 +178,7 @@ while True:
 
 
 @pytest.mark.skipif(os.name != "posix", reason="kills with SIGKILL")
-def test_a_killed_run_leaves_all_that_was_committed(tmp_path: Path) -> None:
+def test_a_killed_run_leaves_all_committed_frames(tmp_path: Path) -> None:
     replayed = list(killed_recording(tmp_path / "run", PROGRAM, parts=3).frames())
     assert len(replayed) > 3
     with closing(parallel_env("ring")) as env:
@@ -186,7 +186,7 @@ def test_a_killed_run_leaves_all_that_was_committed(tmp_path: Path) -> None:
             assert_same(one, other)
 
 
-def test_a_process_that_ends_without_close_leaves_the_whole_run(tmp_path: Path) -> None:
+def test_a_process_that_ends_without_close_leaves_a_complete_recording(tmp_path: Path) -> None:
     program = PROGRAM.replace("while True", "for _ in range(9)")
     subprocess.run([sys.executable, "-c", program, str(tmp_path / "run")], check=True)
     recording = Recording.open(tmp_path / "run")
@@ -194,7 +194,7 @@ def test_a_process_that_ends_without_close_leaves_the_whole_run(tmp_path: Path) 
     assert len(list(recording.frames())) == 10
 
 
-def test_a_recording_keeps_vehicles_of_the_caller(tmp_path: Path) -> None:
+def test_a_recording_has_external_vehicles(tmp_path: Path) -> None:
     path = tmp_path / "run"
     overrides = {"population.external": 2}
     env = parallel_env("ring", agents=1, background=0, record=path, overrides=overrides)

@@ -1,4 +1,4 @@
-"""Exports of a recording: FCD, CSV, MCAP, pictures, and the command."""
+"""Exports of a recording: FCD, emissions, CSV, MCAP, pictures and the command."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from cavmarl.recordings.recording_exports import (
 )
 from cavmarl.recordings.replay_pictures import ReplayPictures
 
-pytestmark = pytest.mark.integration  # the manifest asks git; videos are made by ffmpeg
+pytestmark = pytest.mark.integration  # the manifest calls git, videos need ffmpeg
 
 STEPS = 12
 
@@ -47,7 +47,7 @@ def frames(path: Path) -> list[WorldFrame]:
     return list(Recording.open(path).frames())
 
 
-def test_fcd_has_each_vehicle_as_sumo_would(
+def test_fcd_has_each_vehicle_in_sumos_format(
     path: Path, frames: list[WorldFrame], tmp_path: Path
 ) -> None:
     recording = Recording.open(path)
@@ -92,10 +92,10 @@ def test_emissions_have_energy_co2_and_fuel_of_each_vehicle(
     assert total_mg > 0.0
 
 
-def test_emissions_are_those_since_the_frame_before(
+def test_emissions_are_totals_since_the_previous_frame(
     path: Path, frames: list[WorldFrame], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Frames need not be one step apart, as in recordings of the server for CARLA's clients."""
+    """Frames can be several steps apart, as in recordings of the server for CARLA's clients."""
     late = [frames[0], *(frame._replace(time_s=frame.time_s + 0.7) for frame in frames[1:])]
     monkeypatch.setattr(Recording, "frames", lambda *_: iter(late))
     write_emissions(Recording.open(path), tmp_path / "emissions.xml", 0, 0)
@@ -108,7 +108,9 @@ def test_emissions_are_those_since_the_frame_before(
         assert co2_g > 0.0
 
 
-def test_csv_has_all_numbers_in_full(path: Path, frames: list[WorldFrame], tmp_path: Path) -> None:
+def test_csv_has_all_numbers_with_full_precision(
+    path: Path, frames: list[WorldFrame], tmp_path: Path
+) -> None:
     write_csv(Recording.open(path), tmp_path / "all.csv", 0, 0)
     with (tmp_path / "all.csv").open(newline="") as file:
         lines = list(csv.DictReader(file))
@@ -138,7 +140,7 @@ def test_mcap_has_scenes_and_events(path: Path, frames: list[WorldFrame], tmp_pa
     assert sorted(map(str, events)) == sorted(str(e.event._asdict()) for e in recording.events())
 
 
-def test_pictures_equal_those_of_the_world(tmp_path: Path) -> None:
+def test_pictures_of_a_recording_equal_those_of_the_world(tmp_path: Path) -> None:
     made = parallel_env("grid4x4", zones=4, render_mode="rgb_array", record=tmp_path / "run")
     with closing(made) as env:
         env.reset(seed=2)
@@ -154,13 +156,13 @@ def test_pictures_equal_those_of_the_world(tmp_path: Path) -> None:
         drawn = pictures.picture(frame)
         assert drawn.shape == picture.shape
         differing = (drawn[:, :, :] != picture).any(axis=2)
-        assert differing[60:].mean() < 0.002  # titles of worlds and recordings may differ
+        assert differing[60:].mean() < 0.002  # the titles differ
     pictures.close()
     with pytest.raises(ConfigError, match="ghosts_of = 9"):
         ReplayPictures(recording, ghosts_of=9)
 
 
-def test_the_command_exports_and_films(path: Path, tmp_path: Path) -> None:
+def test_the_command_writes_all_exports_and_a_video(path: Path, tmp_path: Path) -> None:
     words = [
         "replay",
         str(path),

@@ -1,4 +1,4 @@
-"""Forged recordings, changed at random: each is read, or refused with a typed error."""
+"""Recordings with random changes: each one is read, or refused with a typed error."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.support.hostile_recordings import Forger, Use, limited_memory, make_r
 
 MUTATIONS = 150
 MANY_MUTATIONS = int(os.environ.get("CAVMARL_RECORDING_MUTATIONS", "1500"))
-EVERY = 10  # one in this number of recordings is also drawn and shown on a page
+EVERY = 10  # of this many recordings, one is drawn and one is shown on a page
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Small real maps and vehicles to draw on them."""
+"""Fixtures: small maps of environments, and vehicles to draw."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def grid() -> RoadNetwork:
 
 @pytest.fixture
 def car() -> Callable[..., NDArray[np.void]]:
-    """Return a function that makes a VEHICLE row with the given fields: `car(x=3.0, agent=1)`."""
+    """Return a function that makes a row of a vehicle: `car(x=3.0, agent=1)`."""
 
     def make(**fields: float) -> NDArray[np.void]:
         row = blank_vehicle()

@@ -37,7 +37,7 @@ def test_another_format_is_refused(tmp_path: Path) -> None:
         AnimationWriter(tmp_path / "drive.mp4", fps=10.0)
 
 
-def test_a_folder_that_is_missing_is_named(tmp_path: Path) -> None:
+def test_a_missing_folder_is_an_error(tmp_path: Path) -> None:
     animation = AnimationWriter(tmp_path / "none" / "drive.webp", fps=10.0)
     animation.write(np.zeros((48, 96, 3), dtype=np.uint8))
     with pytest.raises(ConfigError, match="cannot write an animation there: No such file"):

@@ -1,4 +1,4 @@
-"""Drawings of divided worlds: pixels of zones, owners, ghosts and transfers."""
+"""Pictures of divided worlds: zones, owners, ghosts and transfers."""
 
 from __future__ import annotations
 
@@ -41,8 +41,8 @@ def picture(
     return TopDownRenderer(ring, SIZE, FOCUS).frame(rows, zones=view, ghosts_of=ghosts_of)
 
 
-def at(frame: NDArray[np.uint8], x: float, y: float) -> tuple[int, ...]:
-    """Return the pixel at a point in metres."""
+def color_at(frame: NDArray[np.uint8], x: float, y: float) -> tuple[int, ...]:
+    """Return the colour at a point in metres."""
     column, row = pixel(x, y)
     return tuple(int(c) for c in frame[row, column])
 
@@ -58,24 +58,24 @@ def count(frame: NDArray[np.uint8], color: palette.Color) -> int:
 
 @pytest.mark.parametrize("agent", [-1, 3])
 @pytest.mark.parametrize("owner", [0, 1, 2, 3])
-def test_a_vehicle_has_the_colour_of_its_owner_at_any_position(
+def test_a_vehicle_has_the_colour_of_its_owning_zone(
     ring: RoadNetwork, car: Car, owner: int, agent: int
 ) -> None:
     rows = car(x=5.0, y=9.0, id=5, agent=agent)
     frame = picture(ring, rows, view_of([owner]))
-    assert at(frame, 5.0, 9.0) == palette.zone_color(owner)
+    assert color_at(frame, 5.0, 9.0) == palette.zone_color(owner)
 
 
-def test_each_zone_has_its_tint_and_is_bordered(ring: RoadNetwork, car: Car) -> None:
+def test_each_zone_has_a_tint_and_a_border(ring: RoadNetwork, car: Car) -> None:
     frame = picture(ring, car()[:0], view_of([]))
-    # These points are beside the roads.
-    tints = {at(frame, x, y) for x in (-4.0, 4.0) for y in (-4.0, 4.0)}
+    # Four points beside the roads, one in each zone.
+    tints = {color_at(frame, x, y) for x in (-4.0, 4.0) for y in (-4.0, 4.0)}
     assert len(tints) == 4
-    assert at(frame, 10.0, 0.0) == at(frame, 0.0, 10.0) == palette.INK
+    assert color_at(frame, 10.0, 0.0) == color_at(frame, 0.0, 10.0) == palette.INK
     plain = TopDownRenderer(ring, SIZE, FOCUS).frame(car()[:0])
     for x, y in ((-4.0, -4.0), (8.0, 10.0)):
-        lost = np.array(at(plain, x, y)) - at(frame, x, y)
-        assert 0 < np.abs(lost).max() < 80, "a light tint"
+        lost = np.array(color_at(plain, x, y)) - color_at(frame, x, y)
+        assert 0 < np.abs(lost).max() < 80, "the tint is missing or too strong"
 
 
 def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> None:
@@ -92,10 +92,10 @@ def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> No
 
     assert count(around(seen[0], 6.0), rim(0)) > 20 > count(around(plain, 6.0), rim(0))
     assert count(around(seen[1], 13.0), rim(1)) > 20 > count(around(plain, 13.0), rim(1))
-    # A zone without ghosts outlines no vehicle.
+    # Zone 2 has no ghosts.
     np.testing.assert_array_equal(around(seen[2], 6.0), around(plain, 6.0))
     for frame in seen.values():
-        assert at(frame, 6.0, 5.0) == palette.zone_color(3)
+        assert color_at(frame, 6.0, 5.0) == palette.zone_color(3)
 
 
 def test_the_drawn_sight_of_a_zone_ends_with_its_halo() -> None:
@@ -104,32 +104,30 @@ def test_the_drawn_sight_of_a_zone_ends_with_its_halo() -> None:
     draw_sight(surface, PINWHEEL, 3.0, 4, Viewport.fit(PINWHEEL.bounds, (300, 300)))
     image = pixels(surface)
     lined = np.argwhere(np.abs(image.astype(int) - palette.zone_color(4)).sum(axis=2) < 12)
-    # Zone 4 is from 10 to 20 m both ways, at 10 pixels a metre.
+    # Zone 4 has x and y from 10 to 20 m, and its halo is 3 m wide; 1 m is 10 pixels.
     assert lined.min(axis=0).tolist() == pytest.approx([70, 70], abs=6)
     assert lined.max(axis=0).tolist() == pytest.approx([230, 230], abs=6)
     assert (image[150, 150] == 255).all()
-    assert (image[72, 72] == 255).all(), "corners are round"
+    assert (image[72, 72] == 255).all(), "the corner of the line is not round"
 
 
-def test_a_transfer_is_ringed_in_the_targets_colour_and_points_there(
-    ring: RoadNetwork, car: Car
-) -> None:
+def test_a_transfer_has_a_ring_and_an_arrow_to_the_target_zone(ring: RoadNetwork, car: Car) -> None:
     rows = car(x=-1.5, y=8.0, id=4)
     still = view_of([2])
     moving = replace(still, transfers=(TransferInFlight(4, 2, 3, "offered"),))
     before, after = picture(ring, rows, still), picture(ring, rows, moving)
-    # Below the line of text, which counts transfers.
+    # Ignore the line of text at the top, which has the number of transfers.
     changed = np.argwhere((before[80:] != after[80:]).any(axis=2)) + np.array([80, 0])
     column, row = pixel(-1.5, 8.0)
     offsets = changed - np.array([row, column])
     half_m = 0.5 * float(rows["length"][0])
     away_m = np.hypot(*offsets.T) / CAMERA.scale
-    assert half_m < away_m.min(), "around the car"
+    assert half_m < away_m.min(), "the ring touches the car"
     assert away_m.max() < half_m + 2.0
-    # The target is to the east, and so is the head of the arrow.
+    # The arrow points to the target zone in the east.
     assert offsets[:, 1].max() > 6 - offsets[:, 1].min()
     assert count(after[80:], palette.zone_color(3)) > count(before[80:], palette.zone_color(3))
-    assert at(after, -1.5, 8.0) == palette.zone_color(2)
+    assert color_at(after, -1.5, 8.0) == palette.zone_color(2)
 
 
 def test_a_transfer_of_a_vehicle_that_has_left_is_not_drawn(ring: RoadNetwork, car: Car) -> None:
@@ -139,7 +137,7 @@ def test_a_transfer_of_a_vehicle_that_has_left_is_not_drawn(ring: RoadNetwork, c
     np.testing.assert_array_equal(shown[80:], picture(ring, rows, view_of([2]))[80:])
 
 
-def test_the_order_of_vehicles_does_not_matter(ring: RoadNetwork, car: Car) -> None:
+def test_a_picture_does_not_depend_on_the_order_of_vehicles(ring: RoadNetwork, car: Car) -> None:
     rows = np.concatenate([car(x=4.0 * k - 8.0, y=5.0, id=k) for k in range(5)])
     view = view_of([0, 1, 2, 3, 0])
     other = replace(view, owners=view.owners[::-1])
@@ -168,7 +166,7 @@ TRITANOPIA = [
 
 
 @pytest.mark.parametrize("vision", [np.eye(3), PROTANOPIA, DEUTERANOPIA, TRITANOPIA])
-def test_zones_differ_for_any_colour_vision(vision: NDArray[np.float64]) -> None:
+def test_the_colours_of_zones_differ_for_any_colour_vision(vision: NDArray[np.float64]) -> None:
     linear = (np.array(palette.ZONES) / 255.0) ** 2.2
     seen = np.clip(linear @ np.array(vision).T, 0.0, 1.0) ** (1 / 2.2)
     least = min(float(np.linalg.norm(a - b)) for a, b in combinations(seen, 2))

@@ -19,7 +19,7 @@ coordinates = st.tuples(st.integers(-20, 20), st.integers(-20, 20))
 
 
 @given(st.lists(coordinates, min_size=3, max_size=30))
-def test_hull_is_convex_and_holds_all_points(points: list[tuple[int, int]]) -> None:
+def test_the_convex_hull_contains_all_points(points: list[tuple[int, int]]) -> None:
     hull = convex_hull(np.array(points, dtype=float))
     assert {tuple(corner) for corner in hull.tolist()} <= {(float(x), float(y)) for x, y in points}
     if len(hull) < 3:
@@ -31,14 +31,14 @@ def test_hull_is_convex_and_holds_all_points(points: list[tuple[int, int]]) -> N
         assert (side >= 0.0).all()
 
 
-def test_offset_keeps_its_distance_round_a_corner() -> None:
+def test_an_offset_line_keeps_its_distance_at_a_corner() -> None:
     corner = np.array([[0.0, 0.0], [10.0, 0.0], [10.0, 10.0]])
     assert offset_polyline(corner, 1.0) == pytest.approx(
         np.array([[0.0, 1.0], [9.0, 1.0], [9.0, 10.0]])
     )
 
 
-def test_stop_lines_cover_the_end_of_the_lane_from_left_to_right(grid: RoadNetwork) -> None:
+def test_stop_lines_divide_the_width_of_a_lane_among_its_links(grid: RoadNetwork) -> None:
     lines = road_shapes(grid).stop_lines
     for lane in np.flatnonzero(grid.lanes["num_links"] > 1)[:20]:
         row = grid.lanes[lane]
@@ -52,14 +52,14 @@ def test_stop_lines_cover_the_end_of_the_lane_from_left_to_right(grid: RoadNetwo
         assert width == pytest.approx(row["width_m"] - 0.2)
 
 
-def test_dashes_lie_between_neighbours(grid: RoadNetwork) -> None:
+def test_dashes_between_lanes_are_3_m_long(grid: RoadNetwork) -> None:
     dashes = road_shapes(grid).dashes
     assert len(dashes)
     assert np.linalg.norm(dashes[:, 1] - dashes[:, 0], axis=1) == pytest.approx(3.0)
 
 
-def test_arrows_lie_on_their_lanes_and_show_where_these_lead(grid: RoadNetwork) -> None:
-    lane = int(np.flatnonzero(grid.lanes["num_links"] == 2)[0])  # straight on, or to one side
+def test_the_arrow_of_a_lane_has_the_directions_of_its_links(grid: RoadNetwork) -> None:
+    lane = int(np.flatnonzero(grid.lanes["num_links"] == 2)[0])  # straight on and one turn
     row = grid.lanes[lane]
     end = grid.points[row["first_point"] + row["num_points"] - 1]
     ahead, left = np.array([[end["cos"], end["sin"]], [-end["sin"], end["cos"]]])
@@ -72,7 +72,7 @@ def test_arrows_lie_on_their_lanes_and_show_where_these_lead(grid: RoadNetwork) 
     assert (side * d[on_lane]).max() > 2.0 * (-side * d[on_lane]).max()
 
 
-def test_camera_shows_all_of_its_bounds_unstretched() -> None:
+def test_the_camera_shows_all_of_its_bounds_with_one_scale() -> None:
     camera = Viewport.fit((-100.0, 0.0, 300.0, 50.0), (800, 600), margin_px=40.0)
     corners = camera.to_pixels(np.array([[-100.0, 0.0], [300.0, 50.0]]))
     assert corners[0] == pytest.approx([40.0, 345.0])
@@ -82,18 +82,18 @@ def test_camera_shows_all_of_its_bounds_unstretched() -> None:
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.0, "0:00.0"), (83.25, "1:23.2"), (59.98, "1:00.0")]
 )
-def test_the_clock_is_drawn(seconds: float, text: str) -> None:
+def test_the_clock_has_minutes_seconds_and_tenths(seconds: float, text: str) -> None:
     assert clock_text(seconds) == text
 
 
 @pytest.mark.parametrize(
     ("scale", "length_m"), [(0.4, 200.0), (1.4, 100.0), (5.0, 20.0), (40.0, 2.0)]
 )
-def test_scale_bar_is_a_round_number(scale: float, length_m: float) -> None:
+def test_the_length_of_the_scale_bar_is_a_round_number(scale: float, length_m: float) -> None:
     assert scale_bar_m(scale) == length_m
 
 
-def test_where_one_drives_on_the_left_the_picture_is_mirrored(tmp_path: Path) -> None:
+def test_the_markings_of_left_hand_traffic_are_mirrored(tmp_path: Path) -> None:
     options = ["--grid", "--grid.number", "3", "--grid.length", "120", "-L", "2"]
     plain = netgenerate(tmp_path / "right.net.xml", *options)
     mirror = read_network(mirror_net(plain, tmp_path / "left.net.xml"))

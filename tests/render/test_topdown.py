@@ -40,15 +40,15 @@ def count(frame: NDArray[np.uint8], color: palette.Color) -> int:
     return int((np.abs(frame.astype(int) - color).sum(axis=2) < 30).sum())
 
 
-def test_frame_is_rgb_of_the_asked_size(ring: RoadNetwork, car: Car) -> None:
+def test_a_frame_is_rgb_of_the_requested_size(ring: RoadNetwork, car: Car) -> None:
     frame = TopDownRenderer(ring, SIZE).frame(car(agent=-1), title="ring", clock_s=1.0)
     assert frame.shape == (240, 320, 3)
     assert frame.dtype == np.uint8
-    assert middle(frame) != palette.LAND  # the car
+    assert middle(frame) != palette.LAND
     assert tuple(frame[120, 130]) == palette.LAND
 
 
-def test_the_picture_has_the_proportions_of_the_map(grid: RoadNetwork) -> None:
+def test_the_picture_has_the_aspect_ratio_of_the_map(grid: RoadNetwork) -> None:
     width, height = TopDownRenderer(grid).size
     wide = TopDownRenderer(grid, focus=(0.0, 0.0, 5000.0, 10.0)).size
     assert width > height
@@ -64,7 +64,9 @@ def test_equal_worlds_give_equal_pictures(grid: RoadNetwork, car: Car) -> None:
 
 
 @pytest.mark.parametrize("agent", [-1, 0, 3, 25])
-def test_vehicle_has_its_colour_at_its_place(ring: RoadNetwork, car: Car, agent: int) -> None:
+def test_a_vehicle_is_drawn_at_its_position_in_its_colour(
+    ring: RoadNetwork, car: Car, agent: int
+) -> None:
     renderer = TopDownRenderer(ring, SIZE, focus=(40.0, -20.0, 80.0, 10.0))
     row = car(agent=agent, x=60.0, y=-5.0, heading=1.0)
     expected = palette.BACKGROUND_CAR if agent < 0 else palette.agent_color(agent)
@@ -86,7 +88,7 @@ def test_a_vehicle_is_drawn_with_its_length_and_width(ring: RoadNetwork, car: Ca
 
 def test_buildings_are_drawn_at_their_positions(ring: RoadNetwork) -> None:
     min_x, min_y, max_x, max_y = ring.extent_of(0)
-    x, y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)  # within the ring
+    x, y = 0.5 * (min_x + max_x), 0.5 * (min_y + max_y)  # inside the ring road
     focus = (x - 10.0, y - 7.5, x + 10.0, y + 7.5)
     house = np.array(
         [(x - 4.0, y - 3.0), (x + 4.0, y - 3.0), (x + 4.0, y + 3.0), (x - 4.0, y + 3.0)]
@@ -107,7 +109,7 @@ def test_buildings_are_drawn_at_their_positions(ring: RoadNetwork) -> None:
         ({"events": 1}, palette.COLLIDED),
     ],
 )
-def test_vehicle_shows_its_state(
+def test_braking_blinking_and_collisions_are_drawn(
     ring: RoadNetwork, car: Car, fields: dict[str, float], color: palette.Color
 ) -> None:
     renderer = TopDownRenderer(ring, SIZE, focus=(-8.0, -6.0, 8.0, 6.0))
@@ -116,14 +118,14 @@ def test_vehicle_shows_its_state(
     assert count(shown, color) > count(calm, color)
 
 
-def test_left_blinker_is_at_the_left(ring: RoadNetwork, car: Car) -> None:
+def test_the_left_blinker_is_on_the_left_side(ring: RoadNetwork, car: Car) -> None:
     renderer = TopDownRenderer(ring, SIZE, focus=(-8.0, -6.0, 8.0, 6.0))
-    left = renderer.frame(car(agent=-1, blinker=1))  # it drives east: left is up
+    left = renderer.frame(car(agent=-1, blinker=1))  # its left side is at the top
     assert count(left[:120], palette.BLINKER) > 0
     assert count(left[120:200], palette.BLINKER) == 0
 
 
-def test_signal_letters_equal_those_of_the_phase(grid: RoadNetwork) -> None:
+def test_each_link_has_the_signal_state_of_its_phase(grid: RoadNetwork) -> None:
     phases = grid.programs["first_phase"][grid.signals["program"]].astype(np.int32)
     codes = signal_codes(grid, phases)
     signalled = grid.links["signal"] >= 0
@@ -162,7 +164,7 @@ def test_stop_lines_switch_with_their_signal(grid: RoadNetwork) -> None:
     assert seen == {"r", "G"}
 
 
-def test_camera_follows_agents_and_waits_for_them(grid: RoadNetwork, car: Car) -> None:
+def test_the_camera_follows_an_agent_and_stops_without_it(grid: RoadNetwork, car: Car) -> None:
     renderer = TopDownRenderer(grid, SIZE)
     row = car(agent=5, x=150.0, y=200.0)
     renderer.draw(row, follow=[5])
@@ -190,10 +192,10 @@ def test_destinations_are_marked(grid: RoadNetwork, car: Car) -> None:
     assert count(marked[part], palette.agent_color(4)) > 10
 
 
-def test_pictures_need_no_display_and_leave_the_environment_alone(
+def test_pictures_need_no_display_and_change_no_environment_variable(
     ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    load_pygame().display.quit()  # another test may have opened a window
+    load_pygame().display.quit()  # window of another test
     monkeypatch.setenv("SDL_VIDEODRIVER", "no-such-driver")
     before = dict(os.environ)
     TopDownRenderer(ring, SIZE).frame(car())
@@ -210,7 +212,7 @@ def test_the_window_shows_the_drawn_frame(headless: None, ring: RoadNetwork, car
     assert renderer.frame(car()).shape == (240, 320, 3)
 
 
-def test_window_keeps_pace(headless: None, ring: RoadNetwork, car: Car) -> None:
+def test_the_window_limits_the_frame_rate(headless: None, ring: RoadNetwork, car: Car) -> None:
     pygame = load_pygame()
     renderer = TopDownRenderer(ring, SIZE)
     picture = renderer.draw(car())
@@ -222,7 +224,7 @@ def test_window_keeps_pace(headless: None, ring: RoadNetwork, car: Car) -> None:
     renderer.close()
 
 
-def test_a_run_continues_when_its_window_is_closed(
+def test_a_closed_window_is_not_opened_again(
     headless: None, ring: RoadNetwork, car: Car, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pygame = load_pygame()
@@ -245,7 +247,7 @@ def test_a_run_continues_when_its_window_is_closed(
     assert len(opened) == 1
 
 
-def test_without_pygame_the_extra_is_named(
+def test_the_error_without_pygame_names_the_extra(
     ring: RoadNetwork, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(module: str) -> None:

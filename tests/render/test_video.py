@@ -12,7 +12,7 @@ from cavmarl.render.video import VideoWriter
 
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 
-# imageio-ffmpeg's reader leaves the pipes of its ffmpeg to the garbage collector.
+# The reader of imageio-ffmpeg does not close its pipes.
 reads_back = pytest.mark.filterwarnings("ignore:unclosed file:ResourceWarning")
 
 
@@ -40,7 +40,7 @@ def test_video_can_be_read_back(tmp_path: Path, height: int, width: int) -> None
 
 
 @reads_back
-def test_file_is_finished_when_the_block_fails(tmp_path: Path) -> None:
+def test_the_video_is_complete_after_an_exception_in_the_with_block(tmp_path: Path) -> None:
     path = tmp_path / "drive.mp4"
     with contextlib.suppress(KeyError), VideoWriter(path, fps=10.0) as video:
         video.write(np.zeros((64, 64, 3), dtype=np.uint8))
@@ -55,7 +55,7 @@ def test_without_frames_no_file_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["file/drive.mp4", "folder.mp4", "drive.avi", "drive"])
-def test_unwritable_path_is_refused_at_once(tmp_path: Path, name: str) -> None:
+def test_an_unwritable_path_is_refused_before_the_first_frame(tmp_path: Path, name: str) -> None:
     (tmp_path / "file").touch()
     (tmp_path / "folder.mp4").mkdir()
     with pytest.raises(ConfigError, match=Path(name).name):
@@ -63,7 +63,7 @@ def test_unwritable_path_is_refused_at_once(tmp_path: Path, name: str) -> None:
 
 
 @pytest.mark.parametrize("fps", [0.0, -1.0, float("nan"), float("inf")])
-def test_impossible_pace_is_refused(tmp_path: Path, fps: float) -> None:
+def test_an_invalid_frame_rate_is_refused(tmp_path: Path, fps: float) -> None:
     with pytest.raises(ConfigError, match="fps"):
         VideoWriter(tmp_path / "drive.mp4", fps)
 
@@ -77,14 +77,14 @@ def test_impossible_pace_is_refused(tmp_path: Path, fps: float) -> None:
         np.zeros((32, 64, 3), dtype=np.uint8),
     ],
 )
-def test_wrong_frame_is_refused(tmp_path: Path, frame: np.ndarray) -> None:
+def test_a_frame_of_another_shape_or_type_is_refused(tmp_path: Path, frame: np.ndarray) -> None:
     with VideoWriter(tmp_path / "drive.mp4", fps=10.0) as video:
         video.write(np.zeros((64, 64, 3), dtype=np.uint8))
         with pytest.raises(ConfigError, match="frame"):
             video.write(frame)
 
 
-def test_without_imageio_ffmpeg_the_extra_is_named(
+def test_the_error_without_imageio_ffmpeg_names_the_extra(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def missing(module: str) -> None:

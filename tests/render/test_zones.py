@@ -21,7 +21,7 @@ def pixels(surface: object) -> NDArray[np.uint8]:
     return np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
 
-def test_each_zone_has_its_colour_darker_within_the_halo() -> None:
+def test_each_zone_has_a_colour_that_is_darker_in_the_halo() -> None:
     surface = blank((300, 300))
     surface.fill((255, 255, 255))
     draw_zones(surface, PINWHEEL, 2.0, Viewport.fit(PINWHEEL.bounds, (300, 300)))
@@ -33,7 +33,7 @@ def test_each_zone_has_its_colour_darker_within_the_halo() -> None:
     middle, halo, other = at(15.0, 13.0), at(15.0, 11.0), at(15.0, 5.5)
     assert len({tuple(middle), tuple(halo), tuple(other)}) == 3
     assert sum(halo) < sum(middle)
-    # The rim reaches to infinity: no halo there.
+    # Outer zones have no end, so there is no halo at the edge of the picture.
     assert at(3.0, 1.0) == at(3.0, 5.0)
     assert sum(at(3.0, 9.0)) < sum(at(3.0, 5.0))
 

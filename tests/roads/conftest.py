@@ -1,4 +1,4 @@
-"""A crossing small enough to check by hand, as a fixture."""
+"""The fixture `crossing`, a map that is small enough to check by hand."""
 
 from tests.support.crossing import crossing
 

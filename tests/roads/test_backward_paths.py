@@ -15,7 +15,7 @@ from tests.support.kept_maps import network_of
 sumo = pytest.importorskip("sumo", reason="needs the extra: sumo")
 
 MOST_CORNER_RAD = np.radians(100.0)
-U_TURN_RAD = np.radians(150.0)  # if roads turn by this angle, a path may have no width
+U_TURN_RAD = np.radians(150.0)  # between roads that turn by more, paths may have sharp corners
 
 
 def _line(*points: tuple[float, float]) -> Shape:
@@ -27,14 +27,14 @@ def _length(shape: Shape) -> float:
 
 
 def _corners(*parts: Shape) -> NDArray[np.float64]:
-    """Return unsigned angles between segments of polylines, by their dot products, in rad."""
+    """Return the unsigned angles between consecutive segments of polylines, in rad."""
     steps = np.concatenate([np.diff(part[:, :2], axis=0) for part in parts])
     steps /= np.hypot(*steps.T)[:, None]
     cosines: NDArray[np.float64] = (steps[1:] * steps[:-1]).sum(axis=1)
     return np.arccos(np.clip(cosines, -1.0, 1.0))
 
 
-def _whole(shapes: list[Shape], way: Way) -> Shape:
+def _joined(shapes: list[Shape], way: Way) -> Shape:
     return np.concatenate([shapes[way.before], *(shapes[k] for k in way.inside), shapes[way.after]])
 
 
@@ -45,14 +45,14 @@ def test_roads_that_overlap_are_cut_back_and_joined_by_a_forward_path() -> None:
         _line((50.0, 0.0), (49.0, 0.1)),
     ]
     mend_backward_paths(shapes, [Way(0, (2,), 1)])
-    whole = _whole(shapes, Way(0, (2,), 1))
+    whole = _joined(shapes, Way(0, (2,), 1))
     assert (np.diff(whole[:, 0]) >= 0.0).all()
     assert shapes[2][0].tolist() == shapes[0][-1].tolist()
     assert shapes[2][-1].tolist() == shapes[1][0].tolist()
     assert _length(shapes[2]) > 0.5
 
 
-def test_other_paths_from_the_same_lane_keep_their_way() -> None:
+def test_other_paths_from_the_same_lane_keep_their_course() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((49.0, 0.1), (100.0, 0.1)),
@@ -61,10 +61,10 @@ def test_other_paths_from_the_same_lane_keep_their_way() -> None:
         _line((50.0, 0.0), (57.0, 3.0), (60.0, 10.0)),
     ]
     turn = Way(0, (4,), 2)
-    before = _length(_whole(shapes, turn))
+    before = _length(_joined(shapes, turn))
     mend_backward_paths(shapes, [Way(0, (3,), 1), turn])
     assert _length(shapes[0]) < 50.0
-    assert _length(_whole(shapes, turn)) == pytest.approx(before, abs=1e-9)
+    assert _length(_joined(shapes, turn)) == pytest.approx(before, abs=1e-9)
     assert shapes[4][-3:].tolist() == _line((50.0, 0.0), (57.0, 3.0), (60.0, 10.0)).tolist()
 
 
@@ -92,7 +92,7 @@ def test_paths_that_a_car_can_follow_are_unchanged() -> None:
     assert [shape.tolist() for shape in shapes] == drawn
 
 
-def test_a_lane_with_a_movement_without_a_path_keeps_its_end() -> None:
+def test_a_lane_keeps_its_end_if_one_of_its_movements_has_no_path() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((49.0, 0.1), (100.0, 0.1)),
@@ -105,7 +105,7 @@ def test_a_lane_with_a_movement_without_a_path_keeps_its_end() -> None:
 
 
 def _check_forward(network: RoadNetwork) -> None:
-    """Check that paths over junctions do not run backwards, except where the roads do."""
+    """Check that no path over a junction runs backwards, except paths of U-turns."""
     for link in network.links[network.links["first_internal"] >= 0]:
         lanes = [int(link["from_lane"]), int(link["first_internal"])]
         while network.lanes["internal"][lanes[-1]]:
@@ -137,7 +137,7 @@ def test_no_path_of_a_city_runs_backwards(shared_maps: Path, name: str) -> None:
     _check_forward(network_of(shared_maps / "net" / f"{name}.net.xml"))
 
 
-def test_a_replaced_path_has_an_even_grade() -> None:
+def test_a_replaced_path_has_a_constant_grade() -> None:
     shapes = [
         _line((0.0, 0.0), (50.0, 0.0)),
         _line((49.0, 0.1), (50.0, 40.0)),

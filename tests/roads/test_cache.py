@@ -51,19 +51,19 @@ def test_a_second_load_restores_every_array(
     assert [entry.suffix for entry in cache_folder.iterdir()] == [".network"]
 
 
-@pytest.mark.parametrize("copied", [0, 1 << 27])
-def test_a_large_map_stays_in_its_file(
+@pytest.mark.parametrize("max_copied", [0, 1 << 27])
+def test_a_map_above_the_size_limit_is_mapped_from_its_file(
     crossing: Callable[..., Path],
     cache_folder: Path,
     monkeypatch: pytest.MonkeyPatch,
-    copied: int,  # bytes up to which a map is copied
+    max_copied: int,  # in bytes; larger maps are mapped from their file
 ) -> None:
-    monkeypatch.setattr("cavmarl.roads.network.COPIED", copied)
+    monkeypatch.setattr("cavmarl.roads.network.COPIED", max_copied)
     monkeypatch.setattr("cavmarl.core.huge_pages.LEAST", 1)
     path = crossing()
     first, second = load_network(path), load_network(path)
     assert first.content_hash == second.content_hash
-    assert (file_of(second.arrays.lanes) is None) == (copied > 0)
+    assert (file_of(second.arrays.lanes) is None) == (max_copied > 0)
     for one, other in zip(first.arrays, second.arrays, strict=True):
         assert one.tobytes() == other.tobytes()
     assert not second.lanes.flags.writeable
@@ -77,7 +77,7 @@ def test_a_changed_source_is_read_again(crossing: Callable[..., Path], cache_fol
 
 
 @pytest.mark.parametrize("content", [b"", b"PK\x03\x04 nonsense", b"text"])
-def test_a_broken_entry_is_built_again(
+def test_an_invalid_entry_is_built_again(
     crossing: Callable[..., Path], cache_folder: Path, content: bytes
 ) -> None:
     path = crossing()
@@ -98,7 +98,7 @@ def test_a_truncated_entry_is_built_again(
     assert load_network(path).content_hash == whole.content_hash
 
 
-def test_the_name_of_a_network_is_that_of_its_present_file(
+def test_a_cached_network_has_the_name_of_the_loaded_file(
     crossing: Callable[..., Path], cache_folder: Path
 ) -> None:
     path = crossing()
@@ -107,7 +107,7 @@ def test_the_name_of_a_network_is_that_of_its_present_file(
     assert load_network(renamed).name == "other"
 
 
-# Raise `FORMAT` together with these, and record golden rows and results again (`make record`).
+# If these hashes change, raise `FORMAT`, and record golden rows and results (`make record`).
 OF_FORMAT = 52
 ROWS_SHA256 = {
     "merge": "2306899fd71f4dcfb40a199b3205e8d96babc4bcc392db1e47fc0b896e846ae0",

@@ -27,13 +27,13 @@ def test_separate_paths_are_not_near_even_if_the_map_lists_them_as_foes(
     assert shared.near == near
     merging = overlap(one, other, merging=True)
     assert merging is not None
-    assert merging.near, "the lane behind is the same"
+    assert merging.near, "merging paths are not near"
 
 
 def waiting_place(
     wait_m: float, enter_m: float, yields: tuple[bool, bool] = (True, False)
 ) -> float:
-    """Return a turn's waiting position, given netconvert's position and the start of an area."""
+    """Return a turn's waiting position, for netconvert's position and the area's start, in m."""
     links, lanes = np.zeros(2, LINK), np.zeros(2, LANE)
     links["wait_m"] = wait_m, np.inf
     links["from_lane"] = links["to_lane"] = 0, 1
@@ -50,24 +50,24 @@ def waiting_place(
 @pytest.mark.parametrize(
     ("enter_m", "place_m"),
     [
-        (9.5, 10.0),  # the front stops 1 m before the position, so 0.5 m before the area
+        (9.5, 10.0),  # a front stops 1 m before the position, so 0.5 m before the area
         (8.9, 9.9),
         (6.1, 7.1),
-        (5.9, 10.0),  # the area is checked at the line
+        (5.9, 10.0),  # over 3 m before the position, so vehicles wait at the stop line
     ],
 )
-def test_a_turn_waits_inside_before_the_paths_to_which_it_yields(
+def test_a_turn_waits_inside_the_junction_before_the_shared_area(
     enter_m: float, place_m: float
 ) -> None:
     assert waiting_place(10.0, enter_m) == pytest.approx(place_m)
 
 
 @pytest.mark.parametrize("yields", [(False, True), (True, True), (False, False)])
-def test_only_links_with_priority_move_a_waiting_position(
+def test_a_waiting_position_moves_only_before_links_with_priority(
     yields: tuple[bool, bool],
 ) -> None:
     assert waiting_place(10.0, 8.0, yields) == 10.0
 
 
-def test_a_turn_without_need_to_wait_has_no_waiting_position() -> None:
+def test_a_turn_without_a_waiting_position_of_netconvert_gets_none() -> None:
     assert waiting_place(np.inf, 8.0) == np.inf

@@ -1,4 +1,4 @@
-"""Several maps in one entry: drawn by the seed, apart, and the same in any zones."""
+"""Environments with several maps: each world draws one of them by its seed."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ OVERRIDES: dict[str, Any] = {"map.source": MAPS, "horizon_s": 8.0}
 
 
 def drive(vec: CavVectorEnv, steps: int) -> list[str]:
-    """Return the states of all worlds after some steps."""
+    """Return the state hashes of all worlds after some steps."""
     vec.reset(seed=5)
     actions = np.zeros((vec.num_envs, vec.num_agents, 2), dtype=np.float32)
     actions[:, :, 0] = 0.2
@@ -32,7 +32,7 @@ def drive(vec: CavVectorEnv, steps: int) -> list[str]:
 
 
 def maps_of(vec: CavVectorEnv) -> list[set[int]]:
-    """Return the maps of the vehicles of each world."""
+    """Return the maps on which each world has vehicles."""
     on = vec.network.lanes["map"]
     simulation = vec.simulation
     return [set(on[simulation.vehicles(w)["lane"]].tolist()) for w in range(vec.num_envs)]
@@ -54,7 +54,7 @@ def test_each_episode_of_each_world_draws_its_map_by_the_seed() -> None:
     assert [vec.worlds.state_hash(world) for world in range(6)] == first
 
 
-def test_worlds_on_workers_are_the_same() -> None:
+def test_worlds_on_workers_have_the_same_states() -> None:
     settings: dict[str, Any] = {"agents": 4, "background": 4, "overrides": OVERRIDES}
     here = make_vec("cities", num_envs=4, **settings)
     there = make_vec("cities", num_envs=4, workers=2, **settings)
@@ -68,7 +68,7 @@ def test_worlds_on_workers_are_the_same() -> None:
     assert alone.worlds.state_hash(0) == here.worlds.state_hash(2)
 
 
-def test_a_divided_world_is_the_undivided_one() -> None:
+def test_a_divided_world_equals_the_undivided_world() -> None:
     found = verify_zones("cities", (4, 9), steps=90, worlds=2, overrides=OVERRIDES)
     assert [result.difference for result in found.results] == [None, None]
     assert sum(result.crossings for result in found.results) > 10
@@ -114,7 +114,7 @@ def test_rows_of_a_map_point_to_rows_of_the_same_map() -> None:
         assert apart >= 1000.0
 
 
-def test_errors_of_several_maps_are_reported_at_once(tmp_path: Path) -> None:
+def test_errors_of_several_maps_are_reported_in_one_message(tmp_path: Path) -> None:
     broken = tmp_path / "broken.net.xml"
     broken.write_text("<net>")
     sources = [MAPS[0], str(broken), "map/nowhere.net.xml"]
@@ -128,7 +128,7 @@ def test_errors_of_several_maps_are_reported_at_once(tmp_path: Path) -> None:
     assert "other.net.xml" in str(caught.value)
 
 
-def test_trips_that_maps_do_not_have_are_named_map_by_map() -> None:
+def test_the_error_for_impossible_trips_names_all_maps() -> None:
     with pytest.raises(ConfigError) as caught:
         make_vec("cities", overrides={**OVERRIDES, "traffic.min_trip_m": 9000.0,
                                       "traffic.max_trip_m": 0.0})  # fmt: skip
@@ -145,7 +145,7 @@ def test_trips_that_maps_do_not_have_are_named_map_by_map() -> None:
         ("scenario.name", "road_closure"),
     ],
 )
-def test_keys_of_one_map_are_refused_with_several(key: str, value: object) -> None:
+def test_settings_of_a_single_map_are_refused_with_several_maps(key: str, value: object) -> None:
     with pytest.raises(ConfigError, match=rf"{key}.*several"):
         load_world("cities", overrides={**OVERRIDES, key: value})
 

@@ -29,7 +29,7 @@ def grid(tmp_path: Path) -> Path:
 
 
 def with_rules(source: Path, rules: str, inside: str = "", lane: str = f"{ROAD}_0") -> Path:
-    """Write a network whose lane has more attributes and elements."""
+    """Write a network in which one lane has added attributes and elements."""
     text = source.read_text()
     begin = text.index(f'<lane id="{lane}"')
     end = text.index("/>", begin)
@@ -39,18 +39,23 @@ def with_rules(source: Path, rules: str, inside: str = "", lane: str = f"{ROAD}_
     return target
 
 
-def barred(network: RoadNetwork, lane: str, side: int) -> int:
+def classes_without_change(network: RoadNetwork, lane: str, side: int) -> int:
     bits = int(network.lanes["permissions"][network.lane_ids.index(lane)])
     return (bits >> (NO_CHANGE_LEFT if side > 0 else NO_CHANGE_RIGHT)) & 0x1FF
 
 
-def test_lanes_bar_classes_from_changes(grid: Path) -> None:
+def test_lanes_forbid_lane_changes_to_vehicle_classes(grid: Path) -> None:
     rules = with_rules(grid, 'changeLeft="bus"')
     network = read_network(rules)
-    assert barred(network, f"{ROAD}_0", 1) == 0x1FF & ~BUS
-    assert barred(network, f"{ROAD}_0", -1) == barred(network, f"{ROAD}_1", 1) == 0
+    assert classes_without_change(network, f"{ROAD}_0", 1) == 0x1FF & ~BUS
+    assert (
+        classes_without_change(network, f"{ROAD}_0", -1)
+        == classes_without_change(network, f"{ROAD}_1", 1)
+        == 0
+    )
     mirrored = read_network(mirror_net(rules, rules.with_name("left.net.xml")))
-    assert barred(mirrored, f"{ROAD}_0", -1) == 0x1FF & ~BUS  # "left" is towards the middle
+    # In left-hand traffic, SUMO's "left" is to the right.
+    assert classes_without_change(mirrored, f"{ROAD}_0", -1) == 0x1FF & ~BUS
 
 
 @pytest.mark.parametrize("rules", ["", 'changeLeft="all" changeRight=""'])
@@ -58,7 +63,7 @@ def test_networks_without_rules_are_unchanged(grid: Path, rules: str) -> None:
     assert read_network(with_rules(grid, rules)).content_hash == read_network(grid).content_hash
 
 
-def test_plans_keep_behind_solid_lines(grid: Path) -> None:
+def test_plans_have_no_lane_change_across_a_solid_line(grid: Path) -> None:
     plain = read_network(grid)
     lane = plain.lane_ids.index(f"{ROAD}_0")
     goals = [

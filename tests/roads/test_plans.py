@@ -40,7 +40,7 @@ def test_plans_take_the_least_time_from_every_lane(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_distances_add_up_along_the_way(name: str) -> None:
+def test_the_distance_of_a_plan_is_the_sum_of_its_lanes(name: str) -> None:
     roads = network(name)
     edges = goals(roads)
     for goal, plan in zip(edges, make_plans(roads, edges), strict=True):
@@ -64,7 +64,7 @@ def test_distances_add_up_along_the_way(name: str) -> None:
             assert plan[lane]["turnarounds"] == turns.count("t")
 
 
-def test_lanes_that_forbid_cars_are_no_way() -> None:
+def test_plans_do_not_use_lanes_that_forbid_the_vehicle_class() -> None:
     roads = network("ring")
     plan = make_plans(roads, goals(roads, 1), "tram")[0]
     reached = np.isfinite(plan["to_go"])

@@ -1,4 +1,4 @@
-"""Shapes of lanes whose neighbours have other lengths."""
+"""Shapes of lanes beside longer or shorter lanes."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ def straight(first_m: float, last_m: float, y: float) -> Shape:
 
 
 @pytest.mark.parametrize("long_first", [True, False])
-def test_a_lane_has_a_point_where_its_neighbour_ends(long_first: bool) -> None:
+def test_a_lane_gets_a_point_where_its_neighbour_ends(long_first: bool) -> None:
     shapes = [straight(0.0, 20.0, 0.0), straight(0.0, 12.0, 3.5)]
     if not long_first:
         shapes.reverse()
@@ -23,7 +23,7 @@ def test_a_lane_has_a_point_where_its_neighbour_ends(long_first: bool) -> None:
     assert len(short) == 2
 
 
-def test_ends_that_lie_nearly_side_by_side_make_no_points() -> None:
+def test_ends_that_lie_nearly_side_by_side_add_no_points() -> None:
     shapes = [straight(0.0, 20.0, 0.0), straight(2.0, 18.0, 3.5)]
     split_beside_ends(shapes, [0])
     assert [len(shape) for shape in shapes] == [2, 2]

@@ -26,7 +26,9 @@ def lane(network: RoadNetwork, name: str) -> int:
     return network.lane_ids.index(name)
 
 
-def test_pavements_are_left_out_and_rows_run_from_right_to_left(network: RoadNetwork) -> None:
+def test_pavements_are_dropped_and_lanes_are_numbered_from_right_to_left(
+    network: RoadNetwork,
+) -> None:
 
     assert network.lane_ids[:5] == ("w_1", "w_2", "s_0", "e_0", "n_0")
     assert "w_0" not in network.lane_ids
@@ -43,7 +45,7 @@ def test_permissions_are_bits_of_the_vehicle_classes(network: RoadNetwork) -> No
     assert network.lanes["permissions"][lane(network, "w_1")] == (1 << len(VEHICLE_CLASSES)) - 1
 
 
-def test_lanes_across_a_dropped_lane_are_no_neighbours(crossing: Crossing) -> None:
+def test_lanes_on_both_sides_of_a_dropped_lane_are_not_neighbours(crossing: Crossing) -> None:
     swapped = ('id="w_1" index="1" speed', 'id="w_1" index="1" allow="bicycle" speed')
     freed = ('id="w_0" index="0" allow="pedestrian"', 'id="w_0" index="0"')
     network = read_network(crossing(swapped, freed))
@@ -51,7 +53,7 @@ def test_lanes_across_a_dropped_lane_are_no_neighbours(crossing: Crossing) -> No
     assert network.lanes["right"][lane(network, "w_2")] == -1
 
 
-def test_repeated_points_are_dropped_and_slopes_kept(network: RoadNetwork) -> None:
+def test_repeated_points_are_dropped_and_slopes_are_kept(network: RoadNetwork) -> None:
 
     west = network.lanes[lane(network, "w_1")]
     assert west["num_points"] == 3
@@ -78,7 +80,7 @@ def test_a_link_leads_over_its_chain_of_internal_lanes(network: RoadNetwork) -> 
     assert chr(turn["state"]) == "o"
 
 
-def test_lanes_into_a_lane_are_internal_lanes(network: RoadNetwork) -> None:
+def test_the_lanes_that_lead_into_a_lane_are_listed(network: RoadNetwork) -> None:
 
     row = network.lanes[lane(network, "e_0")]
     into = network.into[row["first_into"] : row["first_into"] + row["num_into"]]
@@ -88,7 +90,7 @@ def test_lanes_into_a_lane_are_internal_lanes(network: RoadNetwork) -> None:
     assert network.lanes["num_into"][lane(network, "w_1")] == 0
 
 
-def test_right_of_way_is_read_from_the_right_end_of_the_bits(network: RoadNetwork) -> None:
+def test_bits_of_right_of_way_are_read_from_right_to_left(network: RoadNetwork) -> None:
 
     owner = np.repeat(np.arange(3), network.links["num_conflicts"])
     pairs = zip(owner, network.conflicts["foe"], network.conflicts["must_yield"], strict=True)
@@ -115,19 +117,19 @@ def test_crossing_paths_share_the_middle_and_merging_paths_the_end(crossing: Cro
         assert mirrored[f"foe_{end}"] == cross[end]
 
 
-def test_paths_over_and_under_a_bridge_do_not_conflict(crossing: Crossing) -> None:
+def test_a_path_on_a_bridge_does_not_conflict_with_a_path_below(crossing: Crossing) -> None:
     network = read_network(crossing(('shape="0,-5 0,-5 0,5"', 'shape="0,-5,6 0,5,6"')))
     assert network.conflicts["foe"].tolist() == [2, 0]
 
 
-def test_foes_that_never_meet_share_their_closest_points(crossing: Crossing) -> None:
+def test_foes_whose_paths_never_meet_share_their_closest_points(crossing: Crossing) -> None:
     network = read_network(crossing(('shape="0,-5 0,-5 0,5"', 'shape="0,-5 0,-4"')))
     conflict = network.conflicts[0]
     assert conflict["leave_m"] - conflict["enter_m"] == 2.0
     assert (conflict["foe_enter_m"], conflict["foe_leave_m"]) == (0.0, 1.0)
 
 
-def test_signals_keep_their_program(network: RoadNetwork) -> None:
+def test_programs_of_signals_are_read(network: RoadNetwork) -> None:
 
     assert network.signal_ids == ("c",)
     signal = network.signals[0]
@@ -143,7 +145,7 @@ def test_signals_keep_their_program(network: RoadNetwork) -> None:
     assert signals == {"c": 0, "W": -1, "S": -1, "E": -1, "N": -1}
 
 
-def test_internal_lanes_of_no_length_get_one(crossing: Crossing) -> None:
+def test_internal_lanes_without_length_get_a_length_of_1_cm(crossing: Crossing) -> None:
     network = read_network(crossing(('shape="-5,0 5,0"', 'shape="-5,0 -5,0"')))
     row = network.lanes[lane(network, ":c_0_0")]
     assert row["length_m"] == pytest.approx(0.01)
@@ -151,14 +153,14 @@ def test_internal_lanes_of_no_length_get_one(crossing: Crossing) -> None:
     assert (point["cos"], point["sin"]) == pytest.approx((1.0, 0.0))
 
 
-def test_a_stub_is_level_even_behind_a_slope(crossing: Crossing) -> None:
+def test_an_internal_lane_without_length_is_level_even_after_a_slope(crossing: Crossing) -> None:
     climb = ('shape="-100,0 -50,0', 'shape="-100,0,-9 -50,0,-6')
     network = read_network(crossing(climb, ('shape="-5,0 5,0"', 'shape="-5,0 -5,0"')))
     point = network.points[network.lanes[lane(network, ":c_0_0")]["first_point"]]
     assert point["slope"] == 0.0
 
 
-def test_connections_for_others_are_no_links(crossing: Crossing) -> None:
+def test_connections_for_bicycles_only_are_dropped(crossing: Crossing) -> None:
     cyclists = ('from="s" to="n"', 'allow="bicycle" from="s" to="n"')
     network = read_network(crossing(cyclists))
     assert network.links["index"].tolist() == [0, 2]
@@ -166,7 +168,7 @@ def test_connections_for_others_are_no_links(crossing: Crossing) -> None:
     assert network.conflicts["foe"].tolist() == [1, 0]
 
 
-def test_a_map_without_internal_lanes_leads_straight_on(crossing: Crossing) -> None:
+def test_links_without_internal_lanes_lead_directly_to_their_target(crossing: Crossing) -> None:
     vias = [(f' via=":c_{k}_0"', "") for k in range(4)]
     network = read_network(crossing(*vias))
     assert not network.edges["internal"].any()
@@ -176,7 +178,7 @@ def test_a_map_without_internal_lanes_leads_straight_on(crossing: Crossing) -> N
     assert len(network.conflicts) == 4
 
 
-def test_gzip_and_plain_files_are_equal_but_for_their_hash(crossing: Crossing) -> None:
+def test_gzip_and_plain_files_have_the_same_content_hash(crossing: Crossing) -> None:
     plain = crossing()
     packed = plain.with_name("crossing.net.xml.gz")
     packed.write_bytes(gzip.compress(plain.read_bytes()))
@@ -240,7 +242,9 @@ BROKEN = {
 
 
 @pytest.mark.parametrize("case", BROKEN)
-def test_broken_maps_are_refused_with_a_place_and_a_cure(crossing: Crossing, case: str) -> None:
+def test_the_error_for_a_broken_map_names_the_file_and_the_fault(
+    crossing: Crossing, case: str
+) -> None:
     old, new, message = BROKEN[case]
     path = crossing((old, new))
     with pytest.raises(MapError, match=message) as caught:
@@ -249,7 +253,7 @@ def test_broken_maps_are_refused_with_a_place_and_a_cure(crossing: Crossing, cas
     assert ":" in str(caught.value)
 
 
-def test_entity_bombs_and_external_entities_are_refused(tmp_path: Path) -> None:
+def test_files_with_xml_entities_are_refused(tmp_path: Path) -> None:
     bomb = '<!DOCTYPE n [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><net version="1.20">&b;</net>'
     leak = '<!DOCTYPE n [<!ENTITY a SYSTEM "file:///etc/hostname">]><net version="1.20">&a;</net>'
     for text in (bomb, leak):
@@ -270,13 +274,13 @@ def test_truncated_gzip_and_missing_files_are_refused(crossing: Crossing, tmp_pa
         read_network(tmp_path)
 
 
-def test_size_is_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_size_of_a_file_is_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("cavmarl.roads.sumo_net.xml_source.MAX_XML_BYTES", 100)
     with pytest.raises(MapError, match="larger than 100 bytes"):
         read_network(crossing())
 
 
-def test_a_text_packed_a_hundred_fold_is_refused(
+def test_the_compression_ratio_of_a_gzip_file_is_limited(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     packed = tmp_path / "bomb.net.xml.gz"
@@ -288,7 +292,7 @@ def test_a_text_packed_a_hundred_fold_is_refused(
         read_network(packed)
 
 
-def test_elements_deep_in_one_another_are_refused(
+def test_deeply_nested_elements_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     for kind, name in (("net", "deep.net.xml"), ("osm", "deep.osm")):
@@ -300,7 +304,9 @@ def test_elements_deep_in_one_another_are_refused(
     assert map_kind(deep) == "osm"
 
 
-def test_points_of_a_lane_are_limited(crossing: Crossing, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_points_of_a_lane_is_limited(
+    crossing: Crossing, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = crossing()
     monkeypatch.setenv("CAVMARL_MAX_LANE_POINTS", "1")
     with pytest.raises(
@@ -315,7 +321,7 @@ def test_points_of_a_lane_are_limited(crossing: Crossing, monkeypatch: pytest.Mo
 @pytest.mark.parametrize(
     ("name", "before"), [("edge", '<edge id="w" '), ("junction", 'id="E" type="dead_end" ')]
 )
-def test_points_of_edges_and_junctions_are_limited(
+def test_the_number_of_points_of_edges_and_junctions_is_limited(
     crossing: Crossing, name: str, before: str
 ) -> None:
     many = f'shape="{" ".join(["0,0"] * 100_001)}"'
@@ -325,13 +331,13 @@ def test_points_of_edges_and_junctions_are_limited(
 
 
 @pytest.mark.parametrize("coordinate", ["2e8", "-1e300"])
-def test_points_beyond_the_earth_are_refused(crossing: Crossing, coordinate: str) -> None:
+def test_coordinates_beyond_100_000_km_are_refused(crossing: Crossing, coordinate: str) -> None:
     path = crossing(('shape="5,0,0 ', f'shape="{coordinate},0,0 '))
     with pytest.raises(MapError, match=rf"<lane .* the point '{coordinate},.*', beyond 1e\+08 m"):
         read_network(path)
 
 
-def test_a_path_over_a_junction_is_limited(
+def test_the_length_of_a_path_over_a_junction_is_limited(
     crossing: Crossing, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     far = crossing(('shape="5,0,0 ', 'shape="9005,0,0 '))
@@ -346,7 +352,7 @@ def test_a_path_over_a_junction_is_limited(
         read_network(crossing())
 
 
-def test_extents_come_from_roads_and_not_from_stray_nodes(tmp_path: Path) -> None:
+def test_the_extent_of_a_map_ignores_nodes_without_roads(tmp_path: Path) -> None:
     path = write_roads(tmp_path / "road.net.xml", [((0.0, 0.0), (100.0, 50.0))], 10.0)
     stray = '<junction id="far" type="dead_end" x="0" y="-9000" incLanes="" intLanes="" shape=""/>'
     text = path.read_text().replace('Boundary="0.0,0.0', 'Boundary="0.0,-9000.0')

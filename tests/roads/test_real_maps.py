@@ -1,4 +1,4 @@
-"""Properties of all maps, checked on real maps, and compared with sumolib."""
+"""Properties that every road network must have, checked on real maps, and against sumolib."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ MAPS = [
     "xodr/multi_intersections.xodr", "xodr/newmarket.xodr", "xodr/soderleden_invalid.xodr",
 ]  # fmt: skip
 
-# Networks that come with SUMO: pedestrians, trams, bicycles, trains, motorways, zipper merges.
+# Networks in SUMO's package. They have pedestrians, trams, bicycles, trains, motorways and
+# zipper merges.
 GAMES = [
     "A10KW/osm.net.xml", "DRT/osm.net.xml", "bs3d/bs.net.xml", "cross/cross.net.xml",
     "fkk_in/ingolstadt.net.xml.gz", "fokr_bs_demo/fokr_bs.net.xml.gz", "grid6/grid6.net.xml",
@@ -34,9 +35,9 @@ GAMES = [
 NOT_FOR_CARS = ["rail/net.net.xml", "rail_demo/net.net.xml", "racing/spreewaldring.net.xml"]
 
 
-def game(name: str) -> Path:
+def network_of_sumo(name: str) -> Path:
     sumo = pytest.importorskip("sumo")
-    path = Path(sumo.SUMO_HOME) / "tools" / "game" / name
+    path = Path(sumo.SUMO_HOME) / "tools" / "network_of_sumo" / name
     if not path.exists():
         pytest.skip(f"this version of SUMO has no {name}")
     return path
@@ -119,9 +120,9 @@ def check_conflicts(network: RoadNetwork) -> None:
     assert len(rows) == len(conflicts)
     assert list(rows) == sorted(rows)
     for (mine, foe), row in rows.items():
-        twin = rows[foe, mine]
+        reverse = rows[foe, mine]
         assert 0.0 <= row["enter_m"] <= row["leave_m"] <= links["length_m"][mine] + 1e-9
-        assert (row["foe_enter_m"], row["foe_leave_m"]) == (twin["enter_m"], twin["leave_m"])
+        assert (row["foe_enter_m"], row["foe_leave_m"]) == (reverse["enter_m"], reverse["leave_m"])
         assert links["junction"][mine] == links["junction"][foe]
         if links["to_lane"][mine] == links["to_lane"][foe]:
             assert row["leave_m"] == pytest.approx(links["length_m"][mine])
@@ -160,7 +161,7 @@ def check_against_sumolib(network: RoadNetwork, net: Any) -> None:
         for foe in np.flatnonzero(links["junction"] == link["junction"]) if node._foes else ():
             a, b = int(link["index"]), int(links["index"][foe])
             either = foe != mine and (node.areFoes(a, b) or node.areFoes(b, a))
-            # All foes of the map are listed, and also links that pass too closely.
+            # The list has all foes of the map, and also links whose paths pass too closely.
             assert foe in listed or not either
             if either:
                 assert listed[foe] == node.forbids(connections[foe], connections[mine])
@@ -179,13 +180,13 @@ def check_everything(path: Path, read: Callable[[Path], RoadNetwork] = network_o
 
 
 @pytest.mark.parametrize("name", MAPS)
-def test_all_of_a_real_map_is_read(built_map: BuiltMap, name: str) -> None:
+def test_real_maps_are_read_completely(built_map: BuiltMap, name: str) -> None:
     check_everything(built_map(name))
 
 
 @pytest.mark.parametrize("name", GAMES)
-def test_all_of_a_network_of_sumo_is_read(name: str) -> None:
-    check_everything(game(name))
+def test_networks_of_sumo_are_read_completely(name: str) -> None:
+    check_everything(network_of_sumo(name))
 
 
 @pytest.mark.parametrize(
@@ -196,7 +197,7 @@ def test_all_of_a_network_of_sumo_is_read(name: str) -> None:
         ["--rand", "--rand.iterations=30", "--seed=3", "--no-internal-links"],
     ],
 )
-def test_all_of_a_generated_network_is_read(tmp_path: Path, options: list[str]) -> None:
+def test_generated_networks_are_read_completely(tmp_path: Path, options: list[str]) -> None:
     sumo = pytest.importorskip("sumo")
     path = tmp_path / "made.net.xml"
     command = [str(Path(sumo.SUMO_HOME) / "bin" / "netgenerate"), *options, "-o", str(path)]
@@ -207,7 +208,7 @@ def test_all_of_a_generated_network_is_read(tmp_path: Path, options: list[str]) 
 @pytest.mark.parametrize("name", NOT_FOR_CARS)
 def test_a_network_without_roads_is_refused(name: str) -> None:
     with pytest.raises(MapError, match="no lane that road vehicles may use"):
-        read_network(game(name))
+        read_network(network_of_sumo(name))
 
 
 def test_elevation_is_kept(built_map: BuiltMap) -> None:

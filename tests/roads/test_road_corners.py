@@ -1,4 +1,4 @@
-"""Corners inside a road are rounded, so that cars keep to their lanes; other shapes remain."""
+"""Sharp corners within roads become curves that cars can follow; other shapes do not change."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def radii(shape: Shape) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("turn_deg", [40.0, 90.0, -90.0, 135.0, 160.0])
-def test_a_corner_becomes_a_tangent_curve_in_which_a_car_keeps_within_its_lane(
+def test_a_corner_becomes_a_curve_of_the_required_radius(
     turn_deg: float,
 ) -> None:
     turn = np.radians(turn_deg)
@@ -50,7 +50,7 @@ def test_a_corner_becomes_a_tangent_curve_in_which_a_car_keeps_within_its_lane(
     assert find_corners(shape) == []
 
 
-def test_rounded_lanes_keep_their_distance() -> None:
+def test_rounding_keeps_the_distance_between_lanes() -> None:
     shapes = [
         line((0, -3.2 * k), (100 + 3.2 * k, -3.2 * k), (100 + 3.2 * k, 100)) for k in range(3)
     ]
@@ -87,7 +87,7 @@ def test_a_corner_of_several_points_is_rounded_once() -> None:
     assert radii(shapes[0])[1:-1].min() > 10.0
 
 
-def test_curves_of_near_corners_share_their_segment() -> None:
+def test_curves_of_two_near_corners_divide_the_segment_between_them() -> None:
     shapes = [line((0, 0), (100, 0), (100, 12), (200, 12))]
     assert round_corners(shapes, [3.2], [range(1)]) == [0]
     assert radii(shapes[0])[1:-1].min() == pytest.approx(6.0, rel=0.05)
@@ -98,7 +98,7 @@ def test_curves_of_near_corners_share_their_segment() -> None:
 
 @pytest.mark.parametrize("lanes", [1, 2])
 @pytest.mark.parametrize("turn_deg", [60.0, 90.0, 110.0, 135.0])
-def test_cars_take_the_corner_without_a_collision(
+def test_cars_drive_around_a_corner_without_a_collision(
     tmp_path: Path, turn_deg: float, lanes: int
 ) -> None:
     path = bent_street(tmp_path, [turn_deg], lanes=lanes)
@@ -107,9 +107,7 @@ def test_cars_take_the_corner_without_a_collision(
     assert found["success"].mean == 1.0
 
 
-def test_rounded_lanes_are_reported_by_the_world(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_rounded_lanes_are_reported(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     path = bent_street(tmp_path, [90.0])
     (note,) = read_network(path).notes
     assert note.startswith("rounded the corners of 2 lanes")
@@ -119,7 +117,7 @@ def test_rounded_lanes_are_reported_by_the_world(
     assert note in caplog.text
 
 
-def test_corners_without_room_are_defects(tmp_path: Path) -> None:
+def test_a_corner_that_is_too_tight_for_a_car_is_a_defect(tmp_path: Path) -> None:
     path = bent_street(tmp_path, [90.0, 90.0], [300.0, 9.0, 300.0])
     network = read_network(path)
     found = [one for one in find_defects(network, path) if one.kind == "corner too tight for a car"]

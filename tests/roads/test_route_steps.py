@@ -16,11 +16,11 @@ from cavmarl.roads.sumo_net.reader import read_network
 from tests.naive import routes as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
-FIRST_STEP = 5  # other routes precede them in the table
+FIRST_STEP = 5  # the table begins with steps of other routes
 
 
 def following(roads: RoadNetwork, edge: int) -> list[int]:
-    """Return the edges to which some lane of an edge leads, by rising row."""
+    """Return the rows of the edges to which the lanes of an edge lead, in order."""
     found = set()
     for lane in naive.lanes_of(roads, edge):
         row = roads.lanes[lane]
@@ -31,7 +31,7 @@ def following(roads: RoadNetwork, edge: int) -> list[int]:
 
 @st.composite
 def routes(draw: st.DrawFn, name: str) -> tuple[str, list[int]]:
-    """Draw a walk over the edges of an environment; on a ring, it repeats edges."""
+    """Draw a route of connected edges; on a ring, edges can repeat."""
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"]).tolist()
     edges = [draw(st.sampled_from(outside))]
@@ -46,7 +46,7 @@ def routes(draw: st.DrawFn, name: str) -> tuple[str, list[int]]:
 def planned(
     roads: RoadNetwork, edges: list[int], permission: int = CARS
 ) -> tuple[NDArray[np.void], NDArray[np.float64], list[int]]:
-    """Return steps, costs, and the route on each edge."""
+    """Return steps, their costs, and per edge the offset from a lane to its step."""
     number = int(roads.edges["num_lanes"][edges].sum())
     steps, cost = np.zeros(FIRST_STEP + number, PLAN), np.full(FIRST_STEP + number, -1.0)
     row = np.array(edges, np.int32)
@@ -100,7 +100,7 @@ def test_the_steps_of_a_route_take_the_least_time_along_its_edges(
     check_route(network(name), edges, CARS)
 
 
-def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(shared_maps: Path) -> None:
+def test_routes_do_not_use_lanes_that_forbid_the_vehicle_class(shared_maps: Path) -> None:
     roads = read_network(shared_maps / "net" / "bologna_acosta" / "acosta_buslanes.net.xml")
     forbidden = np.flatnonzero(~roads.lanes["internal"] & (roads.lanes["permissions"] & CARS == 0))
     edges = np.unique(roads.lanes["edge"][forbidden]).tolist()
@@ -112,7 +112,7 @@ def test_lanes_that_the_class_may_not_use_are_no_part_of_a_route(shared_maps: Pa
 
 
 def walk(roads: RoadNetwork, steps: NDArray[np.void], lane: int, way_: int) -> list[int]:
-    """Return the lanes along which `next_step` leads, with lane changes."""
+    """Return the lanes that a vehicle visits along the steps, with lane changes."""
     travel, lanes = travel_by(steps), [lane]
     for _ in range(10_000):
         here = roads.lanes[lane]
@@ -126,7 +126,7 @@ def walk(roads: RoadNetwork, steps: NDArray[np.void], lane: int, way_: int) -> l
             return lanes
         assert (link >= 0) == (not here["internal"])
         lanes.append(lane)
-    raise AssertionError("no end")
+    raise AssertionError("the steps have no end")
 
 
 @settings(max_examples=30)
@@ -141,13 +141,13 @@ def test_the_steps_lead_over_the_edges_in_order(case: tuple[str, list[int]]) -> 
         outside = [k for k in walk(roads, steps, lane, ways[0]) if not roads.lanes[k]["internal"]]
         driven = [int(roads.lanes[k]["edge"]) for k in outside]
         visited = [e for k, e in enumerate(driven) if k == 0 or e != driven[k - 1]]
-        # An edge that leads to itself again is visited twice in a row.
+        # Repeats are dropped, because lane changes repeat an edge too.
         assert visited == [e for k, e in enumerate(edges) if k == 0 or e != edges[k - 1]]
 
 
 @settings(max_examples=30)
 @given(st.sampled_from(NAMES).flatmap(routes), st.floats(0.0, 1.0))
-def test_the_remaining_length_is_the_sum_of_the_steps_ahead(
+def test_the_remaining_length_is_the_sum_of_the_lanes_ahead(
     case: tuple[str, list[int]], share: float
 ) -> None:
     name, edges = case
@@ -163,7 +163,7 @@ def test_the_remaining_length_is_the_sum_of_the_steps_ahead(
             here = roads.lanes[lane]
             if k > 0 and not here["internal"] and roads.lanes[lanes[k - 1]]["internal"]:
                 n += 1
-            # Inside a junction, the way already belongs to the edge beyond.
+            # Inside a junction, the offset is already that of the next edge.
             way_ = ways[min(n + int(here["internal"]), len(ways) - 1)]
             s = share * float(here["length_m"])
             row = on_lane(roads, lane, s, travel, way=way_)
@@ -186,7 +186,7 @@ def changes_lane(roads: RoadNetwork, pair: list[int]) -> bool:
 
 
 def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
-    """Return the time at the speed limits; an edge with lane changes counts by its last lane."""
+    """Return the time at the speed limits; on each edge, only the last lane counts."""
     total = 0.0
     for k, lane in enumerate(lanes):
         if k + 1 == len(lanes) or not changes_lane(roads, lanes[k : k + 2]):
@@ -195,7 +195,7 @@ def _time_s(roads: RoadNetwork, lanes: list[int]) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_the_edges_of_a_way_are_the_edges_of_its_lanes(name: str) -> None:
+def test_trace_edges_returns_the_edges_of_the_fastest_way(name: str) -> None:
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"]).tolist()
     room = np.zeros(len(outside) + 1, np.int32)
@@ -211,7 +211,7 @@ def test_the_edges_of_a_way_are_the_edges_of_its_lanes(name: str) -> None:
             if not ways:
                 assert number == 0
                 continue
-            # First the fastest path, then the path with the fewest lane changes at its start.
+            # Of equally fast ways, the one with the fewest lane changes at its start is best.
             best = min(ways, key=lambda lanes: (_time_s(roads, lanes), plan[lanes[0]]["changes"]))
             driven = [
                 int(roads.lanes[lane]["edge"]) for lane in best if not roads.lanes[lane]["internal"]

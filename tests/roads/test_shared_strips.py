@@ -60,7 +60,7 @@ def least_apart(network: RoadNetwork) -> float:
     return float(min(found))
 
 
-def test_lanes_on_the_same_strip_move_to_the_side_on_which_they_are_driven() -> None:
+def test_in_right_hand_traffic_lanes_on_the_same_strip_move_to_the_right() -> None:
     shapes = [line((0, 0), (100, 0)), line((100, 0.4), (0, 0.4))]
     (strip,) = strips_of(*shapes)
     assert strip.lanes == ((0, 1),)
@@ -78,7 +78,7 @@ def test_in_left_hand_traffic_lanes_on_the_same_strip_move_to_the_left() -> None
     np.testing.assert_allclose([shape[0, 1] for shape in shapes], [1.6, -1.6])
 
 
-def test_parallels_of_a_bent_lane_keep_their_distance() -> None:
+def test_bent_lanes_move_apart_by_a_constant_distance() -> None:
     drawn = line((0, 0), (100, 0), (100, 100))
     shapes = [drawn, drawn[::-1].copy()]
     move_apart(shapes, strips_of(*shapes), [], left_hand=False)
@@ -89,12 +89,12 @@ def test_parallels_of_a_bent_lane_keep_their_distance() -> None:
 @pytest.mark.parametrize(
     "other",
     [
-        line((100, 3.2), (0, 3.2)),  # an edge beside it
-        line((100, 0, 5.0), (0, 0, 5.0)),  # an edge on a bridge above it
-        line((100, 0), (50, 40), (0, 0)),  # an edge that touches only its ends
+        line((100, 3.2), (0, 3.2)),  # beside the first lane
+        line((100, 0, 5.0), (0, 0, 5.0)),  # on a bridge above
+        line((100, 0), (50, 40), (0, 0)),  # touches only the ends
     ],
 )
-def test_other_streets_do_not_change(other: Shape) -> None:
+def test_lanes_that_do_not_overlap_share_no_strip(other: Shape) -> None:
     assert strips_of(line((0, 0), (100, 0)), other) == []
 
 
@@ -116,7 +116,7 @@ def test_cars_drive_a_street_with_shared_tracks_without_a_collision(tmp_path: Pa
 
 
 @pytest.mark.parametrize("lanes", [1, 2])
-def test_a_street_around_its_centre_line_becomes_two_directions(tmp_path: Path, lanes: int) -> None:
+def test_two_directions_with_one_centre_line_move_apart(tmp_path: Path, lanes: int) -> None:
     path = bent_street(tmp_path, [30.0], lanes=lanes, attributes='spreadType="center"')
     assert least_apart(read_network(path)) > 3.1
     found = evaluate(path, "idm", episodes=4, agents=6, background=0)["idm"]

@@ -1,4 +1,4 @@
-"""Programs of additional files are added to the map's; as in SUMO, the last program is active."""
+"""Signal programs of additional files: as in SUMO, the program that is read last is active."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def additional(tmp_path: Path) -> Callable[..., Path]:
 def states(
     network: RoadNetwork, ticks: Iterable[int], dt: float = 1.0, stands_m: float | None = None
 ) -> list[str]:
-    """Return the shown states at these ticks, with an optional car standing on the main road."""
+    """Return the shown states at these ticks; with `stands_m`, a car stands on the main road."""
     worlds = make_worlds(1, 1, network)
     if stands_m is not None:
         worlds.rows[0, 0] = on_lane(network, network.lane_ids.index("w_1"), stands_m)[0]
@@ -90,13 +90,13 @@ def test_the_program_loaded_last_is_active(
     network = with_programs(plain, [additional()])
     assert network.program_ids == ("0", "night")
     assert states(network, [0, 4, 5, 9, 10]) == ["Grr", "Grr", "rGG", "rGG", "Grr"]
-    assert plain.program_ids == ("0",), "the network given is not changed"
+    assert plain.program_ids == ("0",), "the argument was changed"
     assert network.content_hash != plain.content_hash
     assert network.source_hash != plain.source_hash
     assert with_programs(plain) is plain
 
 
-def test_phases_change_at_their_tick_though_sums_of_ticks_are_not_exact(
+def test_phases_change_at_the_exact_tick_despite_rounding(
     crossing: Callable[..., Path],
 ) -> None:
     durations = ("0.7", "0.4", "1.9")
@@ -134,7 +134,7 @@ def test_a_selected_program_overrides_all_others(
     assert states(with_programs(plain, chosen={"c": "off"}), [0, 50]) == ["Ooo", "Ooo"]
 
 
-def test_a_signal_goes_dark_and_stays_dark(
+def test_a_signal_with_an_outage_goes_dark_and_stays_dark(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     plain = read_network(crossing())
@@ -161,13 +161,13 @@ def test_a_timetable_switches_programs(
 def test_states_beyond_the_links_have_no_effect(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
-    """SUMO warns of unused states."""
+    """SUMO accepts such programs with a warning."""
     longer = additional("", ('state="Grr"', 'state="GrrGG"'), ('state="rGG"', 'state="rGGrr"'))
     network = with_programs(read_network(crossing()), [longer])
     assert states(network, [0, 5, 10]) == ["Grr", "rGG", "Grr"]
 
 
-def test_a_program_may_have_fewer_states_than_another_if_they_suffice(
+def test_a_program_may_have_fewer_states_than_another_but_not_than_links(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     longer = (('state="Grr"', 'state="Grrr"'), ('state="yrr"', 'state="yrrr"'),
@@ -179,7 +179,7 @@ def test_a_program_may_have_fewer_states_than_another_if_they_suffice(
         with_programs(read_network(crossing()), [shorter])
 
 
-def test_a_program_without_a_name_gets_sumos(
+def test_a_program_without_a_name_gets_the_same_name_as_in_sumo(
     crossing: Callable[..., Path], additional: Callable[..., Path]
 ) -> None:
     unnamed = additional("", (' programID="night"', ""))
@@ -221,13 +221,13 @@ def test_broken_programs_are_refused(
         with_programs(read_network(crossing()), [additional(extra, change)])
 
 
-def test_actuated_programs_get_detectors_where_the_green_empties(
+def test_a_detector_of_an_actuated_program_is_2_s_before_the_end_of_the_lane(
     crossing: Callable[..., Path],
 ) -> None:
     text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="3"')
     green = ('duration="30"', 'duration="30" minDur="5" maxDur="50"')
     network = read_network(crossing(text, green))
-    # 2 s at 10 m/s before the end of the 95 m lane: closer than the queue that 5 s of green empty.
+    # 95 m - 2 s * 10 m/s. The queue that can drive off in 5 s of green is longer than 20 m.
     assert network.detectors["s_m"].tolist() == [75.0]
     assert [network.lane_ids[row] for row in network.detectors["lane"]] == ["w_1"]
     assert network.phases["num_detectors"].tolist() == [1, 0, 0]
@@ -236,7 +236,7 @@ def test_actuated_programs_get_detectors_where_the_green_empties(
     assert network.phase_detectors.tolist() == [0]
 
 
-def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
+def test_an_actuated_green_ends_at_its_maximum_duration_to_the_millisecond(
     crossing: Callable[..., Path],
 ) -> None:
     text = ('type="static" programID="0" offset="3"', 'type="actuated" programID="0" offset="0"')
@@ -246,7 +246,7 @@ def test_an_actuated_green_ends_at_its_longest_to_the_millisecond(
     shown = states(network, ticks, 0.001, stands_m=75.0)
     assert ticks[shown.index("yrr")] == 12_500
     assert ticks[states(network, ticks, 0.001).index("yrr")] == 5_000, (
-        "no vehicle prolongs the green"
+        "without a vehicle, the green lasted longer than its minimum"
     )
 
 

@@ -1,4 +1,4 @@
-"""SUMO's configurations: names of options, files and variables as SUMO reads them."""
+"""SUMO's configuration files: options, file names and variables are read as SUMO reads them."""
 
 from __future__ import annotations
 
@@ -43,11 +43,11 @@ def test_every_option_of_sumo_is_known(tmp_path: Path) -> None:
         for name in (option, *synonyms.split())
     }
     assert len(theirs) > 500
-    theirs["osg-view"] = ("osg-view", "false")  # exists only in SUMO with OpenSceneGraph
+    theirs["osg-view"] = ("osg-view", "false")  # only builds with OpenSceneGraph have this option
     assert theirs == {name: (o.name, o.default) for name, o in known_options().items()}
 
 
-def test_an_option_has_any_of_its_names_in_any_section(tmp_path: Path) -> None:
+def test_an_option_may_have_any_of_its_names_in_any_section(tmp_path: Path) -> None:
     path = write(
         tmp_path,
         '<input>\n<net v="a.net.xml"/><r>b.rou.xml</r></input><e value="60"/><scale value=""/>',
@@ -90,7 +90,7 @@ def test_names_of_files_are_read_as_sumo_reads_them(
         files_of(path, read_options(path, DemandError), ["additional-files"], DemandError)
 
 
-def test_a_configuration_is_known_by_its_root(tmp_path: Path) -> None:
+def test_a_configuration_is_recognized_by_its_root_element(tmp_path: Path) -> None:
     assert is_sumo_config(write(tmp_path, "", "plain.xml"))
     assert is_sumo_config(write(tmp_path, "", "plain.txt", "sumoConfiguration"))
     assert is_sumo_config(tmp_path / "gone.sumocfg")
@@ -103,7 +103,7 @@ def test_a_configuration_is_known_by_its_root(tmp_path: Path) -> None:
     assert root_tag(long) == "configuration"
 
 
-def test_a_configuration_stands_for_its_map(tmp_path: Path) -> None:
+def test_a_configuration_is_accepted_in_place_of_its_map(tmp_path: Path) -> None:
     (tmp_path / "a.net.xml").write_text("<net/>", encoding="utf-8")
     path = write(tmp_path, '<n value="a.net.xml"/>')
     assert map_of_config(path) == map_file(path) == tmp_path / "a.net.xml"
@@ -113,12 +113,12 @@ def test_a_configuration_stands_for_its_map(tmp_path: Path) -> None:
         map_of_config(write(tmp_path, '<n value="gone.net.xml"/>'))
 
 
-def test_other_files_are_no_configurations(tmp_path: Path) -> None:
+def test_other_files_are_refused_as_configurations(tmp_path: Path) -> None:
     with pytest.raises(DemandError, match=r"<routes> is not the root of a SUMO configuration"):
         read_options(write(tmp_path, "", root="routes"), DemandError)
 
 
-def test_defaults_are_compared_as_values() -> None:
+def test_values_are_compared_with_defaults_by_number_or_truth() -> None:
     known = known_options()
     assert not differs_from_default(known["scale"], "1.0")
     assert differs_from_default(known["scale"], "2")

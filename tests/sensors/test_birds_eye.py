@@ -56,7 +56,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
         assert seen(rows, row=row).tobytes() == seen(rows[order], row=place).tobytes()
 
 
-def test_in_the_grid_ahead_is_up_and_left_is_left() -> None:
+def test_the_top_of_the_grid_is_ahead_and_its_left_side_is_left() -> None:
     rows = vehicles([(0.0, 0.0, 0.5), (8 * math.cos(0.5), 8 * math.sin(0.5), 0.5)])
     rows = np.concatenate([rows, vehicles([(-9 * math.sin(0.5), 9 * math.cos(0.5), 0.5)], id=2)])
     rows["vtype"][2] = 1
@@ -67,7 +67,7 @@ def test_in_the_grid_ahead_is_up_and_left_is_left() -> None:
     assert walkers[:, 1].max() < SIZE // 2
 
 
-def test_lanes_have_lines_and_bodies_cover_them() -> None:
+def test_the_grid_shows_lane_lines_roads_and_bodies_on_top() -> None:
     strip = np.array([[(-20.0, -2.2), (-20.0, 2.2), (20.0, 2.2), (20.0, -2.2)]])
     out = seen(vehicles([(0.0, 0.0, 0.0), (6.0, 2.0, 0.0)]), strip)
     column = int((HALF_M - 2.2) / CELL_M)

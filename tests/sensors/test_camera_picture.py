@@ -41,8 +41,8 @@ def shoot(
     strips: Floats | None = None,
     row: int = 0,
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8], PixelRows]:
-    """Return depths and classes of a picture."""
-    reach_m = camera_reach_m(camera, *size) + 1.0  # a pitch moves a camera above the ground
+    """Return the depths, the classes and the pixel rows of a picture."""
+    reach_m = camera_reach_m(camera, *size) + 1.0  # a pitched vehicle moves its camera by up to 1 m
     panorama, counts = look_around(rows, row, backdrop(walls, strips), reach_m)
     picture = make_picture(*size, panorama)
     num = find_faces(camera, panorama, counts, picture)
@@ -55,10 +55,10 @@ def shoot(
 
 
 @given(crowds(most=6), wall_sets(), mounts(), st.integers(1, HEIGHT))
-def test_rows_do_not_depend_on_bands(
+def test_pixel_rows_do_not_depend_on_the_bands_in_which_they_are_rendered(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, band: int
 ) -> None:
-    """Pictures that exceed the cache are rendered in bands; a worker may render some of them."""
+    """Large pictures are rendered in bands of rows, and a worker may render only some bands."""
     camera = make_camera(matrix, WIDTH, RIGHT, 60.0)
     depths, classes, _ = shoot(rows, camera, walls=walls)
     reach_m = camera_reach_m(camera, WIDTH, HEIGHT) + 1.0
@@ -81,7 +81,7 @@ def forward(range_m: float = 60.0, width: int = WIDTH, z_m: float = 1.0) -> Came
 
 
 def stands_in(wall: np.void, row: np.void, mounted: Floats) -> bool:
-    """Return whether a camera is in the plane of a wall or on its top, so that it sees no side."""
+    """Return whether a camera is inside or on top of a wall, where it sees no side of the wall."""
     turned = np.exp(1j * row["heading"]) * complex(mounted[0], mounted[1])
     camera = complex(row["x"], row["y"]) + turned
     one, other = complex(wall["ax"], wall["ay"]), complex(wall["bx"], wall["by"])
@@ -110,7 +110,7 @@ def test_pixels_equal_twin(
         ray = naive.pixel_ray(matrix[:, :3], WIDTH, HEIGHT, fov, j, i)
         exact = naive.trace(rows, 0, walls, start, ray, range_m, 0.0)
         if exact.distance < 0.02:
-            continue  # the camera is inside a body, where it sees no face, or touches a body
+            continue  # a camera inside a body sees no face of it
         is_equal = depths[j, i] == pytest.approx(exact.distance, rel=1e-5, abs=1e-4)
         if is_equal and classes[j, i] == CLASS_OF[exact.what[0]]:
             continue
@@ -134,19 +134,19 @@ def test_the_order_of_rows_does_not_matter(
         assert once[1].tobytes() == again[1].tobytes()
 
 
-def test_a_wall_at_ten_metres_is_ten_metres_deep_in_every_pixel() -> None:
+def test_a_wall_ten_metres_ahead_has_the_depth_10_m_in_every_pixel() -> None:
     wall = np.array([(10.0, -40.0, 10.0, 40.0, 80.0, 0)], WALL)
     depths, classes, _ = shoot(vehicles([(0.0, 0.0, 0.0)]), forward(z_m=1.5), walls=wall)
     above = HEIGHT // 2
     assert (depths[:above] == 10.0).all()
     assert (classes[:above] == BUILDING).all()
     assert (classes[-1] == GROUND).all()
-    # Depth of the ground: height divided by the slope of the lowest row.
+    # The depth of the ground is the height of the camera divided by the slope of the lowest row.
     slope = (HEIGHT - 0.5 - 0.5 * HEIGHT) / (0.5 * WIDTH)
     assert depths[-1] == pytest.approx(1.5 / slope)
 
 
-def test_a_long_box_at_ten_metres_is_ten_metres_deep() -> None:
+def test_a_long_body_ten_metres_ahead_has_the_depth_10_m() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (11.0, 0.0, RIGHT)], length=60.0, height=4.0)
     depths, classes, _ = shoot(rows, forward())
     middle = HEIGHT // 2 - 1
@@ -165,7 +165,7 @@ def test_the_nearer_body_hides_the_other() -> None:
     assert (classes[middle] == BUILDING).all()
 
 
-def test_left_is_left_and_up_is_up() -> None:
+def test_the_left_side_of_a_picture_is_left_and_its_top_is_up() -> None:
     left = vehicles([(0.0, 0.0, 0.0), (10.0, 6.0, 0.0)])
     _, classes, _ = shoot(left, forward())
     seen = np.argwhere(classes == CAR)
@@ -174,10 +174,10 @@ def test_left_is_left_and_up_is_up() -> None:
     assert (classes[-1] == GROUND).all()
 
 
-def test_a_rolled_camera_sees_the_horizon_upright() -> None:
+def test_a_camera_rolled_by_90_degrees_sees_the_horizon_vertical() -> None:
     camera = make_camera(mount((0.0, 0.0, 1.0), (0.0, 0.0, RIGHT)), WIDTH, RIGHT, 60.0)
     _, classes, _ = shoot(vehicles([(0.0, 0.0, 0.0)]), camera)
-    # The left side of the camera is up, so the sky is to the left.
+    # The left side of the camera points up, so the sky is on the left.
     assert (classes[:, 0] == NOTHING).all()
     assert (classes[:, -1] == GROUND).all()
 
@@ -192,7 +192,7 @@ def test_roads_lie_on_the_ground_and_bodies_stand_on_them() -> None:
 
 
 def test_neighbouring_faces_leave_no_gap() -> None:
-    """A rotated prism shows no ground or sky inside of its outline."""
+    """No ground or sky is visible inside the outline of a rotated body."""
     for heading in np.linspace(0.0, math.pi, 25):
         rows = vehicles([(0.0, 0.0, 0.0), (8.0, 0.3, heading)])
         _, classes, _ = shoot(rows, forward(width=64, z_m=1.6), (64, 40))

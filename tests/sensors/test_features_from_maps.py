@@ -1,8 +1,12 @@
-"""Features of observations equal those computed from the map file, and from rays and rectangles.
+"""Features of observations equal values computed from the map file, and from rays and rectangles.
 
-Checked are of `ego` the offset, direction and limit; of `way` the places, widths, limits, stop
-lines, colours, times of change and stop signs; of `lidar` all distances; and of `neighbors` the
-positions. `conflicts` and `lanes` are compared with plain twins in other files of this folder.
+The tests check
+
+- offset, direction and speed limit of `ego`;
+- places, widths, speed limits, stop lines, colours, times of change and stop signs of `way`;
+- all distances of `lidar`, and positions of `neighbors`.
+
+Other files of this folder compare `conflicts` and `lanes` with their twins.
 """
 
 from __future__ import annotations
@@ -41,7 +45,7 @@ Seen = dict[tuple[str, str], float]
 
 
 def observed(path: Path, steps: int) -> Iterator[tuple[Seen, np.void, NDArray[np.void], Any]]:
-    """Yield each agent's features by sensor and name, its row, all rows, and the environment."""
+    """Drive; yield an agent's features by (sensor, name), its row, all rows and the environment."""
     vec = cavmarl.make_vec(path, agents=6, background=40, overrides=SETTINGS)
     names = feature_names(vec.config.sensors)
     observations, infos = vec.reset(seed=4)
@@ -64,7 +68,7 @@ def turned(angle: float) -> float:
 
 
 @pytest.mark.parametrize("kind", ["traffic_light", "allway_stop", "priority_stop"])
-def test_path_and_stop_lines_are_those_of_the_file(tmp_path: Path, kind: str) -> None:
+def test_paths_and_stop_lines_equal_those_of_the_map_file(tmp_path: Path, kind: str) -> None:
     path = netgenerate(tmp_path / "grid.net.xml", *GRID, kind)
     net = net_features.read_net(path)
     told = {"stop": 0, "red": 0, "green": 0, "bend": 0}
@@ -90,7 +94,7 @@ def test_path_and_stop_lines_are_those_of_the_file(tmp_path: Path, kind: str) ->
                 if j not in poses and (distance <= end or k + 1 == len(way)):
                     poses[j] = (*lane.pose(min(distance, end) - start)[:2], lane)
             after = way[k + 1][1] if k + 1 < len(way) else ""
-            # After a lane change, the next lane is reached from another lane of the same edge.
+            # Search by the next lane only. After a lane change, the link begins on another lane.
             before = [one for one in net.states if one[1] == after]
             if not name.startswith(":") and before and end <= 100.0:
                 lines.append((end, *net.states[before[0]]))
@@ -122,7 +126,9 @@ def test_path_and_stop_lines_are_those_of_the_file(tmp_path: Path, kind: str) ->
     assert min(told["red"], told["green"]) > 10 if kind == "traffic_light" else told["stop"] > 10
 
 
-def test_rays_end_at_rectangles_and_neighbours_are_where_they_are(tmp_path: Path) -> None:
+def test_rays_end_at_the_rectangles_of_vehicles_and_neighbours_have_their_positions(
+    tmp_path: Path,
+) -> None:
     path = netgenerate(tmp_path / "grid.net.xml", *GRID, "traffic_light")
     hits = 0
     for seen, row, rows, _ in observed(path, 60):

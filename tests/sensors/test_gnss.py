@@ -1,4 +1,4 @@
-"""GNSS: from the map to the earth and back, compared with PROJ and with the vehicle's position."""
+"""GNSS positions equal those of PROJ and of the vehicle; errors of antennas are independent."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ def _metres_apart(one: NDArray[np.float64], other: NDArray[np.float64]) -> float
 
 
 @pytest.mark.parametrize("origin", [(48.0, 11.0, 0.0), (-33.9, 151.2, 58.0), (69.6, -18.9, 3.0)])
-def test_a_tangent_plane_equals_projs(origin: tuple[float, float, float]) -> None:
+def test_a_tangent_plane_equals_the_projection_of_proj(origin: tuple[float, float, float]) -> None:
     plane = TangentPlane(*origin)
     points = np.random.default_rng(0).uniform(-5000.0, 5000.0, (50, 3)) * [1.0, 1.0, 0.01]
     lat, lon, height = origin
@@ -45,7 +45,7 @@ def test_a_tangent_plane_equals_projs(origin: tuple[float, float, float]) -> Non
 def test_the_projection_of_a_map_is_used(shared_maps: Path) -> None:
     network = read_network(shared_maps / ACOSTA)
     assert load_network(shared_maps / ACOSTA).geo == network.geo
-    assert load_network(shared_maps / ACOSTA).geo == network.geo  # also from the cache
+    assert load_network(shared_maps / ACOSTA).geo == network.geo  # the second call reads the cache
     geodesy = geodesy_of(network, GnssConfig(rate_hz=1.0, origin_height_m=54.0))
     low, high = np.array(network.extent_m).reshape(2, 2)
     points = np.random.default_rng(1).uniform([*low, 0.0], [*high, 20.0], (200, 3))
@@ -54,7 +54,7 @@ def test_the_projection_of_a_map_is_used(shared_maps: Path) -> None:
     wanted = np.array([net.convertXY2LonLat(x, y)[::-1] for x, y, _ in points])
     assert _metres_apart(found, np.column_stack([wanted, points[:, 2] + 54.0])) < 0.01
     assert np.abs(geodesy.to_map(found) - points).max() < 0.01
-    assert 44.4 < found[0, 0] < 44.6  # Bologna
+    assert 44.4 < found[0, 0] < 44.6  # latitude and longitude of Bologna
     assert 11.2 < found[0, 1] < 11.4
 
 
@@ -93,8 +93,12 @@ def test_errors_of_an_antenna_differ_between_ticks_and_vehicles() -> None:
     found = np.stack(errors)  # (ticks, agents, axes)
     np.testing.assert_allclose(found[..., 2], 0.0, atol=1e-6)
     for axis in range(2):
-        assert found[..., axis].std(axis=0).mean() == pytest.approx(2.0, rel=0.2), "over ticks"
-        assert found[..., axis].std(axis=1).mean() == pytest.approx(2.0, rel=0.2), "over vehicles"
+        assert found[..., axis].std(axis=0).mean() == pytest.approx(2.0, rel=0.2), (
+            "errors over ticks"
+        )
+        assert found[..., axis].std(axis=1).mean() == pytest.approx(2.0, rel=0.2), (
+            "errors over vehicles"
+        )
 
 
 def test_an_offset_that_is_not_a_number_is_refused(tmp_path: Path, shared_maps: Path) -> None:

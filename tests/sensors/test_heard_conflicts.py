@@ -1,4 +1,4 @@
-"""`sensors.conflicts.heard`: vehicles behind houses are known only from messages."""
+"""`sensors.conflicts.heard`: vehicles behind houses are known from messages only."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ def part(vec: Any) -> slice:
 
 
 def reported(vec: Any, me: np.void) -> dict[int, tuple[np.void, float]]:
-    """Return the vehicles in an agent's inbox: extrapolated rows, and ages of the reports in s."""
+    """Return by id the vehicles in an agent's inbox: (extrapolated row, age of the report in s)."""
     found = {}
     for report in vec.simulation.messages.mail.objects[0, me["agent"]]:
         if report["sender"] < 0:
@@ -61,9 +61,9 @@ def reported(vec: Any, me: np.void) -> dict[int, tuple[np.void, float]]:
 
 
 def by_place(numbers: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Sort rows by position, since rounding decides the order of equally critical vehicles."""
+    """Sort rows by position, because rounding decides the order of equally critical vehicles."""
     rows = numbers.reshape(COUNT, SIZE)
-    assert bool(rows[-1, 0] == 0.0), "more vehicles are known than observed"
+    assert bool(rows[-1, 0] == 0.0), "more vehicles are known than fit into the observation"
     return rows[np.lexsort(np.round(rows[:, 2:4], 3).T)]
 
 
@@ -71,7 +71,7 @@ def hidden_from(rows: NDArray[np.void], me: np.void) -> list[int]:
     return [int(row["id"]) for row in rows if blocked(me["x"], me["y"], float(row["x"]), row["y"])]
 
 
-def test_seen_and_heard_vehicles_count_at_their_reported_position() -> None:
+def test_visible_vehicles_and_reported_positions_of_hidden_ones_equal_twin() -> None:
     vec = made({"v2x.channel.loss": 0.3})
     simulation = vec.worlds.simulation
     heard = old = 0
@@ -110,7 +110,7 @@ def test_without_messages_only_visible_vehicles_are_known() -> None:
     sight.close()
 
 
-def test_a_hidden_vehicle_has_no_effect_until_its_message_arrives() -> None:
+def test_the_true_state_of_a_hidden_vehicle_has_no_effect() -> None:
     vec = made()
     for _ in driven(vec, 60):
         pass
@@ -146,7 +146,7 @@ def test_a_hidden_vehicle_has_no_effect_until_its_message_arrives() -> None:
 
 
 @pytest.mark.parametrize("split", [{"zones": 2}, {"zones": 4}, {"zones": 2, "workers": 2}])
-def test_zones_and_workers_change_nothing(split: dict[str, int]) -> None:
+def test_zones_and_workers_change_no_result(split: dict[str, int]) -> None:
     lossy = {"v2x.channel.loss": 0.3}
     whole, divided = made(lossy), made(lossy, **split)
     for one, other in zip(driven(whole, 40), driven(divided, 40), strict=True):

@@ -11,7 +11,7 @@ import cavmarl
 from cavmarl.engine.spaces import observation_parts
 
 COUNT, RANGE_M = 6, 80.0
-# blind_junction: along the main road, and along the side road.
+# Extents of the houses of blind_junction in m, in x and in y.
 HOUSES_X, HOUSES_Y = [(-60.0, -5.0), (5.0, 60.0)], [(-60.0, -4.0), (4.0, 60.0)]
 
 
@@ -33,7 +33,7 @@ def seen_from(through_walls: bool, steps: int, **keywords: Any) -> Any:
 
 
 def blocked(x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Return whether the line of sight runs through a house, by sampling the line."""
+    """Return whether one of 401 points of the line of sight is inside a house."""
     share = np.linspace(0.0, 1.0, 401)
     px, py = x + share * (to_x - x), y + share * (to_y - y)
     inside = np.zeros(len(share), dtype=bool)
@@ -76,7 +76,7 @@ def test_vehicles_behind_a_house_are_hidden() -> None:
     assert hidden > 0
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     whole = [seen.tobytes() for seen, _ in seen_from(False, 40)]
     assert whole == [seen.tobytes() for seen, _ in seen_from(False, 40, zones=2)]
 

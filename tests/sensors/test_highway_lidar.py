@@ -1,4 +1,4 @@
-"""The cells of the lidar equal highway-env's, on its roads and with bodies at any position."""
+"""The cells of `lidar_observation` equal those of highway-env, for bodies at any position."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tests.support.builders import vehicles
 
 
 def cells(rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
-    """Return the array (cells, 2) of cavmarl for row i."""
+    """Return the cells (cells, 2) that cavmarl computes for row i."""
     settings = SensorsConfig(lidar_observation=LidarObservationConfig(**config))
     sensor = lidar_observation.settings(settings, 0)
     out = np.zeros(np.prod(lidar_observation.shape(settings), dtype=int), np.float32)
@@ -27,9 +27,9 @@ def cells(rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
 @pytest.mark.parametrize("name", ["highway-v0", "merge-v0", "intersection-v1"])
 @pytest.mark.parametrize("num_cells", [4, 16, 64])
 @pytest.mark.parametrize("normalize", [True, False])
-def test_the_cells_equal_highway_envs(name: str, num_cells: int, normalize: bool) -> None:
+def test_the_cells_equal_those_of_highway_env(name: str, num_cells: int, normalize: bool) -> None:
     env = highway.make(name, 1)
-    env.road.objects.clear()  # an obstacle at the ramp's end in merge-v0; cavmarl has no obstacles
+    env.road.objects.clear()  # merge-v0 has an obstacle, and cavmarl has none
     config = {"cells": num_cells, "normalize": normalize}
     theirs = highway.observation(env, "LidarObservation", **config)
     ours = cells(highway.vehicles(env), highway.own_row(env), **config)
@@ -64,6 +64,6 @@ def test_the_order_of_rows_does_not_matter() -> None:
         np.testing.assert_array_equal(shuffled, cells(rows, row, cells=16))
 
 
-def test_other_levels_are_not_seen() -> None:
+def test_vehicles_on_other_levels_are_not_seen() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0)], z=[0.0, 6.0])
     assert np.all(cells(rows, 0, cells=8) == 1.0)

@@ -1,4 +1,4 @@
-"""Readings of lidars, radars, cameras and grids before a wall."""
+"""Lidars, radars, cameras and grids in front of a wall, and their settings."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _alone(**overrides: Any) -> CavVectorEnv:
 
 @pytest.fixture
 def before_a_wall(tmp_path: Path) -> CavVectorEnv:
-    """Return a world with one vehicle, ten metres in front of the wall of a hall."""
+    """Return a world with one vehicle whose sensors are 10 m in front of the wall of a hall."""
     row = _alone().simulation.vehicles()[0]
     heading, away = float(row["heading"]), FRONT["x_m"] + DISTANCE_M
     corners = [
@@ -68,7 +68,7 @@ def before_a_wall(tmp_path: Path) -> CavVectorEnv:
     return _alone(**{"map.buildings": str(path)})
 
 
-def test_a_wall_at_ten_metres_reads_ten_metres(before_a_wall: CavVectorEnv) -> None:
+def test_all_sensors_measure_10_m_to_a_wall_ten_metres_ahead(before_a_wall: CavVectorEnv) -> None:
     data: dict[str, NDArray[Any]] = {
         name: frames.data[0, 0, -1] for name, frames in before_a_wall.frames().items()
     }
@@ -85,12 +85,14 @@ def test_a_wall_at_ten_metres_reads_ten_metres(before_a_wall: CavVectorEnv) -> N
     assert (data["classes"][upper] == BUILDING).all()
     assert len(np.unique(data["colours"][upper].reshape(-1, 3), axis=0)) == 1
     middle = data["grid"][:, data["grid"].shape[1] // 2]
-    first = np.flatnonzero(middle == BUILDING).max()  # the lowest row is the nearest
+    first = np.flatnonzero(
+        middle == BUILDING
+    ).max()  # the lowest row of the grid is the nearest one
     assert 20.0 - 0.25 * (first + 1) == pytest.approx(FRONT["x_m"] + DISTANCE_M, abs=0.25)
     assert set(middle[first + 1 :].tolist()) <= {ROAD, LANE_LINE}
 
 
-def test_rays_of_a_fan_are_spread_evenly() -> None:
+def test_rays_of_a_lidar_are_spread_evenly() -> None:
     fan = lidar_fan(LidarRigConfig(rate_hz=5, rays=5, fov_deg=90.0))
     angles = np.degrees(np.arctan2(fan.rays[:, 0, 1], fan.rays[:, 0, 0]))
     assert angles == pytest.approx([-45.0, -22.5, 0.0, 22.5, 45.0])
@@ -128,7 +130,7 @@ def test_invalid_camera_settings_are_refused(sensor: dict[str, Any], words: str)
 
 
 def _crossing(occluded: bool) -> tuple[set[int], NDArray[np.void]]:
-    """Return the classes that a driver sees before a pedestrian starts, and the rows."""
+    """Return the classes that an agent's camera sees before a pedestrian starts, and all rows."""
     rig = {"eyes": {"type": "semantic_camera", "rate_hz": 5, "width": 640, "height": 90, **FRONT}}
     scenario = {"scenario.name": "pedestrian_crossing", "scenario.params": {"occluded": occluded}}
     vec = make_vec("grid4x4", agents=1, background=0, overrides={"rig": rig, **scenario})
@@ -136,7 +138,7 @@ def _crossing(occluded: bool) -> tuple[set[int], NDArray[np.void]]:
     return set(vec.frames()["eyes"].data[0, 0, -1].ravel().tolist()), vec.simulation.vehicles()
 
 
-def test_a_pedestrian_is_seen_and_hidden_by_a_van() -> None:
+def test_a_camera_sees_a_pedestrian_unless_a_van_hides_the_pedestrian() -> None:
     seen, rows = _crossing(occluded=False)
     assert len(rows) == 2
     assert PEDESTRIAN in seen

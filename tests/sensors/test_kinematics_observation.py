@@ -1,4 +1,4 @@
-"""The table of vehicles equals highway-env's, on its own roads."""
+"""The table of `kinematics` equals that of highway-env on roads of highway-env."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.support.traffic import network
 def table(
     env: Any, rows: NDArray[np.void], i: int, ranges: dict[str, Any], **config: Any
 ) -> NDArray[np.float32]:
-    """Return the table (V, F) of cavmarl for row i."""
+    """Return the table (V, F) that cavmarl computes for row i."""
     settings = SensorsConfig(kinematics=KinematicsConfig(**config))
     sensor = kinematics.settings(settings, 0, network("ring"), highway.destinations(env))
     if ranges and config.get("normalize", True):
@@ -31,13 +31,13 @@ def table(
 
 
 def road_ranges(env: Any) -> dict[str, Any]:
-    """Return highway-env's default ranges on the road of its vehicle."""
+    """Return the default ranges of highway-env on the road of its own vehicle."""
     y = 4.0 * len(env.road.network.all_side_lanes(env.vehicle.lane_index))
     return {"x": (-200, 200), "y": (-y, y), "vx": (-80, 80), "vy": (-80, 80)}
 
 
-# Curved lanes of cavmarl are polylines of `highway.SAMPLES` points: a quarter turn has steps of
-# 0.025.
+# Accepted differences. Curved lanes of cavmarl are polylines of `highway.SAMPLES` points, so the
+# heading of a quarter turn has steps of 0.025 rad.
 OFFSETS = {"long_off": 0.1, "lat_off": 0.02, "ang_off": 0.0125}
 
 CONFIGS: dict[str, dict[str, Any]] = {
@@ -56,14 +56,14 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 @cache
 def standing(name: str, seed: int) -> Any:
-    """Return an environment of highway-env that tests do not step."""
+    """Return an environment of highway-env, which the tests must not step."""
     return highway.make(name, seed)
 
 
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", ["highway-v0", "merge-v0", "two-way-v0", "intersection-v1"])
 @pytest.mark.parametrize("case", CONFIGS)
-def test_the_table_equals_highway_envs(name: str, seed: int, case: str) -> None:
+def test_the_table_equals_that_of_highway_env(name: str, seed: int, case: str) -> None:
     env = standing(name, seed)
     config = {"vehicles_count": 5, "features": KinematicsConfig.features, **CONFIGS[case]}
     theirs = highway.observation(
@@ -80,7 +80,7 @@ def test_the_table_equals_highway_envs(name: str, seed: int, case: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_shuffled_rows_equal_highway_envs_in_another_order(seed: int) -> None:
+def test_shuffled_rows_equal_those_of_highway_env_in_another_order(seed: int) -> None:
     env = standing("highway-v0", seed)
     config = {"vehicles_count": 8, "order": "shuffled"}
     theirs = highway.observation(env, "Kinematics", **config)
@@ -115,6 +115,6 @@ def test_a_table_of_one_row_describes_the_own_vehicle() -> None:
     )
 
 
-def test_the_default_range_of_y_is_the_widest_road() -> None:
+def test_the_default_range_of_y_is_the_width_of_the_widest_road() -> None:
     assert default_ranges(network("merge"))["y"] == (-12.0, 12.0)
     assert default_ranges(network("ring"))["x"] == (-200.0, 200.0)

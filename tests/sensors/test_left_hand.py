@@ -1,4 +1,4 @@
-"""Left-hand traffic: observations are the mirrored observations of the mirrored world."""
+"""Observations in left-hand traffic are mirror images of those in right-hand traffic."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ EVERY = {
 
 
 def mirror_of(names: list[str]) -> tuple[list[int], NDArray[np.float64]]:
-    """Return for each feature the index in the mirrored world, and the sign."""
+    """Return the index of each feature in the mirrored world, and the factor 1 or -1."""
     sides = str.maketrans({"<": "right_", ">": "left_"})
     other = [name.replace("left_", "<").replace("right_", ">").translate(sides) for name in names]
     stems = [name.rstrip("_0123456789") for name in names]
@@ -70,9 +70,9 @@ def mirror_of(names: list[str]) -> tuple[list[int], NDArray[np.float64]]:
 def both_worlds(
     folder: Path, overrides: dict[str, Any], junctions: str = "traffic_light"
 ) -> tuple[CavVectorEnv, CavVectorEnv]:
-    """Return a world in right-hand traffic, and its mirror image in left-hand traffic.
+    """Return a world in right-hand traffic and its mirror image in left-hand traffic.
 
-    All vehicles are agents, because background vehicles prefer a side for changes of lanes.
+    All vehicles are agents, because background vehicles prefer one side for lane changes.
     """
     plain = netgenerate(folder / "right.net.xml", *GRID[:-1], junctions)
     mirror = mirror_net(plain, folder / "left.net.xml")
@@ -84,7 +84,7 @@ def both_worlds(
 
 
 @pytest.mark.parametrize("junctions", ["traffic_light", "allway_stop"])
-def test_the_exchange_of_sides_turns_a_world_into_its_mirror_image(
+def test_exchanging_sides_turns_observations_into_those_of_the_mirrored_world(
     tmp_path: Path, junctions: str
 ) -> None:
     overrides = EVERY
@@ -110,7 +110,7 @@ def test_the_exchange_of_sides_turns_a_world_into_its_mirror_image(
 
 
 @pytest.mark.parametrize("driver", ["cities_ippo", "cities_residual", "merge_ippo"])
-def test_a_trained_driver_drives_the_mirror_image_of_a_world_as_the_world(
+def test_a_trained_driver_drives_mirror_images_in_the_mirrored_world(
     tmp_path: Path, driver: str
 ) -> None:
     clock = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
@@ -158,6 +158,6 @@ def test_features_of_route_and_lanes_are_mirrored(tmp_path: Path) -> None:
         different |= (seen != other)[..., chosen].any(axis=(0, 1))
         seen = right.step(right.suggest_actions())[0]
         other = left.step(left.suggest_actions())[0]
-    assert different.sum() > 20, "compared features are not symmetric"
+    assert different.sum() > 20, "too few features differ between the worlds for a comparison"
     right.close()
     left.close()

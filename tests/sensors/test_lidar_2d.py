@@ -32,7 +32,8 @@ def scan(
 def test_lidar_equals_twin(rows: NDArray[np.void], row: int, num_rays: int, range_m: float) -> None:
     row %= len(rows)
     out = scan(rows, row, num_rays, range_m)
-    # Rounding decides whether a ray that grazes a side hits it, so sizes differ by a micrometre.
+    # Rounding decides whether a ray along a side hits it, so compute with sizes 1 µm larger and
+    # smaller.
     nearer = naive.lidar(rows, row, num_rays, range_m, 1e-6)
     further = naive.lidar(rows, row, num_rays, range_m, -1e-6)
     twin = naive.lidar(rows, row, num_rays, range_m)
@@ -53,7 +54,7 @@ def test_the_order_of_rows_does_not_matter(rows: NDArray[np.void], random: objec
 
 
 @given(st.floats(3.0, 50.0), st.floats(-math.pi, math.pi), st.floats(-math.pi, math.pi))
-def test_every_ray_that_can_meet_a_body_is_tried(
+def test_no_ray_that_meets_a_body_is_skipped(
     distance: float, direction: float, heading: float
 ) -> None:
     place = (distance * math.cos(direction), distance * math.sin(direction), heading)
@@ -63,8 +64,8 @@ def test_every_ray_that_can_meet_a_body_is_tried(
     assert np.all(out["distance"] <= np.array([d for d, _ in twin]) + 1e-9)
 
 
-def test_rays_that_pass_a_corner_meet_nothing() -> None:
-    """A fine fan of rays over rotated bodies near and far passes each corner on both sides."""
+def test_rays_beside_a_corner_do_not_hit_the_body() -> None:
+    """The 720 rays pass each corner of a rotated body closely on both sides."""
     for k in range(8):
         place = (7.0 * math.cos(0.8 * k), 7.0 * math.sin(0.8 * k), 0.35 * k)
         rows = vehicles([(0.0, 0.0, 0.3), place], length=8.0)
@@ -76,7 +77,7 @@ def test_rays_that_pass_a_corner_meet_nothing() -> None:
             assert out[ray]["distance"] == pytest.approx(nearer[ray][0], abs=1e-3)
 
 
-def test_rays_go_counter_clockwise_from_ahead() -> None:
+def test_rays_are_listed_counter_clockwise_from_the_ray_ahead() -> None:
     heading = 1.0
     ahead = (20.0 * math.cos(heading), 20.0 * math.sin(heading), heading)
     left = (-10.0 * math.sin(heading), 10.0 * math.cos(heading), heading)
@@ -85,7 +86,7 @@ def test_rays_go_counter_clockwise_from_ahead() -> None:
     assert out["id"].tolist() == [1, 2, -1, -1]
 
 
-def test_speed_is_positive_where_the_other_goes_away() -> None:
+def test_the_speed_of_a_body_that_moves_away_is_positive() -> None:
     rows = vehicles(
         [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (0.0, 10.0, 0.0), (-20.0, 0.0, 0.0)],
         speed=[10.0, 13.0, 10.0, 12.0],
@@ -93,19 +94,19 @@ def test_speed_is_positive_where_the_other_goes_away() -> None:
     assert scan(rows, 0, 4)["speed"] == pytest.approx([3.0, 0.0, -2.0, 0.0])
 
 
-def test_inside_of_a_body_the_distance_is_zero() -> None:
+def test_the_distance_inside_a_body_is_zero() -> None:
     out = scan(vehicles([(0.0, 0.0, 0.0), (1.0, 0.5, 0.7)]), 0, 8)
     assert np.all(out["distance"] == 0.0)
     assert np.all(out["id"] == 1)
 
 
-def test_of_equally_near_bodies_the_smaller_id_counts() -> None:
+def test_a_ray_reports_the_smaller_id_of_equally_near_bodies() -> None:
     places = [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (20.0, 0.0, 0.0)]
     assert scan(vehicles(places, id=[1, 6, 4]), 0, 4)["id"][0] == 4
     assert scan(vehicles(places, id=[1, 4, 6]), 0, 4)["id"][0] == 4
 
 
-def test_range_and_levels_limit_the_view() -> None:
+def test_bodies_beyond_the_range_or_on_other_levels_are_not_seen() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (62.4, 0.0, 0.0), (0.0, 10.0, 0.0)], z=[0.0, 0.0, 4.5])
     assert scan(rows, 0, 4)["distance"] == pytest.approx([59.9, 60.0, 60.0, 60.0])
     rows["x"][1] = 62.6

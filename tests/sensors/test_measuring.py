@@ -1,4 +1,4 @@
-"""Sensors that measure only their own vehicle, compared with plain twins in each tick."""
+"""Sensors that measure their own vehicle, compared with their twins in each tick."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _trembling(vec: CavVectorEnv, rng: np.random.Generator) -> NDArray[np.float3
     return np.clip(shaken, -1.0, 1.0).astype(np.float32)
 
 
-def test_every_sample_equals_the_twins() -> None:
+def test_every_sample_equals_twin() -> None:
     vec, rng = _make(), np.random.default_rng(0)
     vec.reset(seed=2)
     before = _agents(vec)
@@ -76,7 +76,7 @@ def test_every_sample_equals_the_twins() -> None:
 
 
 def _circling(steering: float) -> tuple[CavVectorEnv, float]:
-    """Return a car that circles at constant speed and steering, and the radius."""
+    """Return a world with one car, and the radius of its circle at this steering angle."""
     vec = make_vec(
         "ring", agents=1, background=0,
         overrides={"clock.sim_dt_s": 0.01, "clock.ctrl_dt_s": 0.01, "rig": {
@@ -103,16 +103,16 @@ def test_the_imu_measures_the_centripetal_acceleration() -> None:
     assert speed > 1.0
     x, y, z, *rates = frames["imu"].data[0, 0, -1].tolist()
     assert math.hypot(x, y) == pytest.approx(speed**2 / radius, rel=1e-4)
-    assert y > 0.0  # inwards, which is to the left
+    assert y > 0.0  # the centre of the circle is to the left
     assert z == pytest.approx(GRAVITY_MPS2)
     assert rates == pytest.approx([0.0, 0.0, speed / radius], rel=1e-4)
-    # Two metres ahead of the centre, the acceleration along the car differs by -rate² · x.
+    # At 2 m ahead of the centre, the acceleration along the car differs by -rate² · 2 m.
     ahead = frames["front"].data[0, 0, -1].tolist()
     assert ahead[0] - x == pytest.approx(-2.0 * (speed / radius) ** 2, rel=1e-3)
     assert ahead[3:] == pytest.approx(rates)
 
 
-def test_the_imu_of_a_standing_vehicle_measures_gravity_only() -> None:
+def test_the_imu_of_a_standing_vehicle_measures_only_gravity() -> None:
     imu = {"type": "imu", "rate_hz": 20, "pitch_deg": 30.0}
     vec = _make(rig={"imu": imu})
     vec.reset(seed=0)
@@ -125,7 +125,7 @@ def test_the_imu_of_a_standing_vehicle_measures_gravity_only() -> None:
     np.testing.assert_allclose(felt, [half, 0.0, half * math.sqrt(3.0), 0, 0, 0], atol=1e-5)
 
 
-def test_events_are_reported_in_their_tick_and_once() -> None:
+def test_each_event_is_reported_once_in_its_tick() -> None:
     settings = {"clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
     vec, rng = _make(**settings), np.random.default_rng(1)
     vec.reset(seed=1)

@@ -1,4 +1,4 @@
-"""Mounting transforms, compared with products of rotation matrices."""
+"""Mounting positions and rotations of sensors equal products of rotation matrices."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _some(seed: int) -> tuple[OdometryConfig, np.void]:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_turns_are_yaw_then_pitch_then_roll(seed: int) -> None:
+def test_a_mount_rotates_by_yaw_then_pitch_then_roll(seed: int) -> None:
     config, _ = _some(seed)
     angles = np.radians([config.yaw_deg, config.pitch_deg, config.roll_deg]).tolist()
     np.testing.assert_allclose(mount_of(config).turn, turn(*angles), atol=1e-15)
@@ -52,14 +52,14 @@ def test_the_pose_of_a_sensor_combines_vehicle_and_mount(seed: int) -> None:
     np.testing.assert_allclose(points @ axes.T + np.array(place), in_world, atol=1e-12)
 
 
-def test_pitch_looks_up_and_uphill() -> None:
+def test_a_positive_pitch_looks_up() -> None:
     mount = mount_of(OdometryConfig(rate_hz=10.0, pitch_deg=30.0))
     ahead = sensor_to_vehicle(mount, np.array([[1.0, 0.0, 0.0]]))[0]
     assert ahead[2] == pytest.approx(0.5)
 
 
 @pytest.mark.parametrize("place", [{"x_m": 2.6}, {"y_m": -1.1}, {"z_m": 1.7}, {"z_m": -0.1}])
-def test_a_place_outside_of_the_body_is_refused(place: dict[str, float]) -> None:
+def test_a_position_outside_of_the_body_is_refused(place: dict[str, float]) -> None:
     car = generated_types()[0]
     check_place("a", OdometryConfig(rate_hz=1.0, x_m=2.5, y_m=-1.0, z_m=1.6), car)
     with pytest.raises(ConfigError, match=r"rig\.a\.[xyz]_m = .*outside the vehicle's body"):

@@ -1,4 +1,4 @@
-"""Every sensor in its environment: spaces, both forms of an observation, stacks."""
+"""Every sensor in an environment: spaces, flat and dict observations, and stacks."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from cavmarl.policies.policy import Policy
 from cavmarl.sensors.observed import SENSORS, frame_size
 
 with warnings.catch_warnings():
-    # PettingZoo's tests import its own environments in a deprecated way.
+    # PettingZoo's test module imports deprecated environments.
     warnings.simplefilter("ignore", DeprecationWarning)
     from pettingzoo.test import parallel_api_test
 
@@ -52,7 +52,7 @@ ONLY_HIGHWAY = {**NOTHING, "sensors.kinematics.vehicles_count": 5}
 
 
 def make(env: str = "merge", mode: str = "respawn", **overrides: Any) -> Any:
-    """Make a small world; typed Any, because observations are arrays or dicts."""
+    """Make a small world. Its type is Any, because observations may be arrays or dicts."""
     return cavmarl.parallel_env(
         env, agents=4, background=10, seed=3, max_cycles=60,
         overrides={"population.mode": mode, "population.budget": 8, **overrides},
@@ -60,7 +60,7 @@ def make(env: str = "merge", mode: str = "respawn", **overrides: Any) -> Any:
 
 
 def wild(env: Any, rng: np.random.Generator) -> dict[str, Any]:
-    """Return full throttle and random steering: most vehicles soon leave the road or collide."""
+    """Return full throttle and random steering, with which most vehicles soon end their trips."""
     return {agent: np.array([1.0, rng.uniform(-1.0, 1.0)]) for agent in env.agents}
 
 
@@ -81,7 +81,7 @@ def wild(env: Any, rng: np.random.Generator) -> dict[str, Any]:
         ("history.steps", 2),
     ],
 )
-def test_any_one_sensor_is_enough(key: str, value: object) -> None:
+def test_each_sensor_can_be_the_only_one(key: str, value: object) -> None:
     env = make(**{**NOTHING, f"sensors.{key}": value})
     assert list(observation_parts(env.config.sensors)) == [key.partition(".")[0]]
     observations, _ = env.reset()
@@ -125,7 +125,7 @@ def test_observations_lie_in_their_spaces(overrides: dict[str, Any], raw: bool) 
 
 
 @pytest.mark.parametrize("overrides", [{}, EVERYTHING, IMAGE], ids=["default", "all", "image"])
-def test_both_forms_hold_the_same_numbers(overrides: dict[str, Any]) -> None:
+def test_flat_and_dict_observations_contain_the_same_numbers(overrides: dict[str, Any]) -> None:
     flat, named = (make(**{**overrides, "observation.kind": kind}) for kind in ("flat", "dict"))
     config = named.config.sensors
     parts = observation_parts(config)
@@ -140,7 +140,7 @@ def test_both_forms_hold_the_same_numbers(overrides: dict[str, Any]) -> None:
             assert part.dtype == dicts[agent][name].dtype
 
 
-def test_images_are_bytes() -> None:
+def test_an_image_has_bytes() -> None:
     env = make(**{**IMAGE, "observation.kind": "dict"})
     image = env.reset()[0]["car_0"]["occupancy_grid"]
     assert image.dtype == np.uint8
@@ -149,7 +149,7 @@ def test_images_are_bytes() -> None:
 
 
 @pytest.mark.parametrize("mode", ["respawn", "open"])
-def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> None:
+def test_a_stack_contains_the_last_frames_and_begins_with_copies_of_the_first(mode: str) -> None:
     plain, stacked = (make(mode=mode, **{**EVERYTHING, "sensors.stack": k}) for k in (1, 4))
     seen, _ = plain.reset()
     held, infos = stacked.reset()
@@ -160,7 +160,9 @@ def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> N
     for _ in range(60):
         for agent, frame in seen.items():
             if infos[agent]["vehicle_id"] < 0:
-                assert not held[agent].any(), "a seat without a vehicle observes zeros"
+                assert not held[agent].any(), (
+                    "an agent without a vehicle observes other values than 0"
+                )
                 continue
             if vehicle.get(agent) != infos[agent]["vehicle_id"]:
                 vehicle[agent] = infos[agent]["vehicle_id"]
@@ -177,10 +179,10 @@ def test_a_stack_holds_the_last_frames_and_begins_with_the_first(mode: str) -> N
     assert fresh > 5, "no agent entered later"
     again, _ = stacked.reset()
     first = again[stacked.agents[0]].reshape(4, -1)
-    assert np.all(first == first[0]), "a new episode begins a new stack"
+    assert np.all(first == first[0]), "a stack contains frames of the last episode"
 
 
-def test_a_batch_stacks_as_a_single_world_does() -> None:
+def test_stacks_of_a_batch_equal_stacks_of_a_single_world() -> None:
     overrides = {**EVERYTHING, "population.mode": "respawn"}
     batch = cavmarl.make_vec("merge", num_envs=2, agents=4, background=10, overrides=overrides)
     alone = make(**EVERYTHING)
@@ -208,7 +210,7 @@ def test_policies_get_stacked_dicts_as_flat_vectors() -> None:
     np.testing.assert_array_equal(policy.shown[0], np.stack(list(flat.reset()[0].values())))
 
 
-def test_highway_envs_default_observation_alone() -> None:
+def test_the_default_observation_of_highway_env_can_be_the_only_sensor() -> None:
     for kind, shape in (("flat", (25,)), ("dict", (5, 5))):
         env = make(**{**ONLY_HIGHWAY, "observation.kind": kind})
         seen = env.reset()[0]["car_0"]
@@ -218,7 +220,7 @@ def test_highway_envs_default_observation_alone() -> None:
     assert frame_size(env.config.sensors) == 25
 
 
-def test_features_are_named_once_and_bounded_by_the_space() -> None:
+def test_features_of_a_sensor_have_different_names_and_the_bounds_of_the_space() -> None:
     told = {"v2x.enabled": True, "sensors.messages.objects": 4, "sensors.messages.events": 2}
     config, _ = load_config("merge", overrides=EVERYTHING | told)
     box = flat_observation_space(config)

@@ -46,7 +46,7 @@ def observed(
 
 
 def phases(name: str, random: object) -> NDArray[np.int32]:
-    """Return a phase for each signal."""
+    """Return a random phase for each signal."""
     programs = network(name).programs[network(name).signals["program"]]
     found = [p["first_phase"] + random.randrange(p["num_phases"]) for p in programs]  # type: ignore[attr-defined]
     return np.array(found, dtype=np.int32)
@@ -66,7 +66,8 @@ def traffic(draw: st.DrawFn, name: str) -> NDArray[np.void]:
     placed = [on_lane(network(name), row["lane"], row["s"])[0] for row in rows]
     for row, there in zip(rows, placed, strict=True):
         row["x"], row["y"], row["heading"] = there["x"], there["y"], there["heading"]
-        # Off its route, a vehicle follows its lane in the kernel, but stands in the twin.
+        # Draw a goal that the lane leads to. For other goals, the kernel and the twin differ: the
+        # kernel continues along the lane, the twin does not.
         ways = plans(name)[:4, row["lane"]]["to_go"]
         row["goal"] = draw(st.sampled_from(np.flatnonzero(np.isfinite(ways)).tolist() or [0]))
         assume(np.isfinite(ways[row["goal"]]) or not network(name).lanes[row["lane"]]["internal"])
@@ -92,7 +93,7 @@ def test_lanes_equals_twin_for_any_order_of_rows(
         assert found == pytest.approx(twin, abs=1e-6)
 
 
-def test_gaps_on_a_straight_road() -> None:
+def test_gaps_on_a_straight_road_have_known_values() -> None:
     roads = network("merge")
     lane = roads.lane_ids.index("main_out_0")
     left = int(roads.lanes[lane]["left"])
@@ -108,8 +109,10 @@ def test_gaps_on_a_straight_road() -> None:
     assert found[6:] == [0.0] * 8
 
 
-def test_a_vehicle_that_has_left_a_shorter_lane_is_ahead_on_the_longer_lane(tmp_path: Path) -> None:
-    """By its own lane, the vehicle is on the junction; it still covers the longer adjacent lane."""
+def test_a_vehicle_beyond_a_shorter_lane_is_observed_on_the_longer_lane_that_it_covers(
+    tmp_path: Path,
+) -> None:
+    """The lane of its centre is in the junction, but its body covers the longer adjacent lane."""
     path = with_shorter_lane(build_crossing(tmp_path, "priority", side_lanes=2), "S_in_1", 8.0)
     roads = read_network(path)
     own, inside = (roads.lane_ids.index(lane) for lane in ("S_in_0", ":c_10_0"))

@@ -1,4 +1,4 @@
-"""The sensors `way` and `conflicts` equal their twins, and observe positions and vehicles."""
+"""The sensors `way`, `conflicts` and `history`: twins, known values, divisions and settings."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ SIGNS = {
 INDICATED = replace(CONFIG, conflicts=replace(CONFIG.conflicts, indicators=True))
 NEAR_M = 25.0
 INDICATED_NEAR = replace(CONFIG, conflicts=replace(INDICATED.conflicts, indicators_m=NEAR_M))
-# The settings of the environment `cities`.
+# These settings are those of the environment `cities`.
 ON = {
     "sensors.way.distances_m": DISTANCES_M,
     "sensors.way.lines": LINES,
@@ -98,7 +98,7 @@ def observed_conflicts(
 
 
 def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
-    """Return the letter of each link with a signal."""
+    """Return the letter that each link with a signal shows."""
     roads = network(name)
     with_signal = np.flatnonzero(roads.links["signal"] >= 0)
     return {int(k): SIGNAL_STATES[link_signal(roads.arrays, int(k), phase)] for k in with_signal}
@@ -107,13 +107,13 @@ def shown(name: str, phase: NDArray[np.int32]) -> dict[int, str]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(deadline=None, max_examples=25)
 @given(data=st.data(), random=st.randoms(use_true_random=False))
-def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
+def test_way_and_conflicts_equal_twin_for_any_order_of_rows(
     name: str, data: st.DataObject, random: object
 ) -> None:
     rows = data.draw(traffic(name))
     rows["width"] = 2.0
-    # Vehicles may have equal or mirrored positions, so rounding of sums could decide their ranks.
-    # Random numbers avoid this; squares do not (1 + 49 is twice 25).
+    # Rounding would decide the order of vehicles at equal or mirrored positions, so move all
+    # vehicles by random distances.
     nudge = np.random.default_rng(0).uniform(0.0, 1.0, (2, len(rows)))
     rows["x"], rows["y"] = rows["x"] + nudge[0], rows["y"] + nudge[1]
     phase = phases(name, random)
@@ -139,7 +139,7 @@ def test_way_and_conflicts_equal_their_twins_for_any_order_of_rows(
             assert seen == pytest.approx(twin, abs=2e-5)
 
 
-def test_a_route_is_unknown_until_it_is_indicated() -> None:
+def test_the_route_of_another_vehicle_is_unknown_until_it_is_indicated() -> None:
     roads, ways = network("grid4x4"), plans("grid4x4")
     phase = np.zeros(len(roads.arrays.signals), np.int32)
     links = roads.links
@@ -161,7 +161,7 @@ def test_a_route_is_unknown_until_it_is_indicated() -> None:
 
 
 def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
-    """Return cars at (s, d, speed) on the road behind the merge, whose goal is its end."""
+    """Return cars at (s, d, speed) on the road behind the merge, whose goal is the road's end."""
     roads = network("merge")
     lane = roads.lane_ids.index("main_out_0")
     rows = np.concatenate([on_lane(roads, lane, s, d=d, speed=speed) for s, d, speed in cars])
@@ -171,20 +171,22 @@ def on_main_road(*cars: tuple[float, float, float]) -> NDArray[np.void]:
     return rows
 
 
-def test_vehicles_are_ordered_by_time_to_contact_and_not_by_distance() -> None:
-    # One car stands 30 m ahead; the other is 10 m behind and falls back.
+def test_vehicles_are_ordered_by_time_to_contact() -> None:
+    # One car stands 30 m ahead. The other car is 10 m behind and slower.
     rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
     numbers = np.array(observed_conflicts("merge", rows, 0, np.zeros(0, np.int32))).reshape(-1, 9)
     assert numbers[0, 2] == pytest.approx(30.0 / 40.0)
     assert numbers[0, 4] == pytest.approx(-20.0 / 30.0)
-    assert numbers[0, :2] == pytest.approx([1.0, 2.0 / 3.5])  # the standing car is hit within 1.5 s
+    assert numbers[0, :2] == pytest.approx(
+        [1.0, 2.0 / 3.5]
+    )  # contact with the standing car in 1.5 s
     assert numbers[1, 2] == pytest.approx(-10.0 / 20.0)
     assert not numbers[2:].any()
 
 
 @pytest.mark.parametrize("config", [CONFIG, INDICATED_NEAR])
-def test_the_plan_of_another_changes_nothing(config: SensorsConfig) -> None:
-    """Vehicles that indicate near junctions are too far from one."""
+def test_plans_and_controls_of_other_vehicles_have_no_effect(config: SensorsConfig) -> None:
+    """Vehicles indicate only near junctions, and these vehicles are far from any junction."""
     rows = on_main_road((100.0, 0.0, 20.0), (90.0, 0.0, 2.0), (130.0, 0.0, 0.0))
     phase = np.zeros(0, np.int32)
     before = observed_conflicts("merge", rows, 0, phase, config)
@@ -193,8 +195,8 @@ def test_the_plan_of_another_changes_nothing(config: SensorsConfig) -> None:
     assert observed_conflicts("merge", rows, 0, phase, config) == before
 
 
-def test_an_indicated_route_is_observed_over_one_junction_only() -> None:
-    """A car changes its route over the next junction, or only over the junction after it."""
+def test_an_indicated_route_is_known_over_the_next_junction_only() -> None:
+    """Compare routes that differ at the next junction, and routes that differ only later."""
     roads, ways = network("grid4x4"), plans("grid4x4")
     phase = np.zeros(len(roads.arrays.signals), np.int32)
     num_lanes = len(roads.lanes)
@@ -228,11 +230,11 @@ def made(env: str = "grid4x4", **overrides: Any) -> Any:
 
 
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
-def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
+def test_history_contains_earlier_observations_and_begins_with_copies_of_the_first() -> None:
     vec = made()
     place = layout(vec.config.sensors)["history"]
     observations, infos = vec.reset()
-    assert place.stop == observations.shape[2], "the history is the last part"
+    assert place.stop == observations.shape[2], "the history is not the last part"
     rng = np.random.default_rng(0)
     fresh = 0
     before = None
@@ -256,7 +258,7 @@ def test_history_has_earlier_observations_and_starts_with_the_first() -> None:
 
 @pytest.mark.skipif(IS_PLAIN, reason="compares no twin")
 @pytest.mark.parametrize("indicators", [False, True])
-def test_a_divided_world_observes_the_same(indicators: bool) -> None:
+def test_observations_in_a_divided_world_equal_the_undivided_ones(indicators: bool) -> None:
     shown = {"sensors.conflicts.indicators": indicators, "sensors.way.stop_signs": "own"}
     whole, divided = made(**shown), made(**shown, **{"zones.count": 4})
     rng = np.random.default_rng(1)
@@ -291,7 +293,7 @@ def test_invalid_distances_are_refused(wrong: tuple[float, ...]) -> None:
         WayConfig(distances_m=wrong)
 
 
-def test_sensors_without_sight_omit_visible_vehicles() -> None:
+def test_settings_without_sight_omit_sensors_of_vehicles_and_lines() -> None:
     config = SensorsConfig(
         way=WayConfig(distances_m=(5.0,), lines=2),
         conflicts=ConflictsConfig(count=3),
@@ -302,7 +304,7 @@ def test_sensors_without_sight_omit_visible_vehicles() -> None:
     assert config.without_sight().way.lines == 0
 
 
-def test_the_time_of_change_is_off_unless_it_is_asked_for() -> None:
+def test_the_time_of_change_is_off_by_default() -> None:
     config = SensorsConfig(way=WayConfig(lines=1))
     assert not config.way.timing
     assert not config.signal.timing
@@ -312,9 +314,7 @@ def test_the_time_of_change_is_off_unless_it_is_asked_for() -> None:
 
 @pytest.mark.integration
 @pytest.mark.parametrize("kind", ["allway_stop", "priority_stop"])
-def test_stop_signs_are_shown_alike_in_any_division_and_in_any_process(
-    tmp_path: Path, kind: str
-) -> None:
+def test_stop_signs_are_observed_equally_in_all_divisions(tmp_path: Path, kind: str) -> None:
     path = netgenerate(
         tmp_path / "stops.net.xml",
         "--grid",

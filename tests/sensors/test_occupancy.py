@@ -1,4 +1,4 @@
-"""The occupancy grid equals highway-env's on its own roads."""
+"""The occupancy grid equals that of highway-env on roads of highway-env."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.sensors.observed import occupancy_grid_sensor
 from tests.support import highway
 from tests.support.traffic import network, on_lane
 
-FEATURES = ("presence", "vx", "vy", "on_road")  # highway-env's default
+FEATURES = ("presence", "vx", "vy", "on_road")  # default of highway-env
 
 CONFIGS: dict[str, dict[str, Any]] = {
     "default": {},
@@ -31,7 +31,7 @@ CONFIGS: dict[str, dict[str, Any]] = {
 
 
 def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[np.float32]:
-    """Return the grid (F, W, H) of cavmarl for row i."""
+    """Return the grid (F, W, H) that cavmarl computes for row i."""
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(**config))
     sensor = occupancy_grid_sensor.settings(settings, 0, network("ring"), highway.destinations(env))
     road = highway.roads(env)
@@ -45,7 +45,7 @@ def layers(env: Any, rows: NDArray[np.void], i: int, **config: Any) -> NDArray[n
 @pytest.mark.parametrize("seed", range(2))
 @pytest.mark.parametrize("name", ["highway-v0", "two-way-v0"])
 @pytest.mark.parametrize("case", CONFIGS)
-def test_the_grid_equals_highway_envs(name: str, seed: int, case: str) -> None:
+def test_the_grid_equals_that_of_highway_env(name: str, seed: int, case: str) -> None:
     env = highway.make(name, seed)
     rng = np.random.default_rng(seed)
     for vehicle in env.road.vehicles[:9]:
@@ -76,7 +76,7 @@ def test_a_grid_turns_with_the_vehicle() -> None:
         np.testing.assert_allclose(ours, theirs, rtol=1e-6)
 
 
-def test_a_cell_shows_the_smallest_id_and_no_other_level() -> None:
+def test_a_cell_shows_the_vehicle_with_the_smallest_id_on_its_level() -> None:
     env = highway.make("highway-v0", 0)
     rows = highway.vehicles(env)[:3]
     for field in ("x", "y", "heading"):
@@ -88,7 +88,7 @@ def test_a_cell_shows_the_smallest_id_and_no_other_level() -> None:
 
 
 @pytest.mark.parametrize("name", ["ring", "grid4x4", "merge"])
-def test_near_lanes_suffice_for_the_grid(name: str) -> None:
+def test_the_grid_of_near_lanes_equals_the_grid_of_all_lanes(name: str) -> None:
     roads = network(name)
     settings = SensorsConfig(occupancy_grid=OccupancyGridConfig(features=("on_road",)))
     rng = np.random.default_rng(0)
@@ -101,4 +101,4 @@ def test_near_lanes_suffice_for_the_grid(name: str) -> None:
             observe_occupancy(roads.arrays, lane_grid, rows, 0, highway.grid_of(rows), sensor, out)
             drawn.append(out)
         np.testing.assert_array_equal(*drawn)
-        assert drawn[0].reshape(11, 11)[4:7, 4:7].any(), "the own lane is on the road"
+        assert drawn[0].reshape(11, 11)[4:7, 4:7].any(), "the own lane is not shown as road"

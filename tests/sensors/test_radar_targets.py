@@ -22,7 +22,7 @@ AZIMUTHS = (-0.5, 0.05, 21)
 def echoes(
     rows: NDArray[np.void], matrix: Floats, walls: NDArray[np.void] = NO_WALLS, row: int = 0
 ) -> NDArray[np.void]:
-    """Return TARGET records, nearest first."""
+    """Return the records TARGET, sorted by distance."""
     fan = make_fan(matrix, AZIMUTHS, np.zeros(1), 60.0)
     panorama, counts = look_around(rows, row, backdrop(walls), 65.0)
     hits = np.zeros((AZIMUTHS[2], 1), HIT)
@@ -47,7 +47,7 @@ def test_targets_equal_twin(
         )
         if large.what != small.what or abs(large.distance - small.distance) > 1e-3:
             unsure |= {large.what, small.what}
-        if large.what[0] == "wall":  # another body may be at the same place
+        if large.what[0] == "wall":  # another body or wall may be equally near
             others = walls[walls["building"] != large.what[1]]
             other = naive.trace(rows, 0, others, matrix[:, 3], ray, 60.0)
             if other.distance - large.distance < 1e-3:
@@ -62,7 +62,7 @@ def test_targets_equal_twin(
     assert ranges == sorted(ranges)
 
 
-def test_targets_are_listed_nearest_first_for_any_order_of_rows() -> None:
+def test_targets_are_sorted_by_distance_for_any_order_of_rows() -> None:
     places = [(0.0, 0.0, 0.0), (40.0, -12.0, 0.0), (20.0, 0.0, 0.0), (30.0, 9.0, 0.0)]
     for order in ([0, 1, 2, 3], [0, 3, 1, 2], [0, 2, 3, 1]):
         rows = vehicles([places[k] for k in order])
@@ -71,7 +71,7 @@ def test_targets_are_listed_nearest_first_for_any_order_of_rows() -> None:
         assert ranges == sorted(ranges)
 
 
-def test_a_wall_at_ten_metres_is_one_target() -> None:
+def test_a_wall_of_two_parts_is_one_target() -> None:
     walls = np.array([(10.0, -20.0, 10.0, 0.0, 8.0, 7), (10.0, 0.0, 10.0, 20.0, 8.0, 7)], WALL)
     (target,) = echoes(vehicles([(0.0, 0.0, 0.0)], speed=3.0), mount((0.0, 0.0, 0.5)), walls)
     assert target["range"] == pytest.approx(10.0)
@@ -82,7 +82,7 @@ def test_a_wall_at_ten_metres_is_one_target() -> None:
 
 @pytest.mark.parametrize("azimuth", [-0.45, -0.2, 0.3, 0.5])
 def test_the_nearest_echo_may_come_from_any_ray(azimuth: float) -> None:
-    """The corner of a body points to the sensor; its sides are hit by several rays."""
+    """A corner of a body points to the sensor, and several rays hit the sides of the body."""
     x, y = 20.0 * math.cos(azimuth), 20.0 * math.sin(azimuth)
     rows = vehicles(
         [(0.0, 0.0, 0.0), (x, y, azimuth + 0.25 * math.pi)], length=4.0, width=4.0, speed=[3.0, 7.0]
@@ -94,13 +94,13 @@ def test_the_nearest_echo_may_come_from_any_ray(azimuth: float) -> None:
     assert target["speed"] == pytest.approx(7.0 * math.cos(0.25 * math.pi) - own)
 
 
-def test_a_sensor_at_the_end_of_a_wall_is_in_it() -> None:
+def test_a_sensor_at_the_end_of_a_wall_is_inside_the_wall() -> None:
     walls = np.array([(0.0, 0.0, 0.0, 1.0, 8.0, 3), (10.0, -20.0, 10.0, 20.0, 8.0, 7)], WALL)
     targets = echoes(vehicles([(0.0, 0.0, 0.0)], speed=0.0), mount((0.0, 0.0, 0.5)), walls)
     assert [(target["id"], target["range"]) for target in targets] == [(3, 0.0)]
 
 
-def test_radial_speeds_are_relative_and_positive_away() -> None:
+def test_radial_speeds_are_relative_and_positive_for_targets_that_move_away() -> None:
     rows = vehicles(
         [(0.0, 0.0, 0.0), (20.0, 0.0, 0.0), (20.0, 8.0, math.pi)], speed=[10.0, 14.0, 5.0]
     )
@@ -111,10 +111,10 @@ def test_radial_speeds_are_relative_and_positive_away() -> None:
 
 
 @given(st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-0.5, 0.5))
-def test_a_turning_vehicle_moves_its_sensors(
+def test_radial_speeds_include_the_rotation_of_the_own_vehicle(
     yaw_rate: float, x: float, y: float, normal: float
 ) -> None:
-    """The nearest point of a long wall is along its normal."""
+    """The nearest point of a long wall lies in the direction of its normal."""
     cos, sin = math.cos(normal), math.sin(normal)
     ends = [(30.0 * cos - side * sin, 30.0 * sin + side * cos) for side in (-90.0, 90.0)]
     wall = np.array([(*ends[0], *ends[1], 8.0, 0)], WALL)

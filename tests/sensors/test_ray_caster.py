@@ -21,7 +21,7 @@ LEVEL = np.zeros(1)
 def scan(
     rows: NDArray[np.void], fan: Fan, row: int = 0, walls: NDArray[np.void] = NO_WALLS
 ) -> NDArray[np.void]:
-    """Return HIT (A, E); `what` is the number of the body or wall, not of its panorama entry."""
+    """Return HIT (azimuths, elevations) of all rays of a fan."""
     panorama, counts = look_around(rows, row, backdrop(walls), fan.range_m + 3.0)
     hits = np.zeros(fan.rays.shape[:2], HIT)
     cast(fan, panorama.prisms, counts.prisms, panorama.walls, counts.walls, 0, len(hits), hits)
@@ -38,7 +38,7 @@ AZIMUTHS = st.sampled_from(
 
 
 @given(crowds(most=6), wall_sets(), mounts(), st.integers(1, 16))
-def test_a_ray_gives_the_same_hit_in_any_batch(
+def test_the_hit_of_a_ray_does_not_depend_on_its_batch(
     rows: NDArray[np.void], walls: NDArray[np.void], matrix: Floats, columns: int
 ) -> None:
     fan = make_fan(matrix, (0.3, math.pi / 8, 16), np.array([-0.2, 0.1]), 60.0)
@@ -61,7 +61,7 @@ def begins_on_a_wall(walls: NDArray[np.void], start: Floats) -> bool:
 
 
 def runs_within_a_wall(walls: NDArray[np.void], start: Floats, ray: Floats) -> bool:
-    """Return whether a ray starts on a wall's line and is parallel to it, within 1 µm per m."""
+    """Return whether a ray starts on the line of a wall and is parallel to the wall."""
     along = np.array([walls["bx"] - walls["ax"], walls["by"] - walls["ay"]])
     before = np.array([start[0] - walls["ax"], start[1] - walls["ay"]])
     least = 1e-6 * np.hypot(*along)
@@ -93,13 +93,14 @@ def test_rays_equal_twin(
     start = matrix[:, 3]
     axes = naive.turn(rows["heading"][0], 0.0, 0.0)
     place = axes @ start + np.array([rows["x"][0], rows["y"][0], 0.0])
-    # The wall is 0 m away, so rounding decides whether it is ahead of the ray or behind it.
+    # Skip sensors on a wall, because rounding decides whether the wall is ahead of a ray.
     assume(not begins_on_a_wall(walls, place))
     for a, e in np.ndindex(*hits.shape):
         hit = hits[a, e]
         if runs_within_a_wall(walls, place, axes @ rays[a, e]):
             continue  # rounding decides whether and where the ray hits that wall
-        # Rounding decides whether a ray that grazes a side hits it, so sizes differ by 1 µm.
+        # Rounding decides whether a ray along a side hits it, so compute with sizes 1 µm larger and
+        # smaller.
         nearer, further = (
             naive.trace(rows, 0, walls, start, rays[a, e], range_m, margin)
             for margin in (1e-6, -1e-6)
@@ -128,7 +129,7 @@ def test_the_order_of_rows_does_not_matter(
         assert once["id"].tobytes() == again["id"].tobytes()
 
 
-def test_a_wall_and_a_long_box_at_ten_metres_read_ten_metres() -> None:
+def test_rays_measure_10_m_to_a_wall_and_to_a_long_body_ten_metres_ahead() -> None:
     wall = np.array([(10.0, -20.0, 10.0, 20.0, 8.0, 0)], WALL)
     ego = vehicles([(0.0, 0.0, 0.0)])
     assert scan(ego, full_circle(mount()), walls=wall)["distance"][0, 0] == 10.0
@@ -160,7 +161,7 @@ def test_a_rolled_sensor_sees_the_ground_on_its_lower_side() -> None:
     assert right == pytest.approx(1.5 / math.sin(0.3))
 
 
-def test_rays_pass_over_low_bodies_and_walls() -> None:
+def test_rays_pass_over_bodies_and_walls_below_the_sensor() -> None:
     rows = vehicles([(0.0, 0.0, 0.0), (10.0, 0.0, 0.0)], height=[1.5, 0.9])
     wall = np.array([(20.0, -5.0, 20.0, 5.0, 0.9, 0), (30.0, -5.0, 30.0, 5.0, 1.1, 1)], WALL)
     hits = scan(rows, full_circle(mount((0.0, 0.0, 1.0))), walls=wall)
@@ -178,10 +179,10 @@ def test_a_ray_at_the_corner_of_a_building_hits_it() -> None:
 
 
 @given(st.floats(3.0, 50.0), st.floats(-math.pi, math.pi), mounts())
-def test_every_ray_that_can_meet_a_wall_is_tried(
+def test_no_ray_that_meets_a_wall_is_skipped(
     distance: float, direction: float, matrix: Floats
 ) -> None:
-    """All level rays hit a closed square around the vehicle, for any position of its corners."""
+    """Walls form a square around the vehicle, so every ray that is long enough hits a wall."""
     corners = [
         (distance * math.cos(direction + k * 0.5 * math.pi),
          distance * math.sin(direction + k * 0.5 * math.pi))

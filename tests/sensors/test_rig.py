@@ -1,4 +1,4 @@
-"""Mounted sensors in worlds: samples do not depend on zones, workers or deaths of hosts."""
+"""Samples of mounted sensors do not depend on zones, workers or saved states."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ RIG: dict[str, Any] = {
     "events": {"type": "collision", "dropout": 0.2},
 }
 WORLD = {**BUSY, "rig": RIG}
-# The rates of the ten sensors do not fit the long ticks of these tests.
+# All rates are 5 Hz, because the original rates do not fit the long ticks of these tests.
 TEN: dict[str, Any] = {
     "rig": "ten_sensors",
     **dict.fromkeys((f"rig.{name}.rate_hz" for name in load_rig("ten_sensors")), 5),
@@ -53,7 +53,7 @@ def test_samples_of_divided_worlds_equal_the_undivided_world(rig: dict[str, Any]
 
 
 def _drive(vec: CavVectorEnv, steps: int = 8) -> list[bytes]:
-    """Return all frames and hashes of some steps."""
+    """Drive some steps; return all frames and state hashes."""
     vec.reset(seed=7)
     seen = []
     for _ in range(steps):
@@ -65,7 +65,9 @@ def _drive(vec: CavVectorEnv, steps: int = 8) -> list[bytes]:
 
 
 @pytest.mark.parametrize(("worlds", "zones", "workers"), [(2, 1, 2), (1, 2, 2)])
-def test_workers_sense_the_same(worlds: int, zones: int, workers: int) -> None:
+def test_samples_of_workers_equal_those_of_one_process(
+    worlds: int, zones: int, workers: int
+) -> None:
     def make(zones: int, workers: int) -> CavVectorEnv:
         return make_vec(
             "grid4x4", num_envs=worlds, zones=zones, workers=workers, max_cycles=5, overrides=WORLD
@@ -79,7 +81,7 @@ def test_workers_sense_the_same(worlds: int, zones: int, workers: int) -> None:
         vec.close()
 
 
-def test_a_reset_begins_with_the_samples_that_are_due_then() -> None:
+def test_a_world_after_a_reset_has_only_the_samples_that_are_due_at_its_start() -> None:
     vec = make_vec("grid4x4", num_envs=2, overrides=WORLD)
     vec.reset(seed=0)
     for _ in range(3):
@@ -97,7 +99,7 @@ def test_a_reset_begins_with_the_samples_that_are_due_then() -> None:
     assert (frames["slow"].data[0] == 0.0).all()
 
 
-def test_worlds_that_resume_elsewhere_keep_their_samples() -> None:
+def test_worlds_that_are_loaded_into_other_worlds_keep_their_samples() -> None:
     world = load_world("grid4x4", overrides=WORLD)
     here, there = LocalWorlds(world, 2), LocalWorlds(world, 2)
     here.arrays.chosen[:] = True
@@ -116,7 +118,7 @@ def test_worlds_that_resume_elsewhere_keep_their_samples() -> None:
     assert [here.state_hash(w) for w in (0, 1)] == [there.state_hash(w) for w in (0, 1)]
 
 
-def test_agents_without_a_vehicle_have_zeros() -> None:
+def test_samples_of_agents_without_a_vehicle_are_zeros() -> None:
     overrides = {**WORLD, "population.mode": "open", "population.agents": 6}
     vec = make_vec("grid4x4", overrides=overrides, autoreset_mode="NextStep")
     rng = np.random.default_rng(0)
@@ -135,7 +137,7 @@ def test_agents_without_a_vehicle_have_zeros() -> None:
     assert left > 0
 
 
-def test_one_agent_has_its_own_samples() -> None:
+def test_frames_of_an_agent_contain_only_its_own_samples() -> None:
     vec = make_vec("grid4x4", overrides=WORLD)
     env = parallel_env("grid4x4", overrides=WORLD)
     vec.reset(seed=4)
@@ -150,7 +152,7 @@ def test_one_agent_has_its_own_samples() -> None:
         env.frames("car_99")
 
 
-def test_a_rig_is_given_by_a_name_or_a_file(tmp_path: Path) -> None:
+def test_a_rig_can_be_named_or_read_from_a_file(tmp_path: Path) -> None:
     config, _ = load_config("merge", overrides={"rig": "ten_sensors", "rig.gnss.rate_hz": 10})
     assert len(config.rig) == 10
     assert len({type(sensor) for sensor in config.rig.values()}) == 10
@@ -171,7 +173,7 @@ def test_a_rig_is_given_by_a_name_or_a_file(tmp_path: Path) -> None:
         load_config("merge", overrides={"rig": "nowhere.yaml"})
 
 
-def test_ten_sensors_stay_in_their_spaces() -> None:
+def test_samples_of_ten_sensors_lie_in_their_spaces() -> None:
     overrides = {"rig": "ten_sensors", "observation.mode": "sensors", "observation.kind": "dict"}
     env = parallel_env("grid4x4", agents=4, background=60, overrides=overrides)
     seen, _ = env.reset(seed=0)

@@ -57,7 +57,9 @@ def test_flat_observations_have_the_samples_in_the_order_of_the_rig() -> None:
 
 @pytest.mark.parametrize("overrides", [NAMED, FLAT])
 @pytest.mark.parametrize("mode", ["SameStep", "NextStep"])
-def test_ended_worlds_keep_their_last_observations(overrides: dict[str, Any], mode: str) -> None:
+def test_final_observations_are_those_of_the_ended_episode(
+    overrides: dict[str, Any], mode: str
+) -> None:
     vec = make_vec(
         "grid4x4", num_envs=2, agents=3, background=5, max_cycles=3, overrides=overrides,
         autoreset_mode=mode,

@@ -1,4 +1,4 @@
-"""Errors of sensors: their size, their independence, and their repeatability."""
+"""Random errors of sensors have their configured sizes and are independent."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ CLEAN = {"type": "odometry", "rate_hz": 20}
 
 
 def _speeds(rig: dict[str, Any], seed: int = 0, steps: int = 40) -> dict[str, NDArray[np.float64]]:
-    """Return (steps, A, 3) samples of each sensor, of cars that the built-in driver drives."""
+    """Let the built-in driver drive; return the samples (steps, agents, 3) of each sensor."""
     settings = {"rig": rig, "clock.ctrl_dt_s": 0.05, "population.mode": "respawn"}
     vec = make_vec("grid4x4", agents=24, background=0, overrides=settings)
     vec.reset(seed=seed)

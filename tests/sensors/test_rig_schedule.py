@@ -1,4 +1,4 @@
-"""Times of samples, compared with a list, and in worlds over a minute."""
+"""Times of samples equal a computed list, also in worlds that run for a minute."""
 
 from __future__ import annotations
 
@@ -50,7 +50,9 @@ def test_samples_are_due_at_the_listed_ticks(rate: Fraction, phase: int) -> None
         (0.05, 3.0, "accumulate"),
     ],
 )
-def test_a_minute_has_sixty_times_the_rate_samples(dt: float, rate: float, schedule: str) -> None:
+def test_a_minute_has_sixty_times_as_many_samples_as_the_rate(
+    dt: float, rate: float, schedule: str
+) -> None:
     rig = {"a": {"type": "odometry", "rate_hz": rate, "schedule": schedule}}
     settings = {
         "rig": rig, "clock.sim_dt_s": dt, "clock.ctrl_dt_s": 1.0, "horizon_s": 60.0,
@@ -101,11 +103,11 @@ def test_invalid_arguments_are_refused(settings: dict[str, Any], words: str) -> 
 
 
 @pytest.mark.parametrize("rate", [2.85714, 3.33333])
-def test_rates_that_errors_propose_are_accepted(rate: float) -> None:
+def test_rates_that_error_messages_propose_are_accepted(rate: float) -> None:
     load_config("merge", overrides={"rig": {"a": {"type": "gnss", "rate_hz": rate}}})
 
 
 @pytest.mark.parametrize("name", ["Roof", "a.b", "", "9a", "a" * 65])
-def test_names_with_other_characters_are_refused(name: str) -> None:
+def test_invalid_names_of_sensors_are_refused(name: str) -> None:
     with pytest.raises(ConfigError, match="a sensor's name"):
         load_config("merge", overrides={"rig": {name: {"type": "collision"}}})

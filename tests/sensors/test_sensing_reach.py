@@ -21,7 +21,7 @@ from tests.support.driving import drive, make_simulation, start
 from tests.support.world import tick_of
 
 TERMS_ALONE = "none but ego"
-MOST = 30  # number of vehicles of a crowd
+MOST = 30  # largest number of vehicles in a crowd
 RADIUS_M = 0.5 * float(np.hypot(16.0, 3.0))  # half the diagonal of the largest vehicles
 EVERYWHERE = np.ones(1, dtype=np.bool_)
 
@@ -29,7 +29,7 @@ OFF: dict[str, Any] = {
     "sensors.route.points": 0, "sensors.neighbors.count": 0, "sensors.signal.enabled": False,
     "sensors.lanes.range_m": 0.0, "sensors.lidar.rays": 0,
 }  # fmt: skip
-# Settings that switch each sensor on, with reaches above that of the terms.
+# Settings that switch one sensor on, with a larger reach than that of the reward terms.
 ON: dict[str, dict[str, Any]] = {
     TERMS_ALONE: {},
     "route": {"sensors.route.points": 8},
@@ -56,13 +56,13 @@ ON: dict[str, dict[str, Any]] = {
     "history": {"sensors.history.steps": 2},
 }
 BLIND = {"route", "signal", "way", "history"}  # these sensors observe no vehicle
-# It observes an inbox, which one bus fills for all zones at any distance (see tests/v2x).
+# This sensor observes an inbox. The bus fills inboxes from any distance (see tests/v2x).
 TOLD = {"messages"}
 
 
 @cache
 def world(env: str, sensor: str) -> Simulation:
-    """Return a world after one step, whose agents have one sensor in addition to `ego`."""
+    """Return a world after one step, whose agent has `ego` and one other sensor."""
     overrides = {**OFF, **ON[sensor]}
     simulation = make_simulation(env, mode="closed", agents=1, background=MOST, overrides=overrides)
     start(simulation, seed=4)
@@ -72,7 +72,7 @@ def world(env: str, sensor: str) -> Simulation:
 
 @cache
 def places(env: str) -> NDArray[np.float64]:
-    """Return (N, 5) lane, s, x, y and heading of positions on all lanes."""
+    """Return positions on all lanes as (N, 5): lane, s, x, y and heading."""
     network = world(env, TERMS_ALONE).network
     found = []
     for lane in range(len(network.lanes)):
@@ -111,7 +111,7 @@ def put(env: str, where: NDArray[np.int64], rng: np.random.Generator) -> NDArray
 
 
 def sensed(simulation: Simulation, rows: NDArray[np.void]) -> tuple[bytes, bytes]:
-    """Return the agent's observation and terms among these vehicles."""
+    """Return the agent's observation and reward terms in a world of these vehicles."""
     worlds = simulation.worlds
     worlds.rows[0, : rows.size] = rows
     worlds.num_owned[0] = worlds.num_rows[0] = rows.size
@@ -121,7 +121,7 @@ def sensed(simulation: Simulation, rows: NDArray[np.void]) -> tuple[bytes, bytes
     return outputs.observations[0, 0].tobytes(), outputs.terms[0, 0].tobytes()
 
 
-def test_every_sensor_has_its_case() -> None:
+def test_every_sensor_has_a_case_in_this_file() -> None:
     assert set(ON) - {TERMS_ALONE} == {sensor.name for sensor in SENSORS} - {"ego"} - TOLD
     for name in set(ON) - {TERMS_ALONE}:
         assert set(layout(world("grid4x4", name).config.sensors)) == {"ego", name}
@@ -146,7 +146,7 @@ def test_a_crowd_beyond_the_reach_changes_nothing(env: str, sensor: str, seed: i
 
 
 @pytest.mark.parametrize("sensor", sorted(set(ON) - BLIND))
-def test_the_declared_reach_is_at_most_half_a_metre_too_long(sensor: str) -> None:
+def test_a_vehicle_up_to_half_a_metre_within_the_declared_reach_is_observed(sensor: str) -> None:
     env = "grid4x4"
     simulation = world(env, sensor)
     agent = agent_of(simulation)
@@ -170,7 +170,7 @@ def test_the_declared_reach_is_at_most_half_a_metre_too_long(sensor: str) -> Non
     assert reach_m - 0.5 < farthest <= reach_m
 
 
-def test_rays_see_the_corner_of_a_body_whose_centre_is_beyond_their_range() -> None:
+def test_the_reach_of_rays_is_their_range_plus_half_the_diagonal_of_a_body() -> None:
     simulation = world("grid4x4", "lidar")
     config = simulation.config.sensors
     assert sensing_reach_m(config, RADIUS_M) == config.lidar.range_m + RADIUS_M

@@ -1,4 +1,4 @@
-"""Rows for sensor workers: each once; first the agents of the worker's share, then other agents."""
+"""A sensor worker gets each row once, and the rows of the agents in its share first."""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ def test_frames_move_up_and_the_newest_is_last(stack: int) -> None:
 
 
 @pytest.mark.parametrize("stack", [1, 3])
-def test_kept_numbers_move_to_the_next_frame(stack: int) -> None:
+def test_kept_numbers_are_copied_to_the_next_frame(stack: int) -> None:
     observation = np.zeros(4 * stack, np.float32)
     newest = newest_frame(observation, stack)
     observation[newest:] = [1, 2, 3, 4]

@@ -1,4 +1,4 @@
-"""Agents of signals: observations, actions and rewards, and equality of divided worlds."""
+"""Agents that control signals: observations, actions, rewards and equality of divided worlds."""
 
 from __future__ import annotations
 
@@ -55,15 +55,15 @@ def letters(env: CavEnv, s: int = 0) -> str:
 
 
 def choose(env: CavEnv, choices: Any) -> dict[str, Any]:
-    """Return actions: the suggested ones for vehicles, and one choice for all signals."""
+    """Return the suggested actions for vehicles, and `choices` for each signal."""
     actions = env.suggest_actions()
     return actions | dict.fromkeys(env.signals.agents, choices)
 
 
-# Greens, and the phases between them
+# Sequence of phases
 
 
-def test_between_two_greens_come_yellow_and_all_red() -> None:
+def test_yellow_and_all_red_come_between_two_greens() -> None:
     with closing(world(yellow_s=3.0, all_red_s=1.0, min_green_s=4.0, decide_s=2.0)) as env:
         env.reset()
         shown = []
@@ -75,7 +75,7 @@ def test_between_two_greens_come_yellow_and_all_red() -> None:
             "y" if old in "gG" and new == "r" else old
             for old, new in zip(first, second, strict=True)
         )
-        # The episode begins as if the first green had been chosen: 3 + 1 + 4 s, then yellow.
+        # The first green is shown at once, but its minimum of 4 s begins after 3 s + 1 s.
         assert shown[:9] == [first] * 9
         assert shown[9:11] == [yellow] * 2
         assert shown[11] == "r" * len(first)
@@ -88,7 +88,7 @@ def test_a_green_lasts_at_least_its_minimum_and_at_most_its_maximum() -> None:
         lasted, since = [], 0
         for step in range(60):
             states = env.worlds.arrays.signal_states[0, 0].copy()
-            env.step(choose(env, int(states[GREEN])))  # the agent always tries to keep the green
+            env.step(choose(env, int(states[GREEN])))  # try to keep the green
             after = env.worlds.arrays.signal_states[0, 0]
             if after[SINCE] != states[SINCE]:
                 lasted.append(step - since - 2)
@@ -98,7 +98,7 @@ def test_a_green_lasts_at_least_its_minimum_and_at_most_its_maximum() -> None:
         assert env.worlds.arrays.signal_states[0, 0, REFUSED] == len(lasted)
 
 
-def test_choices_that_are_not_allowed_are_counted_or_refused() -> None:
+def test_forbidden_choices_are_counted_or_raise_an_error() -> None:
     with closing(world(min_green_s=8.0)) as env:
         _, infos = env.reset()
         agent = env.signals.agents[0]
@@ -114,7 +114,7 @@ def test_choices_that_are_not_allowed_are_counted_or_refused() -> None:
         env.step(choose(env, 0))
 
 
-def test_keep_or_next_selects_the_greens_in_their_order() -> None:
+def test_the_action_next_selects_the_next_green() -> None:
     with closing(world(action="keep_or_next", min_green_s=0.0, decide_s=5.0)) as env:
         env.reset()
         assert env.action_space(env.signals.agents[0]) == spaces.Discrete(2)
@@ -122,7 +122,7 @@ def test_keep_or_next_selects_the_greens_in_their_order() -> None:
         for step in range(21):
             env.step(choose(env, 1 if step % 10 == 0 else 0))
             greens.append(int(env.worlds.arrays.signal_states[0, 0, GREEN]))
-        # The first choice comes before the first green has begun: it is refused.
+        # The choice of step 0 is refused, because the first green has not begun.
         assert greens[0] == 0
         assert greens[10] == 1
         assert greens[20] == 0
@@ -150,20 +150,25 @@ def test_signals_without_an_agent_keep_their_programs() -> None:
 
 
 def expected_counts(
-    env: CavEnv, stood: dict[int, tuple[int, int]]
+    env: CavEnv, standing_times: dict[int, tuple[int, int]]
 ) -> dict[str, NDArray[np.float64]]:
-    """Return counts by lane, from all vehicles; `stood`: lane and standing ticks by vehicle."""
+    """Return the expected counts of each lane.
+
+    Args:
+        env: the world.
+        standing_times: (lane, standing ticks) of each vehicle.
+    """
     found: dict[str, NDArray[np.float64]] = defaultdict(lambda: np.zeros(4))
     speed_mps = env.network.lanes["speed_mps"]
     for row in env.simulation.vehicles(0):
         lane = env.network.lane_ids[row["lane"]]
         standing = abs(row["speed"]) < 0.1
         lost = 1.0 - abs(row["speed"]) / (speed_mps[row["lane"]] * row["speed_factor"])
-        found[lane] += [1, standing, stood[int(row["id"])][1], lost]
+        found[lane] += [1, standing, standing_times[int(row["id"])][1], lost]
     return found
 
 
-def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
+def test_observations_and_rewards_equal_a_computation_from_all_vehicles() -> None:
     weights = {"diff_wait": 1.0, "average_speed": 0.5, "queue": 0.25, "pressure": 0.125}
     weights |= {"delay": 0.1, "wait": 0.2}
     ticks = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2}
@@ -172,19 +177,19 @@ def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
     with closing(env):
         env.reset()
         table, arrays = env.signals.table, env.worlds.arrays
-        stood: dict[int, tuple[int, int]] = {}
+        standing_times: dict[int, tuple[int, int]] = {}
         waited_before = np.zeros(len(table.ids))
         waits = 0
         rewards: dict[str, float] = {}
         for step in range(151):
             rows = env.simulation.vehicles(0)
-            old, stood = stood, {}
+            old, standing_times = standing_times, {}
             for number, lane, speed in zip(rows["id"], rows["lane"], rows["speed"], strict=True):
                 before = old.get(int(number), (-1, 0))
                 ticks_before = before[1] if before[0] == lane else 0
-                stood[int(number)] = (int(lane), ticks_before + (abs(speed) < 0.1))
+                standing_times[int(number)] = (int(lane), ticks_before + (abs(speed) < 0.1))
             if step % 5 == 0:
-                counts = expected_counts(env, stood)
+                counts = expected_counts(env, standing_times)
                 for k, lane_id in enumerate(table.lanes):
                     columns = [VEHICLES, STANDING, STOOD_TICKS]
                     assert (
@@ -231,8 +236,8 @@ def test_observations_and_rewards_are_computed_from_the_vehicles() -> None:
 # The API
 
 
-def test_the_parallel_environment_keeps_its_contract() -> None:
-    # In an open world, PettingZoo's test warns of agents that have not entered at the horizon.
+def test_an_environment_with_signal_agents_passes_pettingzoos_test() -> None:
+    # In open mode, PettingZoo's test warns of agents that never entered.
     overrides = ALL | {"population.mode": "closed"}
     env = parallel_env("grid4x4", agents=2, background=60, overrides=overrides)
     with closing(env):
@@ -296,7 +301,7 @@ def test_dicts_and_arrays_have_the_same_trajectories(mode: str, agents: int) -> 
         assert infos["signal_refused"].any()
 
 
-def test_signals_are_truncated_at_the_horizon_and_never_terminated() -> None:
+def test_signal_agents_are_truncated_at_the_horizon_and_never_terminated() -> None:
     env = parallel_env("grid4x4", agents=1, background=5, overrides=ALL | {"horizon_s": 9.0})
     with closing(env):
         env.reset(seed=0)
@@ -310,7 +315,7 @@ def test_signals_are_truncated_at_the_horizon_and_never_terminated() -> None:
         assert steps == 9
 
 
-def test_a_world_can_have_agents_of_signals_alone() -> None:
+def test_a_world_can_have_only_signal_agents() -> None:
     vec = make_vec("grid4x4", num_envs=2, agents=0, background=40, overrides=ALL)
     with closing(vec):
         observations, infos = vec.reset(seed=0)
@@ -338,7 +343,7 @@ def test_a_world_can_have_agents_of_signals_alone() -> None:
         ({"vehicles": None, "signals": np.full((1, 16), -1)}, "signal_A0: the action is -1, must"),
     ],
 )
-def test_wrong_choices_have_clear_errors(actions: Any, message: str) -> None:
+def test_an_invalid_choice_raises_an_error_and_changes_nothing(actions: Any, message: str) -> None:
     vec = make_vec("grid4x4", num_envs=1, agents=2, background=5, overrides=ALL)
     with closing(vec):
         vec.reset(seed=0)
@@ -350,14 +355,14 @@ def test_wrong_choices_have_clear_errors(actions: Any, message: str) -> None:
         assert vec.state_hash(0) == before
 
 
-def test_a_missing_choice_is_an_error_only_when_a_signal_decides() -> None:
+def test_a_missing_choice_is_an_error_only_when_signals_decide() -> None:
     with closing(world()) as env:
         env.reset()
         cars = {agent: value for agent, value in env.suggest_actions().items() if "car" in agent}
         with pytest.raises(ActionError, match=r"no action for signal_A0, .*'decides'"):
             env.step(cars)
         env.step(choose(env, 0))
-        env.step(cars)  # no choice is due in this step
+        env.step(cars)  # signals do not decide now
 
 
 @pytest.mark.parametrize(
@@ -376,12 +381,14 @@ def test_a_missing_choice_is_an_error_only_when_a_signal_decides() -> None:
         ),
     ],
 )
-def test_wrong_settings_have_clear_errors(overrides: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_refused_with_the_reason(
+    overrides: dict[str, Any], message: str
+) -> None:
     with pytest.raises(ConfigError, match=message):
         make_vec("grid4x4", agents=1, background=5, overrides=ALL | overrides)
 
 
-def test_maps_without_a_choice_have_no_agents_of_signals() -> None:
+def test_signals_with_one_green_cannot_have_agents() -> None:
     with pytest.raises(ConfigError, match="no signal of this map has two or more greens"):
         make_vec("merge", agents=1, overrides=ALL)
     with pytest.raises(ConfigError, match=r"signals\.agents = none: set it"):
@@ -420,7 +427,7 @@ SENSING: dict[str, dict[str, Any]] = {
 def hashes(
     sensing: str = "truth", kill_at: tuple[int, ...] = (), num_envs: int = 2, **more: Any
 ) -> list[str]:
-    """Return hashes of the states and of all results of the agents of signals."""
+    """Run worlds; return the hashes of their states and of the results of signal agents."""
     overrides = ALL | SENSING[sensing]
     overrides |= {"horizon_s": 30.0, "sensors.signal.timing": True, "signals.max_green_s": 10.0}
     vec: CavVectorEnv = make_vec(
@@ -429,7 +436,7 @@ def hashes(
     with closing(vec):
         vec.reset(seed=1)
         rng, given = np.random.default_rng(0), hashlib.sha256()
-        for step in range(45):  # one horizon, and half of the next episode
+        for step in range(45):  # one and a half episodes
             if step in kill_at:
                 os.kill(vec.worlds.worker_pids[1], signal.SIGKILL)
             actions = vec.suggest_actions()
@@ -478,7 +485,7 @@ def test_a_divided_world_equals_the_undivided_one(
 def test_results_are_the_same_on_workers_when_one_is_killed(
     sensing: str, undivided: list[str], undivided_world: list[str]
 ) -> None:
-    # A single world is divided among the workers by zones; several worlds are divided as wholes.
+    # Workers share the zones of a single world, or each worker runs whole worlds.
     assert hashes(sensing, num_envs=1, zones=4, workers=2, kill_at=(7, 22)) == undivided_world
     assert hashes(sensing, workers=2, kill_at=(33,)) == undivided
 
@@ -533,7 +540,7 @@ def test_a_saved_state_continues_with_other_zones(sensing: str) -> None:
 
 
 def arrived(name: str) -> tuple[int, float]:
-    """Return the number of vehicles that arrive in ten minutes, and of vehicles that stand."""
+    """Return the number of arrivals in 350 s, and a measure of the number of standing vehicles."""
     overrides = ALL | {
         "clock.ctrl_dt_s": 5.0,
         "horizon_s": 900.0,
@@ -552,7 +559,7 @@ def arrived(name: str) -> tuple[int, float]:
         return sum(int(vec.traffic_stats(w)["arrived"]) for w in range(2)), stands
 
 
-def test_max_pressure_lets_more_vehicles_through_than_the_program() -> None:
+def test_more_vehicles_arrive_with_max_pressure_than_with_the_program() -> None:
     through, stands = arrived("program")
     assert through > 1000
     for name in ("longest_queue", "max_pressure"):
@@ -566,7 +573,7 @@ def test_an_unknown_controller_is_refused() -> None:
         make_controller("greedy")
 
 
-def test_a_controller_chooses_for_signals_in_worlds_of_vehicles() -> None:
+def test_a_configured_controller_equals_choices_of_the_caller() -> None:
     overrides = ALL | {"signals.controller": "max_pressure", "horizon_s": 40.0}
     own = make_vec("grid4x4", agents=3, background=60, seed=2, overrides=ALL | {"horizon_s": 40.0})
     ready = make_vec("grid4x4", agents=3, background=60, seed=2, zones=4, overrides=overrides)
@@ -584,14 +591,14 @@ def test_a_controller_chooses_for_signals_in_worlds_of_vehicles() -> None:
         assert own.state_hash() == ready.state_hash()
 
 
-def test_drivers_of_vehicles_refuse_agents_of_signals() -> None:
+def test_policies_for_vehicles_refuse_worlds_with_signal_agents() -> None:
     vec = make_vec("grid4x4", agents=3, background=5, overrides=ALL)
     with closing(vec), pytest.raises(PolicyError, match=r"set signals\.controller to one of prog"):
         load_policy("idm", vec)
 
 
-def test_drivers_of_vehicles_act_beside_agents_of_signals() -> None:
-    """They drive as under a controller that chooses the same greens."""
+def test_policies_for_vehicles_can_be_loaded_beside_signal_agents() -> None:
+    """They drive as in a world whose controller chooses the same greens."""
     program = {"signals.controller": "program"}
     vec = make_vec("grid4x4", agents=3, background=5, overrides=ALL)
     ready = make_vec("grid4x4", agents=3, background=5, overrides=ALL | program)
@@ -615,17 +622,17 @@ def test_drivers_of_vehicles_act_beside_agents_of_signals() -> None:
 
 
 @pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
-def test_adapters_that_show_vehicles_alone_refuse_agents_of_signals(adapter: Any) -> None:
+def test_adapters_for_vehicles_refuse_signal_agents(adapter: Any) -> None:
     with pytest.raises(ConfigError, match="this adapter has agents of vehicles alone; set sig"):
         adapter("grid4x4", overrides=ALL)
 
 
-def test_a_followed_world_refuses_agents_of_signals(tmp_path: Path) -> None:
+def test_a_followed_world_refuses_signal_agents(tmp_path: Path) -> None:
     with closing(world()) as env, pytest.raises(ConfigError, match="a followed world has agents"):
         FollowedWorld(env, tmp_path / "socket")
 
 
-def test_a_world_for_clients_of_carla_refuses_agents_of_signals() -> None:
+def test_a_world_for_clients_of_carla_refuses_signal_agents() -> None:
     message = "a world for CARLA's clients has agents of vehicles"
     with closing(world()) as env, pytest.raises(ConfigError, match=message):
         serve(env)
@@ -634,7 +641,7 @@ def test_a_world_for_clients_of_carla_refuses_agents_of_signals() -> None:
         source.load("grid4x4", 0.05)
 
 
-def test_calls_for_vehicles_name_agents_of_signals() -> None:
+def test_calls_for_vehicles_refuse_the_names_of_signal_agents() -> None:
     with closing(world()) as env:
         env.reset()
         name = env.signals.agents[0]
@@ -649,7 +656,7 @@ def test_calls_for_vehicles_name_agents_of_signals() -> None:
 
 
 @pytest.mark.parametrize("change", [(2.0, 1.0), (0.0, 0.0), (3.0, 0.0)])
-def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float, float]) -> None:
+def test_the_reported_time_to_a_change_is_a_lower_bound(change: tuple[float, float]) -> None:
     yellow_s, all_red_s = change
     times: dict[str, Any] = {"yellow_s": yellow_s, "all_red_s": all_red_s, "min_green_s": 4.0}
     with closing(world(decide_s=1.0, **times)) as env:
@@ -678,13 +685,13 @@ def test_the_time_to_a_change_is_never_later_than_the_change(change: tuple[float
             for k in range(len(links)):
                 later = [n for n in range(tick, 70) if shown[n][k] != now[k]]
                 if later:
-                    # The letter changed at some time in the second before `later`.
+                    # The letter changed in the second before `later`.
                     assert soonest[k] <= later[0] - tick + 1e-9
                     is_exact += soonest[k] >= later[0] - tick - 1.0 - 1e-9
         assert is_exact > 100
 
 
-def test_an_overridden_letter_takes_precedence_over_a_chosen_green() -> None:
+def test_an_overridden_signal_state_takes_precedence_over_a_chosen_green() -> None:
     def run(**more: Any) -> list[str]:
         overrides = ALL | {"signals.overrides": 8, "horizon_s": 60.0}
         env = parallel_env("grid4x4", agents=2, background=60, overrides=overrides, **more)

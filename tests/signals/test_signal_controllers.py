@@ -1,4 +1,4 @@
-"""Controllers of signals: their rules, their counts of lanes, and equality of divided worlds."""
+"""Signal controllers: their rules, the counts that they use, and equality of divided worlds."""
 
 from __future__ import annotations
 
@@ -37,15 +37,15 @@ CONTROLLERS: dict[str, dict[str, Any]] = {
 }
 
 
-# Rules, on a view with values set by hand
+# Rules; the test sets the counts
 
 
 def view_of(vec: CavVectorEnv) -> SignalView:
-    """Return the signals at 100 s, when the first green has lasted for 20 s."""
+    """Return a view of the signals at 100 s, when the first green has lasted for 20 s."""
     vec.reset(seed=0)
     given = vec.signals.view
     states, history = np.zeros_like(given.states), np.zeros_like(given.history)
-    states[..., SINCE] = 500 - 110  # 2 s of yellow, and 20 s of green
+    states[..., SINCE] = 500 - 110  # 22 s ago: 2 s of yellow, 20 s of green
     history[..., FLOW] = NOT_MEASURED
     return given._replace(
         ticks=given.ticks + 500,
@@ -64,14 +64,14 @@ def view() -> Iterator[SignalView]:
 
 
 def lanes_of(view: SignalView, green: int) -> list[int]:
-    """Return the lanes that this green of the signal A0 opens and the other green does not."""
+    """Return the lanes that only this green of the signal A0 opens."""
     moves, opened = view.table.movements[0], view.table.opened[0]
     other = set(moves[opened[1 - green], 0].tolist())
     return sorted(set(moves[opened[green], 0].tolist()) - other)
 
 
-def lasted(view: SignalView, green_s: float) -> SignalView:
-    """Return the same view with another duration of the present green."""
+def with_green_s(view: SignalView, green_s: float) -> SignalView:
+    """Return a copy of the view in which the present green has lasted for `green_s`."""
     states = view.states.copy()
     states[..., SINCE] = 500 - round((2.0 + green_s) / view.dt)
     return view._replace(states=states)
@@ -83,25 +83,25 @@ def choice(name: str, view: SignalView, s: int = 0, **keys: Any) -> int:
 
 
 def test_webster_divides_the_cycle_by_critical_flows(view: SignalView) -> None:
-    # In 300 s, 150 vehicles could leave a lane: y = 0.4 and 0.2. 8 s are lost.
+    # At most 150 vehicles leave a lane in 300 s, so the flow ratios are 0.4 and 0.2; 8 s are lost.
     # C = (1.5 · 8 + 5) / (1 - 0.6) = 42.5 s; greens of 34.5 · 2/3 + 2 = 25 s, and 13.5 s.
     view.history[0, :, FLOW] = 0
     view.history[0, lanes_of(view, 0)[0], FLOW] = 60
     view.history[0, lanes_of(view, 0)[-1], FLOW] = 20
     view.history[0, lanes_of(view, 1)[0], FLOW] = 30
-    assert choice("webster", lasted(view, 24.4), decide_s=1.0) == 0
-    assert choice("webster", lasted(view, 24.6), decide_s=1.0) == 1
+    assert choice("webster", with_green_s(view, 24.4), decide_s=1.0) == 0
+    assert choice("webster", with_green_s(view, 24.6), decide_s=1.0) == 1
     view.states[..., GREEN] = 1
-    assert choice("webster", lasted(view, 12.8), decide_s=1.0) == 1
-    assert choice("webster", lasted(view, 13.2), decide_s=1.0) == 0
-    # With half of the saturation flow, Y > 1, so the longest cycle of 120 s is divided.
-    late = lasted(view, (120.0 - 8.0) / 3.0 + 2.0 - 0.6)
+    assert choice("webster", with_green_s(view, 12.8), decide_s=1.0) == 1
+    assert choice("webster", with_green_s(view, 13.2), decide_s=1.0) == 0
+    # With half of the saturation flow, the sum of flow ratios is 1.2, so the cycle is 120 s.
+    late = with_green_s(view, (120.0 - 8.0) / 3.0 + 2.0 - 0.6)
     assert choice("webster", late, decide_s=1.0, saturation_per_h=900.0) == 1
-    late = lasted(view, (120.0 - 8.0) / 3.0 + 2.0 - 0.4)
+    late = with_green_s(view, (120.0 - 8.0) / 3.0 + 2.0 - 0.4)
     assert choice("webster", late, decide_s=1.0, saturation_per_h=900.0) == 0
 
 
-def test_webster_counts_a_lane_of_several_greens_in_equal_parts() -> None:
+def test_webster_divides_the_flow_of_a_lane_among_its_greens() -> None:
     with closing(make_vec("town", num_envs=1, agents=0, background=0, overrides=ALL)) as vec:
         view = view_of(vec)
         table = view.table
@@ -112,20 +112,20 @@ def test_webster_counts_a_lane_of_several_greens_in_equal_parts() -> None:
             if len(openers := np.flatnonzero(opened[:, moves[:, 0] == lane].any(axis=1))) == 2
         )
         view.history[0, :, FLOW] = 0
-        view.history[0, lane, FLOW] = 60  # Y = 0.4: each of the two greens counts 0.2
+        view.history[0, lane, FLOW] = 60  # flow ratio 0.4, 0.2 for each green
         lost_s = 4.0 * len(table.greens[s])
         cycle_s = max(30.0, (1.5 * lost_s + 5.0) / 0.6)
         green_s = (cycle_s - lost_s) / 2.0 + 2.0
         for green in openers:
             view.states[0, s, GREEN] = green
-            assert choice("webster", lasted(view, green_s - 0.7), s, decide_s=1.0) == green
-            assert choice("webster", lasted(view, green_s - 0.3), s, decide_s=1.0) != green
+            assert choice("webster", with_green_s(view, green_s - 0.7), s, decide_s=1.0) == green
+            assert choice("webster", with_green_s(view, green_s - 0.3), s, decide_s=1.0) != green
 
 
 def test_webster_follows_the_program_before_a_flow_is_known(view: SignalView) -> None:
     due_s = float(view.table.green_s[0, 0])
-    assert choice("webster", lasted(view, due_s - 1.0), decide_s=1.0) == 0
-    assert choice("webster", lasted(view, due_s), decide_s=1.0) == 1
+    assert choice("webster", with_green_s(view, due_s - 1.0), decide_s=1.0) == 0
+    assert choice("webster", with_green_s(view, due_s), decide_s=1.0) == 1
 
 
 def test_actuated_ends_a_green_at_a_gap(view: SignalView) -> None:
@@ -137,27 +137,29 @@ def test_actuated_ends_a_green_at_a_gap(view: SignalView) -> None:
     view.history[0, lane, DETECTED_MS] = 97_000
     assert choice("actuated", view) == 1
     assert choice("actuated", view, max_gap_s=3.1) == 0
-    view.history[0, lanes_of(view, 1)[0], DETECTED_MS] = 100_000  # a lane at red
+    view.history[0, lanes_of(view, 1)[0], DETECTED_MS] = 100_000  # this lane has red
     assert choice("actuated", view) == 1
 
 
-def test_sotl_gives_a_green_on_demand_but_keeps_platoons(view: SignalView) -> None:
+def test_sotl_changes_on_demand_but_does_not_interrupt_small_platoons(view: SignalView) -> None:
     red, green = lanes_of(view, 1), lanes_of(view, 0)
     view.history[0, red[0], RED_VEHICLE_TICKS] = 150
     view.history[0, red[1], RED_VEHICLE_TICKS] = 49
-    assert choice("sotl", view) == 0  # 199 vehicle ticks of 0.2 s: below 40 s
+    assert choice("sotl", view) == 0  # 199 · 0.2 s < 40 s
     view.history[0, red[1], RED_VEHICLE_TICKS] = 50
     assert choice("sotl", view) == 1
     view.counts[0, green[0], NEAR_LINE] = 1
     view.counts[0, green[1], NEAR_LINE] = 2
     assert choice("sotl", view) == 0
     assert choice("sotl", view, platoon=2) == 1
-    view.counts[0, green[1], NEAR_LINE] = 3  # a platoon of four may be interrupted
+    view.counts[0, green[1], NEAR_LINE] = 3  # more than `platoon` vehicles
     assert choice("sotl", view) == 1
 
 
 @pytest.mark.parametrize("name", ["longest_queue", "max_pressure"])
-def test_the_longest_red_takes_precedence_over_the_queue(name: str, view: SignalView) -> None:
+def test_a_lane_at_its_longest_red_takes_precedence_over_queues(
+    name: str, view: SignalView
+) -> None:
     view.counts[0, lanes_of(view, 0), VEHICLES] = 9
     view.history[0, lanes_of(view, 1)[0], RED_TICKS] = 300
     assert choice(name, view) == 0
@@ -168,8 +170,8 @@ def test_the_longest_red_takes_precedence_over_the_queue(name: str, view: Signal
 
 
 @pytest.mark.parametrize("name", CONTROLLERS)
-def test_controllers_begin_the_next_green_of_the_order(name: str, view: SignalView) -> None:
-    view.history[0, :, FLOW] = 0  # without flow, two equal greens in a cycle of 30 s
+def test_controllers_can_choose_the_action_next(name: str, view: SignalView) -> None:
+    view.history[0, :, FLOW] = 0  # cycle of 30 s with equal greens
     view.history[0, lanes_of(view, 1), RED_VEHICLE_TICKS] = 1000
     view.counts[0, lanes_of(view, 1), VEHICLES] = 1
     assert choice(name, view, action="keep_or_next") == 1
@@ -180,7 +182,7 @@ def test_controllers_begin_the_next_green_of_the_order(name: str, view: SignalVi
 # Counts of lanes
 
 
-def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
+def test_detectors_count_vehicles_and_store_the_last_time() -> None:
     keys = ALL | {"clock.ctrl_dt_s": 0.2, "signals.decide_s": 1.0, "signals.flow_interval_s": 20.0}
     vec = make_vec("grid4x4", num_envs=1, agents=0, background=150, overrides=keys)
     with closing(vec):
@@ -189,7 +191,7 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
         lanes = np.flatnonzero(table.arrays.detector >= 0)
         places = network.detectors[table.arrays.detector[lanes]]
         assert (places["lane"] == table.arrays.lane_row[lanes]).all()
-        # 2 s away at the speed limit, but at most as far as the queue that 5 s of green empty
+        # 2 s before the line at the speed limit, at most the length of a queue that leaves in 5 s
         speed = table.arrays.speed_mps[lanes]
         away_m = np.minimum(2.0 * speed, (5.0 / 1.9 + 0.5) * 7.5)
         np.testing.assert_allclose(places["s_m"], table.arrays.length_m[lanes] - away_m)
@@ -202,7 +204,7 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
                 on = rows[rows["lane"] == place["lane"]]
                 is_over = np.abs(on["s"] - place["s_m"]) <= 0.5 * on["length"]
                 now = set(on["id"][is_over].tolist())
-                # A loop reports that it is free once before it counts the next vehicle.
+                # A loop has to be free for a tick before it counts the next vehicle.
                 counted[k] += bool(now) and not over[k] and tick > 1
                 last[k] = 200 * tick if now else last[k]
                 over[k] = now
@@ -212,7 +214,7 @@ def test_detectors_count_vehicles_and_keep_the_last_time() -> None:
                 assert counted.sum() > 20
                 counted[:] = 0
             assert (history[:, PASSED] == counted).all()
-            since_ms = history[:, DETECTED_MS] - last  # the vehicle may leave between two ticks
+            since_ms = history[:, DETECTED_MS] - last  # it may leave between ticks
             assert ((since_ms >= 0) & (since_ms <= 200)).all()
 
 
@@ -234,7 +236,7 @@ def test_vehicles_near_the_line_are_counted() -> None:
         assert total > 100
 
 
-def test_counts_of_red_lanes_last_until_the_lanes_get_green() -> None:
+def test_the_counts_of_a_red_lane_are_cleared_by_its_green() -> None:
     keys = ALL | {"signals.min_green_s": 30.0, "signals.max_green_s": 30.0}
     vec = make_vec("grid4x4", num_envs=1, agents=0, background=150, overrides=keys)
     with closing(vec):
@@ -261,7 +263,7 @@ def test_counts_of_red_lanes_last_until_the_lanes_get_green() -> None:
 
 
 def test_a_side_road_does_not_starve(tmp_path: Path) -> None:
-    """Twelve vehicles a minute on each road across, and one vehicle that waits for them."""
+    """One vehicle waits at the side road while 15 vehicles a minute drive on the main road."""
     demand = tmp_path / "main.rou.xml"
     demand.write_text(
         '<routes><vType id="car" sigma="0" speedDev="0"/>'
@@ -286,7 +288,7 @@ def test_a_side_road_does_not_starve(tmp_path: Path) -> None:
 
 
 def drive(name: str, kill_at: tuple[int, ...] = (), num_envs: int = 1, **more: Any) -> list[str]:
-    """Return hashes of the states, and the greens of all signals."""
+    """Run worlds; return the hashes of their states, and the greens of all signals."""
     keys = ALL | CONTROLLERS[name] | {"horizon_s": 35.0, "signals.controller": name}
     vec = make_vec("grid4x4", num_envs=num_envs, agents=4, background=80, overrides=keys, **more)
     with closing(vec):
@@ -367,6 +369,6 @@ def test_a_saved_state_continues_with_other_zones(name: str) -> None:
         ({"signals.platoon": -1}, r"signals.platoon = -1"),
     ],
 )
-def test_wrong_settings_have_clear_errors(keys: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_refused_with_the_reason(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_vec("grid4x4", agents=1, background=5, overrides=ALL | keys)

@@ -1,4 +1,4 @@
-"""Knowledge of vehicles of agents and controllers of signals, for each `signals.sensing`."""
+"""What signal agents and controllers know of vehicles, for each value of `signals.sensing`."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def make_messages(
 
 
 def ticks(vec: CavVectorEnv, seconds: float, seed: int = 3) -> Iterator[int]:
-    """Run a world in which every signal changes its green when it may; yield after each tick."""
+    """Run a world whose signals change as early as allowed; yield the number of each tick."""
     vec.reset(seed=seed)
     yield 0
     for tick in range(round(seconds / TICK_S)):
@@ -65,13 +65,13 @@ def ticks(vec: CavVectorEnv, seconds: float, seed: int = 3) -> Iterator[int]:
 
 
 def watched(vec: CavVectorEnv) -> tuple[NDArray[np.void], NDArray[np.int64]]:
-    """Return the vehicles on watched lanes, and the index of the lane of each vehicle."""
+    """Return the vehicles on lanes of signals, and the index of each vehicle's lane."""
     rows = vec.simulation.vehicles(0)
     lanes = vec.signals.table.arrays.lane_index[rows["lane"]].astype(np.int64)
     return rows[lanes >= 0], lanes[lanes >= 0]
 
 
-def ways_m(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.float64]:
+def distances_m(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.float64]:
     """Return the distance of each vehicle to the signal that observes its lane."""
     table = vec.signals.table
     before = {lane for row in table.arrays.incoming.tolist() for lane in row}
@@ -92,7 +92,7 @@ def near_line(vec: CavVectorEnv, rows: NDArray[np.void]) -> NDArray[np.bool_]:
 
 
 def sums(rows: NDArray[np.void], lanes: NDArray[np.int64], num: int) -> NDArray[np.int64]:
-    """Return the numbers of vehicles and of standing vehicles by lane."""
+    """Return for each lane the numbers of vehicles and of standing vehicles."""
     standing = lanes[np.abs(rows["speed"]) < 0.1]
     return np.stack([np.bincount(each, minlength=num) for each in (lanes, standing)], axis=1)
 
@@ -101,14 +101,14 @@ def sums(rows: NDArray[np.void], lanes: NDArray[np.int64], num: int) -> NDArray[
 
 
 def test_a_camera_counts_the_vehicles_within_its_range() -> None:
-    # From this height, vehicles do not hide one another.
+    # Seen from 100 m above the ground, no vehicle hides another.
     with closing(make(sensing="camera", camera_range_m=60.0, camera_height_m=100.0)) as vec:
         beyond = 0
         for tick in ticks(vec, 40.0):
             if tick % 5:
                 continue
             rows, lanes = watched(vec)
-            is_near = ways_m(vec, rows) <= 60.0
+            is_near = distances_m(vec, rows) <= 60.0
             beyond += np.count_nonzero(~is_near)
             counts = vec.signals.view.counts[0]
             expected = sums(rows[is_near], lanes[is_near], len(counts))
@@ -123,7 +123,7 @@ def test_a_camera_counts_the_vehicles_within_its_range() -> None:
 def is_in_sight(
     camera: NDArray[np.float64], row: np.void, others: NDArray[np.void]
 ) -> NDArray[np.bool_]:
-    """Return whether the line from a camera to a vehicle's middle passes above other vehicles."""
+    """Return whether no other vehicle hides the middle of a vehicle from a camera."""
     target = np.array([row["x"], row["y"], row["z"] + 0.5 * row["height"]])
     far = np.sqrt(((target - camera)[:2] ** 2).sum())
     along, across = (target - camera)[:2] / far, np.array([-1.0, 1.0]) * (target - camera)[1::-1]
@@ -156,7 +156,7 @@ def test_vehicles_hide_others_from_a_camera() -> None:
             if tick % 25:
                 continue
             rows, lanes = watched(vec)
-            rows, lanes = (each[ways_m(vec, rows) <= 150.0] for each in (rows, lanes))
+            rows, lanes = (each[distances_m(vec, rows) <= 150.0] for each in (rows, lanes))
             expected = np.zeros(len(table.lanes), dtype=np.int64)
             for s, signal in enumerate(table.arrays.row.tolist()):
                 links = network.links[network.links["signal"] == signal]
@@ -199,7 +199,7 @@ def test_a_camera_misses_vehicles_by_chance() -> None:
     everything, some = counted(0.0), counted(0.3)
     assert (some <= everything).all()
     assert some.sum() / everything.sum() == pytest.approx(0.7, abs=0.03)
-    # Each vehicle is drawn anew for each decision, so missed vehicles change.
+    # Misses are drawn anew for each decision.
     standing = (np.diff(everything, axis=0) == 0) & (everything[1:] > 0)
     assert 0.1 < (np.diff(some, axis=0)[standing] != 0).mean() < 0.9
     np.testing.assert_array_equal(some, counted(0.3))
@@ -209,7 +209,7 @@ def test_a_camera_misses_vehicles_by_chance() -> None:
 # Induction loops
 
 
-def test_loops_read_the_vehicles_over_them() -> None:
+def test_loops_report_the_vehicles_over_them() -> None:
     with closing(make(sensing="loops", loop_upstream_m=30.0)) as vec:
         table = vec.signals.table
         lanes = vec.network.lanes[table.arrays.lane_row]
@@ -249,7 +249,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             if tick % 25 or tick < 150:
                 continue
             rows, lanes = watched(vec)
-            is_between = ways_m(vec, rows) <= 50.0
+            is_between = distances_m(vec, rows) <= 50.0
             counts = vec.signals.view.counts[0]
             true.append(sums(rows[is_between], lanes[is_between], len(counts))[incoming])
             guessed.append(counts[incoming][:, [VEHICLES, STANDING]])
@@ -257,7 +257,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             np.testing.assert_array_equal(counts[:, LENGTH_MM], 5000 * counts[:, VEHICLES])
             moving = counts[:, VEHICLES] - counts[:, STANDING]
             np.testing.assert_array_equal(counts[:, SPEED_PPM], 1_000_000 * moving)
-            # A vehicle that stands at the line is counted. At most as many are estimated as fit.
+            # The estimate is at least 1 if a vehicle covers the loop at the line, and at most 7.
             covered = vec.signals.view.loops[0, :, EXIT, FREE_TICKS] == 0
             assert (counts[covered, VEHICLES] > 0).all()
             np.testing.assert_array_equal(counts[:, NEAR_LINE], covered)
@@ -268,7 +268,7 @@ def test_loops_estimate_the_vehicles_between_them() -> None:
             assert np.mean(one) == pytest.approx(np.mean(other), rel=0.35)
 
 
-def test_the_estimate_of_loops_is_zero_where_no_vehicle_comes() -> None:
+def test_loops_estimate_no_vehicles_on_an_empty_road() -> None:
     with closing(make(0, sensing="loops")) as vec:
         for _ in ticks(vec, 5.0):
             assert not vec.signals.view.counts.any()
@@ -278,7 +278,7 @@ def test_the_estimate_of_loops_is_zero_where_no_vehicle_comes() -> None:
         assert not vec.signals.view.observations[0, :, 3:].any()
 
 
-def test_the_standing_time_is_estimated_from_the_decisions_with_a_queue() -> None:
+def test_loops_estimate_standing_times_from_the_number_of_decisions_with_a_queue() -> None:
     with closing(make(sensing="loops")) as vec:
         before: NDArray[np.int64] | None = None
         longest = 0
@@ -305,7 +305,7 @@ def test_without_loops_there_are_no_readings() -> None:
 # Messages
 
 
-def test_units_count_the_vehicles_that_send_messages() -> None:
+def test_roadside_units_count_the_vehicles_that_send_messages() -> None:
     with closing(make_messages(V2X, background=50)) as vec:
         before = None
         differing = total = 0
@@ -315,7 +315,7 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
                 assert not counts.any()
             elif tick % 5 == 0:
                 assert before is not None
-                # The newest message was sent in the tick before the decision.
+                # The newest messages were sent in the previous tick.
                 found = counts[:, [VEHICLES, STANDING, NEAR_LINE]]
                 differing += int(np.abs(found - before).sum())
                 total += int(before.sum())
@@ -323,7 +323,7 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
             near = np.bincount(lanes[near_line(vec, rows)], minlength=len(counts))
             before = np.column_stack([sums(rows, lanes, len(counts)), near])
         assert total > 500
-        # Differences: vehicles that change lanes, or are in two inboxes.
+        # Vehicles that change lanes, or that two units receive, cause differences.
         assert differing < 0.03 * total
 
 
@@ -333,11 +333,11 @@ def test_units_count_the_vehicles_that_send_messages() -> None:
         ({"v2x.equipped": 0.0}, 0.0, 0.0),
         ({"v2x.equipped": 0.5}, 0.3, 0.7),
         ({"v2x.channel.loss": 1.0}, 0.0, 0.0),
-        ({"v2x.channel.loss": 0.5}, 0.8, 1.05),  # after a loss, another message comes soon
+        ({"v2x.channel.loss": 0.5}, 0.8, 1.05),  # later messages arrive
         ({"v2x.channel.range_m": 40.0}, 0.1, 0.7),
     ],
 )
-def test_units_know_only_vehicles_whose_messages_arrive(
+def test_roadside_units_count_only_vehicles_whose_messages_arrive(
     keys: dict[str, Any], low: float, high: float
 ) -> None:
     with closing(make_messages(V2X | keys, background=50)) as vec:
@@ -349,7 +349,7 @@ def test_units_know_only_vehicles_whose_messages_arrive(
         assert low <= known / true <= high
 
 
-def test_messages_of_the_last_episode_are_forgotten() -> None:
+def test_messages_of_the_previous_episode_are_deleted() -> None:
     with closing(make_messages(V2X, background=50)) as vec:
         for _ in ticks(vec, 3.0):
             pass
@@ -384,12 +384,12 @@ def test_full_inboxes_are_reported_once(caplog: pytest.LogCaptureFixture) -> Non
         ({"signals.camera_misses": 1.5}, r"signals\.camera_misses"),
     ],
 )
-def test_wrong_settings_have_clear_errors(keys: dict[str, Any], message: str) -> None:
+def test_invalid_settings_are_refused_with_the_reason(keys: dict[str, Any], message: str) -> None:
     with pytest.raises(ConfigError, match=message):
         make_messages(V2X | keys)
 
 
-# All kinds
+# All kinds of sensing
 
 
 @pytest.mark.parametrize("keys", [{"signals.sensing": "camera"}, {"signals.sensing": "loops"}, V2X])

@@ -1,4 +1,4 @@
-"""The departure queue decides on proposals of departures of all zones."""
+"""The departure queue accepts or rejects the departures that the zones propose."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MAIN = [ROADS.lane_ids.index(f"main_in_{k}") for k in range(2)]
 FIRST_ID = 50
 
 
-def gate_of(num_queue: int) -> DepartureQueue:
+def queue_of(num_queue: int) -> DepartureQueue:
     """Return a departure queue of this length; the vehicle at position q has the id 50 + q."""
     departures = make_departure_queue(1, 12, ROADS.arrays, VEHICLE)
     departures.queue[0]["id"] = FIRST_ID + np.arange(12)
@@ -35,7 +35,7 @@ def gate_of(num_queue: int) -> DepartureQueue:
 
 
 def offer(departures: DepartureQueue, xs: Sequence[tuple[int, float]]) -> None:
-    """Add proposals (position in the queue, x) in the order in which the zones made them."""
+    """Propose the departures (position in the queue, x) in the given order."""
     for n, (q, x) in enumerate(xs):
         departures.passing[0, n] = vehicles([(x, 0.0, 0.0)], id=FIRST_ID + q)[0]
         departures.places[0, n] = q
@@ -55,7 +55,7 @@ def running(number: int) -> NDArray[np.int64]:
 
 
 def test_proposals_are_accepted_in_the_order_of_the_queue() -> None:
-    departures = gate_of(6)
+    departures = queue_of(6)
     offer(departures, [(3, 300.0), (5, 500.0), (0, 0.0), (2, 200.0)])
     accept(departures, running(0), 100)
     assert passing(departures) == [50, 52, 53, 55]
@@ -67,7 +67,7 @@ def test_proposals_are_accepted_in_the_order_of_the_queue() -> None:
 def test_if_two_departures_would_touch_over_a_border_the_first_in_the_queue_enters(
     order: tuple[int, int],
 ) -> None:
-    departures = gate_of(3)
+    departures = queue_of(3)
     offer(departures, [(q, 4.0 * q) for q in order])
     accept(departures, running(0), 100)
     assert passing(departures) == [50]
@@ -75,8 +75,10 @@ def test_if_two_departures_would_touch_over_a_border_the_first_in_the_queue_ente
 
 
 @pytest.mark.parametrize(("present", "enter"), [(8, 2), (9, 1), (10, 0)])
-def test_a_full_world_accepts_only_as_many_as_fit(present: int, enter: int) -> None:
-    departures = gate_of(4)
+def test_a_nearly_full_world_accepts_only_as_many_departures_as_fit(
+    present: int, enter: int
+) -> None:
+    departures = queue_of(4)
     offer(departures, [(3, 300.0), (1, 100.0), (2, 200.0)])
     accept(departures, running(present), 10)
     assert passing(departures) == [51, 52][:enter]
@@ -85,7 +87,7 @@ def test_a_full_world_accepts_only_as_many_as_fit(present: int, enter: int) -> N
 
 
 def test_one_vehicle_per_tick_tries_to_enter_each_lane() -> None:
-    departures = gate_of(4)
+    departures = queue_of(4)
     departures.queue[0, :4]["lane"] = [MAIN[0], MAIN[0], MAIN[1], MAIN[0]]
     worlds = make_worlds(1, 12, ROADS)
     assign_lanes(ROADS.arrays, travel("merge"), departures, worlds.keys, worlds.lanes)
@@ -93,7 +95,8 @@ def test_one_vehicle_per_tick_tries_to_enter_each_lane() -> None:
 
 
 def test_an_entered_vehicle_has_one_owner_and_is_a_ghost_nearby() -> None:
-    # Four zones around (10, 20), halo 5 m; vehicles: in a corner, near a border, far from both.
+    # Four zones meet at (10, 20), with a halo of 5 m. The vehicles enter near that corner, near one
+    # border, and far from all borders.
     partition = four()
     halo = zone_halo(partition, 5.0)
     entering = vehicles([(9.0, 19.0, 0.0), (12.0, 40.0, 0.0), (-30.0, -20.0, 0.0)], id=[7, 8, 9])
@@ -103,7 +106,7 @@ def test_an_entered_vehicle_has_one_owner_and_is_a_ghost_nearby() -> None:
         worlds = make_worlds(1, 12, ROADS)
         worlds.next_rows[0, :2] = vehicles([(0.0, 0.0, 0.0)] * 2, id=[1, 2])
         worlds.num_owned[0], worlds.num_rows[0] = 1, 2
-        departures = gate_of(0)
+        departures = queue_of(0)
         departures.passing[0, :3] = entering
         departures.num_passing[0] = 3
         admit(partition.arrays, halo, zone, departures, worlds)

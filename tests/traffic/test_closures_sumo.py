@@ -10,7 +10,7 @@ from benchmarks.closures import ROADS, compare
 
 
 @pytest.mark.slow
-def test_arrivals_and_travel_times_are_those_of_sumo_s_rerouters() -> None:
+def test_arrivals_and_travel_times_agree_with_sumos_rerouters() -> None:
     found = compare("grid4x4", ROADS.split(","), 300, 900, 60, seed=3)
     assert found["rerouted"] > 50
     assert found["arrived"] == pytest.approx(found["sumo_arrived"], rel=0.15)

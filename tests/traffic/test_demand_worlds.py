@@ -49,10 +49,10 @@ def test_shuffled_rows_give_the_same_bytes(make: Make) -> None:
     assert shuffled.traffic_stats() == tidy.traffic_stats()
     assert shuffled.state_hash() == tidy.state_hash()
     assert tidy.traffic_stats().departed > 30
-    assert moved > 10 * step, "hardly anything shuffled"
+    assert moved > 10 * step, "few rows were shuffled"
 
 
-def test_worlds_together_equal_single_worlds_and_differ(make: Make) -> None:
+def test_worlds_of_one_simulation_differ_and_equal_single_worlds(make: Make) -> None:
     together = make(num_worlds=3)
     start(together, seed=9)
     alone = [make() for _ in range(3)]
@@ -118,7 +118,7 @@ def test_no_vehicle_is_lost_or_duplicated(make: Make) -> None:
         assert most_waiting > 0, "the queue was never used"
 
 
-def test_two_processes_agree(tmp_path: Path) -> None:
+def test_two_processes_compute_equal_states(tmp_path: Path) -> None:
     code = (
         "import sys; from pathlib import Path\n"
         "from tests.support.demand_worlds import TINY, tiny\n"
@@ -142,7 +142,7 @@ def test_two_processes_agree(tmp_path: Path) -> None:
     assert int(said[0][2]) > 5
 
 
-def test_the_hash_covers_waiting_vehicles_and_called_orders(tmp_path: Path) -> None:
+def test_the_hash_covers_waiting_vehicles_and_the_next_departure(tmp_path: Path) -> None:
     simulation = tiny("merge", tmp_path)
     start(simulation, seed=1)
     departures = simulation.departures

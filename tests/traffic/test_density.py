@@ -23,7 +23,8 @@ from tests.support.driving import drive, start
 LOW, MEDIUM, HIGH = 25, 50, 100
 DENSITIES = (LOW, MEDIUM, HIGH)
 ZONES = 4
-# The fullest of four zones has at least this share, so maximum ÷ mean is at least four times this.
+# Least share of all vehicles in the fullest of the four zones. The imbalance, which is maximum
+# divided by mean, is then at least four times this share.
 SHARE = 0.6
 APPROACH_TICKS = 100
 EPISODE = 600  # steps
@@ -97,10 +98,10 @@ def test_in_low_density_vehicles_rarely_cross_borders() -> None:
         in_flight = simulation.zones.view().transfers
         at_once |= Counter((transfer.source, transfer.target) for transfer in in_flight)
     assert simulation.migrations >= 1
-    assert min(at_once.values()) == 1, "at some border, there are never two vehicles at a time"
+    assert min(at_once.values()) == 1, "two vehicles crossed at once at every border"
 
 
-def test_medium_density_has_twice_the_updates_of_low() -> None:
+def test_medium_density_has_twice_as_many_vehicle_updates_as_low_density() -> None:
     updates = []
     for vehicles in (LOW, MEDIUM):
         simulation = world(vehicles)
@@ -109,46 +110,50 @@ def test_medium_density_has_twice_the_updates_of_low() -> None:
 
 
 def test_high_density_has_many_vehicles_at_borders_at_once() -> None:
-    # Approaches are announced four seconds ahead.
+    # A transfer is announced four seconds before it.
     simulation = world(HIGH, zones=9, approach_ticks=APPROACH_TICKS)
     in_flight = []
     for _ in first_minute(simulation):
         in_flight.append(len({transfer.vehicle for transfer in simulation.zones.view().transfers}))
         ids = simulation.vehicles()["id"]
-        assert len(set(ids.tolist())) == len(ids), "no vehicle is duplicated"
+        assert len(set(ids.tolist())) == len(ids), "a vehicle is duplicated"
         stats = simulation.traffic_stats()
-        assert stats.departed - stats.arrived - stats.removed == len(ids), "no vehicle is lost"
+        assert stats.departed - stats.arrived - stats.removed == len(ids), "a vehicle is lost"
     assert max(in_flight) >= 10
     assert simulation.migrations >= 50
     (transfers,) = simulation.transfers
     assert len(transfers.rows) == simulation.migrations
     assert all(0 <= row.tick - row.approached for row in transfers.rows), (
-        "each change was announced"
+        "a transfer was not announced"
     )
     assert {row.forced for row in transfers.rows} == {False}
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
 def test_a_divided_city_equals_the_undivided_city(vehicles: int) -> None:
-    equal("rush", vehicles, steps=60)
+    check_divisions("rush", vehicles, steps=60)
 
 
 @pytest.mark.parametrize("vehicles", DENSITIES)
 def test_a_divided_town_of_carla_equals_the_undivided_town(
     vehicles: int, shared_maps: Path
 ) -> None:
-    # There is no room for all hundred agents: the others wait.
-    equal(shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"})
+    # Not all of the 100 agents find room at the start; the others wait.
+    check_divisions(
+        shared_maps / CITY, vehicles, steps=60, overrides={"population.mode": "respawn"}
+    )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("layout", ["bisection", "grid", "strips"])
 @pytest.mark.parametrize("vehicles", [*DENSITIES, 200, 400])
-def test_whole_episodes_are_equal_in_all_layouts(vehicles: int, layout: str) -> None:
-    equal("rush", vehicles, steps=EPISODE, layout=layout, seed=vehicles)
+def test_whole_episodes_of_divided_worlds_equal_undivided_ones_in_all_layouts(
+    vehicles: int, layout: str
+) -> None:
+    check_divisions("rush", vehicles, steps=EPISODE, layout=layout, seed=vehicles)
 
 
-def equal(env: str | Path, vehicles: int, steps: int, **settings: Any) -> None:
+def check_divisions(env: str | Path, vehicles: int, steps: int, **settings: Any) -> None:
     found = verify_zones(env, (2, ZONES, 9), steps=steps, agents=vehicles, background=0, **settings)
     for result in found.results:
         assert result.difference is None, result

@@ -17,7 +17,7 @@ PASSENGER, BUS = (1 << VEHICLE_CLASSES.index(name) for name in ("passenger", "bu
 
 
 class Meter:
-    """The arrays of one world, updated second by second."""
+    """Speeds measured on the edges of one world; `see` adds the sample of one second."""
 
     def __init__(self, roads: RoadNetwork) -> None:
         self.roads = roads
@@ -48,7 +48,7 @@ def vehicles(draw: st.DrawFn, lanes: int) -> NDArray[np.void]:
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=25, deadline=None)
 @given(data=st.data())
-def test_sums_equal_the_sums_of_the_last_means(name: str, data: st.DataObject) -> None:
+def test_speed_sums_equal_the_sums_of_the_last_mean_speeds(name: str, data: st.DataObject) -> None:
     roads = network(name)
     meter, shuffled = Meter(roads), Meter(roads)
     means = [naive.mean_speeds(roads, np.zeros(0, VEHICLE))] * SAMPLES
@@ -64,7 +64,7 @@ def test_sums_equal_the_sums_of_the_last_means(name: str, data: st.DataObject) -
     np.testing.assert_array_equal(meter.past, shuffled.past)
 
 
-def test_travel_times_use_measured_speeds_and_closed_edges_are_no_way() -> None:
+def test_travel_times_use_measured_speeds_and_the_closures_of_edges() -> None:
     roads = network("grid4x4")
     edge = int(np.flatnonzero(~roads.edges["internal"])[0])
     sums = np.full(len(roads.edges), 10**9, dtype=np.int64)
@@ -80,11 +80,13 @@ def test_travel_times_use_measured_speeds_and_closed_edges_are_no_way() -> None:
 
     mine = roads.lanes["edge"] == edge
     assert (speeds(5)[mine] == 2.5).all()
-    assert (speeds(5)[~mine] == roads.lanes["speed_mps"][~mine]).all(), "never above the limit"
+    assert (speeds(5)[~mine] == roads.lanes["speed_mps"][~mine]).all(), "a speed is above the limit"
     assert (speeds(0) == roads.lanes["speed_mps"]).all()
     sums[edge] = 0
-    assert (speeds(5)[mine] > 0.0).all(), "a jam has a travel time"
+    assert (speeds(5)[mine] > 0.0).all(), "a jam has no finite travel time"
     closed[edge] = PASSENGER
     np.testing.assert_allclose((roads.lanes["length_m"] / speeds(5))[mine], CLOSED_S)
-    assert (speeds(0, BUS) == roads.lanes["speed_mps"]).all(), "closed to others"
-    assert (speeds(0, BUS | PASSENGER) == roads.lanes["speed_mps"]).all(), "ignores permissions"
+    assert (speeds(0, BUS) == roads.lanes["speed_mps"]).all(), "the edge is closed to buses"
+    assert (speeds(0, BUS | PASSENGER) == roads.lanes["speed_mps"]).all(), (
+        "the edge is closed to a class that ignores permissions"
+    )

@@ -1,4 +1,4 @@
-"""`traffic.endless`: agents get another goal, without effect on their rewards."""
+"""`traffic.endless`: agents that arrive get another goal, which does not reduce their reward."""
 
 from __future__ import annotations
 
@@ -23,14 +23,14 @@ def drive(endless: bool) -> tuple[float, bool]:
     return way_m, ended
 
 
-def test_no_trip_ends_where_trips_are_endless() -> None:
+def test_an_endless_trip_does_not_end() -> None:
     way_m, ended = drive(endless=True)
     assert not ended
-    assert way_m > 2 * 260.0  # the car has driven round, and each metre was counted
+    assert way_m > 2 * 260.0  # over two rounds
     assert drive(endless=False)[1]
 
 
-def test_zones_change_nothing() -> None:
+def test_zones_change_no_result() -> None:
     def seen(zones: int) -> list[bytes]:
         overrides = {"traffic.endless": True}
         vec = cavmarl.make_vec("ring", agents=3, background=6, zones=zones, overrides=overrides)

@@ -1,4 +1,4 @@
-"""Departures: SUMO's words for lane, position and speed, and other vehicles."""
+"""Lane, position and speed of departures: SUMO's attribute values, and gaps to other vehicles."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ LIMIT = float(ROADS.lanes["speed_mps"][MAIN[0]])
 
 
 def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
-    """Return a waiting departure; lane, position and speed are given unless `fields` differ."""
+    """Return a waiting departure with given lane, position and speed, unless `fields` differ."""
     row = np.zeros(1, DEPARTURE)
     row["id"], row["agent"], row["lane"], row["speed_factor"] = 50, -1, lane, 1.0
     for field, value in fields.items():
@@ -50,7 +50,7 @@ def departure(lane: int = MAIN[0], **fields: Any) -> np.void:
 
 
 def traffic(*places: tuple[int, float, float]) -> tuple[NDArray[np.void], Scratch]:
-    """Return cars at (lane, s, speed) by rising id, and their index."""
+    """Return cars at (lane, s, speed) with ids from 0 on, and their index by lane."""
     rows = [
         on_lane(ROADS, lane, s, TRAVEL, speed=speed, id=k)
         for k, (lane, s, speed) in enumerate(places)
@@ -85,7 +85,7 @@ def test_one_departure_per_tick_enters_a_given_lane() -> None:
     assert lane_of(codes.LANE_GIVEN, room, WEAVE[1], taken=[WEAVE[1]]) == -1
 
 
-def test_first_is_the_rightmost_lane_that_leads_on() -> None:
+def test_lane_first_is_the_rightmost_lane() -> None:
     _, room = traffic()
     assert lane_of(codes.LANE_FIRST, room, WEAVE[2]) == WEAVE[0]
     assert lane_of(codes.LANE_FIRST, room, WEAVE[2], taken=[WEAVE[0]]) == -1
@@ -102,7 +102,7 @@ def test_random_lanes_are_equally_likely_and_repeatable() -> None:
 
 
 @pytest.mark.parametrize("code", [codes.LANE_FREE, codes.LANE_ALLOWED])
-def test_free_is_the_emptiest_lane_or_the_right_lane_of_two(code: int) -> None:
+def test_lane_free_is_the_emptiest_lane_and_of_two_empty_lanes_the_right_one(code: int) -> None:
     _, room = traffic((WEAVE[0], 20.0, 5.0), (WEAVE[0], 60.0, 5.0), (WEAVE[1], 40.0, 5.0))
     assert lane_of(code, room) == WEAVE[2]
     _, room = traffic((WEAVE[0], 20.0, 5.0))
@@ -111,7 +111,7 @@ def test_free_is_the_emptiest_lane_or_the_right_lane_of_two(code: int) -> None:
 
 
 @pytest.mark.parametrize(("way_m", "counts"), [(2900.0, False), (3100.0, True)])
-def test_lanes_that_a_way_can_be_followed_on_for_3_km_are_equally_good(
+def test_lane_best_treats_lanes_alike_that_serve_the_route_for_3_km(
     way_m: float, counts: bool
 ) -> None:
     plan = PLAN.copy()
@@ -121,13 +121,13 @@ def test_lanes_that_a_way_can_be_followed_on_for_3_km_are_equally_good(
     assert lane == (WEAVE[0] if counts else WEAVE[1])
 
 
-def test_best_is_the_emptiest_of_the_lanes_that_need_no_change() -> None:
+def test_lane_best_is_the_emptiest_lane_that_needs_no_lane_change() -> None:
     assert PLAN[0][WEAVE[0]]["changes"] > 0
     _, room = traffic((WEAVE[1], 20.0, 5.0))
     assert lane_of(codes.LANE_BEST, room) == WEAVE[2]
     taken = WEAVE[1:]
     assert lane_of(codes.LANE_BEST, room, taken=taken) == -1, (
-        "the departure waits for one of the lanes"
+        "the departure does not wait for one of these lanes"
     )
 
 
@@ -143,15 +143,17 @@ def place(room: Scratch, tick: int = 0, **fields: Any) -> float:
     return entry_place(ROADS.arrays, TRAVEL, KEY, waiting, KIND, MAIN[0], tick, room)
 
 
-def test_given_positions_are_those_of_the_front_bumper_from_either_end() -> None:
+def test_a_given_position_is_the_front_bumper_counted_from_either_end() -> None:
     _, room = traffic()
     assert place(room, pos_code=codes.POS_GIVEN, pos=40.0) == 37.5
     assert place(room, pos_code=codes.POS_GIVEN, pos=-40.0) == pytest.approx(LENGTH - 42.5)
-    assert place(room, pos_code=codes.POS_GIVEN, pos=1.0) == 2.5, "the whole body is on the lane"
+    assert place(room, pos_code=codes.POS_GIVEN, pos=1.0) == 2.5, "the rear is not on the lane"
     assert place(room, pos_code=codes.POS_GIVEN, pos=LENGTH) == pytest.approx(LENGTH - 3.5)
 
 
-def test_no_vehicle_enters_with_its_front_over_the_line_even_on_a_shorter_lane() -> None:
+def test_no_vehicle_enters_with_its_front_over_the_line_even_if_it_is_longer_than_the_lane() -> (
+    None
+):
     _, room = traffic()
     bus = generated_types().copy()[0]
     bus["length"] = LENGTH + 5.0
@@ -161,13 +163,13 @@ def test_no_vehicle_enters_with_its_front_over_the_line_even_on_a_shorter_lane()
         assert s + 0.5 * bus["length"] == pytest.approx(LENGTH - 1.0)
 
 
-def test_base_puts_the_rear_at_the_start() -> None:
+def test_position_base_puts_the_rear_at_the_start() -> None:
     _, room = traffic((MAIN[0], 100.0, 5.0))
     assert place(room, pos_code=codes.POS_BASE) == 2.5
 
 
 @pytest.mark.parametrize("wanted_mps", [0.0, 5.0, 10.0])
-def test_last_keeps_the_gap_to_stop_behind_the_last(wanted_mps: float) -> None:
+def test_position_last_keeps_the_gap_to_stop_behind_the_last_vehicle(wanted_mps: float) -> None:
     _, room = traffic((MAIN[0], 100.0, 6.0), (MAIN[0], 80.0, 3.0))
     words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN, "speed": wanted_mps}
     decel = float(KIND["decel"])
@@ -176,18 +178,18 @@ def test_last_keeps_the_gap_to_stop_behind_the_last(wanted_mps: float) -> None:
     assert place(room, **words) == pytest.approx(expected)
     _, room = traffic((MAIN[0], 60.0, 0.0))
     words["speed"] = LIMIT
-    assert place(room, **words) == 2.5, "the departure waits for that position"
+    assert place(room, **words) == 2.5, "the departure does not wait at the start of the lane"
 
 
-def test_last_on_an_empty_lane_is_the_end_of_the_lane() -> None:
-    """The vehicle has the speed at which it may approach the line, or stands at the line."""
+def test_position_last_on_an_empty_lane_is_before_the_line() -> None:
+    """A standing vehicle enters at the line, a fast one where it can still stop before the line."""
     _, room = traffic()
     words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN}
     assert place(room, **words, speed=0.0) == pytest.approx(LENGTH - 3.5)
     assert place(room, **words, speed=LIMIT) < LENGTH - 3.5
 
 
-def test_behind_the_last_a_departure_waits_until_its_speed_is_safe() -> None:
+def test_a_departure_at_position_last_waits_until_its_speed_is_safe() -> None:
     _, room = traffic((MAIN[0], 50.0, 3.0))
     slower = {"speed_code": codes.SPEED_MAX}
     assert 0.0 < speed(room, **slower) < LIMIT
@@ -195,7 +197,7 @@ def test_behind_the_last_a_departure_waits_until_its_speed_is_safe() -> None:
 
 
 @pytest.mark.parametrize("code", [codes.POS_RANDOM, codes.POS_FREE, codes.POS_RANDOM_FREE])
-def test_random_positions_are_anywhere_and_differ_between_ticks(code: int) -> None:
+def test_random_positions_cover_the_lane_and_differ_between_ticks(code: int) -> None:
     _, room = traffic()
     found = np.array([place(room, tick, pos_code=code) for tick in range(400)])
     assert (found >= 2.5).all()
@@ -218,7 +220,7 @@ def speed(
 
 
 @pytest.mark.parametrize("factor", [0.8, 1.2])
-def test_on_a_free_lane_each_word_gives_its_speed(factor: float) -> None:
+def test_each_departure_speed_has_its_value_on_an_empty_lane(factor: float) -> None:
     _, room = traffic()
     wanted = {"speed_factor": factor}
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=5.0, **wanted) == 5.0
@@ -235,14 +237,14 @@ def test_on_a_free_lane_each_word_gives_its_speed(factor: float) -> None:
     assert drawn.mean() == pytest.approx(0.5 * factor * LIMIT, rel=0.1)
 
 
-def test_last_is_the_speed_of_the_leader_and_average_the_mean_of_the_lane() -> None:
+def test_speed_last_is_the_speed_of_the_last_vehicle_and_speed_average_is_the_mean() -> None:
     _, room = traffic((MAIN[0], 120.0, 6.0), (MAIN[0], 150.0, 10.0))
     assert speed(room, speed_code=codes.SPEED_LAST) == 6.0
     assert speed(room, speed_code=codes.SPEED_AVERAGE) == 8.0
 
 
 @pytest.mark.parametrize("code", [codes.SPEED_DESIRED, codes.SPEED_LIMIT, codes.SPEED_AVERAGE])
-def test_only_max_and_random_may_enter_more_slowly(code: int) -> None:
+def test_departures_with_speed_desired_limit_or_average_wait_for_their_speed(code: int) -> None:
     _, room = traffic((MAIN[0], 50.0, 3.0), (MAIN[0], 60.0, 2.0 * LIMIT))
     assert 0.0 < speed(room, speed_code=codes.SPEED_MAX) < LIMIT
     assert speed(room, speed_code=code) == -1.0
@@ -255,10 +257,12 @@ def test_a_leader_reduces_the_speed_but_a_departure_with_a_given_speed_waits() -
     assert speed(room, speed_code=codes.SPEED_MAX) == pytest.approx(safe)
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=0.9 * safe) == 0.9 * safe
     assert speed(room, speed_code=codes.SPEED_GIVEN, speed=1.1 * safe) == -1.0
-    assert speed(room, s=44.5, speed_code=codes.SPEED_MAX) == -1.0, "there is no room"
+    assert speed(room, s=44.5, speed_code=codes.SPEED_MAX) == -1.0, (
+        "a departure enters without room"
+    )
 
 
-def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
+def test_a_vehicle_on_the_next_lane_is_a_leader() -> None:
     # The next lane is inside the junction.
     beyond = int(PLAN[0][MAIN[0]]["next"])
     _, room = traffic((beyond, 0.0, 0.0))
@@ -271,7 +275,7 @@ def test_the_leader_may_be_beyond_the_end_of_the_lane() -> None:
     [(-0.47, codes.DRIVER_AGENT, True), (0.0, codes.DRIVER_AGENT, False),
      (-0.47, codes.DRIVER_BACKGROUND, False)],
 )  # fmt: skip
-def test_a_steered_car_that_reaches_over_from_the_adjacent_lane_is_a_leader(
+def test_a_steered_car_on_the_adjacent_lane_is_a_leader_if_its_rear_is_on_the_lane(
     askew: float, driver: int, minds: bool
 ) -> None:
     # The car has nearly finished its change to the left; its rear is over the departure's lane.
@@ -287,14 +291,14 @@ def test_a_steered_car_that_reaches_over_from_the_adjacent_lane_is_a_leader(
     assert (near == -1.0) == minds
 
 
-def test_before_the_end_of_a_lane_no_vehicle_enters_fast() -> None:
+def test_a_vehicle_enters_slowly_before_the_end_of_a_lane() -> None:
     slow = speed_at(ROADS.arrays, KIND, MAIN[0], LENGTH - 6.5, 20.0)
     assert slow == pytest.approx(np.sqrt(2.0 * 2.0 * 2.0))
     assert speed_at(ROADS.arrays, KIND, MAIN[0], 10.0, 20.0) == 20.0
 
 
-def test_a_departure_is_slow_only_before_a_line_where_it_may_have_to_stop() -> None:
-    """Behind that line, a lower speed limit has the same effect."""
+def test_a_departure_is_slow_only_before_a_line_with_a_conflict_or_a_signal() -> None:
+    """A lower speed limit behind the line also makes the departure slow."""
     _, room = traffic()
     place_m = LENGTH - 12.0
     link = int(PLAN[0][MAIN[0]]["link"])
@@ -319,7 +323,7 @@ def test_a_departure_is_slow_only_before_a_line_where_it_may_have_to_stop() -> N
     ("behind_m", "pace", "brakes"),
     [(5.5, 0.0, True), (60.0, 15.0, False), (15.0, 25.0, True), (15.0, 0.0, False)],
 )
-def test_a_follower_need_not_brake_hard_for_a_departure(
+def test_a_departure_is_refused_if_a_follower_would_brake_hard(
     behind_m: float, pace: float, brakes: bool
 ) -> None:
     cars, room = traffic((MAIN[0], 100.0 - behind_m, pace))
@@ -330,7 +334,7 @@ def test_a_follower_need_not_brake_hard_for_a_departure(
 
 
 def test_all_followers_are_checked_not_only_the_nearest() -> None:
-    """A nearer, standing vehicle on another link does not hide a fast vehicle."""
+    """A fast vehicle is found although a standing vehicle on another link is nearer."""
     roads, ways = network("grid4x4"), travel("grid4x4")
     lane = next(
         k for k, row in enumerate(roads.lanes) if row["num_into"] > 1 and not row["internal"]
@@ -356,7 +360,7 @@ def test_all_followers_are_checked_not_only_the_nearest() -> None:
 def test_a_vehicle_on_another_link_is_a_leader_while_its_rear_is_before_the_fork(
     rear_m: float, safe: bool
 ) -> None:
-    """The departure goes straight on; `rear_m`: the other vehicle's rear beyond the common line."""
+    """The departure goes straight on. `rear_m` is the other rear beyond the stop line."""
     roads, plans = network("grid4x4"), travel("grid4x4")
     lane, link, other = _fork(roads)
     plan = np.zeros(len(roads.lanes), _PLAN)
@@ -377,13 +381,17 @@ def test_a_vehicle_on_another_link_is_a_leader_while_its_rear_is_before_the_fork
 @pytest.mark.parametrize(
     ("to_start_m", "fork_m", "brakes"), [(2.0, 3.0, True), (60.0, 3.0, False), (2.0, 1.0, False)]
 )
-def test_no_vehicle_enters_before_a_vehicle_that_turns_into_the_lane_beside(
+def test_no_vehicle_enters_close_before_a_vehicle_that_turns_onto_another_lane(
     to_start_m: float, fork_m: float, brakes: bool
 ) -> None:
-    """`to_start_m`: way of the other front, at 10 m/s, to the end of its path. `fork_m`: length
-    over which the path runs beside the own path.
+    """The departure enters behind a junction, on the lane that the straight link leads to.
 
-    A long vehicle blocks the lane for 6 m more.
+    The other vehicle drives on another link from the same lane, at 10 m/s.
+
+    Args:
+        to_start_m: Distance of the other front from the end of its link.
+        fork_m: Length of the other link on which its path is near the straight link. The kernel
+            adds 6 m for long vehicles.
     """
     roads, plans = network("grid4x4"), travel("grid4x4")
     _, link, other = _fork(roads)
@@ -400,7 +408,7 @@ def test_no_vehicle_enters_before_a_vehicle_that_turns_into_the_lane_beside(
 
 
 def _fork(roads: Any) -> tuple[int, int, int]:
-    """Return a lane, and two links from it: straight on over the junction, and another link."""
+    """Return a lane and two links that begin there: the straight link and another link."""
     for lane in np.flatnonzero(roads.lanes["num_links"] > 1).tolist():
         first, num = roads.lanes["first_link"][lane], roads.lanes["num_links"][lane]
         links = range(first, first + num)

@@ -27,7 +27,7 @@ from tests.support.vec_runs import Make, drive, same
 from tests.support.world import tick_of
 
 MIXED = {"zoo:cities_ippo": 0.5, "zoo:intersection_ippo": 0.3, "idm": 0.2}
-# Ring22's driver has no memory, and no optional sensors.
+# The driver ring22_ippo has no memory and no optional sensors.
 TWO_KINDS = {"zoo:cities_ippo": 1.0, "zoo:ring22_ippo": 1.0}
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
 SHOWN = ("x", "y", "heading", "speed", "throttle", "steering", "lane", "s", "d", "to_go")
@@ -46,7 +46,7 @@ def simulation(env: str, model: Any, background: int, agents: int = 0, **more: A
 
 
 def owned(world: Simulation) -> NDArray[np.void]:
-    """Return the rows of the vehicles, to be changed."""
+    """Return a writable view of the rows of the vehicles."""
     worlds = tick_of(world).worlds
     rows: NDArray[np.void] = worlds.rows[0, : worlds.num_owned[0]]
     return rows
@@ -108,7 +108,7 @@ def test_a_network_drives_a_background_vehicle_as_it_drives_an_agent(
     assert moved_m > 50.0
 
 
-def test_shares_are_those_of_the_departures() -> None:
+def test_departing_vehicles_have_the_given_shares_of_drivers() -> None:
     world = simulation("town", MIXED, background=400)
     types = tick_of(world).traffic.travel.types[owned(world)["vtype"]]
     counts = np.bincount(types["network"], minlength=3)
@@ -188,7 +188,7 @@ def test_the_hash_of_a_state_includes_the_memory() -> None:
     assert world.state_hash() == before
 
 
-def test_a_recording_shows_the_drivers_of_the_whole_and_the_divided_world(
+def test_recordings_of_undivided_and_divided_worlds_show_equal_drivers(
     make: Make, tmp_path: Path
 ) -> None:
     wanted: dict[str, Any] = {
@@ -243,7 +243,7 @@ def load(model: Any, **more: Any) -> None:
         ({"zoo:cities_residual": 0.5, "IDM": 0.5}, "residual"),
     ],
 )
-def test_drivers_that_do_not_fit_are_refused_by_name(model: Any, said: str) -> None:
+def test_unusable_drivers_are_refused_by_name(model: Any, said: str) -> None:
     with pytest.raises(PolicyError, match=f"traffic.model = 'zoo:.*{said}"):
         load(model)
 
@@ -268,7 +268,7 @@ def test_unknown_models_in_a_mixture_are_refused() -> None:
         simulation("town", {"IDN": 0.5, "IDM": 0.5}, background=4)
 
 
-def test_networks_need_native_traffic_and_zones() -> None:
+def test_networks_need_native_traffic_and_native_zones() -> None:
     for model in ("zoo:cities_ippo", {"IDM": 1.0, "ACC": 1.0}):
         with pytest.raises(ConfigError, match=r"traffic.source = sumo-traffic needs one"):
             load(model, **{"traffic.source": "sumo-traffic", "traffic.demand": ["a.rou.xml"]})
@@ -284,7 +284,7 @@ def copied(tmp_path: Path) -> Path:
     return folder
 
 
-def test_a_driver_of_a_folder_drives_as_the_bundled_one(copied: Path) -> None:
+def test_a_driver_from_a_folder_drives_like_the_bundled_driver(copied: Path) -> None:
     ours, theirs = (
         simulation("cities", model, background=6) for model in (f"zoo:{copied}", "zoo:cities_ippo")
     )
@@ -313,7 +313,7 @@ def test_a_network_that_gives_nan_ends_the_step_with_its_name(
 
     path = copied / "model.safetensors"
     weights = load_file(path)
-    weights["body.0.bias"] = np.full_like(weights["body.0.bias"], 3e38)  # sums of it overflow
+    weights["body.0.bias"] = np.full_like(weights["body.0.bias"], 3e38)  # the sum overflows
     save_file(weights, path)
     wanted: dict[str, Any] = {"overrides": {"traffic.model": f"zoo:{copied}"}}
 

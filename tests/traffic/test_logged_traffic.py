@@ -1,6 +1,6 @@
-"""Worlds of logged scenes: replayed road users, agents in logged seats, drivers that react.
+"""Worlds of logged scenes: replayed road users, agents in logged vehicles, reactive drivers.
 
-A divided world is the undivided one, bit for bit, over zones, workers and nodes.
+A divided world equals the undivided one, bit for bit, over zones, workers and nodes.
 """
 
 from __future__ import annotations
@@ -70,14 +70,14 @@ def rows_of(env: CavEnv, driver: int) -> NDArray[np.void]:
     return found
 
 
-def test_a_file_is_a_world_with_an_agent_in_the_vehicle_that_logged_it(scene: Path) -> None:
+def test_without_settings_the_agent_drives_the_vehicle_that_logged_the_scene(scene: Path) -> None:
     with closing(made(scene)) as env:
         assert env.config.max_steps == TIMES - 1
         (agent,) = rows_of(env, DRIVER_AGENT)
         assert (agent["x"], agent["y"]) == pytest.approx((-60.0, -ASIDE_M), abs=1e-5)
         assert agent["speed"] == pytest.approx(10.0, abs=1e-4)
         assert (agent["length"], agent["width"]) == (4.5, 2.0)
-        assert len(rows_of(env, DRIVER_EXTERNAL)) == 4  # the fifth is seen later
+        assert len(rows_of(env, DRIVER_EXTERNAL)) == 4  # the fifth road user appears later
         goal = env.simulation.goal_edges[0, agent["goal"]]
         line = env.network.lane_polyline(int(env.network.edges["first_lane"][goal]))
         assert line[-1, 0] == pytest.approx(100.0)
@@ -110,7 +110,7 @@ def test_poses_between_samples_are_interpolated(scene: Path) -> None:
         assert first["speed"] == pytest.approx(8.0, abs=1e-3)
 
 
-def test_seats_are_chosen_by_name_or_in_the_order_of_the_file(scene: Path) -> None:
+def test_vehicles_of_agents_are_chosen_by_name_or_in_the_order_of_the_file(scene: Path) -> None:
     with closing(made(scene, agents=2)) as env:
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([-60.0, 80.0], abs=1e-4)
     seats = {"scenario.seats": ["8", "7"]}
@@ -139,7 +139,7 @@ def test_drivers_that_react_follow_the_logged_way(scene: Path) -> None:
         assert (driven["x"], driven["speed"]) == pytest.approx((80.0, 8.0), abs=1e-4)
         advance(env, 40)
         driven = rows_of(env, DRIVER_BACKGROUND)
-        assert len(driven) == 2  # the vehicle 9 has entered, not before its time
+        assert len(driven) == 2  # vehicle 9 has entered at its logged time
         assert driven["order"].tolist() == [0, 1]
         assert len(rows_of(env, DRIVER_EXTERNAL)) == 3
 
@@ -182,7 +182,7 @@ def hashes(scene: Path, kill_at: tuple[int, ...] = (), **more: Any) -> list[str]
 
 @pytest.mark.parametrize("params", [{}, {"reactive": True}, {"start_s": 1.0}])
 @pytest.mark.parametrize("seats", [["8"], ["7", "8"]])
-def test_zones_and_workers_change_nothing(
+def test_zones_and_workers_change_no_result(
     scene: Path, seats: list[str], params: dict[str, Any]
 ) -> None:
     overrides = {
@@ -228,14 +228,16 @@ def test_a_successor_of_a_dead_worker_continues(scene: Path) -> None:
 
 
 @pytest.mark.slow
-def test_nodes_change_nothing(scene: Path) -> None:
+def test_nodes_change_no_result(scene: Path) -> None:
     for overrides in ({}, REACTIVE):
         whole = hashes(scene, overrides=overrides)
         assert hashes(scene, overrides=overrides, zones=2, nodes=2) == whole
         assert hashes(scene, overrides=overrides, zones=2, nodes=2, kill_at=(24,)) == whole
 
 
-def test_worlds_of_a_vector_begin_again_on_their_own(scene: Path) -> None:
+def test_worlds_of_a_vectorized_environment_begin_new_episodes_equally_in_zones(
+    scene: Path,
+) -> None:
     with closing(make_vec(scene, num_envs=3, overrides=REACTIVE)) as vec:
         vec.reset(seed=0)
         for _ in range(TIMES + 20):
@@ -283,7 +285,7 @@ def test_a_recorded_run_is_repeated(scene: Path, tmp_path: Path) -> None:
         assert (found.first_difference, found.state_hash) == (None, wanted)
 
 
-def test_a_recorded_run_is_repeated_with_a_moved_scene_only_if_it_is_the_same(
+def test_a_recorded_run_is_repeated_with_a_moved_scene_file_only_if_its_content_is_equal(
     scene: Path, tmp_path: Path
 ) -> None:
     record = RecordOptions(tmp_path / "run", include=(INPUTS,))
@@ -361,24 +363,24 @@ WRONG: dict[str, tuple[dict[str, Any], type[Exception], str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG)
-def test_settings_that_do_not_fit_are_refused_with_a_cure(name: str, scene: Path) -> None:
+def test_invalid_settings_are_refused_with_a_remedy(name: str, scene: Path) -> None:
     overrides, kind, message = WRONG[name]
     with pytest.raises(kind) as caught:
         parallel_env(scene, overrides=overrides)
     assert message in str(caught.value)
 
 
-def test_an_agent_s_vehicle_must_not_overlap_another_one(tmp_path: Path) -> None:
+def test_an_agent_in_a_vehicle_that_overlaps_another_one_is_refused(tmp_path: Path) -> None:
     scene = scenario()
     scene["tracks"]["twin"] = track(-58.0, -ASIDE_M, 10.0, 0.0)
     path = write_pickle(tmp_path, scene)
     with pytest.raises(ConfigError, match=r"'7' overlaps another road user at 0 s; name another"):
         parallel_env(path, overrides={"scenario.seats": ["7"]})
-    with closing(made(path)) as env:  # chosen automatically, another vehicle is the agent's
+    with closing(made(path)) as env:  # without a name, the agent gets another vehicle
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([80.0], abs=1e-4)
 
 
-def test_where_lanes_diverge_the_log_decides_on_which_an_agent_is(tmp_path: Path) -> None:
+def test_the_log_decides_on_which_of_two_diverging_lanes_an_agent_is(tmp_path: Path) -> None:
     lines = lane_lines()
     line = np.concatenate([lines["tWN"], lines["outN"][1:]])[:, :2]
     steps = np.diff(line, axis=0)
@@ -386,7 +388,7 @@ def test_where_lanes_diverge_the_log_decides_on_which_an_agent_is(tmp_path: Path
     at = 1.0 + 0.5 * np.arange(TIMES)
     heading = np.interp(at, along[:-1], np.arctan2(steps[:, 1], steps[:, 0]))
     turner = track(0.0, 0.0, 1.0, 0.0)
-    for axis, aside in enumerate((np.sin(heading), -np.cos(heading))):  # 0.5 m on the right
+    for axis, aside in enumerate((np.sin(heading), -np.cos(heading))):  # 0.5 m to the right
         turner["state"]["position"][:, axis] = np.interp(at, along, line[:, axis]) + 0.5 * aside
     turner["state"]["heading"][:] = heading
     scene = scenario()
@@ -401,7 +403,7 @@ def test_where_lanes_diverge_the_log_decides_on_which_an_agent_is(tmp_path: Path
     assert found.seats[0].goal_edge == matcher.edge(end.lane, is_start=False)
 
 
-def test_a_missing_or_hostile_file_is_a_typed_error(tmp_path: Path) -> None:
+def test_a_missing_or_hostile_file_is_refused_with_a_typed_error(tmp_path: Path) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(tmp_path / "none.pkl")
     (tmp_path / "bad.pkl").write_bytes(b"cos\nsystem\n(S'true'\ntR.")

@@ -1,4 +1,4 @@
-"""Starts of generated trips."""
+"""Places where generated vehicles enter."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from tests.support.driving import make_traffic
 from tests.support.world import traffic_of
 
 
-def test_without_usable_roads_into_the_map_vehicles_enter_anywhere() -> None:
+def test_vehicles_enter_anywhere_if_no_usable_road_leads_into_the_map() -> None:
     traffic = traffic_of(make_traffic("grid4x4", background=4, overrides={"traffic.origins": []}))
     trips, num_goals = traffic.trips_of(0), traffic.goal_edges.shape[1]
     ways_in = np.flatnonzero(

@@ -1,4 +1,4 @@
-"""Mirrored rows of SUMO's vehicles compared with a plain twin, for random fronts on a map."""
+"""Rows that mirror SUMO's vehicles, compared with a slow, plain version for random positions."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def network() -> RoadNetwork:
 
 
 def fronts(network: RoadNetwork, number: int) -> np.ndarray:
-    """Return SEEN (number,) with random fronts on the lanes, many of them near a lane's start."""
+    """Return SEEN (number,) with random front bumpers on lanes, many near the start of a lane."""
     random = np.random.default_rng(3)
     seen = np.zeros(number, dtype=SEEN)
     seen["number"] = np.sort(random.permutation(10 * number)[:number])
@@ -45,7 +45,7 @@ def fronts(network: RoadNetwork, number: int) -> np.ndarray:
 
 
 def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
-    """Return empty routes: each consists of one edge without vehicles."""
+    """Return tables of routes that lead nowhere, and one path of one edge."""
     steps = np.zeros(2 * len(network.lanes), dtype=PLAN)
     steps["next"] = -1
     stops = np.zeros(0, dtype=STOP)
@@ -65,7 +65,7 @@ def nowhere(network: RoadNetwork) -> tuple[TripTables, Paths]:
     return travel, Paths(first, np.array([-1], dtype=np.int32), np.zeros(1, dtype=np.int64), 0)
 
 
-def test_positions_of_rows_equal_the_twin(network: RoadNetwork) -> None:
+def test_positions_of_mirrored_rows_equal_those_of_the_plain_version(network: RoadNetwork) -> None:
     seen = fronts(network, 200)
     zoned = make_zone_state(2, 1, 300)
     travel, paths = nowhere(network)
@@ -105,7 +105,7 @@ def test_positions_of_rows_equal_the_twin(network: RoadNetwork) -> None:
 
 
 def came_by(network: RoadNetwork, seen: np.void) -> int:
-    """Draw a link that leads to the front's lane."""
+    """Return a link that leads to the lane of the vehicle's front, or -1."""
     found = np.flatnonzero(network.links["to_lane"] == seen["lane"])
     return int(found[0]) if len(found) else -1
 

@@ -1,5 +1,4 @@
-"""Vehicles that search for routes while the world runs, compared with SUMO's on a map with two
-routes."""
+"""Vehicles search for routes while they drive, as in SUMO, on a map with two routes."""
 
 from __future__ import annotations
 
@@ -51,14 +50,14 @@ def cars(device: str = "") -> str:
 
 
 @pytest.mark.parametrize("device", [DEVICE, ONCE, "", NONE])
-def test_vehicles_without_a_given_route_choose_it_as_in_sumo(
+def test_vehicles_without_a_given_route_choose_their_route_as_in_sumo(
     net: Path, tmp_path: Path, device: str
 ) -> None:
     body = cars(device) + FLOW
     simulation = two_ways(net, tmp_path, body)
     ours = passed(simulation, SECONDS)
     sumo = sumo_passed(net, write_demand(tmp_path, body), tmp_path)
-    assert sumo["long1"] > 60, "the short route was not jammed"
+    assert sumo["long1"] > 60, "the short route was not jammed in SUMO"
     for edge in ("short", "long1", "long2", "out"):
         assert ours[edge] == pytest.approx(sumo[edge], rel=0.15), edge
     stats = simulation.traffic_stats()
@@ -67,7 +66,7 @@ def test_vehicles_without_a_given_route_choose_it_as_in_sumo(
     assert stats.contacts == 0
 
 
-def test_vehicles_of_a_route_stand_in_the_jam(net: Path, tmp_path: Path) -> None:
+def test_vehicles_with_a_given_route_stay_in_the_jam(net: Path, tmp_path: Path) -> None:
     flow = FLOW.replace('from="in" to="out"', 'route="near"')
     simulation = two_ways(net, tmp_path, cars() + ROUTES + flow)
     assert traffic_of(simulation).rerouting is None
@@ -131,7 +130,7 @@ def test_vehicles_with_a_stop_or_an_edge_to_pass_keep_their_route(
 
 
 def jam(net: Path, folder: Path, num_worlds: int = 1) -> Simulation:
-    """Make worlds with devices and a rerouter, before their first reset."""
+    """Make worlds with rerouting devices and a rerouter; the caller resets them first."""
     sometimes = rerouter(CLOSED, 'probability="0.5"', 'begin="90" end="120"')
     body = cars(SOME) + FLOW.replace('period="3"', 'period="exp(0.4)"')
     return two_ways(net, folder, body, sometimes, num_worlds=num_worlds, seed=None)
@@ -191,7 +190,7 @@ def test_the_hash_covers_measured_speeds_and_found_routes(net: Path, tmp_path: P
     rerouting = traffic_of(simulation).rerouting
     assert rerouting is not None
     past, speed_sums, looks, steps = rerouting.arrays()
-    # A vehicle is on the first of these steps.
+    # A vehicle is on the first step of `steps`, so the hash covers that step.
     for array in (past, speed_sums, looks["next"], looks["goal"], steps["to_go"]):
         value = array.reshape(-1)[:1].copy()
         array[(0,) * array.ndim] -= 1
@@ -210,7 +209,7 @@ def test_memory_does_not_grow_and_slots_are_reused(net: Path, tmp_path: Path) ->
         drive(simulation)
     arrays = (traffic.travel.steps, *traffic.rerouting.arrays())
     assert [array.size for array in arrays] == sizes
-    # Slots were reused: fewer slots than found routes were ever written.
+    # Fewer slots were written than routes were found, so slots were reused.
     written = (arrays[-1]["to_go"].reshape(-1, traffic.slots.steps) > 0.0).any(axis=1)
     assert 0 < np.count_nonzero(written) < 60
 

@@ -1,4 +1,4 @@
-"""Scenarios on random maps: staged only where their conflict exists."""
+"""Scenarios on random maps take place only where their conflict is possible."""
 
 from __future__ import annotations
 

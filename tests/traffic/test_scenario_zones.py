@@ -1,4 +1,4 @@
-"""A scenario does not depend on borders of zones, not even on borders through its place."""
+"""A scenario does not depend on borders of zones, even if a border crosses its place."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CUTS = {2: (2, 1), 4: (2, 2), 9: (3, 3)}  # columns and rows of zones
 
 
 def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
-    """Write a zone file with a border or a corner of borders in the middle of the scene."""
+    """Write a zone file with a border, or a corner of four zones, in the middle of the scene."""
     scene, extent = vec.simulation.scene, vec.network.extent_m
     assert scene is not None
     low_x, low_y, high_x, high_y = extent
@@ -36,7 +36,7 @@ def cut_through(vec: CavVectorEnv, path: Path, count: int) -> Path:
 
 
 def hashes(vec: CavVectorEnv, driver: str = "idm", steps: int = STEPS) -> list[str]:
-    """Yield the state after each step, until the agent has left."""
+    """Return the state hash after each step, until the agent has left."""
     observations, infos = vec.reset(seed=0)
     policy = load_policy(driver, vec)
     found = [vec.state_hash()]
@@ -68,7 +68,7 @@ def test_a_border_through_the_scene_changes_nothing(name: str, tmp_path: Path) -
 @pytest.mark.slow
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize(("count", "agents"), [(2, 1), (9, 3)])
-def test_workers_change_nothing_in_scenarios(
+def test_workers_change_no_result_in_scenarios(
     name: str, count: int, agents: int, tmp_path: Path
 ) -> None:
     place = ROOMY.get(name, "")
@@ -102,24 +102,24 @@ def test_several_agents_are_independent_of_zones(name: str, tmp_path: Path) -> N
     assert hashes(vec, steps=50) == expected
 
 
-def test_a_vehicle_that_turns_on_a_border_does_not_alternate_its_owner(tmp_path: Path) -> None:
-    """The car turns where four zones meet: the hysteresis keeps it with one of them."""
+def test_a_vehicle_that_turns_on_a_border_keeps_its_owner(tmp_path: Path) -> None:
+    """A car turns where four zones meet; the hysteresis keeps the car in one zone."""
     whole = make_scenario("failed_u_turn")
     steady, restless = (
         divided("failed_u_turn", tmp_path, 4, whole, **{"zones.hysteresis_m": hysteresis_m})
         for hysteresis_m in (whole.config.zones.hysteresis_m, 0.0)
     )
-    owners, crossings = turning(steady)
+    owners, crossings = owners_of_turning_car(steady)
     assert crossings >= 2
     assert len(set(owners)) == 1
-    owners, again = turning(restless)
+    owners, again = owners_of_turning_car(restless)
     assert again == crossings
     changes = sum(here != before for before, here in pairwise(owners))
     assert 2 <= changes <= crossings
 
 
-def turning(vec: CavVectorEnv) -> tuple[list[int], int]:
-    """Return the owner of the turning car at each step, and the number of crossed borders."""
+def owners_of_turning_car(vec: CavVectorEnv) -> tuple[list[int], int]:
+    """Return the owner of the turning car at each step, and how often it crosses a border."""
     _, infos = vec.reset(seed=0)
     policy = load_policy("idm", vec)
     rows, scene = vec.simulation.vehicles(), vec.simulation.scene

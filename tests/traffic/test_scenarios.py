@@ -29,9 +29,9 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
 )
-# A place with a road behind the first agent, unlike the randomly drawn place.
+# Places with a road behind the first agent, which the randomly drawn places lack.
 ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
-# The reference driver on grid4x4, seed 0, without other traffic.
+# Hashes of runs of the reference driver on grid4x4 with seed 0, without other traffic.
 GOLDEN = {
     ("failed_u_turn", False): "8c96686d6f7f4c3fb7618e14c20de981",
     ("intersection_blockage", False): "8076b53af2bd13a47b5420ae08f51132",
@@ -58,7 +58,7 @@ def played(name: str, driver: str, seed: int = 0, **settings: Any) -> ScenarioRu
         return run_scenario(vec, driver, seed)
 
 
-def test_the_library_has_each_file_of_its_folder() -> None:
+def test_each_scenario_of_the_folder_is_listed_and_described() -> None:
     assert scenario_names() == list(NAMES)
     for name in NAMES:
         assert summary_of(name).endswith(".")
@@ -87,7 +87,7 @@ def test_the_reference_driver_passes_and_a_driver_that_never_yields_fails(
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("seed", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_scenarios_separate_drivers_in_a_town(name: str, seed: int) -> None:
+def test_idm_passes_and_never_yield_collides_in_a_town(name: str, seed: int) -> None:
     assert played(name, "idm", seed, env="town").verdict == "passed"
     assert played(name, "never_yield", seed, env="town").verdict == "collided"
 
@@ -96,7 +96,7 @@ def test_scenarios_separate_drivers_in_a_town(name: str, seed: int) -> None:
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
 @pytest.mark.parametrize("density", ["low", "high"])
 @pytest.mark.parametrize("seed", [0, 1, 2, 3])
-def test_scenarios_separate_drivers_in_traffic(
+def test_idm_passes_and_never_yield_collides_in_traffic(
     name: str, params: Mapping[str, bool | float], density: str, seed: int
 ) -> None:
     found = played(name, "idm", seed, density=density, params=params)
@@ -107,7 +107,7 @@ def test_scenarios_separate_drivers_in_traffic(
 @pytest.mark.slow
 @pytest.mark.parametrize(("name", "params"), VARIANTS)
 @pytest.mark.parametrize("seed", [0, 1, 2, 3, 4])
-def test_scenarios_separate_drivers_on_a_real_map(
+def test_idm_passes_and_never_yield_collides_on_a_real_map(
     name: str, params: Mapping[str, bool | float], seed: int, shared_maps: Path
 ) -> None:
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
@@ -116,7 +116,7 @@ def test_scenarios_separate_drivers_on_a_real_map(
 
 
 def test_between_two_lanes_of_a_bend_no_vehicle_is_off_the_road(shared_maps: Path) -> None:
-    """The lanes at this place leave a gap of millimetres, in which a vehicle was off the road."""
+    """The lanes at this place have a gap of millimetres between them, which counts as road."""
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
     assert played("intersection_blockage", "idm", env=env, place="85_1").verdict == "passed"
 

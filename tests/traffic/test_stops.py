@@ -1,4 +1,4 @@
-"""Stops and detours on bundled maps."""
+"""Vehicles on bundled maps make their stops and take another route if necessary."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ World = Callable[..., Simulation]
 
 @pytest.fixture
 def world(tmp_path: Path) -> World:
-    """Make a world with the content of a <routes>, and reset it."""
+    """Return a function that makes a world from the elements inside <routes>, and resets it."""
 
     def build(body: str, env: str = "merge") -> Simulation:
         path = tmp_path / "x.rou.xml"
@@ -40,7 +40,7 @@ def car(stops: str, depart: float = 0.0, lane: str = "0") -> str:
 
 
 def stands(simulation: Simulation, seconds: float) -> list[tuple[float, float, str, float]]:
-    """Return (first second, last second, lane, position of the front) of the vehicle's stops."""
+    """Drive, and return (begin in s, end in s, lane, position of the front) of each stop."""
     found: list[tuple[float, float, str, float]] = []
     standing = False
     for _ in range(round(seconds / DT)):
@@ -75,7 +75,7 @@ def test_a_vehicle_leaves_no_sooner_than_its_timetable(
     begun, ended, _, _ = stand
     if leaves is None:
         assert ended - begun == pytest.approx(4.0, abs=2.0 * DT), (
-            "a late vehicle leaves after the duration"
+            "a late vehicle does not leave after the duration"
         )
     else:
         assert ended == pytest.approx(leaves, abs=2.0 * DT)
@@ -102,7 +102,7 @@ def test_a_vehicle_makes_its_stops_in_their_order(world: World) -> None:
     assert simulation.traffic_stats().arrived == 1
 
 
-def test_a_stop_that_was_missed_is_left_out(world: World) -> None:
+def test_a_vehicle_beyond_its_stop_drives_on(world: World) -> None:
     simulation = world(car('<stop lane="main_in_0" endPos="200" duration="10"/>'))
     while not len(simulation.vehicles()):
         drive(simulation)
@@ -122,7 +122,7 @@ def test_vehicles_pass_a_vehicle_that_stands_on_another_lane(world: World) -> No
         drive(simulation)
         assert (simulation.vehicles()["hit"] < 0).all()
     assert simulation.traffic_stats().arrived >= 3
-    assert 0 in simulation.vehicles()["id"], "the first vehicle has stood all the time"
+    assert 0 in simulation.vehicles()["id"], "the first vehicle has left"
 
 
 def test_a_vehicle_that_cannot_change_lanes_takes_another_route(world: World) -> None:

@@ -20,7 +20,7 @@ from tests.support.sumo_worlds import MODES, tiny_file
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
-# The routes are given, so that no router of SUMO avoids the closed road before a vehicle departs.
+# Vehicles have given routes; otherwise SUMO would choose a route around the closed road.
 ROUTED = (
     CARS.format(device="")
     + '<route id="near" edges="in short narrow out"/>'
@@ -67,10 +67,10 @@ def drive(vec: CavVectorEnv, seconds: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_vehicles_take_another_way_until_a_road_opens(
+def test_vehicles_take_another_route_until_a_road_opens(
     tmp_path: Path, source: str, caplog: pytest.LogCaptureFixture
 ) -> None:
-    """A vehicle before the junction turns off; SUMO drops a vehicle that starts on the road."""
+    """A vehicle before the closed road turns off; SUMO drops a vehicle that departs on the road."""
     with closing(two_ways(tmp_path, source)) as vec, caplog.at_level(logging.WARNING):
         vec.reset(seed=3)
         before = drive(vec, 60)
@@ -101,8 +101,8 @@ def test_without_rerouting_vehicles_wait_before_a_closed_road(tmp_path: Path, so
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
-    """With agents, generated cars and SUMO's cars; the rows are compared after each tick."""
+def test_divisions_change_no_result(tmp_path: Path, source: str) -> None:
+    """The world has agents, generated cars and SUMO's cars; the check compares rows every tick."""
     events = [
         {"at_s": 8, "action": "close", "edges": ["A0B0", "B1C1"]},
         {"at_s": 10, "action": "damage", "edges": ["A1B1"], "speed_mps": 4.0},
@@ -130,7 +130,7 @@ def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
 def test_a_worker_that_dies_changes_nothing(
     tmp_path: Path, source: str, num: int, zones: int
 ) -> None:
-    """Its successor tells SUMO of the changes again, at the same ticks."""
+    """The worker's successor repeats the changes of roads in SUMO at the same ticks."""
     overrides = settings(source, [tiny_file(tmp_path)])
     made: dict[str, Any] = {"num_envs": num, "agents": 2, "background": 2, "overrides": overrides}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", zones=zones, workers=2, **made)

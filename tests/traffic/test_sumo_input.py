@@ -1,4 +1,4 @@
-"""SUMO writes no files, although files of users may ask for outputs."""
+"""SUMO writes no files, even if files of users request output."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ TRIP = '<vType id="t"/><trip id="a" type="t" depart="0" from="{}" to="{}"/>'
 
 @pytest.fixture(scope="module")
 def trip() -> str:
-    """Write a trip over two edges of the map."""
+    """Return a trip over two edges of the map as XML."""
     network = network_of(MAP)
     link = network.links[0]
     ends = (network.lanes["edge"][link[side]] for side in ("from_lane", "to_lane"))
@@ -33,7 +33,7 @@ def trip() -> str:
 
 
 def run(folder: Path, *demand: str, map_file: Path = MAP) -> None:
-    """Run SUMO itself for ten seconds."""
+    """Run the program `sumo` for ten simulated seconds, with the arguments that cavmarl passes."""
     given = read_input([folder / name for name in demand])
     own = folder / "own"
     own.mkdir()
@@ -68,7 +68,7 @@ def test_additional_files_write_nothing(tmp_path: Path, element: str, trip: str)
     try:
         run(tmp_path, "a.add.xml", "r.rou.xml")
     except (ConfigError, subprocess.CalledProcessError):
-        pass  # refused by cavmarl, because the file is not XML, or by SUMO
+        pass  # either cavmarl or SUMO may refuse the file
     assert not (tmp_path / "victim").exists()
     assert sorted(path.name for path in tmp_path.iterdir()) == ["a.add.xml", "own", "r.rou.xml"]
 
@@ -95,7 +95,7 @@ def test_signal_programs_of_a_map_write_nothing(tmp_path: Path, trip: str, param
     assert not (tmp_path / "victim").exists()
 
 
-def test_apparent_comments_do_not_hide_outputs(tmp_path: Path, trip: str) -> None:
+def test_comment_marks_inside_cdata_do_not_hide_outputs(tmp_path: Path, trip: str) -> None:
     data = '<edgeData id="d" file="victim"/>'
     (tmp_path / "a.add.xml").write_text(
         f"<additional><![CDATA[<!--]]>{data}<![CDATA[-->]]></additional>"
@@ -113,10 +113,10 @@ def test_a_map_that_writes_nothing_is_not_copied(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["a,other.add.xml", "${OTHER}.add.xml"])
-def test_a_name_that_means_another_file_is_refused(
+def test_a_file_name_that_sumo_expands_to_another_file_is_refused(
     tmp_path: Path, trip: str, monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """SUMO would read a file that was not checked for outputs."""
+    """If cavmarl accepted the name, SUMO would read a file that was not checked for outputs."""
     monkeypatch.setenv("OTHER", "other")
     (tmp_path / "a").write_text("<additional/>")
     (tmp_path / name).write_text("<additional/>")
@@ -136,7 +136,7 @@ SECTIONS = {
 
 
 @pytest.mark.parametrize(("section", "option"), SECTIONS.items())
-def test_options_that_write_are_not_passed_on(
+def test_options_that_request_output_are_not_passed_to_sumo(
     tmp_path: Path, trip: str, section: str, option: str
 ) -> None:
     (tmp_path / "r.rou.xml").write_text(f"<routes>{trip}</routes>")
@@ -149,7 +149,7 @@ def test_options_that_write_are_not_passed_on(
     assert not (tmp_path / "victim").exists()
 
 
-def test_options_that_change_traffic_are_passed_on(tmp_path: Path, trip: str) -> None:
+def test_options_that_change_traffic_are_passed_to_sumo(tmp_path: Path, trip: str) -> None:
     (tmp_path / "r.rou.xml").write_text(f"<routes>{trip}</routes>")
     (tmp_path / "run.sumocfg").write_text(
         '<c><input><route-files value="r.rou.xml"/></input><processing><time-to-teleport '

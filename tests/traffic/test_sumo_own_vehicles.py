@@ -1,4 +1,4 @@
-"""Fleets, insertions and the caller's vehicles in worlds with SUMO: SUMO's drivers see them."""
+"""SUMO's drivers react to agents' fleets, inserted vehicles and vehicles of the caller."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ FLOW = (
     '<vType id="car" sigma="0" speedDev="0"/>'
     '<flow id="f" type="car" from="in" to="out" begin="0" end="900" period="4"/>'
 )
-MIN_GAP_M = 2.5  # of SUMO's car
+MIN_GAP_M = 2.5  # gap at which SUMO's car stops
 
 
 def settings(source: str, files: list[Path], **more: Any) -> dict[str, Any]:
@@ -40,7 +40,7 @@ def settings(source: str, files: list[Path], **more: Any) -> dict[str, Any]:
 
 
 def gap_behind(rows: np.ndarray, own: np.void) -> float:
-    """Return the distance in m from a vehicle's rear to the next front behind it."""
+    """Return the gap in m between a vehicle and SUMO's next car behind it, which stands."""
     behind = rows[(rows["driver"] == DRIVER_SUMO) & (rows["x"] < own["x"])]
     assert len(behind) >= 3
     first = behind[behind["x"].argmax()]
@@ -79,7 +79,7 @@ def test_sumos_cars_stop_behind_an_agent_of_another_type(
 
 
 def test_sumos_cars_stop_behind_a_posed_vehicle_until_it_leaves(tmp_path: Path) -> None:
-    """The vehicle has a size of its own, and a person who stands beside the road stops nobody."""
+    """The posed vehicle has its own size. A person beside the road does not stop SUMO's cars."""
     files = write_demand(tmp_path, FLOW)
     wanted = settings("sumo-traffic", files, population__external=2)
     net = make_map(tmp_path)
@@ -105,7 +105,7 @@ def test_sumos_cars_stop_behind_a_posed_vehicle_until_it_leaves(tmp_path: Path) 
 
 
 def act(env: CavEnv, step: int) -> None:
-    """Insert, spawn, pose and remove vehicles at some steps."""
+    """Insert, spawn, pose or remove a vehicle if it is planned for this step."""
     roads = np.flatnonzero(~env.network.lanes["internal"] & (env.network.lanes["length_m"] > 60.0))
     lane = int(roads[7])
     x, y = env.network.lane_polyline(lane)[0][:2]
@@ -141,7 +141,7 @@ def hashes(source: str, folder: Path, **more: Any) -> list[str]:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_divisions_change_nothing(tmp_path: Path, source: str) -> None:
+def test_divisions_change_no_result(tmp_path: Path, source: str) -> None:
     undivided = hashes(source, tmp_path)
     assert hashes(source, tmp_path, zones=4) == undivided
     assert hashes(source, tmp_path, zones=2, workers=2) == undivided

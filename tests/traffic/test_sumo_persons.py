@@ -1,4 +1,4 @@
-"""SUMO's persons are mirrored, and what is not mirrored is told with a count."""
+"""SUMO's persons are mirrored as rows; other persons, and containers, are counted."""
 
 from __future__ import annotations
 
@@ -79,12 +79,12 @@ def test_persons_are_at_their_places_in_sumo_until_they_arrive(tmp_path: Path) -
             ).all()
             most = max(most, len(rows))
         assert most == 3
-        assert len(people(simulation)) < 3, "nobody has arrived"
+        assert len(people(simulation)) < 3, "no person has arrived"
         heading = math.radians(90.0 - persons.getAngle("p0"))
         assert np.abs(np.cos(people(simulation)["heading"] - heading)).max() > 0.99
 
 
-def test_zones_change_nothing(tmp_path: Path) -> None:
+def test_zones_change_no_result(tmp_path: Path) -> None:
     found = verify_zones(
         make_map(tmp_path),
         (1, 4),
@@ -100,7 +100,7 @@ def test_zones_change_nothing(tmp_path: Path) -> None:
         assert result.steps == 80
 
 
-def test_workers_change_nothing_even_if_one_dies(tmp_path: Path) -> None:
+def test_workers_change_no_result_even_if_one_dies(tmp_path: Path) -> None:
     net = make_map(tmp_path)
     made: dict[str, Any] = {"agents": 2, "overrides": settings("sumo-traffic", tmp_path)}
     plain, divided = parallel_env(net, **made), parallel_env(net, zones=2, workers=2, **made)
@@ -116,7 +116,7 @@ def test_workers_change_nothing_even_if_one_dies(tmp_path: Path) -> None:
             assert plain.state_hash() == divided.state_hash(), step
             if step == 20:
                 assert len(people(plain.simulation)) == 3
-        assert len(people(plain.simulation)) < 3, "nobody has arrived"
+        assert len(people(plain.simulation)) < 3, "no person has arrived"
         assert len(workers.pool.deaths) == 1
 
 
@@ -140,7 +140,9 @@ def tolerated(net: Path, overrides: dict[str, Any]) -> str:
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_what_is_not_mirrored_is_told_with_counts(tmp_path: Path, source: str) -> None:
+def test_elements_that_are_not_mirrored_are_reported_with_counts(
+    tmp_path: Path, source: str
+) -> None:
     net = make_map(tmp_path)
     told = tolerated(net, settings(source, tmp_path))
     assert "1 <container> moves in SUMO only" in told
@@ -150,7 +152,7 @@ def test_what_is_not_mirrored_is_told_with_counts(tmp_path: Path, source: str) -
     assert "3 <person> moves in SUMO only; traffic.source = sumo-traffic mirrors" in told
 
 
-def test_persons_without_room_are_told_once(
+def test_persons_without_room_are_reported_once(
     tmp_path: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     own = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.4, "sumo.max_persons": 2}

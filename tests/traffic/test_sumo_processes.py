@@ -1,4 +1,4 @@
-"""The processes of SUMO: they start and end with their worlds, and a death loses no world."""
+"""SUMO's processes start and end with their worlds; if one dies, its world stays usable."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.support.sumo_worlds import MODES, alone, coupled, demand_of, tiny_fil
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
 
-# A program that is started in the background ignores Ctrl-C.
+# Install the handler of Ctrl-C, because a program that a shell starts in the background ignores it.
 RUN = """
 import signal, sys
 from cavmarl import make_vec
@@ -84,7 +84,7 @@ def test_the_memory_of_sumo_is_limited(tmp_path: Path, monkeypatch: pytest.Monke
 
 @pytest.mark.parametrize("source", MODES)
 def test_two_processes_with_one_seed_have_equal_hashes(tmp_path: Path, source: str) -> None:
-    """One of the two is this process."""
+    """The second process is the one that runs this test."""
     demand = tiny_file(tmp_path)
     with run(demand, source, "end") as other:
         both = settings(demand, source)
@@ -116,7 +116,7 @@ def test_no_process_is_left_after_ctrl_c_or_a_kill(tmp_path: Path, number: signa
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_dead_sumo_loses_no_world(tmp_path: Path, source: str) -> None:
+def test_a_world_with_a_dead_sumo_continues_after_a_reset(tmp_path: Path, source: str) -> None:
     with coupled("grid4x4", [tiny_file(tmp_path)], source, agents=3, num_worlds=2) as simulation:
         for _ in range(40):
             drive(simulation)
@@ -144,7 +144,7 @@ def test_a_dead_sumo_loses_no_world(tmp_path: Path, source: str) -> None:
 
 
 def resets(folder: Path, number: int) -> None:
-    """Reset a number of times with a few steps between; processes, files and memory do not grow."""
+    """Check that processes, open files and memory do not grow in a number of resets and steps."""
     with coupled("grid4x4", [tiny_file(folder)], agents=2) as simulation:
         assert simulation.sumo is not None
         (pid,) = simulation.sumo.worlds.pids
@@ -163,12 +163,12 @@ def resets(folder: Path, number: int) -> None:
         assert len(here.children()) == children
 
 
-def test_100_resets_leak_nothing(tmp_path: Path) -> None:
+def test_processes_files_and_memory_do_not_grow_in_100_resets(tmp_path: Path) -> None:
     resets(tmp_path, 100)
 
 
 @pytest.mark.slow
-def test_1000_resets_leak_nothing(tmp_path: Path) -> None:
+def test_processes_files_and_memory_do_not_grow_in_1000_resets(tmp_path: Path) -> None:
     resets(tmp_path, 1000)
 
 
@@ -177,7 +177,7 @@ def test_a_second_start_in_one_process_is_refused(tmp_path: Path) -> None:
         with alone(simulation, tmp_path):
             with pytest.raises(SumoError, match="one simulation per process"):
                 free_libsumo()
-            drive(simulation)  # this SUMO runs in a process of its own
+            drive(simulation)  # the SUMO of the world runs in another process
         free_libsumo()
 
 
@@ -200,7 +200,7 @@ def test_traci_gives_the_same_results_as_libsumo(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1]
 
 
-def test_files_of_another_map_are_refused_with_sumos_words(tmp_path: Path) -> None:
+def test_files_of_another_map_are_refused_with_sumos_message(tmp_path: Path) -> None:
     with (
         pytest.raises(
             DemandError, match=r"(?s)main_in.*Cure: give demand that was made for the map"
@@ -279,7 +279,7 @@ def test_each_worker_has_its_own_sumo(tmp_path: Path, source: str, zones: int) -
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("zones", [1, 2])
 def test_a_successor_of_a_dead_worker_continues(tmp_path: Path, source: str, zones: int) -> None:
-    """SUMO repeats the run up to the tick; workers die again after that, and after a reset."""
+    """SUMO repeats its run up to the tick. Workers also die right after that and after a reset."""
     worlds = 2 if zones == 1 else 1
     made = {"num_envs": worlds, "agents": 3, "background": 2, "zones": zones, "max_cycles": 37,
             "overrides": settings(tiny_file(tmp_path), source)}  # fmt: skip
@@ -303,9 +303,7 @@ def test_a_successor_of_a_dead_worker_continues(tmp_path: Path, source: str, zon
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
-    tmp_path: Path, source: str
-) -> None:
+def test_a_dead_sumo_of_a_worker_is_restarted_in_the_next_step(tmp_path: Path, source: str) -> None:
     both = settings(tiny_file(tmp_path), source)
     made = {"num_envs": 2, "agents": 3, "background": 2, "overrides": both}
     plain, vec = make_vec("grid4x4", **made), make_vec("grid4x4", workers=2, **made)
@@ -330,7 +328,7 @@ def test_a_sumo_of_a_worker_that_dies_runs_again_with_the_next_step(
         vec.close()
 
 
-def test_a_killed_worker_with_a_too_long_sumo_log_is_an_error(tmp_path: Path) -> None:
+def test_the_death_of_a_worker_is_an_error_if_its_sumo_log_is_too_long(tmp_path: Path) -> None:
     both = settings(tiny_file(tmp_path), "sumo-traffic") | {"sumo.replay_mib": 0}
     vec = make_vec("grid4x4", num_envs=2, agents=3, background=0, workers=2, overrides=both)
     try:
@@ -349,7 +347,7 @@ def test_a_killed_worker_with_a_too_long_sumo_log_is_an_error(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_a_node_resumes_the_log_of_another_node(tmp_path: Path, source: str) -> None:
+def test_a_node_continues_from_the_sumo_log_of_a_dead_node(tmp_path: Path, source: str) -> None:
     wanted = {"num_envs": 2, "agents": 3, "background": 0}
     wanted["overrides"] = settings(tiny_file(tmp_path), source)
     with (
@@ -371,7 +369,7 @@ def test_a_node_resumes_the_log_of_another_node(tmp_path: Path, source: str) -> 
 @pytest.mark.skipif(not Path("/proc").is_dir(), reason="asks Linux for a process's settings")
 @pytest.mark.parametrize("own", ["", "glibc.malloc.hugetlb=0"])
 @pytest.mark.usefixtures("fresh_processes")
-def test_settings_of_the_c_library_by_the_user_take_precedence(
+def test_the_users_settings_of_the_c_library_are_kept_and_come_last(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, own: str
 ) -> None:
     monkeypatch.setenv("GLIBC_TUNABLES", own)
@@ -386,7 +384,7 @@ def test_settings_of_the_c_library_by_the_user_take_precedence(
         environ = Path(f"/proc/{pid}/environ").read_bytes()
     finally:
         vec.close()
-    # The C library writes an end after each setting that it has read.
+    # The C library replaces the colon after each setting that it has read by a zero byte.
     _, _, found = environ.replace(b":", b"\0").partition(b"GLIBC_TUNABLES=")
     words = found.decode().split("\0")
     assert words[0] == "glibc.malloc.hugetlb=1"

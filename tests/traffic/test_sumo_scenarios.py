@@ -1,4 +1,4 @@
-"""Scripted scenarios beside SUMO: SUMO's drivers see the actors, and its signals fail."""
+"""Scripted scenarios with SUMO: SUMO's drivers react to the actors, and SUMO's signals fail."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def shown(simulation: Any, name: str) -> str:
 
 
 def test_sumos_cars_stop_before_actors(tmp_path: Path) -> None:
-    """Vans close all lanes of a road as long as no agent is near; SUMO's cars queue behind them."""
+    """Vans close all lanes of a road until an agent is near; SUMO's cars queue behind them."""
     own = {"scenario.name": "road_closure", **CLOCK}
     world = load_world("grid4x4", agents=1, overrides=own)
     scene = plan_scene(world.config.scenario, world.network, 1)
@@ -87,7 +87,7 @@ def test_sumos_cars_stop_before_actors(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("name", ["pedestrian_crossing", "signal_outage"])
-def test_divisions_change_nothing(tmp_path: Path, source: str, name: str) -> None:
+def test_divisions_change_no_result(tmp_path: Path, source: str, name: str) -> None:
     found = verify_zones(
         "grid4x4",
         (1, 4),

@@ -1,4 +1,4 @@
-"""`sumo-demand`: vehicles make the stops that SUMO has for them."""
+"""`sumo-demand`: vehicles make the stops that SUMO reports."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ MODE = {"traffic.source": "sumo-demand", "sensors.signal.timing": False}
 
 
 def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, float, float]]]:
-    """Return the stops of each vehicle by name: position of the front in m, start, duration."""
+    """Drive, and return (x of the centre in m, start in s, length in s) of each vehicle's stops."""
     assert simulation.sumo is not None
     dt, tracks = simulation.config.clock.ctrl_dt_s, {}
     for step in range(round(seconds / dt)):
@@ -46,7 +46,7 @@ def stands(simulation: Simulation, seconds: int) -> dict[str, list[tuple[float, 
     return found
 
 
-def test_the_table_of_stops_equals_that_of_the_reader(tmp_path: Path) -> None:
+def test_stops_from_sumo_equal_stops_from_the_reader_of_demand(tmp_path: Path) -> None:
     """SUMO reports the same lanes, positions and times as cavmarl's reader, also for a bus stop."""
     paths = write_stops(tmp_path)
     with coupled("merge", paths, "sumo-demand") as simulation:
@@ -93,12 +93,14 @@ def test_vehicles_stop_at_their_stops_for_the_given_time(tmp_path: Path) -> None
         for (_, _, lasted), seconds in zip(found[name], SECONDS[name], strict=True):
             assert lasted >= seconds - 0.2
     (_, since, lasted), _ = found["bus"]
-    assert since + lasted == pytest.approx(25.0, abs=0.6), "the vehicle leaves at the time `until`"
+    assert since + lasted == pytest.approx(25.0, abs=0.6), (
+        "the bus did not leave at its time `until`"
+    )
     first, second = (x for x, _, _ in found["bus"])
     assert second > first
 
 
-def test_zones_and_workers_change_nothing(tmp_path: Path) -> None:
+def test_zones_and_workers_change_no_result(tmp_path: Path) -> None:
     paths = [str(path) for path in write_stops(tmp_path)]
     both = {**MODE, "traffic.demand": paths, "clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2}
     verified = verify_zones(

@@ -1,4 +1,4 @@
-"""`sumo-traffic`: SUMO moves its vehicles, which are mirrored as rows, and brake for agents."""
+"""`sumo-traffic`: SUMO moves its vehicles. They are mirrored as rows and brake for agents."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ STEADY = '<vType id="car" sigma="0" speedDev="0"/>'
 
 
 def mirrored(simulation: Simulation) -> np.ndarray:
-    """Return SUMO's rows of the first world by rising id."""
+    """Return the rows of SUMO's vehicles in the first world, sorted by id."""
     rows = simulation.vehicles()
     rows = rows[rows["driver"] == DRIVER_SUMO]
     return np.sort(rows, order="order")
@@ -39,8 +39,8 @@ def names(simulation: Simulation) -> list[str]:
     return simulation.sumo.worlds.names[0]
 
 
-def test_positions_speeds_and_signals_equal_those_of_sumo_alone(tmp_path: Path) -> None:
-    """Without agents, the coupled SUMO runs as if it were alone; rows equal SUMO at every tick."""
+def test_without_agents_rows_and_signals_equal_those_of_sumo_alone(tmp_path: Path) -> None:
+    """Compare positions, speeds and signals after each step with a second SUMO without a world."""
     turned = False
     with (
         coupled("grid4x4", [tiny_file(tmp_path)]) as simulation,
@@ -86,7 +86,7 @@ def blinker(signals: int) -> int:
 
 
 def shown(simulation: Simulation) -> dict[str, str]:
-    """Return the letters of each signal."""
+    """Return the state of each signal in SUMO's letters."""
     network = simulation.network
     found = {}
     for name, phase, row in zip(
@@ -134,7 +134,7 @@ def test_ids_and_names_are_a_bijection(tmp_path: Path) -> None:
 
 
 def test_a_vehicle_has_the_route_that_sumo_gave_it(tmp_path: Path) -> None:
-    """This also holds after it has moved to another zone."""
+    """Some of the vehicles have moved to another zone."""
     zones = {"zones.count": 4}
     with (
         coupled("grid4x4", [tiny_file(tmp_path)], overrides=zones) as simulation,
@@ -157,7 +157,7 @@ def test_a_vehicle_has_the_route_that_sumo_gave_it(tmp_path: Path) -> None:
 
 
 def edges_ahead(simulation: Simulation, row: np.void) -> list[str]:
-    """Return the edges from a vehicle to the end of its route, with its lane changes."""
+    """Return the edges from a vehicle to the end of its route, following planned lane changes."""
     network, travel = simulation.network, simulation.shards[0].travel
     lane, way, found = int(row["lane"]), int(row["way"]), []
     for _ in range(1000):
@@ -176,7 +176,7 @@ def edges_ahead(simulation: Simulation, row: np.void) -> list[str]:
     raise AssertionError("the way does not end")
 
 
-def test_the_clocks_of_sumo_and_the_world_are_equal(tmp_path: Path) -> None:
+def test_different_clocks_of_sumo_and_the_world_are_an_error(tmp_path: Path) -> None:
     files = write_demand(tmp_path, STEADY + FLOW)
     (tmp_path / "late.sumocfg").write_text(
         "<configuration><input>"
@@ -189,7 +189,7 @@ def test_the_clocks_of_sumo_and_the_world_are_equal(tmp_path: Path) -> None:
             drive(simulation)
         assert simulation.sumo is not None
         assert simulation.sumo.worlds.at(0).tick == simulation.ticks()[0]
-        # The flow began 100 s earlier, because SUMO starts at its 100th second.
+        # SUMO starts at second 100, so the flow, which begins at second 0, began 100 s earlier.
         assert demand_begin(simulation) == 100.0
         simulation.shards[0].worlds.ticks[0] += 1
         with pytest.raises(Exception, match="its SUMO at"):
@@ -306,8 +306,8 @@ def test_closed_edges_and_new_routes_of_sumo_take_effect(tmp_path: Path, source:
     assert abs(found["short"] - expected["short"]) <= 1
 
 
-def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path) -> None:
-    """SUMO keeps the agent at its position, and accepts its successor under the same name."""
+def test_an_agent_may_leave_the_road_and_the_map(tmp_path: Path) -> None:
+    """SUMO keeps that agent at its position and accepts the next agent under the same name."""
     files = write_demand(tmp_path, STEADY + FLOW)
     origin = {"traffic.origins": ["in"], "traffic.destinations": ["out"], "clock.sim_dt_s": 0.1}
     with coupled(make_map(tmp_path), files, agents=1, overrides=origin) as simulation:
@@ -322,8 +322,10 @@ def test_an_agent_that_leaves_the_road_and_the_map_stays_in_sumo(tmp_path: Path)
         assert simulation.traffic_stats().removed == 1
 
 
-def test_a_cycle_follows_algorithm_1(tmp_path: Path) -> None:
-    """SUMO steps to t + dt, its vehicles are mirrored, the world ticks once, sensors see t + dt."""
+def test_each_step_runs_sumo_the_mirror_the_tick_and_the_sensors_in_this_order(
+    tmp_path: Path,
+) -> None:
+    """SUMO steps to t + dt, the mirror copies its vehicles, the world ticks, sensors see t + dt."""
     own = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
     with coupled("grid4x4", [tiny_file(tmp_path)], agents=1, overrides=own) as simulation:
         trace = StepTrace()

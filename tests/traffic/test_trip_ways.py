@@ -1,4 +1,4 @@
-"""Routes of trips on an empty map: as fast as duarouter's; loops are reported."""
+"""Routes of trips on an empty map are as fast as duarouter's; routes with loops are reported."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ GRID = "--grid --grid.number=4 --grid.length=70 --turn-lanes=1 --turn-lanes.leng
 
 
 def duarouter(folder: Path, net: Path, pairs: Sequence[tuple[str, str]]) -> list[list[str] | None]:
-    """Return the edges of duarouter's routes; None: there is no route."""
+    """Return the edges of each of duarouter's routes, or None where no route exists."""
     trips, routes = folder / "d.trips.xml", folder / "d.rou.xml"
     rows = (TRIP.format(k=k, start=start, goal=goal) for k, (start, goal) in enumerate(pairs))
     trips.write_text(f'<routes><vType id="car" maxSpeed="99"/>{"".join(rows)}</routes>')
@@ -62,7 +62,7 @@ def time_s(roads: RoadNetwork, edges: Sequence[int]) -> float:
 
 
 @pytest.mark.parametrize("name", ["grid4x4", "town", "turn lanes", "one lane"])
-def test_no_way_is_slower_than_that_of_duarouter(name: str, tmp_path: Path) -> None:
+def test_no_route_is_slower_than_the_route_of_duarouter(name: str, tmp_path: Path) -> None:
     options = {"turn lanes": GRID, "one lane": "--rand --rand.iterations=40 -L=1"}
     if name in options:
         net = netgenerate(tmp_path / "made.net.xml", *options[name].split(), "--seed=3")

@@ -26,7 +26,7 @@ from cavmarl.traffic.rerouting import LOOK
 from tests.naive import plans as naive
 from tests.support.traffic import NAMES, network, on_lane, travel_by
 
-ROOM = 400  # steps
+ROOM = 400  # most steps of a route
 
 
 def outside(roads: RoadNetwork) -> list[int]:
@@ -35,7 +35,7 @@ def outside(roads: RoadNetwork) -> list[int]:
 
 
 def with_speeds(roads: RoadNetwork, seed: int) -> RoadNetwork:
-    """Return the roads with reduced speeds on some edges."""
+    """Return the roads with lower speed limits on randomly drawn edges."""
     lanes = roads.lanes.copy()
     share = np.random.default_rng(seed).choice([1.0, 0.5, 0.05], len(roads.edges))
     lanes["speed_mps"] *= share[lanes["edge"]]
@@ -55,16 +55,14 @@ def way_to(
 
 
 def on_edge(roads: RoadNetwork, lane: int) -> int:
-    """Return the route of steps from 0 on, as an offset for the edge of a lane."""
+    """Return the value of `way` for steps that are stored from index 0 on, for a lane's edge."""
     return -int(roads.edges[roads.lanes[lane]["edge"]]["first_lane"])
 
 
 @pytest.mark.parametrize("name", NAMES)
 @settings(max_examples=30, deadline=None)
 @given(data=st.data())
-def test_ways_are_as_fast_as_the_fastest_and_lead_to_the_goal(
-    name: str, data: st.DataObject
-) -> None:
+def test_found_routes_are_the_fastest_and_lead_to_the_goal(name: str, data: st.DataObject) -> None:
     roads = with_speeds(network(name), data.draw(st.integers(0, 5)))
     goal = data.draw(st.sampled_from(outside(roads)))
     cost = naive.costs(roads, goal, CARS)
@@ -132,7 +130,7 @@ def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> Non
     assert asking(9, changed_at=7) == [3, 8]
     edge = int(roads.lanes[second]["edge"])
     assert looks[8]["seen"] == edge
-    assert asking(9, edge) == [], "a vehicle that was there before counts as seen by the rerouter"
+    assert asking(9, edge) == [], "a vehicle that was already on the edge asks again"
     looks[8]["seen"] = -1
     assert asking(9, edge) == [0]
 
@@ -162,7 +160,7 @@ def test_a_vehicle_needs_room_to_leave_its_route(
     assert has_room(roads.arrays, travel, row[0], travel.steps, len(roads.lanes)) == fits
 
 
-def test_slots_are_taken_in_order_kept_by_their_vehicles_and_free_again() -> None:
+def test_slots_are_taken_in_order_and_freed_when_their_vehicles_leave() -> None:
     roads = network("grid4x4")
     lane = int(roads.edges[roads.edge_ids.index("left0A0")]["first_lane"])
     found, number = way_to(roads, roads.edge_ids.index("D3right3"), lane)
@@ -181,11 +179,11 @@ def test_slots_are_taken_in_order_kept_by_their_vehicles_and_free_again() -> Non
     np.testing.assert_array_equal(travel.steps[first : first + number], found[:number])
     mark_slots(roads.arrays, rows[1:], 2, first, steps, used)
     assert used.tolist() == [False, True]
-    # A vehicle with a slot writes its next route there.
+    # A vehicle that has a slot writes its next route into that slot.
     again = take_slot(roads.arrays, travel, rows[1:2][0], found[:number], first, steps, used)
     assert again
     assert rows[1]["way"] + lane == first + steps
-    # Inside a junction, the route is that of the lane behind the junction.
+    # Inside a junction, `way` refers to the lane behind the junction.
     step = found[:number][found[:number]["next"] >= 0][0]
     assert step["shift"] > 0
     rows[1]["way"] += step["shift"]

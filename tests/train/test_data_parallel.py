@@ -1,4 +1,4 @@
-"""Two real processes train one network with `torchrun`."""
+"""Training of one network by two processes that `torchrun` starts."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TINY = [
     "--num-steps", "8", "--epochs", "2", "--minibatches", "2", "--checkpoint-updates", "2",
 ]  # fmt: skip
 
-# `ppo.py`, which writes the weights of its process. In update STOP, process 1 is told to end.
+# Run `ppo.py` and save the weights of each process. After update STOP, signal process 1 to end.
 WATCHED = """\
 import importlib.util, os, signal, sys
 import torch
@@ -54,7 +54,7 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path
 
 
-def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
+def results_of(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
     with (folder / "progress.csv").open(newline="") as file:
         rows = [{key: row[key] for key in row.keys() - TIMES} for row in csv.DictReader(file)]
     return (folder / "model.safetensors").read_bytes(), rows
@@ -80,8 +80,8 @@ def test_two_processes_learn_one_network_and_resume_bit_for_bit(here: Path) -> N
     assert done.stdout.count("driver: runs/whole") == 1
     one, other = (torch.load(f"rank_{rank}.pt", weights_only=True) for rank in (0, 1))
     assert all(torch.equal(one[name], other[name]) for name in one)
-    rows = learnt(here / "runs/whole")[1]
-    # 4 worlds with 2 agents and 8 steps: the decisions of both processes are counted.
+    rows = results_of(here / "runs/whole")[1]
+    # Steps of both processes count: at most 4 worlds · 2 agents · 8 steps.
     assert 4 * 2 * 8 * 0.5 < int(rows[0]["agent_steps"]) <= 4 * 2 * 8
     state = read_checkpoint(here / "runs/whole")
     worlds = [parts["collector"]["worlds"] for parts in (state.parts, state.shares[0]["parts"])]
@@ -90,7 +90,7 @@ def test_two_processes_learn_one_network_and_resume_bit_for_bit(here: Path) -> N
     assert read_checkpoint(here / "runs/cut").updates == 3
     done = torchrun("--resume", "runs/cut")
     assert done.returncode == 0, done.stderr
-    assert learnt(here / "runs/cut") == learnt(here / "runs/whole")
+    assert results_of(here / "runs/cut") == results_of(here / "runs/whole")
 
 
 def test_another_number_of_processes_is_refused(
@@ -104,7 +104,7 @@ def test_another_number_of_processes_is_refused(
     assert "run has 2 processes, not 1; torchrun has to start 2" in capsys.readouterr().err
 
 
-def test_worlds_that_cannot_be_shared_equally_are_refused(
+def test_a_number_of_worlds_that_cannot_be_shared_equally_is_refused(
     here: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     program = load_program("ppo")
@@ -115,15 +115,15 @@ def test_worlds_that_cannot_be_shared_equally_are_refused(
     assert not (here / "runs").exists()
 
 
-def test_without_torchrun_a_process_is_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("WORLD_SIZE", "4")  # some batch systems set it
+def test_without_torchrun_a_run_has_one_process(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("WORLD_SIZE", "4")  # set by some batch systems
     assert Ranks.of_torchrun().size == 1
 
 
-def test_a_process_that_is_told_to_end_saves_its_run(
+def test_a_process_that_gets_sigterm_saves_its_run(
     here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """A run of one process that is told to end resumes from its last update, bit for bit."""
+    """The run resumes bit for bit from its last update."""
     program: ModuleType = load_program("ppo")
     words = [*TINY, "--total-agent-steps", "300"]
     assert program.main([*words, "--name", "whole"]) == 0
@@ -142,10 +142,10 @@ def test_a_process_that_is_told_to_end_saves_its_run(
     assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
     assert read_checkpoint(here / "runs/cut").updates == 3
     assert program.main(["--resume", "runs/cut"]) == 0
-    assert learnt(here / "runs/cut") == learnt(here / "runs/whole")
+    assert results_of(here / "runs/cut") == results_of(here / "runs/whole")
 
 
-def test_means_of_trips_are_weighted_by_their_numbers() -> None:
+def test_means_of_processes_are_weighted_by_their_numbers_of_trips() -> None:
     nan = float("nan")
     one = {"trips": 1, "success": 1.0}
     assert mean_of_ranks([one]) is one

@@ -1,4 +1,4 @@
-"""Sanity checks of learning on a crossing without signals.
+"""Checks that PPO learns, on a crossing without signals.
 
 First, an agent alone learns to reach its goal. Second, two agents learn not to collide, while
 drivers that were trained alone collide.
@@ -37,7 +37,7 @@ def ippo() -> ModuleType:
 
 
 def learn(ippo: ModuleType, folder: Path, agents: int, agent_steps: int) -> Path:
-    """Train from random weights, without imitation."""
+    """Train a driver from random weights, without imitation."""
     words = ["--env", str(CROSSING), "--agents", str(agents), "--num-envs", str(64 // agents)]
     words += ["--total-agent-steps", str(agent_steps), "--hidden", "32"]
     words += ["--throttle-std", "0.4"]
@@ -47,7 +47,7 @@ def learn(ippo: ModuleType, folder: Path, agents: int, agent_steps: int) -> Path
 
 
 def ends(driver: Path, agents: int) -> tuple[float, float]:
-    """Return the shares of trips that arrive and collide, in one episode of many worlds."""
+    """Run an episode in many worlds; return the shares of trips that arrive and that collide."""
     vec = make_vec(CROSSING, num_envs=WORLDS, agents=agents, seed=1)
     policy = load_policy(driver, vec)
     observations, infos = vec.reset()
@@ -63,14 +63,12 @@ def ends(driver: Path, agents: int) -> tuple[float, float]:
 
 
 def test_an_agent_alone_learns_to_reach_its_goal(ippo: ModuleType, tmp_path: Path) -> None:
-    """The short variant, which is part of every run of the tests."""
+    """This is the short variant of the next test."""
     assert ends(learn(ippo, tmp_path, agents=1, agent_steps=120_000), agents=1)[0] > 0.9
 
 
 @pytest.mark.slow
-def test_an_agent_alone_learns_and_then_two_agents_learn_to_avoid_collisions(
-    ippo: ModuleType, tmp_path: Path
-) -> None:
+def test_two_agents_learn_to_avoid_collisions(ippo: ModuleType, tmp_path: Path) -> None:
     alone = learn(ippo, tmp_path, agents=1, agent_steps=400_000)
     assert ends(alone, agents=1)[0] > 0.98
     reckless = ends(alone, agents=2)[1]

@@ -1,4 +1,4 @@
-"""The table of `train/messages.py`: with and without messages, and paired differences by seed."""
+"""`train/messages.py` compares training with and without messages, seed by seed."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tests.support.training import TRAIN, load_program
 pytest.importorskip("torch", reason="needs the extra: train")
 
 
-def test_training_with_and_without_messages_is_compared_by_seed(
+def test_the_table_has_differences_paired_by_seed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.syspath_prepend(TRAIN)
@@ -27,12 +27,12 @@ def test_training_with_and_without_messages_is_compared_by_seed(
     lines = program.table(arms, args).splitlines()
     assert lines[-1].startswith("| on minus off | -2.50 [-8.85, 3.85] | 15.00 [")
     assert "| off | 4.00 [" in lines[-2]
-    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # this metric is not a share
+    assert lines[-2].endswith(" | 6.50 [-12.56, 25.56] |")  # not limited to 0 to 100
     assert "| on | 1.50 [" in lines[-3]
 
 
 def test_intervals_of_shares_end_at_0_and_100(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Student's t around 99.9 and 0.1 % would exceed these limits."""
+    """Intervals of Student's t around 99.9 or 0.1 % would exceed these limits."""
     monkeypatch.syspath_prepend(TRAIN)
     found = load_program("messages").row(np.array([99.9, 99.8, 100.0]), percent=True).interval
     assert 99.0 < found.low < 99.9 < found.high <= 100.0
@@ -42,7 +42,7 @@ def test_intervals_of_shares_end_at_0_and_100(monkeypatch: pytest.MonkeyPatch) -
     assert five.interval_of(np.array([0.0, 0.003, 0.0]), False).low < 0.0
 
 
-def test_both_trainings_get_the_given_settings(
+def test_the_trainings_with_and_without_messages_get_the_given_settings(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     monkeypatch.syspath_prepend(TRAIN)

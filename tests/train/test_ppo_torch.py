@@ -1,4 +1,4 @@
-"""The PPO programs of cavmarl, run from the command line with small settings."""
+"""The training program `ppo.py`, called with small settings."""
 
 from __future__ import annotations
 
@@ -55,11 +55,11 @@ def here(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
 
 
 @pytest.mark.parametrize("config", CONFIGS, ids=lambda path: path.stem)
-def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path) -> None:
+def test_every_config_loads_and_options_override_it(ippo: ModuleType, config: Path) -> None:
     args = parse_run(ippo.Args, ["--config", str(config), "--seed", "77"], "")
     assert args.env in entries()
     bounds = {"total_agent_steps", "minutes"} & yaml.safe_load(config.read_text()).keys()
-    assert bounds, "the config does not state the length of the training"
+    assert bounds, "the config does not set the length of the training"
     assert all(getattr(args, bound) > 0 for bound in bounds)
     assert args.seed == 77
 
@@ -68,7 +68,7 @@ def test_every_config_loads_and_options_shadow_it(ippo: ModuleType, config: Path
     ("text", "said"),
     [("minute: 3.0", "minute: .*minutes"), ("- 1", "must be a mapping"), ("seed: x", "seed")],
 )
-def test_a_wrong_config_is_refused(ippo: ModuleType, here: Path, text: str, said: str) -> None:
+def test_an_invalid_config_is_refused(ippo: ModuleType, here: Path, text: str, said: str) -> None:
     (here / "wrong.yaml").write_text(text)
     with pytest.raises(ConfigError, match=said):
         parse_run(ippo.Args, ["--config", "wrong.yaml"], "")
@@ -100,7 +100,9 @@ def test_two_updates_run_from_the_command_line(tmp_path: Path) -> None:
     assert "model.safetensors" in manifest["results_sha256"]
 
 
-def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path, form: list[str]) -> None:
+def test_the_same_seed_gives_the_same_weights(
+    ippo: ModuleType, here: Path, form: list[str]
+) -> None:
     words = [*TINY, *form, "--total-agent-steps", "100"]
     for name, seed in (("a", "1"), ("b", "1"), ("c", "2")):
         assert ippo.main([*words, "--name", name, "--seed", seed]) == 0
@@ -108,13 +110,13 @@ def test_the_same_seed_learns_the_same(ippo: ModuleType, here: Path, form: list[
     assert weights[0] == weights[1] != weights[2]
 
 
-def learnt(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
-    """Return the weights, and the learning curve without times."""
+def results_of(folder: Path) -> tuple[bytes, list[dict[str, str]]]:
+    """Return the weights and the learning curve; columns of times are left out."""
     rows = [{key: row[key] for key in row.keys() - TIMES} for row in log(folder)]
     return (folder / "model.safetensors").read_bytes(), rows
 
 
-def test_workers_that_are_killed_change_nothing_that_is_learnt(
+def test_killed_workers_do_not_change_what_is_learned(
     ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, form: list[str]
 ) -> None:
     words = [*TINY, "--total-agent-steps", "100", *form]
@@ -132,14 +134,14 @@ def test_workers_that_are_killed_change_nothing_that_is_learnt(
     monkeypatch.setattr(ippo.Collector, "collect", collect_after_a_kill)
     assert ippo.main([*words, "--name", "killed", "--workers", "2"]) == 0
     assert len(set(killed)) >= 2
-    assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "killed")
+    assert results_of(here / "runs" / "whole") == results_of(here / "runs" / "killed")
 
 
-def test_zones_over_workers_change_nothing_that_is_learnt(ippo: ModuleType, here: Path) -> None:
+def test_zones_in_workers_do_not_change_what_is_learned(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--mappo", "--num-envs", "1", "--total-agent-steps", "40"]
     assert ippo.main([*words, "--name", "whole"]) == 0
     assert ippo.main([*words, "--name", "split", "--zones", "2", "--workers", "2"]) == 0
-    assert learnt(here / "runs" / "whole") == learnt(here / "runs" / "split")
+    assert results_of(here / "runs" / "whole") == results_of(here / "runs" / "split")
 
 
 def test_a_central_critic_is_not_part_of_the_driver(ippo: ModuleType, here: Path) -> None:
@@ -180,14 +182,14 @@ def test_a_stopped_run_resumes_and_its_driver_drives(
     vec.step(load_policy(folder, vec).act_batch(observations, infos["mask"]))
 
 
-def test_the_clock_ends_a_run(ippo: ModuleType, here: Path) -> None:
+def test_the_time_limit_ends_a_run(ippo: ModuleType, here: Path) -> None:
     words = [*TINY, "--minutes", "0.0001", "--name", "short"]
     assert ippo.main([*words, "--total-agent-steps", "1000000000"]) == 0
     rows = log(here / "runs" / "short")
-    assert 1 <= len(rows) < 1000  # in 6 ms, any machine makes few updates
+    assert 1 <= len(rows) < 1000  # any machine does few updates in 6 ms
 
 
-def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None:
+def test_the_logger_tensorboard_writes_a_file_of_events(ippo: ModuleType, here: Path) -> None:
     pytest.importorskip("tensorboard")
     words = [*TINY, "--total-agent-steps", "20", "--name", "board", "--loggers", "tensorboard"]
     assert ippo.main(words) == 0
@@ -209,7 +211,7 @@ def test_tensorboard_gets_the_same_numbers(ippo: ModuleType, here: Path) -> None
         (["--resume", "nowhere"], "--resume nowhere: has no checkpoint"),
     ],
 )
-def test_wrong_settings_are_refused(
+def test_invalid_settings_are_refused(
     ippo: ModuleType,
     here: Path,
     capsys: pytest.CaptureFixture[str],
@@ -235,7 +237,7 @@ def test_unknown_options_are_refused(ippo: ModuleType, words: list[str]) -> None
         ippo.main(words)
 
 
-def test_settings_that_cannot_change_are_refused(
+def test_a_resumed_run_refuses_changes_of_fixed_settings(
     ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert ippo.main([*TINY, "--total-agent-steps", "20", "--name", "run"]) == 0
@@ -247,7 +249,7 @@ def test_settings_that_cannot_change_are_refused(
     assert "has" in capsys.readouterr().err
 
 
-def test_a_pickle_is_not_run(
+def test_a_checkpoint_with_pickled_objects_is_refused(
     ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert ippo.main([*TINY, "--total-agent-steps", "20", "--name", "run"]) == 0
@@ -258,7 +260,7 @@ def test_a_pickle_is_not_run(
     assert f"{CHECKPOINT_FILE}: is damaged" in capsys.readouterr().err.replace("\n", "")
 
 
-def test_a_run_begins_with_the_weights_of_a_driver(
+def test_a_run_with_start_begins_with_the_weights_of_that_driver(
     ippo: ModuleType, here: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert ippo.main([*TINY, "--total-agent-steps", "60", "--name", "first"]) == 0
@@ -271,7 +273,7 @@ def test_a_run_begins_with_the_weights_of_a_driver(
     assert "--start runs/first: does not fit this run" in capsys.readouterr().err
 
 
-def test_a_run_that_observes_less_than_its_start_says_so(
+def test_a_run_that_observes_less_than_its_start_logs_the_number(
     ippo: ModuleType, here: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     short = [*TINY, "--total-agent-steps", "20"]
@@ -283,7 +285,7 @@ def test_a_run_that_observes_less_than_its_start_says_so(
 
 
 @pytest.mark.parametrize("form", [["--shared"], ["--residual"], ["--hidden", "9"]])
-def test_a_run_has_the_form_of_the_driver_that_it_begins_with(
+def test_a_run_with_start_has_the_form_of_that_driver(
     ippo: ModuleType, here: Path, form: list[str]
 ) -> None:
     short = [*TINY, "--total-agent-steps", "20"]

@@ -1,4 +1,4 @@
-"""The other training programs, called as by a user, with few decisions."""
+"""The training programs that use other libraries, called as a user calls them, but small."""
 
 from __future__ import annotations
 
@@ -41,17 +41,17 @@ def call(program: str, *words: object) -> subprocess.CompletedProcess[str]:
 
 
 def refusal(capsys: pytest.CaptureFixture[str], program: str, *words: object) -> str:
-    """Return a program's message about wrong arguments; run it here, because torch loads slowly."""
+    """Return a program's error; the program runs in this process, because torch loads slowly."""
     try:
         code = load_program(program.removesuffix(".py")).main([*map(str, words)])
-    except SystemExit as end:  # argparse writes its errors there
+    except SystemExit as end:  # raised by argparse
         code = end.code
     assert code == 2
     return capsys.readouterr().err
 
 
 def small(updates: int) -> list[object]:
-    """Return options of a run with this number of updates, each of 2 worlds · 8 steps."""
+    """Return options for a run with this number of updates of 2 worlds · 8 steps."""
     sizes = ["--num-worlds", 2, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
     return [*sizes, "--total-agent-steps", 2 * 8 * AGENTS * (updates - 1) + 1]
 
@@ -66,7 +66,7 @@ def small(updates: int) -> list[object]:
     ],
 )
 @pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
-def test_a_library_trains_a_driver_that_evaluate_takes(
+def test_a_library_trains_a_driver_that_can_be_loaded(
     tmp_path: Path, program: str, module: str, extra: str
 ) -> None:
     pytest.importorskip(module, reason=f"needs the extra: {extra}")
@@ -105,7 +105,7 @@ def test_benchmarl_trains(tmp_path: Path, algorithm: str) -> None:
 
 
 def check_driver_of_benchmarl(folder: Path) -> None:
-    """Compare the driver's outputs with those of BenchMARL's weights."""
+    """Compare the outputs of the saved driver with a network of BenchMARL's weights."""
     torch = pytest.importorskip("torch")
     network = load_driver_network(folder)
     seen = np.random.default_rng(0).uniform(-1.0, 1.0, (7, 105)).astype(np.float32)
@@ -134,7 +134,7 @@ def check_driver_of_benchmarl(folder: Path) -> None:
     ],
 )
 @pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
-def test_wrong_use_of_a_librarys_program_is_refused(
+def test_a_program_of_a_library_refuses_invalid_arguments(
     tmp_path: Path,
     program: str,
     module: str,
@@ -151,7 +151,7 @@ def test_wrong_use_of_a_librarys_program_is_refused(
     [("ppo.py", "torch"), ("ippo_torchrl.py", "torchrl"), ("ppo_rllib.py", "ray.rllib")],
 )
 @pytest.mark.filterwarnings("ignore")  # the libraries warn about their own code
-def test_programs_for_drivers_refuse_agents_of_signals(
+def test_programs_that_train_drivers_refuse_signal_agents(
     tmp_path: Path, program: str, module: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     pytest.importorskip(module)
@@ -165,7 +165,7 @@ def test_programs_for_drivers_refuse_agents_of_signals(
     assert "this program has agents of vehicles alone" in said
 
 
-def test_five_seeds_trains_what_is_missing_and_writes_the_table(tmp_path: Path) -> None:
+def test_five_seeds_trains_missing_seeds_and_writes_the_table(tmp_path: Path) -> None:
     pytest.importorskip("matplotlib", reason="needs the extra: report")
     config = tmp_path / "small.yaml"
     config.write_text(SMALL)
@@ -191,7 +191,7 @@ def test_five_seeds_trains_what_is_missing_and_writes_the_table(tmp_path: Path) 
         (["--config", "{list}"], "mapping"),
     ],
 )
-def test_wrong_use_of_five_seeds_is_refused(
+def test_five_seeds_refuses_invalid_arguments(
     tmp_path: Path, words: list[str], message: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     small, listed = tmp_path / "small.yaml", tmp_path / "list.yaml"
@@ -202,7 +202,7 @@ def test_wrong_use_of_five_seeds_is_refused(
 
 
 @pytest.mark.filterwarnings("ignore")  # the library warns about its own code
-def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
+def test_a_network_for_signals_is_trained_and_compared_with_controllers(tmp_path: Path) -> None:
     pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     sizes = ["--num-worlds", 1, "--num-steps", 8, "--minibatches", 2, "--hidden", 8]
     words: list[object] = [
@@ -230,8 +230,8 @@ def test_a_network_for_signals_is_trained_and_compared(tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore")  # the library warns about its own code
-def test_a_network_scores_signals_of_any_shape(tmp_path: Path) -> None:
-    """Learning changes the weights, and forbidden greens are never chosen."""
+def test_one_network_controls_signals_with_different_numbers_of_greens(tmp_path: Path) -> None:
+    """Learning changes all weights, and no forbidden green is chosen."""
     pytest.importorskip("stable_baselines3", reason="needs the extra: train")
     program = load_program("signals_sb3")
     args = program.Args(

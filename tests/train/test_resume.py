@@ -1,6 +1,6 @@
-"""Interrupted runs resume bit for bit, and overwrite or mix no files of other runs.
+"""Interrupted runs resume bit for bit, and do not overwrite or mix files of other runs.
 
-Only one test kills a separate program, which needs 2 s to start.
+Starting a separate program takes 2 s, so only one test does that and kills it.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ TINY = [
     "--num-steps", "8", "--epochs", "1", "--minibatches", "2", "--checkpoint-updates", "2",
 ]  # fmt: skip
 LENGTH = ["--total-agent-steps", "200"]
-CUT_AFTER = 5  # updates, of seven or more; the checkpoint is that of update 4
+CUT_AFTER = 5  # updates; the last checkpoint is of update 4
 
-# A program that is killed after a row of its log.
+# Run a program and kill it after the fifth row of its log.
 KILLED = """\
 import os, runpy, signal, sys
 from cavmarl.learning.log import Log
@@ -54,8 +54,8 @@ runpy.run_path(sys.argv[0], run_name="__main__")
 Learnt = tuple[bytes, list[dict[str, str]], set[str]]
 
 
-class Cut(BaseException):
-    """An exception that ends a run, and that no code catches."""
+class Interrupted(BaseException):
+    """An exception that ends a run and that the code of cavmarl does not catch."""
 
 
 @pytest.fixture(scope="module")
@@ -65,10 +65,10 @@ def ippo() -> ModuleType:
 
 @pytest.fixture(scope="module")
 def whole(ippo: ModuleType, tmp_path_factory: pytest.TempPathFactory) -> Learnt:
-    """Return the result of an uninterrupted run."""
+    """Return the results of an uninterrupted run."""
     runs = tmp_path_factory.mktemp("runs")
     assert ippo.main([*TINY, *LENGTH, "--runs", str(runs), "--name", "whole"]) == 0
-    return learnt(runs / "whole")
+    return results_of(runs / "whole")
 
 
 @pytest.fixture
@@ -86,26 +86,28 @@ def refusal(ippo: ModuleType, capsys: pytest.CaptureFixture[str]) -> Callable[..
     return call
 
 
-def learnt(folder: Path) -> Learnt:
-    """Return the weights, the learning curve without times, and the names of files."""
+def results_of(folder: Path) -> Learnt:
+    """Return the weights, the learning curve without columns of times, and the names of files."""
     with (folder / "progress.csv").open(newline="") as file:
         rows = [{key: row[key] for key in row.keys() - TIMES} for row in csv.DictReader(file)]
     return (folder / "model.safetensors").read_bytes(), rows, {p.name for p in folder.iterdir()}
 
 
-def cut(program: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch) -> None:
-    """Let a run end after `CUT_AFTER` updates."""
+def run_until_interrupted(
+    program: ModuleType, words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Run a program that `Interrupted` ends after `CUT_AFTER` updates."""
     update = program.Run.update
 
     def update_and_end(self: Any) -> dict[str, float]:
         row = update(self)
         if self.updates == CUT_AFTER:
-            raise Cut
+            raise Interrupted
         return row
 
     with monkeypatch.context() as patch:
         patch.setattr(program.Run, "update", update_and_end)
-        with pytest.raises(Cut):
+        with pytest.raises(Interrupted):
             program.main(words)
 
 
@@ -119,13 +121,13 @@ def test_a_killed_run_resumes_bit_for_bit(ippo: ModuleType, here: Path, whole: L
     assert state.updates == 4
     rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
     assert len(rows) == 1 + CUT_AFTER
-    left = here / "runs" / "cut" / ".build-left"  # its writer was killed
+    left = here / "runs" / "cut" / ".build-left"  # as left by a killed writer
     left.mkdir()
     (left / CHECKPOINT_FILE).touch()
-    # The saved driver is for users: a run does not resume from it.
+    # Resuming must not read the saved driver.
     (here / "runs" / "cut" / "model.safetensors").write_bytes(b"of another step")
     assert ippo.main(["--resume", "runs/cut"]) == 0
-    assert learnt(here / "runs" / "cut") == whole
+    assert results_of(here / "runs" / "cut") == whole
     assert is_trained(here / "runs" / "cut")
 
 
@@ -141,40 +143,40 @@ def test_a_killed_run_resumes_bit_for_bit(ippo: ModuleType, here: Path, whole: L
     ],
 )
 @pytest.mark.filterwarnings("ignore:workers = 2")
-def test_a_run_resumes_bit_for_bit_with_each_way_to_collect(
+def test_a_run_with_other_settings_resumes_bit_for_bit(
     here: Path, monkeypatch: pytest.MonkeyPatch, words: list[str], others: list[str]
 ) -> None:
     program = load_program("ppo")
     words = [*TINY, *LENGTH, *words]
     assert program.main([*words, "--name", "whole"]) == 0
-    cut(program, [*words, "--name", "cut"], monkeypatch)
+    run_until_interrupted(program, [*words, "--name", "cut"], monkeypatch)
     assert program.main(["--resume", "runs/cut", *others]) == 0
-    assert learnt(here / "runs" / "cut") == learnt(here / "runs" / "whole")
+    assert results_of(here / "runs" / "cut") == results_of(here / "runs" / "whole")
 
 
-def test_a_run_that_died_before_its_manifest_was_closed_is_ended(
+def test_resuming_a_finished_run_with_an_open_manifest_closes_it(
     ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def die(*_: object, **__: object) -> None:
-        raise Cut
+        raise Interrupted
 
     words = [*TINY, "--total-agent-steps", "60", "--name", "run"]
     with monkeypatch.context() as patch:
         patch.setattr("cavmarl.learning.run_folder.end_training", die)
-        with pytest.raises(Cut):
+        with pytest.raises(Interrupted):
             ippo.main(words)
-    before = learnt(here / "runs" / "run")
+    before = results_of(here / "runs" / "run")
     assert ippo.main(["--resume", "runs/run"]) == 0
-    assert learnt(here / "runs" / "run") == before
+    assert results_of(here / "runs" / "run") == before
     more = ["--resume", "runs/run"]
     assert "--total-agent-steps 60: the run has 61; ask for more" in refusal(*more)
     more += ["--total-agent-steps", "90"]
     assert "--minutes 1e-05: the run has" in refusal(*more, "--minutes", "1e-5")
     assert ippo.main(more) == 0
-    assert len(learnt(here / "runs" / "run")[1]) > len(before[1])
+    assert len(results_of(here / "runs" / "run")[1]) > len(before[1])
 
 
-def test_a_folder_has_one_run_and_one_process(
+def test_a_folder_can_have_only_one_run_and_one_process(
     ippo: ModuleType, here: Path, refusal: Callable[..., str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     words = [*TINY, "--total-agent-steps", "60", "--name", "run"]
@@ -190,13 +192,13 @@ def test_a_folder_has_one_run_and_one_process(
     monkeypatch.setattr(ippo.Run, "update", update_beside_another)
     assert ippo.main(words) == 0
     assert locked[0].count(f"runs/run: process {os.getpid()} trains here; wait until") == 2
-    before = learnt(here / "runs" / "run")
+    before = results_of(here / "runs" / "run")
     assert "runs/run: contains a run, which is not overwritten; continue" in refusal(*words)
-    assert learnt(here / "runs" / "run") == before
+    assert results_of(here / "runs" / "run") == before
 
 
 @pytest.mark.parametrize("full", ["checkpoint.pt", "progress.csv"])
-def test_a_full_disk_leaves_the_last_checkpoint_whole(
+def test_a_full_disk_does_not_damage_the_last_checkpoint(
     ippo: ModuleType,
     here: Path,
     whole: Learnt,
@@ -222,10 +224,10 @@ def test_a_full_disk_leaves_the_last_checkpoint_whole(
     assert not list((here / "runs" / "cut").glob(".build-*"))
     assert read_checkpoint(here / "runs" / "cut").updates == 0
     assert ippo.main(["--resume", "runs/cut"]) == 0
-    assert learnt(here / "runs" / "cut") == whole
+    assert results_of(here / "runs" / "cut") == whole
 
 
-def test_a_full_disk_while_a_row_is_written_is_a_typed_error(here: Path) -> None:
+def test_a_full_disk_at_a_row_of_the_log_is_a_typed_error(here: Path) -> None:
     (here / "progress.csv").symlink_to("/dev/full")
     log = Log(here)
     with pytest.raises(TrainingError, match=r"progress\.csv: cannot be written \(No space left"):
@@ -267,7 +269,7 @@ def test_damaged_files_and_files_of_other_runs_are_refused(
     assert "progress.csv: rows written before the checkpoint are missing" in refusal(*resume)
 
 
-def test_another_world_is_refused(
+def test_resuming_in_a_changed_environment_is_refused(
     ippo: ModuleType, here: Path, refusal: Callable[..., str]
 ) -> None:
     entry = here / "envs" / "small"
@@ -282,18 +284,18 @@ def test_another_world_is_refused(
     assert "--resume runs/run: the environment has changed since that run" in said
 
 
-def test_another_driver_of_the_background_is_another_environment(
+def test_resuming_with_a_changed_background_driver_is_refused(
     ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch, refusal: Callable[..., str]
 ) -> None:
     shutil.copytree(TRAIN.parent / "agents" / "cities_ippo", here / "driver")
     model = ["--set", f"traffic.model=zoo:{here / 'driver'}"]
-    cut(ippo, [*TINY, *LENGTH, *model, "--name", "run"], monkeypatch)
+    run_until_interrupted(ippo, [*TINY, *LENGTH, *model, "--name", "run"], monkeypatch)
     shutil.copytree(TRAIN.parent / "agents" / "merge_ippo", here / "driver", dirs_exist_ok=True)
     said = refusal("--resume", "runs/run")
     assert "--resume runs/run: the environment has changed since that run" in said
 
 
-def test_tensorboard_is_cut_where_the_checkpoint_is(
+def test_events_of_tensorboard_after_the_checkpoint_are_removed(
     ippo: ModuleType, here: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     pytest.importorskip("tensorboard")
@@ -310,7 +312,7 @@ def test_tensorboard_is_cut_where_the_checkpoint_is(
 
     words = [*TINY, *LENGTH, "--loggers", "tensorboard"]
     assert ippo.main([*words, "--name", "whole"]) == 0
-    cut(ippo, [*words, "--name", "cut"], monkeypatch)
+    run_until_interrupted(ippo, [*words, "--name", "cut"], monkeypatch)
     assert ippo.main(["--resume", "runs/cut"]) == 0
     assert points("cut") == points("whole") != []
 
@@ -329,7 +331,7 @@ def test_a_run_of_a_library_resumes(
     def write_and_end(self: Log, row: dict[str, float]) -> None:
         write(self, row)
         if row["updates"] == CUT_AFTER:
-            raise Cut
+            raise Interrupted
 
     words = ["--env", "ring", "--num-worlds", "2", "--num-steps", "8", "--hidden", "8"]
     words += ["--epochs", "1", "--minibatches", "2", "--checkpoint-updates", "2"]
@@ -338,13 +340,13 @@ def test_a_run_of_a_library_resumes(
     assert program.main([*words, "--name", "whole"]) == 0
     with monkeypatch.context() as patch:
         patch.setattr(Log, "write", write_and_end)
-        with pytest.raises(Cut):
+        with pytest.raises(Interrupted):
             program.main([*words, "--name", "cut"])
     assert program.main([*words, "--name", "cut"]) == 2
     assert program.main(["--resume", "runs/cut"]) == 0
     assert is_trained(here / "runs" / "cut")
-    uncut, resumed = learnt(here / "runs" / "whole"), learnt(here / "runs" / "cut")
-    if name == "ippo_torchrl":  # the collector keeps its worlds; they begin new episodes
+    uncut, resumed = results_of(here / "runs" / "whole"), results_of(here / "runs" / "cut")
+    if name == "ippo_torchrl":  # its resumed worlds begin new episodes
         assert (resumed[1][:4], resumed[2]) == (uncut[1][:4], uncut[2])
         rows = (here / "runs" / "cut" / "progress.csv").read_text().splitlines()
         updates = [int(row.partition(",")[0]) for row in rows[1:]]

@@ -1,4 +1,4 @@
-"""Message buses of vehicles at chosen positions."""
+"""Worlds whose vehicles stand at positions that a test chooses, with their message bus."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ from cavmarl.v2x.bus import Bus
 CLOCK = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.1}
 
 
-class Standing:
-    """A message bus of one world, whose rows a test writes.
+class StationWorld:
+    """A world with a message bus; the test writes the rows of vehicles.
 
     Args:
         agents: number of agents; agent k drives vehicle k < agents.
-        env: environment with the map.
+        env: environment that gives the map.
         rays: number of rays of the agents' lidar.
-        walls: (n, 4) ends of the buildings' walls, ax, ay, bx, by.
+        walls: (n, 4) ends of buildings' walls: ax, ay, bx, by.
         settings: values of keys under `v2x`.
     """
 
@@ -60,7 +60,7 @@ class Standing:
         self.bus.reset(np.ones(1, dtype=np.bool_))
 
     def put(self, places: NDArray[np.float64], **fields: Any) -> NDArray[np.void]:
-        """Put standing vehicles at (n, 2) positions; vehicle k has the id k."""
+        """Replace all vehicles by standing vehicles at (n, 2) positions; vehicle k has the id k."""
         rows = np.zeros(len(places), VEHICLE)
         rows[:] = blank_vehicle()
         rows["id"] = np.arange(len(places))
@@ -72,13 +72,13 @@ class Standing:
         return self.write(rows)
 
     def write(self, rows: NDArray[np.void]) -> NDArray[np.void]:
-        """Replace the vehicles, in any order."""
+        """Replace all vehicles; the order of rows does not matter."""
         self.worlds.rows[0, : len(rows)] = rows
         self.worlds.num_owned[0] = self.worlds.num_rows[0] = len(rows)
         return rows
 
     def tick(self) -> int:
-        """Send and receive; return the tick."""
+        """Let all stations send and receive for a tick; return the tick."""
         self.worlds.ticks[0] += 1
         self.bus.exchange(self.simulation.shards[0].side)
         return int(self.worlds.ticks[0])

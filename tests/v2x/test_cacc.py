@@ -1,4 +1,4 @@
-"""A driver with messages of the vehicle ahead follows closer than a driver without them."""
+"""The driver `cacc`, which uses messages of the vehicle ahead, compared with `idm`."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ WARMUP, STEPS = 500, 900
 
 
 class Platoon(NamedTuple):
-    """Motion of a platoon behind a leader with oscillating speed; the leader is first.
+    """Measured motion of a platoon whose leader's speed oscillates.
 
     Attributes:
-        spread: (n,) standard deviation of each vehicle's speed, m/s.
+        spread: (n,) standard deviation of each vehicle's speed in m/s, the leader first.
         headway_s: mean headway of the followers.
         gap_m: the smallest gap.
     """
@@ -43,7 +43,7 @@ class Platoon(NamedTuple):
 
 @pytest.fixture(scope="module")
 def road(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make four kilometres of road with one lane."""
+    """Make a road of four kilometres with one lane."""
     folder = tmp_path_factory.mktemp("road")
     (folder / "n.xml").write_text(
         '<nodes><node id="A" x="0" y="0"/><node id="B" x="500" y="0"/><node id="C" x="4000" y="0"/>'
@@ -96,7 +96,7 @@ def test_without_messages_cacc_drives_like_idm(road: Path) -> None:
     assert (deaf.spread == idm.spread).all()
 
 
-def test_missing_requirements_are_named() -> None:
+def test_the_error_names_missing_requirements() -> None:
     with pytest.raises(PolicyError, match=r"cacc needs .* overrides=.*v2x\.enabled"):
         load_policy("cacc", make_vec("ring"))
     discrete = make_vec("ring", overrides=HEARS | {"action.kind": "discrete"})

@@ -1,4 +1,4 @@
-"""Roadside units tell of closed roads."""
+"""Roadside units send messages about closed roads."""
 
 from __future__ import annotations
 
@@ -35,21 +35,21 @@ def close(env: Any, step: int) -> None:
         env.open_road("B2B1")
 
 
-def known(vec: Any, agent: int) -> set[str]:
+def known_closed_roads(vec: Any, agent: int) -> set[str]:
     """Return the closed roads in the inbox of an agent."""
     box = vec.simulation.messages.mail.events[0, agent]
     rows = box[(box["sender"] >= 0) & (box["code"] == CAUSE_ROAD_CLOSED)]
     return {vec.network.edge_ids[row] for row in (rows["subject"] - FIRST_CLOSED_ROAD).tolist()}
 
 
-def test_agents_hear_of_closed_roads_until_they_open() -> None:
+def test_agents_know_closed_roads_from_messages_until_they_open() -> None:
     with closing(make_vec("grid4x4", agents=2, background=10, overrides=KEYS)) as vec:
         vec.reset(seed=1)
         heard: list[set[str]] = []
         for step in range(100):
             close(vec, step)
             observations = vec.step(vec.suggest_actions())[0]
-            heard.append(known(vec, 0))
+            heard.append(known_closed_roads(vec, 0))
             if step == 30:
                 box = vec.simulation.messages.mail.events[0, 0]
                 seen = observations[0, 0]
@@ -70,7 +70,7 @@ def test_agents_hear_of_closed_roads_until_they_open() -> None:
     assert seen[names.index(("messages", "event_other_0"))] == 1.0
 
 
-def test_units_report_only_roads_near_them() -> None:
+def test_roadside_units_report_only_nearby_roads() -> None:
     with closing(make_vec("grid4x4", agents=1, background=5, overrides=KEYS)) as vec:
         vec.reset(seed=1)
         senders: set[int] = set()
@@ -103,18 +103,18 @@ def hashes(act: Any = close, **more: Any) -> list[str]:
         return found
 
 
-def test_a_divided_world_with_such_messages_equals_the_undivided_one() -> None:
+def test_a_divided_world_with_closed_roads_equals_the_undivided_one() -> None:
     undivided = hashes()
     assert hashes(zones=4) == undivided
     assert hashes(zones=4, workers=2) == undivided
 
 
 @pytest.mark.slow
-def test_worlds_with_such_messages_over_nodes_are_equal() -> None:
+def test_a_world_with_closed_roads_over_nodes_equals_the_undivided_one() -> None:
     assert hashes(zones=2, nodes=2) == hashes()
 
 
-def test_saved_states_continue_with_such_messages() -> None:
+def test_a_saved_state_keeps_messages_about_closed_roads() -> None:
     with closing(make_vec("grid4x4", agents=3, background=20, overrides=KEYS)) as vec:
         vec.reset(seed=2)
         for step in range(80):

@@ -1,4 +1,4 @@
-"""Agents and roadside units send messages about events, also in other processes."""
+"""Messages about events that agents and roadside units declare."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ TOLD = {
     "sensors.messages.events": 1,
     "population.mode": "respawn",
 }
-PRESENT, OTHER = 0, 7  # indices of the features of an event
+PRESENT, OTHER = 0, 7  # indices of observed features
 
 
 def run(workers: int, zones: int = 1, steps: int = 6) -> np.ndarray[Any, Any]:
-    """Return observations of events; an agent declares an obstacle in the third step."""
+    """Return observed events of a world in which agent 1 declares an obstacle in the third step."""
     env = make_vec("grid4x4", agents=4, workers=workers, zones=zones, overrides=TOLD)
     part = observation_parts(env.config.sensors)["messages"].place
     env.reset(seed=3)
@@ -43,16 +43,16 @@ def test_declared_events_reach_all_other_agents() -> None:
     assert (seen[:2] == 0.0).all()
     assert seen[2:, [0, 2, 3], PRESENT].all()
     assert seen[2:, [0, 2, 3], OTHER].all()
-    assert not seen[:, 1].any()  # the sender knows its own event
+    assert not seen[:, 1].any()  # senders do not observe their events
 
 
-def test_workers_and_zones_receive_the_same_events() -> None:
+def test_received_events_do_not_depend_on_workers_and_zones() -> None:
     whole = run(workers=0)
     assert (run(workers=2, zones=2) == whole).all()
     assert (run(workers=1) == whole).all()
 
 
-def test_an_event_is_sent_once_per_step_and_kept_for_its_validity() -> None:
+def test_a_declared_event_is_sent_once_and_known_while_valid() -> None:
     overrides = TOLD | {"v2x.denm.validity_s": 0.4}
     env = make_vec("grid4x4", agents=2, overrides=overrides)
     env.reset(seed=3)
@@ -63,7 +63,7 @@ def test_an_event_is_sent_once_per_step_and_kept_for_its_validity() -> None:
         env.step(env.suggest_actions())
         known.append(len(messages_of(KIND_DENM, bus.mail.events[0, 1])))
     assert bus.statistics().sent[KIND_DENM] == 1
-    assert known == [1, 1, 0, 0]  # sent in tick 1, valid up to tick 9; a step has four ticks
+    assert known == [1, 1, 0, 0]  # valid from tick 1 to 9; a step has 4 ticks
 
 
 def test_a_roadside_unit_sends_and_receives_events() -> None:
@@ -81,7 +81,7 @@ def test_a_roadside_unit_sends_and_receives_events() -> None:
         bus.declare_of_unit(0, 16, "obstacle")
 
 
-def test_wrong_events_are_refused() -> None:
+def test_unknown_agents_and_causes_of_events_are_refused() -> None:
     env = parallel_env("grid4x4", overrides=TOLD)
     env.reset(seed=0)
     with pytest.raises(ActionError, match="car_99"):

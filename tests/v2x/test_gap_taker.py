@@ -1,4 +1,4 @@
-"""`gap_taker` crosses in known gaps: messages prevent collisions at a blind junction."""
+"""The driver `gap_taker` at a blind junction, with and without messages."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ COLLISION, DELAY = TERMS.index("collision"), TERMS.index("delay")
 
 
 def driven(loss: float, seed: int, worlds: int = 8, **overrides: Any) -> tuple[int, int, float]:
-    """Return the numbers of ended trips and of collisions, and the mean delay in s."""
+    """Run worlds; return the numbers of ended trips and of collisions, and the mean delay in s."""
     vec = make_vec("blind_junction", num_envs=worlds, overrides={LOSS: loss, **overrides})
     driver = load_policy("gap_taker", vec)
     driver.reset(seed)
@@ -40,7 +40,7 @@ def test_messages_halve_the_collisions_without_more_delay() -> None:
     assert delay_s < deaf_delay_s
 
 
-def test_results_do_not_depend_on_the_division() -> None:
+def test_results_do_not_depend_on_zones() -> None:
     whole = driven(0.3, seed=3, worlds=2)
     assert driven(0.3, seed=3, worlds=2, **{"zones.count": 2}) == whole
 
@@ -54,7 +54,7 @@ def test_results_do_not_depend_on_the_division() -> None:
         {"action.kind": "discrete"},
     ],
 )
-def test_missing_requirements_are_named(settings: dict[str, Any]) -> None:
+def test_the_error_names_missing_requirements(settings: dict[str, Any]) -> None:
     env = cavmarl.make_vec("blind_junction", overrides=settings)
     with pytest.raises(PolicyError, match=r"sensors\.conflicts\.heard"):
         load_policy("gap_taker", env)

@@ -1,4 +1,4 @@
-"""Messages contain the time of the next signal change; a driver that uses them stops less."""
+"""Times of signal changes in messages, and the driver `glosa`, which uses them."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ from tests.support.actuated import actuated_grid
 KNOWN, GO, LINE, CHANGE, RETURN = 0, 1, 4, 5, 6
 
 
-def told(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
-    """Return the received data on the next signal, (steps, A, 7), in s, and the true times.
+def signal_data(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
+    """Return what agents know of their next signal in each step, (steps, A, 9).
 
-    The last column is the time until the letter of the next line changes, without messages.
+    Columns 0 to 6 are from messages, in m and s. Columns 7 and 8 are the true distance to the line
+    in m, and the true time to the change of its letter in s.
     """
     keys = {**ADVISED} | {"clock.ctrl_dt_s": 0.2, "sensors.signal.range_m": 200.0} | settings
     keys |= {"sensors.signal.timing": True}
@@ -44,12 +45,12 @@ def told(env: str | Path, steps: int, **settings: Any) -> NDArray[np.float64]:
 
 
 def test_the_times_of_the_next_two_changes_are_correct() -> None:
-    heard = told("grid4x4", 400)
+    heard = signal_data("grid4x4", 400)
     tick_s = 0.06  # messages may be a tick old
     changes = steps = 0
     is_known = (heard[..., KNOWN] > 0.0) & (heard[..., 7] > 0.0)
     np.testing.assert_allclose(heard[is_known, LINE], heard[is_known, 7], atol=1e-3)
-    # A driver also sees when a green ends.
+    # While a signal is green, compare its change with the true time.
     ends = is_known & (heard[..., GO] > 0.0) & (heard[..., CHANGE] > tick_s)
     np.testing.assert_allclose(heard[ends, CHANGE], heard[ends, 8], atol=tick_s)
     for before, after in pairwise(heard):
@@ -68,7 +69,7 @@ def test_the_times_of_the_next_two_changes_are_correct() -> None:
 
 
 def test_actuated_signals_report_the_earliest_times(tmp_path: Path) -> None:
-    heard = told(actuated_grid(tmp_path), 300)
+    heard = signal_data(actuated_grid(tmp_path), 300)
     ahead = (heard[:-1, :, KNOWN] > 0.0) & (np.abs(heard[:-1, :, LINE] - heard[1:, :, LINE]) < 5.0)
     ahead &= heard[1:, :, KNOWN] > 0.0
     flips = ahead & (heard[:-1, :, GO] != heard[1:, :, GO])
@@ -84,7 +85,7 @@ def test_signals_with_agents_report_the_earliest_change(min_green_s: float) -> N
         "signals.controller": "max_pressure",
         "signals.min_green_s": min_green_s,
     }
-    heard = told("grid4x4", 400, **keys)
+    heard = signal_data("grid4x4", 400, **keys)
     is_known = heard[..., KNOWN] > 0.0
     assert np.isinf(heard[is_known][:, RETURN]).all()
     assert np.isfinite(heard[is_known][:, CHANGE]).all()
@@ -97,12 +98,12 @@ def test_signals_with_agents_report_the_earliest_change(min_green_s: float) -> N
     flips = same & (before[..., GO] != after[..., GO])
     assert flips.sum() > 20
     assert (before[flips][:, CHANGE] < 0.2 + tick_s).all()
-    steady = same & ~flips  # an earliest time never comes nearer than the clock
+    steady = same & ~flips  # the earliest time cannot decrease faster than time passes
     passed_s = before[steady][:, CHANGE] - after[steady][:, CHANGE]
     assert (passed_s < 0.2 + tick_s).all()
 
 
-def test_glosa_halves_the_stops_at_almost_the_same_speed() -> None:
+def test_glosa_reduces_stops_at_almost_the_same_speed() -> None:
     advised, plain = drive("glosa", agents=12), drive("idm", agents=12)
     assert plain.stops > 100
     assert advised.stops < 0.65 * plain.stops
@@ -111,7 +112,7 @@ def test_glosa_halves_the_stops_at_almost_the_same_speed() -> None:
     assert advised.co2_g < plain.co2_g
 
 
-def test_without_messages_glosa_drives_as_idm() -> None:
+def test_without_messages_glosa_drives_like_idm() -> None:
     deaf = {"v2x.channel.loss": 1.0}
     found = (drive(name, agents=12, seconds=60, overrides=deaf) for name in ("glosa", "idm"))
     assert len(set(found)) == 1
@@ -122,7 +123,7 @@ def test_the_benchmark_has_a_row_for_each_driver() -> None:
     assert [(row["driver"], row["agents"]) for row in rows] == [("idm", 2), ("glosa", 2)]
 
 
-def test_missing_requirements_are_named() -> None:
+def test_the_error_names_missing_requirements() -> None:
     with pytest.raises(PolicyError, match=r"glosa needs .* overrides=.*v2x\.roadside\.signals"):
         load_policy("glosa", make_vec("grid4x4", agents=1, background=0))
     with pytest.raises(ConfigError, match=r"sensors\.messages\.timing.*needs sensors\.messages\.s"):

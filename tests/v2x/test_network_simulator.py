@@ -1,4 +1,4 @@
-"""A network simulator coupled with the world: a barrier in each tick, and checked answers."""
+"""External network simulators: synchronization in each tick, and checks of their answers."""
 
 from __future__ import annotations
 
@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import ConfigError, MessageError
 from cavmarl.v2x.kernels.v2x_records import KIND_CAM
 from cavmarl.v2x.v2x_messages import RECEPTION, Exchange, messages_of
-from tests.v2x.station_worlds import Standing
+from tests.v2x.station_worlds import StationWorld
 
 PLACES = np.array([[100.0, 100.0], [120.0, 100.0], [150.0, 100.0], [200.0, 100.0]])
 EXTERNAL = {"channel__external": True, "channel__latency_ticks": 3}
 
 
 class Federate:
-    """A fake network simulator in its own thread with its own clock.
+    """A fake network simulator with its own thread and clock.
 
-    It delivers each packet to all receivers except the sender, after `delay(sender)` ticks.
+    Each packet reaches all receivers except its sender after `delays[sender]` ticks.
     """
 
     def __init__(self, delays: dict[int, int]) -> None:
@@ -36,7 +36,7 @@ class Federate:
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         self._asked.put((sent.tick, sent.packets.copy(), sent.receivers.copy()))
-        return self._answers.get()  # the simulator waits at the barrier
+        return self._answers.get()  # the world waits for the answer
 
     def _run(self) -> None:
         while (asked := self._asked.get()) is not None:
@@ -59,8 +59,8 @@ class Federate:
         self._thread.join()
 
 
-def test_world_and_simulator_advance_together_and_packets_are_delayed() -> None:
-    world = Standing(2, cam__rate_hz=10.0, **EXTERNAL)
+def test_the_simulator_has_the_tick_of_the_world_and_delays_packets() -> None:
+    world = StationWorld(2, cam__rate_hz=10.0, **EXTERNAL)
     federate = Federate({1: 2, 2: 0, 3: 3})
     world.bus.connect(federate)
     world.put(PLACES)
@@ -80,12 +80,12 @@ def test_world_and_simulator_advance_together_and_packets_are_delayed() -> None:
     assert statistics.mean_latency_s == pytest.approx(0.1 * (2 * 3 + 3 * 4) / 22)
 
 
-def test_the_order_of_an_answer_does_not_matter() -> None:
+def test_results_do_not_depend_on_the_order_of_receptions() -> None:
     said = []
     for turn in (1, -1):
-        world = Standing(2, inbox__objects=1, **EXTERNAL)
+        world = StationWorld(2, inbox__objects=1, **EXTERNAL)
 
-        class Everything:
+        class ReceiveAll:
             def __init__(self, turn: int) -> None:
                 self.turn = turn
 
@@ -93,7 +93,7 @@ def test_the_order_of_an_answer_does_not_matter() -> None:
                 pairs = [(sent.tick, n, r) for n in range(len(sent.packets)) for r in range(2)]
                 return np.array(pairs[:: self.turn], dtype=RECEPTION)
 
-        world.bus.connect(Everything(turn))
+        world.bus.connect(ReceiveAll(turn))
         world.put(PLACES)
         for _ in range(3):
             world.tick()
@@ -112,31 +112,31 @@ def test_the_order_of_an_answer_does_not_matter() -> None:
         ((1, 0, 2), "by an unknown receiver"),
     ],
 )
-def test_invalid_answers_are_refused(reception: tuple[int, int, int], words: str) -> None:
-    world = Standing(2, **EXTERNAL)
+def test_invalid_receptions_are_refused(reception: tuple[int, int, int], words: str) -> None:
+    world = StationWorld(2, **EXTERNAL)
 
-    class Liar:
+    class InvalidReception:
         def exchange(self, sent: Exchange) -> NDArray[np.void]:
             return np.array([reception], dtype=RECEPTION)
 
-    world.bus.connect(Liar())
+    world.bus.connect(InvalidReception())
     world.put(PLACES)
     with pytest.raises(MessageError, match=words):
         world.tick()
 
 
-def test_invalid_arrays_and_a_missing_simulator_are_refused() -> None:
-    world = Standing(2, **EXTERNAL)
+def test_a_wrong_type_of_answer_and_a_missing_simulator_are_refused() -> None:
+    world = StationWorld(2, **EXTERNAL)
     world.put(PLACES)
     with pytest.raises(ConfigError, match="connect a network simulator"):
         world.tick()
 
-    class Wordy:
+    class ListAnswer:
         def exchange(self, sent: Exchange) -> Any:
             return [(1, 0, 0)]
 
-    world.bus.connect(Wordy())
+    world.bus.connect(ListAnswer())
     with pytest.raises(MessageError, match="dtype RECEPTION"):
         world.tick()
     with pytest.raises(ConfigError, match="external is off"):
-        Standing(2).bus.connect(Wordy())
+        StationWorld(2).bus.connect(ListAnswer())

@@ -1,4 +1,4 @@
-"""Hidden vehicles are known by messages."""
+"""Vehicles that an agent cannot see are known from messages."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 from cavmarl.sensors.observed import layout
 from cavmarl.v2x.kernels.v2x_records import FIRST_ROADSIDE_ID, KIND_CAM, KIND_CPM
 from tests.support.world import tick_of
-from tests.v2x.station_worlds import Standing
+from tests.v2x.station_worlds import StationWorld
 
-# The agent, a truck ahead, a car behind the truck, and a car beside the truck that sees all.
+# The agent, a truck ahead, a car that the truck hides, and a car that sees all vehicles.
 PLACES = np.array([[100.0, 120.0], [112.0, 120.0], [135.0, 120.0], [118.0, 140.0]])
 HIDDEN = 2
 
 
-def known(world: Standing, receiver: int = 0) -> dict[int, tuple[int, int]]:
-    """Return the known vehicles of a receiver, with the sender and the kind of message."""
+def known(world: StationWorld, receiver: int = 0) -> dict[int, tuple[int, int]]:
+    """Return (sender, kind of message) for each vehicle that a receiver knows."""
     box = world.bus.mail.objects[0, receiver]
     return {
         int(report["subject"]): (int(report["sender"]), int(report["kind"]))
@@ -26,17 +26,17 @@ def known(world: Standing, receiver: int = 0) -> dict[int, tuple[int, int]]:
     }
 
 
-def behind_a_truck(**settings: Any) -> Standing:
-    world = Standing(1, **settings)
+def behind_a_truck(**settings: Any) -> StationWorld:
+    world = StationWorld(1, **settings)
     rows = world.put(PLACES)
     rows["length"][1], rows["width"][1], rows["height"][1] = 16.0, 2.6, 4.0
     world.write(rows)
     return world
 
 
-def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
+def test_a_car_behind_a_truck_is_known_only_from_messages() -> None:
     world = behind_a_truck(perception__rate_hz=10.0)
-    # The CPM of the agent lists the vehicles that the agent sees, without the hidden car.
+    # The agent's own CPM has the vehicles that the agent sees.
     world.tick()
     mail = world.bus.mail
     reports = mail.reports[0, 0, : mail.num_reports[0, 0]]
@@ -49,7 +49,7 @@ def test_a_car_behind_a_truck_is_known_through_messages_only() -> None:
 
 
 def test_a_vehicle_hidden_from_lidar_is_known_from_messages() -> None:
-    world = Standing(1, rays=64)
+    world = StationWorld(1, rays=64)
     simulation = world.simulation
     rows = world.worlds.rows[0, : world.worlds.num_owned[0]]
     agent = rows[rows["agent"] == 0][0]
@@ -70,21 +70,21 @@ def test_a_vehicle_hidden_from_lidar_is_known_from_messages() -> None:
         return simulation.outputs.observations[0, 0, place].copy()
 
     with_hidden, without = lidar(placed), lidar(placed[:2])
-    assert (with_hidden == without).all()  # the readings of the rays are the same without the car
+    assert (with_hidden == without).all()  # the car is hidden from all rays
     world.write(placed)
     world.tick()
     assert known(world)[2] == (2, KIND_CAM)
 
 
-def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
+def test_a_car_without_radio_is_reported_by_a_roadside_unit_that_sees_it() -> None:
     # Only the agent and the roadside unit are equipped; a wall hides the car from the agent.
     settings: dict[str, Any] = {
         "equipped": 0.0, "perception__rate_hz": 10.0, "roadside__signals": ["all"],
         "roadside__perception_hz": 10.0, "roadside__range_m": 60.0,
     }  # fmt: skip
-    unit = Standing(1, **settings).bus.units[5]
+    unit = StationWorld(1, **settings).bus.units[5]
     x, y = float(unit["x"]), float(unit["y"])
-    world = Standing(1, walls=[(x - 15.0, y + 5.0, x - 15.0, y + 200.0)], **settings)
+    world = StationWorld(1, walls=[(x - 15.0, y + 5.0, x - 15.0, y + 200.0)], **settings)
     world.put(np.array([[x - 40.0, y], [x + 3.0, y + 30.0]]))
     world.tick()
     world.tick()
@@ -94,11 +94,11 @@ def test_a_car_without_radio_is_reported_by_vehicles_that_see_it() -> None:
 def test_packets_through_buildings_are_weaker() -> None:
     ratios = []
     for building_db in (0.0, 12.0, 60.0):
-        world = Standing(
+        world = StationWorld(
             1, walls=[(150.0, -500.0, 150.0, 500.0)], channel__path_loss_exponent=2.75,
             channel__building_db=building_db, inbox__objects=1,
         )  # fmt: skip
-        # 20 cars are 60 m away behind the wall: without the wall, nearly all packets are received.
+        # 20 cars are 60 m away behind the wall. Without the wall, nearly all packets are received.
         ring = np.linspace(-0.5, 0.5, 20)
         behind = 100.0 + 60.0 * np.stack([np.cos(ring), np.sin(ring)], 1)
         world.put(np.concatenate([[[100.0, 100.0]], behind]))

@@ -1,4 +1,4 @@
-"""Receptions and inboxes agree with the definitions."""
+"""Receptions and inboxes equal a direct computation from the definitions."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.v2x.kernels.v2x_records import (
     KIND_CPM,
 )
 from tests.naive import v2x as naive
-from tests.v2x.station_worlds import Standing
+from tests.v2x.station_worlds import StationWorld
 
 AGENTS, VEHICLES = 6, 40
 CHANNELS: dict[str, dict[str, Any]] = {
@@ -35,10 +35,10 @@ CHANNELS: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 
 
-def heard_by(
-    world: Standing, tick: int, receiver: int, x: float, y: float
+def expected_receptions(
+    world: StationWorld, tick: int, receiver: int, x: float, y: float
 ) -> tuple[list[naive.Said], int, int]:
-    """Return the receptions in a tick, and the number of packets within reach, by definition."""
+    """Return the received reports of a tick, and the numbers of reachable and received packets."""
     config = world.config.v2x.channel
     slots = config.latency_ticks + 1
     slot = (tick - config.latency_ticks) % slots
@@ -46,7 +46,7 @@ def heard_by(
     packets = mail.packets[0, slot, : mail.num_packets[0, slot]]
     near = np.hypot(packets["x"] - x, packets["y"] - y)
     busy = naive.airtime_s(config) / 0.1 * float((near <= naive.sensing_m(config)).sum())
-    busy = math.floor(64.0 * min(busy, 1.0) + 0.5) / 64.0  # probabilities are tabulated in 64 steps
+    busy = math.floor(64.0 * min(busy, 1.0) + 0.5) / 64.0  # the table has 64 steps
     said: list[naive.Said] = []
     reachable = received = 0
     for packet, distance in zip(packets, near.tolist(), strict=True):
@@ -84,9 +84,9 @@ def drift(random: np.random.Generator, places: NDArray[np.float64]) -> NDArray[n
 
 @pytest.mark.parametrize("seen", [False, True], ids=["cams", "cpms"])
 @pytest.mark.parametrize("name", CHANNELS)
-def test_inboxes_agree_with_the_definitions(name: str, seen: bool) -> None:
+def test_inboxes_equal_the_definitions(name: str, seen: bool) -> None:
     settings = CHANNELS[name] | {"inbox__objects": 5, "inbox__memory_s": 0.4, "cam__rate_hz": 5.0}
-    world = Standing(AGENTS, perception__rate_hz=2.5 if seen else 0.0, **settings)
+    world = StationWorld(AGENTS, perception__rate_hz=2.5 if seen else 0.0, **settings)
     random = np.random.default_rng(1)
     places = random.uniform(0.0, 420.0, (VEHICLES, 2))
     known: list[list[naive.Said]] = [[] for _ in range(AGENTS)]
@@ -98,7 +98,7 @@ def test_inboxes_agree_with_the_definitions(name: str, seen: bool) -> None:
         tick = world.tick()
         for agent in range(AGENTS):
             x, y = places[agent]
-            said, reachable, received = heard_by(world, tick, agent, x, y)
+            said, reachable, received = expected_receptions(world, tick, agent, x, y)
             total[0] += reachable
             total[1] += received
             old = [report for report in known[agent] if report.tick + 4 >= tick]
@@ -114,8 +114,8 @@ def test_inboxes_agree_with_the_definitions(name: str, seen: bool) -> None:
 
 
 def test_receptions_have_the_configured_probability() -> None:
-    # 300 receptions at each distance agree within four standard deviations.
-    world = Standing(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
+    # The ratio of 300 receptions at each distance may differ by four standard deviations.
+    world = StationWorld(1, channel__path_loss_exponent=2.75, channel__loss=0.1, equipped=1.0)
     distances = np.array([20.0, 90.0, 120.0, 140.0, 220.0])
     ring = np.linspace(0.0, 2.0 * np.pi, 60, endpoint=False)
     config = world.config.v2x.channel
@@ -132,8 +132,8 @@ def test_receptions_have_the_configured_probability() -> None:
         assert band * BAND_M <= distance <= (band + 1) * BAND_M
 
 
-def test_packets_of_the_larger_ids_exceed_the_capacity() -> None:
-    world = Standing(1, capacity=10)
+def test_packets_of_the_largest_ids_are_dropped_beyond_the_capacity() -> None:
+    world = StationWorld(1, capacity=10)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (30, 2)))
     world.tick()
     mail = world.bus.mail
@@ -142,9 +142,8 @@ def test_packets_of_the_larger_ids_exceed_the_capacity() -> None:
 
 
 def test_packets_beyond_the_capacity_of_the_channel_are_dropped() -> None:
-    # 60 packets of 300 bytes in 100 ms at 0.5 Mbit/s take 4.84 ms each, three times the available
-    # time.
-    world = Standing(1, channel__data_rate_mbps=0.5)
+    # 60 packets of 300 bytes at 0.5 Mbit/s take 4.84 ms each: 290 ms, but only 100 ms are there.
+    world = StationWorld(1, channel__data_rate_mbps=0.5)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
     world.tick()
     dropped = world.bus.mail.counts[0, COUNT_NO_ACCESS]
@@ -160,10 +159,10 @@ def test_packets_beyond_the_capacity_of_the_channel_are_dropped() -> None:
     # At 6 Mbit/s, a symbol of 8 µs has 48 bits.
     [(300, 6.0, 440.0), (300, 3.0, 840.0), (1500, 12.0, 1040.0), (300, 0.0, 0.0)],
 )
-def test_a_packet_takes_the_air_for_its_preamble_and_its_bits(
+def test_airtime_depends_on_preamble_size_and_data_rate(
     bytes_: int, rate_mbps: float, airtime_us: float
 ) -> None:
-    world = Standing(1, channel__data_rate_mbps=rate_mbps, channel__packet_bytes=bytes_)
+    world = StationWorld(1, channel__data_rate_mbps=rate_mbps, channel__packet_bytes=bytes_)
     assert airtime_s(world.config.v2x.channel) == pytest.approx(1e-6 * airtime_us)
     world.put(np.array([[0.0, 0.0], [10.0, 0.0], [20.0, 0.0]]))
     world.tick()
@@ -171,10 +170,10 @@ def test_a_packet_takes_the_air_for_its_preamble_and_its_bits(
     assert busy == pytest.approx(3 * 1e-6 * airtime_us / 0.1, rel=1e-6)
 
 
-def test_more_traffic_means_fewer_receptions() -> None:
+def test_the_reception_ratio_falls_with_the_number_of_vehicles() -> None:
     ratios = []
     for vehicles in (10, 40, 75):
-        world = Standing(
+        world = StationWorld(
             1, channel__path_loss_exponent=2.0, channel__sensitivity_dbm=-66.0,
             channel__data_rate_mbps=3.0,
         )  # fmt: skip
@@ -187,8 +186,8 @@ def test_more_traffic_means_fewer_receptions() -> None:
     assert ratios[0] > ratios[1] > ratios[2]
 
 
-def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
-    world = Standing(1, cam__rate_hz=1.0)
+def test_the_inbox_of_an_agent_is_empty_for_a_new_vehicle() -> None:
+    world = StationWorld(1, cam__rate_hz=1.0)
     places = np.random.default_rng(3).uniform(0.0, 300.0, (20, 2))
     rows = world.put(places)
     for _ in range(9):
@@ -198,7 +197,7 @@ def test_a_new_vehicle_in_a_seat_has_heard_nothing() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert there[there >= 0].tolist() == [10]  # the only other station that sends in this tick
+    assert there[there >= 0].tolist() == [10]  # only 10 sends in this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

@@ -1,4 +1,4 @@
-"""Times and contents of messages of stations."""
+"""Times and contents of the messages that stations send."""
 
 from __future__ import annotations
 
@@ -20,24 +20,24 @@ from cavmarl.v2x.kernels.v2x_records import (
 )
 from cavmarl.v2x.v2x_messages import messages_of
 from tests.naive import v2x as naive
-from tests.v2x.station_worlds import Standing
+from tests.v2x.station_worlds import StationWorld
 
 SPREAD = np.stack([np.linspace(0.0, 390.0, 40), np.full(40, 100.0)], 1)
 
 
-def sent(world: Standing, kind: int) -> Any:
-    """Return the packets of this tick, as records of the schema."""
+def sent(world: StationWorld, kind: int) -> Any:
+    """Return the messages of a kind that were sent in this tick."""
     mail, slot = world.bus.mail, 0
     return messages_of(kind, mail.reports[0, slot, : mail.num_reports[0, slot]])
 
 
 @pytest.mark.parametrize("dtype", [REPORT, PACKET, LAST_CAM])
-def test_records_of_the_state_have_no_gaps(dtype: np.dtype[Any]) -> None:
+def test_records_have_no_padding(dtype: np.dtype[Any]) -> None:
     assert dtype.itemsize == sum(dtype[name].itemsize for name in dtype.names or ())
 
 
-def test_stations_take_turns_by_id() -> None:
-    world = Standing(1, cam__rate_hz=2.5)
+def test_each_station_sends_in_a_tick_that_depends_on_its_id() -> None:
+    world = StationWorld(1, cam__rate_hz=2.5)
     world.put(SPREAD)
     for _ in range(8):
         tick = world.tick()
@@ -47,7 +47,7 @@ def test_stations_take_turns_by_id() -> None:
 
 
 def test_a_cam_has_the_state_of_its_vehicle() -> None:
-    world = Standing(1)
+    world = StationWorld(1)
     rows = world.put(SPREAD, speed=7.0, accel=-1.5, yaw_rate=0.1, heading=0.3, length=4.2)
     world.tick()
     cams = sent(world, KIND_CAM)
@@ -56,11 +56,11 @@ def test_a_cam_has_the_state_of_its_vehicle() -> None:
     assert (cams["vclass"] == 0).all()
 
 
-def test_triggered_cams_come_with_a_change_and_once_a_second() -> None:
-    world = Standing(1, cam__triggered=True)
+def test_triggered_cams_are_sent_after_a_change_and_once_a_second() -> None:
+    world = StationWorld(1, cam__triggered=True)
     rows = world.put(SPREAD)
     world.tick()
-    assert len(sent(world, KIND_CAM)) == 40  # the first CAM of each vehicle
+    assert len(sent(world, KIND_CAM)) == 40  # each vehicle's first CAM
     rows["x"][3] += 4.1
     rows["heading"][4] += math.radians(4.1)
     rows["speed"][5] += 0.6
@@ -76,8 +76,8 @@ def test_triggered_cams_come_with_a_change_and_once_a_second() -> None:
         assert sent(world, KIND_CAM)["sender"].tolist() == expected
 
 
-def test_only_equipped_vehicles_send_and_agents_do() -> None:
-    world = Standing(4, equipped=0.5)
+def test_only_equipped_vehicles_and_agents_send() -> None:
+    world = StationWorld(4, equipped=0.5)
     world.put(SPREAD)
     world.tick()
     senders = set(sent(world, KIND_CAM)["sender"].tolist())
@@ -85,14 +85,14 @@ def test_only_equipped_vehicles_send_and_agents_do() -> None:
     assert 10 <= len(senders) <= 30
     world.tick()
     assert set(sent(world, KIND_CAM)["sender"].tolist()) == senders
-    silent = Standing(4, equipped=0.0)
+    silent = StationWorld(4, equipped=0.0)
     silent.put(SPREAD)
     silent.tick()
     assert sent(silent, KIND_CAM)["sender"].tolist() == [0, 1, 2, 3]
 
 
-def test_events_are_sent_with_the_worst_cause() -> None:
-    world = Standing(1)
+def test_a_vehicle_with_several_events_sends_the_worst_cause() -> None:
+    world = StationWorld(1)
     rows = world.put(SPREAD, hit=-1)
     rows["accel"][3] = -4.5
     rows["wait_s"][4] = 31.0
@@ -111,7 +111,7 @@ def test_events_are_sent_with_the_worst_cause() -> None:
 
 
 @pytest.mark.parametrize("units", [False, True], ids=["vehicles", "roadside"])
-def test_seen_vehicles_are_reported(units: bool) -> None:
+def test_stations_report_the_vehicles_that_they_see(units: bool) -> None:
     settings: dict[str, Any] = {"perception__rate_hz": 10.0, "perception__objects": 5}
     if units:
         settings = {
@@ -120,10 +120,9 @@ def test_seen_vehicles_are_reported(units: bool) -> None:
             "perception__objects": 5,
             "roadside__range_m": 60.0,
         }
-    world = Standing(1, cam__rate_hz=0.0, denm__rate_hz=0.0, **settings)
+    world = StationWorld(1, cam__rate_hz=0.0, denm__rate_hz=0.0, **settings)
     random = np.random.default_rng(8)
     cells = np.stack(np.meshgrid(np.arange(9), np.arange(8)), -1).reshape(-1, 2)
-    # In other ticks, no station sends.
     places = 210.0 + 14.0 * cells + random.uniform(-3.0, 3.0, (72, 2))
     rows = world.put(places, heading=random.uniform(-3.0, 3.0, 72))
     world.tick()
@@ -141,8 +140,8 @@ def test_seen_vehicles_are_reported(units: bool) -> None:
     assert sum(map(len, told.values())) > 10
 
 
-def test_roadside_units_send_the_active_phase() -> None:
-    world = Standing(1, cam__rate_hz=0.0, roadside__signals=["all"], roadside__rate_hz=10.0)
+def test_roadside_units_send_the_active_phase_and_its_remaining_time() -> None:
+    world = StationWorld(1, cam__rate_hz=0.0, roadside__signals=["all"], roadside__rate_hz=10.0)
     network = world.simulation.network
     world.put(SPREAD)
     world.tick()

@@ -1,4 +1,4 @@
-"""States of overridden signals in SPAT reports."""
+"""Encoding of the states of overridden signals in SPAT reports."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from cavmarl.v2x.kernels.shown_states import (
 from cavmarl.v2x.kernels.v2x_records import REPORT
 
 
-def test_states_are_read_as_they_were_written() -> None:
+def test_written_states_are_read_back() -> None:
     random = np.random.default_rng(3)
     report = np.zeros(1, REPORT)[0]
     report["code"] = 41
@@ -26,14 +26,14 @@ def test_states_are_read_as_they_were_written() -> None:
     for index in random.permutation(NUM_LETTERS)[:30].tolist():
         wanted[index] = random.integers(0, SIGNAL_YELLOW_MAJOR + 1)
         note_shown(report, index, int(wanted[index]))
-        note_shown(report, index, int(wanted[index]))  # a link with this index at another signal
+        note_shown(report, index, int(wanted[index]))  # writing twice changes nothing
     assert [shown_at(report, index) for index in range(NUM_LETTERS)] == wanted.tolist()
     assert report["code"] == -42
     assert phase_of(report) == 41
 
 
 @pytest.mark.parametrize("index", [NUM_LETTERS, 200])
-def test_states_beyond_the_report_are_unknown(index: int) -> None:
+def test_states_of_links_beyond_the_report_are_unknown(index: int) -> None:
     report = np.zeros(1, REPORT)[0]
     note_shown(report, index, 2)
     assert report["code"] == -1

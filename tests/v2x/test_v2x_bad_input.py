@@ -1,4 +1,4 @@
-"""Impossible settings are refused with the key, the value and the remedy."""
+"""The errors for impossible settings name the key, the value and the remedy."""
 
 from __future__ import annotations
 
@@ -57,13 +57,13 @@ def test_messages_that_no_station_sends_cannot_be_observed(name: str) -> None:
         load_world("grid4x4", overrides={f"sensors.messages.{name}": value})
 
 
-def test_heard_vehicles_need_messages() -> None:
+def test_the_sensor_of_heard_vehicles_needs_messages() -> None:
     settings = {"sensors.conflicts.count": 4, "sensors.conflicts.heard": True}
     with pytest.raises(ConfigError, match=r"sensors\.conflicts\.heard = True: .*set v2x\.enabled"):
         load_world("grid4x4", overrides=settings)
 
 
-def test_messages_and_all_effects_of_the_channel_are_off_by_default() -> None:
+def test_messages_and_channel_effects_are_off_by_default() -> None:
     default = V2xConfig()
     assert not default.enabled
     channel = default.channel
@@ -71,7 +71,7 @@ def test_messages_and_all_effects_of_the_channel_are_off_by_default() -> None:
     assert (channel.path_loss_exponent, channel.building_db, channel.data_rate_mbps) == (0, 0, 0)
 
 
-def test_in_mode_messages_other_vehicles_are_observed_from_messages_only() -> None:
+def test_the_observation_mode_messages_has_other_vehicles_only_from_messages() -> None:
     overrides = {
         "v2x.enabled": True, "sensors.messages.objects": 3, "sensors.messages.events": 1,
         "sensors.messages.signal": True, "observation.mode": "messages", "observation.kind": "dict",

@@ -1,4 +1,4 @@
-"""The schema of messages is fixed: recorded bytes stay readable."""
+"""The binary schema of messages must not change, so that recorded bytes stay readable."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_decoded_messages_equal_encoded_ones(kind: int) -> None:
     assert records["sender"].tolist() == [2, 3, 4]
 
 
-def test_bytes_that_are_no_message_are_refused() -> None:
+def test_invalid_bytes_are_refused() -> None:
     data = example(KIND_CAM)
     with pytest.raises(MessageError, match="3 bytes are no message"):
         decode(data[:3])

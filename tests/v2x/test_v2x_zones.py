@@ -1,4 +1,4 @@
-"""Receptions do not depend on how a world is divided, although messages reach further."""
+"""Received messages do not depend on zones, although messages reach beyond the halo."""
 
 from __future__ import annotations
 
@@ -40,8 +40,8 @@ def test_received_messages_do_not_depend_on_zones(channel: dict[str, Any], stack
     assert sum(result.crossings for result in found.results) >= 10
 
 
-def everything_said(zones: int) -> list[bytes]:
-    """Return all inboxes and counts after each step, in the order of the receivers."""
+def all_messages(zones: int) -> list[bytes]:
+    """Run worlds; return the bytes of all inboxes, counts and observations after each step."""
     overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
     env = make_vec("grid4x4", num_envs=2, zones=zones, overrides=overrides)
     said = []
@@ -54,13 +54,13 @@ def everything_said(zones: int) -> list[bytes]:
     return said
 
 
-def test_inboxes_are_the_same_byte_for_byte() -> None:
-    whole = everything_said(1)
+def test_inboxes_do_not_depend_on_zones() -> None:
+    whole = all_messages(1)
     for zones in (2, 4, 9):
-        assert everything_said(zones) == whole
+        assert all_messages(zones) == whole
 
 
-def test_worker_processes_send_the_same_messages() -> None:
+def test_worlds_in_workers_receive_the_same_messages() -> None:
     overrides = FAST | OBSERVED | LOSSY | {"population.mode": "respawn"}
 
     def seen(**split: int) -> list[bytes]:

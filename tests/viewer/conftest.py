@@ -1,4 +1,4 @@
-"""A server with a small divided world, and a browser if there is one."""
+"""Fixtures: a server with a small divided world, and a browser."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from tests.support.chromium import chromium
 
 @dataclass
 class Served:
-    """A world that a thread drives, and its server."""
+    """A world with its server; a thread can step the world."""
 
     env: CavEnv
     run: ShownRun
@@ -32,7 +32,7 @@ class Served:
     map_bytes: bytes
 
     def note_actions(self, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
-        """Return a list of the actions of the first agent, to which each step adds."""
+        """Return a list to which each further step appends the action of the first agent."""
         noted: list[Any] = []
         step = self.env.step
 
@@ -46,7 +46,7 @@ class Served:
 
 @contextmanager
 def served(env: CavEnv, options: WebOptions, drives: bool = True) -> Iterator[Served]:
-    """Serve a world; a thread drives it unless `drives` is false."""
+    """Serve a world; a thread steps the world unless `drives` is false."""
     with ExitStack() as stack:
         stack.callback(env.close)
         stage = first_stage("world 0", env.network, hello_of(env, "idm"))

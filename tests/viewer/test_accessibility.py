@@ -1,4 +1,4 @@
-"""axe-core in a real browser finds no fault of the pages, light and dark."""
+"""axe-core finds no accessibility fault on the light and dark pages in a real browser."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ def axe() -> str:
 
 
 def violations(page: Any, axe: str) -> list[str]:
-    """Return the findings of axe: rules and elements."""
+    """Return the violated rules of axe with the elements that violate them."""
     page.evaluate(axe)
     found = page.evaluate("axe.run(document)")
     assert len(found["passes"]) > 10
@@ -38,7 +38,7 @@ def violations(page: Any, axe: str) -> list[str]:
 
 
 @pytest.mark.parametrize("theme", ["light", "dark"])
-def test_axe_finds_nothing_on_the_page(browser: Any, serve: Serve, axe: str, theme: str) -> None:
+def test_axe_finds_no_fault_of_the_page(browser: Any, serve: Serve, axe: str, theme: str) -> None:
     served = serve(insertions=4)
     page = browser.new_page(viewport={"width": 1280, "height": 760}, color_scheme=theme)
     page.goto(served.server.address)
@@ -47,13 +47,13 @@ def test_axe_finds_nothing_on_the_page(browser: Any, serve: Serve, axe: str, the
     page.fill("#wanted", "car_1")
     page.press("#wanted", "Enter")
     until(page, "document.querySelector('#observation').rows.length > 5")
-    page.click("#insert")  # with its notice
+    page.click("#insert")  # shows a notice
     assert violations(page, axe) == []
     page.set_viewport_size({"width": 360, "height": 640})
     assert violations(page, axe) == []
 
 
-def test_axe_finds_nothing_on_the_request_for_a_token(browser: Any, serve: Serve, axe: str) -> None:
+def test_axe_finds_no_fault_of_the_token_form(browser: Any, serve: Serve, axe: str) -> None:
     served = serve(options=WebOptions(port=0, token="open sesame"))
     page = browser.new_page()
     page.goto(served.server.address)
@@ -61,7 +61,7 @@ def test_axe_finds_nothing_on_the_request_for_a_token(browser: Any, serve: Serve
     assert violations(page, axe) == []
 
 
-def test_axe_finds_nothing_on_the_page_of_failed_trips(
+def test_axe_finds_no_fault_of_the_page_of_failed_trips(
     browser: Any, axe: str, tmp_path: Path
 ) -> None:
     evaluate("merge", "random_actions", episodes=1, out=tmp_path / "out", failures=3)

@@ -1,4 +1,4 @@
-"""Frames and rosters are decoded equal; late watchers get complete messages."""
+"""Binary messages of the viewer: decoded frames and rosters equal the encoded ones."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ ORIGIN = np.array([100.0, -50.0])
 
 
 class Page:
-    """A reader of messages like the page."""
+    """A decoder of messages that works like the page."""
 
     def __init__(self) -> None:
         self.roster = np.zeros(0, ROSTER_ROW)
@@ -94,7 +94,7 @@ def check(page: Page, frame: WorldFrame, message: bytes) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.sets(st.integers(0, 40)), st.booleans(), st.booleans()), max_size=12))
-def test_late_watchers_and_watchers_that_miss_frames_get_the_same_data(
+def test_pages_that_join_late_or_miss_frames_get_the_same_data(
     moments: list[tuple[set[int], bool, bool]],
 ) -> None:
     encoder = FrameEncoder(ORIGIN)
@@ -111,7 +111,7 @@ def test_late_watchers_and_watchers_that_miss_frames_get_the_same_data(
             check(page, frame, shown.frame)
 
 
-def test_many_changes_are_sent_as_a_whole_and_no_watcher_is_lost() -> None:
+def test_many_changes_are_replaced_by_a_whole_roster() -> None:
     encoder = FrameEncoder(ORIGIN)
     page = Page()
     for tick in range(3 * REBASE_CHANGES):
@@ -124,7 +124,7 @@ def test_many_changes_are_sent_as_a_whole_and_no_watcher_is_lost() -> None:
             check(page, frame, shown.frame)
 
 
-def test_ten_thousand_vehicles_are_at_most_100_kb() -> None:
+def test_a_frame_of_ten_thousand_vehicles_has_at_most_100_kb() -> None:
     encoder = FrameEncoder(ORIGIN)
     encoder.publication(frame_with(list(range(10_000)), 1))
     shown = encoder.publication(frame_with(list(range(10, 10_010)), 2))

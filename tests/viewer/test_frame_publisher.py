@@ -1,4 +1,4 @@
-"""Times at which frames, details and events are sent, with a clock and events of the test."""
+"""Times at which frames, details and events are sent; the test sets the clock and the events."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from cavmarl.viewer.subscribers import Wishes
 
 
 class World:
-    """A world with given ticks, and the messages to its watchers."""
+    """A substitute for a world, with lists of the messages to its watchers."""
 
     def __init__(self, has_events: bool = True) -> None:
         self.frames: list[int] = []  # ticks of the frames
-        self.details: list[tuple[int, int, bool]] = []  # tick, vehicle, whether with sensors
+        self.details: list[tuple[int, int, bool]] = []  # (tick, vehicle, has sensors)
         self.events: list[list[Any]] = []
         self.ghosts: list[bool] = []
         self.tick = 0
@@ -46,7 +46,7 @@ class World:
         self.publisher.publish(now_s, self.clock, frame_of, details_of)
 
 
-def test_twenty_frames_and_five_details_a_second() -> None:
+def test_at_most_twenty_frames_and_five_details_are_sent_per_second() -> None:
     world = World(has_events=False)
     for now_s in (10.0, 10.04, 10.06, 10.12, 10.18, 10.21, 10.24, 10.3, 10.46, 10.47):
         world.publish(now_s)
@@ -55,7 +55,7 @@ def test_twenty_frames_and_five_details_a_second() -> None:
     assert [tick for tick, _, _ in world.details] == [1, 7, 9]
 
 
-def test_a_paused_world_is_sent_again_when_a_page_asks_for_more() -> None:
+def test_an_unchanged_world_is_sent_again_when_a_page_asks_for_more() -> None:
     world = World(has_events=False)
     world.publish(10.0)
     world.publish(10.1, is_new=False)
@@ -80,7 +80,7 @@ def test_a_world_without_watchers_is_not_encoded() -> None:
     assert (world.frames, world.ghosts, world.publisher.published) == ([], [], 0)
 
 
-def test_at_most_fifty_events_of_the_time_line_are_sent_with_a_frame(
+def test_at_most_fifty_events_are_sent_with_a_frame(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     happened = [FrameEvent(2, "departed", 0, -1, "")]
@@ -88,7 +88,7 @@ def test_at_most_fifty_events_of_the_time_line_are_sent_with_a_frame(
     monkeypatch.setattr(frame_publisher, "events_between", lambda before, frame: happened)
     world = World()
     world.publish(10.0)
-    assert world.events == [], "there is no frame before the first"
+    assert world.events == [], "events before the first frame"
     world.publish(10.1)
     (sent,) = world.events
     assert sent == [[2, "arrived", number, -1, ""] for number in range(50)]
@@ -98,7 +98,7 @@ def test_at_most_fifty_events_of_the_time_line_are_sent_with_a_frame(
     assert silent.events == []
 
 
-def test_an_earlier_tick_begins_an_episode_and_the_same_tick_does_not(
+def test_a_new_episode_is_reported_when_the_tick_decreases(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(frame_publisher, "events_between", lambda before, frame: [])

@@ -1,4 +1,4 @@
-"""An environment is shown while a program steps it, also in notebooks and evaluations."""
+"""`cavmarl.show`: web pages show the environment of a running program, notebook or evaluation."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ def vec() -> Any:
     made.close()
 
 
-def test_a_page_chooses_among_the_worlds_that_a_program_steps(
+def test_a_page_shows_the_world_that_it_asks_for(
     vec: CavVectorEnv, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vec.reset(seed=0)
@@ -70,7 +70,7 @@ def test_a_page_chooses_among_the_worlds_that_a_program_steps(
         assert tick_of(client) % ticks == 0
         assert shown.publishers[0].published == 0
     monkeypatch.setattr(shown, "turn", None)
-    vec.step(vec.suggest_actions())  # the step no longer calls `turn`
+    vec.step(vec.suggest_actions())  # must not call `turn` after the `with` block
 
 
 def test_showing_a_world_does_not_change_it() -> None:
@@ -116,13 +116,13 @@ def test_an_unknown_world_is_refused(vec: CavVectorEnv) -> None:
                 assert ended_with(client) == (1003, "no such world: must be from 0 to 2")
 
 
-def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVectorEnv) -> None:
+def test_a_notebook_on_this_machine_can_embed_the_page(vec: CavVectorEnv) -> None:
     with cavmarl.show(vec, port=0) as shown:
-        assert shown.address in shown._repr_html_()  # also before the first reset
+        assert shown.address in shown._repr_html_()  # before the first reset
         vec.reset(seed=0)
         vec.step(vec.suggest_actions())
         assert "<iframe" in shown._repr_html_()
-        with joined(shown.address) as client:  # although the program runs no further step
+        with joined(shown.address) as client:  # no further step is needed
             assert tick_of(client) == vec.config.clock.ticks_per_step
         policy = httpx.get(shown.address).headers["content-security-policy"]
         assert "frame-ancestors 'self' http://127.0.0.1:* http://localhost:* vscode" in policy
@@ -133,7 +133,7 @@ def test_a_notebook_of_this_machine_shows_the_page_within_its_own(vec: CavVector
 
 
 def test_watching_an_evaluation_does_not_change_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CavVectorEnv, "watch", None)  # requests of the page
+    monkeypatch.setattr(CavVectorEnv, "watch", None)  # requests of the page use it
     keys: dict[str, Any] = {"agents": 2, "background": 2, "overrides": {"horizon_s": 5.0}}
     looks: list[int] = []
 
@@ -156,7 +156,7 @@ def test_watching_an_evaluation_does_not_change_it(monkeypatch: pytest.MonkeyPat
         evaluate("ring", "idm", episodes=1, repeats=2, watcher=watcher, **keys)
 
 
-def test_messages_include_the_load_of_workers_and_their_zones() -> None:
+def test_load_rows_have_the_zones_and_the_score_of_each_worker() -> None:
     vec = make_vec("grid4x4", num_envs=1, zones=2, workers=2, agents=1, background=2)
     try:
         vec.reset(seed=0)

@@ -1,4 +1,4 @@
-"""A recording on the page: playing, pausing, seeking; and bad recordings."""
+"""Recordings on the page: play, pause and seek; errors of incomplete recordings."""
 
 from __future__ import annotations
 
@@ -39,13 +39,13 @@ def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def loop() -> Iterator[asyncio.AbstractEventLoop]:
-    """A substitute for the server's event loop, which runs waiting calls in each turn."""
+    """An event loop in place of the server's; each turn runs the calls that wait in it."""
     with closing(asyncio.new_event_loop()) as made:
         yield made
 
 
-class Heard:
-    """A watcher of a stage without a server."""
+class RecordingWatcher:
+    """A watcher of one world of a recording, without a server."""
 
     def __init__(self, path: Path, loop: asyncio.AbstractEventLoop, world: int = 1) -> None:
         recording = Recording(path)
@@ -60,7 +60,7 @@ class Heard:
         self.stage.audience.ask(self.watcher, PageRequest(kind, number, sensors=True))
 
     def turn(self) -> tuple[int, bool] | None:
-        """Return the tick of the last frame, and whether it is paused."""
+        """Return the tick of the newest frame, and whether the recording is paused."""
         time.sleep(0.06)
         self.shown.turn()
         self._loop.run_until_complete(asyncio.sleep(0.0))
@@ -71,7 +71,7 @@ class Heard:
         head = FRAME_HEAD.unpack_from(newest.frame)
         return head[5], bool(head[1])
 
-    def told_of(self, vehicle: int, tick: int) -> Any:
+    def details_of(self, vehicle: int, tick: int) -> Any:
         """Return the details of a vehicle at a tick."""
         self.ask("pause")
         self.ask("seek", tick)
@@ -84,9 +84,9 @@ class Heard:
         return told
 
 
-def turns(heard: Heard, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int, bool]:
+def turns(watcher: RecordingWatcher, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int, bool]:
     for _ in range(100):
-        found = heard.turn()
+        found = watcher.turn()
         if found is not None and is_so(found):
             return found
     raise AssertionError("no such frame came")
@@ -95,50 +95,50 @@ def turns(heard: Heard, is_so: Callable[[tuple[int, bool]], bool]) -> tuple[int,
 def test_a_recording_plays_to_its_end_pauses_and_restarts(
     path: Path, loop: asyncio.AbstractEventLoop
 ) -> None:
-    heard = Heard(path, loop)
-    heard.ask("pace", 10.0)
-    first, last = heard.stage.hello["span"]
-    assert turns(heard, lambda found: True)[0] < last
-    assert turns(heard, lambda found: found[1]) == (last, True)
-    heard.ask("play")
-    assert turns(heard, lambda found: not found[1])[0] < last
+    watcher = RecordingWatcher(path, loop)
+    watcher.ask("pace", 10.0)
+    first, last = watcher.stage.hello["span"]
+    assert turns(watcher, lambda found: True)[0] < last
+    assert turns(watcher, lambda found: found[1]) == (last, True)
+    watcher.ask("play")
+    assert turns(watcher, lambda found: not found[1])[0] < last
     assert first < last
 
 
-def test_a_page_goes_to_any_moment(path: Path, loop: asyncio.AbstractEventLoop) -> None:
-    heard = Heard(path, loop)
-    heard.ask("pause")
+def test_a_page_can_seek_any_tick(path: Path, loop: asyncio.AbstractEventLoop) -> None:
+    watcher = RecordingWatcher(path, loop)
+    watcher.ask("pause")
     ticks = Recording(path).ticks(1, 0)
     for wanted, shown in ((ticks[17] + 1, ticks[17]), (0, ticks[0]), (10**9, ticks[-1])):
-        heard.ask("seek", wanted)
-        assert turns(heard, lambda found: True) == (shown, True)
+        watcher.ask("seek", wanted)
+        assert turns(watcher, lambda found: True) == (shown, True)
 
 
 def test_a_vehicle_is_shown_as_recorded(path: Path, loop: asyncio.AbstractEventLoop) -> None:
-    heard = Heard(path, loop, world=0)
+    watcher = RecordingWatcher(path, loop, world=0)
     frame: WorldFrame = Recording(path).at(10, 0, 0)
     row = frame.vehicles[0]
-    found = heard.told_of(int(row["id"]), frame.tick)
+    found = watcher.details_of(int(row["id"]), frame.tick)
     assert found["here"]
     assert dict(found["rows"])["speed"].startswith(f"{row['speed']:.2f} m/s")
-    assert not heard.told_of(10**6, frame.tick)["here"]
+    assert not watcher.details_of(10**6, frame.tick)["here"]
 
 
 def test_an_agent_is_shown_with_its_observation(
     path: Path, loop: asyncio.AbstractEventLoop
 ) -> None:
-    heard, recording = Heard(path, loop, world=1), Recording(path)
+    watcher, recording = RecordingWatcher(path, loop, world=1), Recording(path)
     tick = recording.ticks(1, 0)[5]
     frame = recording.at(tick, 1, 0)
     row = recording.extra_at("observations", tick, 1)[0]
-    found = heard.told_of(int(row["vehicle"]), tick)
+    found = watcher.details_of(int(row["vehicle"]), tick)
     names = [tuple(told[:2]) for told in found["observation"]]
     assert names == [tuple(name) for name in recording.head.features]
     numbers = [told[2] for told in found["observation"]]
     assert numbers == pytest.approx(row["values"].tolist(), abs=1e-4)
     assert [name for name, _ in found["terms"]] == list(recording.head.terms)
     others = frame.vehicles[frame.vehicles["agent"] < 0]
-    assert "observation" not in heard.told_of(int(others["id"][0]), tick)
+    assert "observation" not in watcher.details_of(int(others["id"][0]), tick)
 
 
 def test_a_recording_without_a_map_or_frames_is_refused(path: Path, tmp_path: Path) -> None:

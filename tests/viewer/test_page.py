@@ -29,7 +29,7 @@ HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
 
 
 def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[str], set[str]]:
-    """Open a page until its first frame; return it with its errors, and the requested hosts."""
+    """Open a page and wait for its first frame; return the page, its errors and the used hosts."""
     page = browser.new_page(viewport={"width": 1280, "height": 760})
     problems: list[str] = []
     hosts: set[str] = set()
@@ -43,12 +43,14 @@ def opened(browser: Any, served: Served, script: str = "") -> tuple[Any, list[st
     return page, problems, hosts
 
 
-def test_the_page_draws_and_follows_without_other_hosts(browser: Any, serve: Serve) -> None:
+def test_the_page_draws_and_follows_a_vehicle_and_uses_no_other_host(
+    browser: Any, serve: Serve
+) -> None:
     served = serve()
     page, problems, hosts = opened(browser, served)
     until(page, "viewer.firstPicture > 0")
     assert page.evaluate("viewer.frame.count") >= 3
-    assert page.evaluate("viewer.calls") <= 10  # layers
+    assert page.evaluate("viewer.calls") <= 10  # draw calls
     page.fill("#wanted", "car_1")
     page.press("#wanted", "Enter")
     until(page, "document.querySelector('#observation').rows.length > 5")
@@ -91,7 +93,7 @@ def test_a_seat_is_driven_with_the_arrow_keys(
     assert not problems
 
 
-def test_a_vehicle_is_added_and_a_road_closed_and_opened(browser: Any, serve: Serve) -> None:
+def test_a_page_can_add_a_vehicle_and_close_and_open_a_road(browser: Any, serve: Serve) -> None:
     served = serve(insertions=9, background=4)
     page, problems, _ = opened(browser, served)
     assert page.is_visible("#insert")
@@ -124,7 +126,7 @@ def test_a_vehicle_is_added_and_a_road_closed_and_opened(browser: Any, serve: Se
     assert not problems
 
 
-def test_without_room_nothing_can_be_added(browser: Any, serve: Serve) -> None:
+def test_a_page_cannot_add_vehicles_without_room_for_them(browser: Any, serve: Serve) -> None:
     page, _, _ = opened(browser, serve())
     assert not page.is_visible("#insert")
     assert not page.is_visible("#close")
@@ -141,13 +143,13 @@ def test_every_control_has_a_name(browser: Any, serve: Serve) -> None:
     assert page.evaluate("document.documentElement.lang") == "en"
 
 
-def test_names_of_maps_are_text(
+def test_markup_in_names_of_a_map_is_shown_as_text(
     browser: Any, serve: Serve, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     nasty = "<script>alert(1)</script><img src=x onerror=alert(1)>"
     served = serve()
     network = served.env.network
-    # Undo this later, because worlds of one process share the network of a map.
+    # Use a patch, because worlds of one process share the network of a map.
     monkeypatch.setitem(vars(network), "lane_ids", (nasty,) * len(network.lane_ids))
     page, problems, _ = opened(browser, served)
     page.on("dialog", lambda dialog: problems.append(dialog.message))
@@ -173,7 +175,7 @@ def test_without_webgl2_a_message_and_a_still_picture_are_shown(browser: Any, se
     assert not problems
 
 
-def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Serve) -> None:
+def test_the_page_draws_the_sensors_and_the_route_of_a_vehicle(browser: Any, serve: Serve) -> None:
     page, problems, _ = opened(browser, serve(env="merge", zones=1, rig=CAMERA))
     page.fill("#wanted", "car_0")
     page.press("#wanted", "Enter")
@@ -182,15 +184,15 @@ def test_the_sensors_and_the_way_of_a_vehicle_are_drawn(browser: Any, serve: Ser
     drawn = """(() => { const c = document.querySelector('#labels');
         const d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data;
         let n = 0; for (let k = 3; k < d.length; k += 4) n += d[k] > 0; return n; })()"""
-    until(page, f"{drawn} > 20000")  # the cone of the camera alone has more pixels
+    until(page, f"{drawn} > 20000")  # the camera's cone has more pixels
     page.uncheck("#sensors")
     until(page, "viewer.shapes && viewer.shapes.all.length === 0")
     until(page, f"{drawn} < 20000 && {drawn} > 0")
-    # The test itself causes this message.
+    # The test's own calls of getImageData cause a message.
     assert not [one for one in problems if "getImageData" not in one]
 
 
-def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_path: Path) -> None:
+def test_a_page_can_seek_in_a_recording_and_choose_its_world(browser: Any, tmp_path: Path) -> None:
     with ExitStack() as stack:
         address, span = replayed(stack, tmp_path / "run")
         page = browser.new_page()
@@ -222,7 +224,7 @@ def test_a_recording_is_searched_and_its_worlds_are_chosen(browser: Any, tmp_pat
 
 
 def replayed(stack: ExitStack, path: Path) -> tuple[str, list[int]]:
-    """Serve a recording of two worlds; yield its address, and the span of its time line."""
+    """Serve a recording of two worlds; return the address, and the first and last tick."""
     vec = make_vec("ring", num_envs=2, agents=1, background=2, record=path)
     vec.reset(seed=0)
     for _ in range(30):
@@ -245,7 +247,7 @@ def replayed(stack: ExitStack, path: Path) -> tuple[str, list[int]]:
     return address, stages[0].hello["span"]
 
 
-def test_a_token_is_asked_for(browser: Any, serve: Serve) -> None:
+def test_a_page_asks_for_the_token(browser: Any, serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, token="open sesame"))
     page = browser.new_page()
     page.goto(served.server.address)

@@ -1,4 +1,4 @@
-"""A replay shows the sensor data of an agent like the live page, or reports missing data."""
+"""A replay shows the same sensor data of an agent as the live page, or reports missing data."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEPS = 12
 
 
 def recorded(path: Path, *include: str) -> list[tuple[int, int, Any]]:
-    """Return tick, vehicle and its details on the live page, step by step."""
+    """Record some steps; return (tick, vehicle, details on the live page) of each step."""
     seen = []
     options = RecordOptions(path, include)
     with closing(

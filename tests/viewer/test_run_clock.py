@@ -29,7 +29,7 @@ def steps_due(clock: RunClock, now_s: float, step_s: float) -> int:
 
 
 @pytest.mark.parametrize(("pace", "wait_s"), [(2.0, 0.05), (0.5, 0.2), (0.1, 0.25)])
-def test_the_next_step_is_due_after_its_time_over_the_pace(
+def test_the_next_step_is_due_after_its_duration_divided_by_the_pace(
     now: SimpleNamespace, pace: float, wait_s: float
 ) -> None:
     clock = RunClock(pace)
@@ -39,19 +39,19 @@ def test_the_next_step_is_due_after_its_time_over_the_pace(
     assert clock.wait_s(now.s + 2.0) == 0.0
 
 
-def test_as_fast_as_possible_never_waits(now: SimpleNamespace) -> None:
+def test_pace_0_never_waits(now: SimpleNamespace) -> None:
     assert steps_due(RunClock(0.0), now.s, 0.1) == 100
 
 
-def test_a_late_clock_makes_up_for_at_most_half_a_second(now: SimpleNamespace) -> None:
+def test_a_late_clock_catches_up_at_most_half_a_second(now: SimpleNamespace) -> None:
     clock = RunClock(1.0)
     now.s += 3.0
-    # The steps of 102.5, 102.7 and 102.9 s are taken at once.
+    # The steps that were due at 102.5, 102.7 and 102.9 s are taken at once.
     assert steps_due(clock, now.s, 0.2) == 3
     assert clock.wait_s(now.s) == pytest.approx(0.1)
 
 
-def test_a_paused_world_takes_only_requested_steps_ten_at_most(now: SimpleNamespace) -> None:
+def test_a_paused_world_takes_at_most_ten_requested_steps(now: SimpleNamespace) -> None:
     clock = RunClock(1.0)
     assert clock.handle(PageRequest("pause"))
     assert steps_due(clock, now.s, 0.1) == 0
@@ -62,7 +62,7 @@ def test_a_paused_world_takes_only_requested_steps_ten_at_most(now: SimpleNamesp
         assert clock.wait_s(now.s) == 0.25
     now.s += 60.0
     assert clock.handle(PageRequest("play"))
-    assert steps_due(clock, now.s, 0.1) == 1, "the time of the pause is not made up for"
+    assert steps_due(clock, now.s, 0.1) == 1, "steps of the pause were made up for"
 
 
 def test_a_requested_step_pauses_a_running_world(now: SimpleNamespace) -> None:
@@ -72,7 +72,7 @@ def test_a_requested_step_pauses_a_running_world(now: SimpleNamespace) -> None:
     assert steps_due(clock, now.s, 0.1) == 1
 
 
-def test_a_new_pace_counts_from_now_on(now: SimpleNamespace) -> None:
+def test_a_new_pace_applies_at_once(now: SimpleNamespace) -> None:
     clock = RunClock(0.1)
     clock.tick(now.s, 1.0)  # due in 10 s
     assert clock.handle(PageRequest("pace", 4.0))

@@ -1,4 +1,4 @@
-"""Shapes of sensor data are at the positions of the sensed objects."""
+"""The drawn shapes of sensor data are at the positions of the sensed objects."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ RIG = {
 
 @pytest.fixture(scope="module")
 def told() -> Any:
-    """Return details of an agent with all kinds of sensors, its frame and its environment."""
+    """Yield the details of an agent with all kinds of sensors, its frame and its vehicle id."""
     grid = {"features": ["presence", "on_road"], "align_to_vehicle_axes": True}
     sensors = {"sensors.lidar.rays": 72, "sensors.occupancy_grid": grid}
     env = parallel_env("merge", agents=4, background=20, overrides={"rig": RIG, **sensors})
@@ -44,7 +44,7 @@ def shapes_of(told: Any) -> dict[str, dict[str, Any]]:
 
 
 def on_map(told: Any, flat: list[float]) -> np.ndarray:
-    """Transform points of the vehicle's frame to the map."""
+    """Transform points from the vehicle's coordinates to the map's."""
     rows = told[1].vehicles
     row = rows[rows["id"] == told[2]][0]
     cos, sin = np.cos(row["heading"]), np.sin(row["heading"])
@@ -54,7 +54,7 @@ def on_map(told: Any, flat: list[float]) -> np.ndarray:
 
 
 def to_bodies_m(told: Any, places: np.ndarray) -> np.ndarray:
-    """Return the distance of each point to the nearest body of another vehicle; 0: inside."""
+    """Return the distance of each point to the nearest other vehicle; 0 inside of its body."""
     others = told[1].vehicles[told[1].vehicles["id"] != told[2]]
     gaps = []
     for row in others:
@@ -66,7 +66,7 @@ def to_bodies_m(told: Any, places: np.ndarray) -> np.ndarray:
     return least
 
 
-def test_rays_end_at_the_bodies_of_others(told: Any) -> None:
+def test_lidar_rays_end_at_the_bodies_of_other_vehicles(told: Any) -> None:
     shape = shapes_of(told)["lidar"]
     hits = np.array(shape["hits"], bool)
     assert 0 < hits.sum() < len(hits) == 72
@@ -84,7 +84,7 @@ def test_neighbours_and_radar_targets_lie_on_vehicles(told: Any) -> None:
         assert to_bodies_m(told, places).max() < 0.3
 
 
-def test_occupied_cells_hold_the_vehicles(told: Any) -> None:
+def test_occupied_cells_are_at_vehicles(told: Any) -> None:
     shape = shapes_of(told)["occupancy_grid"]
     shown = np.frombuffer(base64.b64decode(shape["rgba"]), np.uint8)
     shown = shown.reshape(shape["height"], shape["width"], 4)
@@ -114,7 +114,7 @@ def test_pictures_of_all_kinds_are_small_enough(told: Any) -> None:
     json.dumps(told[0], allow_nan=False)
 
 
-def test_the_way_leads_from_the_vehicle_to_its_goal(told: Any) -> None:
+def test_the_drawn_route_has_the_length_to_the_goal(told: Any) -> None:
     details, frame, vehicle = told
     way = np.array(details["way"]).reshape(-1, 2)
     length_m = np.hypot(*np.diff(way, axis=0).T).sum()

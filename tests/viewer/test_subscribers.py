@@ -1,4 +1,4 @@
-"""Messages to each watcher of a world, without a server and without a world."""
+"""Queues of messages to the watchers of a world, without a server or a world."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ def audience() -> Audience:
     return found
 
 
-def test_a_newer_frame_replaces_one_that_was_not_sent() -> None:
+def test_a_newer_frame_replaces_an_unsent_frame() -> None:
     watcher = PageWatcher(1)
     for number in range(3):
         watcher.offer(Publication(b"frame %d" % number, FIRST))
@@ -39,7 +39,7 @@ def test_a_newer_frame_replaces_one_that_was_not_sent() -> None:
     assert watcher.take() == []
 
 
-def test_changes_of_the_roster_are_sent_once_each() -> None:
+def test_each_change_of_the_roster_is_sent_once() -> None:
     watcher = PageWatcher(1)
     sent = []
     for frame, changes in ((b"1", FIRST), (b"2", FIRST), (b"3", SECOND), (b"4", SECOND)):
@@ -49,7 +49,7 @@ def test_changes_of_the_roster_are_sent_once_each() -> None:
     assert watcher.take() == []
 
 
-def test_a_watcher_that_reads_no_texts_is_lost_after_256() -> None:
+def test_a_watcher_with_more_than_256_unread_texts_is_lost() -> None:
     watcher = PageWatcher(1)
     for number in range(256):
         watcher.queue(str(number))
@@ -88,7 +88,7 @@ def test_details_go_to_the_pages_that_watch_the_vehicle() -> None:
     assert here.wishes == Wishes(3, frozenset({7}), frozenset(), (2,))
 
 
-def test_a_page_that_leaves_frees_its_seat_and_its_requests_end() -> None:
+def test_a_page_that_leaves_frees_its_seat_and_ends_its_requests() -> None:
     here = audience()
     watcher, stays = here.join(), here.join()
     here.ask(watcher, PageRequest("watch", 7.0))

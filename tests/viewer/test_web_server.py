@@ -1,4 +1,4 @@
-"""The viewer's server: headers, origins, tokens, slow and invalid watchers, a taken port."""
+"""The viewer's web server: headers, origins, tokens, slow and invalid clients, a used port."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def welcome(server: WebServer, token: str = "") -> Iterator[ClientConnection]:
 
 
 def first_of(client: ClientConnection, kind: int | str) -> Any:
-    """Return the next message of a kind, given by number or name."""
+    """Return the next message of a kind; binary kinds are numbers, texts have names."""
     end = time.monotonic() + 20.0
     while time.monotonic() < end:
         message = client.recv(timeout=20.0)
@@ -71,7 +71,7 @@ def test_a_page_gets_the_world_the_map_and_frames(serve: Serve) -> None:
         assert hello["title"] == "grid4x4"
         assert len(hello["zones"]) == 4
         assert first_of(client, 1) == served.map_bytes
-        assert first_of(client, 2)[1] == 1  # a whole roster
+        assert first_of(client, 2)[1] == 1  # a complete roster
         ticks = [struct.unpack_from("<I", first_of(client, 3), 16)[0] for _ in range(3)]
         assert ticks == sorted(set(ticks))
 
@@ -103,9 +103,7 @@ def test_requests_reach_the_world(serve: Serve) -> None:
             pass
 
 
-def test_a_seat_is_driven_by_one_page_and_given_back(
-    serve: Serve, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_one_page_at_a_time_drives_a_seat(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
     served = serve(drives=False)
     noted, run = served.note_actions(monkeypatch), served.run
     with welcome(served.server) as one, welcome(served.server) as other:
@@ -135,7 +133,7 @@ def first_of_turning(served: Served, client: ClientConnection) -> Any:
 
 
 @pytest.mark.parametrize("path", ["", "main.js", "viewer.css", "icon.svg", "nothing", "../app.py"])
-def test_all_answers_have_the_headers(serve: Serve, path: str) -> None:
+def test_all_answers_have_the_security_headers(serve: Serve, path: str) -> None:
     served = serve(drives=False)
     answer = httpx.get(served.server.address + path)
     assert answer.status_code == (200 if (PAGE / (path or "index.html")).is_file() and
@@ -148,7 +146,7 @@ def test_all_answers_have_the_headers(serve: Serve, path: str) -> None:
     assert "server" not in answer.headers
 
 
-def test_the_page_obeys_its_content_security_policy() -> None:
+def test_the_page_has_no_code_that_its_content_security_policy_forbids() -> None:
     for file in PAGE.iterdir():
         text = file.read_text(encoding="utf-8")
         assert "innerHTML" not in text
@@ -157,18 +155,16 @@ def test_the_page_obeys_its_content_security_policy() -> None:
         assert " style=" not in text
         assert " onclick=" not in text
         assert "https://" not in text
-        assert text.count("\n") <= 560, f"{file.name}: divide it"
+        assert text.count("\n") <= 560, f"{file.name}: too long, divide it"
 
 
-def test_foreign_origins_and_names_are_refused(serve: Serve) -> None:
+def test_foreign_origins_and_host_names_are_refused(serve: Serve) -> None:
     served = serve(drives=False)
     port = served.server.port
     for headers in (
         {"Origin": "http://evil.example"},
         {"Origin": "null"},
-        {
-            "Origin": f"http://localhost:{port}"
-        },  # an origin of this machine, but not that of the page
+        {"Origin": f"http://localhost:{port}"},  # the same machine, but another origin
         {"Host": f"evil.example:{port}", "Origin": f"http://evil.example:{port}"},
     ):
         assert status_of_handshake(port, headers) == 403
@@ -203,7 +199,7 @@ def test_a_configured_token_is_required(serve: Serve) -> None:
         assert first_of(client, "hello")
 
 
-def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
+def test_the_watch_token_gives_no_control(serve: Serve) -> None:
     options = WebOptions(port=0, token="a secret", watch_token="another")
     served = serve(drives=False, options=options)
     with welcome(served.server, "another") as client:
@@ -222,7 +218,7 @@ def test_a_token_to_watch_gives_no_control(serve: Serve) -> None:
         assert first_of(client, "hello")["control"] is True
 
 
-def test_other_machines_are_only_served_with_a_token() -> None:
+def test_serving_other_machines_requires_a_token() -> None:
     with pytest.raises(
         ServiceError, match=r"--host 0\.0\.0\.0: reachable from outside; give a --to"
     ):
@@ -259,7 +255,7 @@ def test_invalid_messages_end_the_connection(serve: Serve, text: str, reason: st
 
 
 @pytest.mark.parametrize("hello", ['{"token": "\\ud800"}', '{"world": "\\ud800"}', "{\ud800}"])
-def test_a_hello_with_half_a_character_is_refused(serve: Serve, hello: str) -> None:
+def test_a_first_message_with_half_a_surrogate_pair_is_refused(serve: Serve, hello: str) -> None:
     served = serve(drives=False)
     with live(served.server) as client:
         client.send(hello.encode(errors="surrogatepass"), text=True)
@@ -268,7 +264,7 @@ def test_a_hello_with_half_a_character_is_refused(serve: Serve, hello: str) -> N
         assert first_of(client, "hello")
 
 
-def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
+def test_a_page_without_control_changes_nothing(serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, control=False))
     with welcome(served.server) as client:
         assert first_of(client, "hello")["control"] is False
@@ -278,7 +274,7 @@ def test_a_page_that_may_only_watch_changes_nothing(serve: Serve) -> None:
             assert first_of(client, 3)[1] == 0
 
 
-def test_a_watcher_that_reads_nothing_is_dropped_and_the_world_continues(serve: Serve) -> None:
+def test_a_watcher_that_reads_nothing_is_dropped(serve: Serve) -> None:
     served = serve(options=WebOptions(port=0, send_s=0.5), drives=False)
     served.run.clock.pace = 0.0
     large = Publication(b"\x03" + bytes(2**20), (Change(1, b""),))
@@ -324,14 +320,14 @@ def test_frames_are_published_no_more_often_than_20_times_a_second(serve: Serve)
     assert served.run.steps > served.run.publisher.published
 
 
-def test_two_servers_on_one_port_are_a_typed_error(serve: Serve) -> None:
+def test_a_used_port_is_a_typed_error(serve: Serve) -> None:
     served = serve(drives=False)
     env = parallel_env("ring", agents=1, background=0)
     with pytest.raises(ServiceError, match="Address already in use; give another --port"):
         show_worlds([env], "idm", 0, WebOptions(port=served.server.port), lambda _: None, 1.0)
 
 
-def test_the_head_of_a_map_names_its_sections(serve: Serve) -> None:
+def test_the_head_of_a_map_lists_its_sections(serve: Serve) -> None:
     head, sections = unpack(serve(drives=False).map_bytes)
     assert head["name"]
     ends = [start for start, _ in head["sections"].values()]

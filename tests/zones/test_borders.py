@@ -1,4 +1,4 @@
-"""Vehicles near a border, and changes of owner of rows."""
+"""Search for vehicles near a border; transfer of a vehicle's row to another zone."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BORDERS = Borders(2.0, 1.0, MAX_SPEED_MPS)
     st.sampled_from([0.1, 0.5]),
     st.booleans(),
 )
-def test_vehicles_that_have_crossed_or_soon_will_are_found(
+def test_crossed_and_approaching_vehicles_are_found(
     data: st.DataObject,
     partition: ZonePartition,
     hysteresis_m: float,
@@ -48,7 +48,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
             id=100 * zone + np.arange(len(xy)),
         )
         parts.append(rows)
-    reach_m = MAX_SPEED_MPS * ahead_s  # distance that a vehicle can drive in this time
+    reach_m = MAX_SPEED_MPS * ahead_s  # longest distance in `ahead_s`
     borders = Borders(hysteresis_m, ahead_s, MAX_SPEED_MPS)
     zoned = exchanged(partition, reach_m, parts, borders=borders)
     if check_all:
@@ -63,14 +63,14 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
         ]
         expected = naive.near_borders(partition.reaching, zone, hysteresis_m, ahead_s, rows)
         margins = _margins(partition, zone, hysteresis_m, ahead_s, rows)
-        # Squares are rounded differently.
+        # The kernel compares squared distances, so rounding may change a result near a limit.
         clear = {i for i, margin in enumerate(margins) if margin > 1e-6}
         assert [e for e in told if e[0] in clear] == [e for e in expected if e[0] in clear]
     for entry in out[:found]:
         row = parts[entry["source"]][entry["row"]]
         assert entry["vehicle"] == row["id"]
         depth_m = naive.distance(partition.reaching[entry["source"]], row["x"], row["y"])
-        if depth_m * depth_m == 0.0:  # the square of this small distance is 0
+        if depth_m * depth_m == 0.0:  # too small for the kernel's square
             target = partition.reaching[entry["target"]]
             depth_m = -naive.distance(target, row["x"], row["y"])
         assert entry["depth_m"] == pytest.approx(depth_m)
@@ -79,7 +79,7 @@ def test_vehicles_that_have_crossed_or_soon_will_are_found(
 def _margins(
     partition: ZonePartition, zone: int, hysteresis_m: float, ahead_s: float, rows: NDArray[np.void]
 ) -> list[float]:
-    """Return the distance of each vehicle to the limits at which the result changes."""
+    """Return how close each vehicle's depth, now or after `ahead_s`, is to the hysteresis."""
     rect = partition.reaching[zone]
     margins = []
     for row in rows:
@@ -94,7 +94,7 @@ def _margins(
     return margins
 
 
-def test_a_vehicle_near_a_corner_is_found_for_both_zones() -> None:
+def test_a_vehicle_near_a_corner_is_found_for_both_adjacent_zones() -> None:
     partition = four()
     row = vehicles([(13.0, 12.0, math.pi / 2)], speed=10.0)  # 3 m to the east of zone 0
     none = row[:0]

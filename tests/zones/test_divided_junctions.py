@@ -11,7 +11,7 @@ from tests.support.divided_scenes import TICK_S, DividedScene
 from tests.support.junction_scenes import build_crossing, with_shorter_lane
 from tests.support.netgenerate import netconvert
 
-CRAWLS = 1e-3  # share of the speed limit: such a vehicle counts as standing
+CRAWLS = 1e-3  # speed factor at which a vehicle counts as standing
 
 
 @pytest.fixture(scope="module")
@@ -22,10 +22,10 @@ def priority(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.mark.parametrize(
     "corner_m", [(0.0, 0.0), (1.6, -1.6), (-3.0, 4.5), (7.5, -7.5), (-9.0, 9.0), (14.0, 3.0)]
 )
-def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
+def test_a_border_at_a_blocked_junction_changes_no_result(
     priority: Path, tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """A vehicle that stays on the junction blocks three others, but not the fourth."""
+    """The vehicle "stays" blocks the vehicles "held", "north" and "west", but not "east"."""
     here = DividedScene(priority, tmp_path, corner_m, ("car",))
     here.put("stays", "W_in_0 E_out_0", 9.0, wait_s=10.0, speed_factor=CRAWLS)
     here.put("held", "S_in_0 N_out_0", 2.0, wait_s=10.0)
@@ -44,10 +44,10 @@ def test_a_border_through_or_beside_a_junction_that_is_blocked_changes_nothing(
 
 
 @pytest.mark.parametrize("corner_m", [(0.0, 0.0), (1.6, -1.6), (-9.0, 9.0), (20.0, 14.0)])
-def test_a_border_through_a_deadlock_on_equal_roads_changes_nothing(
+def test_a_border_through_a_deadlock_changes_no_result(
     tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """Each vehicle yields to the vehicle on its right; a random draw decides which gives way."""
+    """Each vehicle yields to the vehicle on its right; a random draw decides which drives first."""
     here = DividedScene(build_crossing(tmp_path, "right_before_left"), tmp_path, corner_m, ("car",))
     for arm, goal in {"W": "E", "S": "N", "E": "W", "N": "S"}.items():
         here.put(arm, f"{arm}_in_0 {goal}_out_0", -0.2, wait_s=1.0, hold=HOLD_YIELD)
@@ -60,10 +60,10 @@ def test_a_border_through_a_deadlock_on_equal_roads_changes_nothing(
     assert set(order[:4]) == set("WSEN")
 
 
-def test_no_driver_waits_for_an_unseen_vehicle_that_cannot_come(
+def test_a_driver_does_not_wait_for_a_vehicle_that_cannot_reach_its_path(
     tmp_path: Path,
 ) -> None:
-    # No lane leads to the zone of the side road, so no vehicle can follow a vehicle there.
+    # No road leads into the zone of the side road, so that zone needs no ghost of "held".
     path = build_crossing(tmp_path, "priority", only_in="S")
     here = DividedScene(path, tmp_path, (-1.0, -24.0), ("car",))
     here.put("stays", "E_in_0 W_out_0", 23.0, speed_factor=CRAWLS)
@@ -73,14 +73,14 @@ def test_no_driver_waits_for_an_unseen_vehicle_that_cannot_come(
     for vehicles in here.run(0.5):
         assert vehicles["held"]["hold"] == HOLD_EXIT_BLOCKED
         assert "held" not in here.ghosts("side")
-        assert vehicles["side"]["speed"] > 8.0, "the vehicle does not wait"
+        assert vehicles["side"]["speed"] > 8.0, "the vehicle waits"
 
 
 @pytest.mark.parametrize("is_second", [False, True])
-def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
+def test_a_bus_leaves_room_for_a_queued_bus_beyond_a_border(
     priority: Path, tmp_path: Path, is_second: bool
 ) -> None:
-    """The queued bus turns over the position where the other bus would stop, but stands still."""
+    """The queued bus stands, but its path covers the position where the other bus would stop."""
     here = DividedScene(priority, tmp_path, (6.0, -22.0), ("car", "bus"))
     here.put("waits", "S_in_0 N_out_0", -11.0, "bus", speed=8.0)
     here.put("queued", "E_in_0 S_out_0", -22.5, "bus", wait_s=10.0)
@@ -91,14 +91,14 @@ def test_room_is_left_for_a_bus_that_stands_in_a_queue_behind_a_border(
     assert "queued" in here.ghosts("waits")
     first = next(here.run(1.0))
     assert first["waits"]["hold"] == HOLD_YIELD
-    assert first["waits"]["speed"] < 7.8, "the bus brakes for a position before its line"
+    assert first["waits"]["speed"] < 7.8, "the bus does not brake for a position before its line"
     for _ in here.run(3.0):
         pass
 
 
 @pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -9.0), (0.0, 0.0)])
 @pytest.mark.parametrize("is_far", [False, True])
-def test_no_car_departs_where_a_bus_turns_over_the_line(
+def test_a_car_departs_after_a_bus_has_turned_across_its_position(
     priority: Path, tmp_path: Path, corner_m: tuple[float, float], is_far: bool
 ) -> None:
     car = """<vehicle id="late" type="car" depart="0.2" departPos="-0.2" departSpeed="0">
@@ -110,9 +110,9 @@ def test_no_car_departs_where_a_bus_turns_over_the_line(
     for vehicles in here.run(8.0):
         entered_s += TICK_S * ("late" not in vehicles)
     if is_far:
-        assert entered_s < 0.5, "the bus can wait"
+        assert entered_s < 0.5, "the car waits for a distant bus"
     else:
-        assert 2.0 < entered_s < 6.0, "the car waits until the bus has passed, and no longer"
+        assert 2.0 < entered_s < 6.0, "the car does not enter just after the bus"
 
 
 @pytest.fixture(scope="module")
@@ -124,7 +124,7 @@ def shorter(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.mark.parametrize("corner_m", [(6.0, -22.0), (-9.0, -11.5), (0.0, -14.0), (0.0, 0.0)])
 @pytest.mark.parametrize("way", ["S_in_1 N_out_1", "S_in_1 W_out_0"])
-def test_a_vehicle_that_has_left_a_shorter_lane_is_seen_on_the_longer_lane(
+def test_a_vehicle_that_leaves_a_shorter_lane_is_seen_from_the_longer_lane(
     shorter: Path, tmp_path: Path, corner_m: tuple[float, float], way: str
 ) -> None:
     here = DividedScene(shorter, tmp_path, corner_m, ("car",))
@@ -139,12 +139,12 @@ def test_a_vehicle_that_has_left_a_shorter_lane_is_seen_on_the_longer_lane(
     for vehicles in here.run(9.0):
         covered += int(vehicles["changed"]["side_lane"]) == right
     assert covered > 20
-    assert vehicles["follows"]["speed"] > 3.0, "the vehicle continues where it has room"
+    assert vehicles["follows"]["speed"] > 3.0, "the follower does not pass"
 
 
 @pytest.fixture
 def streets(tmp_path: Path) -> Path:
-    """Return two crossings; the 115 m of road between them lead only to the first."""
+    """Return two junctions with a one-way road of 115 m between them, towards the junction `c`."""
     places = {"W": "-150 0", "m": "-115 0", "n": "-115 90", "c": "0 0"}
     places |= {"E": "150 0", "S": "0 -150", "N": "0 150"}
     ways = [("far", "W", "m"), ("beside", "n", "m"), ("W_in", "m", "c")]
@@ -165,10 +165,10 @@ def streets(tmp_path: Path) -> Path:
 
 
 @pytest.mark.parametrize("corner_m", [(-5.0, 4.0), (-2.0, 9.0)])
-def test_a_turning_vehicle_waits_for_a_vehicle_before_the_previous_junction(
+def test_a_turning_vehicle_yields_to_a_vehicle_that_is_two_junctions_away(
     streets: Path, tmp_path: Path, corner_m: tuple[float, float]
 ) -> None:
-    """At 11 m/s, the vehicle has 130 m to the line, too far to register for other vehicles."""
+    """At 11 m/s and 130 m from the line, the vehicle is too far away to register at the line."""
     way = """<vehicle id="w" type="car" depart="900"><route edges="far W_in E_out"/></vehicle>"""
     here = DividedScene(streets, tmp_path, corner_m, ("car",), {"w": way})
     here.put("side", "S_in_0 E_out_0", -1.0, wait_s=2.0, hold=HOLD_YIELD)

@@ -1,4 +1,4 @@
-"""Rows that move between shards, and rows that leave."""
+"""Exchange of ghosts between shards, and removal of vehicles that leave."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def ids(rows: NDArray[np.void]) -> list[int]:
 
 
 @given(st.data(), partitions(), st.booleans())
-def test_one_zone_takes_each_vehicle_in_the_given_order(
+def test_each_vehicle_is_taken_by_one_zone_in_unchanged_order(
     data: st.DataObject, partition: ZonePartition, in_place: bool
 ) -> None:
     xy = data.draw(places(partition))
@@ -59,7 +59,7 @@ def test_one_zone_takes_each_vehicle_in_the_given_order(
 
 
 def spread(data: st.DataObject, partition: ZonePartition) -> list[NDArray[np.void]]:
-    """Draw rows of each zone at any position, because a transfer may be late."""
+    """Draw rows of each zone; they may be outside of the zone, because a transfer may be late."""
     parts, next_id = [], 0
     for _ in range(partition.count):
         xy = data.draw(places(partition, size=4))
@@ -113,7 +113,7 @@ def test_exchange_equals_twin(
     st.sampled_from([0.0, 3.0, 40.0]),
     st.booleans(),
 )
-def test_gathering_zones_have_the_rows_of_exchanging_zones(
+def test_gather_gives_the_same_rows_as_exchange(
     data: st.DataObject,
     partition: ZonePartition,
     halo_m: float,
@@ -143,7 +143,7 @@ def test_gathering_zones_have_the_rows_of_exchanging_zones(
         assert name == "due" or array.tobytes() == getattr(book, name).tobytes(), name
 
 
-def test_several_batches_of_ghosts_equal_those_that_zones_gather() -> None:
+def test_gather_equals_exchange_for_several_batches_of_ghosts() -> None:
     rng, rects = np.random.default_rng(3), four().reaching
     middle = np.array([rects[0, 2], rects[0, 3]])
     xy = middle + rng.uniform(-9.0, 9.0, (6 * BATCH_SIZE, 2))
@@ -161,12 +161,12 @@ def test_several_batches_of_ghosts_equal_those_that_zones_gather() -> None:
     for name in ("rows", "num_rows", "num_near"):
         assert getattr(sent, name).tobytes() == getattr(gathered, name).tobytes(), name
     assert (sent.num_rows - sent.num_owned).sum() > 4 * BATCH_SIZE, (
-        "some zone sends a vehicle twice"
+        "too few ghosts for several batches"
     )
 
 
 def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> None:
-    """List the rows that other zones may see, as `advance` does."""
+    """List the rows that other zones may see in `outer`, as `advance` does."""
     for zone, rows in enumerate(parts):
         left, low, right, high = halo.inner[zone]
         x, y = rows["x"], rows["y"]
@@ -176,14 +176,14 @@ def note_outer(zoned: ZoneState, halo: Halo, parts: list[NDArray[np.void]]) -> N
 
 
 def note(noted: NDArray[np.void], rows: NDArray[np.void], places: NDArray[np.int64]) -> None:
-    """List some rows as OUTER."""
+    """Write the rows at `places` as OUTER records."""
     noted["row"][: len(places)] = places
     for name in ("x", "y", "s", "speed", "lane", "driver"):
         noted[name][: len(places)] = rows[name][places]
 
 
-def test_ghosts_carry_the_route_step_of_their_owner() -> None:
-    """Ghosts that can touch owned vehicles precede other ghosts, which are moved."""
+def test_ghosts_have_the_route_steps_of_the_owned_vehicles() -> None:
+    """The exchange moves rows: ghosts that can touch owned vehicles precede the other ghosts."""
     rng = np.random.default_rng(5)
     xy = rng.uniform(-10.0, 50.0, (40, 2))
     rows = vehicles([(x, y, 0.0) for x, y in xy.tolist()], id=np.arange(len(xy)))
@@ -210,7 +210,7 @@ def test_a_world_of_one_zone_has_no_ghosts() -> None:
     assert zoned.num_rows.tolist() == zoned.num_near.tolist() == [[3]]
 
 
-def test_other_worlds_keep_their_ghosts() -> None:
+def test_an_exchange_changes_only_the_ghosts_of_its_world() -> None:
     halo = zone_halo(four(), 5.0)
     zoned = make_zone_state(4, 3, 2)
     zoned.num_rows[:] = 2
@@ -219,7 +219,7 @@ def test_other_worlds_keep_their_ghosts() -> None:
 
 
 @given(st.data(), partitions(3), st.sampled_from([0.0, 7.5, 30.0]))
-def test_listed_rows_suffice_for_the_exchange(
+def test_an_exchange_with_listed_rows_equals_one_without_lists(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
     parts = spread(data, partition)
@@ -231,7 +231,7 @@ def test_listed_rows_suffice_for_the_exchange(
     exchange(partition.arrays, halo, 5.0, borders, zoned, SIDE, 0, 1, book)
     for name in ("rows", "num_rows", "num_near", "border", "num_border"):
         assert getattr(zoned, name).tobytes() == getattr(expected, name).tobytes()
-    assert partition.count == 1 or (zoned.num_outer == -1).all(), "rows may change from here on"
+    assert partition.count == 1 or (zoned.num_outer == -1).all(), "the lists of outer rows remain"
 
 
 def test_unlisted_rows_are_not_read() -> None:
@@ -251,7 +251,7 @@ def world(rows: NDArray[np.void], owned: int) -> tuple[Worlds, DepartureQueue]:
     return worlds, make_departure_queue(1, len(rows), roads.arrays, VEHICLE)
 
 
-def test_background_vehicles_leave_when_they_have_arrived() -> None:
+def test_arrived_background_vehicles_leave() -> None:
     rows = cars(6)
     rows["driver"] = codes.DRIVER_BACKGROUND
     rows["events"] = codes.EVENT_ARRIVED
@@ -262,11 +262,11 @@ def test_background_vehicles_leave_when_they_have_arrived() -> None:
     assert set(ids(departures.passing[0, : departures.num_passing[0]])) == {100, 103}
     assert (worlds.num_owned[0], worlds.num_rows[0]) == (2, 4)
     assert set(ids(worlds.rows[0, :2])) == {101, 102}
-    assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "ghosts leave in their owner's zone"
+    assert set(ids(worlds.rows[0, 2:4])) == {104, 105}, "a ghost was removed"
 
 
 @given(st.lists(st.tuples(st.booleans(), st.booleans()), min_size=1, max_size=9))
-def test_a_leaving_vehicle_is_unlisted_and_other_rows_stay_listed(
+def test_a_leaving_vehicle_is_removed_from_the_list_of_outer_rows(
     fates: list[tuple[bool, bool]],
 ) -> None:
     rows = cars(len(fates))
@@ -286,7 +286,7 @@ def test_a_leaving_vehicle_is_unlisted_and_other_rows_stay_listed(
     assert worlds.outer[0, : len(places)].tolist() == expected[: len(places)].tolist()
 
 
-def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
+def test_agents_leave_after_a_whole_step_at_the_end_of_their_trip() -> None:
     rows = cars(5)
     rows["driver"] = codes.DRIVER_AGENT
     rows["tick"] = 10
@@ -299,7 +299,7 @@ def test_agents_leave_when_their_trip_has_ended_and_they_have_acted() -> None:
     assert set(ids(worlds.rows[0, : worlds.num_rows[0]])) == {102, 103}
 
 
-def test_ghosts_of_vehicles_that_left_are_dropped_once() -> None:
+def test_ghosts_of_vehicles_that_left_are_removed() -> None:
     worlds, departures = world(cars(6), owned=2)
     departures.passing[0, :3]["id"] = [105, 102, 999]
     departures.num_passing[0] = 3

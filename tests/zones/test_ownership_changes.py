@@ -1,4 +1,4 @@
-"""Changes of owner in one call: vehicles, order and records."""
+"""Ownership changes in one call of the kernel: vehicles, order and records."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=0.2, max_speed_mps=60.0)
 def world(
     *places: tuple[float, float, float], ids: list[int], speed: float = 10.0
 ) -> tuple[ZoneState, BorderRecords]:
-    """Return vehicles of zone 0 at (x, y, heading), with ghosts in all zones, at tick 7."""
+    """Create vehicles at (x, y, heading) that zone 0 owns at tick 7, with ghosts in all zones."""
     rows = vehicles(list(places), speed=speed, id=np.array(ids), epoch=4)
     book = make_book(1, 16)
     book.tick[0] = 6
@@ -42,7 +42,7 @@ def call(zoned: ZoneState, book: BorderRecords, check_all: bool = False, newborn
 
 
 def next_tick(zoned: ZoneState, book: BorderRecords) -> None:
-    """Search again, after rows have moved."""
+    """Search for vehicles near borders in the next tick; the test has moved the rows."""
     book.ms[0] += 1.0
     owned = zoned.num_owned[0, 0]
     zoned.num_border[:, 0] = [owned, 0, 0, 0]
@@ -78,7 +78,7 @@ def test_crossed_vehicles_change_owners_by_rising_ids() -> None:
     assert book.num_crossed[0] == 0
 
 
-def test_a_vehicle_in_the_row_of_a_left_vehicle_is_found() -> None:
+def test_a_vehicle_that_moved_into_a_freed_row_is_found() -> None:
     coming_in = vehicles([(13.0, 5.0, 0.0)], id=np.array([10]))
     leaving = vehicles([(7.0, 5.0, math.pi), (15.0, 5.0, 0.0)], id=np.array([20, 30]))
     book = make_book(1, 16)
@@ -90,7 +90,7 @@ def test_a_vehicle_in_the_row_of_a_left_vehicle_is_found() -> None:
     assert changes(book)["place"].tolist() == [0, 0]
 
 
-def test_an_approach_is_remembered_until_the_change() -> None:
+def test_the_tick_of_the_approach_is_kept_until_the_owner_changes() -> None:
     zoned, book = world((9.5, 5.0, 0.0), ids=[3], speed=20.0)
     rows = zoned.rows[SIDE, 0, 0]
     for x in (11.0, 11.9, 12.5):
@@ -111,7 +111,7 @@ def test_an_approach_is_remembered_until_the_change() -> None:
     assert book.aborted[0] == 0
 
 
-def test_a_vehicle_that_turns_away_is_counted_once() -> None:
+def test_a_vehicle_that_turns_away_is_counted_once_as_aborted() -> None:
     zoned, book = world((9.5, 5.0, 0.0), ids=[3], speed=20.0)
     zoned.rows[SIDE, 0, 0]["heading"][0] = math.pi
     for _ in range(3):
@@ -120,7 +120,7 @@ def test_a_vehicle_that_turns_away_is_counted_once() -> None:
     assert book.aborted[0] == 1
 
 
-def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
+def test_a_repeated_search_in_one_tick_counts_each_vehicle_once() -> None:
     zoned, book = world((9.5, 5.0, 0.0), (9.0, 5.0, 0.0), ids=[3, 4], speed=20.0)
     next_tick(zoned, book)
     zoned.num_owned[0, 0] = 1  # the other vehicle has left
@@ -132,7 +132,7 @@ def test_looking_again_at_the_same_tick_counts_nothing_twice() -> None:
     assert (book.acknowledged[0], book.aborted[0]) == (2 + 1, 1)
 
 
-def test_a_newly_entered_vehicle_keeps_its_owner_for_a_tick() -> None:
+def test_a_departed_vehicle_keeps_its_owner_for_one_tick() -> None:
     zoned, book = world((13.0, 5.0, 0.0), (14.0, 5.0, 0.0), ids=[3, 4])
     book.newborn[0, 0] = 3
     assert call(zoned, book, check_all=True, newborn=1) == 1
@@ -142,7 +142,7 @@ def test_a_newly_entered_vehicle_keeps_its_owner_for_a_tick() -> None:
     assert changes(book)["vehicle"].tolist() == [4, 3]
 
 
-def test_a_vehicle_that_left_in_the_tick_of_its_change_has_no_release_depth() -> None:
+def test_a_vehicle_that_leaves_in_the_tick_of_its_transfer_has_no_release_depth() -> None:
     zoned, book = world((13.0, 5.0, 0.0), ids=[3])
     assert call(zoned, book) == 1
     zoned.num_owned[1, 0] = 0
@@ -150,7 +150,7 @@ def test_a_vehicle_that_left_in_the_tick_of_its_change_has_no_release_depth() ->
     assert math.isnan(changes(book)["release_depth_m"][0])
 
 
-def test_a_vehicle_without_a_ghost_cannot_enter_a_zone() -> None:
+def test_a_vehicle_without_a_ghost_in_the_target_zone_is_not_handed_over() -> None:
     zoned, book = world((13.0, 5.0, 0.0), ids=[3])
     zoned.num_rows[1, 0] = 0
     assert call(zoned, book) == NOT_SEEN

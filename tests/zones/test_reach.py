@@ -1,4 +1,4 @@
-"""The declared reach of drivers covers all that they look at; longest moves of vehicles."""
+"""Reach: how far drivers look, how far vehicles move in a tick and how far off their lanes."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from tests.support.traffic import NAMES, network, travel
 from tests.support.watchers import looks_of
 
 LENGTH_M = 5.0  # length of generated cars
-# Two roads of 40 m and a gap of 20 m between them, which vehicles jump over.
+# Two roads of 40 m; the junction between them has no lanes, so vehicles jump over 20 m.
 GAP = """<?xml version="1.0" encoding="UTF-8"?>
 <net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
@@ -47,7 +47,7 @@ GAP = """<?xml version="1.0" encoding="UTF-8"?>
 
 
 def widest_junction_m(roads: RoadNetwork) -> float:
-    """Return the largest distance between ends of lanes with conflicting paths, pair by pair."""
+    """Return the largest distance between the stop lines of two conflicting links."""
     widest = 0.0
     for link in roads.links:
         first = int(link["first_conflict"])
@@ -62,15 +62,15 @@ def widest_junction_m(roads: RoadNetwork) -> float:
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_reach_covers_view_junction_and_approaching_vehicles(name: str) -> None:
+def test_reach_includes_view_junctions_and_approaching_vehicles(name: str) -> None:
     roads = network(name)
     reach_m = driving_reach_m(roads, travel(name))
     rest_m = reach_m - VIEW_M - APPROACH_M - 2.0 * LENGTH_M - ASIDE_M
     assert widest_junction_m(roads) <= rest_m + 1e-9
-    assert rest_m <= 40.0, "the halo does not cover the map"
+    assert rest_m <= 40.0, "the halo covers the whole map"
 
 
-def test_reach_shrinks_with_how_far_lines_are_seen() -> None:
+def test_reach_shrinks_with_the_sight_distance_of_stop_lines() -> None:
     near = travel("merge")._replace(see_m=100.0)
     shrunk = driving_reach_m(network("merge"), travel("merge")) - driving_reach_m(
         network("merge"), near
@@ -78,7 +78,7 @@ def test_reach_shrinks_with_how_far_lines_are_seen() -> None:
     assert shrunk == pytest.approx(VIEW_M - 100.0)
 
 
-def test_reach_grows_with_a_view_beyond_the_junctions() -> None:
+def test_reach_grows_with_a_view_longer_than_junctions() -> None:
     roads = network("merge")
     blind = travel("merge")._replace(see_m=0.0)
     assert roads.links["length_m"].max() + APPROACH_M < VIEW_M
@@ -86,7 +86,7 @@ def test_reach_grows_with_a_view_beyond_the_junctions() -> None:
     assert grown == pytest.approx(2000.0 - VIEW_M)
 
 
-def test_jumps_over_junctions_without_lanes_count(tmp_path: Path) -> None:
+def test_reach_includes_jumps_over_junctions_without_lanes(tmp_path: Path) -> None:
     path = tmp_path / "gap.net.xml"
     path.write_text(GAP, encoding="utf-8")
     roads = load_network(find_map(path))
@@ -95,7 +95,7 @@ def test_jumps_over_junctions_without_lanes_count(tmp_path: Path) -> None:
     assert reach_m == pytest.approx(stretched + 2.0 * LENGTH_M + ASIDE_M)
 
 
-def test_the_longest_move_counts_jumps_over_junctions_without_lanes(tmp_path: Path) -> None:
+def test_the_longest_move_includes_jumps_over_junctions_without_lanes(tmp_path: Path) -> None:
     path = tmp_path / "gap.net.xml"
     path.write_text(GAP, encoding="utf-8")
     tick_s = 0.1
@@ -106,10 +106,10 @@ def test_the_longest_move_counts_jumps_over_junctions_without_lanes(tmp_path: Pa
     )
     assert longest_move_m(roads, travel("merge"), 1.0) == pytest.approx(
         10.0 * way_m + 2.0 * 20.0 + LENGTH_M / 2
-    ), "two jumps in a tick"
+    ), "the second jump in a tick of 1 s is missing"
 
 
-def test_the_longest_move_counts_kinks() -> None:
+def test_the_longest_move_includes_kinks_of_lanes() -> None:
     roads, tick_s = network("merge"), 0.1
     way_m = float(np.hypot(MAX_SPEED_MPS, LATERAL_MPS)) * tick_s
     lines = zip(roads.lanes["first_point"], roads.lanes["num_points"], strict=True)
@@ -152,7 +152,7 @@ def test_no_vehicle_exceeds_the_longest_move(internal: tuple[str, ...], tmp_path
 def test_no_vehicle_exceeds_the_distance_off_its_lane(
     internal: tuple[str, ...], tmp_path: Path
 ) -> None:
-    """A body with bumpers on both sides of a jump has its centre between them."""
+    """While a vehicle jumps over a junction, its centre is far from both lanes."""
     path = netgenerate(
         tmp_path / "x.net.xml",
         "--grid", "--grid.number", "3", "--grid.length", "120", "-L", "3", *internal,
@@ -172,8 +172,8 @@ def test_no_vehicle_exceeds_the_distance_off_its_lane(
     assert furthest_m <= off_lane_m(roads, travel("merge"))
 
 
-def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
-    """The distance includes how far drivers look along lanes, and how far bodies are off lanes."""
+def test_the_sight_of_a_zone_includes_vehicles_beside_seen_lanes(tmp_path: Path) -> None:
+    """`seen_m` is the look-ahead of drivers along lanes plus the distance of bodies to lanes."""
     path = netgenerate(
         tmp_path / "x.net.xml",
         "--grid", "--grid.number", "8", "--grid.length", "100", "--no-internal-links",
@@ -194,7 +194,7 @@ def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
     margins = partition.reaching[inner, 2] - halo.inner[inner, 2]
     assert len(margins) == 2
     assert margins == pytest.approx(halo.seen_m, abs=1e-4)
-    # This also holds for the zone's own drivers, whose transfer may be late.
+    # Own drivers may be up to `outside_m` outside of the zone, because a transfer may be late.
     wide_m = 8.0 + aside_m
     half_m = 0.5 * float(kinds.types["length"].max())
     scratch = make_scratch(len(roads.lanes), len(roads.links))
@@ -205,5 +205,5 @@ def test_zones_see_vehicles_beside_a_lane_that_matters(tmp_path: Path) -> None:
         assert asked[zone].tolist() == looks.tolist()
 
 
-def test_without_jumps_agents_are_farthest_off_their_lanes() -> None:
+def test_without_jumps_the_distance_off_a_lane_is_that_of_agents() -> None:
     assert off_lane_m(network("grid4x4"), travel("grid4x4")) == LOST_M

@@ -1,4 +1,4 @@
-"""Maps that are cut through roundabouts, bridges and junctions equal the undivided world."""
+"""Worlds that are cut through a roundabout, a bridge or a junction equal the undivided world."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from cavmarl.verify.equivalence import verify_zones
 from tests.support.borders import bounds_around, cut_at
 
 FAST = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.2, "population.mode": "respawn"}
-BRIDGE_M = 4.0  # height of one road above another,
-NEAR_M = 5.0  # where points of both roads are this close in the plane
+BRIDGE_M = 4.0  # smallest height between the two roads of a bridge
+NEAR_M = 5.0  # largest horizontal distance between points of the two roads
 Place = NDArray[np.float64]
 
 
 def equal_around(place: Place, net: Path, folder: Path, *, crossings: int, steps: int = 60) -> None:
-    """Check four zones that meet at a point, and nine zones whose cuts are around it."""
+    """Compare worlds with four zones that meet at `place`, and with nine zones around `place`."""
     x, y = (float(v) for v in place[:2])
     bounds = bounds_around(load_network(net))
     for name, xs, ys in (("four", [x], [y]), ("nine", [x - 6.0, x + 6.0], [y - 6.0, y + 6.0])):
@@ -49,7 +49,7 @@ def roundabouts(net: Path, network: RoadNetwork) -> list[tuple[float, Place]]:
 
 
 def bridges(network: RoadNetwork) -> Place:
-    """Return points (n, 2) of lanes above or below points of other lanes."""
+    """Return (n, 2) points of lanes that are above or below other lanes."""
     lanes = [network.lane_polyline(lane) for lane in range(len(network.lanes))]
     points = np.concatenate(lanes)
     found = []
@@ -60,7 +60,7 @@ def bridges(network: RoadNetwork) -> Place:
     return np.array(found)
 
 
-def test_a_border_through_a_roundabout_changes_nothing(
+def test_a_border_through_a_roundabout_changes_no_result(
     built_map: Callable[[str], Path], tmp_path: Path
 ) -> None:
     net = built_map("osm/berlin_siegessaeule.osm.gz")
@@ -69,7 +69,7 @@ def test_a_border_through_a_roundabout_changes_nothing(
     equal_around(middle, net, tmp_path, crossings=10)
 
 
-def test_a_border_through_a_bridge_changes_nothing(
+def test_a_border_through_a_bridge_changes_no_result(
     built_map: Callable[[str], Path], tmp_path: Path
 ) -> None:
     net = built_map("xodr/Town04.xodr")
@@ -79,7 +79,7 @@ def test_a_border_through_a_bridge_changes_nothing(
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "town", "merge"])
-def test_a_border_through_the_busiest_junction_changes_nothing(env: str, tmp_path: Path) -> None:
+def test_a_border_through_the_busiest_junction_changes_no_result(env: str, tmp_path: Path) -> None:
     net = find_map(env)
     network = load_network(net)
     internal = np.flatnonzero(network.lanes["internal"])

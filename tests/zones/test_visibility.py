@@ -1,4 +1,4 @@
-"""Zones see all vehicles that their drivers may look at, and no other distant vehicles."""
+"""A zone gets ghosts of the distant vehicles that its drivers may look at, and of no others."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ STEPS = 40
 
 @pytest.fixture(scope="module")
 def blocks(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Make fast streets without signals, where drivers consider distant vehicles with priority."""
+    """Make streets with fast traffic and no signals: drivers yield to distant vehicles."""
     return netgenerate(
         tmp_path_factory.mktemp("blocks") / "blocks.net.xml",
         "--grid", "--grid.number", "4", "--grid.length", "200", "-L", "2",
@@ -48,15 +48,15 @@ def ghosts(world: DrivenWorld) -> int:
     return int(world.simulation.zones.loads().ghosts.sum())
 
 
-def test_a_configured_halo_is_seen_whole_and_changes_no_result(blocks: Path) -> None:
-    """There are more ghosts, but the world is equal."""
+def test_a_configured_halo_adds_ghosts_and_changes_no_result(blocks: Path) -> None:
+    """With ghosts from the whole halo, the world has more ghosts and the same state."""
     narrow = driven(blocks)
     whole = driven(blocks, **{"zones.halo_m": narrow.simulation.zones.loads().halo_m})
     assert ghosts(narrow) < 0.9 * ghosts(whole)
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 
 
-def test_vehicles_at_a_line_are_within_half_a_body_and_the_clearance(
+def test_the_sight_at_a_stop_line_is_half_a_body_and_the_clearance(
     blocks: Path,
 ) -> None:
     simulation = driven(blocks).simulation
@@ -65,16 +65,16 @@ def test_vehicles_at_a_line_are_within_half_a_body_and_the_clearance(
     assert half_m + kept_m < simulation.division.halo.line_m < half_m + kept_m + 5.0
 
 
-def test_the_monitor_expects_ghosts_of_seen_vehicles(blocks: Path) -> None:
-    """The monitor would report missing and needless ghosts."""
+def test_the_monitor_accepts_the_ghosts_of_seen_vehicles(blocks: Path) -> None:
+    """The invariant monitor reports no missing and no unneeded ghost."""
     assert ghosts(driven(blocks, **{"zones.check_invariants": True})) > 0
 
 
 @pytest.mark.parametrize("fields", [("head",), ("line", "merge")])
-def test_a_smaller_visible_part_changes_results(
+def test_seeing_less_of_a_lane_changes_results(
     blocks: Path, fields: tuple[str, ...], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Unseen leaders, and unseen vehicles with the right of way, cause collisions."""
+    """Without ghosts of leaders or of vehicles with the right of way, the world differs."""
     seen = Visibility.halo
 
     def blind(sight: Visibility, partition: ZonePartition) -> Halo:

@@ -1,4 +1,4 @@
-"""The lanes that drivers of a zone look at, compared with a twin, and on plain maps."""
+"""The parts of lanes that drivers of a zone look at, compared with a slow twin."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from tests.support.netgenerate import netgenerate
 from tests.support.traffic import network
 
 VIEW_M, SEE_M, HALF_M = 90.0, 40.0, 6.0
-# Three consecutive roads of 400 m, without junctions at which drivers look at others.
+# Three consecutive roads of 400 m; at their junctions, no drivers yield.
 LINE = """<?xml version="1.0" encoding="UTF-8"?>
 <net version="1.20">
   <location netOffset="0,0" convBoundary="0,0,0,0" origBoundary="0,0,0,0" projParameter="!"/>
@@ -51,13 +51,13 @@ def looks_of(
 ) -> NDArray[np.void]:
     looks = np.zeros(len(roads.lanes), dtype=LOOK)
     scratch = make_scratch(len(roads.lanes), len(roads.links))
-    for _ in range(2):  # earlier content of the scratch does not matter
+    for _ in range(2):  # the second call finds used scratch arrays
         find_looks(roads.arrays, np.array(rect), VIEW_M, SEE_M, half_m, scratch, looks)
     return looks
 
 
 def same_looks(found: NDArray[np.void], twin: Looks) -> None:
-    """Check that parts are equal, up to the step with which the twin checks lanes."""
+    """Check that all parts are equal; the twin tests positions on lanes with a step of STEP_M."""
     for field, told in (
         ("head", twin.head),
         ("tail", twin.tail),
@@ -79,8 +79,7 @@ def same_looks(found: NDArray[np.void], twin: Looks) -> None:
 def test_the_kernel_equals_its_twin(
     name: str, part: tuple[float, float, float, float], half_m: float, steered: bool
 ) -> None:
-    """Heads, tails and lines are equal, up to the step with which the twin checks lanes."""
-    # Read from the cache: without the compiler, driving a car over each link takes minutes.
+    # Steered maps come from a cache: computing the paths takes minutes without the compiler.
     roads = load_steered(find_map(name)) if steered else network(name)
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)
@@ -88,17 +87,17 @@ def test_the_kernel_equals_its_twin(
     found, twin = looks_of(roads, rect, half_m), Looks(roads, rect, VIEW_M, SEE_M, half_m)
     same_looks(found, twin)
     assert np.isfinite(found["line"]).any() == (name == "grid4x4")
-    # On these maps, only vans, buses and steered cars sweep over adjacent paths.
+    # On this map, only long vehicles and steered cars sweep over adjacent paths.
     sweeps = name == "grid4x4" and (half_m == HALF_M or steered)
     assert np.isfinite(found["room"]).any() == sweeps
 
 
 @pytest.mark.parametrize("side_m", [60.0, 140.0])
 @pytest.mark.parametrize("part", [(0.0, 0.0, 0.2, 0.2), (0.45, 0.45, 0.55, 0.55)])
-def test_merging_drivers_see_vehicles_beyond_the_previous_junction(
+def test_merging_drivers_see_vehicles_before_the_previous_junction(
     tmp_path: Path, side_m: float, part: tuple[float, float, float, float]
 ) -> None:
-    """Vehicles are seen one lane farther if no vehicle has to stop before the junction."""
+    """A merge point can be beyond the end of a lane if no vehicle has to stop at that end."""
     options = ("--grid.number", "7", "--grid.length", str(side_m), "-L", "2")
     net = netgenerate(tmp_path / "net.net.xml", "-g", "-j", "priority_stop", *options)
     roads = read_network(net)
@@ -114,16 +113,16 @@ def test_merging_drivers_see_vehicles_beyond_the_previous_junction(
 
 
 @pytest.mark.parametrize(("junctions", "seen"), [("right_before_left", 4), ("priority", 1)])
-def test_on_equal_roads_vehicles_to_which_foes_yield_are_seen(
+def test_drivers_on_equal_roads_see_the_vehicles_to_which_their_foe_yields(
     tmp_path: Path, junctions: str, seen: int
 ) -> None:
-    """A driver checks for a deadlock along the vehicles to which each vehicle yields."""
+    """To find a deadlock, a driver looks at the foe and at the vehicles to which the foe yields."""
     roads = read_network(netgenerate(tmp_path / "net.net.xml", "-g", "-j", junctions))
     links, conflicts = roads.links.copy(), roads.conflicts.copy()
     middle = np.bincount(links["junction"]).argmax()
     one, other, *rest = ends = np.unique(links["from_lane"][links["junction"] == middle])
     assert len(rest) == 2
-    # Links from one lane yield to a single link of another lane, which yields to the most links.
+    # Let the links from `one` yield only to the link from `other` that yields to the most links.
     owner = np.repeat(np.arange(len(links)), links["num_conflicts"])
     yields = np.bincount(owner[conflicts["must_yield"]], minlength=len(links))
     conflicts["foe"][links["from_lane"][owner] == one] = np.argmax(
@@ -141,10 +140,10 @@ def test_on_equal_roads_vehicles_to_which_foes_yield_are_seen(
 
 
 @pytest.mark.parametrize("from_line_m", [-40.0, 10.0, 95.0, 120.0])
-def test_vehicles_behind_a_shorter_lane_are_seen_if_they_may_cover_the_longer_lane(
+def test_vehicles_past_a_shorter_lane_are_seen_from_the_longer_lane(
     tmp_path: Path, from_line_m: float
 ) -> None:
-    """The zone is behind the junction, or before it: near, far, and too far."""
+    """The zone is beyond the junction (-40 m), or before it; at 120 m it is too far away."""
     path = build_crossing(tmp_path, "priority", side_lanes=2)
     roads = read_network(with_shorter_lane(path, "S_in_1", 8.0))
     turn = roads.lane_ids.index(":c_10_0")
@@ -166,18 +165,18 @@ def line(tmp_path_factory: pytest.TempPathFactory) -> RoadNetwork:
     return load_network(path)
 
 
-def test_drivers_look_ahead_and_less_far_back(line: RoadNetwork) -> None:
-    """A zone at the end of the second road sees into the third road, and back on its own road."""
+def test_drivers_look_farther_ahead_than_back(line: RoadNetwork) -> None:
+    """The zone is at the end of the second road; its drivers also look at the third road."""
     before, own, beyond = looks_of(line, (780.0, -10.0, 795.0, 10.0))
     assert before["head"] == -np.inf
-    assert before["back"] == np.inf, "followers this far behind do not matter"
+    assert before["back"] == np.inf, "distant followers are seen"
     assert own["tail"] == pytest.approx(380.0 - ASIDE_M - VIEW_M - ROUNDING_M)
     assert beyond["head"] == pytest.approx(VIEW_M + ROUNDING_M)
     assert (np.array([before["line"], own["line"], beyond["line"]]) == np.inf).all()
 
 
 def test_a_follower_across_a_border_is_seen(line: RoadNetwork) -> None:
-    """The end of a lane before the zone is near, so vehicles on it may be followers."""
+    """The zone begins 50 m after the end of the first road, where a follower may be."""
     before, own, beyond = looks_of(line, (450.0, -10.0, 460.0, 10.0))
     assert before["tail"] == np.inf
     assert before["back"] == pytest.approx(400.0 + 50.0 - ASIDE_M - ROUNDING_M)
@@ -196,7 +195,7 @@ def test_a_zone_without_roads_sees_no_vehicles(line: RoadNetwork) -> None:
 def test_no_visible_vehicle_is_beyond_the_farthest_distance(
     part: tuple[float, float, float, float],
 ) -> None:
-    """Vehicles are beside closely spaced positions on all lanes."""
+    """The twin tests closely spaced positions on all lanes."""
     roads = network("grid4x4")
     min_x, min_y, max_x, max_y = roads.extent_m
     low, high = np.array([min_x, min_y] * 2), np.array([max_x, max_y] * 2)

@@ -1,4 +1,4 @@
-"""Vehicles are sent to the zones that watch their lanes, as if each zone checked each vehicle."""
+"""The watchers of a lane are the zones that get ghosts of the vehicles on the lane."""
 
 from __future__ import annotations
 
@@ -34,10 +34,10 @@ SURE_M, SEEN_M, ASIDE_M, LINE_M = 12.0, 90.0, 10.0, 4.0
 VEHICLES = 150
 
 
-def asked_at_random(
+def random_looks(
     rng: np.random.Generator, roads: RoadNetwork, partition: ZonePartition
 ) -> tuple[Halo, NDArray[np.void]]:
-    """Draw the parts of lanes that zones watch, mostly none."""
+    """Draw the parts of lanes that zones look at; most lanes have none."""
     looks = blank_looks((partition.count, len(roads.lanes)))
     length = roads.lanes["length_m"]
     for field in LOOK.names or ():
@@ -56,10 +56,10 @@ def asked_at_random(
     return halo, looks
 
 
-def dealt(
+def random_rows(
     rng: np.random.Generator, roads: RoadNetwork, partition: ZonePartition
 ) -> list[NDArray[np.void]]:
-    """Draw rows of each zone: drivers near their lanes, agents anywhere."""
+    """Draw rows of each zone: background vehicles near their lanes, agents anywhere."""
     lanes = rng.integers(0, len(roads.lanes), VEHICLES)
     rows = vehicles([(0.0, 0.0, 0.0)] * VEHICLES, id=100 + np.arange(VEHICLES))
     rows["lane"] = lanes
@@ -84,7 +84,7 @@ def dealt(
 def expected_of(
     looks: NDArray[np.void], partition: ZonePartition, zone: int, others: list[np.void]
 ) -> list[int]:
-    """Return the ids that a zone has to see."""
+    """Return the ids of the vehicles of which a zone needs ghosts, by definition."""
     near = {int(row["id"]) for row in naive.within(partition.reaching[zone], SURE_M, others)}
     found = []
     for row in naive.within(partition.reaching[zone], SEEN_M, others):
@@ -106,11 +106,11 @@ def expected_of(
 
 @pytest.mark.parametrize("seed", range(6))
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_exactly_the_vehicles_that_matter_are_seen(seed: int, zones: int) -> None:
+def test_zones_get_exactly_the_ghosts_that_they_need(seed: int, zones: int) -> None:
     rng, roads = np.random.default_rng(seed), network("grid4x4")
     partition = cut_map(roads, "grid", zones)
-    halo, looks = asked_at_random(rng, roads, partition)
-    parts = dealt(rng, roads, partition)
+    halo, looks = random_looks(rng, roads, partition)
+    parts = random_rows(rng, roads, partition)
     sent, gathered = zoned_of(parts), zoned_of(parts)
     arrays, touching_m, border_m = partition.arrays, 5.0, 8.0
     sent.num_outer[:] = -1
@@ -129,11 +129,11 @@ def test_exactly_the_vehicles_that_matter_are_seen(seed: int, zones: int) -> Non
     assert 0.05 * VEHICLES < seen < (zones - 1) * VEHICLES
 
 
-def test_zones_watch_lanes_that_they_ask_about_and_adjacent_lanes() -> None:
+def test_zones_watch_the_lanes_that_their_drivers_look_at_and_nearby_lanes() -> None:
     roads = network("grid4x4")
     partition = cut_map(roads, "grid", 4)
     looks = blank_looks((4, len(roads.lanes)))
-    # Distance to the zone at the origin.
+    # The lane that is farthest from zone 0, which is at the origin.
     far = int(np.argmax(roads.lanes["min_x"] + roads.lanes["min_y"]))
     looks["line"][0, far] = 3.0
     start, watchers = lane_watchers(partition, roads.lanes, looks, 20.0)

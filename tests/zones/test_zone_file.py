@@ -80,7 +80,9 @@ def document() -> dict[str, Any]:
         ),
     ],
 )
-def test_bad_files_are_refused_with_the_place(tmp_path: Path, change: Change, words: str) -> None:
+def test_the_error_for_an_invalid_zone_file_names_the_key(
+    tmp_path: Path, change: Change, words: str
+) -> None:
     content = document()
     change(content)
     path = tmp_path / "bad.json"
@@ -90,7 +92,7 @@ def test_bad_files_are_refused_with_the_place(tmp_path: Path, change: Change, wo
 
 
 @pytest.mark.parametrize("number", [".nan", ".inf", "-.inf"])
-def test_numbers_that_are_not_finite_are_refused(tmp_path: Path, number: str) -> None:
+def test_infinite_numbers_and_nan_are_refused(tmp_path: Path, number: str) -> None:
     path = tmp_path / "bad.yaml"
     path.write_text(json.dumps(document()).replace("[20.0, 0.0", f"[20.0, {number}"))
     with pytest.raises(ConfigError, match=r"bad\.yaml: "):

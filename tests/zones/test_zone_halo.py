@@ -26,7 +26,7 @@ def test_near_zones_are_those_within_the_halo() -> None:
     assert near(10.0) == [[0, 1, 2, 3, 4]] * 5
 
 
-def test_the_inner_part_of_a_zone_is_outside_of_other_halos() -> None:
+def test_the_inner_part_of_a_zone_is_outside_of_the_halos_of_other_zones() -> None:
     halo = zone_halo(PINWHEEL, 3.0)
     assert halo.inner[4] == pytest.approx([13.0, 13.0, 17.0, 17.0])
     assert halo.inner[0].tolist()[:2] == [-math.inf, -math.inf]

@@ -67,7 +67,7 @@ def test_the_box_of_a_junction_contains_its_internal_lanes(cross: RoadNetwork) -
 
 
 @pytest.mark.parametrize("layout", ["grid", "strips"])
-def test_cuts_can_keep_out_of_junctions(cross: RoadNetwork, layout: str) -> None:
+def test_cuts_can_avoid_junctions(cross: RoadNetwork, layout: str) -> None:
     plain = cut_map(cross, layout, 2)
     kept = cut_map(cross, layout, 2, avoid_junctions=True)
     assert zone_statistics(plain, cross).junctions_cut == 1
@@ -105,7 +105,7 @@ def test_zones_can_have_equal_area(cross: RoadNetwork) -> None:
         ("bisection", 256, r"no cut divides x .*, y .* into \d+ zones"),
     ],
 )
-def test_more_than_the_map_can_hold_is_refused(
+def test_layouts_that_do_not_fit_the_map_are_refused(
     cross: RoadNetwork, layout: str, count: int, words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):

@@ -27,7 +27,7 @@ def cars(xy: NDArray[np.float64]) -> NDArray[np.void]:
 def ghosts(
     partition: ZonePartition, halo_m: float, rows: NDArray[np.void], zone: int
 ) -> list[list[int]]:
-    """Return the rows, all owned by `zone`, that each zone gets."""
+    """Return for each zone the ghosts that it gets, if `zone` owns all rows."""
     rows = rows.copy()
     rows["id"] = np.arange(len(rows))
     parts = [rows if own == zone else rows[:0] for own in range(partition.count)]
@@ -63,7 +63,9 @@ def test_a_corner_belongs_to_the_zone_that_begins_there(x: float, y: float, zone
 
 
 @given(st.data(), partitions())
-def test_distance_equals_twin(data: st.DataObject, partition: ZonePartition) -> None:
+def test_the_distance_to_a_zone_equals_the_twin(
+    data: st.DataObject, partition: ZonePartition
+) -> None:
     for x, y in data.draw(places(partition)).tolist():
         for zone, rect in enumerate(partition.reaching):
             squared = squared_distance(partition.reaching, zone, x, y)
@@ -71,10 +73,10 @@ def test_distance_equals_twin(data: st.DataObject, partition: ZonePartition) -> 
 
 
 @given(st.data(), partitions(), st.sampled_from(HALOS))
-def test_publication_equals_twin(
+def test_published_ghosts_equal_the_twin(
     data: st.DataObject, partition: ZonePartition, halo_m: float
 ) -> None:
-    # Positions outside of the zone, too: a vehicle whose transfer is late can be anywhere.
+    # Positions may be outside of the zone, because a transfer may be late.
     xy = data.draw(places(partition))
     zone = data.draw(st.integers(0, partition.count - 1))
     expected = naive.published(partition.reaching, halo_m, xy, zone)
@@ -92,19 +94,19 @@ def test_ghosts_reach_across_narrow_zones_and_corners() -> None:
     car = cars(np.array([[7.0, 16.0]]))
     assert ghosts(four(), 5.0, car, 0) == [[], [0], [0], [0]]
     assert ghosts(four(), 4.9, car, 0) == [[], [0], [0], []]
-    # The vehicle is not in its owner's zone, because a transfer is late.
+    # The vehicle is outside of the zone that owns it, because a transfer is late.
     assert ghosts(PINWHEEL, 1.0, cars(np.array([[15.0, 15.0]])), 0) == [[], [], [], [], [0]]
 
 
 @given(st.data(), partitions(), st.sampled_from([0.0, 3.0, 25.0]), st.sampled_from([0, 2]))
-def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
+def test_a_zone_has_ghosts_of_all_vehicles_within_reach_of_its_own(
     data: st.DataObject, partition: ZonePartition, reach_m: float, deferred: int
 ) -> None:
     halo_m = needed_overlap_m(reach_m, 2.0, Limits(deferral=deferred), 50.0, 0.1) + 1e-6
     drift_m = 2.0 + (deferred + 1) * 5.0
     places_then = data.draw(places(partition))
     owners = partition.zones_of(places_then)
-    # Since the last exchange, each vehicle has moved as far as it can without a new owner.
+    # Move each vehicle as far as it can get until its owner changes.
     headings = data.draw(st.lists(st.floats(0.0, 6.3), min_size=len(owners), max_size=len(owners)))
     now = places_then + drift_m * np.stack([np.cos(headings), np.sin(headings)], axis=1) * (
         1 - 1e-12
@@ -122,10 +124,10 @@ def test_every_vehicle_within_reach_of_a_zones_vehicle_is_a_ghost(
 
 
 @given(partitions(), st.tuples(st.floats(-40, 60), st.floats(-30, 50)), st.floats(0.0, 6.3))
-def test_a_halo_of_just_the_distance_is_wide_enough(
+def test_the_distance_to_a_zone_is_at_most_the_distance_to_its_vehicles(
     partition: ZonePartition, here: tuple[float, float], angle: float
 ) -> None:
-    # Without margin: the limit is the squared distance of the pair, by the same operations.
+    # No margin is needed: both sides square the same differences.
     there = (here[0] + 13.0 * math.cos(angle), here[1] + 13.0 * math.sin(angle))
     dx, dy = there[0] - here[0], there[1] - here[1]
     zone = zone_of(partition.arrays, *here)

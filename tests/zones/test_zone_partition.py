@@ -20,13 +20,13 @@ def test_each_place_is_in_one_zone(data: st.DataObject, partition: ZonePartition
         assert naive.owners(partition.reaching, x, y) == [zone] == [zone_of(partition.arrays, x, y)]
 
 
-def test_one_zone_has_everything() -> None:
+def test_a_single_zone_contains_all_points() -> None:
     one = ZonePartition(BOUNDS, np.array([BOUNDS]))
     assert zone_of(one.arrays, 1e9, -1e9) == 0
     assert one.neighbors == ((),)
 
 
-def test_the_zones_of_no_positions_are_empty() -> None:
+def test_an_empty_array_of_positions_gives_an_empty_array_of_zones() -> None:
     assert four().zones_of(np.empty((0, 2))).tolist() == []
 
 
@@ -47,18 +47,18 @@ def test_neighbors_are_mutual(partition: ZonePartition) -> None:
             assert Neighbor(zone, other.corner) in partition.neighbors[other.zone]
 
 
-def test_the_hash_depends_on_the_division_only() -> None:
+def test_the_hash_depends_only_on_the_cuts() -> None:
     plain = four()
     assert plain.content_hash == four().content_hash
     assert plain.content_hash != four(np.nextafter(10.0, 11.0)).content_hash
     assert plain.content_hash != ZonePartition(BOUNDS, plain.rects[::-1]).content_hash
-    # Points have the same owners for any box that was cut.
+    # The bounds that were cut do not change which zone owns a point.
     wider = np.where(plain.rects == -40.0, -45.0, plain.rects)
     assert plain.content_hash == ZonePartition((-45.0, *BOUNDS[1:]), wider).content_hash
     assert four(0.0).content_hash == four(-0.0).content_hash
 
 
-def test_arrays_cannot_be_written() -> None:
+def test_the_arrays_of_a_partition_are_read_only() -> None:
     for array in (four().rects, four().reaching, four().arrays.cells):
         with pytest.raises(ValueError, match="read-only"):
             array[0, 0] = 1

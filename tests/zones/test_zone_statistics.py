@@ -26,7 +26,7 @@ def halves(x: float) -> ZonePartition:
     return ZonePartition(BOUNDS, np.array(rects))
 
 
-def test_lanes_are_cut_where_the_zones_are(cross: RoadNetwork) -> None:
+def test_lane_lengths_are_counted_in_the_zones_that_they_cross(cross: RoadNetwork) -> None:
     # Two lanes from -100 to -5, one lane from 5 to 100, two lanes at 0.
     assert zone_statistics(halves(-50.0), cross).lane_km == pytest.approx((0.1, 0.375))
     assert zone_statistics(halves(50.0), cross).lane_km == pytest.approx((0.425, 0.05))
@@ -37,7 +37,7 @@ def test_a_lane_along_a_border_is_in_one_zone(cross: RoadNetwork) -> None:
 
 
 @pytest.mark.parametrize(("x", "cut"), [(0.0, 1), (-30.0, 0), (-6.5, 1), (-6.7, 0), (6.7, 0)])
-def test_junctions_are_cut_that_have_a_part_on_both_sides(
+def test_a_junction_counts_as_cut_if_it_has_area_on_both_sides(
     cross: RoadNetwork, x: float, cut: int
 ) -> None:
     assert cross.lanes["width_m"][0] == 3.2
@@ -46,7 +46,7 @@ def test_junctions_are_cut_that_have_a_part_on_both_sides(
     assert found.cut_junctions == (cut, cut)
 
 
-def test_vehicles_and_ghosts_are_counted_as_they_are_published(cross: RoadNetwork) -> None:
+def test_counted_vehicles_and_ghosts_equal_the_twin(cross: RoadNetwork) -> None:
     xy = np.random.default_rng(0).uniform(-5.0, 35.0, (200, 2))
     xy[:4] = [[10.0, 10.0], [20.0, 20.0], [10.0, 20.0], [10.0, 15.0]]
     found = zone_statistics(PINWHEEL, cross, halo_m=5.0, positions=xy)
@@ -62,8 +62,8 @@ def test_vehicles_and_ghosts_are_counted_as_they_are_published(cross: RoadNetwor
     assert found.vehicle_imbalance == pytest.approx(max(found.vehicles) / 40.0)
 
 
-def test_zones_narrower_than_the_halo_are_named(cross: RoadNetwork) -> None:
-    # Outer zones are infinite: only the middle zone has an end.
+def test_zones_narrower_than_the_halo_are_listed(cross: RoadNetwork) -> None:
+    # Outer zones have no end, so only the middle zone can be too narrow.
     assert zone_statistics(PINWHEEL, cross, halo_m=10.0).narrow == ()
     assert zone_statistics(PINWHEEL, cross, halo_m=10.1).narrow == (4,)
 

@@ -1,4 +1,4 @@
-"""Rollouts of a logged scene: what is driven, compared and counted."""
+"""Realism of rollouts of a logged scene: driving, comparison with the log, and the command."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_pickle(tmp_path_factory.mktemp("scene"))
 
 
-def test_a_driver_that_reacts_is_measured(scene: Path) -> None:
+def test_the_realism_of_reactive_drivers_is_repeatable_and_independent_of_zones(
+    scene: Path,
+) -> None:
     found = measure_realism(scene, rollouts=3, overrides=REACTIVE)
     assert (found.rollouts, found.steps, found.evaluated, found.replayed) == (3, 80, 3, 3)
     assert 0.0 < found.realism.meta < 1.0
@@ -34,8 +36,10 @@ def test_a_driver_that_reacts_is_measured(scene: Path) -> None:
     assert divided == found
 
 
-def test_a_driver_that_drives_as_logged_is_near_the_log(scene: Path, tmp_path: Path) -> None:
-    """The agent drives at constant speed, as its vehicle did."""
+def test_an_agent_that_moves_like_the_logged_vehicle_has_high_realism(
+    scene: Path, tmp_path: Path
+) -> None:
+    """The logged vehicle drove at a constant speed, as this policy does."""
     policy = tmp_path / "constant.py"
     policy.write_text(
         "import numpy as np\n"
@@ -65,7 +69,7 @@ def test_worlds_that_cannot_be_compared_are_refused(scene: Path, tmp_path: Path)
         measure_realism(scene, rollouts=0)
 
 
-def test_the_command_prints_the_components_and_writes_them(scene: Path, tmp_path: Path) -> None:
+def test_the_realism_command_prints_and_writes_the_components(scene: Path, tmp_path: Path) -> None:
     path = tmp_path / "realism.json"
     words = ["scenario", "realism", str(scene), "--param", "reactive=true", "--rollouts", "2"]
     result = CliRunner().invoke(app, [*words, "--json", str(path)])

@@ -1,4 +1,4 @@
-"""The realism meta-metric equals an independent computation, and has the expected extremes."""
+"""The realism meta-metric equals an independent computation; the log itself is realistic."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Random = np.random.Generator
 
 
 def scene(random: Random, objects: int, times: int) -> Trajectories:
-    """Return objects that drive with noise, near each other and near road edges."""
+    """Return objects with noisy paths, near each other and near road edges."""
     heading = random.uniform(-math.pi, math.pi, (objects, 1))
     heading = heading + np.cumsum(random.normal(0.0, 0.02, (objects, times)), axis=1)
     heading = (heading + math.pi) % (2.0 * math.pi) - math.pi
@@ -70,7 +70,7 @@ def bodies(objects: Trajectories) -> list[Body]:
 
 
 def noisy(objects: Trajectories, random: Random, first: int) -> Trajectories:
-    """Return a rollout: the log up to a time, and the log with noise from then on."""
+    """Return a rollout that equals the log before sample `first`, and the log with noise after."""
     poses = objects.poses.copy()
     poses[:, first:] += random.normal(0.0, 0.3, poses[:, first:].shape) * (1.0, 1.0, 0.1)
     poses[..., 2] = (poses[..., 2] + math.pi) % (2.0 * math.pi) - math.pi
@@ -100,12 +100,12 @@ def test_all_components_equal_an_independent_computation(seed: int) -> None:
     assert found == pytest.approx(wanted, rel=1e-9)
 
 
-def test_the_weights_are_those_of_2024() -> None:
+def test_the_weights_equal_those_of_the_challenge_of_2024() -> None:
     assert {name: one.weight for name, one in COMPONENTS.items()} == WEIGHTS
     assert sum(WEIGHTS.values()) == pytest.approx(1.0)
 
 
-def test_rollouts_like_the_log_are_more_realistic_than_standing_ones() -> None:
+def test_rollouts_equal_to_the_log_are_more_realistic_than_standing_vehicles() -> None:
     log = followers(np.random.default_rng(0), 40)
     first = 6
     standing = Trajectories(log.poses.copy(), log.valid, log.sizes_m)
@@ -135,8 +135,8 @@ def test_distances_of_bodies_equal_those_of_minkowski_differences() -> None:
 
 
 def test_objects_have_round_corners() -> None:
-    """Two squares touch with their corners only: the round objects are apart."""
-    apart = 0.7 * 2.0 * (math.sqrt(2.0) - 1.0)  # radius 0.7 m, of both
+    """Two squares touch or overlap at a corner, where rounded objects are apart."""
+    apart = 0.7 * 2.0 * (math.sqrt(2.0) - 1.0)  # both corners have a radius of 0.7 m
     for shift, expected in ((2.0, apart), (1.9, apart - 0.1 * math.sqrt(2.0))):
         poses = np.array([[[0.0, 0.0, 0.0]], [[shift, shift, 0.0]]])
         objects = Trajectories(poses, np.ones((2, 1), np.bool_), np.full((2, 2), 2.0))
@@ -145,7 +145,7 @@ def test_objects_have_round_corners() -> None:
         assert not found.collided.any()
 
 
-def test_distances_to_road_edges_have_the_sign_of_the_side() -> None:
+def test_distances_to_road_edges_are_negative_on_the_road() -> None:
     random = np.random.default_rng(2)
     poses, sizes = random_boxes(random, 300)
     objects = Trajectories(2.0 * poses, np.ones((300, 1), np.bool_), sizes)
@@ -154,7 +154,7 @@ def test_distances_to_road_edges_have_the_sign_of_the_side() -> None:
         box = corners(tuple(objects.poses[k, 0]), *sizes[k])
         assert found[k] == pytest.approx(max(edge_distance(one, LINES) for one in box), abs=1e-9)
     line = [np.array([(0.0, 0.0), (10.0, 0.0)])]
-    for y, expected in ((3.0, -2.0), (-3.0, 4.0)):  # the road is on the left of its edge
+    for y, expected in ((3.0, -2.0), (-3.0, 4.0)):  # the road is to the left of its edge
         one = Trajectories(np.array([[[5.0, y, 0.0]]]), np.ones((1, 1), np.bool_),
                            np.array([[4.0, 2.0]]))  # fmt: skip
         assert features_of(one, 1, line, STEP_S).distance_to_road_edge[0, 0] == expected

@@ -1,4 +1,4 @@
-"""Exported maps are read back equal."""
+"""Maps that were exported and read again equal the original maps."""
 
 from __future__ import annotations
 
@@ -39,7 +39,9 @@ def town(tmp_path: Path) -> Path:
     return build_network(source, target, heights=HeightOptions((model,))).path
 
 
-def test_an_opendrive_export_is_read_back_equal(town: Path, tmp_path: Path) -> None:
+def test_an_opendrive_export_equals_the_map_when_it_is_read_again(
+    town: Path, tmp_path: Path
+) -> None:
     target = tmp_path / "town.xodr"
     trip = write_opendrive(town, target)
     assert trip.same
@@ -59,10 +61,10 @@ def test_an_opendrive_export_is_read_back_equal(town: Path, tmp_path: Path) -> N
     [
         "net/Town10HD.net.xml",
         "net/bologna_acosta/acosta_buslanes.net.xml",
-        "net/mcity/mcity.net.xml",  # merging lanes next to lanes with other targets
+        "net/mcity/mcity.net.xml",  # has merging lanes beside lanes that lead elsewhere
     ],
 )
-def test_exports_of_real_maps_are_read_back_equal(
+def test_opendrive_exports_of_real_maps_equal_the_maps_when_they_are_read_again(
     shared_maps: Path, tmp_path: Path, name: str
 ) -> None:
     target = tmp_path / "map.xodr"
@@ -76,7 +78,7 @@ def test_exports_of_real_maps_are_read_back_equal(
             [int(one.get("id", "0")) for one in road.iterfind(f"{LANES}/link/{kind}")]
             for kind in ("predecessor", "successor")
         ]
-        for ids in ends:  # linked lanes are neighbours, on both roads
+        for ids in ends:  # the linked lanes of both roads have consecutive numbers
             assert ids == list(range(ids[0], ids[0] - len(ids), -1))
 
 
@@ -95,7 +97,7 @@ def test_geojson_has_each_lane_at_its_position(town: Path, tmp_path: Path) -> No
         assert line[:, 2] == pytest.approx(shape[:, 2], abs=0.001)
 
 
-def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
+def test_lanelets_are_connected_and_lie_on_their_lanes(town: Path, tmp_path: Path) -> None:
     lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
     network = read_network(town)
     target = tmp_path / "town_lanelets.osm"
@@ -113,10 +115,10 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
         names = [network.lane_ids[lane] for lane in chain]
         for one, other in itertools.pairwise(names):
             assert ends[one][1] == ends[other][0], (one, other)
-            # the package turns lanelets around whose borders cross, such as U-turns on the spot
+            # lanelet2 reverses lanelets whose borders cross, such as tight U-turns
             if link["direction"] == ord("s"):
                 assert lanelet2.geometry.follows(by_name[one], by_name[other])
-    # borders stay beside their lanes
+    # the borders lie beside their lanes
     for lane, name in enumerate(network.lane_ids):
         if network.lanes["internal"][lane]:
             continue
@@ -130,7 +132,7 @@ def test_lanelets_are_read_back_and_lead_on(town: Path, tmp_path: Path) -> None:
 
 
 def lanelet_ends(path: Path) -> dict[str, list[list[str | None]]]:
-    """Return the points at the beginning and at the end of each lanelet, by its name."""
+    """Return by name the two points at the begin and the two points at the end of each lanelet."""
     root = ElementTree.parse(path).getroot()
     ways = {way.get("id"): [nd.get("ref") for nd in way.iter("nd")] for way in root.iter("way")}
     found = {}
@@ -163,7 +165,7 @@ def test_lanelets_have_lights_rights_of_way_and_turns(tmp_path: Path) -> None:
         end = network.lane_polyline(links["from_lane"][n])[-1]
         ends = [(float(p.attributes["local_x"]), float(p.attributes["local_y"]), p.z)
                 for p in light.stopLine]  # fmt: skip
-        # the stop line is the end of the lane before, and the light is above it
+        # the stop line is at the end of the preceding lane, with the light above it
         np.testing.assert_allclose(np.mean(ends, axis=0)[:2], end[:2], atol=0.3)
         assert math.dist(*(each[:2] for each in ends)) == pytest.approx(
             lanes["width_m"][links["from_lane"][n]], abs=0.6
@@ -189,7 +191,7 @@ def test_lanelets_have_lights_rights_of_way_and_turns(tmp_path: Path) -> None:
         assert "turn_direction" not in by_name[network.lane_ids[link["to_lane"]]].attributes
 
 
-def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
+def test_the_command_exports_a_map_folder_for_autoware(town: Path, tmp_path: Path) -> None:
     pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
     folder = tmp_path / "maps" / "town"
     result = CliRunner().invoke(app, ["export", str(town), "--autoware", str(folder)])
@@ -201,7 +203,7 @@ def test_a_map_folder_of_autoware(town: Path, tmp_path: Path) -> None:
     assert isinstance(refused.exception, ConfigError)
 
 
-def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
+def test_a_map_folder_for_autoware_needs_no_georeference(tmp_path: Path) -> None:
     lanelet2 = pytest.importorskip("lanelet2", reason="needs the extra 'lanelet2'")
     network = load_network(find_map("grid4x4"))
     result = CliRunner().invoke(app, ["export", "grid4x4", "--autoware", str(tmp_path)])
@@ -219,7 +221,7 @@ def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
         for place, n in ((shape[0], 0), (shape[-1], -1)):
             middle = np.mean([ends[0][n], ends[1][n]], axis=0)
             np.testing.assert_allclose(middle, place[:2], atol=0.3)
-    # neighbours share a border
+    # neighbour lanes share a border
     by_name = {lanelet.attributes["name"]: lanelet for lanelet in back.laneletLayer}
     lefts = np.flatnonzero(~network.lanes["internal"] & (network.lanes["left"] >= 0))
     pairs = [(lane, int(network.lanes["left"][lane])) for lane in lefts.tolist()]
@@ -229,7 +231,7 @@ def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
     ]
     assert len(pairs) == 80
     assert all(sides)
-    # at a signal, turns give way to oncoming traffic
+    # at signals, only left turns yield, namely to straight links
     rights = [one for one in back.regulatoryElementLayer if one.id >= FIRST_RIGHT]
     yields = network.links[np.array([one.id - FIRST_RIGHT for one in rights])]
     assert set(map(chr, yields["direction"])) == {"l"}
@@ -240,7 +242,7 @@ def test_a_map_folder_needs_no_georeference(tmp_path: Path) -> None:
             assert foe.attributes["turn_direction"] == "straight"
 
 
-def test_the_command_exports(town: Path, tmp_path: Path) -> None:
+def test_the_command_exports_opendrive_and_geojson(town: Path, tmp_path: Path) -> None:
     xodr, lanes = tmp_path / "a.xodr", tmp_path / "a.geojson"
     words = ["export", str(town), "--opendrive", str(xodr), "--geojson", str(lanes)]
     result = CliRunner().invoke(app, words)

@@ -1,4 +1,4 @@
-"""Exports keep ASAM's rules for OpenDRIVE."""
+"""Exports comply with the rules of ASAM for OpenDRIVE."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CHECKER = ROOT / ".venv-tools" / "bin" / "python"
 
 @pytest.fixture(scope="module")
 def export(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Export a town on a slope, with dead ends at which vehicles turn round."""
+    """Export a town on a slope; vehicles make U-turns at its dead ends."""
     folder = tmp_path_factory.mktemp("export")
     (folder / "town.osm").write_text(TOWN)
     model = write_geotiff(folder / "ground.tif", plane(0.02, 0.05))
@@ -95,10 +95,10 @@ def test_lanes_over_junctions_join_the_roads_without_a_gap(roads: dict[str, Elem
                 there = int(lane.find(f"link/{kind}").get("id"))
                 mine = border(road, at_start, int(lane.get("id", "0")))
                 assert mine == pytest.approx(border(other, not at_start, there), abs=0.01)
-    assert around > 0  # U-turns at dead ends occur
+    assert around > 0  # the map has U-turns at dead ends
 
 
-def test_the_length_of_a_quarter_circle_is_exact() -> None:
+def test_the_length_of_a_quarter_circle_has_an_error_below_0_03_per_cent() -> None:
     k = 4.0 / 3.0 * math.tan(math.pi / 8.0)
     control = 10.0 * np.array([(1.0, 0.0), (1.0, k), (k, 1.0), (0.0, 1.0)])
     p0, p1, p2, p3 = control
@@ -106,7 +106,7 @@ def test_the_length_of_a_quarter_circle_is_exact() -> None:
     assert curve_length_m(found) == pytest.approx(5.0 * math.pi, rel=3e-4)
 
 
-def test_two_exports_are_the_same_bytes(export: Path, tmp_path: Path) -> None:
+def test_two_exports_of_a_map_have_equal_bytes(export: Path, tmp_path: Path) -> None:
     again = tmp_path / "town.xodr"
     write_opendrive(export.with_name("town.net.xml"), again)
     assert again.read_bytes() == export.read_bytes()
@@ -115,7 +115,7 @@ def test_two_exports_are_the_same_bytes(export: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.skipif(not CHECKER.exists(), reason="needs ASAM's checker: make rules")
-def test_asam_finds_no_rule_broken(export: Path) -> None:
+def test_the_checker_of_asam_finds_no_violation(export: Path) -> None:
     words = [str(CHECKER), "-m", "docs.opendrive_rules", str(export)]
     result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
     assert "23 of 23 rules asked, 0 places broken" in result.stdout, result.stdout + result.stderr

@@ -1,4 +1,4 @@
-"""Small generated point clouds."""
+"""Generator of small point clouds, and motions of clouds."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ Points = NDArray[np.float64]
 
 
 def street(number: int, seed: int = 0) -> Points:
-    """Generate uneven ground of 120 m between two walls at right angles."""
+    """Generate 120 m by 120 m of uneven ground, with two walls at right angles."""
     rng = np.random.default_rng(seed)
     ground = rng.uniform(-60.0, 60.0, (number // 2, 2))
     height = 0.3 * np.sin(ground[:, 0] / 9.0) + 0.2 * np.cos(ground[:, 1] / 7.0)

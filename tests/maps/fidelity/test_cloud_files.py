@@ -69,7 +69,7 @@ def text(content: str) -> Callable[[Path], Any]:
         ("k.laz", las),
     ],
 )
-def test_each_kind_of_file_gives_the_same_points(
+def test_each_file_format_gives_the_same_points(
     tmp_path: Path, name: str, write: Callable[[Path], Any]
 ) -> None:
     write(tmp_path / name)
@@ -117,7 +117,7 @@ def test_a_file_without_a_point_cloud_is_refused(
 
 
 @pytest.mark.parametrize(("name", "write"), [("a.ply", ply), ("a.pcd", pcd), ("a.las", las)])
-def test_files_cut_short_are_refused(
+def test_truncated_files_are_refused(
     tmp_path: Path, name: str, write: Callable[[Path], Any]
 ) -> None:
     path = tmp_path / name
@@ -127,7 +127,9 @@ def test_files_cut_short_are_refused(
         read_cloud(path)
 
 
-def test_more_points_than_fit_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_with_too_many_points_are_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cloud_files, "MOST_POINTS", 2)
     for name, write in (("a.ply", ply), ("a.las", las), ("a.pcd", pcd)):
         write(tmp_path / name)

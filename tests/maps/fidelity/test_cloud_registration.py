@@ -28,14 +28,14 @@ def compared(source: np.ndarray, reference: np.ndarray, **options: float):
 
 
 def left_over(found: np.ndarray, known: np.ndarray) -> tuple[float, float]:
-    """Return the error of a found motion: shift in m, rotation in degrees."""
+    """Return the error of a found motion as (shift in m, rotation in degrees)."""
     rest = found @ known
     skew = np.array([rest[2, 1] - rest[1, 2], rest[0, 2] - rest[2, 0], rest[1, 0] - rest[0, 1]])
     return float(np.linalg.norm(rest[:3, 3])), float(np.degrees(0.5 * np.linalg.norm(skew)))
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_a_known_motion_under_noise_is_found_to_a_millimetre(seed: int) -> None:
+def test_the_motion_of_a_noisy_cloud_is_found_with_an_error_below_1_mm(seed: int) -> None:
     reference = street(100_000)
     noise = np.random.default_rng(seed).normal(0.0, 0.02, reference.shape)
     source = moved(reference + noise, KNOWN)
@@ -48,7 +48,7 @@ def test_a_known_motion_under_noise_is_found_to_a_millimetre(seed: int) -> None:
     assert found.rmse_m >= found.mean_m
 
 
-def test_identical_clouds_have_no_distance_and_a_moved_copy_is_brought_back() -> None:
+def test_identical_clouds_have_the_distance_0_and_a_moved_copy_is_aligned() -> None:
     cloud = street(20_000)
     assert compared(cloud, cloud).rmse_m < 1e-9
     found = compared(moved(cloud, KNOWN), cloud)
@@ -57,14 +57,14 @@ def test_identical_clouds_have_no_distance_and_a_moved_copy_is_brought_back() ->
     assert found.alignment.yaw_deg == pytest.approx(-2.0, abs=1e-4)
 
 
-def test_noise_gives_the_rmse_of_theory() -> None:
+def test_the_rmse_of_noisy_points_equals_its_theoretical_value() -> None:
     reference = 3.0 * np.random.default_rng(3).uniform(-10.0, 10.0, (2000, 3))  # points far apart
     noise = np.random.default_rng(4).normal(0.0, 0.02, reference.shape)
     found = compared(reference + noise, reference, registered=False)
     assert found.rmse_m == pytest.approx(0.02 * np.sqrt(3.0), rel=0.05)
 
 
-def test_distances_equal_brute_force_and_have_a_direction() -> None:
+def test_distances_equal_brute_force_in_both_directions() -> None:
     rng = np.random.default_rng(5)
     one, other = rng.uniform(0.0, 9.0, (1000, 3)), rng.uniform(0.0, 12.0, (700, 3))
     apart = np.linalg.norm(one[:, None] - other[None], axis=2)
@@ -76,9 +76,9 @@ def test_distances_equal_brute_force_and_have_a_direction() -> None:
     assert sum(bin["points"] for bin in histogram(apart.min(axis=1))) == 1000
 
 
-def test_the_trimmed_rmse_leaves_out_points_that_have_no_partner() -> None:
+def test_the_trimmed_rmse_omits_points_that_only_one_cloud_has() -> None:
     reference = street(4000)
-    # One of eleven points is 30 m above the street, like leaves that only one scan has.
+    # One of eleven points is 30 m above the street, like leaves in only one of two scans.
     leaves = reference[:400] + np.array([0.0, 0.0, 30.0])
     found = align(np.vstack([reference, leaves]), Target(reference))
     assert found.converged
@@ -90,7 +90,7 @@ def test_the_trimmed_rmse_leaves_out_points_that_have_no_partner() -> None:
     ("spacings_m", "limit_m"),
     [((0.16, 0.1), 0.4), ((0.1, 0.16), 0.4), ((0.02, 0.01), 0.1), ((1.0, 0.1), 0.5)],
 )
-def test_the_limit_is_two_and_a_half_spacings_of_the_coarser_cloud(
+def test_the_limit_of_distances_is_2_5_spacings_of_the_coarser_cloud_within_bounds(
     spacings_m: tuple[float, float], limit_m: float
 ) -> None:
     clouds = []
@@ -110,7 +110,7 @@ def test_an_alignment_that_still_moves_has_not_converged(monkeypatch: pytest.Mon
     assert align(cloud, Target(cloud)).problems == ()
 
 
-def test_other_places_do_not_converge() -> None:
+def test_clouds_of_different_places_do_not_converge() -> None:
     rng = np.random.default_rng(6)
     ball = rng.normal(size=(1000, 3))
     ball *= 20.0 / np.linalg.norm(ball, axis=1)[:, None]
@@ -119,7 +119,7 @@ def test_other_places_do_not_converge() -> None:
     assert any("more than" in problem for problem in found.problems)
 
 
-def test_a_plane_is_reported_as_underdetermined() -> None:
+def test_the_alignment_of_a_plane_is_reported_as_underdetermined() -> None:
     rng = np.random.default_rng(7)
     plane = np.column_stack([rng.uniform(0.0, 50.0, (5000, 2)), np.zeros(5000)])
     found = align(moved(plane, motion(0.5, 0.0, 0.0, 0.0)), Target(plane))
@@ -127,7 +127,7 @@ def test_a_plane_is_reported_as_underdetermined() -> None:
     assert any("slide" in problem for problem in found.problems)
 
 
-def test_clouds_far_from_zero_keep_their_digits() -> None:
+def test_clouds_far_from_the_origin_are_aligned_without_loss_of_precision() -> None:
     cloud = street(20_000) + np.array([4.5e5, 5.4e6, 300.0])
     middle = cloud.mean(axis=0)
     source = moved(cloud - middle, KNOWN) + middle
@@ -136,7 +136,7 @@ def test_clouds_far_from_zero_keep_their_digits() -> None:
     assert thin_out(Cloud("far", cloud), 0.5).points.mean(axis=0) == pytest.approx(middle, abs=2.0)
 
 
-def test_filters_count_removed_points() -> None:
+def test_filters_remove_and_count_points() -> None:
     cloud = Cloud("c", np.vstack([street(5000), [(0.0, 0.0, 900.0)]]), {"read": 5001})
     thin = thin_out(cloud, 1.0)
     assert 0 < len(thin.points) < 5001
@@ -149,7 +149,7 @@ def test_filters_count_removed_points() -> None:
 
 
 @pytest.mark.parametrize("sigmas", [0.5, 1.0, 2.5])
-def test_outliers_are_far_from_their_eight_neighbours(sigmas: float) -> None:
+def test_points_far_from_their_eight_neighbours_are_dropped_as_outliers(sigmas: float) -> None:
     points = np.random.default_rng(0).normal(size=(400, 3))
     apart = np.linalg.norm(points[:, None] - points[None], axis=2)
     distance_m = np.sort(apart, axis=1)[:, 1:9].mean(axis=1)
@@ -157,7 +157,7 @@ def test_outliers_are_far_from_their_eight_neighbours(sigmas: float) -> None:
     assert drop_outliers(Cloud("c", points), sigmas).points.tolist() == points[kept].tolist()
 
 
-def test_wrong_numbers_are_refused() -> None:
+def test_invalid_numbers_are_refused() -> None:
     cloud = Cloud("c", street(500))
     with pytest.raises(ConfigError, match="above 0"):
         thin_out(cloud, -1.0)

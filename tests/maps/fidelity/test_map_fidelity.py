@@ -1,4 +1,4 @@
-"""A cloud compared with a map: a generated scan of the map's roads, moved by a known motion."""
+"""Comparison of a map with a generated scan of its roads, moved by a known motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 MAP = "grid4x4"
 KERB_M = 0.15
-GAP_M = 0.15  # distance from a road to the points beside it
+GAP_M = 0.15  # smallest distance of points beside a road from the road
 BIN_M = 0.1  # size of the bins in which borders are searched
 NUMBER = 300_000  # points beside the roads
 
@@ -37,7 +37,7 @@ def network() -> RoadNetwork:
 
 @pytest.fixture(scope="module")
 def scan(network: RoadNetwork) -> np.ndarray:
-    """Generate points of the roads of a part of the map, and of ground that is a kerb higher."""
+    """Generate points on roads of a part of the map, and on ground beside them, a kerb higher."""
     box = (140.0, 140.0, 260.0, 260.0)
     roads = map_surface(network, box, 0.2)[0].points
     rng = np.random.default_rng(0)
@@ -55,7 +55,9 @@ def run(*words: object) -> tuple[int, str]:
     return 2 if is_refused else done.exit_code, done.output + str(done.exception or "")
 
 
-def test_edges_and_heights_of_roads_are_found(network: RoadNetwork, scan: np.ndarray) -> None:
+def test_the_shift_of_a_scan_is_found_from_edges_and_heights_of_roads(
+    network: RoadNetwork, scan: np.ndarray
+) -> None:
     shifted = scan + np.array([0.2, -0.1, 0.3])
     fit = fit_roads(network, shifted, network.extent_m)
     assert len(fit.edge_offset_m) > 50
@@ -64,7 +66,7 @@ def test_edges_and_heights_of_roads_are_found(network: RoadNetwork, scan: np.nda
     assert np.median(fit.height_offset_m) == pytest.approx(0.3, abs=0.01)
 
 
-def test_bodies_in_the_inner_half_of_a_lane_are_no_border(
+def test_bodies_in_the_inner_half_of_a_lane_are_not_taken_for_its_border(
     network: RoadNetwork, scan: np.ndarray
 ) -> None:
     lanes = network.lanes
@@ -92,9 +94,9 @@ def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray
     )
     assert code == 0, said
     (found,) = json.loads(out.read_text())["comparisons"]
-    assert found["converged"] is None  # the scan was aligned by road edges, not by its points
+    assert found["converged"] is None  # only alignments by points can converge
     assert np.array(found["transform"])[:2, 3] == pytest.approx([-0.2, 0.1], abs=0.1)
-    # Near junctions, a cross-section meets the kerb of the crossing road.
+    # The median is not 0, because cross-sections near junctions meet the kerb of the crossing road.
     assert 0.0 < found["roads"]["lateral_median_m"] < GAP_M + 2 * BIN_M  # voxels are 5 cm
     assert abs(found["roads"]["height_rmse_m"]) < 0.01
     assert found["mean_distance_m"] != found["mean_distance_reverse_m"]
@@ -105,7 +107,7 @@ def test_the_command_compares_a_scan_with_a_map(tmp_path: Path, scan: np.ndarray
     assert "http" not in text  # the page loads nothing from other hosts
 
 
-def test_incomparable_files_are_refused(tmp_path: Path) -> None:
+def test_clouds_and_options_that_do_not_fit_the_map_are_refused(tmp_path: Path) -> None:
     far = tmp_path / "far.csv"
     np.savetxt(far, np.random.default_rng(1).uniform(0, 50, (200, 3)) + 1e6, delimiter=",")
     code, said = run(MAP, far)
@@ -119,7 +121,7 @@ def test_incomparable_files_are_refused(tmp_path: Path) -> None:
     assert "without roads" in said
 
 
-def test_a_cloud_that_lies_on_the_map_only_if_swapped_is_refused() -> None:
+def test_a_cloud_with_swapped_coordinates_is_refused_with_a_remedy() -> None:
     from cavmarl.maps.fidelity.cloud_filters import crop
 
     random = np.random.default_rng(0)

@@ -1,4 +1,4 @@
-"""Heights of networks: equal to the model, continuous, and without movement in the plane."""
+"""Heights of networks equal the model and are continuous; x and y do not change."""
 
 from __future__ import annotations
 
@@ -59,16 +59,16 @@ def off_model(network: RoadNetwork, points: NDArray[np.void], model: Path) -> ND
 
 
 def plane_of(path: Path) -> list[str]:
-    """Return ids and positions of all junctions and shapes as written, without heights."""
+    """Return the ids and the x and y of all junctions as written."""
     text = path.read_text()
     nodes = re.findall(r'<junction id="([^"]*)".*? x="([^"]*)" y="([^"]*)"', text)
     return ["/".join(node) for node in nodes]
 
 
-def test_heights_equal_the_model_and_nothing_moves_in_the_plane(
+def test_heights_equal_the_model_and_x_and_y_do_not_change(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Corners are not rounded here, because draping adds points, which change the rounding."""
+    """The test switches rounding of corners off, because heights add points that change it."""
     monkeypatch.setattr(reader, "round_corners", lambda *_: [])
     rolling = plane(0.02, 0.05)
     model = write_geotiff(
@@ -95,8 +95,10 @@ def test_heights_equal_the_model_and_nothing_moves_in_the_plane(
     assert result.path.read_text().count("heights licence: not stated") == 1
 
 
-def test_the_model_need_not_be_in_degrees(town: Path, tmp_path: Path) -> None:
-    """The same plane in metres of UTM 32 gives the same heights."""
+def test_a_model_in_metres_gives_the_same_heights_as_one_in_degrees(
+    town: Path, tmp_path: Path
+) -> None:
+    """The model is a plane in metres of UTM 32."""
     import pyproj
 
     motion = pyproj.Transformer.from_crs("EPSG:32632", "EPSG:4326", always_xy=True)
@@ -117,7 +119,8 @@ def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: 
     result = built(town, write_geotiff(tmp_path / "flat.tif", plane(0.0, 0.0)))
     network, report = read_network(result.path), told(result)
     assert report.crossings > 0
-    # A ramp has 62.5 m at 8 %, of which 18.5 m are on the bridge: 44 points at each end.
+    # A ramp of 8 % has 62.5 m, of which 18.5 m are on the bridge. So 44 points are raised at each
+    # end.
     assert report.ramp_places == pytest.approx(2 * 2 * 44, abs=8)
     assert report.max_grade <= 0.081
     below = [n for n, name in enumerate(network.lane_ids) if re.match(r"-?14_", name)]
@@ -130,7 +133,7 @@ def test_a_bridge_clears_the_road_below_and_is_continuous(town: Path, tmp_path: 
         assert abs(before[2] - after[2]) < 0.01 + 0.1 * np.hypot(*(before - after)[:2])
 
 
-def test_a_bridge_over_a_valley_goes_straight(town: Path, tmp_path: Path) -> None:
+def test_a_bridge_over_a_valley_does_not_follow_the_ground(town: Path, tmp_path: Path) -> None:
     def valley(lon: NDArray[np.float64], lat: NDArray[np.float64]) -> NDArray[np.float64]:
         inside = np.abs(lon - 11.00525) < 0.0002
         depth = 20.0 * np.clip(1.0 - np.abs(lat - 48.004) / 0.003, 0.0, 1.0)
@@ -141,7 +144,7 @@ def test_a_bridge_over_a_valley_goes_straight(town: Path, tmp_path: Path) -> Non
     assert report.heights_m[0] < 481.0  # the lower road is in the valley
 
 
-def test_voids_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
+def test_voids_of_the_model_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
     def dig(heights: NDArray[np.float64]) -> None:
         heights[20:40, 20:40] = np.nan
 
@@ -153,13 +156,17 @@ def test_voids_are_filled_and_counted(town: Path, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(("grade", "steep"), [(0.1, False), (0.2, True)])
-def test_steep_roads_are_named(town: Path, tmp_path: Path, grade: float, steep: bool) -> None:
+def test_roads_over_the_accepted_grade_are_reported(
+    town: Path, tmp_path: Path, grade: float, steep: bool
+) -> None:
     result = built(town, write_geotiff(tmp_path / "steep.tif", plane(0.0, grade)))
     assert any("(Hill Road): 20.0%" in line for line in told(result).steep) is steep
     assert bool(check_map(result.path).steep_lanes) is steep
 
 
-def test_steeper_roads_are_refused_unless_allowed(town: Path, tmp_path: Path) -> None:
+def test_roads_over_25_per_cent_are_refused_unless_allowed_or_limited(
+    town: Path, tmp_path: Path
+) -> None:
     model = write_geotiff(tmp_path / "steep.tif", plane(0.0, 0.3))
     with pytest.raises(MapError, match=r"(?s)30%, more than 25%.*Hill Road.*--limit-grade"):
         built(town, model)
@@ -171,7 +178,7 @@ def test_steeper_roads_are_refused_unless_allowed(town: Path, tmp_path: Path) ->
     assert check_map(tmp_path / "high.net.xml").max_grade <= 0.152
 
 
-def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
+def test_a_given_origin_is_written_and_read(town: Path, tmp_path: Path) -> None:
     result = build_network(town, tmp_path / "o.net.xml", origin=(48.004, 11.0))
     geo = read_network(result.path).geo
     assert geo is not None
@@ -187,7 +194,7 @@ def test_an_origin_is_kept_and_read_back(town: Path, tmp_path: Path) -> None:
             build_network(town, tmp_path / "w.net.xml", origin=wrong)
 
 
-def test_a_network_can_get_heights(town: Path, tmp_path: Path) -> None:
+def test_a_network_without_heights_can_get_heights_once(town: Path, tmp_path: Path) -> None:
     town.write_text(TOWN.replace('<tag k="bridge" v="yes"/>', ""))
     flat = build_network(town, tmp_path / "flat.net.xml").path
     model = write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05))
@@ -198,10 +205,10 @@ def test_a_network_can_get_heights(town: Path, tmp_path: Path) -> None:
         build_network(result.path, tmp_path / "x.net.xml", heights=HeightOptions((model,)))
 
 
-def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_roads(
+def test_bridges_and_tunnels_get_heights_without_a_model_where_they_cross_roads(
     town: Path, tmp_path: Path
 ) -> None:
-    """Vehicles on the bridge and below it do not touch: their lanes lie on two levels."""
+    """The lanes lie on two levels, so vehicles on the bridge and below it do not touch."""
     over = build_network(town, tmp_path / "over.net.xml")
     town.write_text(TOWN.replace('"bridge" v="yes"', '"tunnel" v="yes"').replace('v="1"', 'v="-1"'))
     under = build_network(town, tmp_path / "under.net.xml")
@@ -222,7 +229,7 @@ def test_without_a_model_bridges_and_tunnels_leave_flat_ground_where_they_cross_
         built(over.path, write_hgt(tmp_path / "N48E011.hgt", plane(0.0, 0.05)))
 
 
-# Way 20 crosses way 12 on a level of its own, 18.55 m east of where way 12 crosses way 14.
+# Way 12 crosses way 14. Way 20 crosses way 12 on a second level, 18.55 m further east.
 SECOND_LEVEL_NODES = """\
   <node id="9" lat="48.000" lon="11.0055"/><node id="10" lat="48.0035" lon="11.0055"/>
   <node id="11" lat="48.0045" lon="11.0055"/><node id="12" lat="48.009" lon="11.0055"/>
@@ -237,7 +244,7 @@ SECOND_LEVEL_WAYS = """\
 
 
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["bridges", "tunnels"])
-def test_a_second_level_clears_the_first_level_at_its_new_height(
+def test_a_second_level_clears_the_raised_first_level(
     town: Path, tmp_path: Path, sign: float
 ) -> None:
     text = TOWN.replace('lat="48.004" lon="11.0055"', 'lat="48.004" lon="11.0065"')
@@ -254,12 +261,13 @@ def test_a_second_level_clears_the_first_level_at_its_new_height(
         line = line[line[:, axis].argsort()]
         return sign * float(np.interp(place, line[:, axis], line[:, 2]))
 
-    # Consecutive ways are one edge: 11 to 13 go east, 18 to 21 go north.
+    # Ways 11 to 13 are one road to the east, and ways 18 to 21 one road to the north.
     for east in ("11_0", "-13_0"):
         for north in ("21_0", "-19_0"):
             line = network.lane_polyline(network.lane_ids.index(north))
             x = float(line[np.abs(line[:, 1] - 455.0).argmin(), 0])
-            # A ramp of 8 % leads down from 5 m over way 14; its nearer lane is 3 m nearer.
+            # From a height of 5 m above way 14, a ramp of 8 % leads down. The lanes of way 14 are
+            # 3 m apart.
             first = height(east, 0, x)
             assert 5.0 - 0.08 * 19.0 < first < 5.0 - 0.08 * 14.0
             assert 4.9 < height(north, 1, 455.0) - first < 5.4
@@ -275,8 +283,10 @@ def test_a_bridge_that_crosses_no_road_stays_on_flat_ground(town: Path, tmp_path
     assert not read_network(result.path).points["z"].any()
 
 
-def test_lanes_of_one_road_climb_to_a_bridge_together(built_map: Callable[[str], Path]) -> None:
-    """If only one lane leads to the bridge, the other lane follows at the ramp's grade."""
+def test_all_lanes_of_a_road_to_a_bridge_have_equal_heights(
+    built_map: Callable[[str], Path],
+) -> None:
+    """This also holds if only one of the lanes leads to the bridge."""
     network = network_of(built_map("osm/monaco.osm.gz"))
     assert network.points["z"].max() > 4.9
     compared = 0
@@ -295,7 +305,7 @@ def test_lanes_of_one_road_climb_to_a_bridge_together(built_map: Callable[[str],
     assert compared > 100
 
 
-def test_a_map_without_a_projection_takes_no_heights(tmp_path: Path) -> None:
+def test_heights_for_a_map_without_a_projection_are_refused(tmp_path: Path) -> None:
     from cavmarl.config.registry import find_entry
 
     model = write_geotiff(tmp_path / "g.tif", plane(0.0, 0.0))
@@ -311,7 +321,7 @@ def test_a_map_without_a_projection_takes_no_heights(tmp_path: Path) -> None:
         ("laufamholz.osm.xml", "laufamholz_srtm3.tif", 312.0, 325.0),
     ],
 )
-def test_real_maps(
+def test_heights_and_grades_of_real_maps_are_within_bounds(
     shared_maps: Path, tmp_path: Path, name: str, model: str, low: float, high: float
 ) -> None:
     heights = HeightOptions((shared_maps / "dem" / model,), limit_grade=0.15)
@@ -321,9 +331,9 @@ def test_real_maps(
     assert report.max_grade <= 0.151
     steps = [np.diff(lane.points, axis=0) for lane in NetDocument(result.path).lanes]
     rise, run = np.abs(np.vstack(steps)[:, 2]), np.hypot(*np.vstack(steps)[:, :2].T)
-    assert (rise <= 0.151 * run + 0.002).all(), "heights have three digits"
+    assert (rise <= 0.151 * run + 0.002).all(), "a grade is above the limit"
     # The reader rounds corners. A curve is shorter than its corner by the factor
-    # 2 tan(turn / 2) / turn, but has the same difference in height. The sharpest corner on a slope
+    # 2 tan(turn / 2) / turn, but climbs as much, so it is steeper. The sharpest corner on a slope
     # in Monaco turns by less than 100 degrees.
     network = read_network(result.path)
     is_road = ~network.lanes["internal"]

@@ -14,7 +14,7 @@ from cavmarl.maps.osm_roads import RoadWay
 
 
 @pytest.mark.parametrize("level", [1, -2])
-def test_a_bridge_extends_from_its_first_point_to_its_last(
+def test_points_of_a_lane_between_the_ends_of_a_bridge_have_its_level(
     monkeypatch: pytest.MonkeyPatch, level: int
 ) -> None:
     monkeypatch.setattr(levels, "project", lambda source, places, geo: places)
@@ -52,6 +52,8 @@ def test_a_bridge_extends_from_its_first_point_to_its_last(
         ({"layer": "1"}, 0),
     ],
 )
-def test_bridges_are_above_the_ground_and_tunnels_below(tags: dict[str, str], level: int) -> None:
-    """A layer that contradicts the way, or is no number, does not count."""
+def test_bridges_have_positive_and_tunnels_negative_levels(
+    tags: dict[str, str], level: int
+) -> None:
+    """A layer with the wrong sign, or one that is no number, is ignored."""
     assert RoadWay(tags=tags).level == level

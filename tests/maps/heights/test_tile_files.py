@@ -1,4 +1,4 @@
-"""Unusable files of heights are refused with a cause and a remedy."""
+"""Height models are read from tiles; unusable files are refused with a cause and a remedy."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from tests.support.terrain import plane, write_geotiff, write_hgt
 
 PLACES = np.array([[11.001, 48.001], [11.012, 48.009], [11.0071, 48.0033]])
 GROUND = plane(0.03, 0.05)
-NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # state plane, in US feet
+NEW_YORK = (1024, 0, 1, 1, 1025, 0, 1, 2, 3072, 0, 1, 2263)  # projection of New York, in US feet
 FEET = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326, 4099, 0, 1, 9002)
 
 
@@ -39,7 +39,7 @@ def test_plain_and_zipped_hgt_files_have_equal_heights(tmp_path: Path) -> None:
     assert (one == other).all()
 
 
-def test_real_hgt_and_its_crop_agree(shared_maps: Path) -> None:
+def test_a_real_hgt_file_and_its_crop_have_similar_heights(shared_maps: Path) -> None:
     random = np.random.default_rng(0)
     places = np.column_stack([random.uniform(7.41, 7.44, 500), random.uniform(43.73, 43.75, 500)])
     one = HeightModel([shared_maps / "dem" / "N43E007.hgt.zip"]).at(places)[0]
@@ -47,7 +47,7 @@ def test_real_hgt_and_its_crop_agree(shared_maps: Path) -> None:
     assert np.abs(one - np.maximum(other, -2.0)).max() < 3.0  # the crop has 0 for negative heights
 
 
-def test_a_void_of_one_tile_has_the_height_of_the_next(tmp_path: Path) -> None:
+def test_a_void_of_one_tile_gets_the_height_of_the_next_tile(tmp_path: Path) -> None:
     def hole(heights: NDArray[Any]) -> None:
         heights[40:60, 50:70] = np.nan
 
@@ -63,7 +63,9 @@ def test_a_void_of_one_tile_has_the_height_of_the_next(tmp_path: Path) -> None:
     assert coverage.filled_places == 1
 
 
-def test_a_void_of_all_tiles_is_filled_from_the_first(tmp_path: Path) -> None:
+def test_a_void_of_all_tiles_is_filled_from_the_surroundings_in_the_first_tile(
+    tmp_path: Path,
+) -> None:
     def hole(heights: NDArray[Any]) -> None:
         heights[40:60, 50:70] = np.nan
 
@@ -88,7 +90,7 @@ def test_at_most_half_of_the_roads_may_be_in_voids(tmp_path: Path) -> None:
         model.at(np.array([void, void, known]))
 
 
-def test_a_tile_covers_half_a_cell_around_its_outer_places(tmp_path: Path) -> None:
+def test_a_tile_covers_half_a_cell_beyond_its_outer_points(tmp_path: Path) -> None:
     model = HeightModel([write_geotiff(tmp_path / "g.tif", plane(0.0, 0.0, 500.0), step=0.0002)])
     west = 10.995
     heights, _ = model.at(np.array([[west - 0.00009, 48.0]]))
@@ -97,7 +99,7 @@ def test_a_tile_covers_half_a_cell_around_its_outer_places(tmp_path: Path) -> No
         model.at(np.array([[west - 0.00011, 48.0]]))
 
 
-def test_tiles_continue_each_other(tmp_path: Path) -> None:
+def test_adjacent_tiles_form_one_model(tmp_path: Path) -> None:
     west = write_geotiff(tmp_path / "w.tif", GROUND, (10.995, 47.995, 11.006, 48.015))
     east = write_geotiff(tmp_path / "e.tif", GROUND, (11.006, 47.995, 11.02, 48.015))
     assert np.abs(HeightModel([west, east]).at(PLACES)[0] - GROUND(*PLACES.T)).max() < 0.05
@@ -105,13 +107,13 @@ def test_tiles_continue_each_other(tmp_path: Path) -> None:
         HeightModel([west]).at(PLACES)
 
 
-def test_swapped_coordinates_are_named(tmp_path: Path) -> None:
+def test_the_error_for_swapped_coordinates_says_that_they_look_swapped(tmp_path: Path) -> None:
     model = HeightModel([write_geotiff(tmp_path / "g.tif", GROUND)])
     with pytest.raises(MapError, match="look swapped"):
         model.at(PLACES[:, ::-1])
 
 
-def test_voids_everywhere_are_refused(tmp_path: Path) -> None:
+def test_a_tile_without_any_height_is_refused(tmp_path: Path) -> None:
     path = write_geotiff(tmp_path / "g.tif", GROUND, holes=lambda heights: heights.fill(np.nan))
     with pytest.raises(MapError, match="100% of the roads are in voids"):
         HeightModel([path]).at(PLACES)
@@ -126,14 +128,14 @@ def test_voids_everywhere_are_refused(tmp_path: Path) -> None:
         ((1024, 0, 1, 1, 3072, 0, 1, 32767), "no proj"),
     ],
 )
-def test_models_without_a_frame_are_refused(
+def test_models_without_a_projection_in_metres_or_degrees_are_refused(
     tmp_path: Path, keys: tuple[int, ...], message: str
 ) -> None:
     with pytest.raises(MapError, match=message):
         read_tile(write_geotiff(tmp_path / "g.tif", GROUND, keys=keys))
 
 
-def test_files_cut_short_and_of_other_kinds_are_refused(tmp_path: Path) -> None:
+def test_truncated_files_and_other_file_formats_are_refused(tmp_path: Path) -> None:
     whole = write_geotiff(tmp_path / "g.tif", GROUND)
     content = whole.read_bytes()
     for size in (8, 200, len(content) // 2, len(content) - 10):

@@ -1,4 +1,4 @@
-"""Scene files of ScenarioNet and GPUDrive: what is read, what is counted, what is refused."""
+"""Reading scene files of ScenarioNet and GPUDrive: content, ignored parts and refusals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_both_formats_give_the_same_tracks(tmp_path: Path) -> None:
     assert one.notes == ("1 road lines ignored",)
 
 
-def test_headings_in_degrees_are_recognized_by_the_motion(tmp_path: Path) -> None:
+def test_headings_in_degrees_are_recognized_from_the_motion_of_vehicles(tmp_path: Path) -> None:
     radians = read_scene(write_json_scene(tmp_path))
     degrees = read_scene(write_json_scene(tmp_path, gpudrive(in_degrees=True)))
     for mine, theirs in zip(radians.tracks, degrees.tracks, strict=True):
@@ -63,7 +63,7 @@ def test_every_protocol_of_pickles_is_read(protocol: int) -> None:
 
 
 class Hostile:
-    """Runs a command where it is unpickled."""
+    """An object that calls a function when it is unpickled."""
 
     def __init__(self, *call: Any) -> None:
         self.call = call
@@ -86,7 +86,7 @@ class Hostile:
         Hostile(bytearray, 1 << 60),
     ],
 )
-def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None:
+def test_pickles_that_name_functions_or_classes_are_refused(bad: object, tmp_path: Path) -> None:
     path = write_pickle(tmp_path, {"id": bad})
     with pytest.raises(MapError, match=r"made\.pkl: the pickle contains .*only builtins"):
         read_scene(path)
@@ -96,16 +96,16 @@ def test_pickles_that_name_code_are_refused(bad: object, tmp_path: Path) -> None
 @pytest.mark.parametrize(
     "content",
     [
-        # a function of the reader with other defaults, which later scenes would get
+        # changes the defaults of a function that the reader uses
         b"\x80\x02c_codecs\nencode\nN}X\x0c\x00\x00\x00__defaults__)s\x86b.",
         b"\x80\x02c_codecs\nencode\n}X\x01\x00\x00\x00aNsb.",
-        b"\x80\x02Nr\xff\xff\xff\x7f.",  # a place in the memo that needs 32 GB
+        b"\x80\x02Nr\xff\xff\xff\x7f.",  # an index of the memo that needs 32 GB
         b"\x80\x05\x96\x00\x00\x00\x00\x01\x00\x00\x00.",  # a bytearray of 4 GB
-        b"\x80\x05\x97.",  # a buffer outside of the pickle
+        b"\x80\x05\x97.",  # refers to a buffer outside of the pickle
         b"Pa\n.",
     ],
 )
-def test_pickles_that_reserve_memory_or_call_back_are_refused(content: bytes) -> None:
+def test_pickles_that_reserve_memory_or_change_functions_are_refused(content: bytes) -> None:
     with pytest.raises(MapError, match=r"only builtins|broken pickle"):
         unpickle(content)
 
@@ -118,11 +118,13 @@ def test_arrays_of_any_byte_order_are_read(code: str) -> None:
         assert unpickle(pickle.dumps(numbers[1], protocol)) == numbers[1]
 
 
-def test_a_state_cannot_make_objects_of_the_bytes_of_an_array() -> None:
+def test_the_state_of_a_dtype_cannot_turn_bytes_into_objects() -> None:
     content = pickle.dumps(np.array([b"abcdefgh"]), 2)
-    state = b"NNNK\x08K\x01K\x00t"  # subtype, names, fields, size, alignment and flags
+    state = b"NNNK\x08K\x01K\x00t"  # subtype, names, fields, size, alignment, flags of the dtype
     assert content.count(state) == 1
-    found = unpickle(content.replace(state, b"NNNK\x08K\x01K\x3ft"))  # flags: contains objects
+    found = unpickle(
+        content.replace(state, b"NNNK\x08K\x01K\x3ft")
+    )  # these flags say that the array contains objects
     assert not found.dtype.hasobject
     assert found.tolist() == [b"abcdefgh"]
     named = content.replace(state, b"N)}K\x08K\x01K\x00t")
@@ -130,8 +132,8 @@ def test_a_state_cannot_make_objects_of_the_bytes_of_an_array() -> None:
         unpickle(named)
 
 
-def test_items_of_no_size_are_refused() -> None:
-    """Any number of such items needs no memory in the file."""
+def test_arrays_with_items_of_size_0_are_refused() -> None:
+    """A small file could claim any number of such items."""
     with pytest.raises(MapError, match="an array of dtype 'S0'"):
         unpickle(pickle.dumps(Hostile(np.dtype, "S0")))
 
@@ -213,7 +215,7 @@ WRONG_SCENARIOS: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG_SCENARIOS)
-def test_invalid_scenarios_are_refused_with_a_cure(name: str, tmp_path: Path) -> None:
+def test_invalid_scenarios_are_refused_with_place_and_cause(name: str, tmp_path: Path) -> None:
     change, message = WRONG_SCENARIOS[name]
     scene = scenario()
     change(scene)
@@ -238,7 +240,7 @@ WRONG_DOCUMENTS: dict[str, tuple[Change, str]] = {
 
 
 @pytest.mark.parametrize("name", WRONG_DOCUMENTS)
-def test_invalid_documents_are_refused_with_a_cure(name: str, tmp_path: Path) -> None:
+def test_invalid_json_scenes_are_refused_with_place_and_cause(name: str, tmp_path: Path) -> None:
     change, message = WRONG_DOCUMENTS[name]
     scene = gpudrive()
     change(scene)
@@ -255,7 +257,7 @@ def test_broken_json_is_refused(text: str, tmp_path: Path) -> None:
         read_scene(path)
 
 
-def test_jumps_cut_a_track_and_overlaps_are_counted(tmp_path: Path) -> None:
+def test_tracks_are_cut_at_jumps_and_overlaps_are_counted(tmp_path: Path) -> None:
     scene = scenario()
     scene["tracks"]["8"]["state"]["position"][50:, 0] -= 60.0
     scene["tracks"]["twin"] = scene["tracks"]["parked"]
@@ -268,7 +270,7 @@ def test_jumps_cut_a_track_and_overlaps_are_counted(tmp_path: Path) -> None:
     assert second.times.tolist() == list(range(50, TIMES))
 
 
-def test_parts_of_tracks_get_names_of_their_own(tmp_path: Path) -> None:
+def test_parts_of_a_cut_track_get_unused_names(tmp_path: Path) -> None:
     scene = scenario()
     scene["tracks"]["8"]["state"]["position"][50:, 0] -= 60.0
     scene["tracks"]["8#2"] = scene["tracks"]["parked"]
@@ -281,9 +283,12 @@ def test_parts_of_tracks_get_names_of_their_own(tmp_path: Path) -> None:
     [
         ({"speed_limit_kmh": 72.0, "speed_limit_mph": 45.0}, 20.0),
         ({"speed_limit_kmh": 0.0, "speed_limit_mph": 45.0}, 20.1168),
-        ({"speed_limit_mps": 11.2}, 11.2),  # nuPlan
+        ({"speed_limit_mps": 11.2}, 11.2),  # as in nuPlan
         ({"speed_limit_mps": None}, None),
-        ({"speed_limit_kmh": 1000.0}, None),  # MetaDrive's default
+        (
+            {"speed_limit_kmh": 1000.0},
+            None,
+        ),  # the default of MetaDrive means that the limit is unknown
         ({}, None),
     ],
 )
@@ -299,7 +304,7 @@ def test_speed_limits_are_read_in_all_units(
 
 
 def test_headings_in_place_of_heights_are_recognized(tmp_path: Path) -> None:
-    """nuScenes gives the poses of lanes: x, y and the heading."""
+    """Lanes of nuScenes have points (x, y, heading) instead of (x, y, z)."""
     scene, slope = scenario(), scenario()
     for number, changed in enumerate((scene, slope)):
         for feature in changed["map_features"].values():
@@ -317,7 +322,7 @@ def test_headings_in_place_of_heights_are_recognized(tmp_path: Path) -> None:
 
 
 def test_sidewalks_are_ignored_and_counted(tmp_path: Path) -> None:
-    """nuPlan and nuScenes state sidewalks as areas, with a type of road edges."""
+    """In scenes of nuPlan and nuScenes, sidewalks are areas with a type of road edges."""
     scene = scenario()
     scene["map_features"]["walk"] = {"type": "ROAD_EDGE_SIDEWALK", "polygon": np.zeros((4, 2))}
     found = read_scene(write_pickle(tmp_path, scene))
@@ -325,7 +330,7 @@ def test_sidewalks_are_ignored_and_counted(tmp_path: Path) -> None:
     assert len(found.road_edges) == 4
 
 
-def test_what_is_ignored_is_counted(tmp_path: Path) -> None:
+def test_ignored_tracks_and_map_features_are_counted(tmp_path: Path) -> None:
     scene = scenario()
     scene["tracks"]["cone"] = {**scene["tracks"]["parked"], "type": "TRAFFIC_CONE"}
     scene["map_features"]["bikes"] = {**scene["map_features"]["inE"], "type": "LANE_BIKE_LANE"}

@@ -1,4 +1,4 @@
-"""Networks of logged scenes: connections, rights of way, lanes side by side."""
+"""Networks of logged scenes: connections, rights of way and parallel lanes."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def network_of(scene: LoggedScene, folder: Path) -> RoadNetwork:
 
 
 def scene_of(*lines: list[tuple[float, float]]) -> LoggedScene:
-    """Return a scene with lanes that state no exits."""
+    """Return a scene with lanes along these lines, without stated exits."""
     lanes = [
         SceneLane(str(k), np.array([(x, y, 0.0) for x, y in line]), False, None, None, None)
         for k, line in enumerate(lines)
@@ -36,7 +36,7 @@ def drawn(*lines: list[tuple[float, float]], folder: Path) -> RoadNetwork:
     return network_of(scene_of(*lines), folder)
 
 
-def test_stated_and_inferred_exits_give_the_same_crossing(tmp_path: Path) -> None:
+def test_stated_and_inferred_exits_of_lanes_give_the_same_crossing(tmp_path: Path) -> None:
     one = network_of(read_scene(write_pickle(tmp_path)), tmp_path)
     other = network_of(read_scene(write_json_scene(tmp_path)), tmp_path)
     for network in (one, other):
@@ -49,7 +49,7 @@ def test_stated_and_inferred_exits_give_the_same_crossing(tmp_path: Path) -> Non
     assert (one.conflicts == other.conflicts).all()
 
 
-def test_lanes_keep_their_centre_lines(tmp_path: Path) -> None:
+def test_lanes_begin_and_end_where_their_centre_lines_do(tmp_path: Path) -> None:
     network = network_of(read_scene(write_pickle(tmp_path)), tmp_path)
     lines = lane_lines()
     ends = {tuple(np.round(line[[0, -1], :2].ravel(), 2)) for line in lines.values()}
@@ -85,7 +85,7 @@ def test_parallel_lanes_become_one_edge_from_the_right(tmp_path: Path) -> None:
     assert network.lane_polyline(int(lanes["left"][pair[0]]))[0, 1] == 3.5
 
 
-def test_lanes_that_join_and_leave_are_paths_over_junctions(tmp_path: Path) -> None:
+def test_lanes_that_diverge_become_paths_over_junctions(tmp_path: Path) -> None:
     before = [(-100.0, 0.0), (0.0, 0.0)]
     straight, turning = [(0.0, 0.0), (20.0, 0.0)], [(0.0, 0.0), (10.0, -1.0), (20.0, -6.0)]
     after, away = [(20.0, 0.0), (100.0, 0.0)], [(20.0, -6.0), (100.0, -46.0)]
@@ -95,7 +95,7 @@ def test_lanes_that_join_and_leave_are_paths_over_junctions(tmp_path: Path) -> N
     assert (network.links["first_internal"] >= 0).all()
 
 
-def test_a_bridge_is_no_crossing(tmp_path: Path) -> None:
+def test_lanes_on_different_levels_do_not_cross(tmp_path: Path) -> None:
     def cross(z: float) -> LoggedScene:
         level = [(-50.0, 0.0, 0.0), (-5.0, 0.0, 0.0), (5.0, 0.0, 0.0), (50.0, 0.0, 0.0)]
         high = [(0.0, -50.0, z), (0.0, -5.0, z), (0.0, 5.0, z), (0.0, 50.0, z)]
@@ -110,7 +110,7 @@ def test_a_bridge_is_no_crossing(tmp_path: Path) -> None:
     assert network_of(cross(6.0), tmp_path).lanes["internal"].sum() == 0
 
 
-def test_a_scene_is_built_and_kept_like_any_map(tmp_path: Path) -> None:
+def test_a_scene_is_built_and_cached_like_other_maps(tmp_path: Path) -> None:
     source = write_json_scene(tmp_path)
     built = build_network(source, tmp_path / "out.net.xml")
     assert built.kind == "scene"
@@ -124,7 +124,7 @@ def test_a_scene_is_built_and_kept_like_any_map(tmp_path: Path) -> None:
     assert not (tmp_path / "cut.net.xml").exists()
 
 
-def test_lanes_of_absurd_length_are_refused_before_they_need_memory(tmp_path: Path) -> None:
+def test_lanes_longer_than_the_limit_are_refused(tmp_path: Path) -> None:
     long = [(-1e7, 0.0), (1e7, 0.0)]
     with pytest.raises(MapError, match="longer than 1e"):
         drawn(long, [(0.0, -1e7), (0.0, 1e7)], folder=tmp_path)

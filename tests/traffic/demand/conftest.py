@@ -12,7 +12,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 from cavmarl.traffic.demand import DemandFile, read_demand
 
-# Nodes A, B, C from west to east, two lanes per direction, X north of B: AB BC CB BA BX XB.
+# Nodes A, B and C lie from west to east, node X lies north of B. BX has one lane, other edges two.
 NODES = """<nodes><node id="A" x="0" y="0"/><node id="B" x="200" y="0"/>
 <node id="C" x="400" y="0"/><node id="X" x="200" y="200"/></nodes>"""
 EDGES = (
@@ -50,7 +50,7 @@ Reader = Callable[..., DemandFile]
 
 @pytest.fixture
 def demand(town: RoadNetwork, tmp_path: Path) -> Reader:
-    """Return a function that reads the content of a <routes>: `demand("<vehicle …/>")`."""
+    """Return a function that reads demand from the elements inside <routes>, given as text."""
 
     def read(body: str, *, root: str = "routes", **options: object) -> DemandFile:
         path = tmp_path / "x.rou.xml"

@@ -22,7 +22,7 @@ VEHICLE = re.compile(
 )
 Way = tuple[float, str]
 
-# Attributes of types by id; SUMO's defaults apply to all others.
+# Attributes that each type sets; SUMO's defaults apply to its other attributes.
 TYPES = {f"class_{name}": {"vClass": name} for name in CLASS_DEFAULTS} | {
     "factor": {"speedFactor": "1.2"},
     "factor_dev": {"speedFactor": "normc(1,0.1,0.2,2)", "speedDev": "0.3"},
@@ -36,7 +36,7 @@ TYPES = {f"class_{name}": {"vClass": name} for name in CLASS_DEFAULTS} | {
 
 
 def sumo(folder: Path, *arguments: str | Path) -> dict[str, Way]:
-    """Return departures and edges by vehicle of a run of SUMO."""
+    """Run SUMO and return the departure time and the edges of each vehicle."""
     command = [
         sumo_binary("sumo"),
         *arguments,
@@ -123,7 +123,7 @@ def test_flows_depart_at_sumos_times(
 def test_bologna_is_read_as_sumo_reads_it(shared_maps: Path, tmp_path: Path) -> None:
     folder = tmp_path / "acosta"
     folder.mkdir()
-    # Detectors write files beside their own files.
+    # Copy the folder, because detectors write their output into the folder of their file.
     for path in (shared_maps / "net/bologna_acosta").iterdir():
         (folder / path.name).write_bytes(path.read_bytes())
     network = network_of(folder / "acosta_buslanes.net.xml")

@@ -120,7 +120,9 @@ def test_bad_routes_can_be_skipped_and_are_counted(demand: Reader) -> None:
     assert tally.first.endswith("line 2")
 
 
-def test_allowed_classes_and_class_ignoring_drive_everywhere(demand: Reader) -> None:
+def test_allowed_classes_and_vehicles_that_ignore_permissions_may_use_a_restricted_edge(
+    demand: Reader,
+) -> None:
     types = '<vType id="i" vClass="ignoring"/><vType id="b" vClass="bus"/>'
     cars = "".join(
         f'<vehicle id="{t}" type="{t}" depart="0"><route edges="AB BX"/></vehicle>' for t in "ib"
@@ -156,12 +158,12 @@ def test_stops_in_the_wrong_order_are_refused(demand: Reader) -> None:
     f'{ROUTE}<flow id="f" route="r" begin="0" end="10" number="1000000000000"/>',
     f'{ROUTE}<flow id="f" route="r" begin="0" end="10000" period="exp(1000)"/>',
 ])  # fmt: skip
-def test_a_million_vehicles_are_refused_before_they_are_made(demand: Reader, body: str) -> None:
+def test_a_flow_of_over_a_million_vehicles_is_refused(demand: Reader, body: str) -> None:
     with pytest.raises(CapacityError, match=r'line 2: <flow id="f"> makes more than 1000000'):
         demand(body, max_departures=1_000_000)
 
 
-def test_endless_repetition_is_refused(demand: Reader) -> None:
+def test_a_route_with_too_many_repetitions_is_refused(demand: Reader) -> None:
     body = '<vehicle id="a" depart="0"><route edges="AB BC" repeat="99999999999"/></vehicle>'
     refused(demand, body, "repeat", error=CapacityError)
 
@@ -200,7 +202,9 @@ def test_missing_files_and_files_that_include_themselves_are_refused(
         read_demand([path], town)
 
 
-def test_includes_gzip_and_byte_order_marks_are_read(town: RoadNetwork, tmp_path: Path) -> None:
+def test_included_gzip_files_and_byte_order_marks_are_read(
+    town: RoadNetwork, tmp_path: Path
+) -> None:
     (tmp_path / "b.rou.xml.gz").write_bytes(gzip.compress(f"<routes>{CAR}</routes>".encode()))
     path = tmp_path / "a.rou.xml"
     head = '\ufeff<?xml version="1.0" encoding="UTF-8"?>'
@@ -233,7 +237,7 @@ def test_elements_other_than_demand_are_counted(demand: Reader) -> None:
     assert "<person> is not read (first: " in file.to_report()
 
 
-def test_elements_of_a_definition_are_limited_at_any_depth(demand: Reader) -> None:
+def test_the_number_of_nested_elements_of_a_definition_is_limited(demand: Reader) -> None:
     route = f'<route edges="AB BC">{"<param/>" * 999}</route>'
     body = (
         f'<vehicle id="a" depart="0"><routeDistribution>{route * 101}</routeDistribution></vehicle>'

@@ -1,4 +1,4 @@
-"""Random draws of a demand file: functions of the key, with the stated probabilities."""
+"""Random draws of a demand file depend only on the key and have the given probabilities."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.traffic.demand.conftest import Reader
 KEY = int(world_key(7, 0, 0))
 
 
-def test_draws_depend_on_the_key_and_on_nothing_else(demand: Reader) -> None:
+def test_draws_depend_only_on_the_key(demand: Reader) -> None:
     flows = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
     flows += '<flow id="g" end="900" probability="0.3"><route edges="AB BC"/></flow>'
     file, again = demand(flows), demand(flows)
@@ -56,7 +56,7 @@ def test_the_hash_covers_fields_and_not_padding(demand: Reader) -> None:
     assert replace(file, routes=other).content_hash != file.content_hash
 
 
-def test_a_later_element_changes_no_draw(demand: Reader) -> None:
+def test_an_added_flow_does_not_change_the_draws_of_other_flows(demand: Reader) -> None:
     flow = '<flow id="f" end="900" period="exp(0.5)"><route edges="AB BC"/></flow>'
     alone = demand(flow).draw(KEY)
     beside = demand(flow + flow.replace('"f"', '"g"')).draw(KEY)
@@ -64,7 +64,7 @@ def test_a_later_element_changes_no_draw(demand: Reader) -> None:
 
 
 @pytest.mark.parametrize("rate", ['period="exp(0.5)"', 'probability="0.5"', 'vehsPerHour="1800"'])
-def test_flows_have_the_rate_that_they_state(demand: Reader, rate: str) -> None:
+def test_flows_have_their_given_rate(demand: Reader, rate: str) -> None:
     file = demand(f'<flow id="f" end="10000" {rate}><route edges="AB BC"/></flow>')
     orders = file.draw(KEY)
     assert len(orders) == pytest.approx(5000, abs=4 * 5000**0.5)
@@ -102,7 +102,7 @@ def test_distributions_are_drawn_with_their_weights(demand: Reader) -> None:
     np.testing.assert_allclose(share["route"], [0.2, 0.8], atol=0.02)
 
 
-def test_choices_stay_in_their_list() -> None:
+def test_a_draw_near_one_picks_an_option_of_its_own_list() -> None:
     choices = Choices([Options((k,), (1.0,)) for k in range(5000)])
     most = np.nextafter(1.0, 0.0)
     picked = choices.pick(np.arange(5000, dtype=np.int32), np.full(5000, most))
@@ -120,7 +120,7 @@ def test_equal_routes_are_stored_once_and_orders_are_sorted(demand: Reader) -> N
     assert sum(tally.count for tally in file.report.tolerated.values()) == 2
 
 
-def test_trips_name_the_edges_to_pass(demand: Reader) -> None:
+def test_the_route_of_a_trip_lists_its_start_its_via_edges_and_its_goal(demand: Reader) -> None:
     file = demand('<trip id="t" depart="0" from="AB" via="BC" to="CB"/>')
     (order,) = file.draw(0)
     route = file.routes[order["route"]]
@@ -184,7 +184,7 @@ def test_reroute_chances_are_drawn(demand: Reader) -> None:
      ('<default.departspeed value="3.5"/>', "", LANE_BEST, (SPEED_GIVEN, 3.5)),
      ('<default.departspeed value="max"/>', 'departSpeed="2"', LANE_BEST, (SPEED_GIVEN, 2.0))],
 )  # fmt: skip
-def test_default_lanes_and_speeds_of_departures_come_from_sumo_or_the_configuration(
+def test_default_departure_lanes_and_speeds_come_from_sumo_or_the_configuration(
     town: RoadNetwork, tmp_path: Path, options: str, own: str, lane: int, speed: tuple[int, float]
 ) -> None:
     car = f'<vehicle id="a" depart="0" {own}><route edges="AB"/></vehicle>'
@@ -197,9 +197,7 @@ def test_default_lanes_and_speeds_of_departures_come_from_sumo_or_the_configurat
     assert (element["depart_speed_code"], element["depart_speed"]) == speed
 
 
-def test_an_invalid_departure_speed_is_an_error_of_the_configuration(
-    town: RoadNetwork, tmp_path: Path
-) -> None:
+def test_an_invalid_default_departure_speed_is_refused(town: RoadNetwork, tmp_path: Path) -> None:
     path = tmp_path / "run.sumocfg"
     text = '<configuration>\n<default.departspeed value="fast"/></configuration>'
     path.write_text(text, encoding="utf-8")
@@ -207,7 +205,7 @@ def test_an_invalid_departure_speed_is_an_error_of_the_configuration(
         read_demand([path], town)
 
 
-def test_a_trip_of_od2trips_goes_from_edge_to_edge(demand: Reader) -> None:
+def test_a_trip_of_od2trips_uses_its_edges_and_ignores_its_zones(demand: Reader) -> None:
     plain = '<trip id="v0" depart="0" from="AB" to="BC" departLane="free" departSpeed="max"'
     file = demand(f'{plain} fromTaz="1" toTaz="2" fromJunction="x"/>')
     assert file.draw(0).tobytes() == demand(f"{plain}/>").draw(0).tobytes()
@@ -228,7 +226,7 @@ STOP = '<stop lane="AB_1" endPos="70" duration="5"/>'
         ("stop", STOP, POS_GIVEN, 70.0),
     ],
 )
-def test_words_for_the_position_of_departures_are_sumos(
+def test_departure_positions_follow_sumos_rules(
     demand: Reader, word: str, stop: str, code: int, position: float
 ) -> None:
     """SUMO 1.28 inserts these vehicles with their fronts at 70 m or at 5.1 m."""
@@ -251,7 +249,7 @@ def test_a_vehicle_departs_at_the_stop_of_its_route(demand: Reader) -> None:
 
 
 @pytest.mark.parametrize("word", ["random", "center", "20"])
-def test_positions_of_arrivals_are_counted(demand: Reader, word: str) -> None:
+def test_arrival_positions_without_effect_are_counted(demand: Reader, word: str) -> None:
     file = demand(
         f'<vehicle id="a" depart="0" arrivalPos="{word}" arrivalLane="current">'
         '<route edges="AB"/></vehicle>'

@@ -1,4 +1,4 @@
-"""Any content of a file is read, or refused with an error of cavmarl."""
+"""A demand file with any content is read or is refused with an error of cavmarl."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def test_files_with_inserted_bytes_are_read_or_refused(
     check(town, tmp_path, whole[:at] + content + whole[at:])
 
 
-def test_the_whole_file_is_read(town: RoadNetwork, tmp_path: Path) -> None:
+def test_the_unchanged_file_is_read(town: RoadNetwork, tmp_path: Path) -> None:
     path = tmp_path / "x.rou.xml"
     path.write_text(WHOLE, encoding="utf-8")
     assert len(read_demand([path], town).elements) == 4

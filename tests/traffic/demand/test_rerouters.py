@@ -1,4 +1,4 @@
-"""Reading <rerouter> and the rerouting device: used, refused and counted parts."""
+"""Reading <rerouter> and the rerouting device: parts are used, refused, or ignored and counted."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def rerouter(inside: str, attrs: str = 'edges="AB"', span: str = 'begin="10" end
     return f'{CAR}<rerouter id="r" {attrs}><interval {span}>{inside}</interval></rerouter>'
 
 
-def test_rules_have_an_edge_a_time_and_vehicles(demand: Reader) -> None:
+def test_rules_of_rerouters_have_an_edge_a_time_and_vehicles(demand: Reader) -> None:
     file = demand(
         '<vType id="x"/><vType id="y"/><route id="q" edges="XB BC"/>'
         + CAR
@@ -65,7 +65,7 @@ def test_rules_have_an_edge_a_time_and_vehicles(demand: Reader) -> None:
         ('disallow="all"', (1 << 32) - 1),
     ],
 )
-def test_closings_are_for_classes(demand: Reader, attrs: str, classes: int) -> None:
+def test_a_closing_applies_to_vehicle_classes(demand: Reader, attrs: str, classes: int) -> None:
     file = demand(rerouter(f'<closingReroute id="BC" {attrs}/>'))
     assert file.rerouters.closings["classes"].tolist() == [classes]
 
@@ -139,7 +139,7 @@ def test_rerouters_are_part_of_the_content_hash(demand: Reader) -> None:
     assert len(hashes) == 5
 
 
-def equipped(file: DemandFile) -> list[tuple[bool, int]]:
+def devices_of(file: DemandFile) -> list[tuple[bool, int]]:
     orders = file.draw(KEY)
     return list(zip(orders["reroute"].tolist(), orders["reroute_period_ms"].tolist(), strict=True))
 
@@ -171,7 +171,7 @@ def test_settings_of_a_vehicle_override_those_of_its_type(
         f'<vType id="t">{of_type}</vType>'
         f'<vehicle id="a" type="t" depart="0">{route}{of_vehicle}</vehicle>'
     )
-    assert equipped(file) == [found]
+    assert devices_of(file) == [found]
     assert file.may_look or not found[0]
 
 
@@ -195,7 +195,7 @@ def test_invalid_devices_are_refused(demand: Reader, said: str, words: str, wher
 
 
 class Config:
-    """A `.sumocfg` with options of the device."""
+    """Writer and reader of a `.sumocfg` with options of the rerouting device."""
 
     def __init__(self, folder: Path, network: RoadNetwork) -> None:
         self._folder, self._network = folder, network
@@ -227,7 +227,7 @@ def test_a_configuration_applies_to_all_vehicles(config: Config) -> None:
         probability="1", period="60", adaptation_steps="18", adaptation_interval="10"
     )
     assert file.device == DeviceOptions(1.0, 60_000, 18, 10_000)
-    assert equipped(file) == [(True, 60_000)]
+    assert devices_of(file) == [(True, 60_000)]
     assert file.may_look
     assert config.read(adaptation_weight="0").device == DeviceOptions()
 

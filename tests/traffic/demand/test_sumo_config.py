@@ -35,7 +35,7 @@ Read = Callable[..., DemandFile]
 
 @pytest.fixture
 def read(town_file: Path, town: RoadNetwork, tmp_path: Path) -> Read:
-    """Read a configuration with options, for a file of demand on the town."""
+    """Return a function that reads a configuration with the given options and demand."""
     (tmp_path / "town.net.xml").write_bytes(town_file.read_bytes())
 
     def configured(options: str, demand: str = CARS, **keys: object) -> DemandFile:
@@ -73,7 +73,7 @@ def test_a_scale_multiplies_departures_as_in_sumo(
     ('probability="0.5"', "2", 900, 1100), ('probability="0.5"', "1.5", 675, 825),
     ('period="exp(0.5)"', "2", 900, 1100), ('period="exp(0.5)"', "0.5", 190, 310),
 ])  # fmt: skip
-def test_random_flows_are_multiplied(
+def test_a_scale_multiplies_random_flows(
     read: Read, chance: str, scale: str, low: int, high: int
 ) -> None:
     flow = FLOW.replace('number="7"', chance).replace('end="60"', 'end="1000"')
@@ -82,13 +82,13 @@ def test_random_flows_are_multiplied(
     assert np.unique(orders["number"]).tolist() == list(range(len(orders)))
 
 
-def test_copies_of_a_vehicle_are_drawn_on_their_own(read: Read) -> None:
+def test_copies_of_a_vehicle_have_different_numbers(read: Read) -> None:
     orders = read('<scale value="100"/>', '<vType id="t" speedDev="0.1"/>' + FLOW).draw(3)
     assert len(orders) == 700
     assert np.unique(orders["number"]).size == 700
 
 
-def test_a_scale_belongs_to_the_hash_and_counts_as_departures(read: Read) -> None:
+def test_a_scale_changes_the_hash_and_the_number_of_departures(read: Read) -> None:
     plain = read("").content_hash
     assert read('<scale value="1"/>').content_hash == plain
     assert read('<scale value="2"/>').content_hash != plain
@@ -133,7 +133,7 @@ def test_bad_routes_are_left_out_if_the_configuration_ignores_them(read: Read) -
         ('<max-depart-delay value="10"/>', "option max-depart-delay = 10 is not modelled"),
     ],
 )
-def test_options_that_change_traffic_and_are_not_obeyed_are_named(
+def test_ignored_options_that_change_traffic_are_reported(
     read: Read, option: str, words: str
 ) -> None:
     ((what, tally),) = read(option).report.tolerated.items()
@@ -164,7 +164,7 @@ def test_two_configurations_are_refused(read: Read, town: RoadNetwork, tmp_path:
 LATE = '<flow id="f" begin="25200" end="25260" number="6" from="AB" to="BC"/>'
 
 
-def test_a_demand_of_later_begins_with_its_first_departure(read: Read) -> None:
+def test_a_demand_without_early_departures_begins_with_its_first_departure(read: Read) -> None:
     file = read("", LATE).begun(60.0)
     assert (file.begin_ms, len(file.draw(0, 25260.0))) == (25_200_000, 6)
     ((what, tally),) = file.report.tolerated.items()
@@ -197,7 +197,7 @@ def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
         ('<begin value="25190"/>', 25_190.0, None),
     ],
 )
-def test_sumo_also_begins_with_the_first_departure(
+def test_a_coupled_sumo_begins_with_the_first_departure(
     read: Read, tmp_path: Path, option: str, begin_s: float, words: str | None
 ) -> None:
     read(option, LATE)

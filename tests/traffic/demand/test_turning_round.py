@@ -54,9 +54,9 @@ def test_a_trip_turns_round_if_no_other_movement_exists(net: Path) -> None:
         env.step(env.suggest_actions())
         vehicles = env.simulation.vehicles()
         sides += np.sign(vehicles["y"][vehicles["agent"] < 0]).tolist()
-    assert sides == sorted(sides), "south of the middle, then back north of it"
+    assert sides == sorted(sides), "the vehicle did not drive on the south side first, then north"
     assert {-1.0, 1.0} <= set(sides)
-    assert (vehicles["agent"] >= 0).all(), "it has arrived"
+    assert (vehicles["agent"] >= 0).all(), "the vehicle has not arrived"
     assert env.traffic_stats()["contacts"] == env.traffic_stats()["removed"] == 0
 
 
