@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -95,7 +98,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
             tell(f"log: {known} events, {log.origin}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")
-        server.run(sockets=[listener])
+        asyncio.run(_run(server, listener))
         if log.failure is not None:
             raise log.failure
         if log.is_broken:
@@ -104,6 +107,14 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
     finally:
         listener.close()
         store.close()
+
+
+async def _run(server: uvicorn.Server, listener: socket.socket) -> None:
+    """Run the server until SIGINT or SIGTERM, after which uvicorn itself would kill the process."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, server.handle_exit, number, None)
+    await server._serve([listener])
 
 
 def follow_store(
