@@ -29,9 +29,7 @@ from cavmarl.service.snapshots import (
 
 SERVICE = "service"
 KEY = "key.added"
-_Batch = tuple[
-    list[LogEvent], dict[str, bytes], set[str], SignedHead | None, SealedSnapshot | None
-]
+_Batch = tuple[list[LogEvent], dict[str, bytes], set[str], SignedHead | None, SealedSnapshot | None]
 
 
 class EventLog:

@@ -123,7 +123,9 @@ def test_a_snapshot_and_later_events_give_the_records_of_a_replay(
         "artefact", "configuration", "identity", "key", "node", "session"
     }  # fmt: skip
     empty = Infrastructure()
-    kept = [one.name for one in fields(empty) if getattr(replayed, one.name) != getattr(empty, one.name)]
+    kept = [
+        one.name for one in fields(empty) if getattr(replayed, one.name) != getattr(empty, one.name)
+    ]
     assert {"nodes", "sessions", "identities", "keys", "configurations", "users"} <= set(kept)
 
 
