@@ -230,23 +230,29 @@ class EventStore:
         Raises:
             ServiceError: the store cannot be written; nothing was changed.
         """
+        with self._writing():
+            if lines:
+                self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
+            for sha256, content in blobs.items():
+                there = select(_BLOBS.c.sha256).where(_BLOBS.c.sha256 == sha256)
+                if self._connection.execute(there).scalar() is None:
+                    row = {"sha256": sha256, "content": content}
+                    self._connection.execute(insert(_BLOBS), row)
+            if head is not None:
+                self._connection.execute(delete(_HEAD))
+                self._connection.execute(insert(_HEAD), head._asdict())
+            if snapshot is not None:
+                self._connection.execute(delete(_SNAPSHOT))
+                self._connection.execute(insert(_SNAPSHOT), snapshot._asdict())
+            if gone:
+                self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Run the code inside in one transaction; raise ServiceError if it cannot be written."""
         try:
             with self._guard, self._begin():
-                if lines:
-                    self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
-                for sha256, content in blobs.items():
-                    there = select(_BLOBS.c.sha256).where(_BLOBS.c.sha256 == sha256)
-                    if self._connection.execute(there).scalar() is None:
-                        row = {"sha256": sha256, "content": content}
-                        self._connection.execute(insert(_BLOBS), row)
-                if head is not None:
-                    self._connection.execute(delete(_HEAD))
-                    self._connection.execute(insert(_HEAD), head._asdict())
-                if snapshot is not None:
-                    self._connection.execute(delete(_SNAPSHOT))
-                    self._connection.execute(insert(_SNAPSHOT), snapshot._asdict())
-                if gone:
-                    self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
+                yield
         except SQLAlchemyError as error:
             raise ServiceError(
                 f"store {self.where}: cannot be written ({getattr(error, 'orig', error)}); nothing "
@@ -306,7 +312,7 @@ class EventStore:
 
     def drop_snapshot(self) -> None:
         """Delete the snapshot."""
-        with self._guard, self._begin():
+        with self._writing():
             self._connection.execute(delete(_SNAPSHOT))
 
     def read_checked(
@@ -456,4 +462,4 @@ def _row(line: LogEvent) -> dict[str, Any]:
 
 def _line(row: Any) -> LogEvent:
     *values, data, private, digest = row
-    return LogEvent(*values, json.loads(data), json.loads(private), digest)
+    return LogEvent._make([*values, json.loads(data), json.loads(private), digest])
