@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import asyncio
 import time
-from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -12,11 +10,9 @@ from typing import Any
 import psutil
 import pytest
 
-from cavmarl.core.errors import ServiceError
 from cavmarl.service import node_host, node_link
 from cavmarl.service.error_names import problem
-from cavmarl.service.node_link import NodeLink
-from cavmarl.service.session_worlds import SessionWorlds
+from tests.support.flaky_node import make_host, run_until
 from tests.support.loopback_service import LoopbackService, loopback_service
 from tests.support.service import Cluster, running_service
 
@@ -30,57 +26,11 @@ def service(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Loopbac
         yield running
 
 
-class FlakyLink(NodeLink):
-    """The link of a node whose requests, or their answers, are lost where a test says so."""
-
-    lost: list[str]  # words of requests that do not reach the service, once each
-    unanswered: list[str]  # words of requests whose answers are lost
-    asked: Counter[str]
-
-    async def ask(self, method: str, path: str, **given: Any) -> Any:
-        word = path.rsplit("/", 1)[-1]
-        self.asked[word] += 1
-        if word in self.lost:
-            self.lost.remove(word)
-            raise ServiceError("the service cannot be reached")
-        answer = await super().ask(method, path, **given)
-        if word in self.unanswered:
-            self.unanswered.remove(word)
-            raise ServiceError("the answer was lost")
-        return answer
-
-
-def make_host(
-    service: LoopbackService, lost: list[str], unanswered: list[str]
-) -> tuple[node_host._Host, FlakyLink]:
-    body = {"name": "a", "address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
-    link = FlakyLink(service.url, service.secrets["node"], body, is_supposed_idle=True)
-    link.lost, link.unanswered, link.asked = lost, unanswered, Counter()
-    return node_host._Host(link, SessionWorlds(4), lambda _: None), link
-
-
 def submit(service: LoopbackService) -> str:
     world = {"environment": "ring", "agents": 1, "background": 1}
     found = service.ask("client", "POST", "/configurations", json=world).json()["hash"]
     answer = service.ask("client", "POST", "/jobs", json={"configuration": found, **JOB})
     return str(answer.json()["id"])
-
-
-async def run_until(host: node_host._Host, is_over: Any) -> None:
-    """Beat until a condition holds; fail if the node ends before."""
-    beating = asyncio.create_task(node_host._beat_until_end(host))
-    until_s = time.monotonic() + 30.0
-    while not is_over():
-        assert time.monotonic() < until_s
-        if beating.done():
-            beating.result()
-            pytest.fail(f"the node has ended: {host.failure}")
-        await asyncio.sleep(0.01)
-    beating.cancel()
-    for job in host.jobs.values():
-        job.cancel()
-    await asyncio.gather(beating, *host.jobs.values(), return_exceptions=True)
-    await host.link.close()
 
 
 def test_a_node_registers_again_as_soon_as_the_service_can_be_reached(
