@@ -139,6 +139,15 @@ def serve(
         float,
         about("Days after which an unused file is deleted.", metavar="DAYS", min=0.0),
     ] = 30.0,
+    snapshot_events: Annotated[
+        int,
+        about(
+            "Events after which a snapshot is written, from which the next start continues; 0: "
+            "none, and delete the last one, so that a start replays and checks all events.",
+            metavar="N",
+            min=0,
+        ),
+    ] = 10_000,
     standby: Annotated[
         bool,
         flag(
@@ -162,7 +171,10 @@ def serve(
     rules = BrokerRules(
         beat_s=beat_s, missed_beats=missed_beats, lease_s=lease_s, load=load, artefacts=quota
     )
-    options = ServerOptions(host, port, store, certificate, key, rules=rules, is_standby=standby)
+    options = ServerOptions(
+        host, port, store, certificate, key,
+        rules=rules, is_standby=standby, snapshot_events=snapshot_events,
+    )  # fmt: skip
     run(options, _print)
 
 

@@ -34,6 +34,7 @@ NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the envir
     "auto_configure": False,
 }
 BODY_S = 10.0  # time limit for receiving a body
+CHECK_S = 0.05  # a thread checks older events for this time, and then pauses for as long
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -47,11 +48,15 @@ def make_app(service: Service, sweep_s: float = 0.5) -> ASGIApp:
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        is_over = asyncio.Event()
         sweeper = asyncio.create_task(_sweep(service, sweep_s))
+        checker = asyncio.create_task(_check_older(service, is_over))
         yield
         sweeper.cancel()
         with suppress(asyncio.CancelledError):
             await sweeper
+        is_over.set()
+        await checker
 
     app = FastAPI(
         title="cavmarl coordination service",
@@ -90,6 +95,18 @@ async def _sweep(service: Service, every_s: float) -> None:
             log.is_broken = True
             service.on_broken()
             return
+
+
+async def _check_older(service: Service, is_over: asyncio.Event) -> None:
+    """Check the events before the snapshot, in at most half of the time; end the service if bad."""
+    log = service.broker.log
+    try:
+        while not is_over.is_set() and not await asyncio.to_thread(log.check_older, CHECK_S):
+            with suppress(TimeoutError):
+                await asyncio.wait_for(is_over.wait(), CHECK_S)
+    except ServiceError as error:
+        log.is_broken, log.failure = True, error
+        service.on_broken()
 
 
 class GuardedRequests:

@@ -11,7 +11,7 @@ import json
 import os
 import threading
 from collections.abc import Collection, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import IO, Any, NamedTuple
 
@@ -39,6 +39,7 @@ from sqlalchemy.exc import ArgumentError, NoSuchModuleError, SQLAlchemyError
 from cavmarl.core.errors import CavmarlError, ServiceError, require
 from cavmarl.core.private_files import check_private
 from cavmarl.service.service_records import LogEvent
+from cavmarl.service.snapshots import SealedSnapshot
 
 SCHEMA = "cavmarl.service/2"
 _LOCK_KEY = 0x6361766D  # key of PostgreSQL's advisory lock
@@ -85,6 +86,16 @@ _HEAD = Table(
     Column("sequence", BigInteger, primary_key=True, autoincrement=False),
     Column("digest", String(64), nullable=False),
     Column("key", String(64), nullable=False),
+    Column("seal", String(64), nullable=False),
+)
+_SNAPSHOT = Table(
+    "snapshot",
+    _METADATA,
+    Column("sequence", BigInteger, primary_key=True, autoincrement=False),
+    Column("digest", String(64), nullable=False),
+    Column("schema", String(128), nullable=False),
+    Column("key", String(64), nullable=False),
+    Column("content", Text, nullable=False),
     Column("seal", String(64), nullable=False),
 )
 
@@ -173,7 +184,7 @@ class EventStore:
         """Return whether a service has prepared the store."""
         try:
             with self._guard, self._begin():
-                return _HEAD.name in inspect(self._connection).get_table_names()
+                return set(_METADATA.tables) <= set(inspect(self._connection).get_table_names())
         except SQLAlchemyError as error:
             raise self._lost(error) from error
 
@@ -210,26 +221,38 @@ class EventStore:
         blobs: dict[str, bytes],
         gone: Collection[str] = (),
         head: SignedHead | None = None,
+        snapshot: SealedSnapshot | None = None,
     ) -> None:
-        """Write lines, content and the head, and delete the content `gone`, in one transaction.
+        """Write all of these, and delete the content `gone`, in one transaction.
+
+        A head or a snapshot replaces the earlier one.
 
         Raises:
             ServiceError: the store cannot be written; nothing was changed.
         """
+        with self._writing():
+            if lines:
+                self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
+            for sha256, content in blobs.items():
+                there = select(_BLOBS.c.sha256).where(_BLOBS.c.sha256 == sha256)
+                if self._connection.execute(there).scalar() is None:
+                    row = {"sha256": sha256, "content": content}
+                    self._connection.execute(insert(_BLOBS), row)
+            if head is not None:
+                self._connection.execute(delete(_HEAD))
+                self._connection.execute(insert(_HEAD), head._asdict())
+            if snapshot is not None:
+                self._connection.execute(delete(_SNAPSHOT))
+                self._connection.execute(insert(_SNAPSHOT), snapshot._asdict())
+            if gone:
+                self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        """Run the code inside in one transaction; raise ServiceError if it cannot be written."""
         try:
             with self._guard, self._begin():
-                if lines:
-                    self._connection.execute(insert(_EVENTS), [_row(line) for line in lines])
-                for sha256, content in blobs.items():
-                    there = select(_BLOBS.c.sha256).where(_BLOBS.c.sha256 == sha256)
-                    if self._connection.execute(there).scalar() is None:
-                        row = {"sha256": sha256, "content": content}
-                        self._connection.execute(insert(_BLOBS), row)
-                if head is not None:
-                    self._connection.execute(delete(_HEAD))
-                    self._connection.execute(insert(_HEAD), head._asdict())
-                if gone:
-                    self._connection.execute(delete(_BLOBS).where(_BLOBS.c.sha256.in_(gone)))
+                yield
         except SQLAlchemyError as error:
             raise ServiceError(
                 f"store {self.where}: cannot be written ({getattr(error, 'orig', error)}); nothing "
@@ -280,18 +303,33 @@ class EventStore:
             row = self._connection.execute(select(_HEAD)).one_or_none()
         return None if row is None else SignedHead(**row._asdict())
 
-    def read_checked(self, after: int = 0, digest: str = "") -> Iterator[LogEvent]:
+    def snapshot(self) -> SealedSnapshot | None:
+        """Return the newest snapshot, which is not checked yet."""
+        query = select(_SNAPSHOT).order_by(_SNAPSHOT.c.sequence.desc()).limit(1)
+        with self._valid("its snapshot"), self._guard, self._begin():
+            row = self._connection.execute(query).one_or_none()
+        return None if row is None else SealedSnapshot(*row)
+
+    def drop_snapshot(self) -> None:
+        """Delete the snapshot."""
+        with self._writing():
+            self._connection.execute(delete(_SNAPSHOT))
+
+    def read_checked(
+        self, after: int = 0, digest: str = "", until: int | None = None
+    ) -> Iterator[LogEvent]:
         """Return lines after checking the chain of their digests.
 
         Args:
             after: number of the line before the first one.
             digest: its digest.
+            until: number of the last line; None: all.
 
         Raises:
             ServiceError: a line was changed, removed or inserted.
         """
         last = digest
-        for count, line in enumerate(self._read_valid(after), start=after + 1):
+        for count, line in enumerate(self.read_valid(after, until=until), start=after + 1):
             if line.sequence != count or line.digest != digest_of(last, line):
                 raise ServiceError(
                     f"store {self.where}: event {line.sequence} does not follow from the "
@@ -300,12 +338,20 @@ class EventStore:
             last = line.digest
             yield line
 
-    def _read_valid(self, after: int) -> Iterator[LogEvent]:
+    def read_valid(self, after: int = 0, **wanted: Any) -> Iterator[LogEvent]:
+        """Like `read`, but raise ServiceError if a line cannot be read."""
+        with self._valid("an event"):
+            yield from self.read(after, **wanted)
+
+    @contextmanager
+    def _valid(self, what: str) -> Iterator[None]:
         try:
-            yield from self.read(after)
+            yield
         except (SQLAlchemyError, TypeError, ValueError) as error:
+            if self._connection.invalidated:
+                raise self._lost(error) from error
             raise ServiceError(
-                f"store {self.where}: an event cannot be read ({error}): the log was modified; "
+                f"store {self.where}: {what} cannot be read ({error}): the log was modified; "
                 "restore an older copy"
             ) from error
 
@@ -415,5 +461,5 @@ def _row(line: LogEvent) -> dict[str, Any]:
 
 
 def _line(row: Any) -> LogEvent:
-    found = row._asdict()
-    return LogEvent(**found | {name: json.loads(found[name]) for name in ("data", "private")})
+    *values, data, private, digest = row
+    return LogEvent._make([*values, json.loads(data), json.loads(private), digest])

@@ -26,7 +26,13 @@ from cavmarl.service.configuration_files import placed_policies
 from cavmarl.service.configurations import world_of
 from cavmarl.service.error_names import without_folders
 from cavmarl.service.node_app import in_turn, make_node_app
-from cavmarl.service.node_link import MOST_MESSAGE, NodeLink, is_final, must_register
+from cavmarl.service.node_link import (
+    MOST_MESSAGE,
+    NodeLink,
+    is_final,
+    must_register,
+    until_answered,
+)
 from cavmarl.service.server import ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
@@ -63,6 +69,8 @@ class _Host:
     worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
+    # job whose outcome the service has → number of the next heartbeat then
+    reported: dict[str, int] = field(default_factory=dict)
     steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # steps of jobs: done, total
     zones: ZoneProcesses = field(default_factory=ZoneProcesses)
     telling: asyncio.Task[None] | None = None
@@ -141,16 +149,20 @@ def _end(host: _Host) -> None:
 async def _beat_until_end(host: _Host) -> None:
     """Send heartbeats until the node is drained and empty, or the service rejects it."""
     link, loop = host.link, asyncio.get_running_loop()
-    pause_s, drained_s = 0.2, float("inf")
+    pause_s, drained_s, is_known = 0.2, float("inf"), True
     while True:
         try:
+            if not is_known:
+                await link.register()
+                is_known = True
             if host.is_ending and not link.is_draining:
                 await link.drain()
+            number = link.beats
             told = await link.beat(host.worlds.counters(), host.steps, host.worlds.is_watched)
             host.worlds.tell_scores(told["scores"])
             pause_s = told["beat_s"]
             host.worlds.keep_only(link.own(told["sessions"]))
-            _start_jobs(host, told["jobs"])
+            _start_jobs(host, told["jobs"], number)
             host.zones.follow(told["zones_of"])
             if host.telling is None or host.telling.done():
                 host.telling = asyncio.create_task(_tell_transfers(host))
@@ -162,7 +174,7 @@ async def _beat_until_end(host: _Host) -> None:
                     return
         except ServiceError as error:
             if must_register(error):
-                await link.register()
+                is_known = False
             elif is_final(error):
                 host.failure = error
                 return
@@ -171,13 +183,18 @@ async def _beat_until_end(host: _Host) -> None:
         await asyncio.sleep(pause_s)
 
 
-def _start_jobs(host: _Host, jobs: list[dict[str, Any]]) -> None:
+def _start_jobs(host: _Host, jobs: list[dict[str, Any]], beat: int) -> None:
+    """Run the jobs in the answer to a heartbeat, and end all others."""
     for job in jobs:
-        if job["id"] not in host.jobs:
+        # After the report of its outcome, a job is told again only if this node is to repeat it.
+        is_repeated = host.reported.get(job["id"], beat + 1) <= beat
+        if job["id"] not in host.jobs or is_repeated:
+            host.reported.pop(job["id"], None)
             host.jobs[job["id"]] = asyncio.create_task(_run_job(host, job))
     wanted = {job["id"] for job in jobs}
     for number in [one for one in host.jobs if one not in wanted]:
         host.jobs.pop(number).cancel()
+        host.reported.pop(number, None)
 
 
 async def _tell_transfers(host: _Host) -> None:
@@ -196,8 +213,8 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
     started: list[subprocess.Popen[bytes]] = []
     with TemporaryDirectory() as folder, contextlib.ExitStack() as ended:
         try:
-            document = await link.configuration(job["configuration"])
-            files = await link.fetch_files(document)
+            document = await until_answered(lambda: link.configuration(job["configuration"]))
+            files = await until_answered(lambda: link.fetch_files(document))
             if files is not None:
                 ended.enter_context(files)
             what = f"job {job['id']}"
@@ -211,7 +228,7 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
                 None if files is None else files.name, hear=hear, began=started.append,
             )  # fmt: skip
             for file in sorted(place.iterdir()):
-                await link.ask("PUT", f"{path}/results/{file.name}", content=file.read_bytes())
+                await _report(link, "PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", without_folders(str(error))[:MOST_MESSAGE]
         except asyncio.CancelledError:  # the job is closed, or another node has it
@@ -220,9 +237,16 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             raise
         finally:
             host.steps.pop(job["id"], None)
-    # If the service is unreachable or has reassigned the job, the job runs again elsewhere.
+    # The service refuses the report if it has it already, or if another node has the job.
     with contextlib.suppress(ServiceError):
-        await link.ask("POST", f"{path}/outcome", json={"status": status, "message": message})
+        outcome = {"status": status, "message": message}
+        await _report(link, "POST", f"{path}/outcome", json=outcome)
+    host.reported[job["id"]] = link.beats
+
+
+async def _report(link: NodeLink, method: str, path: str, **given: Any) -> None:
+    """Send a result or an outcome until the service has it; a second one changes nothing."""
+    await until_answered(lambda: link.ask(method, path, **given))
 
 
 def run_evaluation(

@@ -8,11 +8,11 @@ import os
 import secrets
 import socket
 import time
-from collections.abc import Mapping
+from collections.abc import Awaitable, Callable, Mapping
 from importlib.metadata import version
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, TypeVar
 
 import jwt
 import psutil
@@ -25,9 +25,11 @@ from cavmarl.service.error_names import problem, without_folders
 from cavmarl.service.request_bodies import ConfigurationBody
 from cavmarl.service.service_records import STATE_HEADER
 
+T = TypeVar("T")
 NEW_S = 5.0  # time for which a new session is kept without being announced by the service
 GPU_EVERY = 5  # heartbeats between two measurements of the GPUs
 JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
+ANSWER_S = 0.5  # time between two attempts to reach the service
 KEYS_S = 1.0  # shortest time between two requests for the service's keys
 KEYS_KEPT_S = 60.0  # after which known keys are asked for again; the service may have new ones
 MOST_MESSAGE = 2000  # characters of the reason why a session or a job has failed
@@ -281,6 +283,23 @@ class NodeLink:
         await self._client.close()
         for session in tuple(self._key_files):
             self.close_key_file(session)
+
+
+async def until_answered(ask: Callable[[], Awaitable[T]]) -> T:
+    """Repeat a request while the service cannot answer it, and return its answer.
+
+    The request must have the same effect if the service receives it again.
+
+    Raises:
+        ServiceError: the service refuses the request.
+    """
+    while True:
+        try:
+            return await ask()
+        except ServiceError as error:
+            if 0 < error.status < 500 and error.retry_s is None:
+                raise
+            await asyncio.sleep(error.retry_s or ANSWER_S)
 
 
 def must_register(error: ServiceError) -> bool:

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
+import signal
+import socket
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
@@ -20,6 +23,7 @@ from cavmarl.service.event_log import SERVICE, EventLog
 from cavmarl.service.event_store import EventStore
 from cavmarl.service.rate_limit import RateLimit
 from cavmarl.service.route_access import Service
+from cavmarl.service.snapshots import SNAPSHOT_EVENTS
 
 DEFAULT_STORE = Path("runs/service.sqlite")
 DEFAULT_PORT = 8700
@@ -39,6 +43,7 @@ class ServerOptions:
     rate_hz: float = 200.0  # rate limit of one identity
     rules: BrokerRules = field(default_factory=BrokerRules)
     is_standby: bool = False  # follow the store of another service until that one ends
+    snapshot_events: int = SNAPSHOT_EVENTS  # events after which a snapshot is written; 0: none
 
 
 def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
@@ -65,9 +70,12 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
     try:
         if options.is_standby:
             tell(f"standby: {address}, follows store {store.where}")
-            log = follow_store(store, tell)
+            log = follow_store(store, tell, options.snapshot_events)
         else:
-            log = EventLog(store)
+            log = EventLog(store, snapshot_events=options.snapshot_events)
+        if not options.snapshot_events:
+            store.drop_snapshot()
+        known = log.sequence
         access = Access(log)
         admin = first_admin(log, access)
         rules = {**asdict(options.rules), "is_standby": options.is_standby}
@@ -86,22 +94,37 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         if options.is_standby:
             listener.listen(BACKLOG)
         tell(f"service: {address}, store {store.where}")
+        if known:
+            tell(f"log: {known} events, {log.origin}")
         if admin is not None:
             tell(f"admin secret, shown this once: {admin}")
-        server.run(sockets=[listener])
+        asyncio.run(_run(server, listener))
+        if log.failure is not None:
+            raise log.failure
         if log.is_broken:
             raise ServiceError(f"store {store.where}: could not be written; the log has the reason")
-        log.flush()
+        log.end()
     finally:
         listener.close()
         store.close()
 
 
-def follow_store(store: EventStore, tell: Callable[[str], None]) -> EventLog:
+async def _run(server: uvicorn.Server, listener: socket.socket) -> None:
+    """Run the server until SIGINT or SIGTERM, after which uvicorn itself would kill the process."""
+    loop = asyncio.get_running_loop()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, server.handle_exit, number, None)
+    await server._serve([listener])
+
+
+def follow_store(
+    store: EventStore, tell: Callable[[str], None], snapshot_events: int = SNAPSHOT_EVENTS
+) -> EventLog:
     """Return the log of a store as soon as no other service has the store.
 
     Until then, the log is read as the other service writes it. So taking over takes the same time
-    for a log of any length. When all events so far have been read, a line is told.
+    for a log of any length. When the records are complete, a line is told; then the events before
+    the snapshot are checked.
 
     Raises:
         ServiceError: the server of the store does not answer, or the log was modified.
@@ -109,13 +132,14 @@ def follow_store(store: EventStore, tell: Callable[[str], None]) -> EventLog:
     log: EventLog | None = None
     while not store.try_lock():
         if log is None and store.has_tables():
-            log = EventLog(store, is_own=False)
-            tell(f"standby: ready to take over, {log.sequence} events read")
+            log = EventLog(store, is_own=False, snapshot_events=snapshot_events)
+            tell(f"standby: ready to take over, {log.sequence} events, {log.origin}")
         elif log is not None:
             log.catch_up()
-        time.sleep(POLL_S)
+        if log is None or log.check_older(POLL_S):
+            time.sleep(POLL_S)
     if log is None:
-        return EventLog(store)
+        return EventLog(store, snapshot_events=snapshot_events)
     log.catch_up()
     log.check_head()
     return log

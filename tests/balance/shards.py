@@ -15,7 +15,7 @@ COSTS = st.one_of(st.floats(0.0, 1.0), st.sampled_from([0.0, 0.001, 0.01, 1.0]))
 
 
 def grid(rows: int, columns: int) -> tuple[tuple[int, ...], ...]:
-    """Return the neighbour relations of a grid of zones, row by row."""
+    """Return the neighbors of each zone in a grid, row by row."""
     places = list(product(range(rows), range(columns)))
     return tuple(
         tuple(n for n, (c, d) in enumerate(places) if abs(a - c) + abs(b - d) == 1)
@@ -30,13 +30,13 @@ def row(costs: Sequence[float], worlds: int = 1) -> tuple[ShardCost, ...]:
 
 
 def busy(*cpus: float) -> LoadSnapshot:
-    """Return loads of workers whose processors other programs use to these shares."""
+    """Return loads of workers on which other programs use these shares of the processor."""
     workers = tuple(Candidate(n, Utilisation(cpu, 0.0)) for n, cpu in enumerate(cpus))
     return LoadSnapshot(workers, "none", "generated")
 
 
 def least_makespan_s(problem: Problem) -> float:
-    """Return the least makespan of all assignments; every worker is admissible."""
+    """Return the least makespan of all assignments, if every worker is admissible."""
     speeds = [1.0 - 0.6 * one.use.cpu - 0.2 * one.use.ram for one in problem.snapshot.workers]
     costs = [shard.cost_s for shard in problem.shards]
 

@@ -1,4 +1,4 @@
-"""Plans compared with optimal plans, under adverse loads, and over several rounds."""
+"""Compare plans with optimal plans, under adverse loads, and over several rounds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ STRICT = BalanceRule(tolerance=0.0)
 
 
 def alone(costs: list[float], snapshot: LoadSnapshot, rule: BalanceRule | None = None) -> Problem:
-    """Return shards without neighbours."""
+    """Return a problem of shards without neighbors."""
     return Problem(row(costs), ((),) * len(costs), snapshot, rule or BalanceRule())
 
 
@@ -40,7 +40,7 @@ def test_the_makespan_of_equal_workers_is_within_grahams_bound(
 @given(
     st.lists(COSTS, min_size=3, max_size=7), st.lists(st.floats(0.0, 0.85), min_size=2, max_size=3)
 )
-def test_the_makespan_of_unequal_workers_is_at_most_twice_the_least(
+def test_the_makespan_of_unequal_workers_is_at_most_twice_the_optimum(
     costs: list[float], cpus: list[float]
 ) -> None:
     problem = alone(costs, busy(*cpus), STRICT)
@@ -83,14 +83,14 @@ def test_the_order_of_the_input_does_not_matter(
 @pytest.mark.parametrize(
     ("costs", "loads"),
     [
-        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a very expensive shard has a worker of its own
+        ([10.0, 0.1, 0.1, 0.1], [10.0, 0.3]),  # a very expensive shard has its own worker
         ([1.0] * 6, [3.0, 3.0]),
         ([0.0, 0.0, 0.0, 5.0], [0.0, 5.0]),
         ([5e-324, 5e-324, 1.0, 1.0], [1.0, 1.0]),
         ([1e6, 1e-6, 1e6, 1e-6], [1e6, 1e6]),
     ],
 )
-def test_plans_for_extreme_costs_and_loads(costs: list[float], loads: list[float]) -> None:
+def test_extreme_costs_give_the_expected_loads(costs: list[float], loads: list[float]) -> None:
     plan = make_plan(alone(costs, idle_snapshot(2)))
     assert sorted(worker.load_s for worker in plan.workers()) == pytest.approx(sorted(loads))
 
@@ -117,11 +117,13 @@ def test_a_world_above_the_share_of_a_worker_is_split() -> None:
     assert split == [0]
 
 
-def test_neighbours_stay_together() -> None:
+def test_neighboring_zones_are_assigned_to_the_same_worker() -> None:
     zones = grid(4, 4)
     plan = make_plan(Problem(row([1.0] * 16), zones, idle_snapshot(4)))
     assert plan.imbalance == 1.0
-    assert plan.placement.cut_pairs <= 12  # four rows; single shards in turn would cut 24
+    assert (
+        plan.placement.cut_pairs <= 12
+    )  # 12 pairs for four rows; an assignment in turn would cut 24
 
 
 @settings(deadline=None)
@@ -159,14 +161,14 @@ def test_a_fully_used_worker_is_slow_but_its_tick_is_finite() -> None:
     assert plan.homes == (0, 0, 0)
 
 
-def test_a_worker_that_joins_is_given_shards_round_by_round() -> None:
+def test_a_new_worker_gets_shards_round_by_round() -> None:
     plan = make_plan(alone([1.0] * 12, idle_snapshot(2)))
     for _ in range(3):
         plan = make_plan(replace(plan.problem, snapshot=idle_snapshot(3), present=plan.homes))
     assert sorted(plan.homes.count(worker) for worker in range(3)) == [4, 4, 4]
 
 
-def test_shards_of_a_lost_worker_are_placed_beyond_the_bound() -> None:
+def test_all_shards_of_a_lost_worker_are_placed_despite_the_limit_of_moves() -> None:
     rule = BalanceRule(max_moves=1)
     problem = replace(alone([1.0] * 6, idle_snapshot(2), rule), present=(0, 0, 7, 7, 7, 7))
     plan = make_plan(problem)
@@ -178,7 +180,7 @@ def test_shards_of_a_lost_worker_are_placed_beyond_the_bound() -> None:
         make_plan(replace(problem, snapshot=gone))
 
 
-def test_nothing_moves_within_the_tolerance() -> None:
+def test_no_shard_moves_if_the_imbalance_is_within_the_tolerance() -> None:
     problem = replace(alone([1.0, 1.0, 1.0, 1.15], idle_snapshot(2)), present=(0, 0, 1, 1))
     assert make_plan(problem).moves == ()
 
@@ -187,7 +189,7 @@ def test_nothing_moves_within_the_tolerance() -> None:
 @given(
     st.lists(COSTS, min_size=4, max_size=12), st.integers(1, 5), st.randoms(use_true_random=False)
 )
-def test_rounds_with_constant_loads_improve_and_end(
+def test_rounds_with_constant_loads_improve_the_plan_until_no_shard_moves(
     costs: list[float], most: int, draw: random.Random
 ) -> None:
     snapshot = idle_snapshot(3)
@@ -205,7 +207,7 @@ def test_rounds_with_constant_loads_improve_and_end(
     assert make_plan(problem).moves == ()
 
 
-def test_noise_moves_nothing() -> None:
+def test_noise_in_the_costs_moves_no_shard() -> None:
     draw = random.Random(1)
     plan = make_plan(alone([1.0] * 12, idle_snapshot(3)))
     moves = 0
@@ -233,7 +235,7 @@ def _next(plan: Plan, costs: list[float]) -> Plan:
     return make_plan(replace(plan.problem, shards=row(costs), present=plan.homes))
 
 
-def test_a_lasting_jam_is_divided_among_workers() -> None:
+def test_zones_with_a_lasting_jam_are_divided_among_workers() -> None:
     plan = make_plan(Problem(row([1.0] * 16), grid(4, 4), idle_snapshot(4)))
     jam = [8.0 if zone in (0, 1, 4, 5) else 1.0 for zone in range(16)]
     rounds = [plan := _next(plan, jam) for _ in range(10)]
@@ -268,7 +270,7 @@ def test_invalid_problems_are_refused(change: dict[str, object], said: str) -> N
         ({"max_moves": 0}, "max_moves = 0"),
     ],
 )
-def test_rules_are_checked(rule: dict[str, float], said: str) -> None:
+def test_invalid_rules_are_refused(rule: dict[str, float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         BalanceRule(**rule)  # type: ignore[arg-type]
 
@@ -284,6 +286,6 @@ def test_weights_change_the_distribution() -> None:
 
 
 @pytest.mark.parametrize("newest", [0.0, 1.1, math.nan])
-def test_a_smoothing_weight_is_checked(newest: float) -> None:
+def test_an_invalid_smoothing_weight_is_refused(newest: float) -> None:
     with pytest.raises(ConfigError, match="newest"):
         SmoothCosts(newest)

@@ -1,4 +1,4 @@
-"""Plans: their text, their file, and recomputing them from the file."""
+"""Plans as text and as files, and plans recomputed from files."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def plan() -> Plan:
     return make_plan(Problem(row(costs, worlds=2), grid(2, 2), snapshot, rule, present))
 
 
-def test_a_plan_goes_to_json_and_back(plan: Plan) -> None:
+def test_a_plan_read_from_json_equals_the_written_plan(plan: Plan) -> None:
     again = plan_from_dict(json.loads(json.dumps(plan.to_dict())))
     assert again == plan
     assert again.to_dict() == plan.to_dict()
@@ -52,7 +52,7 @@ def test_another_snapshot_gives_another_plan(plan: Plan) -> None:
     assert replan(first, idle_snapshot(1)).homes == (0,) * 8
 
 
-def test_the_document_of_a_plan_has_derived_values(plan: Plan) -> None:
+def test_the_json_of_a_plan_has_derived_values(plan: Plan) -> None:
     document = plan.to_dict()
     assert [worker["worker"] for worker in document["workers"]] == [0, 1, 2]
     assert sum(worker["load_s"] for worker in document["workers"]) == pytest.approx(0.014)
@@ -75,7 +75,7 @@ def test_the_text_of_a_plan_has_its_scores_exclusions_and_moves(plan: Plan) -> N
     assert all(f"worker {move.source} → {move.target}" in text for move in plan.moves)
 
 
-def test_zones_are_named_by_runs() -> None:
+def test_consecutive_zones_are_written_as_ranges() -> None:
     plan = make_plan(Problem(row([1.0] * 8, worlds=2), grid(2, 2), idle_snapshot(1)))
     assert describe_plan(plan).splitlines()[-1].endswith("  0: 0-3; 1: 0-3")
 

@@ -1,4 +1,4 @@
-"""The plan of a run: from measured costs to a bounded number of moves per round."""
+"""The plan of a run follows measured costs with a limited number of moves per round."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def test_a_round_uses_the_measured_costs(balancer: Balancer) -> None:
     assert replan(plan, plan.problem.snapshot) == plan
 
 
-def test_a_new_measurement_counts_in_part(balancer: Balancer) -> None:
+def test_a_new_measurement_changes_the_cost_only_partly(balancer: Balancer) -> None:
     balancer.measure(row([1.0] * 16, worlds=4))
     balancer.measure(row([2.0] * 16, worlds=4))
     assert {shard.cost_s for shard in balancer.costs} == {1.3}
@@ -67,7 +67,7 @@ def test_shards_that_are_not_in_the_plan_are_refused(
 
 
 @pytest.mark.parametrize("keeps_one", [False, True])
-def test_with_keeps_one_a_busy_worker_keeps_its_last_shard(keeps_one: bool) -> None:
+def test_a_busy_worker_keeps_its_last_shard_if_keeps_one_is_set(keeps_one: bool) -> None:
     rule = BalanceRule(tolerance=0.0, move_s=0.0, keeps_one=keeps_one)
     first = Problem(equal_costs(1, 4), grid(2, 2), idle_snapshot(2), rule)
     balancer = Balancer(first)

@@ -1,4 +1,4 @@
-"""Contiguous splits: each worker has consecutive worlds, and boundaries between workers move."""
+"""In a contiguous split, each worker has consecutive worlds, and only boundaries move."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ def test_rounds_with_few_moves_approach_the_best_contiguous_split(problem: Probl
     assert plan.placement.makespan_s <= best_row_s(problem) + costliest / slowest + 1e-9
 
 
-def test_surplus_shards_are_passed_from_worker_to_worker() -> None:
+def test_surplus_shards_move_from_worker_to_adjacent_worker() -> None:
     snapshot = idle_snapshot(3)
     problem = replace(worlds([3.0, 3.0, 2.0, 2.0, 1.0], snapshot), present=(0, 0, 1, 1, 2))
     plan = make_plan(problem)
@@ -88,7 +88,7 @@ def test_surplus_shards_are_passed_from_worker_to_worker() -> None:
     assert [(move.source, move.target) for move in plan.moves] == [(0, 1), (1, 2)]
 
 
-def test_equal_worlds_are_shared_out_evenly() -> None:
+def test_worlds_with_equal_costs_are_distributed_evenly() -> None:
     plan = make_plan(Problem(equal_costs(16, 1), ((),), idle_snapshot(3), in_row=True))
     assert sorted(plan.homes.count(worker) for worker in range(3)) == [5, 5, 6]
     nothing = worlds([0.0] * 6, idle_snapshot(2))
@@ -103,7 +103,7 @@ def test_an_excluded_worker_gets_no_more_shards() -> None:
         make_plan(replace(problem, present=None))
 
 
-def test_after_the_loss_of_a_worker_a_new_split_is_made() -> None:
+def test_the_loss_of_a_worker_leads_to_a_new_split() -> None:
     balancer = Balancer(worlds([1.0] * 6, idle_snapshot(3)))
     left = LoadSnapshot(idle_snapshot(3).workers[1:], "none", "")
     assert balancer.round(left).homes == (1, 1, 1, 2, 2, 2)
@@ -114,7 +114,7 @@ def test_a_present_assignment_that_is_not_contiguous_is_refused() -> None:
         replace(worlds([1.0] * 3, idle_snapshot(2)), present=(0, 1, 0))
 
 
-def test_a_contiguous_plan_is_read_as_it_was_written() -> None:
+def test_a_contiguous_plan_read_from_json_equals_the_written_plan() -> None:
     problem = replace(
         worlds([1.0, 1.0, 4.0], idle_snapshot(2)), present=(0, 1, 1), cost_source="number"
     )

@@ -1,4 +1,4 @@
-"""Zones that follow the measured cost."""
+"""Partitions that follow the measured costs of zones."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def town() -> tuple[object, np.ndarray]:
     return network, np.vstack([everywhere, corner])
 
 
-def test_zones_follow_the_measured_cost(town: tuple[object, np.ndarray]) -> None:
+def test_a_new_partition_follows_the_measured_costs(town: tuple[object, np.ndarray]) -> None:
     network, places = town
     partition = cut_map(network, "grid", 4)  # type: ignore[arg-type]
     counts = np.bincount(partition.zones_of(places), minlength=4)

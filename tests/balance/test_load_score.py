@@ -1,4 +1,4 @@
-"""LoadScore and the worker that it selects: the paper's figures, and exact thresholds."""
+"""LoadScore and the worker that it selects, with the figures of the paper and exact thresholds."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def fleet(*uses: tuple[float, float, float]) -> list[Candidate]:
     return [Candidate(number, Utilisation(*use)) for number, use in enumerate(uses)]
 
 
-def test_the_default_rule_equals_the_papers() -> None:
+def test_the_default_rule_equals_the_rule_of_the_paper() -> None:
     assert LoadRule().weights == (0.6, 0.2, 0.2)
     assert LoadRule().thresholds == (0.85, 0.90, 0.95)
 
@@ -50,7 +50,7 @@ def test_the_default_rule_equals_the_papers() -> None:
         ((0.80, 0.80, 0.80), 0.80),
     ],
 )
-def test_scores_of_the_paper(use: tuple[float, float, float], score: float) -> None:
+def test_scores_equal_those_of_the_paper(use: tuple[float, float, float], score: float) -> None:
     assert load_score(Utilisation(*use)) == pytest.approx(score, abs=1e-15)
 
 
@@ -62,7 +62,9 @@ def test_one_resource_above_its_threshold_excludes_a_worker_with_other_free_reso
 
 
 @pytest.mark.parametrize(("resource", "threshold"), [*zip(RESOURCES, THRESHOLDS, strict=True)])
-def test_a_threshold_is_strict_to_the_last_bit(resource: str, threshold: float) -> None:
+def test_a_use_equal_to_its_threshold_is_allowed_and_the_next_float_is_not(
+    resource: str, threshold: float
+) -> None:
     def use(value: float) -> list[Candidate]:
         return [Candidate(0, Utilisation(**{"cpu": 0.0, "ram": 0.0, resource: value}))]
 
@@ -102,7 +104,9 @@ def test_the_order_of_workers_does_not_matter(workers: list[Candidate]) -> None:
 
 
 @given(USES, SHARES, SHARES)
-def test_a_score_is_a_share_and_rises_with_use(use: Utilisation, first: float, rest: float) -> None:
+def test_a_score_is_between_0_and_1_and_rises_with_use(
+    use: Utilisation, first: float, rest: float
+) -> None:
     weights = (first, (1.0 - first) * rest, (1.0 - first) * (1.0 - rest))
     score = load_score(use, weights)
     assert 0.0 <= score <= 1.0 + 1e-12
@@ -115,7 +119,7 @@ def test_with_equal_scores_the_worker_with_fewer_shards_or_the_lower_number_is_c
     assert select([Candidate(1, use, hosted=2), Candidate(3, use, hosted=1)]).worker == 3
 
 
-def test_when_shards_are_counted_equal_workers_get_equal_numbers() -> None:
+def test_equal_workers_get_equal_numbers_of_shards() -> None:
     hosted = dict.fromkeys(range(5), 0)
     for _ in range(50):
         workers = [Candidate(n, Utilisation(0.0, 0.0), hosted[n]) for n in hosted]
@@ -148,7 +152,7 @@ def test_a_preferred_worker_is_kept_within_the_margin(
     }
 
 
-def test_the_margin_includes_its_end() -> None:
+def test_a_score_exactly_at_the_margin_is_within_the_margin() -> None:
     workers = fleet((0.0, 0.0, 0.0), (0.0, 0.5, 0.0))
     assert select(workers, LoadRule(margin=0.1), preferred=1).worker == 1
     assert select(workers, LoadRule(margin=math.nextafter(0.1, 0.0)), preferred=1).worker == 0
@@ -189,7 +193,7 @@ def test_utilisations_outside_of_0_to_1_are_refused(resource: str, value: float)
         Utilisation(**shares)
 
 
-def test_the_error_for_a_percentage_names_the_share() -> None:
+def test_the_error_for_a_percentage_names_the_fraction() -> None:
     with pytest.raises(ConfigError, match=r"percentage, use 0\.55"):
         Utilisation(55.0, 0.0)
 
@@ -204,7 +208,7 @@ def test_the_error_for_a_percentage_names_the_share() -> None:
         ((60.0, 20.0, 20.0), "sum to 100"),
     ],
 )
-def test_weights_are_checked(weights: tuple[float, float, float], said: str) -> None:
+def test_invalid_weights_are_refused(weights: tuple[float, float, float], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         LoadRule(weights)
 
@@ -223,6 +227,6 @@ def test_weights_that_sum_to_one_are_accepted(weights: tuple[float, float, float
         ({"margin": math.nan}, "margin = nan"),
     ],
 )
-def test_the_rest_of_a_rule_is_checked(rule: dict[str, object], said: str) -> None:
+def test_invalid_thresholds_and_margins_are_refused(rule: dict[str, object], said: str) -> None:
     with pytest.raises(ConfigError, match=said):
         LoadRule(**rule)  # type: ignore[arg-type]

@@ -1,4 +1,4 @@
-"""Load snapshots: measured on this machine, and read from a file."""
+"""Load snapshots that are measured on this machine or read from a file."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def test_a_snapshot_of_this_machine_has_shares_between_0_and_1() -> None:
     assert found.origin == "measured"
 
 
-def test_without_nvidia_smi_there_is_no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_snapshot_without_nvidia_smi_has_no_gpu_load(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PATH", "")
     found = take_snapshot({0: None}, interval_s=0.01)
     assert found.gpu_source == "none"
@@ -58,7 +58,7 @@ def test_a_worker_that_has_died_is_not_available() -> None:
     assert [worker.available for worker in found.workers] == [False, True]
 
 
-def test_workers_are_not_charged_for_their_own_work() -> None:
+def test_the_load_of_a_worker_excludes_its_own_processor_time() -> None:
     endless = "while True: pass"
     with subprocess.Popen([sys.executable, "-c", endless]) as process:
         try:
@@ -71,7 +71,7 @@ def test_workers_are_not_charged_for_their_own_work() -> None:
     assert all(mine < theirs for mine, theirs in zip(own, other, strict=True))
 
 
-def test_the_workers_of_a_snapshot_are_in_order() -> None:
+def test_the_workers_of_a_snapshot_are_sorted() -> None:
     taken = LoadSnapshot(
         (Candidate(1, Utilisation(0.1, 0.2, 0.3), 4), Candidate(0, Utilisation(1 / 3, 0.2))),
         "none",
@@ -80,7 +80,7 @@ def test_the_workers_of_a_snapshot_are_in_order() -> None:
     assert [worker.worker for worker in taken.workers] == [0, 1]
 
 
-def test_a_snapshot_needs_distinct_workers() -> None:
+def test_a_snapshot_with_a_repeated_worker_is_refused() -> None:
     with pytest.raises(ConfigError, match="no workers"):
         idle_snapshot(0)
     with pytest.raises(ConfigError, match="must be named once"):
@@ -88,6 +88,6 @@ def test_a_snapshot_needs_distinct_workers() -> None:
 
 
 @pytest.mark.parametrize("interval_s", [0.0, -1.0, float("nan")])
-def test_an_interval_is_checked(interval_s: float) -> None:
+def test_an_invalid_measuring_interval_is_refused(interval_s: float) -> None:
     with pytest.raises(ConfigError, match="interval_s"):
         take_snapshot({0: None}, interval_s=interval_s)

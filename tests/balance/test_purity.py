@@ -31,5 +31,5 @@ def test_pure_modules_import_only_allowed_modules(path: Path) -> None:
             assert path.stem == "probe" or top not in IMPURE, name
 
 
-def test_the_list_of_files_is_not_empty() -> None:
+def test_these_tests_find_the_files_of_the_core() -> None:
     assert len(FILES) > 10

@@ -9,14 +9,14 @@ import pytest
 
 from cavmarl.handoff.coordinator.journal import Journal
 from tests.cli.test_main import refusal, run
-from tests.handoff.test_journal import eventful
+from tests.handoff.test_journal import run_events
 
 
 @pytest.fixture
 def written(tmp_path: Path) -> Path:
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
-        journal.append(eventful().log)
+        journal.append(run_events().log)
     return path
 
 

@@ -31,7 +31,7 @@ def address(tmp_path: Path) -> Path:
 
 
 def steer(sight: FollowerView) -> dict[str, Any]:
-    """Return controls that depend on nothing but the view of the follower."""
+    """Return controls that depend only on the view of the follower."""
     return {
         vehicle: np.tanh(sight.sensors[vehicle]["observation"].values[0, :2]).tolist()
         for vehicle in sight.snapshot.vehicles
@@ -40,7 +40,7 @@ def steer(sight: FollowerView) -> dict[str, Any]:
 
 @pytest.fixture
 def start() -> Iterator[Callable[..., threading.Thread]]:
-    """Run followers in threads, and join the threads after the test."""
+    """Return a function that runs a follower in a thread; join all threads after the test."""
     threads: list[threading.Thread] = []
 
     def run(action: Callable[[], None]) -> threading.Thread:
@@ -66,7 +66,7 @@ def drive(address: Any, vehicles: list[str], name: str = "driver") -> list[Follo
     return seen
 
 
-def seated(
+def join_world(
     world: FollowedWorld, vehicles: list[str], name: str = "driver", secret: str = ""
 ) -> Follower:
     """Return a follower in this process that has joined the world."""
@@ -81,7 +81,7 @@ def seated(
 
 
 def spawn(code: str, *words: Any) -> subprocess.Popen[str]:
-    """Start a follower in a process of its own."""
+    """Start a follower in its own process."""
     return subprocess.Popen(
         [sys.executable, "-c", code, *map(str, words)],
         stdout=subprocess.PIPE,

@@ -19,11 +19,12 @@ from cavmarl.cosim.stack.stack import CAMERA_RIG, sensor_of
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Obstacle
 
 
-def test_a_pedestrian_and_a_van_are_distinguished() -> None:
-    """No object gets the class of another: pixels have exact classes and are 0.2 m wide at 16 m.
+def test_a_camera_distinguishes_a_pedestrian_from_a_van() -> None:
+    """Check the class of each detected object against the true object at its place.
 
-    Echoes have errors of 2 cm, so most pixels of a group belong to its object. Cases with a
-    pedestrian close to the van are left out, because objects nearer than 0.8 m form one group.
+    A group of lidar echoes gets the class of most of its pixels. Pixels have exact classes and are
+    0.2 m wide at 16 m; echoes have errors of 2 cm. The test skips detections while the pedestrian
+    is close to the van, because objects less than 0.8 m apart form one group.
     """
     env = cavmarl.parallel_env(
         "grid4x4",
@@ -54,7 +55,7 @@ def test_a_pedestrian_and_a_van_are_distinguished() -> None:
             off = np.hypot(others["x"] - seen.x_m, others["y"] - seen.y_m)
             walker, van = off[on_foot].min(initial=99.0), off[~on_foot].min(initial=99.0)
             if seen.kind == "unknown" or (walker > 0.6) == (van > 3.0 or walker < 3.0):
-                continue  # outside of the picture, or too close together
+                continue  # outside of the picture, or pedestrian and van are too close
             if seen.kind != ("pedestrian" if walker < 0.6 else "vehicle"):
                 wrong.append(seen)
             kinds[seen.kind] = kinds.get(seen.kind, 0) + 1
@@ -77,7 +78,7 @@ def grid() -> HdMap:
     return HdMap(load_roads(*load_config("grid4x4")))
 
 
-def test_the_stack_brakes_for_a_pedestrian_who_will_be_on_its_way(grid: HdMap) -> None:
+def test_the_stack_brakes_for_a_pedestrian_who_walks_onto_its_path(grid: HdMap) -> None:
     lanes = grid.network.lanes
     lane = int(np.flatnonzero(~lanes["internal"] & (lanes["length_m"] > 60.0))[0])
     link = int(lanes["first_link"][lane])

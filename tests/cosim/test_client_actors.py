@@ -39,7 +39,7 @@ def make_env(name: str = "ring", zones: int = 1, workers: int = 0, **more: Any) 
 
 
 def far_place(env: cavmarl.CavEnv) -> tuple[float, float]:
-    """Return a place at the edge of the map, where no vehicle sees it."""
+    """Return a place at the edge of the map that no vehicle can see."""
     min_x, min_y, _, _ = env.network.extent_m
     return min_x - 90.0, min_y - 90.0
 
@@ -50,7 +50,7 @@ def request(x: float, y: float, kind: str = "car", **more: Any) -> ActorRequest:
 
 @contextmanager
 def joined(world: FollowedWorld, *actors: ActorRequest, **more: Any) -> Iterator[Follower]:
-    """Yield a follower of this thread that has brought actors."""
+    """Yield a follower that has joined the world with actors."""
     found: list[Follower] = []
 
     def call() -> None:
@@ -67,7 +67,7 @@ def joined(world: FollowedWorld, *actors: ActorRequest, **more: Any) -> Iterator
 
 
 def refusal(world: FollowedWorld, *actors: ActorRequest, **more: Any) -> str:
-    """Return the reason for which the world refuses a follower with actors."""
+    """Return the reason that the world gives when it refuses a follower with actors."""
     reasons: list[str] = []
 
     def call() -> None:
@@ -85,14 +85,14 @@ def refusal(world: FollowedWorld, *actors: ActorRequest, **more: Any) -> str:
 
 
 def others(env: cavmarl.CavEnv) -> bytes:
-    """Return the bytes of all vehicles that no client has brought, by id."""
+    """Return the bytes of all vehicles except actors of clients, sorted by id."""
     rows = env.simulation.vehicles()
     rows = rows[rows["driver"] != DRIVER_EXTERNAL]
     return bytes(rows[np.argsort(rows["id"])].tobytes())
 
 
 @pytest.mark.parametrize("kind", BODIES)
-def test_an_actor_is_there_after_the_next_step_and_leaves_with_its_client(
+def test_an_actor_enters_in_the_next_step_and_leaves_with_its_client(
     address: Path, kind: str
 ) -> None:
     env = make_env()
@@ -112,7 +112,7 @@ def test_an_actor_is_there_after_the_next_step_and_leaves_with_its_client(
             assert first.snapshot.actors["own"].vehicle_id == -1
             seen = second.snapshot.actors["own"]
             assert (seen.vehicle_id, seen.x, seen.y) == (row["id"], x, y)
-        world.step()  # the world learns that the socket is closed
+        world.step()  # in this step the world detects that the socket is closed
         world.step()
         assert len(env.external.vehicles()) == 0
         assert (env.external.ids() == -1).all()
@@ -120,10 +120,10 @@ def test_an_actor_is_there_after_the_next_step_and_leaves_with_its_client(
         assert [entry["type"] for entry in world.actors.report()] == [kind]
 
 
-def test_an_actor_changes_no_id_and_no_byte_of_vehicles_that_it_does_not_meet(
+def test_an_actor_that_no_vehicle_sees_does_not_change_other_vehicles(
     address: Path,
 ) -> None:
-    """Vehicles depart and arrive meanwhile, so that new ids are given."""
+    """Compare runs in which vehicles depart and arrive, so that vehicles get new ids."""
     runs = []
     for brings in (False, True):
         env = make_env("merge", horizon_s=40, **{"population.mode": "open", "population.budget": 8})
@@ -149,7 +149,7 @@ def test_an_actor_changes_no_id_and_no_byte_of_vehicles_that_it_does_not_meet(
     assert runs[0] == runs[1]
 
 
-def test_poses_move_an_actor_in_the_step_whose_end_they_name(address: Path) -> None:
+def test_a_pose_moves_an_actor_in_the_step_that_ends_at_its_time(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -163,7 +163,7 @@ def test_poses_move_an_actor_in_the_step_whose_end_they_name(address: Path) -> N
                 (row,) = env.external.vehicles()
                 assert (row["x"], row["y"]) == (pose.x, y)
                 assert row["speed"] == pytest.approx(8.0)
-            for ahead in range(1, 4):  # no more poses: the move goes on
+            for ahead in range(1, 4):  # without new poses, the actor moves on at its last speed
                 world.step()
                 (row,) = env.external.vehicles()
                 assert row["x"] == pytest.approx(x + 2.0 + 0.4 * ahead)
@@ -214,7 +214,10 @@ def test_controls_drive_an_actor_as_they_drive_an_agent(address: Path, start: St
                 for view in follower:
                     controls = steer(view)
                     if view.snapshot.frame == 1:
-                        controls["own"] = [0.4, 0.0]  # kept until the next ones
+                        controls["own"] = [
+                            0.4,
+                            0.0,
+                        ]  # these controls hold until the client sends others
                     follower.answer(controls)
 
         start(drive)
@@ -226,7 +229,7 @@ def test_controls_drive_an_actor_as_they_drive_an_agent(address: Path, start: St
         assert world.seats[0].agents == (0,)
 
 
-def test_an_actor_is_seen_by_drivers_and_touches_them(address: Path) -> None:
+def test_an_actor_that_is_placed_on_an_agent_collides_with_it(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -235,7 +238,7 @@ def test_an_actor_is_seen_by_drivers_and_touches_them(address: Path) -> None:
         x, y = far_place(env)
         with joined(world, request(x, y), waits=False) as follower:
             world.step()
-            # A jump onto an agent: the actor leaves, and enters there.
+            # The pose is far away, so the actor leaves and enters again on the agent.
             pose = PoseView(0.1, float(agent["x"]), float(agent["y"]), float(agent["heading"]))
             follower.send_poses({"own": [pose]})
             hits = []
@@ -245,7 +248,7 @@ def test_an_actor_is_seen_by_drivers_and_touches_them(address: Path) -> None:
         assert int(agent["id"]) in hits
 
 
-def test_refusals_say_why_and_change_nothing(address: Path) -> None:
+def test_refused_requests_get_a_reason_and_change_nothing(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -274,7 +277,7 @@ def test_refusals_say_why_and_change_nothing(address: Path) -> None:
         assert "the world has to wait" in refusal(world, vehicles=["car_0"], waits=False)
         assert world.seats == ()
         assert env.state_hash() == before
-        # All places are free again.
+        # The refused requests have left all places free.
         with joined(
             world,
             *(ActorRequest(f"a{k}", "car", x + 20.0 * k, y, 0.0) for k in range(3)),
@@ -284,7 +287,7 @@ def test_refusals_say_why_and_change_nothing(address: Path) -> None:
             assert len(env.external.vehicles()) == 3
 
 
-def test_a_world_without_places_for_actors_says_so(address: Path) -> None:
+def test_a_world_without_places_for_actors_names_the_setting(address: Path) -> None:
     env = make_env(**{"population.external": 0})
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -313,7 +316,9 @@ def test_a_client_with_invalid_poses_is_dropped_with_its_actor(
             world.step()
             assert world.seats == ()
             assert len(env.external.vehicles()) == 0
-            assert follower.wait() is not None  # the frames before and after its first step
+            assert (
+                follower.wait() is not None
+            )  # the frames before and after the first step of this client
             assert follower.wait() is not None
             with pytest.raises(FollowerError, match=match):
                 follower.wait()
@@ -331,7 +336,7 @@ def test_invalid_poses_can_be_ignored_and_counted(address: Path) -> None:
             assert len(env.external.vehicles()) == 1
 
 
-def test_a_pose_outside_of_the_map_ends_the_visit(address: Path) -> None:
+def test_a_client_that_poses_its_actor_outside_of_the_map_is_dropped(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         world.reset(seed=1)
@@ -344,7 +349,9 @@ def test_a_pose_outside_of_the_map_ends_the_visit(address: Path) -> None:
             assert len(env.external.vehicles()) == 0
 
 
-def test_a_client_that_does_not_read_misses_snapshots_and_delays_nobody(address: Path) -> None:
+def test_a_client_that_does_not_read_misses_snapshots_but_does_not_delay_the_world(
+    address: Path,
+) -> None:
     env = make_env(horizon_s=600)
     with FollowedWorld(env, address, truth=True) as world:
         world.reset(seed=1)
@@ -359,7 +366,7 @@ def test_a_client_that_does_not_read_misses_snapshots_and_delays_nobody(address:
             assert time.monotonic() - began < 60.0
 
 
-def test_actors_return_in_the_next_episode(address: Path) -> None:
+def test_actors_enter_again_in_the_next_episode(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address) as world:
         x, y = far_place(env)
@@ -376,7 +383,7 @@ def test_actors_return_in_the_next_episode(address: Path) -> None:
 
 
 def run_with_clients(address: Path, zones: int, backend: str) -> list[str]:
-    """Run a world with a client whose actors cross it, in lock step; return the states."""
+    """Run a world in lock step with a client whose actors cross zones; return the state hashes."""
     env = cavmarl.parallel_env(
         "grid4x4",
         agents=2,
@@ -410,19 +417,19 @@ def run_with_clients(address: Path, zones: int, backend: str) -> list[str]:
         world.wait_for(1, 10.0)
         found = hashes(world, 60)
         assert world.actors.report()[0]["extrapolated"] > 3
-        if zones > 1 and "nodes" not in backend:  # both have changed their zone
+        if zones > 1 and "nodes" not in backend:  # both actors have changed their zone
             assert (env.external.vehicles()["epoch"] > 0).all()
     thread.join(10.0)
     return found
 
 
-def test_zones_and_workers_hand_actors_over_without_a_changed_bit(tmp_path: Path) -> None:
+def test_actors_cross_zones_and_workers_without_a_changed_bit(tmp_path: Path) -> None:
     undivided = run_with_clients(tmp_path / "a", 1, "local")
     assert run_with_clients(tmp_path / "b", 4, "local") == undivided
     assert run_with_clients(tmp_path / "c", 4, "processes:2") == undivided
 
 
 @pytest.mark.slow
-def test_nodes_hand_actors_over_without_a_changed_bit(tmp_path: Path) -> None:
+def test_actors_cross_nodes_without_a_changed_bit(tmp_path: Path) -> None:
     undivided = run_with_clients(tmp_path / "a", 1, "local")
     assert run_with_clients(tmp_path / "b", 4, "nodes:2") == undivided

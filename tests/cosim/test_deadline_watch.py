@@ -54,7 +54,7 @@ def test_a_miss_counts_for_the_phase_in_which_the_deadline_passes() -> None:
     }
 
 
-def test_a_step_that_begins_after_its_deadline_is_behind() -> None:
+def test_a_step_that_begins_late_counts_as_behind() -> None:
     clock = Clock()
     pacer = RealTime(1.0, clock.now, clock.sleep, deadline_s=0.05)
     assert pacer.watch is not None
@@ -63,7 +63,8 @@ def test_a_step_that_begins_after_its_deadline_is_behind() -> None:
     for step in (1, 2, 3, 4, 5):
         pacer.wait(0.05 * step)
     pacer.watch.end()
-    # Steps 1 and 2 begin 0.15 s and 0.1 s late. Step 3 begins at its deadline, which is no miss.
+    # Steps 1 and 2 begin 0.15 s and 0.1 s late. Step 3 begins exactly at its deadline, so it counts
+    # as late but not as a miss.
     assert pacer.watch.misses == {WORLD: 1, BEHIND: 2}
     assert pacer.lateness.late == 3
     assert pacer.watch.steps == 6

@@ -1,4 +1,4 @@
-"""The reference stack drives: as a policy, and as a process that follows."""
+"""The reference stack drives as a policy, and as a follower in its own process."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ def test_the_stack_drives_in_traffic_without_a_collision() -> None:
 
 
 @pytest.mark.slow
-def test_a_process_drives_through_town_from_its_sensors_alone(tmp_path: Path) -> None:
+def test_a_follower_process_drives_through_town_from_its_sensors_alone(tmp_path: Path) -> None:
     program = [sys.executable, "-m", "cavmarl"]
     place, led, followed = (str(tmp_path / name) for name in ("s", "led.json", "followed.json"))
     lead = [*program, "lead", "town", "--at", place, "--rig", "reference", "--agents", "1"]

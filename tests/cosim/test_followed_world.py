@@ -24,13 +24,16 @@ from cavmarl.cosim.followers.follower_client import Follower, FollowerView
 from cavmarl.cosim.followers.follower_connection import call
 from cavmarl.cosim.followers.follower_messages import Control, Hello, Say
 from cavmarl.engine.step_trace import QUEUE, SENSORS, STACK, TICK, StepTrace
-from tests.cosim.conftest import drive, hashes, make_env, seated, steer
+from tests.cosim.conftest import drive, hashes, join_world, make_env, steer
 
 Start = Callable[[Callable[[], Any]], threading.Thread]
 
 
 def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
-    """Run the world without followers: agents in `drivers` use the controls of `steer`."""
+    """Return the state hashes of a world without followers.
+
+    Agents in `drivers` use the controls of `steer`; other agents use the suggested actions.
+    """
     env = make_env()
     observations, _ = env.reset(seed=1)
     found = []
@@ -43,7 +46,7 @@ def reference(steps: int, drivers: dict[str, Any]) -> list[str]:
     return found
 
 
-def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> None:
+def test_a_follower_drives_bit_for_bit_like_a_policy(address: Path, start: Start) -> None:
     seen: list[FollowerView] = []
     with FollowedWorld(make_env(), address) as world:
         driver = start(lambda: seen.extend(drive(address, ["car_1"])))
@@ -65,7 +68,7 @@ def test_a_follower_drives_as_a_policy_would(address: Path, start: Start) -> Non
 def test_answers_may_come_in_any_order(address: Path, start: Start) -> None:
     delays = random.Random(0)
 
-    def late(agent: str) -> None:
+    def answer_late(agent: str) -> None:
         with Follower(address, [agent], f"driver of {agent}") as follower:
             for sight in follower:
                 time.sleep(delays.random() * 0.004)
@@ -73,7 +76,7 @@ def test_answers_may_come_in_any_order(address: Path, start: Start) -> None:
 
     with FollowedWorld(make_env(zones=2), address) as world:
         for agent in ("car_2", "car_0", "car_1"):
-            start(lambda agent=agent: late(agent))
+            start(lambda agent=agent: answer_late(agent))
             world.wait_for(len(world.seats) + 1, 10.0)
         world.reset(seed=1)
         found = hashes(world, 12)
@@ -87,7 +90,7 @@ def test_answers_may_come_in_any_order(address: Path, start: Start) -> None:
     assert found == reference(12, dict.fromkeys(["car_0", "car_1", "car_2"]))
 
 
-def test_one_follower_can_drive_several(address: Path, start: Start) -> None:
+def test_one_follower_can_drive_several_vehicles(address: Path, start: Start) -> None:
     with FollowedWorld(make_env(), address) as world:
         start(lambda: drive(address, ["car_2", "car_0"]))
         world.wait_for(1, 10.0)
@@ -108,11 +111,13 @@ def test_a_follower_that_joins_does_not_affect_other_followers(address: Path, st
         start(lambda: drive(address, ["car_1"]))
         world.wait_for(2, 10.0)
         world.step()
-        assert world.seats[0].answers == 2  # an answer to this frame and one to the next
+        assert world.seats[0].answers == 2  # this frame and the next one
     assert found == reference(8, {})
 
 
-def test_the_order_of_a_cycle(address: Path, start: Start) -> None:
+def test_a_cycle_runs_tick_sensors_stack_and_queue_in_this_order(
+    address: Path, start: Start
+) -> None:
     trace = StepTrace()
     with FollowedWorld(make_env(), address, trace=trace) as world:
         start(lambda: drive(address, ["car_0"]))
@@ -146,7 +151,7 @@ def test_controls_are_queued_for_the_next_cycle(address: Path, start: Start) -> 
 def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, start: Start) -> None:
     frames = []
 
-    def slowly() -> None:
+    def answer_slowly() -> None:
         with Follower(address, ["car_0"]) as follower:
             for sight in follower:
                 frames.append(sight.snapshot.frame)
@@ -154,20 +159,20 @@ def test_a_slow_follower_holds_the_world_and_misses_no_frame(address: Path, star
                 follower.answer(steer(sight))
 
     with FollowedWorld(make_env(), address) as world:
-        start(slowly)
+        start(answer_slowly)
         world.wait_for(1, 10.0)
         world.reset(seed=0)
         began = time.monotonic()
         hashes(world, 4)
         assert time.monotonic() - began > 0.2
-        assert world.seats[0].wait_wall_s > 0.2  # the fifth answer may have been sent already
+        assert world.seats[0].wait_wall_s > 0.2  # the world need not wait for the last answer
     assert frames == [0, 1, 2, 3, 4]
 
 
 def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> None:
     env = make_env()
     with FollowedWorld(env, address, timeout_s=0.2) as world:
-        silent = seated(world, ["car_0"], "silent")
+        silent = join_world(world, ["car_0"], "silent")
         with pytest.raises(FollowerLostError, match=r"'silent' has not answered within 0\.2 s"):
             world.reset(seed=1)
         assert world.seats == ()
@@ -178,9 +183,9 @@ def test_a_silent_follower_is_dropped_and_the_world_continues(address: Path) -> 
         silent.close()
 
 
-def test_a_silent_follower_does_not_block_others(address: Path, start: Start) -> None:
+def test_a_silent_follower_does_not_block_other_followers(address: Path, start: Start) -> None:
     with FollowedWorld(make_env(), address, timeout_s=0.3) as world:
-        with seated(world, ["car_0"], "silent"):
+        with join_world(world, ["car_0"], "silent"):
             start(lambda: drive(address, ["car_1"]))
             world.wait_for(2, 10.0)
             with pytest.raises(FollowerLostError):
@@ -191,14 +196,16 @@ def test_a_silent_follower_does_not_block_others(address: Path, start: Start) ->
 
 def test_a_follower_that_leaves_is_no_error(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
-        follower = seated(world, ["car_0"])
+        follower = join_world(world, ["car_0"])
         follower.leave()
         world.reset(seed=1)
         assert world.seats == ()
         assert hashes(world, 2) == reference(2, {})
 
 
-def test_the_end_of_an_episode_is_shown_and_needs_no_answer(address: Path, start: Start) -> None:
+def test_followers_see_the_end_of_an_episode_and_need_not_answer(
+    address: Path, start: Start
+) -> None:
     seen: list[FollowerView] = []
     with FollowedWorld(make_env(horizon_s=0.15), address) as world:
         driver = start(lambda: seen.extend(drive(address, ["car_0"])))
@@ -231,7 +238,7 @@ def test_bad_controls_are_refused_and_the_world_continues(
 ) -> None:
     told = []
 
-    def badly() -> None:
+    def answer_badly() -> None:
         with Follower(address, ["car_0"], "bad") as follower:
             try:
                 for _ in follower:
@@ -240,7 +247,7 @@ def test_bad_controls_are_refused_and_the_world_continues(
                 told.append(str(error))
 
     with FollowedWorld(make_env(), address) as world:
-        start(badly)
+        start(answer_badly)
         world.wait_for(1, 10.0)
         with pytest.raises(FollowerError, match=match):
             world.reset(seed=1)
@@ -248,8 +255,10 @@ def test_bad_controls_are_refused_and_the_world_continues(
     assert "follower 'bad'" in told[0]
 
 
-def test_bad_controls_can_be_held_and_counted(address: Path, start: Start) -> None:
-    def blinks() -> None:
+def test_bad_controls_can_be_replaced_by_the_last_controls_and_counted(
+    address: Path, start: Start
+) -> None:
+    def answer_sometimes_badly() -> None:
         with Follower(address, ["car_0"]) as follower:
             for sight in follower:
                 is_bad = sight.snapshot.frame % 2 == 1
@@ -257,7 +266,7 @@ def test_bad_controls_can_be_held_and_counted(address: Path, start: Start) -> No
 
     env = make_env()
     with FollowedWorld(env, address, bad_controls="hold") as world:
-        start(blinks)
+        start(answer_sometimes_badly)
         world.wait_for(1, 10.0)
         world.reset(seed=1)
         for _ in range(5):
@@ -295,7 +304,7 @@ def test_own_ticks_of_a_follower_do_not_change_the_world(
 
 def test_a_vehicle_has_one_follower(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
-        with seated(world, ["car_0"], "first"):
+        with join_world(world, ["car_0"], "first"):
             for wanted, match in (
                 (["car_0"], "driven by 'first'"),
                 (["car_9"], "no agent 'car_9'"),
@@ -323,7 +332,7 @@ def test_answers_to_other_frames_are_dropped_or_refused(address: Path) -> None:
         line = call(address, 10.0)
         line.say(Say.HELLO, Hello("x", ["car_0"]))
         world.wait_for(1, 10.0)
-        for frame in (-1, 0):  # the first one is late: it is dropped and counted
+        for frame in (-1, 0):  # the answer to frame -1 is late: it is dropped and counted
             line.say(Say.CONTROL, Control(frame, {"car_0": [0.0, 0.0]}))
         world.reset(seed=0)
         (seat,) = world.seats
@@ -349,7 +358,7 @@ def test_a_follower_without_a_world_is_refused(address: Path) -> None:
         Follower("x" * 200)
 
 
-def test_invalid_worlds_with_followers_are_refused(address: Path) -> None:
+def test_a_followed_world_refuses_an_invalid_timeout_or_address(address: Path) -> None:
     with pytest.raises(ConfigError, match="timeout_s"):
         FollowedWorld(make_env(), address, timeout_s=0.0)
     address.write_text("somebody's file")
@@ -358,7 +367,7 @@ def test_invalid_worlds_with_followers_are_refused(address: Path) -> None:
     assert address.read_text() == "somebody's file"
 
 
-def test_the_socket_of_a_dead_world_is_taken_over(address: Path) -> None:
+def test_a_new_world_takes_over_the_socket_of_a_dead_world(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world, pytest.raises(ConfigError, match="cannot"):
         FollowedWorld(make_env(), world.address)
     import socket
@@ -370,7 +379,7 @@ def test_the_socket_of_a_dead_world_is_taken_over(address: Path) -> None:
 
 
 def lead_steps(address: Path, steps: int, ticks: list[int]) -> None:
-    """Lead a world for some steps, and leave; note the ticks of the world."""
+    """Lead a world for `steps` steps, then leave; append each tick of the world to `ticks`."""
     with Follower(address, ["car_1"], "bridge", leads=True) as follower:
         for sight in follower:
             if len(ticks) == steps:
@@ -394,7 +403,7 @@ def test_a_follower_that_leads_releases_each_step(address: Path, start: Start) -
         assert found == reference(5, {"car_1": None})
         assert ticks == [1, 2, 3, 4, 5]
         assert (world.master.own_ticks, world.master.drifts) == (0, 0)
-        world.step()  # the bridge has left, and the world is its own master again
+        world.step()  # the leader has left, so the world steps without it
         assert world.leader is None
 
 
@@ -416,10 +425,10 @@ def test_the_world_does_not_step_without_the_tick_of_its_leader(address: Path) -
         ):
             world.step()
         assert env.state_hash() == before
-        assert hashes(world, 2) == reference(2, {})  # without a leader
+        assert hashes(world, 2) == reference(2, {})  # the world steps without a leader
 
 
-def test_a_world_has_one_leader(address: Path, start: Start) -> None:
+def test_a_second_leader_is_refused(address: Path, start: Start) -> None:
     refused: list[str] = []
 
     def second() -> None:
@@ -441,7 +450,7 @@ def test_a_world_has_one_leader(address: Path, start: Start) -> None:
     assert ticks == [1, 2, 3]
 
 
-def test_a_leader_ticks_once_for_each_step(address: Path) -> None:
+def test_a_leader_that_ticks_twice_in_a_step_is_refused(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         line = call(address, 5.0)

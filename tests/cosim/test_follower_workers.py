@@ -1,4 +1,4 @@
-"""Followed worlds that worker processes run, with sensor workers: same results."""
+"""Followed worlds give the same results in worker processes and with sensor workers."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ Seen = tuple[list[str], list[FollowerView]]
 
 
 def pool_of(env: cavmarl.CavEnv) -> Any:
-    worlds = env.worlds.worlds  # type: ignore[attr-defined] # behind their master's guard
+    worlds = env.worlds.worlds  # type: ignore[attr-defined] # the time master wraps the worlds
     assert isinstance(worlds, PooledWorlds)
     return worlds.pool
 
@@ -88,7 +88,7 @@ def _steer(sight: FollowerView) -> dict[str, list[float]]:
 
 
 def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any) -> Seen:
-    """Return the views of a follower of two vehicles in town, and the world's hashes."""
+    """Return the hashes of a world, and the views of a follower that drives two of its vehicles."""
     overrides = {"rig": RIG, "population.mode": "respawn", "clock.ctrl_dt_s": 0.05}
     env = cavmarl.parallel_env(
         "grid4x4",
@@ -121,7 +121,7 @@ def _followed(address: Path, start: Callable[..., threading.Thread], **more: Any
 
 
 @pytest.fixture(scope="module")
-def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
+def undivided(tmp_path_factory: pytest.TempPathFactory) -> Seen:
     """Return the results of the undivided world in one process."""
     threads = []
 
@@ -143,16 +143,16 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Seen:
     ],
     ids=str,
 )
-def test_followers_see_the_same(
+def test_followers_see_the_same_in_worker_processes(
     address: Path,
     start: Callable[..., threading.Thread],
-    whole: Seen,
+    undivided: Seen,
     how: dict[str, Any],
 ) -> None:
     hashes, sights = _followed(address, start, zones=2, **how)
-    assert hashes == whole[0]
+    assert hashes == undivided[0]
     assert len(sights) == STEPS + 1
-    for found, expected in zip(sights, whole[1], strict=True):
+    for found, expected in zip(sights, undivided[1], strict=True):
         assert found.snapshot == expected.snapshot
         assert list(found.snapshot.vehicles) == ["car_0", "car_2"]
         for vehicle, sensors in expected.sensors.items():
@@ -163,7 +163,7 @@ def test_followers_see_the_same(
                     assert ours.tobytes() == theirs.tobytes()
 
 
-def test_a_trace_needs_the_masters_process(address: Path) -> None:
+def test_a_trace_of_steps_is_refused_if_workers_run_the_world(address: Path) -> None:
     with (
         closing(make_env(workers=1)) as env,
         pytest.raises(ConfigError, match="use backend='local'"),

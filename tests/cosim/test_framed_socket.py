@@ -52,7 +52,7 @@ def ends() -> Iterator[tuple[FramedSocket, FramedSocket]]:
 
 
 def sent_bytes(**arguments: Any) -> bytes:
-    """Return the bytes of a frame on the connection."""
+    """Return the bytes that a frame has on the connection."""
     with socket.create_server(("127.0.0.1", 0)) as listener:
         wire = FramedSocket(socket.create_connection(listener.getsockname()), DIALECT)
         other, _ = listener.accept()
@@ -91,7 +91,7 @@ def test_received_frames_equal_sent_frames(ends: tuple[FramedSocket, FramedSocke
     far.skip()
 
 
-def test_many_and_large_arrays(ends: tuple[FramedSocket, FramedSocket]) -> None:
+def test_many_large_arrays_are_received_unchanged(ends: tuple[FramedSocket, FramedSocket]) -> None:
     near, far = ends
     many = [np.full(3000, k, dtype=np.int64) for k in range(1200)]
     thread = threading.Thread(target=near.send, args=(Kind.COMMAND, 1, None, many))
@@ -104,7 +104,7 @@ def test_many_and_large_arrays(ends: tuple[FramedSocket, FramedSocket]) -> None:
     assert np.array_equal(found, many)
 
 
-def test_every_changed_byte_is_noticed() -> None:
+def test_a_frame_with_any_changed_byte_is_refused() -> None:
     whole = sent_bytes(payload={"answer": None}, arrays=ARRAYS)
     assert read(whole)[0].order == 7
     for at in range(len(whole)):
@@ -121,7 +121,7 @@ def test_garbage_is_refused(raw: bytes) -> None:
         read(raw)
 
 
-def test_a_frame_that_is_cut_short_is_refused() -> None:
+def test_a_truncated_frame_is_refused() -> None:
     whole = sent_bytes(arrays=ARRAYS)
     for size in range(0, len(whole), 7):
         with pytest.raises(EOFError):

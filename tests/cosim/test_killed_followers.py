@@ -46,7 +46,7 @@ def test_followers_are_killed_at_random_ticks(address: Path) -> None:
             assert lost == 1
             assert world.seats == ()
             assert [world.master.world_ticks[0], world.master.drifts] == [STEPS, 0]
-            # The killed follower drove up to the step of its death, which used its last controls.
+            # The step in which the follower dies still uses its last controls.
             driven = reference(STEPS, {"car_0": None})
             assert found[: death + 1] == driven[: death + 1]
             assert found[death + 1 :] != driven[death + 1 :] or death == STEPS - 1
@@ -76,5 +76,5 @@ def test_stopped_followers_are_replaced(address: Path) -> None:
             finally:
                 first.kill()
                 other.kill()
-    # The second follower has driven from its first frame on.
+    # The second follower drives from its first frame on.
     assert found == reference(5, {"car_0": None, "car_1": None})[2:]

@@ -1,4 +1,4 @@
-"""A point-cloud map that is made by driving."""
+"""A point-cloud map from the lidar of a vehicle that drives through the map."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ from cavmarl.sensors.sensed_shapes import sampled_shapes
 pytest.importorskip("small_gicp", reason="needs the extra 'maps'")
 
 
-def test_heights_and_pitches_of_a_hill_are_found() -> None:
-    """A drive of 40 s over a crest, at 10 m/s, with the noise of the reference rig."""
+def test_the_heights_and_pitches_of_a_hill_are_estimated() -> None:
+    """Drive for 40 s over hills at 10 m/s, with the noise of the reference rig."""
     random = np.random.default_rng(1)
     dt, steps, speed = 0.05, 800, 10.0
     s = np.arange(steps) * dt * speed
@@ -42,14 +42,14 @@ def test_heights_and_pitches_of_a_hill_are_found() -> None:
     assert np.abs(turned - pitch).mean() < 0.01
 
 
-def test_echoes_lie_where_rays_end() -> None:
+def test_an_echo_becomes_a_point_at_the_end_of_its_ray() -> None:
     settings = {
         "fov_deg": 360.0, "range_m": 50.0, "lower_deg": -10.0, "upper_deg": 10.0,
         "yaw_deg": 90.0, "pitch_deg": 0.0, "roll_deg": 0.0, "x_m": 1.0, "y_m": 0.0, "z_m": 1.6,
     }  # fmt: skip
     lidar = StackSensor("roof", "lidar", StackMount(1.0, 0.0, 0.0), settings)
     scan = np.full((3, 4), 50.0)
-    scan[1, 0] = 10.0  # level, ahead of the sensor, which looks to the left
+    scan[1, 0] = 10.0  # level and ahead of the sensor, which points to the left of the vehicle
     scan[0, 2] = 5.0
     found = lidar_points(lidar, scan)
     down = np.radians(10.0)
@@ -60,7 +60,7 @@ def test_echoes_lie_where_rays_end() -> None:
 
 
 def test_the_only_ray_of_a_lidar_points_straight_ahead() -> None:
-    """So it does in the world (`lidar_fan`), and in all programs that use its scans."""
+    """Check the world (`lidar_fan`) and all programs that use its scans."""
     config = LidarRigConfig(rate_hz=10.0, rays=1, fov_deg=90.0)
     (ahead,) = lidar_fan(config).rays[:, 0]
     lidar = StackSensor("roof", "lidar", StackMount(0.0, 0.0, 0.0), asdict(config))
@@ -72,7 +72,7 @@ def test_the_only_ray_of_a_lidar_points_straight_ahead() -> None:
 
 
 @pytest.mark.slow
-def test_a_survey_lies_on_the_map(tmp_path: Path) -> None:
+def test_the_points_of_a_survey_lie_on_the_map(tmp_path: Path) -> None:
     cloud, told = tmp_path / "grid.ply", tmp_path / "told.json"
     words = ["survey", "grid4x4", "-o", str(cloud), "--time-s", "12", "--vehicles", "1"]
     words += ["--buildings", "map/buildings.poly.xml", "--voxel", "0.4", "--json", str(told)]
@@ -88,6 +88,6 @@ def test_a_survey_lies_on_the_map(tmp_path: Path) -> None:
     assert 0.0 < surface["seen_share"] <= 1.0
 
 
-def test_a_survey_of_another_kind_of_file_is_refused(tmp_path: Path) -> None:
+def test_a_survey_with_an_unknown_file_type_is_refused(tmp_path: Path) -> None:
     result = CliRunner().invoke(app, ["survey", "ring", "-o", str(tmp_path / "a.las")])
     assert isinstance(result.exception, ConfigError)

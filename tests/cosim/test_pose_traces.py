@@ -1,4 +1,4 @@
-"""Recorded traces: files, playback through the path of clients, late and lost poses."""
+"""Recorded traces: files, playback by the code that handles clients, late and lost poses."""
 
 from __future__ import annotations
 
@@ -18,21 +18,21 @@ from tests.cosim.test_client_actors import STEP_S, far_place, make_env, others
 HEAD = "time_s,x,y,heading"
 
 
-def written(tmp_path: Path, text: str) -> Path:
+def write_trace(tmp_path: Path, text: str) -> Path:
     path = tmp_path / "van.csv"
     path.write_text(text, encoding="utf-8")
     return path
 
 
 def straight(x: float, y: float, count: int = 40, every_s: float = 0.02) -> PoseTrace:
-    """Return a trace at 50 Hz along the x axis, at 10 m/s, whose poses arrive at once."""
+    """Return a trace along the x axis at 10 m/s, at 50 Hz, with poses that arrive without delay."""
     stamps = [round(k * every_s, 6) for k in range(count)]
     samples = [PoseSample(stamp, x + 10.0 * stamp, y, 0.0) for stamp in stamps]
     return PoseTrace("van", "car", None, samples, stamps)
 
 
 def test_a_file_has_one_trace_per_id_with_types_and_sizes(tmp_path: Path) -> None:
-    path = written(
+    path = write_trace(
         tmp_path,
         "id,type,time_s,x,y,heading,speed,received_s,length,width,height\n"
         "a,truck,10.0,1,2,0.5,3,10.1,6,2,3\n"
@@ -64,11 +64,11 @@ def test_a_file_has_one_trace_per_id_with_types_and_sizes(tmp_path: Path) -> Non
 )
 def test_invalid_files_are_refused(tmp_path: Path, text: str, match: str) -> None:
     with pytest.raises(ConfigError, match=match):
-        read_traces(written(tmp_path, text))
+        read_traces(write_trace(tmp_path, text))
 
 
-def test_a_byte_order_mark_is_no_part_of_a_name(tmp_path: Path) -> None:
-    (trace,) = read_traces(written(tmp_path, f"\ufeff{HEAD}\n0,1,2,0\n"))
+def test_a_byte_order_mark_is_not_part_of_a_column_name(tmp_path: Path) -> None:
+    (trace,) = read_traces(write_trace(tmp_path, f"\ufeff{HEAD}\n0,1,2,0\n"))
     assert trace.samples[0].x == 1.0
 
 
@@ -77,8 +77,8 @@ def test_a_missing_file_is_refused(tmp_path: Path) -> None:
         read_traces(tmp_path / "none.csv")
 
 
-def played(address: Path, traces: list[PoseTrace], steps: int, **more: Any) -> tuple[Any, ...]:
-    """Play traces; return the places of external vehicles after each step, and the report."""
+def play(address: Path, traces: list[PoseTrace], steps: int, **more: Any) -> tuple[Any, ...]:
+    """Play traces; return places of actors per step, the report, refusals and other vehicles."""
     places = []
     with closing(make_env(**more)) as env, FollowedWorld(env, address, traces=traces) as world:
         world.reset(seed=1)
@@ -91,10 +91,10 @@ def played(address: Path, traces: list[PoseTrace], steps: int, **more: Any) -> t
 def test_a_body_follows_its_trace_and_leaves_after_it(address: Path) -> None:
     with closing(make_env()) as env:
         x, y = far_place(env)
-    places, (report,), refused, rows = played(address, [straight(x, y)], 25)
+    places, (report,), refused, rows = play(address, [straight(x, y)], 25)
     for step in range(15):
         ((found, _),) = places[step]
-        # The last pose before the end of a step is up to 20 ms old, and is extrapolated.
+        # The last pose before the end of a step is up to 20 ms old, so the body is extrapolated.
         assert found == pytest.approx(
             x + 10.0 * (step + 1) * STEP_S, abs=0.21 if step < 1 else 1e-6
         )
@@ -102,8 +102,8 @@ def test_a_body_follows_its_trace_and_leaves_after_it(address: Path) -> None:
     assert (report["received"], report["late"], report["lost"]) == (40, 0, 0)
     assert report["extrapolated"] > 0
     assert refused == 0
-    _, _, _, without = played(address, [], 25)
-    assert rows == without  # no other vehicle sees it
+    _, _, _, without = play(address, [], 25)
+    assert rows == without  # no other vehicle sees the body
 
 
 def test_late_and_lost_poses_of_a_trace_are_counted(address: Path) -> None:
@@ -116,8 +116,8 @@ def test_late_and_lost_poses_of_a_trace_are_counted(address: Path) -> None:
     trace = PoseTrace(
         "van", "car", None, [whole.samples[k] for k in order], [arrivals[k] for k in order]
     )
-    _, (report,), _, _ = played(address, [trace], 25)
-    assert (report["late"], report["lost"]) == (1, 3)  # pose 30 is late, and not lost
+    _, (report,), _, _ = play(address, [trace], 25)
+    assert (report["late"], report["lost"]) == (1, 3)  # pose 30 is late but not lost
 
 
 def test_a_body_waits_for_a_free_place(address: Path) -> None:
@@ -127,7 +127,7 @@ def test_a_body_waits_for_a_free_place(address: Path) -> None:
         x, y = float(row["x"]), float(row["y"])
     samples = [PoseSample(k * STEP_S, x, y, 0.0) for k in range(200)]
     trace = PoseTrace("van", "pedestrian", None, samples, [pose.stamp_s for pose in samples])
-    places, _, refused, _ = played(address, [trace], 60)
+    places, _, refused, _ = play(address, [trace], 60)
     assert places[0] == []
     assert 0 < refused < 60
     assert places[refused] == [(x, y)]
@@ -138,14 +138,14 @@ def test_a_world_that_refuses_a_trace_says_why(address: Path) -> None:
         x, y = far_place(env)
     several = [replace(straight(x, y + 10.0 * k), name=f"van {k}") for k in range(4)]
     with pytest.raises(CapacityError, match=r"population\.external are in use"):
-        played(address, several, 1)
+        play(address, several, 1)
     with pytest.raises(ActionError, match="outside of the map"):
-        played(address, [straight(1e6, y)], 1)
+        play(address, [straight(1e6, y)], 1)
     with pytest.raises(ActionError, match="vtype = 'tank'"):
-        played(address, [replace(straight(x, y), vtype="tank")], 1)
+        play(address, [replace(straight(x, y), vtype="tank")], 1)
 
 
-def test_a_trace_begins_anew_in_each_episode(address: Path) -> None:
+def test_a_trace_starts_again_in_each_episode(address: Path) -> None:
     with closing(make_env()) as env:
         x, y = far_place(env)
         with FollowedWorld(env, address, traces=[straight(x, y)]) as world:

@@ -1,4 +1,4 @@
-"""Poses with a rate of their own: extrapolation with a bound, late and lost poses."""
+"""Poses that arrive at their own rate: limited extrapolation, late and lost poses."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def straight(stamp_s: float, speed_mps: float = 10.0, **more: Any) -> PoseSample
     return PoseSample(stamp_s, speed_mps * stamp_s, 2.0, 0.0, **more)
 
 
-def test_a_pose_of_the_asked_time_is_returned_as_it_is() -> None:
+def test_a_pose_at_the_requested_time_is_returned_unchanged() -> None:
     track = PoseTrack(20.0, 0.5)
     sample = PoseSample(0.05, 1.0, 2.0, 0.3, 0.1, 0.02, 4.0)
     track.add(sample, 0.0, STEP_S)
@@ -26,7 +26,7 @@ def test_a_pose_of_the_asked_time_is_returned_as_it_is() -> None:
     assert track.counts.extrapolated == 0
 
 
-def test_a_straight_move_is_extrapolated_from_two_poses_or_from_a_speed() -> None:
+def test_straight_motion_is_extrapolated_from_two_poses_or_from_a_speed() -> None:
     without = PoseTrack(100.0, 0.5)
     stated = PoseTrack(100.0, 0.5)
     for stamp_s in (0.01, 0.02):
@@ -59,7 +59,7 @@ def test_a_turn_is_extrapolated_along_its_circle(is_stated: bool) -> None:
     assert found.heading == pytest.approx(expected.heading)
 
 
-def test_extrapolation_ends_at_the_bound_and_the_body_stands() -> None:
+def test_the_body_stops_when_extrapolation_reaches_its_limit() -> None:
     track = PoseTrack(20.0, 0.2)
     for stamp_s in (0.05, 0.1):
         track.add(straight(stamp_s), stamp_s, STEP_S)
@@ -75,30 +75,30 @@ def test_extrapolation_ends_at_the_bound_and_the_body_stands() -> None:
     assert track.counts.worst_age_s == pytest.approx(8.9)
 
 
-def test_lost_poses_are_counted_by_the_rate_and_late_ones_are_not_lost() -> None:
+def test_missing_poses_count_as_lost_and_late_poses_count_as_late() -> None:
     track = PoseTrack(100.0, 0.5)
     for number in (1, 2, 5, 6):
         track.add(straight(number / 100.0), number / 100.0, STEP_S)
     assert (track.counts.lost, track.counts.late) == (2, 0)
-    track.add(straight(0.03), 0.06, STEP_S)  # overtaken
+    track.add(straight(0.03), 0.06, STEP_S)  # arrives after newer poses
     assert (track.counts.lost, track.counts.late, track.counts.received) == (1, 1, 5)
     found = track.at(0.06)
     assert found is not None
     assert found.x == pytest.approx(0.6)
-    track.add(straight(0.07), 0.5, STEP_S)  # it is the newest pose, but it was long under way
+    track.add(straight(0.07), 0.5, STEP_S)  # the newest pose, but it arrives 0.43 s after its time
     assert track.counts.late == 2
-    track.add(straight(0.07), 0.5, STEP_S)  # the same again
+    track.add(straight(0.07), 0.5, STEP_S)  # the same pose a second time
     assert (track.counts.late, track.counts.lost) == (3, 1)
 
 
-def test_without_a_rate_no_pose_is_lost() -> None:
+def test_without_a_rate_no_pose_counts_as_lost() -> None:
     track = PoseTrack(0.0, 0.5)
     for stamp_s in (0.0, 1.0, 3.0):
         track.add(straight(stamp_s), stamp_s, STEP_S)
     assert (track.counts.lost, track.counts.late) == (0, 0)
 
 
-def test_a_new_episode_forgets_the_poses_and_keeps_the_counts() -> None:
+def test_a_new_episode_deletes_the_poses_and_keeps_the_counts() -> None:
     track = PoseTrack(20.0, 0.5)
     track.add(straight(0.05), 0.05, STEP_S)
     track.clear()

@@ -40,19 +40,21 @@ def cloud(world: Any, tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
-    """Without scans, the filter has the error of the bias; with scans, at most that of one scan.
+def test_scan_matching_removes_a_bias_of_gnss(world: Any, cloud: Path) -> None:
+    """Compare the position error of the filter with and without scans.
 
-    With fixes of 1 m at 10 Hz and a drift of 0.1 m/√s, the position has a standard deviation of
-    √(0.1 · √0.1) m = 0.18 m about the biased position. A scan has 0.1 m east and north (lidar
-    2 cm, map 3 cm, points 0.4 m apart), so its mean error is 0.1 · √(π/2) m.
+    Without scans, the error is the bias of GNSS. With fixes of 1 m at 10 Hz and a drift of
+    0.1 m/√s, the position has a standard deviation of √(0.1 · √0.1) m = 0.18 m about the biased
+    position. With scans, the error is at most that of one scan. A scan has a standard deviation of
+    0.1 m east and north (lidar 2 cm, map 3 cm, points 0.4 m apart), so its mean error is
+    0.1 · √(π/2) m.
     """
     drive = Drive(world, cloud, seed=3)
     for _ in range(200):
         assert drive.step()
     bias_m = float(np.hypot(*np.mean(drive.fixes_m, axis=0)))
     before, after = (float(np.mean(off[100:])) for off in drive.off_m.values())
-    assert bias_m > 3.0, "the shift exceeds the range of scan matching"
+    assert bias_m > 3.0, "the bias is within the range of scan matching"
     assert before == pytest.approx(bias_m, abs=3.0 * 0.18)
     assert after < 0.1 * math.sqrt(0.5 * math.pi)
     matching = drive.stages["scan_matching"]
@@ -60,7 +62,9 @@ def test_scans_take_a_bias_of_gnss_away(world: Any, cloud: Path) -> None:
     assert matching.bias == pytest.approx(np.mean(drive.fixes_m, axis=0), abs=3.0 * 0.1)
 
 
-def test_missing_inputs_are_named(world: Any, cloud: Path, tmp_path: Path) -> None:
+def test_missing_inputs_are_errors_that_name_the_input(
+    world: Any, cloud: Path, tmp_path: Path
+) -> None:
     hd_map = HdMap(world.network)
     sensors = [sensor_of(v.name, v.settings) for v in welcome_to(world, ["car_0"], 0).sensors]
 
@@ -80,7 +84,7 @@ def test_missing_inputs_are_named(world: Any, cloud: Path, tmp_path: Path) -> No
     assert stack(sensors, cloud).pose is None
 
 
-def test_a_stack_takes_the_map_with_the_keys_of_the_world(world: Any) -> None:
+def test_a_stack_refuses_a_map_with_other_settings_than_the_world(world: Any) -> None:
     welcome = welcome_to(world, ["car_0"], 0)
     with pytest.raises(ConfigError, match=r"another map than .*--set map\.buildings"):
         StackDriver(load_roads(*load_config("grid4x4")), welcome)

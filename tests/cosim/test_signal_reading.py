@@ -1,4 +1,4 @@
-"""Signals as a driving stack knows them: from the world, or from received messages."""
+"""Signals that a driving stack reads from the world, or from received messages."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ from cavmarl.cosim.stack.signal_reading import SPAT, SpatSignals, ToldSignals
 AIR = {"v2x.enabled": True, "v2x.roadside.signals": ["all"], "v2x.inbox.signals": 64}
 
 
-def looks(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]]:
-    """Return the received and the true signal states of car_0, over some steps."""
+def read_signals(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]]:
+    """Step a world; return the sensors of car_0, the true signal states and the world, per step."""
     env = cavmarl.parallel_env(
         "grid4x4", agents=2, background=0, workers=workers, overrides=AIR | more
     )
@@ -37,28 +37,30 @@ def looks(workers: int = 0, **more: Any) -> list[tuple[Any, Any, cavmarl.CavEnv]
         env.close()
 
 
-def test_received_signal_states_equal_the_signals() -> None:
-    found = looks()
+def test_received_signal_states_equal_the_true_states() -> None:
+    found = read_signals()
     stage = SpatSignals(HdMap(found[0][2].network))
     seen = set()
     equal = 0
     for (_, before, _), (readings, told, _) in pairwise(found[1:]):
         heard = stage.read(readings, None)
-        assert ((heard == told) | (heard == before)).all()  # a message is one or two ticks old
+        assert (
+            (heard == told) | (heard == before)
+        ).all()  # the last message has the state of this step or of the previous one
         equal += int((heard == told).all())
         assert ToldSignals().read({}, told) is told
         seen |= set(told[told != SIGNAL_NONE].tolist())
-    assert len(seen) > 1  # both red and green occurred
+    assert len(seen) > 1  # the signals change during the run
     assert equal > 0.6 * len(found)
 
 
-def test_received_states_are_equal_on_workers() -> None:
-    for (mine, *_), (theirs, *_) in zip(looks(), looks(workers=1), strict=True):
+def test_received_signal_states_are_equal_on_workers() -> None:
+    for (mine, *_), (theirs, *_) in zip(read_signals(), read_signals(workers=1), strict=True):
         assert (mine[SPAT].values == theirs[SPAT].values).all()
 
 
-def test_a_signal_that_is_not_heard_is_red() -> None:
-    found = looks(**{"v2x.channel.loss": 1.0})
+def test_a_signal_without_received_messages_is_red() -> None:
+    found = read_signals(**{"v2x.channel.loss": 1.0})
     network = found[0][2].network
     stage = SpatSignals(HdMap(network))
     heard = stage.read(found[-1][0], found[-1][1])
@@ -69,8 +71,8 @@ def test_a_signal_that_is_not_heard_is_red() -> None:
     assert (stage.read({}, None) == heard).all()
 
 
-def test_signals_out_of_reach_are_red_and_near_signals_are_received() -> None:
-    found = looks(**{"v2x.channel.range_m": 150.0})
+def test_signals_out_of_range_are_red_and_near_signals_are_received() -> None:
+    found = read_signals(**{"v2x.channel.range_m": 150.0})
     readings, told, env = found[-1]
     heard = SpatSignals(HdMap(env.network)).read(readings, None)
     near = np.isin(env.network.links["signal"], readings[SPAT].values[-1][:, 0])
@@ -79,14 +81,17 @@ def test_signals_out_of_reach_are_red_and_near_signals_are_received() -> None:
     assert (heard[(told != SIGNAL_NONE) & ~near] == SIGNAL_RED).all()
 
 
-def test_without_messages_there_is_no_spat() -> None:
-    readings = looks(**{"v2x.enabled": False, "v2x.roadside.signals": []})[-1][0]
+def test_without_messages_the_world_has_no_spat_sensor() -> None:
+    readings = read_signals(**{"v2x.enabled": False, "v2x.roadside.signals": []})[-1][0]
     assert SPAT not in readings
 
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
-def test_the_stack_stops_at_red_with_each(stage: str) -> None:
-    """If a signal has no state, `spat` makes the stack stop, and `told` uses the right of way."""
+def test_a_signal_with_unknown_state_is_red_for_spat_and_ignored_for_told(stage: str) -> None:
+    """Plan towards a signal with no known state.
+
+    With the stage `spat`, the stack stops; with `told`, it follows the right of way.
+    """
     from cavmarl.config.registry import load_config
     from cavmarl.cosim.stack.route_planning import LaneRoute
     from cavmarl.cosim.stack.stack_types import EgoPose, Mission

@@ -67,13 +67,20 @@ def grid() -> HdMap:
 @pytest.mark.parametrize(
     ("vclass", "length_m", "bound_m"), [("passenger", 5.0, 0.1), ("truck", 7.1, 0.1)]
 )
-def test_a_bend_of_50_m_is_held_at_8_mps(vclass: str, length_m: float, bound_m: float) -> None:
+def test_the_control_stage_follows_a_bend_of_50_m_at_8_mps(
+    vclass: str, length_m: float, bound_m: float
+) -> None:
     radius = 50.0
     angles = np.linspace(-0.5 * math.pi, 1.5 * math.pi, 721)
     ring = Trajectory(radius * np.stack([np.cos(angles), np.sin(angles)], axis=1), 0.0)
     mission = Mission(0, vclass, length_m, 2.4)
     control = PurePursuit(TICK_S)
-    x, y, heading, speed = 0.0, -radius - 0.5, 0.0, 8.0  # starts half a metre off the circle
+    x, y, heading, speed = (
+        0.0,
+        -radius - 0.5,
+        0.0,
+        8.0,
+    )  # the vehicle starts half a metre outside of the circle
     off = []
     for _ in range(600):
         driven = control.control(EgoPose(x, y, heading, speed), ring, mission)
@@ -95,16 +102,16 @@ def test_gains_belong_to_the_type_of_the_vehicle() -> None:
         assert -gains.steering_radps * TICK_S <= driven.steering_rad < 0.0
 
 
-class TurnedMap(HdMap):
-    """A map whose lanes have reversed directions."""
+class ReversedMap(HdMap):
+    """A map with reversed lane directions."""
 
     def near(self, x_m: float, y_m: float, within_m: float) -> list[OnLane]:
         found = super().near(x_m, y_m, within_m)
         return [lane._replace(heading_rad=wrap_angle(lane.heading_rad + math.pi)) for lane in found]
 
 
-def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]:
-    """Return the error of the filter after each step, without other sensors."""
+def localise(seed: int, steps: int, *, is_reversed: bool = False) -> list[float]:
+    """Return the position error of the GNSS and inertial filter after each step, in m."""
     env = cavmarl.parallel_env(
         "grid4x4", agents=2, background=0, overrides={"clock.ctrl_dt_s": TICK_S, "rig": RIG}
     )
@@ -113,7 +120,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
     sensors = [sensor_of(view.name, view.settings) for view in welcome.sensors]
     vehicle = vehicle_of(HdMap(env.network), sensors, TICK_S)
     assert vehicle.geodesy is not None
-    hd_map = TurnedMap(env.network) if turned_round else vehicle.hd_map
+    hd_map = ReversedMap(env.network) if is_reversed else vehicle.hd_map
     stage = GnssInertial(sensors, vehicle.geodesy, hd_map, TICK_S)
     off = []
     for step in range(steps):
@@ -121,7 +128,7 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
         view = sight.snapshot.vehicles["car_0"]
         mission = Mission(0, view.vclass, view.length_m, view.width_m)
         pose = stage.locate(sight.sensors["car_0"], mission, sight.snapshot.time_s)
-        assert pose is not None  # from the first fix on, which is part of the reset
+        assert pose is not None  # the reset gives the first fix
         rows = env.simulation.vehicles()
         row = rows[rows["agent"] == 0][0]
         off.append(math.hypot(pose.x_m - row["x"], pose.y_m - row["y"]))
@@ -133,14 +140,14 @@ def located(seed: int, steps: int, *, turned_round: bool = False) -> list[float]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_place_is_known_after_5_s(seed: int) -> None:
-    off = located(seed, 160)
+def test_localisation_converges_within_5_s(seed: int) -> None:
+    off = localise(seed, 160)
     assert max(off[100:]) < 1.2
     assert np.mean(off[100:]) < 0.7
 
 
-def test_a_heading_the_wrong_way_is_noticed() -> None:
-    off = located(1, 240, turned_round=True)
+def test_localisation_corrects_a_reversed_heading() -> None:
+    off = localise(1, 240, is_reversed=True)
     assert max(off) > 3.0
     assert max(off[200:]) < 1.2
 
@@ -161,7 +168,7 @@ def test_a_given_pose_is_used(grid: HdMap) -> None:
 
 
 def lane_of(grid: HdMap, length_m: float) -> int:
-    """Find a lane of some length that ends at a signal and has a link at its end."""
+    """Return a lane with at least this length that has a link at its end."""
     lanes = grid.network.lanes
     for lane, row in enumerate(lanes):
         if row["internal"] or row["length_m"] < length_m or row["num_links"] == 0:
@@ -170,8 +177,8 @@ def lane_of(grid: HdMap, length_m: float) -> int:
     raise AssertionError("no such lane")
 
 
-def goal_behind(grid: HdMap, lane: int) -> tuple[int, int]:
-    """Return a link from a lane, and its target edge."""
+def goal_after(grid: HdMap, lane: int) -> tuple[int, int]:
+    """Return the first link of a lane, and the edge to which it leads."""
     link = int(grid.network.lanes["first_link"][lane])
     return link, int(grid.network.lanes["edge"][grid.network.links["to_lane"][link]])
 
@@ -182,9 +189,9 @@ def pose_on(grid: HdMap, lane: int, s_m: float, speed_mps: float) -> EgoPose:
     return EgoPose(x, y, place.heading_rad, speed_mps)
 
 
-def test_a_red_signal_is_a_place_to_stop(grid: HdMap) -> None:
+def test_the_stack_stops_at_a_red_signal(grid: HdMap) -> None:
     lane = lane_of(grid, 60.0)
-    link, goal = goal_behind(grid, lane)
+    link, goal = goal_after(grid, lane)
     signals = np.full(len(grid.network.links), SIGNAL_GREEN_MAJOR, dtype=np.uint8)
     pose = pose_on(grid, lane, float(grid.network.lanes["length_m"][lane]) - 20.0, 10.0)
     mission = Mission(goal, "passenger", 5.0, 2.0)
@@ -198,7 +205,7 @@ def test_a_red_signal_is_a_place_to_stop(grid: HdMap) -> None:
 
 def test_the_stack_keeps_a_gap_to_objects_on_its_path_only(grid: HdMap) -> None:
     lane = lane_of(grid, 60.0)
-    _, goal = goal_behind(grid, lane)
+    _, goal = goal_after(grid, lane)
     mission = Mission(goal, "passenger", 5.0, 2.0)
     pose = pose_on(grid, lane, 10.0, 10.0)
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
@@ -219,7 +226,7 @@ def test_the_stack_keeps_a_gap_to_objects_on_its_path_only(grid: HdMap) -> None:
     assert plan(-15.0, 0.0, 0.0).reason != "gap"
 
 
-def test_vehicles_with_the_right_of_way_go_first(grid: HdMap) -> None:
+def test_the_stack_yields_to_a_vehicle_with_the_right_of_way(grid: HdMap) -> None:
     network = grid.network
     for row in network.links:
         conflicts = network.conflicts[row["first_conflict"] :][: row["num_conflicts"]]
@@ -269,7 +276,7 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
     stage = LidarObjects([StackSensor("roof", "lidar", StackMount(0.0, 0.0, 0.0), settings)], grid)
     cos, sin = math.cos(pose.heading_rad), math.sin(pose.heading_rad)
     for step in range(8):
-        ahead = 15.0 + 0.5 * step  # 5 m/s, ten scans a second
+        ahead = 15.0 + 0.5 * step  # 5 m/s at ten scans per second
         box = (pose.x_m + ahead * cos, pose.y_m + ahead * sin, 2.5, 1.0)
         found = stage.perceive({"roof": Scan(scan_of(pose, box, 360))}, pose, 0.1 * step)
         assert stage.perceive({}, pose, 0.1 * step + 0.05) == found
@@ -291,7 +298,7 @@ def test_the_only_ray_of_a_lidar_detects_an_object_ahead(grid: HdMap) -> None:
     assert seen.y_m == pytest.approx(pose.y_m + 20.0 * math.sin(pose.heading_rad))
 
 
-def test_stages_are_chosen_by_name() -> None:
+def test_an_unknown_name_of_a_stage_is_refused() -> None:
     with pytest.raises(
         ConfigError, match="perception = 'radar': must be lidar or lidar_camera or blind"
     ):

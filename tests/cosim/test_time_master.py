@@ -50,7 +50,7 @@ def test_time_is_exact_after_5000_ticks() -> None:
     assert env.worlds.arrays.ticks.tolist() == [5000]
 
 
-def test_a_second_master_is_refused_until_the_first_has_gone() -> None:
+def test_a_second_master_is_refused_until_the_first_is_released() -> None:
     env = make()
     first = TimeMaster(env)
     with pytest.raises(ClockError, match="follow"):
@@ -100,12 +100,12 @@ def test_followers_change_no_trajectory(own_ticks: OwnTicks) -> None:
     ]
 
 
-def test_an_obeyed_tick_is_noticed_before_the_next_one() -> None:
+def test_an_obeyed_tick_of_a_follower_is_detected_before_the_next_tick() -> None:
     env = make()
     master = TimeMaster(env, own_ticks="obey", on_drift="record")
     master.reset(seed=0)
     follower = master.follow("rogue")
-    assert not follower.tick()  # there is no last step that could be repeated
+    assert not follower.tick()  # a tick would repeat the last step; there is none
     for step in range(10):
         master.step(env.suggest_actions())
         if step % 3 == 0:
@@ -135,7 +135,7 @@ def test_steps_without_the_master_are_detected_and_refused() -> None:
 @pytest.mark.parametrize(
     "pacer", [None, RealTime(5.0), RealTime(1e6), Stepwise(lambda time_s: None)]
 )
-def test_no_pacing_changes_the_trace(pacer: Pacer | None) -> None:
+def test_no_pacer_changes_the_states(pacer: Pacer | None) -> None:
     env = make()
     master = TimeMaster(env, pacer=pacer)
     master.reset(seed=3)
@@ -155,7 +155,7 @@ class WallClock:
         self.time_s += seconds
 
 
-def test_real_time_pacing_waits_and_measures_delays() -> None:
+def test_a_real_time_pacer_waits_and_measures_delays() -> None:
     wall = WallClock()
     pacer = RealTime(2.0, wall.now, wall.pass_by)
     starts = []
@@ -163,7 +163,7 @@ def test_real_time_pacing_waits_and_measures_delays() -> None:
         pacer.wait(0.1 * step)
         starts.append(round(wall.time_s - 100.0, 6))
         wall.pass_by(work_s)
-    # Steps are due every 0.05 s; the steps after the second one make up for its 0.2 s.
+    # Steps are due every 0.05 s. The second step takes 0.2 s, so later steps start without waiting.
     assert starts == [0.0, 0.05, 0.25, 0.25, 0.25, 0.25]
     lateness = pacer.lateness
     assert (lateness.steps, lateness.late) == (6, 3)
@@ -171,7 +171,7 @@ def test_real_time_pacing_waits_and_measures_delays() -> None:
     assert lateness.mean_wall_s == pytest.approx((0.15 + 0.1 + 0.05) / 6)
 
 
-def test_a_step_waits_until_it_is_allowed() -> None:
+def test_a_stepwise_pacer_is_asked_before_each_step() -> None:
     asked: list[float] = []
     env = make()
     master = TimeMaster(env, pacer=Stepwise(asked.append))
@@ -187,7 +187,7 @@ def test_an_impossible_pace_is_refused(factor: float) -> None:
 
 
 @pytest.mark.parametrize("zones", [1, 3])
-def test_a_step_is_one_tick_and_then_its_sensors(zones: int) -> None:
+def test_a_step_runs_one_tick_and_then_the_sensors(zones: int) -> None:
     trace = StepTrace()
     env = make(zones)
     master = TimeMaster(env, trace=trace)
@@ -206,7 +206,7 @@ def test_a_longer_step_has_more_ticks_and_one_frame() -> None:
     assert master.tick == 4
 
 
-def test_worlds_of_a_vector_keep_their_master_over_new_episodes() -> None:
+def test_the_worlds_of_a_vector_environment_keep_their_time_master_in_new_episodes() -> None:
     vec = cavmarl.make_vec("ring", num_envs=2, agents=2, background=2, overrides={"horizon_s": 0.5})
     master = TimeMaster(vec)
     master.reset(seed=0)
@@ -231,7 +231,7 @@ def test_an_action_takes_effect_after_the_latency() -> None:
         assert throttles[1] < -1.0
 
 
-def test_worlds_of_worker_processes_have_a_master() -> None:
+def test_worlds_in_worker_processes_have_a_time_master() -> None:
     found = []
     for workers in (0, 2):
         vec = cavmarl.make_vec("ring", num_envs=2, workers=workers, agents=2, background=2)

@@ -1,4 +1,4 @@
-"""Callers with unknown or invalid messages: a typed error, and no harm to the world."""
+"""Callers with unknown or invalid messages get a typed error and do not affect the world."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from cavmarl.cosim.followers.follower_messages import (
     read_payload,
 )
 from cavmarl.cosim.followers.framed_socket import FramedSocket
-from tests.cosim.conftest import hashes, make_env, seated
+from tests.cosim.conftest import hashes, join_world, make_env
 from tests.cosim.test_followed_world import reference
 from tests.support.descriptors import without_descriptors
 
@@ -42,7 +42,7 @@ def call(address: Path) -> socket.socket:
 
 
 def refusal(connection: socket.socket) -> str:
-    """Return the reason with which the world closed the connection."""
+    """Return the reason that the world gave when it closed the connection."""
     line = FollowerConnection(connection, "the world")
     heard = line.hear(10.0)
     assert heard.kind is Say.REFUSAL
@@ -120,14 +120,14 @@ def test_a_slow_caller_does_not_block_the_world(
         slow.close()
 
 
-def test_a_crowd_does_not_keep_a_follower_out(address: Path) -> None:
+def test_many_silent_callers_do_not_keep_a_follower_out(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         world.reset(seed=1)
         crowd = [call(address) for _ in range(reception.MAX_CALLERS)]
         world.admit(0.0)
         late = call(address)
         late.sendall(hello_in(VERSION))
-        world.admit(0.0)  # takes the place of the oldest caller
+        world.admit(0.0)  # the new caller replaces the oldest one
         world.admit(0.0)
         assert [follower.name for follower in world.master.followers] == ["x"]
         assert "too many callers" in refusal(crowd[0])
@@ -160,7 +160,7 @@ def test_without_descriptors_the_oldest_caller_is_dropped(address: Path) -> None
         (lambda wire: wire.send(Say.CONTROL, 0, None), "not a Control"),
         (lambda wire: wire.send(Say.CONTROL, 0, {"frame": 0, "controls": {}, "more": 1}), "more"),
     ],
-    ids=["hello twice", "garbage", "no number", "nothing", "more than is known"],
+    ids=["hello twice", "garbage", "no number", "nothing", "unknown key"],
 )
 def test_a_follower_with_invalid_messages_is_dropped(
     address: Path, speak: Callable[[FramedSocket], object], match: str
@@ -189,7 +189,7 @@ def test_a_hello_with_too_many_vehicles_is_refused(address: Path) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.binary(max_size=200))
-def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
+def test_any_bytes_give_a_frame_or_a_typed_error(raw: bytes) -> None:
     near, far = socket.socketpair()
     far.sendall(raw)
     far.close()
@@ -203,7 +203,9 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
         line.close()
 
 
-@settings(deadline=None)  # the first call creates the validators of payloads
+@settings(
+    deadline=None
+)  # no deadline: the first call creates the validators of payloads, which takes longer
 @given(
     st.recursive(
         st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5),
@@ -211,7 +213,7 @@ def test_any_bytes_are_a_frame_or_a_typed_error(raw: bytes) -> None:
         max_leaves=8,
     )
 )
-def test_any_payload_is_a_message_or_a_typed_error(payload: object) -> None:
+def test_any_payload_gives_a_message_or_a_typed_error(payload: object) -> None:
     for kind in (Hello, Control, FollowerSnapshot):
         try:
             read_payload(kind, payload)
@@ -285,7 +287,7 @@ def refusal_of(world: FollowedWorld) -> str:
 def test_followers_can_connect_by_a_local_port() -> None:
     with FollowedWorld(make_env(), 0, secret="of this world") as world:
         assert isinstance(world.address, int)
-        follower = seated(world, ["car_0"], secret="of this world")
+        follower = join_world(world, ["car_0"], secret="of this world")
         caller = threading.Thread(target=lambda: [follower.wait(), follower.leave()])
         caller.start()
         world.reset(seed=0)

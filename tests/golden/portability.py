@@ -3,11 +3,11 @@
     python -m tests.golden.portability [--quick|--emulated]
 
 This command runs the rows of `worlds.py` and episodes of some trained drivers: first without
-settings, then with each setting of `PROCESSORS`. Each run reads the maps anew. The command prints
-a line for each run. The exit code is 1 if the bytes of a run differ from those of the first run.
-Recorded hashes are not used. `--quick` leaves out runs of more than a minute. `--emulated` runs
-one step on the processors that `qemu-x86_64` emulates, and on the processor for which their
-kernels are compiled.
+settings, then with each setting of `PROCESSORS`. Each run reads the maps again. The command prints
+a line for each run. If the results of a run differ from those of the first run, the exit code is 1.
+The command does not use the recorded hashes. `--quick` leaves out runs of more than a minute.
+`--emulated` runs one step on processors that `qemu-x86_64` emulates, and on the processor for which
+their kernels are compiled.
 """
 
 from __future__ import annotations
@@ -41,7 +41,10 @@ def _numpy_without(*names: str) -> dict[str, str]:
 _NUMPY = "NPY_DISABLE_CPU_FEATURES"
 _AVX512 = ("AVX512", "X86_V4")
 _AVX2 = (*_AVX512, "AVX2", "FMA3", "X86_V3")
-_KERNELS = {"CAVMARL_KERNELS": "native", "NUMBA_CPU_FEATURES": ""}  # only features of the named CPU
+_KERNELS = {
+    "CAVMARL_KERNELS": "native",
+    "NUMBA_CPU_FEATURES": "",
+}  # kernels use only features of the named CPU
 _OLD_LIBRARIES = {
     **_numpy_without(*_AVX2),
     "GLIBC_TUNABLES": "glibc.cpu.hwcaps=-FMA,-AVX2,-AVX512F",
@@ -55,9 +58,9 @@ class Processor(NamedTuple):
     """A processor that this machine can imitate.
 
     Attributes:
-        settings: environment variables of the imitation.
-        is_quick: no kernel has to be compiled.
-        emulated: name of the processor for `qemu-x86_64`; empty: none is emulated.
+        settings: environment variables for the imitation.
+        is_quick: whether the run needs no compilation of kernels.
+        emulated: name of the processor for `qemu-x86_64`, or empty without emulation.
     """
 
     settings: Mapping[str, str]
@@ -76,7 +79,8 @@ PROCESSORS = {
     ),
     "kernels for Haswell": Processor({**_KERNELS, "NUMBA_CPU_NAME": "haswell"}),
     "all for Nehalem": Processor({**_KERNELS, "NUMBA_CPU_NAME": "nehalem", **_OLD_LIBRARIES}),
-    # QEMU 7.2 computes NumPy's sort with AVX2 wrongly. The kernels are as in the row above.
+    # NumPy does not use AVX2, because QEMU 7.2 runs its AVX2 sort wrongly. The kernels are those
+    # of the row above.
     "emulated EPYC": Processor(
         {**_KERNELS, "NUMBA_CPU_NAME": "haswell", **_numpy_without(*_AVX2)}, emulated="EPYC"
     ),
@@ -87,14 +91,14 @@ TASKS = (
     *(f"{_DRIVER}{name}" for name in ("merge_ippo", "roundabout_ippo", "intersection_ippo")),
 )
 QUICK_TASKS = ("two", "trained")
-SHORT_TASKS = ("two:5", "rig:2")  # for emulation: with the number of steps
+SHORT_TASKS = ("two:5", "rig:2")  # shorter tasks for emulation
 FIRST_STEP = ("two:1",)
 QUICK = tuple(name for name, processor in PROCESSORS.items() if processor.is_quick)
 EMULATED = ("kernels for Haswell", "emulated EPYC")
 
 
 def run_task(task: str, folder: str) -> dict[str, str]:
-    """Return the hashes of a row or of a driver's tables."""
+    """Return the hashes of a row, or of the tables of a driver."""
     if task.startswith(_DRIVER):
         return _drive_zoo(task.removeprefix(_DRIVER))
     name, _, steps = task.partition(":")
@@ -116,7 +120,7 @@ def hashes(processor: Processor, tasks: tuple[str, ...], folder: str) -> Iterato
     with tempfile.TemporaryDirectory() as cache:
         kernels = cache_dir() / "kernels"
         kernels.mkdir(parents=True, exist_ok=True)
-        Path(cache, "kernels").symlink_to(kernels)  # their names identify processors
+        Path(cache, "kernels").symlink_to(kernels)  # their names contain the processor
         settings = {**os.environ, "CAVMARL_CACHE_DIR": cache, **processor.settings}
         command = [sys.executable, "-m", "tests.golden.portability", "--run", folder]
         if processor.emulated:
@@ -130,7 +134,7 @@ def hashes(processor: Processor, tasks: tuple[str, ...], folder: str) -> Iterato
 
 
 def reason_to_skip(processor: Processor) -> str:
-    """Return why this machine cannot imitate a processor; empty: it can."""
+    """Return the reason why this machine cannot imitate a processor, or an empty text."""
     if processor.emulated:
         return "" if shutil.which(_QEMU) else f"{_QEMU} is not installed"
     if processor.settings.get(_NUMPY) == "":
@@ -144,9 +148,9 @@ def compare(
     """Run tasks on processors, print what differs, and return the exit code.
 
     Args:
-        names: of `PROCESSORS`.
-        tasks: what is run on each.
-        short: what is run on emulated processors instead.
+        names: names in `PROCESSORS`.
+        tasks: tasks to run on each processor.
+        short: tasks to run on emulated processors instead.
     """
     has_failed = False
     processors = {name: PROCESSORS[name] for name in names}

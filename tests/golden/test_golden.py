@@ -1,4 +1,4 @@
-"""Eight worlds, undivided and divided, have the hashes that `make record` has written last."""
+"""Eight worlds, undivided and divided, have the hashes that `make record` has recorded."""
 
 from __future__ import annotations
 

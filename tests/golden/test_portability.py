@@ -8,13 +8,15 @@ from tests.golden import portability
 from tests.golden.portability import PROCESSORS, QUICK, QUICK_TASKS, TASKS, Processor, compare
 
 
-def test_numpy_and_the_c_library_do_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_do_not_depend_on_numpy_or_the_c_library(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
     assert compare(QUICK, QUICK_TASKS) == 0, capsys.readouterr().out
     assert capsys.readouterr().out.count("same") >= 2
 
 
 @pytest.mark.slow
-def test_the_processor_does_not_matter(capsys: pytest.CaptureFixture[str]) -> None:
+def test_results_do_not_depend_on_the_processor(capsys: pytest.CaptureFixture[str]) -> None:
     assert compare(PROCESSORS, TASKS) == 0, capsys.readouterr().out
     with capsys.disabled():  # the result names the skipped processors
         print(capsys.readouterr().out)

@@ -2,10 +2,10 @@
 
     python -m tests.golden.worlds [ROW ...]
 
-This command writes `worlds.json`; `test_golden.py` compares results with it. A row is a world that
-is driven for some steps. The bytes of its results, in a fixed order and without names, give one
-hash per part. `WAYS` are divisions of the world with the same hashes. Names of cavmarl that may
-change are at the top.
+This command writes `worlds.json`, and `test_golden.py` compares results with this file. A row is a
+world that a driver drives for some steps. The results of a row have several parts; the bytes of a
+part, in a fixed order and without names, give one hash. `WAYS` are divisions of a world, which must
+have the same hashes. Names of cavmarl that may change are at the top.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ WAYS: dict[str, dict[str, Any]] = {
     "workers": {"zones": 4, "workers": 2},
     "sensors": {"zones": 2, "sensor_workers": 2},
 }
-# Overrides, by the beginning of the key; FOLDER is where the demand is.
+# Overrides, grouped by the first part of the key; FOLDER stands for the folder of the demand.
 SETTINGS: dict[str, dict[str, dict[str, Any]]] = yaml.safe_load("""{
 respawn: {population: {mode: respawn}},
 fast: {clock: {sim_dt_s: 0.1, ctrl_dt_s: 0.2}},
@@ -63,11 +63,11 @@ class Row(NamedTuple):
     """A world and its driver."""
 
     env: str
-    settings: str  # of SETTINGS; later ones win
+    settings: str  # names in SETTINGS; later settings override earlier ones
     steps: int
-    ways: str = "zones workers"  # of WAYS
-    driver: str = "idm"  # for `load_policy`
-    made: Mapping[str, Any] = {}  # more keywords
+    ways: str = "zones workers"  # names in WAYS
+    driver: str = "idm"  # driver, as for `load_policy`
+    made: Mapping[str, Any] = {}  # further keywords of `make_vec`
 
 
 SOME, FEW = {"agents": 3, "background": 40}, {"agents": 12}
@@ -79,13 +79,13 @@ ROWS: dict[str, Row] = {
     "rig": Row("grid4x4", "respawn rig", 20, "zones sensors", made=SOME),
     "v2x": Row("grid4x4", "respawn fast v2x", 60, made=SOME),
     "sumo-traffic": Row("grid4x4", "respawn fast demand mirrored", 180, "zones", made=FEW),
-    # A driver's network is evaluated by kernels, so its bytes are those of every processor, too.
+    # Kernels evaluate the network of a driver, so its results are the same on every processor, too.
     "trained": Row("merge", "respawn", 100, "zones", "merge_ippo"),
 }
 
 
 def _parts(row: Row, vec: cavmarl.CavVectorEnv) -> Iterator[tuple[str, Any]]:
-    """Drive a world; yield each result with the name of its part."""
+    """Drive a world; yield each array of results with the name of its part."""
     worlds = range(vec.num_envs)
     policy = cavmarl.load_policy(row.driver, vec)
     observations, infos = vec.reset(seed=11)
@@ -107,7 +107,7 @@ def _parts(row: Row, vec: cavmarl.CavVectorEnv) -> Iterator[tuple[str, Any]]:
 def drive(row: Row, way: Mapping[str, Any], folder: str) -> dict[str, str]:
     """Drive a world in one of the `WAYS`, or undivided; return the hash of each part.
 
-    `folder`: as for `write_inputs`.
+    `folder` is the folder for `write_inputs`.
     """
     overrides: dict[str, Any] = {}
     for name in row.settings.split():
@@ -133,12 +133,12 @@ def drive(row: Row, way: Mapping[str, Any], folder: str) -> dict[str, str]:
 
 
 def write_inputs(folder: str) -> None:
-    """Write the demand that rows name."""
+    """Write the demand files that rows use."""
     Path(folder, "demand.rou.xml").write_text(DEMAND, "utf-8")
 
 
 def run_row(name: str, folder: str) -> dict[str, str]:
-    """Return the hash of each part of a row. An AssertionError names a way with other hashes."""
+    """Return the hash of each part of a row; an AssertionError names a division that differs."""
     found = drive(ROWS[name], {}, folder)
     for way in ROWS[name].ways.split():
         assert drive(ROWS[name], WAYS[way], folder) == found, way
@@ -152,7 +152,7 @@ def recorded() -> dict[str, dict[str, str]]:
 
 
 def main() -> None:
-    """Record the rows that the command line names; without a name: all."""
+    """Record the rows that the command line names, or all rows without a name."""
     parser = argparse.ArgumentParser(description="Record golden rows.")
     parser.add_argument("rows", nargs="*", metavar="ROW", help=" ".join(ROWS))
     names = parser.parse_args().rows

@@ -1,11 +1,11 @@
-"""Make the results of the zoo and the board again: evaluate each driver, replace its `result/`.
+"""Record the results of the trained drivers and of the board again.
 
     python -m tests.golden.zoo [DRIVER ...]
 
-This command evaluates the named drivers, or all trained drivers and the drivers of `board/`. It
-runs at the root of the repository. It takes the job of each driver (world, seed, episodes, runs)
-from the manifest of the driver's result. The command is the part `zoo` of `make record`
-(CONTRIBUTING.md). It stops at the first driver that cannot be recorded.
+This command evaluates the named drivers, or all trained drivers and the drivers of `board/`, and
+replaces their folders `result/`. Run it at the root of the repository. The world, seed, episodes
+and runs of each evaluation come from the manifest of the old result. The command is the part `zoo`
+of `make record` (CONTRIBUTING.md). It stops at the first driver that cannot be recorded.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ SAME, OTHER = "same results as before", "recorded anew"
 def record(driver: str | Path) -> str:
     """Replace the result of a driver, given by its name or folder; return a word for the outcome.
 
-    The result of a script is in `board/`.
+    The result of a driver in a script is in `board/`.
 
-    The old result stays if the new one is the same, and if the evaluation fails or is interrupted.
+    The old result stays if the new one is the same, or if the evaluation fails or is interrupted.
     """
     files = policy_files(driver)
     folder = files[0].parent if len(files) > 1 else BOARD / str(driver)
@@ -42,7 +42,7 @@ def record(driver: str | Path) -> str:
     before = read_closed(result)
     with draft_folder(folder) as draft:
         made, old = draft / RESULT_FOLDER, draft / "old"
-        # Keep a name as a name, because a path in the manifest would depend on this machine.
+        # Do not replace a name by a path, which would depend on this machine.
         entry_job(before, folder).drive(next(iter(before["policies"])), Path(driver), made)
         load_report(made)
         found = read_closed(made)

@@ -1,6 +1,7 @@
-"""Difficult crossings of borders: many at once, thin zones, corners, U-turns, arrivals, resets.
+"""Difficult crossings of borders: many vehicles at once, thin zones, corners, U-turns and resets.
 
-Each world is run divided and undivided; after every tick, hashes are equal and no vehicle is lost.
+Each test runs a world divided and undivided. After every tick, the hashes must be equal, and no
+vehicle may be lost.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ def zones_by_id(simulation: Simulation, world: int = 0) -> dict[int, int]:
     return dict(zip(rows["id"].tolist(), zones.tolist(), strict=True))
 
 
-def both(build: Build, layout: Path, count: int, **overrides: Any) -> tuple[Simulation, Simulation]:
+def start_both(
+    build: Build, layout: Path, count: int, **overrides: Any
+) -> tuple[Simulation, Simulation]:
     """Return the undivided and the divided world at the start of the same episode."""
     zones = {"zones.layout": str(layout), "zones.count": count}
     pair = build(ONE_TICK | overrides), build(ONE_TICK | zones | overrides)
@@ -46,8 +49,8 @@ def both(build: Build, layout: Path, count: int, **overrides: Any) -> tuple[Simu
     return pair
 
 
-def together(whole: Simulation, divided: Simulation, ticks: int) -> Iterator[dict[int, int]]:
-    """Run both, and check that they are equal; yield the zone of each vehicle after every tick."""
+def run_both(whole: Simulation, divided: Simulation, ticks: int) -> Iterator[dict[int, int]]:
+    """Run both worlds and check that they are equal; yield the zones by vehicle after each tick."""
     for _ in range(ticks):
         drive(whole)
         drive(divided)
@@ -65,7 +68,7 @@ def check(whole: Simulation, divided: Simulation) -> None:
 
 @pytest.fixture
 def platoon(tmp_path: Path) -> Build:
-    """Return a demand of a hundred parallel roads with a car on each."""
+    """Return a function that makes a world of a hundred parallel roads with a car on each."""
     roads = [((0.0, 4.0 * k), (200.0, 4.0 * k)) for k in range(MANY)]
     net = write_roads(tmp_path / "rows.net.xml", roads, SPEED_MPS)
     cars = write_platoon(tmp_path / "rows.rou.xml", MANY, 40.0, SPEED_MPS)
@@ -77,10 +80,10 @@ def strips(tmp_path: Path, xs: Sequence[float], ys: Sequence[float] = ()) -> Pat
 
 
 def test_a_hundred_vehicles_cross_a_border_in_the_same_tick(platoon: Build, tmp_path: Path) -> None:
-    whole, divided = both(platoon, strips(tmp_path, [80.0]), 2)
+    whole, divided = start_both(platoon, strips(tmp_path, [80.0]), 2)
     before: dict[int, int] = {}
     crossed = []
-    for now in together(whole, divided, 80):
+    for now in run_both(whole, divided, 80):
         crossed.append(sum(zone != before.get(car, zone) for car, zone in now.items()))
         before = now
     assert max(crossed) == sum(crossed) == MANY
@@ -92,84 +95,85 @@ def test_a_hundred_vehicles_cross_in_both_directions_in_the_same_tick(tmp_path: 
     roads = [(b, a) if k % 2 else (a, b) for k, (a, b) in enumerate(ways)]
     net = write_roads(tmp_path / "rows.net.xml", roads, SPEED_MPS)
     cars = write_platoon(tmp_path / "rows.rou.xml", MANY, 60.0, SPEED_MPS)
-    whole, divided = both(
+    whole, divided = start_both(
         lambda overrides: make(net, [cars], overrides=overrides), strips(tmp_path, [80.0]), 2
     )
     starts = zones_by_id(divided)
-    *_, ends = together(whole, divided, 60)
+    *_, ends = run_both(whole, divided, 60)
     assert len(ends) == MANY
     assert sorted(ends.values()).count(0) == MANY // 2
     assert all(ends[car] != zone for car, zone in starts.items())
 
 
 @pytest.mark.parametrize("side_m", [4.0, 1.5])
-def test_a_chain_of_zones_in_consecutive_ticks(side_m: float, tmp_path: Path) -> None:
-    # At 25 m/s and 0.2 s per tick, cars move 5 m: from A to B to C, or past zones without entering.
+def test_vehicles_cross_a_zone_border_in_every_tick(side_m: float, tmp_path: Path) -> None:
+    # At 25 m/s and 0.2 s per tick, cars move 5 m per tick. They enter zones of 4 m one by one, and
+    # skip some zones of 1.5 m.
     roads = [((0.0, 4.0 * k), (200.0, 4.0 * k)) for k in range(10)]
     net = write_roads(tmp_path / "rows.net.xml", roads, 25.0)
     cars = write_platoon(tmp_path / "rows.rou.xml", 10, 20.0, 25.0)
     cuts = [60.0 + side_m * k for k in range(12)]
-    whole, divided = both(
+    whole, divided = start_both(
         lambda overrides: make(net, [cars], overrides=overrides),
         strips(tmp_path, cuts),
         len(cuts) + 1,
         **{"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 0.2, "zones.hysteresis_m": 0.0},
     )
-    visited = [zones[min(zones)] for zones in together(whole, divided, 30) if zones]
+    visited = [zones[min(zones)] for zones in run_both(whole, divided, 30) if zones]
     steps = np.diff(visited)
     run = np.flatnonzero(steps)
     assert len(run) >= 3
-    assert (np.diff(run) == 1).all(), "a change in every tick, from the first to the last"
+    assert (np.diff(run) == 1).all(), "a car has not changed its zone in every tick"
     assert (steps.max() > 1) == (side_m < 5.0)
 
 
-def test_corners_where_four_zones_meet(tmp_path: Path) -> None:
-    # Diagonals go through the corner itself, or so close to it that they touch a third zone.
+def test_vehicles_that_cross_a_corner_of_four_zones_change_nothing(tmp_path: Path) -> None:
+    # The diagonal roads lead through the corner, or so close to it that they touch a third zone.
     aside = np.array([-6.0, -3.0, -1.0, 0.0, 1.0, 3.0, 6.0])
     forth = [((20.0 + a, 20.0 - a), (180.0 + a, 180.0 - a)) for a in aside.tolist()]
     roads = [*forth, ((20.0, 180.0), (180.0, 20.0))]
     net = write_roads(tmp_path / "x.net.xml", roads, 14.0)
     cars = write_platoon(tmp_path / "x.rou.xml", len(roads), 60.0, 14.0)
     layout = cut_at(tmp_path / "zones.json", (-10.0, -10.0, 210.0, 210.0), [100.0], [100.0])
-    whole, divided = both(lambda overrides: make(net, [cars], overrides=overrides), layout, 4)
+    whole, divided = start_both(lambda overrides: make(net, [cars], overrides=overrides), layout, 4)
     visits: dict[int, list[int]] = {}
-    for zones in together(whole, divided, 90):
+    for zones in run_both(whole, divided, 90):
         for car, zone in zones.items():
             if visits.setdefault(car, [zone])[-1] != zone:
                 visits[car].append(zone)
     ways = list(visits.values())
-    assert [0, 3] in ways, "over the corner in one tick"
+    assert [0, 3] in ways, "no car crosses the corner in one tick"
     assert [0, 1, 3] in ways
     assert [0, 2, 3] in ways
     assert len(ways) == len(roads)
 
 
-def test_a_vehicle_that_arrives_on_the_border_leaves_once(platoon: Build, tmp_path: Path) -> None:
-    # The road ends behind the border within the hysteresis, so cars arrive while the old zone owns
-    # them.
-    whole, divided = both(platoon, strips(tmp_path, [199.0]), 2)
-    for _ in together(whole, divided, 200):
+def test_a_vehicle_that_arrives_on_a_border_is_removed_once(platoon: Build, tmp_path: Path) -> None:
+    # The road ends beyond the border but within the hysteresis, so the old zone still owns the cars
+    # when they arrive.
+    whole, divided = start_both(platoon, strips(tmp_path, [199.0]), 2)
+    for _ in run_both(whole, divided, 200):
         pass
     assert whole.traffic_stats().arrived == MANY
     assert divided.traffic_stats().running == 0
 
 
 @pytest.mark.parametrize("ticks", range(43, 49))
-def test_a_reset_around_the_tick_of_the_crossing(
+def test_a_reset_close_to_the_tick_of_a_crossing_changes_nothing(
     ticks: int, platoon: Build, tmp_path: Path
 ) -> None:
-    # After 45 ticks, the centres are 2 m (the hysteresis) behind the border.
-    whole, divided = both(platoon, strips(tmp_path, [80.0]), 2)
+    # After 45 ticks, the centres are 2 m beyond the border, which is the hysteresis.
+    whole, divided = start_both(platoon, strips(tmp_path, [80.0]), 2)
     for simulation in (whole, divided):
         for _ in range(ticks):
             drive(simulation)
         simulation.reset()
     check(whole, divided)
-    *_, zones = together(whole, divided, 60)
+    *_, zones = run_both(whole, divided, 60)
     assert set(zones.values()) == {1}
 
 
-def test_each_episode_may_have_zones_of_its_own(tmp_path: Path) -> None:
+def test_each_episode_may_have_another_partition(tmp_path: Path) -> None:
     def build(overrides: dict[str, Any]) -> Simulation:
         return make_simulation(
             "grid4x4", mode="respawn", agents=6, background=60, overrides=ONE_TICK | overrides
@@ -184,7 +188,7 @@ def test_each_episode_may_have_zones_of_its_own(tmp_path: Path) -> None:
         start(divided, seed=3)
         for _ in range(episode):
             divided.reset()
-        for _ in together(whole, divided, 60):
+        for _ in run_both(whole, divided, 60):
             pass
         assert divided.migrations > 5
         whole.reset()
@@ -205,7 +209,7 @@ TURN_CARS = """<routes>
 
 
 @pytest.mark.parametrize("cut", [97.0, 196.0, 199.5])
-def test_u_turns_near_a_border(cut: float, tmp_path: Path) -> None:
+def test_u_turns_near_a_border_change_nothing(cut: float, tmp_path: Path) -> None:
     nodes, edges, net = (tmp_path / name for name in ("x.nod.xml", "x.edg.xml", "x.net.xml"))
     nodes.write_text(TURN_NODES, encoding="utf-8")
     edges.write_text(TURN_EDGES, encoding="utf-8")
@@ -214,10 +218,10 @@ def test_u_turns_near_a_border(cut: float, tmp_path: Path) -> None:
     cars = tmp_path / "x.rou.xml"
     cars.write_text(TURN_CARS, encoding="utf-8")
     layout = cut_at(tmp_path / "zones.json", bounds_around(load_network(net)), [cut])
-    whole, divided = both(lambda overrides: make(net, [cars], overrides=overrides), layout, 2)
+    whole, divided = start_both(lambda overrides: make(net, [cars], overrides=overrides), layout, 2)
     changes: dict[int, int] = {}
     before: dict[int, int] = {}
-    for now in together(whole, divided, 900):
+    for now in run_both(whole, divided, 900):
         for car, zone in now.items():
             changes[car] = changes.get(car, 0) + (zone != before.get(car, zone))
         before = now

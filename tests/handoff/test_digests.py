@@ -12,7 +12,7 @@ from cavmarl.handoff.coordinator.row_digests import RowDigests
 from cavmarl.handoff.kernels.digests import digest_rows
 from tests.naive import digests as naive
 
-# Without the compiler, NumPy warns of products that wrap around as intended.
+# In uncompiled kernels, NumPy warns of products that overflow, which is intended here.
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 WORDS = st.integers(0, (1 << 64) - 1)
@@ -31,7 +31,7 @@ def test_the_digest_equals_its_plain_twin(
     assert (int(upper) << 64) + int(lower) == expected
 
 
-def test_sums_of_digests_carry_between_words() -> None:
+def test_the_sum_of_digests_carries_from_word_to_word() -> None:
     word = next(w for w in range(1000) if naive.mixed(w) > 1 << 63)
     words = np.full((4, 1), word, dtype=np.uint64)
     all_bits, one = np.array([(1 << 64) - 1], np.uint64), np.array([1], np.uint64)
@@ -57,7 +57,7 @@ def test_the_digest_of_a_world_is_the_same_in_all_divisions() -> None:
 
 
 @pytest.mark.parametrize("name", VEHICLE.names or ())
-def test_a_digest_depends_on_every_field_of_the_state_and_no_other(name: str) -> None:
+def test_a_digest_depends_on_every_state_field_and_on_no_other_field(name: str) -> None:
     rows, of = cars(3), RowDigests().of
     before = of(rows)
     field = rows[name]

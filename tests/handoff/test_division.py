@@ -51,7 +51,7 @@ def ghosts(simulation: Simulation, world: int) -> list[NDArray[np.void]]:
 def test_each_vehicle_has_one_owner_and_a_ghost_in_each_near_zone(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # less than the whole map
+    monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)  # a zone sees less than the whole map
     simulation = divided(9)
     rects = simulation.partition.reaching
     owners: list[dict[int, int]] = [{}, {}]
@@ -61,22 +61,22 @@ def test_each_vehicle_has_one_owner_and_a_ghost_in_each_near_zone(
         drive(simulation)
         for world in range(2):
             parts = owned(simulation, world)
-            everybody = {int(row["id"]): row for part in parts for row in part}
-            assert len(everybody) == sum(map(len, parts)) == len(simulation.vehicles(world))
+            all_rows = {int(row["id"]): row for part in parts for row in part}
+            assert len(all_rows) == sum(map(len, parts)) == len(simulation.vehicles(world))
             now = {int(i): zone for zone, part in enumerate(parts) for i in part["id"]}
             moved += sum(now[i] != zone for i, zone in owners[world].items() if i in now)
             owners[world] = now
             for zone, seen in enumerate(ghosts(simulation, world)):
                 away = {
                     i: squared_distance(rects, zone, row["x"], row["y"]) ** 0.5
-                    for i, row in everybody.items()
+                    for i, row in all_rows.items()
                 }
-                beyond = HYSTERESIS_M + 0.1 * max(row["speed"] for row in everybody.values())
+                beyond = HYSTERESIS_M + 0.1 * max(row["speed"] for row in all_rows.values())
                 assert max((away[i] for i in now if now[i] == zone), default=0) <= beyond
                 near = {i for i, distance in away.items() if distance <= 60.0 and now[i] != zone}
                 assert Counter(seen["id"].tolist()) == Counter(near)
                 for row in seen:
-                    assert row[same] == everybody[int(row["id"])][same]
+                    assert row[same] == all_rows[int(row["id"])][same]
     assert moved > 20
 
 
@@ -93,8 +93,8 @@ def test_a_vehicle_that_enters_a_zone_without_a_ghost_is_an_error() -> None:
         division.changes.hand_over(0, Switch(there, 0, 3, 1, False))
 
 
-def test_a_collision_over_a_border_is_found_once_and_of_both() -> None:
-    # Agents that press on regardless, in strips not much wider than a car is long.
+def test_a_collision_over_a_border_is_detected_for_both_vehicles() -> None:
+    # All agents accelerate without braking, in strips that are only a little longer than a car.
     settings: dict[str, Any] = {
         "mode": "respawn",
         "agents": 40,
@@ -148,11 +148,11 @@ def test_changes_in_the_rows_of_all_shards_return_to_the_shards() -> None:
     for shard in simulation.shards:
         np.copyto(shard.worlds.next_rows, shard.worlds.rows)
     before = [[part.copy() for part in owned(simulation, world)] for world in range(2)]
-    with simulation.division.all_next_rows() as everybody:
+    with simulation.division.all_next_rows() as all_rows:
         for world in range(2):
-            num = everybody.num_owned[world]
+            num = all_rows.num_owned[world]
             assert num == len(simulation.vehicles(world))
-            rows = everybody.next_rows[world, :num]
+            rows = all_rows.next_rows[world, :num]
             rows["leg"] += rows["id"] % 3
     for world in range(2):
         for shard, part in zip(simulation.shards, before[world], strict=True):

@@ -1,4 +1,4 @@
-"""The monitor's check of the rows of a world, compared with its plain twin."""
+"""The check of the rows of a world by the monitor, compared with its plain version."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from tests.naive import monitor as naive
 from tests.naive.zones import distance
 
-# Without the compiler, NumPy warns of products that wrap around as intended.
+# In uncompiled kernels, NumPy warns of products that overflow, which is intended here.
 pytestmark = pytest.mark.filterwarnings("ignore:overflow encountered in scalar:RuntimeWarning")
 
 CAPACITY = 40
@@ -47,7 +47,7 @@ MASKS, FACTORS = digest_tables(GHOST_FIELDS)
 
 
 class Looks:
-    """A world that the kernel and its twin check in every tick."""
+    """A world that the kernel and its plain version check in every tick."""
 
     def __init__(self) -> None:
         self.zoned: ZoneState = make_zone_state(PARTITION.count, 1, CAPACITY)
@@ -56,7 +56,9 @@ class Looks:
         self.strays = make_strays(PARTITION.count, CAPACITY)
         self.found = np.zeros(1, dtype=FINDING)
         self.tallies = np.zeros(PARTITION.count, dtype=TALLY)
-        self.foreign = np.zeros(PARTITION.count, dtype=np.uint64)  # added to expected sums
+        self.foreign = np.zeros(
+            PARTITION.count, dtype=np.uint64
+        )  # added to the expected sums, to make them wrong
         self.before: dict[int, naive.Kept] = {}
 
     def put(self, zones: list[naive.Zone]) -> None:
@@ -73,7 +75,7 @@ class Looks:
         new_late: int = 1,
         missing: int = 0,
     ) -> int:
-        """Run the kernel; return the kind of its finding, KIND_*."""
+        """Run the kernel; return the kind (KIND_*) of its finding."""
         self.put(zones)
         told = watch(
             PARTITION.arrays, HALO, self.zoned, self.words, 0, 0,
@@ -87,7 +89,7 @@ class Looks:
     def compare(
         self, zones: list[naive.Zone], tick: int, new_late: int = 1, missing: int = 0
     ) -> dict[int, str]:
-        """Check that kernel and twin agree, if `missing` more vehicles are expected than exist."""
+        """Check that kernel and plain version agree; `missing` more vehicles are expected."""
         masks, factors = MASKS.tolist(), FACTORS.tolist()
         tallies = naive.tallies(zones, PARTITION.reaching, HALO_M, masks, factors)
         expected = np.array([owned for _, owned, _, _ in tallies], dtype=np.uint64)
@@ -120,8 +122,8 @@ class Looks:
         return sorted(self.strays.entered[: self.found["entered"].item()].tolist())
 
 
-def drawn(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
-    """Draw vehicles anywhere; every second one is at the previous tick."""
+def draw_vehicles(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
+    """Draw vehicles at random places; the rows of odd ids are one tick late."""
     rows = np.zeros(number, dtype=VEHICLE)
     rows["id"] = rng.choice(10_000, number, replace=False)
     rows["x"], rows["y"] = rng.uniform(0, 160, number), rng.uniform(0, 100, number)
@@ -130,7 +132,7 @@ def drawn(rng: np.random.Generator, number: int, tick: int) -> NDArray[np.void]:
     return rows
 
 
-def dealt(rows: NDArray[np.void]) -> list[naive.Zone]:
+def assign_to_zones(rows: NDArray[np.void]) -> list[naive.Zone]:
     """Assign each vehicle to the zone that contains it, with the ghosts that zones must have."""
     owners = np.array([zone_of(PARTITION.arrays, row["x"], row["y"]) for row in rows])
     result = []
@@ -140,73 +142,73 @@ def dealt(rows: NDArray[np.void]) -> list[naive.Zone]:
     return result
 
 
-def moved(rng: np.random.Generator, rows: NDArray[np.void], furthest_m: float) -> NDArray[np.void]:
+def move(rng: np.random.Generator, rows: NDArray[np.void], furthest_m: float) -> NDArray[np.void]:
     after = rows.copy()
     after["x"] += rng.uniform(-furthest_m, furthest_m, len(rows))
     after["tick"] += 1
     return after
 
 
-def started(seed: int) -> tuple[Looks, np.random.Generator, NDArray[np.void]]:
-    """Return a world after ten ticks, and its rows."""
+def start(seed: int) -> tuple[Looks, np.random.Generator, NDArray[np.void]]:
+    """Return a world at tick 10, the random generator, and the rows of the world."""
     rng = np.random.default_rng(seed)
-    looks, rows = Looks(), drawn(rng, 25, 10)
+    looks, rows = Looks(), draw_vehicles(rng, 25, 10)
     rows["tick"] = 10
-    assert not looks.compare(dealt(rows), 10, new_late=0)
+    assert not looks.compare(assign_to_zones(rows), 10, new_late=0)
     return looks, rng, rows
 
 
 @pytest.mark.parametrize("stay", [0.0, 0.8, 1.0], ids=["rows change", "few do", "rows stay"])
 @pytest.mark.parametrize("seed", range(3))
-def test_the_check_of_a_run_equals_its_plain_twin(seed: int, stay: float) -> None:
-    looks, rng, rows = started(seed)
+def test_the_check_of_a_run_equals_its_plain_version(seed: int, stay: float) -> None:
+    looks, rng, rows = start(seed)
     kinds: Counter[str] = Counter()
     for tick in range(11, 70):
-        rows = moved(rng, rows[rng.random(len(rows)) > 0.1], LIMIT_M + 0.1)
-        new = drawn(rng, min(3, CAPACITY - len(rows)), tick)
+        rows = move(rng, rows[rng.random(len(rows)) > 0.1], LIMIT_M + 0.1)
+        new = draw_vehicles(rng, min(3, CAPACITY - len(rows)), tick)
         rows = np.concatenate([rows, new[~np.isin(new["id"], rows["id"])]])
         rows["tick"][rng.random(len(rows)) < 0.01] += 1
         if rng.random() > stay:
             rows = rng.permutation(rows)
-        kinds.update(looks.compare(dealt(rows), tick).values())
+        kinds.update(looks.compare(assign_to_zones(rows), tick).values())
     assert kinds["tick"] > 5
     assert kinds["far"] > 2
 
 
 @pytest.mark.parametrize("name", ["x", "y"])
-def test_a_vehicle_without_a_valid_position_is_found(name: str) -> None:
-    looks, rng, rows = started(7)
-    zones = dealt(moved(rng, rows, 1.0))
+def test_a_vehicle_without_a_valid_position_is_detected(name: str) -> None:
+    looks, rng, rows = start(7)
+    zones = assign_to_zones(move(rng, rows, 1.0))
     lost = zones[2].owned[0]
     lost[name] = np.nan
     assert looks.look(zones, 11, looks.foreign) == KIND_FAR
     assert looks.found["vehicle"] == lost["id"]
 
 
-def test_sums_of_a_correct_state_are_equal() -> None:
-    looks, rng, rows = started(7)
-    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
+def test_expected_and_present_sums_of_a_correct_state_are_equal() -> None:
+    looks, rng, rows = start(7)
+    assert not looks.compare(assign_to_zones(move(rng, rows, 1.0)), 11)
     assert (looks.tallies["due"] == looks.tallies["seen"]).all()
     assert looks.tallies["seen"].all()
-    for z, zone in enumerate(dealt(rows)):
+    for z, zone in enumerate(assign_to_zones(rows)):
         hashes = (int(owner_hash(int(row["id"]), int(row["epoch"]))) for row in zone.owned)
         assert sum(hashes) % (1 << 64) == int(looks.tallies["owned"][z])
 
 
-def test_a_zone_that_owns_wrong_vehicles_is_found() -> None:
-    looks, rng, rows = started(7)
+def test_a_zone_with_a_wrong_sum_of_owned_vehicles_is_detected() -> None:
+    looks, rng, rows = start(7)
     looks.foreign[2] = 1
-    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11)
+    assert not looks.compare(assign_to_zones(move(rng, rows, 1.0)), 11)
 
 
-def test_a_missing_vehicle_is_found() -> None:
-    looks, rng, rows = started(7)
-    assert not looks.compare(dealt(moved(rng, rows, 1.0)), 11, missing=1)
+def test_a_missing_vehicle_is_detected() -> None:
+    looks, rng, rows = start(7)
+    assert not looks.compare(assign_to_zones(move(rng, rows, 1.0)), 11, missing=1)
 
 
 def test_a_vehicle_with_two_owners_is_reported_as_entering_again() -> None:
-    looks, rng, rows = started(8)
-    zones = dealt(moved(rng, rows, 1.0))
+    looks, rng, rows = start(8)
+    zones = assign_to_zones(move(rng, rows, 1.0))
     doubled = zones[0].owned[:1]
     zones[2] = naive.Zone(np.concatenate([zones[2].owned, doubled]), zones[2].ghosts)
     looks.compare(zones, 11, new_late=0)
@@ -214,8 +216,8 @@ def test_a_vehicle_with_two_owners_is_reported_as_entering_again() -> None:
 
 
 def test_a_vehicle_that_moves_into_two_zones_enters_once() -> None:
-    looks, rng, rows = started(8)
-    zones = dealt(moved(rng, rows, 1.0))
+    looks, rng, rows = start(8)
+    zones = assign_to_zones(move(rng, rows, 1.0))
     doubled = zones[0].owned[-1:]
     zones[0] = naive.Zone(zones[0].owned[:-1], zones[0].ghosts)
     for z in (1, 2):
@@ -225,9 +227,9 @@ def test_a_vehicle_that_moves_into_two_zones_enters_once() -> None:
 
 
 @pytest.mark.parametrize("name", ["x", "speed", "tick", "lane"])
-def test_a_ghost_that_is_not_its_owners_row_changes_the_sum(name: str) -> None:
-    looks, rng, rows = started(9)
-    zones = dealt(moved(rng, rows, 1.0))
+def test_a_ghost_that_differs_from_the_owned_row_changes_the_sum(name: str) -> None:
+    looks, rng, rows = start(9)
+    zones = assign_to_zones(move(rng, rows, 1.0))
     ghosts: Any = zones[1].ghosts
     ghosts[name][0] += 1
     assert not looks.compare(zones, 11)
@@ -236,8 +238,8 @@ def test_a_ghost_that_is_not_its_owners_row_changes_the_sum(name: str) -> None:
 
 @pytest.mark.parametrize("name", ["hit", "events", "episode_return", "epoch"])
 def test_fields_that_ghosts_do_not_need_may_differ(name: str) -> None:
-    looks, rng, rows = started(9)
-    zones = dealt(moved(rng, rows, 1.0))
+    looks, rng, rows = start(9)
+    zones = assign_to_zones(move(rng, rows, 1.0))
     zones[1].ghosts[name][0] += 1
     looks.compare(zones, 11)
     assert (looks.tallies["due"] == looks.tallies["seen"]).all()

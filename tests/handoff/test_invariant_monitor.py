@@ -47,7 +47,7 @@ def simulation() -> Simulation:
 
 
 @pytest.mark.parametrize("env", ["ring", "merge", "grid4x4", "town"])
-def test_a_clean_run_passes(env: str) -> None:
+def test_a_correct_run_passes_the_monitor(env: str) -> None:
     simulation = watched(env, worlds=2)
     for _ in range(25):
         drive(simulation)
@@ -56,8 +56,8 @@ def test_a_clean_run_passes(env: str) -> None:
         drive(simulation)
 
 
-class Meddling:
-    """Change rows just before the monitor checks them."""
+class RowChanger:
+    """A monitor that first changes rows and then checks them."""
 
     def __init__(self, simulation: Simulation, monkeypatch: pytest.MonkeyPatch) -> None:
         self.simulation, self._patch = simulation, monkeypatch
@@ -68,11 +68,11 @@ class Meddling:
         worlds = self.simulation.shards[zone].worlds
         return worlds.rows[0], int(worlds.num_owned[0]), int(worlds.num_rows[0])
 
-    def caught(self, meddle: Any, words: str) -> None:
+    def caught(self, change: Any, words: str) -> None:
         look = InvariantMonitor.end
 
         def end(*arguments: Any) -> None:
-            meddle()
+            change()
             look(*arguments)
 
         self._patch.setattr(InvariantMonitor, "end", end)
@@ -80,26 +80,26 @@ class Meddling:
             drive(self.simulation)
 
 
-def a_vehicle_that_two_zones_own(world: Meddling) -> None:
+def a_vehicle_that_two_zones_own(world: RowChanger) -> None:
     rows, owned, _ = world.zone(1)
     others = world.simulation.shards[2].worlds
     rows[owned] = others.rows[0, 0]
     world.simulation.shards[1].worlds.num_owned[0] += 1
 
 
-def a_vehicle_that_is_advanced_twice(world: Meddling) -> None:
+def a_vehicle_that_is_advanced_twice(world: RowChanger) -> None:
     world.zone(0)[0]["tick"][0] += 1
 
 
-def a_vehicle_that_jumps(world: Meddling) -> None:
+def a_vehicle_that_jumps(world: RowChanger) -> None:
     world.zone(3)[0]["x"][0] += 40.0
 
 
-def a_vehicle_without_a_place(world: Meddling) -> None:
+def a_vehicle_without_a_place(world: RowChanger) -> None:
     world.zone(3)[0]["x"][0] = np.nan
 
 
-def a_vehicle_that_is_lost(world: Meddling) -> None:
+def a_vehicle_that_is_lost(world: RowChanger) -> None:
     rows, owned, num = world.zone(2)
     worlds = world.simulation.shards[2].worlds
     rows[owned - 1 : num - 1] = rows[owned:num].copy()
@@ -107,40 +107,40 @@ def a_vehicle_that_is_lost(world: Meddling) -> None:
     worlds.num_rows[0] -= 1
 
 
-def a_vehicle_that_has_never_entered(world: Meddling) -> None:
+def a_vehicle_that_has_never_entered(world: RowChanger) -> None:
     rows, owned, _ = world.zone(2)
     rows[owned] = rows[0]
     rows[owned]["id"], rows[owned]["tick"] = 9_999, world.simulation.ticks()[0] - 1
     world.simulation.shards[2].worlds.num_owned[0] += 1
 
 
-def a_row_whose_epoch_is_not_that_on_record(world: Meddling) -> None:
+def a_row_whose_epoch_is_not_that_on_record(world: RowChanger) -> None:
     world.zone(1)[0]["epoch"][0] += 1
 
 
-def a_row_that_is_with_another_zone_than_on_record(world: Meddling) -> None:
+def a_row_that_is_with_another_zone_than_on_record(world: RowChanger) -> None:
     source, target = (world.simulation.shards[zone].worlds for zone in (0, 1))
     own, other = source.rows[0, 0].copy(), target.rows[0, 0].copy()
     source.rows[0, 0], target.rows[0, 0] = other, own
 
 
-def a_clock_that_is_late(world: Meddling) -> None:
+def a_clock_that_is_late(world: RowChanger) -> None:
     shard = world.simulation.shards[2]
     shard.worlds = shard.worlds._replace(ticks=shard.worlds.ticks - 1)
 
 
-def a_ghost_of_the_tick_before(world: Meddling) -> None:
+def a_ghost_of_the_tick_before(world: RowChanger) -> None:
     rows, owned, num = world.zone(1)
     assert num > owned
     rows[owned]["tick"] -= 1
 
 
-def a_ghost_with_a_changed_field(world: Meddling) -> None:
+def a_ghost_with_a_changed_field(world: RowChanger) -> None:
     rows, owned, _ = world.zone(1)
     rows[owned]["speed"] += 0.5
 
 
-def a_ghost_that_is_not_there(world: Meddling) -> None:
+def a_ghost_that_is_not_there(world: RowChanger) -> None:
     world.simulation.shards[1].worlds.num_rows[0] -= 1
 
 
@@ -160,36 +160,36 @@ VIOLATIONS = {
 }
 
 
-@pytest.mark.parametrize("meddle", VIOLATIONS, ids=lambda meddle: meddle.__name__)
-def test_the_monitor_finds_each_violation(
-    meddle: Callable[[Meddling], None], simulation: Simulation, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("change", VIOLATIONS, ids=lambda change: change.__name__)
+def test_the_monitor_detects_each_violation(
+    change: Callable[[RowChanger], None], simulation: Simulation, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    world = Meddling(simulation, monkeypatch)
-    world.caught(lambda: meddle(world), VIOLATIONS[meddle])
+    world = RowChanger(simulation, monkeypatch)
+    world.caught(lambda: change(world), VIOLATIONS[change])
 
 
 @pytest.fixture
-def narrow(monkeypatch: pytest.MonkeyPatch) -> Meddling:
-    """Return zones that do not see the whole map, with room for more ghosts."""
+def narrow(monkeypatch: pytest.MonkeyPatch) -> RowChanger:
+    """Return a world whose zones do not see the whole map and have room for more ghosts."""
     monkeypatch.setattr(dividing, "halo_m", lambda *_: 60.0)
     found = watched()
     drive(found)
-    return Meddling(found, monkeypatch)
+    return RowChanger(found, monkeypatch)
 
 
-def test_a_duplicated_ghost_is_detected(narrow: Meddling) -> None:
-    def meddle() -> None:
+def test_a_duplicated_ghost_is_detected(narrow: RowChanger) -> None:
+    def change() -> None:
         rows, owned, num = narrow.zone(1)
         rows[num] = rows[owned]
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
     narrow.caught(
-        meddle, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
+        change, r"ghosts: zone 1 has 2 ghosts of vehicle \d+, not 1: the vehicle of zone \d is"
     )
 
 
-def test_a_needless_ghost_is_detected(narrow: Meddling) -> None:
-    def meddle() -> None:
+def test_a_needless_ghost_is_detected(narrow: RowChanger) -> None:
+    def change() -> None:
         rows, _, num = narrow.zone(1)
         others, owned, _ = narrow.zone(2)
         rects = narrow.division.zones.rects
@@ -198,27 +198,27 @@ def test_a_needless_ghost_is_detected(narrow: Meddling) -> None:
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
     narrow.caught(
-        meddle, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: the vehicle of zone 2 is"
+        change, r"ghosts: zone 1 has 1 ghosts of vehicle \d+, not 0: the vehicle of zone 2 is"
     )
 
 
-def test_a_ghost_of_a_missing_vehicle_is_detected(narrow: Meddling) -> None:
-    def meddle() -> None:
+def test_a_ghost_of_a_missing_vehicle_is_detected(narrow: RowChanger) -> None:
+    def change() -> None:
         rows, _, num = narrow.zone(1)
         rows[num]["id"] = 7_777
         narrow.simulation.shards[1].worlds.num_rows[0] += 1
 
-    narrow.caught(meddle, r"ghosts: zone 1 has a ghost of vehicle 7777, which does not exist")
+    narrow.caught(change, r"ghosts: zone 1 has a ghost of vehicle 7777, which does not exist")
 
 
 def test_a_recorded_arrival_of_a_present_vehicle_is_detected(
-    narrow: Meddling, monkeypatch: pytest.MonkeyPatch
+    narrow: RowChanger, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All sums are correct: the vehicle is deep in a zone, and no other zone has a ghost of it."""
+    """All sums are correct, because the vehicle is far from borders and has no ghost."""
     coordination: Any = coordination_of(narrow.simulation)
     coordinator = coordination.coordinators[0]
 
-    def meddle() -> None:
+    def change() -> None:
         rows, owned, num = narrow.zone(1)
         rect = narrow.division.halo.inner[1]
         inside = [is_inside(rect, row["x"], row["y"]) for row in rows[:owned]]
@@ -231,7 +231,7 @@ def test_a_recorded_arrival_of_a_present_vehicle_is_detected(
         worlds.num_rows[0] += 1
         monkeypatch.setattr(coordinator, "notes", lambda: ((Birth(int(vehicle), 1, b""),), ()))
 
-    narrow.caught(meddle, r"one owner: vehicle \d+ is owned by zones \[1, 2\]")
+    narrow.caught(change, r"one owner: vehicle \d+ is owned by zones \[1, 2\]")
 
 
 def test_an_unrecorded_arrival_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -260,7 +260,7 @@ def test_the_memory_of_the_monitor_does_not_grow(monkeypatch: pytest.MonkeyPatch
     assert max(held[50:]) <= max(held[:25])
 
 
-def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) -> None:
+def test_the_ghosts_of_a_view_are_read_only(simulation: Simulation) -> None:
     ghosts = simulation.zones.ghosts(1)
     assert len(ghosts)
     with pytest.raises(ValueError, match="read-only"):
@@ -270,7 +270,7 @@ def test_ghosts_that_are_handed_out_cannot_be_written(simulation: Simulation) ->
 
 
 def test_worlds_resume_from_a_saved_state_with_the_monitor(simulation: Simulation) -> None:
-    """The monitor takes its tick from the state, and still finds a zone at another tick."""
+    """The monitor takes its tick from the state, and still detects a zone at another tick."""
     saved = [array.copy() for array in simulation.save()]
     hashes = []
     for _ in range(2):

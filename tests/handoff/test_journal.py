@@ -1,4 +1,4 @@
-"""The journal on disk: appended records are read back, and damage is refused with file and line."""
+"""The journal on disk: appended records can be read, and damage is refused with file and line."""
 
 from __future__ import annotations
 
@@ -35,8 +35,8 @@ from tests.support.generated import check_block, table
 PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
-def eventful() -> Bench:
-    """Run two zones: births, a hand-off, a forced one after two late ticks, a crash, a removal."""
+def run_events() -> Bench:
+    """Run two zones with births, a hand-off, a forced hand-off, a crash and a removal."""
     bench = Bench()
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.tick(movers=[(7, 1)], births=[(8, 1)])
@@ -48,16 +48,16 @@ def eventful() -> Bench:
 
 
 @pytest.fixture
-def written(tmp_path: Path) -> Path:
-    """Write the journal of `eventful`."""
+def journal_file(tmp_path: Path) -> Path:
+    """Write the journal of `run_events`."""
     path = tmp_path / "run.journal"
     with Journal(path) as journal:
-        journal.append(eventful().log)
+        journal.append(run_events().log)
     return path
 
 
-def test_appended_records_are_read_back(tmp_path: Path) -> None:
-    log = eventful().log
+def test_read_records_equal_appended_records(tmp_path: Path) -> None:
+    log = run_events().log
     with Journal(tmp_path / "run.journal") as journal:
         journal.append(log[:1])
         journal.append([])
@@ -73,7 +73,7 @@ def test_appended_records_are_read_back(tmp_path: Path) -> None:
 def test_an_appended_record_is_in_the_file_when_append_returns(tmp_path: Path, sync: Sync) -> None:
     path = tmp_path / "run.journal"
     with Journal(path, sync=sync) as journal:
-        for number, record in enumerate(eventful().log):
+        for number, record in enumerate(run_events().log):
             journal.append([record])
             assert path.read_text().count("\n") == number + 1
 
@@ -84,7 +84,7 @@ def test_appended_records_are_synced_to_disk_only_with_fsync(
 ) -> None:
     path, there = tmp_path / "run.journal", list[int]()
     monkeypatch.setattr(os, "fsync", lambda _: there.append(path.read_text().count("\n")))
-    log = eventful().log
+    log = run_events().log
     with Journal(path, sync=sync) as journal:
         journal.append(log[:2])
         journal.append(log[2:3])
@@ -93,15 +93,17 @@ def test_appended_records_are_synced_to_disk_only_with_fsync(
     assert there == ([2, 3, 4] if sync == "fsync" else [])
 
 
-def test_an_existing_file_is_not_overwritten(written: Path) -> None:
-    before = written.read_bytes()
-    with pytest.raises(JournalError, match=re.escape(f"{written}: the journal exists already")):
-        Journal(written)
-    assert written.read_bytes() == before
+def test_an_existing_file_is_not_overwritten(journal_file: Path) -> None:
+    before = journal_file.read_bytes()
+    with pytest.raises(
+        JournalError, match=re.escape(f"{journal_file}: the journal exists already")
+    ):
+        Journal(journal_file)
+    assert journal_file.read_bytes() == before
 
 
 def test_a_resumed_journal_appends_to_its_file(tmp_path: Path) -> None:
-    log, path = eventful().log, tmp_path / "run.journal"
+    log, path = run_events().log, tmp_path / "run.journal"
     for at in range(0, len(log), 3):
         with Journal(path, resume=at > 0) as journal:
             assert (journal.sequence, journal.dropped) == (at, "")
@@ -110,7 +112,7 @@ def test_a_resumed_journal_appends_to_its_file(tmp_path: Path) -> None:
 
 
 def test_a_fork_does_not_write_to_the_journal_of_its_parent(tmp_path: Path) -> None:
-    log, path = eventful().log, tmp_path / "run.journal"
+    log, path = run_events().log, tmp_path / "run.journal"
     with Journal(path) as journal:
         journal.append(log[:3])
         said = said_in_fork(lambda: journal.append(log[3:]), journal.close)
@@ -134,7 +136,7 @@ time.sleep(float(sys.argv[2]))
 
 
 def other_process(path: Path, seconds: float) -> subprocess.Popen[str]:
-    """Start a process that opens a journal, and holds it for some seconds."""
+    """Start a process that opens a journal and keeps it open for some seconds."""
     words = [sys.executable, "-c", HOLD, str(path), str(seconds)]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
@@ -144,7 +146,7 @@ def test_two_runs_cannot_write_the_same_journal(tmp_path: Path) -> None:
     path = tmp_path / "run.journal"
     words = f"{re.escape(str(path))}: another run is writing this journal; choose another"
     with Journal(path) as journal:
-        journal.append(eventful().log[:2])
+        journal.append(run_events().log[:2])
         with other_process(path, 0.0) as late:
             _, said = late.communicate(timeout=60.0)
         assert late.returncode == 1
@@ -156,12 +158,12 @@ def test_two_runs_cannot_write_the_same_journal(tmp_path: Path) -> None:
         with pytest.raises(JournalError, match=words):
             Journal(path, resume=True)
         writer.kill()
-    with Journal(path, resume=True) as journal:  # a lock ends with its process
+    with Journal(path, resume=True) as journal:  # the lock ends with the process
         assert journal.sequence == 2
 
 
-def test_a_line_that_is_cut_short_is_named_and_dropped_at_every_byte(tmp_path: Path) -> None:
-    log, path = eventful().log, tmp_path / "run.journal"
+def test_an_incomplete_last_line_is_reported_and_dropped(tmp_path: Path) -> None:
+    log, path = run_events().log, tmp_path / "run.journal"
     *before, last = [line.encode() for line in lines_of(log[:5])]
     whole = b"".join(before)
     for length in range(1, len(last)):
@@ -175,8 +177,8 @@ def test_a_line_that_is_cut_short_is_named_and_dropped_at_every_byte(tmp_path: P
         assert list(JournalReader(path)) == log
 
 
-def test_damage_is_refused_with_file_and_line(written: Path) -> None:
-    lines = written.read_bytes().splitlines(keepends=True)
+def test_damage_is_refused_with_file_and_line(journal_file: Path) -> None:
+    lines = journal_file.read_bytes().splitlines(keepends=True)
     wrong = {
         "does not match its checksum": [
             *lines[:3],
@@ -188,16 +190,19 @@ def test_damage_is_refused_with_file_and_line(written: Path) -> None:
         "codec can't decode": [*lines[:3], b"\xfc\n", *lines[4:]],
     }
     for why, damaged in wrong.items():
-        written.write_bytes(b"".join(damaged))
-        for read in (lambda: list(JournalReader(written)), lambda: Journal(written, resume=True)):
-            where = re.escape(f"{written}: line 4 of the log")
+        journal_file.write_bytes(b"".join(damaged))
+        for read in (
+            lambda: list(JournalReader(journal_file)),
+            lambda: Journal(journal_file, resume=True),
+        ):
+            where = re.escape(f"{journal_file}: line 4 of the log")
             with pytest.raises(JournalError, match=f"{where}.*{why}"):
                 read()
-        assert written.read_bytes() == b"".join(damaged)
+        assert journal_file.read_bytes() == b"".join(damaged)
 
 
-def test_invalid_paths_are_refused_with_a_fix(tmp_path: Path, written: Path) -> None:
-    for path in (tmp_path / "none" / "run.journal", written / "run.journal"):
+def test_invalid_paths_are_refused_with_a_fix(tmp_path: Path, journal_file: Path) -> None:
+    for path in (tmp_path / "none" / "run.journal", journal_file / "run.journal"):
         where = re.escape(f"{path}: the journal cannot be written")
         with pytest.raises(JournalError, match=f"{where}.*choose another path"):
             Journal(path)
@@ -212,7 +217,7 @@ def test_invalid_paths_are_refused_with_a_fix(tmp_path: Path, written: Path) -> 
 
 @contextmanager
 def files_of_at_most(size: int) -> Iterator[None]:
-    """Imitate a full disk: a part of a write is done, then there is an error."""
+    """Imitate a full disk: write the bytes that fit, then raise an error."""
     resource = pytest.importorskip("resource")
     limits = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, limits[1]))
@@ -223,7 +228,7 @@ def files_of_at_most(size: int) -> Iterator[None]:
 
 
 def test_a_full_disk_is_an_error_after_which_the_journal_can_be_resumed(tmp_path: Path) -> None:
-    log, path = eventful().log, tmp_path / "run.journal"
+    log, path = run_events().log, tmp_path / "run.journal"
     journal = Journal(path)
     journal.append(log[:2])
     with files_of_at_most(path.stat().st_size + 30):
@@ -250,9 +255,9 @@ def test_the_memory_of_a_journal_does_not_grow(tmp_path: Path) -> None:
     assert grown < 20_000
 
 
-def test_a_coordinator_continues_with_its_journal(written: Path) -> None:
-    bench = eventful()
-    records = tuple(JournalReader(written))
+def test_a_coordinator_continues_with_its_journal(journal_file: Path) -> None:
+    bench = run_events()
+    records = tuple(JournalReader(journal_file))
     directory = Directory.restore(records, range(2), bench, bench.limits)
     assert directory.table.owners == bench.directory.table.owners
     assert directory.table.tick == bench.directory.table.tick
@@ -261,10 +266,10 @@ def test_a_coordinator_continues_with_its_journal(written: Path) -> None:
 # Contents
 
 
-def test_a_summary_counts_committed_events(written: Path) -> None:
-    summary, table = summarize(written)
+def test_a_summary_counts_committed_events(journal_file: Path) -> None:
+    summary, table = summarize(journal_file)
     assert summary.to_dict() == {
-        "run": bytes(range(16)).hex(), "lines": len(eventful().log), "episodes": 1,
+        "run": bytes(range(16)).hex(), "lines": len(run_events().log), "episodes": 1,
         "ticks": 6, "first_tick": 1, "last_tick": 6, "births": 2, "removals": 1, "switches": 2,
         "forced": 1, "deferrals": 2, "hosts": 3, "fences": 1, "unfinished": -1,
         "torn": "",
@@ -273,19 +278,19 @@ def test_a_summary_counts_committed_events(written: Path) -> None:
     assert table.hosts[1] == (1, 2)
 
 
-def test_a_tick_that_was_begun_or_cut_short_is_named(written: Path) -> None:
-    whole = written.read_bytes()
-    written.write_bytes(whole[: whole.rindex(b'{"schema"')])
-    assert summarize(written)[0].unfinished == 6
-    written.write_bytes(whole[:-5])
-    summary, table = summarize(written)
+def test_the_summary_names_a_tick_that_was_not_committed(journal_file: Path) -> None:
+    whole = journal_file.read_bytes()
+    journal_file.write_bytes(whole[: whole.rindex(b'{"schema"')])
+    assert summarize(journal_file)[0].unfinished == 6
+    journal_file.write_bytes(whole[:-5])
+    summary, table = summarize(journal_file)
     assert (summary.unfinished, summary.last_tick) == (6, 5)
     assert summary.torn.startswith("line ")
     assert table.owners == {7: (1, 1), 8: (0, 1)}
 
 
-def test_owners_at_every_tick(written: Path) -> None:
-    at = {tick: owners_at(written, tick) for tick in range(1, 7)}
+def test_the_journal_gives_the_owners_at_every_tick(journal_file: Path) -> None:
+    at = {tick: owners_at(journal_file, tick) for tick in range(1, 7)}
     assert at[1].owners == {7: (0, 0)}
     assert at[2].owners == {7: (1, 1), 8: (1, 0)}
     assert at[4].owners == at[2].owners
@@ -294,10 +299,10 @@ def test_owners_at_every_tick(written: Path) -> None:
     with pytest.raises(
         JournalError, match="tick 9 was not committed; use a tick up to the last one, 6"
     ):
-        owners_at(written, 9)
+        owners_at(journal_file, 9)
 
 
-def test_records_that_no_coordinator_writes_are_refused_with_their_line(tmp_path: Path) -> None:
+def test_impossible_records_are_refused_with_their_line(tmp_path: Path) -> None:
     def refused(records: list[Record]) -> str:
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.journal"
         with Journal(path) as journal:
@@ -307,7 +312,7 @@ def test_records_that_no_coordinator_writes_are_refused_with_their_line(tmp_path
         assert str(said.value).startswith(f"{path}: ")
         return str(said.value)
 
-    log = eventful().log
+    log = run_events().log
     assert "first line is not a RESET" in refused(log[1:])
     assert "no complete line" in refused([])
     assert "line 5 of the log: BEGIN of tick 1" in refused([*log[:4], log[3]])
@@ -319,7 +324,7 @@ def test_records_that_no_coordinator_writes_are_refused_with_their_line(tmp_path
 def lines_of_all_kinds() -> dict[str, str]:
     """Return the longest line of each kind of record in a run with hand-offs."""
     found: dict[str, str] = {}
-    for line in lines_of(eventful().log):
+    for line in lines_of(run_events().log):
         kind = json.loads(line)["kind"]
         if len(line) > len(found.get(kind, "")):
             found[kind] = line
@@ -327,7 +332,7 @@ def lines_of_all_kinds() -> dict[str, str]:
 
 
 def form(hint: Any, name: str = "") -> str:
-    """Return the type of a field as the page writes it."""
+    """Return the type of a field in the notation of the page."""
     if get_origin(hint) is tuple:
         return f"list of {form(get_args(hint)[0])}"
     if hint in (int, bool):
@@ -370,7 +375,7 @@ def test_the_page_explains_every_key_of_a_line() -> None:
 
 
 def independent_replay(journal: Path) -> Any:
-    """Return the owners as computed by the program of the page, which does not import cavmarl."""
+    """Return the owners that the program of the page computes, without cavmarl."""
     page = PAGE.read_text(encoding="utf-8")
     _, program = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
     assert "cavmarl" not in re.sub(r'"cavmarl[^"]*"', "", program)
@@ -390,9 +395,9 @@ def test_the_replay_of_the_page_finds_the_same_owners(tmp_path: Path, seed: int)
     assert independent_replay(path) == owners == replay(tuple(JournalReader(path))).owners
 
 
-def test_the_replay_of_the_page_refuses_damage(written: Path) -> None:
-    assert independent_replay(written) == summarize(written)[1].owners
-    whole = written.read_bytes()
-    written.write_bytes(whole.replace(b'"tick":3', b'"tick":4', 1))
+def test_the_replay_of_the_page_refuses_damage(journal_file: Path) -> None:
+    assert independent_replay(journal_file) == summarize(journal_file)[1].owners
+    whole = journal_file.read_bytes()
+    journal_file.write_bytes(whole.replace(b'"tick":3', b'"tick":4', 1))
     with pytest.raises(AssertionError):
-        independent_replay(written)
+        independent_replay(journal_file)

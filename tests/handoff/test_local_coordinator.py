@@ -48,7 +48,7 @@ def test_the_journal_of_a_run_names_the_owners(busy: Recorded, tmp_path: Path) -
     assert command("journal", str(path)) == 0
 
 
-def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
+def test_each_world_has_its_own_journal(tmp_path: Path) -> None:
     run = record("grid4x4", BUSY, 6, worlds=2)
     vec = replay(run, 2, {"zones.journal": str(tmp_path / "run.jsonl")})
     for w, coordinator in enumerate(vec.simulation.coordinators):
@@ -57,7 +57,7 @@ def test_each_world_has_a_journal_of_its_own(tmp_path: Path) -> None:
 
 
 def just_before_the_end_of(edge: str, path: Path) -> Path:
-    """Write two strips of grid4x4 as zones: the right strip begins 11 m before an edge's end."""
+    """Write two zones of grid4x4; the right one begins 11 m before the end of an edge."""
     roads = load_world("grid4x4").network
     lane = roads.lanes[int(roads.edges[roads.edge_ids.index(edge)]["first_lane"])]
     end_x = float(roads.points[int(lane["first_point"] + lane["num_points"]) - 1]["x"])
@@ -72,8 +72,8 @@ def just_before_the_end_of(edge: str, path: Path) -> Path:
     return path
 
 
-def test_vehicles_that_leave_in_the_tick_of_their_change_are_marked(tmp_path: Path) -> None:
-    """The trip ends after 3.5 m, and the car moves up to 2.8 m per tick."""
+def test_the_row_of_a_transfer_marks_a_vehicle_that_leaves_in_the_same_tick(tmp_path: Path) -> None:
+    """The trip ends 3.5 m beyond the border, and a car moves up to 2.8 m per tick."""
     demand = tmp_path / "grid.rou.xml"
     demand.write_text(
         '<routes><flow id="a" from="C3D3" to="D3right3" begin="0" end="60" period="2"/></routes>',
@@ -96,14 +96,14 @@ def test_vehicles_that_leave_in_the_tick_of_their_change_are_marked(tmp_path: Pa
     assert [row.release_depth_m is None for row in log.rows] == gone
 
 
-def test_a_vehicle_that_turns_away_from_a_border_is_forgotten() -> None:
+def test_the_offer_of_a_vehicle_that_turns_away_from_a_border_is_withdrawn() -> None:
     run = record("grid4x4", {**BUSY, "zones.approach_ticks": 30}, 2 * STEPS)
     simulation = replay(run, ZONES).simulation
     assert simulation.transfers[0].counts["aborted"] > 0
     assert len(simulation.coordinators[0].in_flight()) > 5
 
 
-def test_a_world_of_few_vehicles_has_room_for_all_pending_changes() -> None:
+def test_a_world_with_few_vehicles_has_room_for_many_unread_changes() -> None:
     whole, divided = (
         make_vec("ring", zones=zones, agents=2, background=3, max_cycles=1000) for zones in (1, 4)
     )
@@ -122,7 +122,7 @@ def test_a_world_of_few_vehicles_has_room_for_all_pending_changes() -> None:
 def test_the_table_is_updated_on_request_or_after_many_changes(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    late = 16  # this number of changes is soon reached
+    late = 16  # a small number, which the run reaches soon
     monkeypatch.setattr(direct, "UNREAD_LIMIT", late)
     vec = make_vec("grid4x4", zones=ZONES, overrides=BUSY)
     vec.reset(seed=1)
@@ -151,7 +151,7 @@ def test_a_change_from_a_zone_that_is_not_the_recorded_owner_is_detected() -> No
     assert isinstance(coordinator, LocalCoordinator)
     vec.step(vec.suggest_actions())
     directory, book = coordinator.directory, vec.simulation.division.book
-    assert directory.table.owners, "initial vehicles are recorded"
+    assert directory.table.owners, "the initial vehicles are not on record"
     while not book.num_changes[0]:
         vec.step(vec.suggest_actions())
     vehicle, target, epoch = book.changes[0, 0][["vehicle", "target", "epoch"]].tolist()
@@ -186,7 +186,7 @@ def test_the_journal_distinguishes_actions(tmp_path: Path) -> None:
     assert not set(one) & set(other)
 
 
-def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> None:
+def test_an_undivided_world_can_have_a_journal(tmp_path: Path) -> None:
     path = tmp_path / "one.jsonl"
     settings = {"zones.journal": str(path), "zones.check_invariants": True}
     vec = make_vec("grid4x4", num_envs=1, agents=4, background=10, overrides=settings)
@@ -198,4 +198,4 @@ def test_an_undivided_world_has_a_journal_if_asked_for_one(tmp_path: Path) -> No
     assert set(owners) == set(vec.simulation.vehicles()["id"].tolist())
     assert {zone for zone, _ in owners.values()} == {0}
     undivided = make_vec("grid4x4", num_envs=1, agents=4, background=10)
-    assert not undivided.simulation.coordinators, "without a journal, no log is kept"
+    assert not undivided.simulation.coordinators, "a world without a journal keeps a log"

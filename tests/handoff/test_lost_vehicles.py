@@ -1,4 +1,4 @@
-"""An agent that leaves its lane and drives against the traffic: other drivers then ignore it."""
+"""Other drivers ignore an agent that leaves its lane and drives against the traffic."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from tests.support.demand_worlds import make
 from tests.support.driving import idle, start
 
 TICK_S = 0.1
-STREET = "road0"  # along y = 0, where the agent begins
+STREET = "road0"  # along y = 0; the agent starts here
 CROSSED = [((200.0 + 3.2 * k, -900.0), (200.0 + 3.2 * k, 30.0)) for k in range(8)]
 BOUNDS = (-10.0, -910.0, 410.0, 40.0)
 WAY = [(203.0, 0.0), (214.0, -8.0), (216.0, -30.0), (216.0, -1000.0)]
@@ -51,7 +51,7 @@ def agent_of(simulation: Simulation) -> np.void:
     return found
 
 
-class Astray:
+class WrongWayDriver:
     """Turn left into the wrong lanes of the other road, and stop far away."""
 
     def __init__(self, simulation: Simulation) -> None:
@@ -87,7 +87,7 @@ def test_a_lost_vehicle_blocks_no_lane_in_any_division(
     whole, divided = worlds
     seed = next(seed for seed in range(100) if begins_on_the_street(whole, seed))
     start(divided, seed)
-    drivers = Astray(whole), Astray(divided)
+    drivers = WrongWayDriver(whole), WrongWayDriver(divided)
     for _ in range(700):
         for driver in drivers:
             driver.step()
@@ -100,14 +100,14 @@ def test_a_lost_vehicle_blocks_no_lane_in_any_division(
     assert away_m > divided.zones.loads().halo_m
     street = whole.vehicles(0)
     passed = (street["driver"] != DRIVER_AGENT) & (street["s"] > row["s"])
-    assert passed.sum() >= 3, "other vehicles pass on the lane of the agent"
+    assert passed.sum() >= 3, "fewer than three vehicles have passed the agent"
 
 
 def test_the_built_in_driver_looks_for_its_lane(worlds: tuple[Simulation, Simulation]) -> None:
     whole, divided = worlds
     seed = next(seed for seed in range(100) if begins_on_the_street(whole, seed))
     start(divided, seed)
-    drivers = Astray(whole), Astray(divided)
+    drivers = WrongWayDriver(whole), WrongWayDriver(divided)
     for _ in range(250):
         for driver in drivers:
             driver.step()
@@ -117,5 +117,5 @@ def test_the_built_in_driver_looks_for_its_lane(worlds: tuple[Simulation, Simula
         simulation.suggest(raw)
         told.append(raw)
     assert agent_of(whole)["speed"] > SLOW_MPS
-    assert told[0][0, 0, 0] < 0.0, "slowly"
+    assert told[0][0, 0, 0] < 0.0, "the built-in driver does not brake"
     assert told[0].tobytes() == told[1].tobytes()

@@ -1,4 +1,4 @@
-"""Partitions that change while a world runs do not change results, and balance loads."""
+"""A partition that changes while a world runs balances loads and does not change results."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def test_the_journal_of_a_repartitioned_world_has_each_change_of_owner(tmp_path:
     assert sum(len(line.get("switches", ())) for line in lines) == repartitioned.migrations > 20
 
 
-def test_balanced_zones_do_not_change() -> None:
+def test_zones_with_balanced_loads_are_not_repartitioned() -> None:
     calm = worlds(
         "grid4x4", 2, **{"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.9}
     )
@@ -93,7 +93,7 @@ def test_balanced_zones_do_not_change() -> None:
     assert calm.partition is before
 
 
-def test_worlds_of_workers_are_repartitioned() -> None:
+def test_worlds_over_workers_are_repartitioned() -> None:
     overrides = {"zones.repartition_steps": 3, "zones.repartition_tolerance": 0.0}
     alone, shared = (
         make_vec("grid4x4", num_envs=2, zones=4, workers=workers, overrides=overrides)
@@ -118,7 +118,7 @@ def test_worlds_of_workers_are_repartitioned() -> None:
         ({"zones.repartition_tolerance": float("nan")}, "zones.repartition_tolerance"),
     ],
 )
-def test_worlds_that_cannot_be_repartitioned_are_refused(
+def test_invalid_settings_of_repartitioning_are_refused(
     overrides: dict[str, Any], words: str
 ) -> None:
     with pytest.raises(ConfigError, match=words):
@@ -130,10 +130,10 @@ def test_repartitioning_of_a_world_over_workers_is_refused() -> None:
         make_vec("grid4x4", zones=4, workers=2, overrides={"zones.repartition_steps": 5})
 
 
-def test_zones_that_swap_places_hand_over_distant_vehicles(
+def test_a_swap_of_zones_hands_over_distant_vehicles(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Vehicles whose new zone is far away count as teleports; all other results are equal."""
+    """Vehicles whose new zone is not a neighbor count as teleports; all results are equal."""
     path = tmp_path / "run.jsonl"
     strips = {"zones.layout": "strips", "zones.journal": str(path), "zones.count": 9, **OFTEN}
     strips["zones.repartition_steps"] = 6

@@ -1,4 +1,4 @@
-"""The halo of zones: as wide as exactness needs; narrower settings are refused with the numbers."""
+"""The halo of zones is as wide as exactness needs; narrower halos are refused."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from tests.support.driving import make_simulation
 SETTINGS = {"clock.sim_dt_s": 0.1, "zones.count": 4, "zones.hysteresis_m": 3.0}
 
 
-def test_the_halo_is_reach_hysteresis_and_the_distance_of_late_ticks() -> None:
+def test_the_halo_is_the_sum_of_reach_hysteresis_and_distance_of_late_ticks() -> None:
     config = load_config("grid4x4", overrides=SETTINGS | {"zones.max_deferred_ticks": 4})[0]
-    for late_ticks in (0, 3):  # late_ticks is the deadline of messages between nodes
+    for late_ticks in (0, 3):  # late_ticks is the deadline for messages between nodes
         needed_m = 100.0 + 3.0 + (late_ticks + 1) * MAX_SPEED_MPS * 0.1
         wide_m = halo_m(config, 100.0, 4, late_ticks=late_ticks)
         assert needed_m < wide_m < needed_m + 1e-5
 
 
-def test_a_wider_halo_is_accepted_and_a_narrower_halo_is_refused_with_the_numbers() -> None:
+def test_a_wider_halo_is_accepted_and_a_narrower_halo_is_refused() -> None:
     narrow = load_config("grid4x4", overrides=SETTINGS | {"zones.halo_m": 120.0})[0]
     with pytest.raises(
         ConfigError,
@@ -29,7 +29,7 @@ def test_a_wider_halo_is_accepted_and_a_narrower_halo_is_refused_with_the_number
     ):
         halo_m(narrow, 100.0, 4, late_ticks=2)
     assert halo_m(narrow, 99.0, 4, late_ticks=2) == 120.0
-    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "no driver looks over a border"
+    assert halo_m(narrow, 100.0, 1, late_ticks=2) == 120.0, "one shard has no border"
 
 
 def test_a_world_whose_halo_is_too_narrow_for_exactness_is_refused() -> None:

@@ -1,4 +1,4 @@
-"""Only its zone drives a vehicle and senses for it: commands to other zones have no effect."""
+"""Only the owner of a vehicle drives it and computes its observations."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ def divided(kind: str) -> Simulation:
 
 
 class Strict(PhaseExecutor):
-    """Call shards one after the other, and check which shards use commands and sense.
+    """An executor that calls shards one by one, and checks their commands and outputs.
 
     Args:
         simulation: simulation whose phases are run.
-        strangers: command to a zone for agents that it does not own.
+        strangers: command that a zone gets for agents whose vehicles it does not own.
     """
 
     def __init__(self, simulation: Simulation, strangers: float) -> None:
@@ -78,7 +78,7 @@ def agents_of(shard: Shard) -> NDArray[np.int64]:
 
 
 @pytest.mark.parametrize(("kind", "strangers"), [("continuous", np.nan), ("discrete", 1e9)])
-def test_only_the_owner_of_a_vehicle_uses_its_control(kind: str, strangers: float) -> None:
+def test_only_the_owner_of_a_vehicle_uses_its_command(kind: str, strangers: float) -> None:
     plain, watched = divided(kind), divided(kind)
     strict = Strict(watched, strangers)
     use_executor(watched, strict)
@@ -93,7 +93,7 @@ def test_only_the_owner_of_a_vehicle_uses_its_control(kind: str, strangers: floa
     assert strict.controlled > STEPS * AGENTS
 
 
-def test_if_the_owner_gets_no_control_the_world_differs() -> None:
+def test_the_world_differs_if_the_owner_gets_no_command() -> None:
     plain, watched = divided("continuous"), divided("continuous")
     use_executor(watched, Strict(watched, 0.0))
     shard = watched.shards[0]

@@ -38,7 +38,7 @@ def test_a_view_has_the_owner_of_each_vehicle_and_the_ghosts_near_zones(
             view, rows = divided.zones.view(world), divided.vehicles(world)
             for row, owner in zip(rows, view.owners.tolist(), strict=True):
                 away = [squared_distance(rects, k, row["x"], row["y"]) for k in range(len(rects))]
-                # Vehicles that crossed in this tick are handed over at the start of the next one.
+                # Vehicles that cross a border are handed over at the start of the next tick.
                 assert away[owner] ** 0.5 <= divided.config.clock.sim_dt_s * row["speed"] + 1e-9
                 seen_by = {k for k, ghosts in enumerate(view.ghosts) if row["id"] in ghosts}
                 assert seen_by == {k for k in range(len(rects)) if away[k] <= HALO_M**2} - {owner}
@@ -48,7 +48,7 @@ def test_a_view_has_the_owner_of_each_vehicle_and_the_ghosts_near_zones(
     assert view.halo_m == HALO_M
 
 
-def test_a_view_does_not_change_later(divided: Simulation) -> None:
+def test_a_view_does_not_change_when_the_world_steps(divided: Simulation) -> None:
     view = divided.zones.view()
     before = [ghosts.copy() for ghosts in view.ghosts]
     for _ in range(20):
@@ -57,7 +57,7 @@ def test_a_view_does_not_change_later(divided: Simulation) -> None:
         np.testing.assert_array_equal(ghosts, then)
 
 
-def test_transfers_are_passed_on(divided: Simulation) -> None:
+def test_a_view_contains_the_given_transfers(divided: Simulation) -> None:
     one = TransferInFlight(vehicle=7, source=0, target=1, state="offered")
     view = view_zones(divided.shards, divided.partition, HALO_M, transfers=[one])
     assert view.transfers == (one,)

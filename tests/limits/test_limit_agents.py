@@ -1,4 +1,4 @@
-"""Agents of speed limits: choices, observations, rewards, equality over divisions, bad input."""
+"""Agents of speed limits: choices, observations, rewards, divided worlds and bad input."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def vec_of(num_envs: int = 2, **more: Any) -> CavVectorEnv:
     return make_vec("lane_drop", num_envs=num_envs, overrides=overrides, **{"agents": 0, **more})
 
 
-def test_vehicles_keep_the_limit_that_is_chosen() -> None:
+def test_vehicles_obey_the_chosen_speed_limit() -> None:
     with closing(vec_of(1)) as vec:
         vec.reset(seed=1)
         fastest = []
@@ -47,16 +47,16 @@ def test_vehicles_keep_the_limit_that_is_chosen() -> None:
             far = rows[lanes == vec.network.edge_ids.index("far")]
             fastest.append(far["speed"].max())
         assert max(fastest[10:18]) < 1.3 * 12.0
-        assert fastest[-1] > 24.0  # 40 m/s is above the map's limit, which then holds
+        assert fastest[-1] > 24.0  # 40 m/s exceeds the limit of the map, which therefore holds
         assert fastest[-1] < 1.35 * 27.78
 
 
-def test_choices_that_are_too_far_are_counted_or_refused() -> None:
+def test_choices_too_far_from_the_present_limit_are_counted_or_refused() -> None:
     with closing(vec_of(1, overrides={"limits.most_change": 1, "limits.decide_s": 10.0})) as vec:
         _, infos = vec.reset(seed=1)
         assert infos["limit_mask"][0].tolist() == [[False, False, True, True]] * 2
         for choice, refused, mask in (
-            (0, 1, [0, 0, 0, 1]),  # every second step is no decision
+            (0, 1, [0, 0, 0, 1]),  # agents decide only in every second step
             (0, 1, [0, 0, 1, 1]),
             (2, 1, [0, 0, 1, 0]),
             (0, 1, [0, 1, 1, 1]),
@@ -71,7 +71,7 @@ def test_choices_that_are_too_far_are_counted_or_refused() -> None:
             vec.step({"limits": np.zeros((1, 2), dtype=int)})
 
 
-def test_observations_and_rewards_are_those_of_the_vehicles() -> None:
+def test_observations_and_rewards_equal_values_computed_from_the_vehicles() -> None:
     keys = {"clock.ctrl_dt_s": 0.2, "limits.decide_s": 10.0, "horizon_s": 100.0}
     keys |= {"limits.terms": {"delay": 2.0, "change": 0.5}}
     with closing(vec_of(1, overrides=keys)) as vec:
@@ -135,13 +135,13 @@ def test_the_parallel_environment_keeps_its_contract() -> None:
 def hashes(
     kill_at: tuple[int, ...] = (), num_envs: int = 2, overrides: Any = None, **more: Any
 ) -> list[str]:
-    """Hashes of the states and of everything that the agents of limits get."""
+    """Return hashes of the states, and of all observations and rewards of the agents of limits."""
     keys = {"limits.decide_s": 10.0, "limits.most_change": 2, **(overrides or {})}
     vec = vec_of(num_envs, agents=3, overrides=keys, **more)
     with closing(vec):
         vec.reset(seed=1)
         rng, given = np.random.default_rng(0), hashlib.sha256()
-        for step in range(55):  # one horizon, and a part of the next episode
+        for step in range(55):  # one whole episode and a part of the next one
             if step in kill_at:
                 os.kill(vec.worlds.worker_pids[1], signal.SIGKILL)
             actions = vec.suggest_actions()
@@ -168,19 +168,21 @@ def undivided() -> list[str]:
 
 
 @pytest.mark.parametrize("zones", [2, 3])
-def test_a_divided_world_is_the_undivided_one(zones: int, undivided: list[str]) -> None:
+def test_a_divided_world_with_limit_agents_equals_the_undivided_world(
+    zones: int, undivided: list[str]
+) -> None:
     assert hashes(zones=zones) == undivided
 
 
 @pytest.mark.integration
-def test_it_is_the_same_on_workers_and_nodes(undivided: list[str]) -> None:
+def test_a_world_with_limit_agents_is_the_same_on_workers_and_nodes(undivided: list[str]) -> None:
     assert hashes(workers=2, kill_at=(33,)) == undivided
     one = hashes(num_envs=1)
     assert hashes(num_envs=1, zones=3, workers=2, kill_at=(7,)) == one
     assert hashes(num_envs=1, zones=3, nodes=2, kill_at=(24,)) == one
 
 
-def test_limits_hold_beside_changes_of_the_caller() -> None:
+def test_the_lower_limit_of_the_caller_and_the_agent_applies() -> None:
     with closing(vec_of(1, overrides={"map.changed_lanes": 3})) as vec:
         vec.reset(seed=1)
         edges = vec.network.lanes["edge"]

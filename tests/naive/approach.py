@@ -1,4 +1,4 @@
-"""Vehicles on links or approaching them, computed for one vehicle at a time."""
+"""Find the vehicles on links and on the way to them, one vehicle at a time."""
 
 from __future__ import annotations
 
@@ -9,11 +9,13 @@ from cavmarl.core.records.codes import HOLD_EXIT_BLOCKED, HOLD_NONE, HOLD_SIGNAL
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.roads.network import RoadNetwork
 
-Entry = tuple[int, int, float]  # link, vehicle's id, m from its centre to the line
+Entry = tuple[
+    int, int, float
+]  # (link, vehicle id, distance in m from the centre of the vehicle to the stop line)
 
 
 def link_into(roads: RoadNetwork, row: np.void) -> int:
-    """Return the link into the vehicle's lane, or else into an adjacent lane; -1: none."""
+    """Return the link into the lane of a vehicle, or else into an adjacent lane, or -1."""
     if row["link"] >= 0 and roads.links[row["link"]]["to_lane"] == row["lane"]:
         return int(row["link"])
     own = roads.lanes[row["lane"]]
@@ -50,8 +52,8 @@ def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[
     idle |= row["hold"] == HOLD_NONE and row["wait_s"] > 3.0
     ahead: list[tuple[int, float]] = []
     while len(ahead) < 2:
-        # Vehicles that turn into its lane consider it from farther away, unless it stands or may
-        # have to stop before that.
+        # Vehicles that merge into the lane of this vehicle see it from farther away, unless this
+        # vehicle stands or may have to stop before the merge.
         may_stop = any(inside or roads.links[link]["state"] != ord("M") for link, _ in ahead)
         stands = idle and row["speed"] <= 0.5
         far = max(sight, 300.0) if here["merges"] else sight
@@ -62,7 +64,9 @@ def announcements(roads: RoadNetwork, travel: TripTables, row: np.void) -> list[
         else:
             step = travel.steps[way + lane]
             if step["next"] < 0:
-                is_minded = to_end < 15.0 or step["change"] == 0  # or its trip ends
+                is_minded = (
+                    to_end < 15.0 or step["change"] == 0
+                )  # at the line, or where the trip ends
                 if not ahead and is_minded and here["num_links"]:
                     found.append((int(here["first_link"]), name, max(to_end, 0.0)))
                 break

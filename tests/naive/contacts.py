@@ -1,4 +1,4 @@
-"""Contacts, computed from the common area of each pair of vehicles."""
+"""Find contacts from the common area of each pair of vehicles."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The lane controller as a chain of angles."""
+"""Compute the steering of the lane controller, one quantity after the other."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from tests.naive.idm import not_zero
 
 
 def steering_control(speed: float, d: float, heading_error: float, length: float) -> float:
-    """Compute offset -> lateral speed -> heading -> yaw rate -> slip -> steering."""
+    """Compute lateral speed, heading, yaw rate, slip and steering in turn from the offset."""
     lateral_speed = -d / 0.6
     sine = max(-1.0, min(1.0, lateral_speed / not_zero(speed)))
     approach = max(-math.pi / 4, min(math.pi / 4, math.asin(sine)))

@@ -1,4 +1,4 @@
-"""Layers of driver networks, written out plainly in NumPy."""
+"""Layers of driver networks in plain NumPy."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def linear(inputs: Floats, weights: Floats, bias: Floats) -> Floats:
 
 
 def layer_norm(inputs: Floats, scale: Floats, shift: Floats) -> Floats:
-    """Normalize each row (N, K); sums consist of 16 partial sums, which are added in order."""
+    """Normalize each row (N, K); each sum is made of 16 partial sums that are added in order."""
 
     def mean(values: Floats) -> Floats:
         partial = np.zeros((len(values), 16), dtype=values.dtype)
@@ -46,7 +46,7 @@ def relu(values: Floats) -> Floats:
 def exact_outputs(
     weights: Mapping[str, NDArray[np.float32]], config: NetworkConfig, observations: Floats
 ) -> Floats:
-    """Compute the results of `DriverNetwork.outputs` in float64, with NumPy's functions."""
+    """Compute `DriverNetwork.outputs` in float64 with functions of NumPy."""
     w = {name: tensor.astype(np.float64) for name, tensor in weights.items()}
     values = (observations.astype(np.float64) - w["mean"]) / w["deviation"]
     values = values.clip(-5.0, 5.0)

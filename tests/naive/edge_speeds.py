@@ -1,4 +1,4 @@
-"""Mean speeds of edges, computed edge by edge from their definition."""
+"""Compute mean speeds of edges from their definition, edge by edge."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def millimetres(speed: float) -> int:
-    """Round a speed in m/s to whole mm/s, halves up; speeds are not negative."""
+    """Round a non-negative speed in m/s to whole mm/s, halves up."""
     return int(np.floor(max(speed, 0.0) * 1000.0 + 0.5))
 
 
 def mean_speeds(roads: RoadNetwork, rows: NDArray[np.void]) -> list[int]:
-    """Return the mean speed per edge in mm/s; an empty lane counts as one vehicle at its limit."""
+    """Return the mean speed per edge in mm/s; an empty lane counts as a vehicle at the limit."""
     means = []
     for edge in roads.edges:
         speeds = []

@@ -1,4 +1,4 @@
-"""Post-encroachment times of vehicles that pass a junction at constant speeds, in closed form."""
+"""Post-encroachment times of vehicles that cross a junction at constant speeds, in closed form."""
 
 from __future__ import annotations
 
@@ -13,15 +13,17 @@ class Passage(NamedTuple):
     """The passage of a vehicle over a junction."""
 
     link: int
-    start_m: float  # position of the centre behind the stop line at time 0; negative: before it
+    start_m: (
+        float  # position of the centre at time 0, measured from the stop line; negative before it
+    )
     speed_mps: float
     length_m: float
 
 
 def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> list[float]:
-    """Return each vehicle's least time between its and another's stay in a shared area; inf: none.
+    """Return, for each vehicle, the least post-encroachment time with any other vehicle, or inf.
 
-    Vehicles on crossing paths share the area of their conflict; on paths into one lane they do not.
+    Only vehicles whose paths cross count, not vehicles whose paths lead into the same lane.
     """
     least = [float("inf")] * len(passages)
     for a, b in combinations(range(len(passages)), 2):
@@ -41,7 +43,7 @@ def least_encroachments(network: RoadNetwork, passages: Sequence[Passage]) -> li
 
 
 def _stay(passage: Passage, enter_m: float, leave_m: float) -> tuple[float, float]:
-    """Return the times at which the front bumper enters and the rear bumper leaves."""
+    """Return the times at which the vehicle enters and leaves a stretch of its link."""
     half = 0.5 * passage.length_m
     return (
         (float(enter_m) - half - passage.start_m) / passage.speed_mps,

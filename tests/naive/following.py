@@ -1,4 +1,4 @@
-"""Twins of IDM and of Krauss's model: the acceleration that a driver finally applies."""
+"""The acceleration that a driver applies with IDM and with the model of Krauss."""
 
 from __future__ import annotations
 
@@ -6,13 +6,13 @@ import numpy as np
 
 from tests.naive import idm, krauss
 
-CAR_M = 5.0  # IDM measures between the centres of two cars of this length
+CAR_M = 5.0  # IDM measures distances between the centres of cars of this length
 
 
 def idm_response(
     kind: np.void, speed: float, allowed: float, leaders: list[tuple[float, float]]
 ) -> float:
-    """Return IDM's acceleration behind the worst of several leaders (bumper gap, speed)."""
+    """Return the acceleration by IDM behind several leaders (bumper gap, speed)."""
     jam = float(kind["min_gap"]) + CAR_M
     own = (float(kind["accel"]), float(kind["decel"]), jam, float(kind["tau"]))
     wanted = [idm.idm_acceleration(speed, allowed, None, 0.0, *own)]
@@ -30,7 +30,7 @@ def krauss_response(
     share: float,
     dt: float,
 ) -> float:
-    """Return Krauss's acceleration behind several leaders (bumper gap, speed, deceleration)."""
+    """Return the acceleration by Krauss behind leaders (bumper gap, speed, deceleration)."""
     accel, decel = float(kind["accel"]), float(kind["decel"])
     wanted = min(allowed, speed + accel * dt)
     for gap, front_speed, front_decel in leaders:

@@ -12,7 +12,7 @@ Point = tuple[float, float]
 
 
 def wrap_angle(angle: float) -> float:
-    """Return the IEEE remainder, with -π replaced by π."""
+    """Return the IEEE remainder of an angle, with -π replaced by π."""
     wrapped = math.remainder(angle, 2.0 * math.pi)
     return math.pi if wrapped == -math.pi else wrapped
 

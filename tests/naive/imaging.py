@@ -1,7 +1,7 @@
-"""The objects that rays and pixels hit, found by testing each object; a body is six half-spaces.
+"""Find the objects that rays and pixels hit by testing each object; a body is six half-spaces.
 
-The frame is the vehicle's. `margin` makes each body and wall larger, to find the cases in which
-rounding decides.
+Coordinates are in the frame of the vehicle. `margin` enlarges each body and wall, to find cases in
+which rounding decides.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Echo:
 
 
 def turn(yaw: float, pitch: float, roll: float) -> Vector:
-    """Return the (3, 3) axes of a frame turned by yaw, then nose up, then left side up."""
+    """Return the (3, 3) axes of a frame after yaw, pitch (nose up) and roll (left side up)."""
     about_z = np.array(
         [[math.cos(yaw), -math.sin(yaw), 0], [math.sin(yaw), math.cos(yaw), 0], [0, 0, 1]]
     )
@@ -54,7 +54,7 @@ def seen_bodies(rows: NDArray[np.void], row: int) -> list[np.void]:
 
 
 def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin: float) -> float:
-    """Return the distance to an upright body in lengths of the ray; 0: inside, inf: missed."""
+    """Return the distance to a body in lengths of the ray; 0 if inside, inf if the ray misses."""
     base = to_vehicle(ego, body["x"], body["y"], body["z"])
     heading = body["heading"] - ego["heading"]
     along = np.array([math.cos(heading), math.sin(heading), 0.0])
@@ -80,7 +80,7 @@ def ray_to_body(start: Vector, ray: Vector, ego: np.void, body: np.void, margin:
 
 
 def ray_to_wall(start: Vector, ray: Vector, ego: np.void, wall: np.void, margin: float) -> float:
-    """Return the distance to a wall in lengths of the ray; inf: missed. Walls start at z = 0."""
+    """Return the distance to a wall (from z = 0 up) in lengths of the ray; inf if it misses."""
     axes = turn(ego["heading"], 0.0, 0.0)[:2, :2]
     a = axes.T @ np.array([wall["ax"] - ego["x"], wall["ay"] - ego["y"]])
     b = axes.T @ np.array([wall["bx"] - ego["x"], wall["by"] - ego["y"]])
@@ -123,7 +123,7 @@ def trace(
 
 
 def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
-    """Return (A, E, 3) unit vectors in the vehicle's frame."""
+    """Return the directions (A, E, 3) of a fan of rays in the frame of the vehicle."""
     return np.array(
         [
             [
@@ -136,7 +136,7 @@ def fan_rays(axes: Vector, azimuths: Vector, elevations: Vector) -> Vector:
 
 
 def pixel_ray(axes: Vector, width: int, height: int, fov: float, row: int, column: int) -> Vector:
-    """Return the ray of a pixel in the vehicle's frame; its length covers one metre of depth."""
+    """Return the ray of a pixel in the frame of the vehicle, with a length of 1 m in depth."""
     focal = 0.5 * width / math.tan(0.5 * fov)
     right = (column + 0.5 - 0.5 * width) / focal
     down = (row + 0.5 - 0.5 * height) / focal
@@ -145,7 +145,7 @@ def pixel_ray(axes: Vector, width: int, height: int, fov: float, row: int, colum
 
 
 def covers(body: np.void, x: float, y: float, margin: float) -> bool:
-    """Return whether a point of the world is under a body."""
+    """Return whether a point in world coordinates is under a body."""
     dx, dy = x - body["x"], y - body["y"]
     along = dx * math.cos(body["heading"]) + dy * math.sin(body["heading"])
     across = dy * math.cos(body["heading"]) - dx * math.sin(body["heading"])

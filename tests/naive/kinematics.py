@@ -15,7 +15,7 @@ def bicycle_step(
     length: float,
     dt: float,
 ) -> tuple[float, float, float, float, float]:
-    """Evaluate the equations of the kernel's docstring one by one; the heading is not wrapped."""
+    """Evaluate the equations of the kernel one by one, without wrapping the heading."""
     slip = math.atan(math.tan(steering) / 2.0)
     yaw_rate = speed * math.sin(slip) / (length / 2.0)
     return (
@@ -30,7 +30,7 @@ def bicycle_step(
 def clip_control(
     speed: float, accel: float, steering: float, crashed: bool, min_speed: float, max_speed: float
 ) -> tuple[float, float]:
-    """Clip acceleration and steering; beyond a speed limit, only return towards it."""
+    """Clip acceleration and steering; outside of the speed range, only allow a return to it."""
     wanted = -speed if crashed else accel
     if speed > max_speed:
         wanted = min(wanted, max_speed - speed)

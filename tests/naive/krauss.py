@@ -1,4 +1,4 @@
-"""Krauss's safe speed by bisection, and his imperfection by its definition."""
+"""The safe speed of Krauss by bisection, and his driver imperfection from its definition."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from __future__ import annotations
 def safe_speed(
     gap: float, front_speed: float, decel: float, front_decel: float, reaction_s: float
 ) -> float:
-    """Return the largest speed whose stopping distance is at most the gap plus the leader's."""
+    """Return the largest speed with a stopping distance up to the gap plus the leader's."""
     room = gap + front_speed**2 / (2.0 * max(decel, front_decel))
     low, high = 0.0, 1000.0
     for _ in range(100):

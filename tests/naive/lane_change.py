@@ -1,4 +1,4 @@
-"""MOBIL as the paper's two criteria: safety, then incentive."""
+"""The lane-change model MOBIL as two criteria of the paper: safety, then incentive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ def mobil_accepts(
     old_follower: tuple[float, float],
     mandatory: bool,
 ) -> bool:
-    """Decide by pairs of accelerations before and after the change; politeness is 0."""
+    """Decide from pairs of accelerations before and after the change, with politeness 0."""
     safe_for_follower = new_follower[1] >= -2.0
     safe_for_me = own[1] >= -2.0
     politeness = 0.0

@@ -1,4 +1,4 @@
-"""The twin of `cavmarl.roads.routing.lane_grid`: lanes are put into their cells piece by piece."""
+"""A plain version of `cavmarl.roads.routing.lane_grid` that adds lanes to cells in pieces."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ __all__ = ["cells_of_lanes"]
 def cells_of_lanes(
     network: RoadNetwork, origin: tuple[float, float], shape: tuple[int, int], cell_m: float
 ) -> list[list[int]]:
-    """The LANE rows of each cell, in order.
+    """Return the LANE rows of each cell, in order.
 
     Args:
         network: the map.
-        origin: x and y of the first cell's corner, m.
+        origin: x and y of the corner of the first cell in m.
         shape: numbers of cells along x and along y.
-        cell_m: the side of a cell.
+        cell_m: side of a cell in m.
     """
     members: list[set[int]] = [set() for _ in range(shape[0] * shape[1])]
     for lane, row in enumerate(network.lanes):

@@ -1,4 +1,4 @@
-"""Vehicles by lane and position, by a search over all vehicles."""
+"""Find vehicles by lane and position, by a search over all vehicles."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ VIEW_M = 250.0
 
 
 def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry]:
-    """Return the vehicles on a lane, or covering it from the side, by (s, id)."""
+    """Return the vehicles on a lane or partly on it, sorted by (s, id)."""
     found = []
     for i, row in enumerate(rows):
         if row["lane"] == lane:
@@ -27,7 +27,7 @@ def on_lane(roads: RoadNetwork, rows: NDArray[np.void], lane: int) -> list[Entry
 
 
 def beside_s(roads: RoadNetwork, lane: int, neighbour: int, s: float) -> float:
-    """Map a position to the adjacent lane, by interpolation between the mapped points."""
+    """Map a position to the adjacent lane, by interpolation between mapped points."""
     row = roads.lanes[lane]
     side = "left_s" if row["left"] == neighbour else "right_s"
     points = roads.points[row["first_point"] : row["first_point"] + row["num_points"]]
@@ -41,7 +41,7 @@ def beside_s(roads: RoadNetwork, lane: int, neighbour: int, s: float) -> float:
 def ahead(
     roads: RoadNetwork, rows: NDArray[np.void], i: int, lane: int, s: float
 ) -> tuple[int, float]:
-    """Return the next vehicle beyond (s, own id): (row, s) or (-1, inf)."""
+    """Return (row, s) of the next vehicle ahead of (s, own id), or (-1, inf)."""
     for other_s, other_id, j in on_lane(roads, rows, lane):
         if j != i and (other_s, other_id) > (s, rows[i]["id"]):
             return (j, other_s) if other_s - s <= VIEW_M else (-1, math.inf)
@@ -60,7 +60,7 @@ def _behind_here(
 def behind(
     roads: RoadNetwork, rows: NDArray[np.void], i: int, lane: int, s: float, reach_m: float
 ) -> tuple[int, float]:
-    """Return the nearest vehicle behind, also on earlier lanes: (row, distance) or (-1, inf)."""
+    """Return (row, distance) of the nearest vehicle behind, also on earlier lanes, or (-1, inf)."""
     j, other_s = _behind_here(roads, rows, i, lane, s)
     if j >= 0:
         return (j, s - other_s) if s - other_s <= VIEW_M else (-1, math.inf)

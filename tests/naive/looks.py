@@ -1,4 +1,4 @@
-"""The lanes that the drivers of a zone may look at, as sets: a slow twin of `find_looks`."""
+"""A plain version of `find_looks`: the lanes at which drivers of a zone may look, as sets."""
 
 from __future__ import annotations
 
@@ -36,8 +36,8 @@ class Looks:
 
     Args:
         network: the map.
-        rect: min_x, min_y, max_x, max_y of the area of the zone's drivers.
-        view_m: how far drivers look along the road.
+        rect: min_x, min_y, max_x, max_y of the area in which drivers of the zone can be.
+        view_m: distance that drivers see along the road.
         see_m: distance to a line at which a driver considers the junction.
         half_m: half the length of the longest vehicle.
     """
@@ -76,7 +76,9 @@ class Looks:
         }
         foes |= swept
         following = foes
-        while following:  # on equal roads, follow cycles of yielding links
+        while (
+            following
+        ):  # if roads have equal priority, follow cycles of links that yield to each other
             following = {
                 int(conflict["foe"])
                 for link in following
@@ -100,7 +102,7 @@ class Looks:
             self._see(lane, 0.0, EXIT_LOOK_M - way)
 
     def _own(self, rect: tuple[float, float, float, float]) -> dict[int, tuple[float, float]]:
-        """Return the zone's part of each lane with a margin, equal for all lanes of an edge."""
+        """Return the part of each lane in the zone with a margin, equal for lanes of an edge."""
         parts: dict[int, list[float]] = defaultdict(list)
         for lane in range(len(self.lengths)):
             row = self.network.lanes[lane]
@@ -119,7 +121,7 @@ class Looks:
         return own
 
     def _along(self, view_m: float) -> Ways:
-        """See along the roads, ahead and back; return the distances to the lanes ahead."""
+        """Add what drivers see ahead and behind; return the distances to the lanes ahead."""
         starts: Ways = {}
         ends: Ways = {}
         for lane, (first, last) in self.own.items():
@@ -140,7 +142,7 @@ class Looks:
         return ahead
 
     def _asked(self, ahead: Ways, see_m: float) -> set[int]:
-        """Return the links that drivers of the zone may enter, or are on."""
+        """Return the links that drivers of the zone are on or may enter."""
         lanes = set()
         for lane, row in enumerate(self.network.lanes):
             if row["internal"]:
@@ -158,13 +160,13 @@ class Looks:
         }
 
     def _leads_to(self, lane: int) -> set[int]:
-        """Return the lanes before the junction at the start of a lane."""
+        """Return the lanes that lead into a lane over the junction at its start."""
         links = self.network.links
         here = (links["to_lane"] == lane) & (links["first_internal"] >= 0)
         return set(links["from_lane"][here].tolist())
 
     def _at_lines(self, foes: set[int], places: dict[int, float]) -> None:
-        """See the vehicles that register at the stop lines of foes."""
+        """Add the parts in which vehicles register at the stop lines of foes."""
         lines: Ways = {}
         for link in foes:
             _shorten(lines, self._beside(int(self.network.links["from_lane"][link])), 0.0)
@@ -174,7 +176,7 @@ class Looks:
                 places[beside] = min(places[beside], line)
 
     def _at_merges(self, foes: set[int]) -> None:
-        """See the merging vehicles that are considered from farther away."""
+        """Add the parts in which drivers see merging vehicles from farther away."""
         lanes, links = self.network.lanes, self.network.links
         before = {k for link in foes for k in self._beside(int(links["from_lane"][link]))}
         for lane in before:
@@ -210,7 +212,7 @@ class Looks:
                 self.head[beside] = math.inf
 
     def _beyond(self, lane: int) -> list[tuple[int, float]]:
-        """Return lanes behind a lane's end, and how far bodies there may cover longer lanes."""
+        """Return lanes after a lane, and how far bodies on them overlap longer adjacent lanes."""
         row = self.network.lanes[lane]
         if row["internal"]:
             return []
@@ -228,7 +230,7 @@ class Looks:
         return found
 
     def _ways(self, begin: Ways, neighbors: Callable[[int], list[int]], limit_m: float) -> Ways:
-        """Return the shortest distances by Dijkstra's algorithm."""
+        """Return the shortest distances to lanes by Dijkstra's algorithm."""
         found: Ways = {}
         waiting = [(way, lane) for lane, way in begin.items() if way <= limit_m]
         heapq.heapify(waiting)
@@ -261,7 +263,7 @@ class Looks:
         return beside
 
     def _path(self, link: int) -> list[int]:
-        """Return the lanes of a link inside the junction, and the lane behind it."""
+        """Return the lanes of a link inside the junction, and the lane after the junction."""
         path = [int(self.network.links["next_lane"][link])]
         while self.network.lanes["internal"][path[-1]]:
             path += self._after(path[-1])

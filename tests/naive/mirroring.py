@@ -1,4 +1,4 @@
-"""The position of a vehicle of SUMO, computed plainly."""
+"""Compute the position of a vehicle of SUMO from its definition."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def centre(seen: np.void, length: float) -> tuple[float, float, float]:
-    """Return x and y of the body's centre, and the heading, counter-clockwise from east."""
+    """Return x and y of the centre of the body, and the heading counter-clockwise from east."""
     north, east = math.cos(math.radians(seen["angle"])), math.sin(math.radians(seen["angle"]))
     return (
         float(seen["x"] - 0.5 * length * east),
@@ -23,7 +23,7 @@ def centre(seen: np.void, length: float) -> tuple[float, float, float]:
 def place(
     network: RoadNetwork, seen: np.void, length: float, link: int
 ) -> tuple[int, float, float]:
-    """Return LANE row and s of the centre, searched backwards from the front along its lanes."""
+    """Return the LANE row and s of the centre, found backwards from the front along the lanes."""
     lanes, edges = network.lanes, network.edges
     lane = int(seen["lane"])
     scale = lanes[lane]["length_m"] / edges[lanes[lane]["edge"]]["length_m"]

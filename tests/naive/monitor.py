@@ -1,4 +1,4 @@
-"""The findings that the monitor must have, computed with sets and integers of Python."""
+"""Compute the findings of the monitor with Python sets and integers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.naive.zones import distance
 
 
 class Kept(NamedTuple):
-    """A vehicle one tick earlier."""
+    """The position of a vehicle at the previous tick, and by how many ticks its row was late."""
 
     x: float
     y: float
@@ -28,14 +28,14 @@ class Zone(NamedTuple):
 
 
 def owner_hash(vehicle: int, epoch: int) -> int:
-    """Return the contribution of a vehicle to the sum of its owner."""
+    """Return the hash of a vehicle in the sum of hashes of its owner."""
     return mixed((mixed(vehicle) + epoch) & WORD)
 
 
 def findings(
     zones: list[Zone], before: Mapping[int, Kept], tick: int, new_late: int, limit_m: float
 ) -> dict[int, str]:
-    """Return vehicle → fault: `tick` or `far`."""
+    """Return the faults by vehicle: `tick` (wrong tick) or `far` (too far from its last place)."""
     found: dict[int, str] = {}
     for zone in zones:
         for row in zone.owned:
@@ -56,7 +56,7 @@ def tallies(
     masks: list[int],
     factors: list[int],
 ) -> list[tuple[int, int, int, int]]:
-    """Return per zone the number of vehicles, and the sums of owners, due and present ghosts."""
+    """Return, per zone, the number of vehicles and the sums of owners, due and present ghosts."""
 
     def sum_of(rows: list[np.void]) -> int:
         words = [np.frombuffer(row.tobytes(), np.uint64).tolist() for row in rows]

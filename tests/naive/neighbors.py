@@ -1,4 +1,4 @@
-"""The nearest vehicles by a search over all vehicles."""
+"""Find the nearest vehicles by a search over all vehicles."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 def k_nearest(
     rows: NDArray[np.void], row: int, x: float, y: float, z: float, radius_m: float, k: int
 ) -> list[tuple[float, int]]:
-    """Return (squared distance, row) of up to k vehicles on the level, by distance, then id."""
+    """Return (squared distance, row) of the k nearest vehicles on the level; ids break ties."""
     found = [
         (_square(other["x"] - x) + _square(other["y"] - y), other["id"], i)
         for i, other in enumerate(rows)

@@ -1,7 +1,7 @@
-"""Features of observations, computed from a SUMO network file and from rectangles of vehicles.
+"""Compute features of observations from a SUMO network file and from rectangles of vehicles.
 
-Nothing of the package is used: lanes, widths, limits, stop signs and signal programs are read from
-the file, and rays are intersected with the sides of rectangles.
+This code does not use the package. It reads lanes, widths, limits, stop signs and signal programs
+from the file, and intersects rays with the sides of rectangles.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ Point = tuple[float, float]
 
 @dataclass(frozen=True)
 class FileLane:
-    """A lane of the file."""
+    """A lane of the network file."""
 
     points: list[Point]
     width_m: float
@@ -49,15 +49,17 @@ class Net:
     """The parts of a network file that features depend on."""
 
     lanes: dict[str, FileLane]
-    # state and, with a signal, its name and index, by lane before and first lane in the junction
+    # (lane before the junction, first lane inside) → state, name and index of the signal if any
     states: dict[tuple[str, str], tuple[str, str, int]]
-    programs: dict[str, list[tuple[float, str]]]  # durations in s and states
+    programs: dict[
+        str, list[tuple[float, str]]
+    ]  # name of a signal → durations in s and states of its phases
     offsets: dict[str, float] = field(default_factory=dict)  # s
 
     def letter(self, signal: str, index: int, time_s: float) -> tuple[str, float]:
-        """Return the letter that a signal shows, and the time until it changes.
+        """Return the letter that a signal shows, and the time until the letter changes.
 
-        If it never changes, the time is that of the cycle.
+        If the letter never changes, the time is the cycle of the signal.
         """
         phases = self.programs[signal]
         cycle = sum(duration for duration, _ in phases)
@@ -112,7 +114,7 @@ def _point(text: str) -> Point:
 def ray_distance(
     origin: Point, direction: float, bodies: NDArray[np.void], range_m: float
 ) -> float:
-    """Return the distance along a ray to the nearest side of a rectangle; the range if none."""
+    """Return the distance along a ray to the nearest side of a rectangle, or the range."""
     nearest = range_m
     ex, ey = math.cos(direction), math.sin(direction)
     for body in bodies:

@@ -1,4 +1,4 @@
-"""The `lanes` sensor, computed by sorting all vehicles."""
+"""Compute the `lanes` sensor by sorting all vehicles."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ def lanes(
     held: set[int],
     range_m: float,
 ) -> list[float]:
-    """Return the sensor's features; `held`: links whose signal is red."""
+    """Return the features of the sensor; `held` are the links with a red signal."""
     ego = rows[i]
     near = [
         other
@@ -107,7 +107,7 @@ def crossing(
     held: set[int],
     range_m: float,
 ) -> list[float]:
-    """Return the features of the first vehicle at an area shared with the own next link."""
+    """Return the features of the first vehicle that reaches a conflict area with the next link."""
     own = next_link(plans, ego, roads, range_m)
     found = []
     for other in near:
@@ -134,7 +134,7 @@ def crossing(
 
 
 def closeness(way: float) -> float:
-    """Return 1 at contact, 0.5 at `HALF_M`."""
+    """Return a closeness: 1 at contact, 0.5 at a distance of `HALF_M`."""
     return float(np.float32(HALF_M / (HALF_M + max(way, 0.0))))
 
 

@@ -1,4 +1,4 @@
-"""The `way` and `conflicts` sensors, computed from the whole path and by sorting all vehicles."""
+"""Compute the `way` and `conflicts` sensors from the whole path and by sorting all vehicles."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ class Stretch:
     """A lane of the path."""
 
     lane: int
-    start_m: float  # distance of its start from the vehicle
+    start_m: float  # distance from the vehicle to the start of the lane
     end_m: float
-    link: int  # the link at its end, or -1
+    link: int  # link at the end of the lane, or -1
 
 
 def way_of(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, most: int = 48
 ) -> list[Stretch]:
-    """Return the lanes of the path from the vehicle on."""
+    """Return the lanes of the path, starting at the vehicle."""
     lane, start = int(vehicle["lane"]), -float(vehicle["s"])
     found: list[Stretch] = []
     while lane >= 0 and len(found) < most:
@@ -109,9 +109,9 @@ def lines(
     range_m: float,
     stop_signs: str = "give_way",
 ) -> list[float]:
-    """Return closeness, red, yellow, green and duty to yield per line; `shown`: letter by link.
+    """Return closeness, red, yellow, green and duty to yield for each stop line.
 
-    With `stop_signs="own"`, the duty to stop follows.
+    `shown` has the signal letter of each link. With `stop_signs="own"`, the duty to stop is added.
     """
     found = []
     for stretch in way_of(roads, plans, vehicle):
@@ -142,7 +142,7 @@ def lines(
 
 
 def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
-    """Return the predicted poses if the vehicle goes straight on: x, y, direction."""
+    """Return the predicted poses (x, y, direction) of a vehicle that goes straight on."""
     x, y, heading, speed = (float(vehicle[name]) for name in ("x", "y", "heading", "speed"))
     return [
         (x + time * speed * math.cos(heading), y + time * speed * math.sin(heading), heading)
@@ -153,9 +153,9 @@ def straight_looks(vehicle: np.void) -> list[tuple[float, float, float]]:
 def indicated_way(
     roads: RoadNetwork, plans: NDArray[np.void], vehicle: np.void, from_m: float = 0.0
 ) -> tuple[list[Stretch], int]:
-    """Return the path up to the end of the lane behind the next junction, and its link or -1.
+    """Return the path up to the end of the lane after the next junction, and the link or -1.
 
-    If the junction is farther away than `from_m`, unless that is 0, the path ends before it.
+    If `from_m` is not 0 and the junction is farther away, the path ends before the junction.
     """
     way = way_of(roads, plans, vehicle)
     here = roads.lanes[way[0].lane]
@@ -174,7 +174,7 @@ def indicated_way(
 def looks_along(
     roads: RoadNetwork, way: list[Stretch], vehicle: np.void, speed: float
 ) -> list[tuple[float, float, float]]:
-    """Return the present and predicted poses of the vehicle: x, y, direction."""
+    """Return the present and predicted poses (x, y, direction) of a vehicle along its path."""
     found = [(float(vehicle["x"]), float(vehicle["y"]), float(vehicle["heading"]))]
     for time in LOOKS_S[1:]:
         stretch, s = on_way(way, speed * time)
@@ -188,7 +188,7 @@ def approach(
     ego: np.void,
     other: np.void,
 ) -> tuple[float, float]:
-    """Return gap and time of the most critical approach."""
+    """Return the gap between two vehicles, and its time, at their most critical approach."""
     gaps = []
     for time, (x, y, direction), (x_there, y_there, direction_there) in zip(
         LOOKS_S, looks, others, strict=True
@@ -270,10 +270,11 @@ def conflicts(
     indicators: bool = False,
     from_m: float = 0.0,
 ) -> list[float]:
-    """Return nine features of each of the `count` most critical vehicles; ten with `indicators`.
+    """Return features of each of the `count` most critical vehicles.
 
-    `hidden`: ids of vehicles that are not seen. `told`: reports of vehicles in messages, as a
-    VEHICLE row and an age in s; with reports, there are eleven features.
+    A vehicle has nine features, ten with `indicators`, and eleven with reports. `hidden` are the
+    ids of vehicles that are not seen. `told` has reports from messages: a VEHICLE row and an age in
+    s per vehicle id.
     """
     ego = rows[i]
     way = way_of(roads, plans, ego)
@@ -291,7 +292,7 @@ def conflicts(
             its_way = indicated_way(roads, plans, other, from_m)[0]
             others = looks_along(roads, its_way, other, float(other["speed"]))
         near, when = approach(looks, others, ego, other)
-        # Rounding may differ between equally critical vehicles, so these are ordered by id.
+        # Rounding must not decide the order of equally critical vehicles, so round and sort by id.
         ranked.append((round(near + 2.0 * when, 6), subject, near, when))
     numbers: list[float] = []
     for _, subject, near, when in sorted(ranked)[:count]:

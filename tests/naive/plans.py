@@ -1,4 +1,4 @@
-"""Least travel times over the lane graph by repeating the definition until nothing changes."""
+"""Compute least travel times over the lane graph by iterating the definition to a fixed point."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ LANE_CHANGE_M = 250.0
 
 
 def followers(roads: RoadNetwork, lane: int) -> list[tuple[int, int]]:
-    """Return (next lane, link or -1) of the movements of a route at the end of a lane.
+    """Return (next lane, link or -1) of each movement at the end of a lane.
 
-    U-turns count only if the whole road has no other movement.
+    U-turns count only if no lane of the road has another movement.
     """
     row = roads.lanes[lane]
     if row["internal"]:
@@ -41,7 +41,7 @@ def _turns_round(roads: RoadNetwork, link: int) -> bool:
 
 
 def neighbours(roads: RoadNetwork, lane: int, permission: int) -> list[int]:
-    """Return the lanes beside a lane to which a vehicle may change; none inside junctions."""
+    """Return the adjacent lanes to which a vehicle may change; inside junctions there are none."""
     row = roads.lanes[lane]
     if row["internal"]:
         return []
@@ -55,7 +55,7 @@ def change_cost(roads: RoadNetwork, lane: int) -> float:
 
 
 def costs(roads: RoadNetwork, goal_edge: int, permission: int) -> NDArray[np.float64]:
-    """Return (L,) travel times in s from the start of each lane to the goal edge's end, or inf."""
+    """Return (L,) travel times in s from the start of each lane to the end of the goal, or inf."""
     drive = roads.lanes["length_m"] / roads.lanes["speed_mps"]
     allowed = roads.lanes["permissions"] & permission != 0
     cost = np.full(len(roads.lanes), math.inf)

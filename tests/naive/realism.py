@@ -1,6 +1,6 @@
-"""The realism meta-metric in plain Python, written from its definition: one number at a time.
+"""The realism meta-metric in plain Python, written from its definition, one number at a time.
 
-Distances between bodies come from Minkowski differences, not from corners in frames of bodies.
+Unlike the package, this code computes distances between bodies from Minkowski differences.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ NONE_M = 1e10
 
 
 class Body(NamedTuple):
-    """The poses of an object, None where it is not there, with its length and width."""
+    """The poses of an object over time (None while it is absent), its length and its width."""
 
     poses: Sequence[Pose | None]
     length: float
@@ -87,7 +87,7 @@ def to_segment(point: Point, start: Point, end: Point) -> float:
 
 
 def body_distance(one: list[Point], other: list[Point]) -> float:
-    """Return the signed distance of two convex bodies: of the origin to their difference."""
+    """Return the signed distance of two convex bodies, from their Minkowski difference."""
     shape = hull([(a[0] - b[0], a[1] - b[1]) for a in one for b in other])
     sides = list(zip(shape, shape[1:] + shape[:1], strict=True))
     nearest = min(to_segment((0.0, 0.0), a, b) for a, b in sides)
@@ -120,7 +120,7 @@ def _line_distance(point: Point, line: Sequence[Point]) -> float:
     apart = [to_segment(point, a, b) for a, b in parts]
     k = apart.index(min(apart))
 
-    def side(number: int) -> float:  # 1: on the right
+    def side(number: int) -> float:  # 1 on the right
         a, b = parts[number]
         value = _cross(a, b, point)
         return 0.0 if value == 0.0 else -math.copysign(1.0, value)
@@ -149,7 +149,7 @@ def _wrapped(angle: float) -> float:
 def series(
     bodies: Sequence[Body], k: int, lines: Sequence[Sequence[Point]], step_s: float
 ) -> dict[str, list[float | None]]:
-    """Return the features of body k at each time; None: it has no value."""
+    """Return the features of body k at each time; None stands for no value."""
     own = bodies[k]
     times = range(len(own.poses))
 

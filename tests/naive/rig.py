@@ -1,4 +1,4 @@
-"""Mounted sensors, computed plainly from their definitions."""
+"""Compute samples of mounted sensors from their definitions."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def odometry(before: np.void | None, after: np.void, share: float) -> Matrix:
 def inertia(
     before: np.void | None, after: np.void, share: float, tick_s: float, config: Any
 ) -> Matrix:
-    """Return specific force and angular rate along the sensor's axes, by vector algebra."""
+    """Return specific force and angular rate along the axes of the sensor, by vector algebra."""
     v, a, r, steering, pitch = (
         between(before, after, name, share)
         for name in ("speed", "accel", "yaw_rate", "steering", "pitch")
@@ -84,7 +84,7 @@ def inertia(
 
 
 def lane_boundary(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, config: Any) -> Matrix:
-    """Return distances left and right, width, direction and curvature, from all segments."""
+    """Return distances to the left and right boundary, width, direction and curvature of a lane."""
     points = roads.lane_polyline(int(row["lane"]))[:, :2]
     x, y, _ = place_in_world(row, config)
     best: tuple[float, float, float] | None = None
@@ -108,7 +108,7 @@ def lane_boundary(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, con
 
 
 def _ahead(roads: RoadNetwork, plans: NDArray[np.void], row: np.void, ahead: float) -> Matrix:
-    """Return a point on the path ahead, by walking along its points."""
+    """Return a point on the path ahead, by going along the points of the path."""
     lane, rest = int(row["lane"]), float(row["s"]) + ahead
     while True:
         points = roads.lane_polyline(lane)[:, :2]

@@ -1,4 +1,4 @@
-"""Philox4x32-10 on Python's unlimited integers, as the paper writes it."""
+"""Philox4x32-10 with Python integers, as in the paper."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def philox4x32(counter: list[int], key: list[int]) -> list[int]:
 
 
 def random_bits(key: int, vehicle: int, tick: int, stream: int) -> int:
-    """Return the first 64 bits with the counter layout of `kernels.rng`, first word on top."""
+    """Return the first two words, the first on top; counters are laid out as in `kernels.rng`."""
     counter = [vehicle & MASK_32, tick & MASK_32, (vehicle >> 32) | (tick >> 32) << 16, stream]
     words = philox4x32(counter, [key & MASK_32, key >> 32])
     return words[0] << 32 | words[1]
@@ -36,7 +36,7 @@ def below(key: int, vehicle: int, tick: int, stream: int, n: int) -> int:
 
 
 def world_key(seed: int, world: int, episode: int) -> int:
-    """Return the words in the other order, as one number."""
+    """Return the first two words as one number, the second word on top."""
     bits = random_bits(seed, world, episode, 0)
     return (bits & MASK_32) << 32 | bits >> 32
 
@@ -46,7 +46,7 @@ GOLDEN = 0x9E3779B97F4A7C15
 
 
 def quick_uniform(key: int, vehicle: int, tick: int, stream: int) -> float:
-    """Mix key, vehicle and (stream, tick) in turn; return the upper 53 bits as a number."""
+    """Mix key, vehicle and (stream, tick) in turn; return the upper 53 bits as a fraction."""
     word = mixed((key + GOLDEN) & MASK_64)
     word = mixed(word ^ vehicle * GOLDEN & MASK_64)
     word = mixed(word ^ ((stream << 32) + tick) * GOLDEN & MASK_64)

@@ -1,4 +1,4 @@
-"""Shortest paths along a sequence of edges, by iterating the definition until nothing changes."""
+"""Compute shortest paths along a sequence of edges by iterating the definition to a fixed point."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def lanes_of(roads: RoadNetwork, edge: int) -> range:
 def costs(
     roads: RoadNetwork, edges: Sequence[int], permission: int
 ) -> dict[tuple[int, int], float]:
-    """Return travel times in s by (index in the route, lane), with lane changes; inf: no path."""
+    """Return travel times in s by (index in the route, lane) with lane changes, or inf."""
     allowed = roads.lanes["permissions"] & permission != 0
     cost = {(n, lane): math.inf for n, edge in enumerate(edges) for lane in lanes_of(roads, edge)}
     while True:

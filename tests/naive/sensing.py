@@ -1,4 +1,4 @@
-"""Lidar, by intersecting each ray with each side of each vehicle."""
+"""Compute a lidar scan by intersecting each ray with each side of each vehicle."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def _ray_to_side(direction: Point, a: Point, b: Point) -> float:
     edge = (b[0] - a[0], b[1] - a[1])
     slant = direction[0] * edge[1] - direction[1] * edge[0]
     if abs(slant) < 1e-12:
-        return math.inf  # parallel to the side; the neighbouring sides decide
+        return math.inf  # the ray is parallel to this side, so the adjacent sides decide
     distance = (a[0] * edge[1] - a[1] * edge[0]) / slant
     share = (a[0] * direction[1] - a[1] * direction[0]) / slant
     return distance if distance >= 0.0 and 0.0 <= share <= 1.0 else math.inf

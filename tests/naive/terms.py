@@ -1,4 +1,4 @@
-"""Time to collision, by moving rectangles and comparing their corners."""
+"""Compute the time to collision by moving rectangles and comparing their corners."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Body = tuple[float, float, float, float, float, float]  # x, y, heading, speed, 
 
 
 def ttc_risk(rows: NDArray[np.void], i: int, larger_m: float = 0.0) -> float:
-    """Return 1 - ttc / horizon of the first vehicle that is hit, or 0; boxes grow by `larger_m`."""
+    """Return 1 - TTC / horizon of the first collision, or 0; boxes grow by `larger_m`."""
     me = rows[i]
     least = HORIZON_S
     for j, other in enumerate(rows):
@@ -27,10 +27,10 @@ def ttc_risk(rows: NDArray[np.void], i: int, larger_m: float = 0.0) -> float:
 
 
 def time_to_collision_s(one: Body, other: Body, horizon_s: float = HORIZON_S) -> float:
-    """Return the time until the free distance of two bodies is 0; inf: not within the horizon.
+    """Return the time until the free distance of two bodies is 0, or inf beyond the horizon.
 
-    The free distance of bodies that keep their velocities is convex in time: it has one minimum,
-    and reaches 0 at most once before.
+    If bodies keep their velocities, their free distance is convex in time. It has one minimum, and
+    is 0 at most once before the minimum.
     """
     begin, end = 0.0, horizon_s
     for _ in range(60):

@@ -1,4 +1,4 @@
-"""Sending and receiving messages, computed slowly from the definitions."""
+"""Compute the sending and reception of messages from the definitions."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class Said:
 
     @property
     def rank(self) -> tuple[int, int, int]:
-        """Return the sort key of a report: newest first, then own reports, then smallest sender."""
+        """Return the sort key of a report: newest, then by its subject, then lowest sender."""
         return (-self.tick, 0 if self.cam else 1, self.sender)
 
 
@@ -64,14 +64,14 @@ def chance(config: ChannelConfig, distance_m: float, blocked: bool, busy: float)
 
 
 def airtime_s(config: ChannelConfig) -> float:
-    """Return the airtime of IEEE 802.11p in 10 MHz: 32 µs training, 8 µs signal field, the bits."""
+    """Return the airtime of IEEE 802.11p in 10 MHz: 32 µs training, 8 µs header, then data."""
     if config.data_rate_mbps == 0.0:
         return 0.0
     return 32e-6 + 8e-6 + config.packet_bytes * 8 / (config.data_rate_mbps * 1e6)
 
 
 def sensing_m(config: ChannelConfig) -> float:
-    """Return the sensing range: where half of the packets are received, or the end of the range."""
+    """Return the distance at which half of the packets are received, at most the range."""
     sensing = config.range_m or math.inf
     if config.path_loss_exponent > 0.0:
         sensing = min(sensing, 10.0 ** (_margin_db(config) / (10.0 * config.path_loss_exponent)))
@@ -79,7 +79,7 @@ def sensing_m(config: ChannelConfig) -> float:
 
 
 def _margin_db(config: ChannelConfig) -> float:
-    """Return the loss in dB beyond the first metre at which half of the packets are lost."""
+    """Return the path loss beyond the first metre, in dB, at which half of the packets are lost."""
     loss_1m = 20.0 * math.log10(4.0 * math.pi * 5.9e9 / 299_792_458.0)
     return config.tx_power_dbm - loss_1m - config.sensitivity_dbm
 
@@ -87,7 +87,7 @@ def _margin_db(config: ChannelConfig) -> float:
 def inbox(
     old: Sequence[Said], heard: Sequence[Said], receiver: int, x: float, y: float, most: int
 ) -> list[Said]:
-    """Return the best report of each of the nearest subjects; nearest first, then by subject."""
+    """Return the best report of each of the nearest subjects, sorted by distance and subject."""
     best: dict[int, Said] = {}
     for said in (*old, *heard):
         if said.subject == receiver:
@@ -96,7 +96,7 @@ def inbox(
         if known is None or said.rank < known.rank:
             best[said.subject] = said
 
-    # A known vehicle stays, wherever it is now, until nearer vehicles displace it.
+    # A known vehicle stays until nearer vehicles replace it, even if it is out of range now.
     def key(said: Said) -> tuple[float, int]:
         return ((said.x - x) ** 2 + (said.y - y) ** 2, said.subject)
 
@@ -125,7 +125,7 @@ def seen(
 
 
 def _meets(row: Any, x: float, y: float, to_x: float, to_y: float) -> bool:
-    """Return whether one of 2,000 points of a line is in the rectangle of a body."""
+    """Return whether one of 2,000 points on a line is inside the rectangle of a body."""
     share = np.linspace(0.0, 1.0, 2001)
     dx, dy = x + share * (to_x - x) - row["x"], y + share * (to_y - y) - row["y"]
     cos, sin = math.cos(row["heading"]), math.sin(row["heading"])

@@ -1,4 +1,4 @@
-"""Zones, by checking each rectangle."""
+"""Find zones by checking each rectangle."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def owners(rects: NDArray[np.float64], x: float, y: float) -> list[int]:
-    """Return all zones whose half-open rectangle contains the point; there should be one."""
+    """Return all zones whose half-open rectangle contains the point; one in a partition."""
     return [
         zone
         for zone, (min_x, min_y, max_x, max_y) in enumerate(rects.tolist())
@@ -30,7 +30,7 @@ def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]
     for row in rows:
         dx = max(rect[0] - row["x"], row["x"] - rect[2], 0.0)
         dy = max(rect[1] - row["y"], row["y"] - rect[3], 0.0)
-        # Compare squares like the kernel, because a root would round once more.
+        # Compare squared distances as the kernel does, because a root would round again.
         if dx * dx + dy * dy <= distance_m * distance_m:
             found.append(row)
     return found
@@ -39,14 +39,14 @@ def within(rect: NDArray[np.float64], distance_m: float, rows: Sequence[np.void]
 def published(
     rects: NDArray[np.float64], halo_m: float, xy: NDArray[np.float64], zone: int
 ) -> list[list[int]]:
-    """Return for each zone the rows of `xy`, all owned by `zone`, within its halo."""
+    """Return, for each zone, the rows of `xy` (owned by `zone`) that are within its halo."""
     needed: list[list[int]] = []
     for other, rect in enumerate(rects.tolist()):
         rows = []
         for row, (x, y) in enumerate(xy.tolist()):
             dx = max(rect[0] - x, x - rect[2], 0.0)
             dy = max(rect[1] - y, y - rect[3], 0.0)
-            # Compare squares like the kernel, because a root would round once more.
+            # Compare squared distances as the kernel does, because a root would round again.
             if other != zone and dx * dx + dy * dy <= halo_m * halo_m:
                 rows.append(row)
         needed.append(rows)

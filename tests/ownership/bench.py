@@ -1,6 +1,6 @@
 """A coordinator and its hosts in one process; the test delivers each message itself.
 
-A vehicle's state is its version, (vehicle, tick), so `Bench` is also the store of committed states.
+The state of a vehicle is the pair (vehicle, tick), so `Bench` is also the committed store.
 """
 
 from __future__ import annotations
@@ -50,20 +50,20 @@ class Bench:
         return output
 
     def crash(self, zone: int) -> Output:
-        """Let a zone's host die, and replace it."""
+        """Replace the host of a zone, as after its death; return the output for the new host."""
         self.note(self.directory.fence(zone))
         return self.host(zone)
 
     def begin(
         self, movers: Iterable[tuple[int, int]] = (), births: Iterable[tuple[int, int]] = ()
     ) -> tuple[Step, ...]:
-        """Begin a tick with moving and new vehicles by zone; return the STEPs."""
+        """Begin a tick with moving and new vehicles, as pairs (vehicle, zone); return the STEPs."""
         new = [Birth(vehicle, zone, self.state(vehicle)) for vehicle, zone in births]
         output = self.note(self.directory.begin(movers, new))
         return tuple(message for message in output.messages if isinstance(message, Step))
 
     def give(self, message: Message, removed: Sequence[int] = ()) -> tuple[Message, ...]:
-        """Deliver a message; return the answers of its receiver, with DONE after a STEP."""
+        """Deliver a message; return the answers of its receiver, such as the DONE after a STEP."""
         destination, *copies = message.destinations()
         for zone in copies:
             self.trace.delivered(zone, message)
@@ -86,7 +86,7 @@ class Bench:
         return (endpoint.complete(rows, gone),)
 
     def offer(self, zone: int, *approaches: tuple[int, int]) -> tuple[Message, ...]:
-        """Let a zone's host offer vehicles to targets, and return its messages."""
+        """Let the host of a zone offer pairs (vehicle, target); return its messages."""
         endpoint = self.endpoints[zone]
         return endpoint.offer(
             Approach(vehicle, target, version(vehicle, endpoint.tick))
@@ -94,7 +94,7 @@ class Bench:
         )
 
     def pass_on(self, messages: Iterable[Message]) -> None:
-        """Deliver messages and all messages that follow from them."""
+        """Deliver messages, the answers to them, and so on."""
         for message in messages:
             self.pass_on(self.give(message))
 
@@ -109,7 +109,7 @@ class Bench:
         offers: Sequence[tuple[int, int]] = (),
         removed: Sequence[int] = (),
     ) -> tuple[Message, ...]:
-        """Run a tick without faults; offers (vehicle, target) are answered."""
+        """Run a tick without faults, in which all offers (vehicle, target) are answered."""
         sent: list[Message] = []
         for step in self.begin(movers, births):
             for done in self.give(step, removed):

@@ -1,12 +1,13 @@
-"""Breadth-first search over all states of the real parties in a small world.
+"""Breadth-first search over all states of coordinator and hosts (the parties) in a small world.
 
-As in docs/model/handoff.pml, sent messages are in a set (the "soup"): each may arrive at any later
-time, any number of times, or never. Hosts and the coordinator may die between any two events, and
-a living host may be suspected. Positions of vehicles after a tick are chosen freely. A vehicle's
-state is its version, (vehicle, tick), so that a state that is not exact is found at once.
+As in docs/model/handoff.pml, sent messages are in a set, the "soup". Each message may arrive at any
+later time, any number of times, or never. Hosts and the coordinator may die between any two events,
+and a living host may be taken for dead. Vehicles may be in any zone after a tick. The state of a
+vehicle is the pair (vehicle, tick), so that a wrong state is detected at once.
 
-Parties are never changed, only replaced by changed copies. Equal parties are stored once under a
-number, and so are the effects of messages on parties: most steps of the search are look-ups.
+The search never changes a party; it replaces the party by a changed copy. Equal parties are stored
+once under a number, and so are the effects of messages on parties. Most steps of the search are
+therefore look-ups.
 """
 
 from __future__ import annotations
@@ -46,19 +47,20 @@ RUN = bytes(16)
 CHANGING = (
     Directory, Decisions, Endpoint, Offers, OwnershipPlan, Readiness, Replicas, SeenIds, Table,
 )  # fmt: skip
-APART = ("dropped", "refusals", "_store")  # counts are no part of the state
+APART = ("dropped", "refusals", "_store")  # fields that do not count as state
 DEAD = -1
 ONE_TICK = Limits(deferral=1)
 Place = tuple[int, bool]
-"""Where a vehicle is after the tick in progress: its zone, and whether others are near."""
+"""Zone of a vehicle after the tick in progress, and whether it approaches other zones."""
 
 
 @dataclass(frozen=True)
 class Small:
     """A small world.
 
-    A message in the soup is forgotten after `window` ticks. Hosts die from the tick on in which
-    the first switch may be. Zones are interchangeable, and the next new one is always the same.
+    A message leaves the soup after `window` ticks. Hosts die only after the first commit, because
+    no vehicle changes its zone earlier. Zones are interchangeable, so vehicles enter new zones in
+    order.
     """
 
     zones: int = 2
@@ -79,16 +81,18 @@ class Node(NamedTuple):
     endpoints: tuple[int, ...]
     soup: frozenset[tuple[int, int]]
     places: tuple[Place, ...]
-    writers: tuple[int, ...]  # the zone that has advanced each vehicle in this tick
-    visited: int  # zones in which a vehicle has been
-    budget: tuple[int, int, int]  # crashes, false alarms, crashes of the coordinator
+    writers: tuple[int, ...]  # zone that has advanced each vehicle in this tick, or -1
+    visited: int  # number of zones that vehicles have visited
+    budget: tuple[
+        int, int, int
+    ]  # remaining crashes of hosts, false alarms, crashes of the coordinator
 
 
 class Versions:
-    """The committed store of a coordinator: all vehicles have the version of its tick.
+    """The committed store of a coordinator, in which the state of a vehicle is (vehicle, tick).
 
     Attributes:
-        tick: tick of the coordinator that reads the store next.
+        tick: tick of the coordinator that reads the store.
     """
 
     tick = 0
@@ -101,7 +105,7 @@ class Versions:
 
 
 class Explorer:
-    """All states of a small world."""
+    """Visits all states of a small world."""
 
     def __init__(self, small: Small) -> None:
         self.small = small
@@ -114,10 +118,10 @@ class Explorer:
         self._known: dict[Any, Any] = {}
 
     def run(self, most: int = 10**7) -> tuple[int, int]:
-        """Visit all states; return their number, and the number from which the end can be reached.
+        """Visit all states; return their number, and how many of them can reach an end state.
 
         Raises:
-            ProtocolError: in some state an invariant does not hold.
+            ProtocolError: an invariant does not hold in a state.
         """
         numbers: dict[Node, int] = {}
         before: list[list[int]] = []
@@ -167,9 +171,9 @@ class Explorer:
             yield self._commit(node)
         for destination, number in node.soup:
             if destination == COORDINATOR:
-                yield self._tell(node, number)
+                yield self._deliver_to_coordinator(node, number)
             elif node.endpoints[destination] != DEAD:
-                yield self._react(node, destination, number)
+                yield self._deliver_to_host(node, destination, number)
         crashes, alarms, restarts = node.budget
         if directory.table.tick == 0:
             return
@@ -181,7 +185,7 @@ class Explorer:
                 dead = (*node.endpoints[:zone], DEAD, *node.endpoints[zone + 1 :])
                 yield node._replace(endpoints=dead, budget=(crashes - 1, alarms, restarts))
             if alarms:
-                said = self._all_that_it_says(node, zone)
+                said = self._receive_all(node, zone)
                 yield self._rehost(said._replace(budget=(crashes, alarms - 1, restarts)), zone)
         if restarts:
             yield self._restart(node._replace(budget=(crashes, alarms, restarts - 1)))
@@ -192,7 +196,7 @@ class Explorer:
         soup, writers = node.soup | sent, (-1,) * small.vehicles
         zones = range(min(small.zones, node.visited + 1))
         paths = product(product(zones, nears), repeat=small.vehicles)
-        if self._tick(node) == small.ticks - 1:  # positions at the end move no vehicle
+        if self._tick(node) == small.ticks - 1:  # positions after the last tick have no effect
             paths = iter([tuple((0, True) for _ in range(small.vehicles))])
         for places in paths:
             visited = max(node.visited, *(zone + 1 for zone, _ in places))
@@ -218,16 +222,16 @@ class Explorer:
         for vehicle, (zone, _) in table.owners.items():
             if node.writers[vehicle] != zone:
                 raise ProtocolError(f"I1: zone {node.writers[vehicle]} advanced v{vehicle}")
-        soup = frozenset(item for item in node.soup if self._remembered(item[1], table.tick))
+        soup = frozenset(item for item in node.soup if self._stays_in_soup(item[1], table.tick))
         return node._replace(directory=number, soup=soup)
 
-    def _tell(self, node: Node, message: int) -> Node:
+    def _deliver_to_coordinator(self, node: Node, message: int) -> Node:
         number, sent = self._changed(
             node.directory, message, lambda directory: directory.on_message(self._messages[message])
         )
         return node._replace(directory=number, soup=node.soup | sent)
 
-    def _react(self, node: Node, zone: int, message: int) -> Node:
+    def _deliver_to_host(self, node: Node, zone: int, message: int) -> Node:
         key = (node.endpoints[zone], message, node.places)
         if key not in self._known:
             self._known[key] = self._reaction(*key, zone)
@@ -268,7 +272,7 @@ class Explorer:
                     for target in range(self.small.zones)
                     if target != zone and places[vehicle][1]
                 )
-        return self._keep(endpoint), self._stirred(sent), advanced
+        return self._keep(endpoint), self._soup_of(sent), advanced
 
     def _rehost(self, node: Node, zone: int) -> Node:
         def replace(directory: Directory) -> Output:
@@ -280,30 +284,30 @@ class Explorer:
         endpoints = (*node.endpoints[:zone], fresh, *node.endpoints[zone + 1 :])
         return node._replace(directory=number, endpoints=endpoints, soup=node.soup | sent)
 
-    def _all_that_it_says(self, node: Node, zone: int) -> Node:
-        """Let a suspected host receive all messages to it before it ends."""
+    def _receive_all(self, node: Node, zone: int) -> Node:
+        """Deliver all messages to a host that is wrongly taken for dead, and keep its answers."""
         zombie = node
         for destination, number in sorted(node.soup):
             if destination == zone:
-                zombie = self._react(zombie, zone, number)
+                zombie = self._deliver_to_host(zombie, zone, number)
         return zombie._replace(writers=node.writers, endpoints=node.endpoints)
 
     def _restart(self, node: Node) -> Node:
         small, log = self.small, self._logs[node.directory]
         directory = Directory.restore(log, range(small.zones), self._store, small.limits)
         self._store.tick = directory.table.tick
-        sent = self._stirred(directory.resend().messages)
+        sent = self._soup_of(directory.resend().messages)
         return node._replace(directory=self._keep_directory(directory, log), soup=node.soup | sent)
 
     def _changed(self, number: int, what: Any, change: Any) -> tuple[int, frozenset[Any]]:
-        """Return the coordinator after a change, and the messages that it sends."""
+        """Return the number of the coordinator after a change, and the messages that it sends."""
         key = (number, what)
         if key not in self._known:
             directory = fork(self._parties[number])
             self._store.tick = directory.table.tick
             output = change(directory)
             log = self._logs[number] + output.records
-            sent = self._stirred(output.messages)
+            sent = self._soup_of(output.messages)
             self._known[key] = (self._keep_directory(directory, log), sent)
         found: tuple[int, frozenset[Any]] = self._known[key]
         return found
@@ -354,8 +358,8 @@ class Explorer:
         hosting = directory.hosting(zone)
         return self._keep(Endpoint(hosting, self.small.limits))
 
-    def _stirred(self, sent: Iterable[Message]) -> frozenset[tuple[int, int]]:
-        """Return messages as items of the soup, without copies for the source, as none repeats."""
+    def _soup_of(self, sent: Iterable[Message]) -> frozenset[tuple[int, int]]:
+        """Return messages as items of the soup, each to its first destination only."""
         items = []
         for message in sent:
             number = self._message_numbers.setdefault(message, len(self._messages))
@@ -364,7 +368,7 @@ class Explorer:
             items.append((message.destinations()[0], number))
         return frozenset(items)
 
-    def _remembered(self, number: int, tick: int) -> bool:
+    def _stays_in_soup(self, number: int, tick: int) -> bool:
         message = self._messages[number]
         if isinstance(message, Step | Done | Need):
             return message.tick > tick
@@ -379,12 +383,12 @@ def version(vehicle: int, tick: int) -> bytes:
 
 
 def fork(party: Any) -> Any:
-    """Return a copy that shares nothing that changes."""
+    """Return a copy of a party that shares no mutable object with the party."""
     return _fork(party, {})
 
 
 def _fork(party: Any, forked: dict[int, Any]) -> Any:
-    """`forked`: the copies so far, by the `id` of the original."""
+    """Copy recursively; `forked` maps the `id` of an original to its copy."""
     if isinstance(party, dict):
         copied = party.copy()
         for key, inner in party.items():
@@ -406,7 +410,7 @@ def _fork(party: Any, forked: dict[int, Any]) -> Any:
 
 
 def freeze(value: Any) -> Any:
-    """Return a hashable value that is equal for equal states."""
+    """Return a hashable form of a party; equal states have equal forms."""
     if isinstance(value, dict):
         return frozenset((key, freeze(inner)) for key, inner in value.items())
     if isinstance(value, set):
@@ -425,7 +429,7 @@ def _names(value: Any) -> tuple[str, ...]:
 
 
 def _reached(before: list[list[int]], ends: list[int]) -> set[int]:
-    """Return the states from which one of the ends can be reached."""
+    """Return the states from which an end state can be reached; `before` has predecessors."""
     found, stack = set(ends), list(ends)
     while stack:
         for origin in before[stack.pop()]:

@@ -1,7 +1,7 @@
-"""The invariants I1 to I10, checked on the states of the parties while they run.
+"""Check invariants of the protocol on the states of coordinator and hosts while they run.
 
-A monitor gets the rows that a host advances, and checks the state before and after each tick.
-It checks each vehicle, so it is slow.
+The monitor is told which vehicles a host advances, and checks the states before and after each
+tick. It visits every vehicle, so it is slow.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.ownership.limits import Limits
 
 
 class Store(Protocol):
-    """The part of the committed store that is checked."""
+    """The part of the committed store that the monitor reads."""
 
     committed: Mapping[int, bytes]
 
@@ -32,12 +32,12 @@ class Monitor:
         self._limits = limits
         self._writers: dict[
             int, tuple[int, int]
-        ] = {}  # vehicle → process that has advanced it in this tick
-        self._executed: dict[tuple[int, int], int] = {}  # process → newest tick that it advanced to
+        ] = {}  # vehicle → (zone, incarnation) that has advanced it in this tick
+        self._executed: dict[tuple[int, int], int] = {}  # (zone, incarnation) → newest tick
         self._tick = -1
 
     def advanced(self, zone: int, incarnation: int, tick: int, vehicles: Iterable[int]) -> None:
-        """Check I1: in a tick, one zone advances a vehicle, and each of its processes once."""
+        """Check I1: in a tick, only one zone advances a vehicle, and each process does so once."""
         if tick > self._tick:
             self._tick, self._writers = tick, {}
         if self._executed.get((zone, incarnation), -1) >= tick:
@@ -52,7 +52,7 @@ class Monitor:
             self._writers[vehicle] = (zone, incarnation)
 
     def check(self, directory: Directory, endpoints: Mapping[int, Endpoint], store: Store) -> None:
-        """Check I1 to I6 and I10, at any time."""
+        """Check I1 to I3, I5 and I6; call this at any time."""
         self._check_copies(directory, store)
         self._check_leases(directory, endpoints)
         self._check_retained(directory, endpoints)
@@ -62,7 +62,7 @@ class Monitor:
                 raise ProtocolError(f"I5: vehicle {vehicle} waits for {ticks} ticks")
 
     def committed(self, world: int, store: Store) -> None:
-        """Check I10: the digest of the world is the sum of the zones' digests."""
+        """Check I10: the digest of the committed world is the sum of the digests of the zones."""
         if world != store.world():
             raise ProtocolError("I10: the committed world is not what the zones told of")
 

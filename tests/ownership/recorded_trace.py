@@ -1,4 +1,4 @@
-"""Traces that tests record and check, and logs as text."""
+"""Traces that tests record and check, and logs in text form."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.ownership.trace_check import TraceChecker
 
 @dataclass(slots=True)
 class Trace:
-    """Entries in the order in which they happened."""
+    """Log records and delivered messages, in the order of their events."""
 
     entries: list[TraceEntry] = field(default_factory=list)
 
@@ -22,7 +22,7 @@ class Trace:
         self.entries.extend(TraceEntry(LOG, record) for record in records)
 
     def delivered(self, destination: int, message: Message) -> None:
-        """Add a message that arrives at a zone or at the coordinator."""
+        """Add a message that is delivered to a zone or to the coordinator."""
         self.entries.append(TraceEntry(destination, message))
 
     def text(self) -> str:

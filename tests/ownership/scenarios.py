@@ -1,4 +1,4 @@
-"""One scenario for each remedy of the protocol that docs/explanation/ownership.md lists."""
+"""One scenario per remedy, a rule that closes a hole of docs/explanation/ownership.md."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from tests.support.zoned import SIDE, zoned_of
 OTHER_RUN = bytes(reversed(range(16)))
 
 
-def explored(**small: object) -> None:
-    """Check that all invariants hold in each state, and that the end can be reached."""
+def explore(**small: object) -> None:
+    """Check the invariants in each state of a small world, and that each can reach the end."""
     states, reached = Explorer(Small(**small)).run()  # type: ignore[arg-type]
     assert states == reached
 
@@ -36,13 +36,13 @@ def explored(**small: object) -> None:
 
 
 def one_step_lease() -> None:
-    """H1: OUT ends the authority of the source before IN begins another."""
-    explored(ticks=2)
+    """H1: OUT ends the authority of the source before IN gives authority to the target."""
+    explore(ticks=2)
 
 
 def copy_until_commit() -> None:
     """H2: the source keeps its frozen row until the switch commits."""
-    explored(ticks=2)
+    explore(ticks=2)
 
 
 def exact_promotion() -> None:
@@ -55,7 +55,7 @@ def exact_promotion() -> None:
 
 
 def reattach() -> None:
-    """H9: a target without its replica is sent the state again."""
+    """H9: the coordinator sends the state again to a target that has lost its replica."""
     bench = approached(Bench())
     bench.begin(movers=[(7, 1)])
     bench.pass_on(bench.crash(1).messages)
@@ -64,16 +64,16 @@ def reattach() -> None:
 
 def deadline() -> None:
     """H14: after D ticks the hand-off is forced."""
-    explored(ticks=3, limits=Limits(deferral=0))
+    explore(ticks=3, limits=Limits(deferral=0))
 
 
 def target_by_position() -> None:
-    """H17, H18: the target is the zone where the vehicle is, not where it was."""
+    """H17, H18: the target is the zone that contains the vehicle now."""
     bench = Bench(3)
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.begin(movers=[(7, 2)])
     assert not bench.directory.table.planned.switches, (
-        "the vehicle is not in the zone that was prepared"
+        "the vehicle is handed over although its present zone is not prepared"
     )
 
 
@@ -99,7 +99,7 @@ def ack_incarnation() -> None:
 
 
 def ack_digest() -> None:
-    """H25: an ACK names the digest of the state that it holds."""
+    """H25: an ACK counts only with the digest of the state that was offered."""
     bench = Bench()
     bench.tick(births=[(7, 0)])
     held = Held(7, 0, b"of another state")
@@ -142,19 +142,19 @@ def abort_fence() -> None:
 
 
 def fence_stays() -> None:
-    """H6: the fence stays when the replica goes."""
+    """H6: the fence stays after the replica is dropped."""
     bench, prepare = prepared()
     bench.commit()
     (step, _) = bench.begin()
     bench.give(bench.give(step)[0])
     (abort,) = bench.offer(0)
     bench.give(abort)
-    assert not bench.give(prepare), "an ended approach is not acknowledged"
+    assert not bench.give(prepare), "the target acknowledges an offer that was withdrawn"
     assert 7 not in bench.endpoints[1].replicas.held
 
 
 def replica_slot() -> None:
-    """H7: a PREPARE never touches the row that is owned."""
+    """H7: a PREPARE never changes a row that the zone owns."""
     bench, prepare = prepared()
     bench.pass_on([prepare])
     bench.commit()
@@ -162,13 +162,15 @@ def replica_slot() -> None:
     bench.entered.clear()
     bench.give(prepare)
     bench.tick()
-    assert not bench.entered, "a late state has reached the row that is owned"
+    assert not bench.entered, "a late PREPARE has changed a row that the zone owns"
 
 
 def replica_lifetime() -> None:
     """I8: a replica that is not refreshed expires."""
     bench = approached(Bench(limits=Limits(lifetime=3)))
-    bench.endpoints[0].offers.open.clear()  # a source that died has forgotten the transfer
+    bench.endpoints[
+        0
+    ].offers.open.clear()  # as after the death of the source, no one refreshes the replica
     for _ in range(5):
         bench.tick()
     assert not bench.endpoints[1].replicas.held
@@ -179,33 +181,33 @@ def replica_lifetime() -> None:
 
 
 def log_before_send() -> None:
-    """H11, H23: a decision is logged before any party gets it."""
-    explored(ticks=2, coordinator_crashes=1)
+    """H11, H23: a decision is logged before it is sent."""
+    explore(ticks=2, coordinator_crashes=1)
 
 
 def done_incarnation() -> None:
     """H12: a DONE of a fenced process is ignored."""
-    explored(ticks=2, false_alarms=1)
+    explore(ticks=2, false_alarms=1)
 
 
 def step_tick() -> None:
     """H13: a STEP is executed once."""
-    explored(ticks=2)
+    explore(ticks=2)
 
 
 def done_tick() -> None:
     """H13: a DONE counts for its own tick only."""
-    explored(ticks=2)
+    explore(ticks=2)
 
 
 def answer_again() -> None:
-    """H13: a repeated STEP is answered, from memory."""
+    """H13: a host answers a repeated STEP from memory."""
     plan = FaultPlan(rates={"Done": Rates(drop=0.5)})
     Simulator(ToyWorld(), plan=plan, patience=60).run(5)
 
 
 def tick_never_resets() -> None:
-    """H15: a reset begins an episode, and ticks continue to count."""
+    """H15: a reset begins an episode, and the tick number continues."""
     bench = Bench()
     late = [bench.give(step)[0] for step in bench.begin()]
     for done in late:
@@ -229,7 +231,7 @@ def run_fence() -> None:
 
 
 def repeat_limit() -> None:
-    """H22: a tick that kills every host ends in an error."""
+    """H22: a tick in which every host dies ends in an error."""
     bench = Bench()
     bench.begin()
     for _ in range(bench.limits.repeats):
@@ -242,7 +244,7 @@ def repeat_limit() -> None:
 
 
 def removed_is_final() -> None:
-    """H19: an id that has been in the episode never returns."""
+    """H19: an id is used only once in an episode."""
     bench = Bench()
     bench.tick(births=[(7, 0)])
     bench.tick(removed=[7])
@@ -251,8 +253,8 @@ def removed_is_final() -> None:
 
 
 def ledger() -> None:
-    """I6: nothing is lost or doubled, or the tick is not committed."""
-    for lie in (
+    """I6: a tick is committed only if no vehicle is lost or doubled."""
+    for forge in (
         lambda done: replace(done, removed=(Removed(8, 0),)),
         lambda done: replace(done, confirmed=(Confirmed(7, 1),)),
         lambda done: replace(done, owned=done.owned._replace(vehicles=0)),
@@ -262,14 +264,14 @@ def ledger() -> None:
         bench.tick(births=[(7, 0), (8, 1)])
         dones = [bench.give(step)[0] for step in bench.begin()]
         assert isinstance(dones[0], Done)
-        bench.give(lie(dones[0]))
+        bench.give(forge(dones[0]))
         bench.give(dones[1])
         with pytest.raises(ProtocolError, match="zone 0"):
             bench.commit()
 
 
 def double_buffer() -> None:
-    """H10: tick t stays whole until t+1 is committed."""
+    """H10: the states of tick t stay complete until tick t + 1 is committed."""
     world = ToyWorld()
     simulator = Simulator(world, crashes=lambda tick, point, zone: point == "half written")
     simulator.run(5)
@@ -277,7 +279,7 @@ def double_buffer() -> None:
 
 
 def segment_per_incarnation() -> None:
-    """H28: a process writes to a segment of its own."""
+    """H28: each process writes to its own segment."""
     store = MemoryStore()
     store.write(0, 2, 7, b"of the living host")
     store.write(0, 1, 7, b"of the zombie")
@@ -286,7 +288,7 @@ def segment_per_incarnation() -> None:
 
 
 def digest_before_commit() -> None:
-    """H28: the stored rows equal the rows that DONE has reported."""
+    """H28: a tick is committed only if the stored rows equal the rows that DONE reported."""
     bench = Bench()
     for step in bench.begin():
         bench.give(bench.give(step)[0])
@@ -307,7 +309,7 @@ BORDERS = Borders(hysteresis_m=2.0, ahead_s=1.0, max_speed_mps=20.0)
 
 
 def near_border(x_m: float, owner: int = 0, speed_mps: float = 0.0) -> list[bool]:
-    """Return the entries for a vehicle that drives east: whether each is a crossing."""
+    """Return, for a vehicle that drives east, one entry per near zone: whether it has crossed."""
     row = vehicles([(x_m, 0.0, 0.0)], speed=speed_mps)
     zoned = zoned_of([row if zone == owner else row[:0] for zone in (0, 1)])
     out = np.zeros(2, dtype=NEAR)
@@ -330,13 +332,13 @@ def early_offer() -> None:
 
 
 def approached(bench: Bench) -> Bench:
-    """Return a run in tick 1: zone 1 has acknowledged the offer of vehicle 7 of zone 0."""
+    """Run tick 1: zone 0 gets vehicle 7 and offers it to zone 1, which acknowledges the offer."""
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     return bench
 
 
 def prepared() -> tuple[Bench, Prepare]:
-    """Return a run whose tick 1 is not committed; a PREPARE of zone 0 has not arrived."""
+    """Return a run in tick 1 in which zone 0 has sent a PREPARE that is not delivered yet."""
     bench = Bench()
     for step in bench.begin(births=[(7, 0)]):
         bench.give(bench.give(step)[0])

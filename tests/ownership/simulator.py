@@ -1,7 +1,8 @@
-"""The whole protocol in one thread: the real parties, and a network and crashes from a seed.
+"""The whole protocol in one thread: real coordinator and hosts, with a seeded network and crashes.
 
-`Simulator.run` drives the toy world tick by tick. `crashes` decides which party dies at which point
-of which tick. All events are in `trace`; the coordinator's log is `log`, as text.
+`Simulator.run` advances the toy world tick by tick. The function `crashes` decides which party (the
+coordinator or a host) dies at which point of which tick. `trace` has all events, and `log` has the
+log of the coordinator as text.
 """
 
 from __future__ import annotations
@@ -43,20 +44,20 @@ ZONE_POINTS = (
 )  # fmt: skip
 
 Crashes = Callable[[int, str, int], bool]
-"""Whether a party (a zone or COORDINATOR) dies at a point of a tick."""
+"""Return whether a party (a zone or COORDINATOR) dies, from (tick, point, party)."""
 
 
 class Stalled(AssertionError):
-    """A tick that does not end."""
+    """Raised if a tick does not end."""
 
 
 class Died(Exception):
-    """A zone host died during its work."""
+    """Raised at the point where a zone host dies."""
 
 
 @dataclass
 class ZoneHost:
-    """A process that hosts a zone: its endpoint and its rows."""
+    """The state of a process that hosts a zone: its endpoint and its rows."""
 
     endpoint: Endpoint
     rows: dict[int, bytes]
@@ -65,7 +66,7 @@ class ZoneHost:
 
 
 class Simulator:
-    """A divided toy world."""
+    """A divided toy world whose zones exchange messages over a faulty network."""
 
     def __init__(
         self,
@@ -94,7 +95,7 @@ class Simulator:
             self._host(zone)
 
     def run(self, ticks: int) -> None:
-        """Run some ticks, and then check the trace so far."""
+        """Run some ticks, then check the whole trace."""
         for _ in range(ticks):
             self.step()
         self.judge()
@@ -109,7 +110,7 @@ class Simulator:
         for wait in range(1, self.patience + 1):
             self._phase()
             if not self.directory.waiting_for() and self._offered():
-                if self._strikes("all done", COORDINATOR):
+                if self._dies("all done", COORDINATOR):
                     self._restart()
                 elif self._commit():
                     return
@@ -126,7 +127,7 @@ class Simulator:
         self.next_id = 0
 
     def open_handoffs(self) -> list[int]:
-        """Return the vehicles outside their owner's zone."""
+        """Return the vehicles that are outside of the zone that owns them."""
         owners = self.directory.table.owners
         states = self.store.committed
         return [v for v, (zone, _) in owners.items() if self.world.zone(states[v]) != zone]
@@ -137,19 +138,21 @@ class Simulator:
         born = self.world.births(tick, self.next_id)
         self.next_id += len(born)
         self._decide(born)
-        if self._strikes("torn log", COORDINATOR):  # no party has acted upon it
+        if self._dies(
+            "torn log", COORDINATOR
+        ):  # the log ends inside the record, which no party has used yet
             self.log = self.log[: -len(self.log.splitlines()[-1]) // 2]
             self.trace.entries.pop()
             self._restart()
             self._decide(born)
-        if self._strikes("BEGIN logged", COORDINATOR):
+        if self._dies("BEGIN logged", COORDINATOR):
             self._restart()
         else:
             self.network.send(self._outbox)
-        if self._strikes("STEP sent", COORDINATOR):
+        if self._dies("STEP sent", COORDINATOR):
             self._restart()
         for zone in self.world.zones:
-            if self._strikes("false alarm", zone):
+            if self._dies("false alarm", zone):
                 self.zombies.append(self.hosts[zone])
                 self._replace(zone)
         record = self.directory.table.planned.record
@@ -178,7 +181,7 @@ class Simulator:
                 self._replace(zone)
             return False
         self._write(output)
-        if self._strikes("COMMIT logged", COORDINATOR):
+        if self._dies("COMMIT logged", COORDINATOR):
             self._restart()
         self._flip()
         self.monitor.committed(self.last_commit.world, self.store)
@@ -247,7 +250,7 @@ class Simulator:
         for zombie in [host for host in self.zombies if host.endpoint.zone == zone]:
             self._react(zombie, message, refused, zombie=True)
             if zombie.endpoint.tick > self.directory.table.tick:
-                self.zombies.remove(zombie)  # the dead process has sent all its messages
+                self.zombies.remove(zombie)  # the fenced process has sent all its messages
         host = self.hosts.get(zone)
         if host is None:
             return
@@ -274,7 +277,7 @@ class Simulator:
             self._advance(host, reaction.advance, zombie)
 
     def _may_die(self, point: str, host: ZoneHost, zombie: bool) -> None:
-        if not zombie and self._strikes(point, host.endpoint.zone):
+        if not zombie and self._dies(point, host.endpoint.zone):
             raise Died(point)
 
     # A zone's work
@@ -318,7 +321,7 @@ class Simulator:
         ]
 
     def _offered(self) -> bool:
-        """Return whether offers of the tick are answered, or were sent as often as allowed."""
+        """Return whether each offer of the tick is answered or has no attempts left."""
         tick = self.directory.table.planned.record.tick
         return all(
             not host.endpoint.offers.unanswered
@@ -330,7 +333,7 @@ class Simulator:
     def _endpoints(self) -> dict[int, Endpoint]:
         return {zone: host.endpoint for zone, host in self.hosts.items()}
 
-    def _strikes(self, point: str, party: int) -> bool:
+    def _dies(self, point: str, party: int) -> bool:
         tick = self.directory.table.tick + (self.directory.table.plan is not None)
         key = (tick, point, party)
         if key in self._struck or not self._crashes(tick, point, party):
@@ -340,5 +343,5 @@ class Simulator:
 
 
 def whole_lines(text: str) -> str:
-    """Return a log up to its last whole line: no party has acted upon a torn record."""
+    """Return a log without an incomplete last line, which no party has used."""
     return text[: text.rfind("\n") + 1]

@@ -1,4 +1,4 @@
-"""One test for each rule of docs/explanation/ownership.md on borders, deadlines and neighbours."""
+"""One test for each rule on borders, deadlines and neighbors in docs/explanation/ownership.md."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.support.builders import vehicles
 from tests.support.zoned import exchanged, ghosts_of
 
 
-def test_r06_the_target_is_where_the_vehicle_is() -> None:
+def test_r06_the_target_is_the_zone_that_contains_the_vehicle() -> None:
     bench = Bench(4)
     bench.tick(births=[(7, 0)], offers=[(7, 1), (7, 2), (7, 3)])
     bench.tick(movers=[(7, 3)])
     assert bench.owner(7) == 3
 
 
-def test_r08_the_source_goes_on_for_d_ticks_and_then_the_hand_off_is_forced() -> None:
+def test_r08_a_hand_off_is_forced_after_d_ticks_without_an_ack() -> None:
     bench = Bench(limits=Limits(deferral=2))
     bench.tick(births=[(7, 0)])
     for ticks in (1, 2):
@@ -45,7 +45,7 @@ def test_r08_the_source_goes_on_for_d_ticks_and_then_the_hand_off_is_forced() ->
     assert step.enter[0].state == version(7, 3)
 
 
-def test_r28_a_vehicle_that_returns_before_the_switch_was_not_deferred() -> None:
+def test_r28_the_count_of_deferred_ticks_restarts_if_the_vehicle_returns() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     bench.tick(movers=[(7, 1)])
@@ -55,7 +55,7 @@ def test_r28_a_vehicle_that_returns_before_the_switch_was_not_deferred() -> None
     assert bench.directory.table.deferred == {7: 1}
 
 
-def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> None:
+def test_r30_an_overlap_that_is_too_narrow_is_refused_with_the_needed_width() -> None:
     limits = Limits(deferral=2)
     assert needed_overlap_m(100.0, 2.0, limits, 40.0, 0.05) == 108.0
     fits = Distances(approach_m=10.0, hysteresis_m=2.0, overlap_m=108.0)
@@ -70,7 +70,7 @@ def test_r30_an_overlap_that_does_not_cover_is_refused_with_the_numbers() -> Non
         )
 
 
-def test_r31_offering_switching_and_releasing_have_distances_of_their_own() -> None:
+def test_r31_offer_switch_and_release_each_have_their_own_distance() -> None:
     steps = []
     for x_m in (-9.0, -7.0, 1.0, 3.0, 19.0, 21.0):
         entries = near_border(x_m, speed_mps=10.0)
@@ -83,13 +83,13 @@ def test_r31_offering_switching_and_releasing_have_distances_of_their_own() -> N
     assert released == (False, False, False, False, False, True)
 
 
-def test_r35_offers_name_vehicles_of_their_own() -> None:
+def test_r35_a_zone_cannot_offer_a_vehicle_that_it_does_not_own() -> None:
     bench, _ = prepared()
     with pytest.raises(ProtocolError, match="offers vehicle 8"):
         bench.endpoints[0].offer([Approach(8, 1, b"")])
 
 
-def test_r36_a_change_to_a_zone_that_is_no_neighbour_is_refused() -> None:
+def test_r36_a_change_to_a_zone_that_is_not_a_neighbour_is_refused() -> None:
     in_a_row = tuple(map(frozenset, ({0, 1}, {0, 1, 2}, {1, 2})))
     for may_teleport in (False, True):
         bench = Bench(zones=3)

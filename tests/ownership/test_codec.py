@@ -1,4 +1,4 @@
-"""Messages as bytes: decoded messages equal sent ones, and other bytes are refused."""
+"""Decoded messages equal encoded messages, and other bytes are refused."""
 
 from __future__ import annotations
 
@@ -56,15 +56,15 @@ MESSAGES: tuple[Message, ...] = (
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_decoded_messages_equal_encoded_ones(message: Message) -> None:
+def test_a_decoded_message_equals_the_encoded_message(message: Message) -> None:
     assert decode(encode(message), RUN) == message
 
 
-def test_the_samples_include_every_kind_of_message() -> None:
+def test_these_tests_have_a_sample_of_every_kind_of_message() -> None:
     assert {type(message) for message in MESSAGES} == set(KINDS)
 
 
-def test_the_wire_form_equals_the_recorded_one() -> None:
+def test_the_bytes_of_messages_equal_the_recorded_bytes() -> None:
     assert GOLDEN.read_text().split() == [encode(message).hex() for message in MESSAGES]
 
 
@@ -79,7 +79,7 @@ def test_messages_that_are_too_short_or_too_long_are_refused(message: Message) -
 
 
 @pytest.mark.parametrize("message", MESSAGES, ids=lambda message: type(message).__name__)
-def test_every_flipped_bit_is_noticed(message: Message) -> None:
+def test_a_message_with_any_flipped_bit_is_refused(message: Message) -> None:
     wire = encode(message)
     for bit in range(8 * len(wire)):
         damaged = bytearray(wire)
@@ -88,7 +88,7 @@ def test_every_flipped_bit_is_noticed(message: Message) -> None:
             decode(bytes(damaged))
 
 
-def resealed(body: bytes) -> bytes:
+def with_checksum(body: bytes) -> bytes:
     import struct
     import zlib
 
@@ -104,21 +104,21 @@ def test_refused_bytes_raise_errors_with_the_reason() -> None:
     with pytest.raises(MessageError, match="version 9"):
         decode(wire[:4] + b"\x09" + wire[5:])
     with pytest.raises(MessageError, match="kind 200"):
-        decode(resealed(wire[:6] + b"\xc8" + wire[7:-4]))
+        decode(with_checksum(wire[:6] + b"\xc8" + wire[7:-4]))
     with pytest.raises(MessageError, match="follow"):
-        decode(resealed(wire[:-4] + b"more"))
+        decode(with_checksum(wire[:-4] + b"more"))
     with pytest.raises(MessageError, match=r"incomplete|ends inside"):
-        decode(resealed(wire[:-9]))
+        decode(with_checksum(wire[:-9]))
     with pytest.raises(MessageError, match=RUN.hex()):
         decode(wire, run=bytes(16))
     nack = encode(MESSAGES[4])
     with pytest.raises(MessageError, match="is not one of"):
-        decode(resealed(nack[:-12] + b"\x63" + nack[-11:-4]))
+        decode(with_checksum(nack[:-12] + b"\x63" + nack[-11:-4]))
 
 
 @given(st.binary(max_size=200))
 def test_arbitrary_bytes_are_refused(data: bytes) -> None:
-    for wire in (data, resealed(b"CVMO\x01\x00\x00\x00" + data)):
+    for wire in (data, with_checksum(b"CVMO\x01\x00\x00\x00" + data)):
         try:
             message = decode(wire)
         except MessageError:
@@ -135,7 +135,7 @@ def test_arbitrary_bytes_are_refused(data: bytes) -> None:
     ),
     st.integers(0, 2**62),
 )
-def test_any_offer_is_decoded_as_it_was_encoded(
+def test_any_decoded_offer_equals_the_encoded_offer(
     entries: list[tuple[int, int, bytes, bytes]], tick: int
 ) -> None:
     message = Prepare(RUN, 0, tick, 0, 1, 1, 1, tuple(Offer(*entry) for entry in entries))

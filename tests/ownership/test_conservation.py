@@ -1,4 +1,4 @@
-"""AT10: no vehicle is lost or doubled in very many hand-offs under random faults."""
+"""No vehicle is lost or doubled in many hand-offs under random faults (acceptance test AT10)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FAULTS = Rates(drop=0.1, delay=0.1, duplicate=0.1, reorder=0.2, corrupt=0.02, lo
 
 
 class Traffic:
-    """Vehicles that change their zone in each tick, over a network that loses messages."""
+    """Vehicles that change their zones in each tick, over a network with random faults."""
 
     def __init__(self) -> None:
         self.bench = Bench(ZONES)
@@ -86,7 +86,7 @@ def test_a_million_hand_offs_lose_no_vehicle() -> None:
     drive(1_000_000)
 
 
-def test_memory_does_not_grow_with_the_ticks() -> None:
+def test_memory_does_not_grow_with_the_number_of_ticks() -> None:
     traffic = Traffic()
     sizes = []
     for tick in range(90):

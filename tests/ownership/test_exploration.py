@@ -1,7 +1,7 @@
-"""All states of small worlds: each is correct, and can reach the end.
+"""Visit all states of small worlds: the invariants hold in each, and each can reach the end.
 
-One vehicle and three zones, two vehicles and two zones, with messages that are late, doubled or
-lost, and with deaths of source, target, bystander and coordinator at any moment.
+The worlds have one vehicle in three zones, or two vehicles in two zones. Messages may be late,
+doubled or lost. Hosts of source, target and other zones, and the coordinator, may die at any time.
 """
 
 from __future__ import annotations
@@ -48,13 +48,15 @@ SLOW = {
 
 
 @pytest.mark.parametrize("small", QUICK.values(), ids=QUICK)
-def test_every_state_is_correct_and_can_reach_the_end(small: Small) -> None:
+def test_the_invariants_hold_in_every_state_and_each_state_can_reach_the_end(small: Small) -> None:
     states, reached = Explorer(small).run()
     assert states == reached > 300
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("small", SLOW.values(), ids=SLOW)
-def test_every_state_of_larger_worlds_is_correct_and_can_reach_the_end(small: Small) -> None:
+def test_the_invariants_hold_in_every_state_of_larger_worlds_and_each_can_reach_the_end(
+    small: Small,
+) -> None:
     states, reached = Explorer(small).run()
     assert states == reached > 300

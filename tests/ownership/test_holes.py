@@ -1,7 +1,7 @@
-"""The holes of the paper's protocol, H1 to H28: none of the faults can occur.
+"""The holes H1 to H28 of the protocol in the paper: none of these faults can occur.
 
-H21 (pairs across a border), H24 (content of a state) and H27 (load readings) lie outside the core,
-which transfers states as bytes; these tests check that the bytes do not change.
+H21 (pairs across a border), H24 (content of a state) and H27 (load readings) are outside of the
+core, which transfers states as bytes. The test of H24 checks that the bytes do not change.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from tests.ownership.simulator import Simulator
 from tests.ownership.toy import ToyWorld
 
 
-def test_h01_no_two_owners() -> None:
+def test_h01_a_vehicle_never_has_two_owners() -> None:
     bench = approached(Bench())
     for step in bench.begin(movers=[(7, 1)]):
         bench.give(step)
@@ -27,7 +27,7 @@ def test_h01_no_two_owners() -> None:
     scenarios.one_step_lease()
 
 
-def test_h02_no_vehicle_without_an_owner_or_a_copy() -> None:
+def test_h02_a_vehicle_always_has_an_owner_or_a_copy() -> None:
     bench = approached(Bench())
     first, second = bench.begin(movers=[(7, 1)])
     bench.give(first)
@@ -39,32 +39,32 @@ def test_h02_no_vehicle_without_an_owner_or_a_copy() -> None:
     scenarios.copy_until_commit()
 
 
-def test_h03_no_jump_back_in_time() -> None:
+def test_h03_a_vehicle_is_not_handed_over_with_an_older_state() -> None:
     bench = approached(Bench())
     bench.tick()
     bench.tick(movers=[(7, 1)])
-    assert bench.owner(7) == 0, "the state at the target is that of an older tick"
+    assert bench.owner(7) == 0, "the target owns the vehicle with the state of an older tick"
 
 
-def test_h04_a_late_ack_after_a_turn_back() -> None:
+def test_h04_a_late_ack_after_a_withdrawn_offer_does_not_count() -> None:
     bench, prepare = prepared()
     (ack,) = bench.give(prepare)
     bench.commit()
-    bench.tick()  # it turns back: an ABORT goes to the target
+    bench.tick()  # the vehicle turns back, so the source sends an ABORT to the target
     bench.directory.on_message(ack)
     bench.tick(movers=[(7, 1)])
     assert bench.owner(7) == 0
 
 
-def test_h05_a_late_abort() -> None:
+def test_h05_a_late_abort_does_not_drop_a_newer_replica() -> None:
     scenarios.abort_fence()
 
 
-def test_h06_a_late_prepare_after_an_abort() -> None:
+def test_h06_a_late_prepare_after_an_abort_makes_no_replica() -> None:
     scenarios.fence_stays()
 
 
-def test_h07_a_doubled_prepare_after_a_return_trip() -> None:
+def test_h07_a_doubled_prepare_after_a_return_does_not_change_the_owned_row() -> None:
     bench, prepare = prepared()
     bench.give(prepare)
     bench.commit()
@@ -77,11 +77,11 @@ def test_h07_a_doubled_prepare_after_a_return_trip() -> None:
     scenarios.replica_slot()
 
 
-def test_h08_a_target_that_died_after_its_ack() -> None:
+def test_h08_the_ack_of_a_dead_target_does_not_count() -> None:
     scenarios.ack_incarnation()
 
 
-def test_h09_a_target_that_dies_after_the_switch() -> None:
+def test_h09_a_target_that_dies_after_the_switch_still_owns_the_vehicle() -> None:
     bench = approached(Bench())
     bench.tick(movers=[(7, 1)])
     bench.crash(1)
@@ -90,11 +90,11 @@ def test_h09_a_target_that_dies_after_the_switch() -> None:
     scenarios.reattach()
 
 
-def test_h10_a_source_that_dies_in_its_step() -> None:
+def test_h10_a_source_that_dies_in_its_step_loses_no_committed_state() -> None:
     scenarios.double_buffer()
 
 
-def test_h11_a_coordinator_that_dies_between_decision_and_cleanup() -> None:
+def test_h11_a_restarted_coordinator_sends_the_same_decisions() -> None:
     bench = approached(Bench())
     steps = bench.begin(movers=[(7, 1)])
     bench.directory = Directory.restore(bench.log, range(2), bench)
@@ -102,11 +102,11 @@ def test_h11_a_coordinator_that_dies_between_decision_and_cleanup() -> None:
     scenarios.log_before_send()
 
 
-def test_h12_a_worker_that_was_wrongly_suspected() -> None:
+def test_h12_a_living_process_that_was_replaced_does_not_count() -> None:
     scenarios.done_incarnation()
 
 
-def test_h13_a_repeated_step_and_an_old_done() -> None:
+def test_h13_a_repeated_step_is_not_executed_and_an_old_done_does_not_count() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     old = bench.begin()
@@ -120,7 +120,7 @@ def test_h13_a_repeated_step_and_an_old_done() -> None:
     assert bench.directory.waiting_for() == (0, 1)
 
 
-def test_h14_the_source_does_not_stay_for_ever() -> None:
+def test_h14_the_source_does_not_remain_the_owner_forever() -> None:
     bench = Bench(limits=Limits(deferral=2))
     bench.tick(births=[(7, 0)])
     for _ in range(3):
@@ -129,16 +129,16 @@ def test_h14_the_source_does_not_stay_for_ever() -> None:
     scenarios.deadline()
 
 
-def test_h15_a_reset_does_not_bring_old_messages_back() -> None:
+def test_h15_messages_from_before_a_reset_do_not_count() -> None:
     scenarios.tick_never_resets()
     scenarios.run_fence()
 
 
-def test_h16_a_car_that_weaves_on_a_border() -> None:
+def test_h16_a_vehicle_that_weaves_on_a_border_keeps_its_owner() -> None:
     scenarios.hysteresis()
 
 
-def test_h17_a_corner_of_four_zones() -> None:
+def test_h17_at_a_corner_of_four_zones_the_owner_is_the_zone_of_the_vehicle() -> None:
     bench = Bench(4)
     bench.tick(births=[(7, 0)], offers=[(7, 1), (7, 2), (7, 3)])
     for zone in (3, 1, 2, 0):
@@ -147,7 +147,7 @@ def test_h17_a_corner_of_four_zones() -> None:
         assert bench.owner(7) == zone
 
 
-def test_h18_a_zone_that_is_skipped_while_waiting() -> None:
+def test_h18_a_vehicle_that_waits_may_skip_a_zone() -> None:
     bench = Bench(3, limits=Limits(deferral=2))
     bench.tick(births=[(7, 0)])
     bench.tick(movers=[(7, 1)])
@@ -156,7 +156,7 @@ def test_h18_a_zone_that_is_skipped_while_waiting() -> None:
     assert bench.owner(7) == 2
 
 
-def test_h19_removed_and_born_in_the_middle_of_a_transfer() -> None:
+def test_h19_vehicles_may_be_removed_and_created_during_a_transfer() -> None:
     bench = approached(Bench())
     bench.tick(movers=[(7, 1)], births=[(8, 0)], removed=[7])
     assert bench.directory.table.owners == {8: (0, 0)}
@@ -166,14 +166,14 @@ def test_h19_removed_and_born_in_the_middle_of_a_transfer() -> None:
     scenarios.removed_is_final()
 
 
-def test_h20_the_approach_prepares_and_the_position_decides() -> None:
+def test_h20_an_ack_alone_does_not_change_the_owner() -> None:
     bench = approached(Bench())
     bench.tick(offers=[(7, 1)])
-    assert bench.owner(7) == 0, "an ACK alone moves no vehicle"
+    assert bench.owner(7) == 0, "an ACK has changed the owner"
     scenarios.early_offer()
 
 
-def test_h22_a_dead_node_does_not_stop_the_clock() -> None:
+def test_h22_a_tick_is_committed_although_a_host_dies() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     first, _ = bench.begin()
@@ -183,7 +183,7 @@ def test_h22_a_dead_node_does_not_stop_the_clock() -> None:
     assert bench.directory.table.tick == 2
 
 
-def test_h23_the_owners_outlive_the_coordinator() -> None:
+def test_h23_a_restarted_coordinator_knows_the_owners() -> None:
     bench = approached(Bench())
     bench.tick(movers=[(7, 1)])
     again = Directory.restore(bench.log, range(2), bench)
@@ -191,14 +191,14 @@ def test_h23_the_owners_outlive_the_coordinator() -> None:
     assert again.table.tallies == bench.directory.table.tallies
 
 
-def test_h24_a_state_is_carried_byte_for_byte() -> None:
+def test_h24_states_are_transferred_byte_for_byte() -> None:
     simulator = Simulator(ToyWorld(cuts_x=(6, 12, 18)))
     simulator.run(20)
     assert simulator.digests == simulator.world.undivided(20)
     assert simulator.switches > 30
 
 
-def test_h25_states_of_other_content_or_schema_are_refused_with_the_reason() -> None:
+def test_h25_a_state_with_another_digest_or_schema_is_refused_with_the_reason() -> None:
     bench, prepare = prepared()
     damaged = replace(prepare, entries=(prepare.entries[0]._replace(state=b""),))
     for message, reason in (
@@ -210,7 +210,7 @@ def test_h25_states_of_other_content_or_schema_are_refused_with_the_reason() -> 
         assert [entry.reason for entry in answer.entries] == [reason]
 
 
-def test_h26_a_zone_that_moves_in_the_middle_of_a_transfer() -> None:
+def test_h26_a_transfer_to_a_zone_that_gets_another_host_is_repeated() -> None:
     bench, prepare = prepared()
     (ack,) = bench.give(prepare)
     bench.commit()
@@ -222,12 +222,12 @@ def test_h26_a_zone_that_moves_in_the_middle_of_a_transfer() -> None:
     assert bench.owner(7) == 1
 
 
-def test_h28_a_wild_write_does_not_become_the_truth() -> None:
+def test_h28_rows_of_other_processes_are_not_committed() -> None:
     scenarios.segment_per_incarnation()
     scenarios.digest_before_commit()
 
 
-def test_a_swap_of_two_and_a_hundred_crossings_in_one_tick() -> None:
+def test_a_hundred_vehicles_change_their_owners_in_one_tick() -> None:
     bench = Bench()
     births = [(vehicle, vehicle % 2) for vehicle in range(100)]
     offers = [(vehicle, 1 - zone) for vehicle, zone in births]
@@ -237,7 +237,7 @@ def test_a_swap_of_two_and_a_hundred_crossings_in_one_tick() -> None:
     bench.judge()
 
 
-def test_a_birth_in_the_overlap_can_be_handed_over_at_once() -> None:
+def test_a_vehicle_that_is_created_in_the_overlap_can_be_handed_over_in_the_next_tick() -> None:
     bench = Bench()
     output = bench.note(bench.directory.begin([], [Birth(7, 0, version(7, 0))]))
     for step in output.messages:

@@ -1,4 +1,4 @@
-"""Impossible limits are refused; small helper functions."""
+"""Impossible limits are refused; tallies and sets of ids work."""
 
 from __future__ import annotations
 
@@ -18,24 +18,24 @@ RUN = bytes(range(16))
 @pytest.mark.parametrize(
     ("change", "why"), [({"deferral": -1}, "deferral = -1"), ({"attempts": 0}, "attempts = 0")]
 )
-def test_deadlines_that_cannot_work_are_refused(change: dict[str, Any], why: str) -> None:
+def test_impossible_deadlines_are_refused(change: dict[str, Any], why: str) -> None:
     with pytest.raises(ConfigError, match=why):
         Limits(**change)
 
 
-def test_distances_that_cannot_work_are_refused() -> None:
+def test_impossible_distances_are_refused() -> None:
     with pytest.raises(ConfigError, match="distance below 0"):
         Distances(approach_m=-1.0, hysteresis_m=0.0, overlap_m=10.0)
     with pytest.raises(ConfigError, match="must be wider"):
         Distances(approach_m=10.0, hysteresis_m=0.0, overlap_m=10.0)
 
 
-def test_a_rate_that_is_no_probability_is_refused() -> None:
+def test_a_rate_above_1_is_refused() -> None:
     with pytest.raises(ConfigError, match="rate of drop is 2"):
         Rates(drop=2.0)
 
 
-def test_a_tally_depends_only_on_its_set_of_vehicles() -> None:
+def test_a_tally_depends_only_on_its_run_and_vehicles() -> None:
     whole = tally(RUN, {7: 0, 8: 3, 9: 1})
     assert whole == OwnedTally().plus(RUN, 9, 1).plus(RUN, 7, 0).plus(RUN, 8, 3)
     assert whole.minus(RUN, 8, 3) == tally(RUN, {7: 0, 9: 1})
@@ -44,7 +44,7 @@ def test_a_tally_depends_only_on_its_set_of_vehicles() -> None:
         whole.check(whole.minus(RUN, 8, 3), "here")
 
 
-def test_dense_ids_take_no_memory() -> None:
+def test_a_set_of_consecutive_ids_stores_only_its_upper_end() -> None:
     seen = SeenIds()
     for block in range(0, 1000, 10):
         for vehicle in reversed(range(block, block + 10)):

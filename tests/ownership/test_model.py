@@ -1,4 +1,4 @@
-"""The formal model and the tests have the same remedies, and the model is correct."""
+"""The formal model and the scenarios have the same remedies, and the model is correct."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ REMEDY_OF = {
 }  # fmt: skip
 
 
-def test_each_mutation_of_the_model_takes_away_a_remedy_of_the_code() -> None:
+def test_each_mutation_of_the_model_removes_a_remedy_of_the_code() -> None:
     model = (MODEL / "handoff.pml").read_text()
     script = (MODEL / "check_model.sh").read_text()
     assert set(re.findall(r"\bM_[A-Z]+", model)) == set(REMEDY_OF)
@@ -32,7 +32,7 @@ def test_each_mutation_of_the_model_takes_away_a_remedy_of_the_code() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(shutil.which("spin") is None, reason="needs spin")
 @pytest.mark.skipif(shutil.which("cc") is None, reason="needs a C compiler")
-def test_the_model_holds_and_every_mutation_is_caught() -> None:
+def test_the_model_is_correct_and_every_mutation_is_detected() -> None:
     script = MODEL / "check_model.sh"
     done = subprocess.run(["sh", str(script)], capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stdout

@@ -1,4 +1,4 @@
-"""The tables and diagrams of docs/explanation/ownership.md are made from the code."""
+"""Generate the tables and diagrams of docs/explanation/ownership.md from the code."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from tests.ownership.bench import Bench
 from tests.ownership.scenarios import SCENARIOS
 from tests.support.generated import check_block, table
 
-NAMES = {0: "Source", COORDINATOR: "Coordinator", 1: "Target"}  # of zones and the coordinator
+NAMES = {0: "Source", COORDINATOR: "Coordinator", 1: "Target"}  # party → name in the diagram
 PAGE = Path(__file__).resolve().parents[2] / "docs/explanation/ownership.md"
 
 
@@ -55,7 +55,7 @@ def test_the_page_shows_every_transition() -> None:
 
 
 class Drawn(Bench):
-    """A run that draws its messages and records."""
+    """A run that draws its messages and records as a Mermaid diagram."""
 
     def __init__(self) -> None:
         self.lines = ["sequenceDiagram", *(f"    participant {name}" for name in NAMES.values())]

@@ -1,4 +1,4 @@
-"""The core is pure: the standard library, without input, output, clocks, threads or randomness."""
+"""The core uses only the standard library, without input, output, clocks, threads or randomness."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def test_a_file_of_the_core_is_pure(path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: path.name)
-def test_a_file_of_the_core_prints_opens_and_hashes_nothing(path: Path) -> None:
+def test_a_file_of_the_core_does_not_call_print_open_or_hash(path: Path) -> None:
     called = {
         node.func.id
         for node in ast.walk(ast.parse(path.read_text(encoding="utf-8")))
@@ -46,11 +46,11 @@ def test_a_file_of_the_core_prints_opens_and_hashes_nothing(path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["trace_check", "trace"])
-def test_the_checker_uses_no_code_that_it_checks(name: str) -> None:
+def test_the_trace_checker_does_not_import_the_code_that_it_checks(name: str) -> None:
     (path,) = (path for path in FILES if path.stem == name)
     judged = {"directory", "endpoint", "table", "planning", "decisions", "readiness", "replicas"}
     assert not {f"cavmarl.ownership.{module}" for module in judged} & imports(path)
 
 
-def test_the_list_of_files_is_not_empty() -> None:
+def test_these_tests_find_the_files_of_the_core() -> None:
     assert len(FILES) > 15

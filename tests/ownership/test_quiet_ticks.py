@@ -1,4 +1,4 @@
-"""Quiet ticks, which have no messages: their results equal those of ticks with messages."""
+"""Ticks without messages (quiet ticks) give the results of ticks with messages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Digests:
         return state_digest(STATE)
 
 
-class Both:
+class World:
     """A coordinator and two zones, of which zone 0 owns vehicles 1 and 2."""
 
     def __init__(self) -> None:
@@ -34,7 +34,7 @@ class Both:
         for zone in (0, 1):
             self.directory.host(zone, worker=zone)
         self.zones = {zone: Endpoint(self.directory.hosting(zone), LIMITS) for zone in (0, 1)}
-        self.tell(births=[Birth(1, 0, b""), Birth(2, 0, b"")])
+        self.tick_with_messages(births=[Birth(1, 0, b""), Birth(2, 0, b"")])
 
     def deliver(self, messages: tuple[Message, ...]) -> None:
         for message in messages:
@@ -44,13 +44,15 @@ class Both:
                 else:
                     self.directory.on_message(message)
 
-    def tell(self, births: list[Birth], movers: list[tuple[int, int]] | None = None) -> None:
-        """Run a tick with STEP and DONE."""
+    def tick_with_messages(
+        self, births: list[Birth], movers: list[tuple[int, int]] | None = None
+    ) -> None:
+        """Run a tick with STEP and DONE messages."""
         self.deliver(self.directory.begin(movers or (), births).messages)
         self.deliver(tuple(zone.complete(0) for zone in self.zones.values()))
         self.directory.commit({0: 0, 1: 0})
 
-    def leave_alone(self) -> None:
+    def quiet_tick(self) -> None:
         """Run a quiet tick."""
         assert self.directory.begin_quiet()
         for zone in self.zones.values():
@@ -67,22 +69,22 @@ class Both:
             assert zone.tally == self.directory.table.tallies[number]
 
 
-def test_quiet_ticks_need_no_messages_and_give_the_same_table() -> None:
-    told, quiet = Both(), Both()
+def test_quiet_ticks_give_the_same_table_as_ticks_with_messages() -> None:
+    told, quiet = World(), World()
     for _ in range(3):
-        told.tell([])
-        quiet.leave_alone()
+        told.tick_with_messages([])
+        quiet.quiet_tick()
         quiet.directory.commit_quiet()
         quiet.check()
         assert quiet.known() == told.known()
     for both in (told, quiet):
-        both.tell([Birth(3, 1, b"")])
+        both.tick_with_messages([Birth(3, 1, b"")])
         both.check()
     assert quiet.known() == told.known()
 
 
 def test_a_zone_can_end_a_quiet_tick_with_an_event() -> None:
-    told, quiet = Both(), Both()
+    told, quiet = World(), World()
     told.deliver(told.directory.begin(()).messages)
     told.deliver((told.zones[0].complete(0, [Removed(2, 1)]), told.zones[1].complete(0)))
     told.directory.commit({0: 0, 1: 0})
@@ -100,31 +102,31 @@ def test_a_zone_can_end_a_quiet_tick_with_an_event() -> None:
 
 
 def test_acknowledgements_in_a_quiet_tick_take_effect() -> None:
-    both = Both()
-    both.leave_alone()
+    both = World()
+    both.quiet_tick()
     both.deliver(both.zones[0].offer([Approach(1, 1, STATE)]))
     both.directory.commit_quiet()
-    both.tell([], movers=[(1, 1)])
+    both.tick_with_messages([], movers=[(1, 1)])
     assert both.directory.table.owners[1] == (1, 1)
     both.check()
-    both.leave_alone()
+    both.quiet_tick()
     both.directory.commit_quiet()
     both.check()
     assert not both.zones[0].retained
 
 
-def test_an_episode_that_begins_in_a_quiet_tick_continues() -> None:
-    both = Both()
-    both.leave_alone()
+def test_a_reset_during_a_quiet_tick_begins_a_normal_episode() -> None:
+    both = World()
+    both.quiet_tick()
     both.directory.reset()
     assert not both.directory.is_quiet
-    both.tell([Birth(1, 1, b"")])
+    both.tick_with_messages([Birth(1, 1, b"")])
     both.check()
 
 
 def test_only_one_tick_is_in_progress() -> None:
-    both = Both()
-    both.leave_alone()
+    both = World()
+    both.quiet_tick()
     with pytest.raises(ProtocolError, match="tick 2 is not committed"):
         both.directory.begin(())
     both.directory.commit_quiet()

@@ -1,4 +1,4 @@
-"""The log as JSON lines: replaying it gives the table; a damaged log is refused with the reason."""
+"""The log as JSON lines: its replay gives the table of owners, and a damaged log is refused."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ def test_a_line_has_its_schema_sequence_and_kind(log: str) -> None:
         assert {"kind", "episode", "tick", "checksum"} <= set(content)
 
 
-def test_records_are_read_as_they_were_written(log: str) -> None:
+def test_read_records_equal_written_records(log: str) -> None:
     records = records_from_lines(log)
     assert "".join(lines_of(records)) == log
     written, read = LogChain(), LogChain()
     assert [read.from_dict(written.to_dict(record)) for record in records] == list(records)
 
 
-def test_every_prefix_can_be_replayed(log: str) -> None:
+def test_every_beginning_of_a_log_can_be_replayed(log: str) -> None:
     records = records_from_lines(log)
     ticks = [replay(records[:length]).tick for length in range(1, len(records) + 1)]
     assert ticks == sorted(ticks)
     assert ticks[-1] == 15
 
 
-def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
+def test_a_line_with_any_changed_character_is_refused(log: str) -> None:
     line = log.splitlines(keepends=True)[8]
     for at in range(len(line) - 1):
         for letter in ("0", "1", "f", '"', "x"):
@@ -55,7 +55,7 @@ def test_every_changed_letter_of_a_line_is_noticed(log: str) -> None:
                     records_from_lines("".join(log.splitlines(keepends=True)[:8]) + damaged)
 
 
-def test_an_added_byte_is_noticed_even_if_the_json_value_is_the_same(log: str) -> None:
+def test_a_line_with_an_added_byte_is_refused_even_if_its_json_value_is_the_same(log: str) -> None:
     lines = log.splitlines(keepends=True)
     line, before = lines[8], lines[:8]
     for at in range(len(line)):
@@ -70,7 +70,7 @@ def test_an_added_byte_is_noticed_even_if_the_json_value_is_the_same(log: str) -
             records_from_lines("".join(before) + same)
 
 
-def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
+def test_a_log_with_a_missing_doubled_or_swapped_line_is_refused(log: str) -> None:
     lines = log.splitlines(keepends=True)
     for wrong in (lines[:5] + lines[6:], lines[:5] + lines[4:], [*lines[:5], lines[6], lines[5]]):
         with pytest.raises(JournalError, match="lines are missing"):
@@ -78,8 +78,8 @@ def test_a_missing_doubled_or_swapped_line_is_noticed(log: str) -> None:
 
 
 @pytest.mark.parametrize("at", [8, 20, 40])
-def test_a_line_of_another_log_is_noticed(log: str, at: int) -> None:
-    """Its number, its kind and its checksum are right, but it follows another line."""
+def test_a_log_with_a_line_of_another_log_is_refused(log: str, at: int) -> None:
+    """Insert a line with valid number, kind and checksum, which follows a different line."""
     other = campaign(5, "corner")
     other.run(15)
     lines, foreign = log.splitlines(keepends=True), other.log.splitlines(keepends=True)
@@ -89,7 +89,7 @@ def test_a_line_of_another_log_is_noticed(log: str, at: int) -> None:
         records_from_lines("".join(mixed))
 
 
-def changed(**change: object) -> dict[str, object]:
+def host_record_with(**change: object) -> dict[str, object]:
     return sealed(LogChain().to_dict(Host(0, 0, 1, 1, 1)) | change)
 
 
@@ -104,18 +104,20 @@ def changed(**change: object) -> dict[str, object]:
         ({"kind": ["HOST"]}, "unknown kind"),
     ],
 )
-def test_a_line_of_another_kind_is_refused(change: dict[str, object], why: str) -> None:
+def test_a_line_with_an_invalid_kind_or_field_is_refused(
+    change: dict[str, object], why: str
+) -> None:
     with pytest.raises(JournalError, match=why):
-        LogChain().from_dict(changed(**change))
+        LogChain().from_dict(host_record_with(**change))
 
 
-def test_lines_that_are_no_objects_are_refused() -> None:
+def test_lines_that_are_not_json_objects_are_refused() -> None:
     for text in ("[1]\n", "nonsense\n", "\n"):
         with pytest.raises(JournalError, match="line 1"):
             records_from_lines(text)
 
 
-def test_a_log_that_no_coordinator_writes_cannot_be_replayed(log: str) -> None:
+def test_a_log_with_records_in_an_impossible_order_is_refused(log: str) -> None:
     records = records_from_lines(log)
     with pytest.raises(JournalError, match="must begin with a RESET"):
         replay(records[1:])

@@ -1,4 +1,4 @@
-"""Each remedy of the protocol closes its hole."""
+"""Run the scenario of each remedy: the remedy closes its hole in the protocol."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ from tests.support.lossy_network import FaultPlan, Network, Rates
 from tests.support.memory_store import MemoryStore
 
 
-def test_r01_a_host_advances_with_a_step_and_once() -> None:
+def test_r01_a_host_advances_only_with_its_step_and_once() -> None:
     bench = Bench()
     step = bench.begin(births=[(7, 0)])[0]
     endpoint = bench.endpoints[0]
@@ -68,7 +68,7 @@ def test_r03_records_come_before_messages() -> None:
     assert not bench.directory.resend().records
 
 
-def test_r03_what_rides_with_a_step_is_sent_again_with_it() -> None:
+def test_r03_the_payload_of_a_step_is_sent_again_with_it() -> None:
     bench = Bench()
     bench.directory.begin([], payloads={1: b"ghosts"})
     for output in (bench.directory.resend(), bench.crash(0), bench.crash(1)):
@@ -80,7 +80,7 @@ def test_r03_what_rides_with_a_step_is_sent_again_with_it() -> None:
     assert [step.payload for step in bench.begin()] == [b"", b""]
 
 
-def test_r04_a_logged_decision_is_not_taken_anew() -> None:
+def test_r04_a_restarted_coordinator_keeps_a_logged_decision() -> None:
     bench = approached(Bench())
     sent = bench.begin([(7, 1)])
     again = Directory.restore(bench.log, range(2), bench)
@@ -92,7 +92,7 @@ def test_r04_a_logged_decision_is_not_taken_anew() -> None:
             Directory.restore(log, range(2), bench)
 
 
-def test_r05_a_tick_is_begun_when_the_one_before_is_committed() -> None:
+def test_r05_a_tick_begins_only_after_the_previous_one_is_committed() -> None:
     bench = Bench()
     bench.begin()
     with pytest.raises(ProtocolError, match="tick 1 is not committed"):
@@ -137,7 +137,7 @@ def test_r09_a_target_promotes_the_exact_state_or_asks_for_it() -> None:
     assert bench.entered[7] == version(7, 1)
 
 
-def test_r10_a_row_that_left_is_kept_until_its_switch_is_committed() -> None:
+def test_r10_the_source_keeps_a_row_until_its_switch_is_committed() -> None:
     bench = approached(Bench())
     bench.tick(movers=[(7, 1)])
     assert bench.endpoints[0].row_state(7) is State.RETAINED
@@ -164,7 +164,7 @@ def test_r11_a_commit_needs_the_done_of_every_living_host() -> None:
     assert not bench.directory.fence(1).records
 
 
-def test_r12_the_ledger_is_exact_or_the_tick_is_not_committed() -> None:
+def test_r12_a_tick_with_a_wrong_ledger_is_not_committed() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0), (8, 1)])
     first, second = bench.begin()
@@ -178,7 +178,7 @@ def test_r12_the_ledger_is_exact_or_the_tick_is_not_committed() -> None:
         bench.commit()
 
 
-def test_r13_stored_rows_equal_the_reported_rows() -> None:
+def test_r13_a_zone_whose_stored_rows_differ_from_its_report_gets_a_new_host() -> None:
     bench = Bench()
     for step in bench.begin(births=[(7, 0)]):
         bench.give(bench.give(step)[0])
@@ -197,7 +197,7 @@ def test_r14_the_epoch_rises_by_one_with_each_switch() -> None:
         assert bench.directory.table.owners[7] == (zone, epoch)
 
 
-def test_r15_only_what_is_newer_than_the_fence_counts() -> None:
+def test_r15_a_prepare_or_abort_that_is_not_newer_than_the_fence_is_dropped() -> None:
     bench, prepare = prepared()
     assert bench.give(replace(prepare, tick=2))
     assert not bench.give(prepare)
@@ -209,7 +209,7 @@ def test_r15_only_what_is_newer_than_the_fence_counts() -> None:
     assert endpoint.dropped["Abort", "fence"] == 1
 
 
-def test_r16_what_is_older_than_the_lifetime_is_gone_and_not_heard() -> None:
+def test_r16_replicas_and_messages_older_than_the_lifetime_are_dropped() -> None:
     bench, prepare = prepared()
     bench.commit()
     for _ in range(bench.limits.lifetime):
@@ -221,7 +221,7 @@ def test_r16_what_is_older_than_the_lifetime_is_gone_and_not_heard() -> None:
     assert not bench.endpoints[1].replicas.fences
 
 
-def test_r17_a_state_that_comes_never_touches_the_row_that_is_owned() -> None:
+def test_r17_a_prepare_never_changes_a_row_that_the_zone_owns() -> None:
     bench, prepare = prepared()
     owner = bench.endpoints[0]
     owner.on_message(replace(prepare, target=0))
@@ -229,7 +229,7 @@ def test_r17_a_state_that_comes_never_touches_the_row_that_is_owned() -> None:
     assert 7 not in owner.replicas.held
 
 
-def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> None:
+def test_r18_a_target_gets_one_prepare_or_abort_per_tick_with_limited_repeats() -> None:
     bench, _ = prepared()
     endpoint = bench.endpoints[0]
     tries = [endpoint.offer_again() for _ in range(4)]
@@ -239,14 +239,14 @@ def test_r18_a_target_gets_one_prepare_or_abort_a_tick_and_some_more_tries() -> 
     assert not bench.offer(0)
     (prepare,) = bench.offer(0, (7, 1))
     bench.pass_on(bench.give(prepare))
-    assert not endpoint.offer_again(), "it has been answered"
+    assert not endpoint.offer_again(), "an answered offer is sent again"
     bench.offer(0, (7, 1))
     bench.commit()
     bench.give(bench.begin()[0])
-    assert not endpoint.offer_again(), "it belonged to the previous tick"
+    assert not endpoint.offer_again(), "an offer of the previous tick is sent again"
 
 
-def test_r19_a_refusal_has_a_reason_and_is_followed_by_silence() -> None:
+def test_r19_a_refusal_has_a_reason_and_stops_offers_for_some_ticks() -> None:
     bench = Bench(limits=Limits(capacity=0, backoff=3))
     offered = []
     for tick in range(8):
@@ -282,7 +282,7 @@ def test_r21_messages_of_a_fenced_process_are_dropped() -> None:
     assert bench.directory.table.hosts[1] == (1, 2)
 
 
-def test_r22_a_new_host_has_the_committed_tick_and_is_sent_what_comes_in() -> None:
+def test_r22_a_new_host_gets_the_committed_tick_and_the_states_of_arriving_vehicles() -> None:
     bench = approached(Bench())
     bench.begin(movers=[(7, 1)])
     source, target = bench.crash(0), bench.crash(1)
@@ -296,7 +296,7 @@ def test_r22_a_new_host_has_the_committed_tick_and_is_sent_what_comes_in() -> No
     assert bench.owner(7) == 1
 
 
-def test_r23_a_tick_that_no_host_survives_ends_in_an_error() -> None:
+def test_r23_a_tick_in_which_every_host_dies_is_an_error() -> None:
     bench = Bench(limits=Limits(repeats=2))
     bench.begin()
     bench.crash(0)
@@ -309,21 +309,23 @@ def test_r23_a_tick_that_no_host_survives_ends_in_an_error() -> None:
     bench.crash(0)
 
 
-def test_r24_a_living_zone_moves_between_ticks_only() -> None:
+def test_r24_a_zone_with_a_living_host_moves_only_between_ticks() -> None:
     bench = approached(Bench())
     bench.host(1)
     bench.tick(movers=[(7, 1)])
-    assert bench.directory.table.deferred == {7: 1}, "the ACK came from another process"
+    assert bench.directory.table.deferred == {7: 1}, (
+        "the vehicle is handed over with the ACK of another process"
+    )
     bench.begin()
     with pytest.raises(ProtocolError, match="fence it first"):
         bench.host(1)
 
 
-def test_r25_a_removed_vehicle_is_gone_for_the_episode() -> None:
+def test_r25_the_id_of_a_removed_vehicle_is_not_used_again_in_the_episode() -> None:
     bench, prepare = prepared()
     bench.commit()
     bench.tick(removed=[7])
-    assert not bench.give(prepare), "the source has withdrawn it"
+    assert not bench.give(prepare), "the target acknowledges an offer that was withdrawn"
     held = Held(7, 0, prepare.entries[0].digest)
     bench.directory.on_message(Ack(prepare.run, 0, 2, 1, 1, 0, (held,)))
     assert bench.directory.dropped["Ack", "unknown"] == 1
@@ -335,7 +337,7 @@ def test_r25_a_removed_vehicle_is_gone_for_the_episode() -> None:
     assert [bench.directory.table.state(vehicle) for vehicle in (7, 8)] == ["REMOVED", "UNKNOWN"]
 
 
-def test_r26_a_reset_begins_an_episode_and_the_ticks_go_on() -> None:
+def test_r26_a_reset_begins_an_empty_episode_and_the_tick_number_continues() -> None:
     bench = approached(Bench())
     late = bench.begin(movers=[(7, 1)])
     bench.note(bench.directory.reset())
@@ -348,7 +350,7 @@ def test_r26_a_reset_begins_an_episode_and_the_ticks_go_on() -> None:
         assert not bench.give(message)
 
 
-def test_r27_messages_from_elsewhere_are_dropped_and_counted() -> None:
+def test_r27_foreign_messages_are_dropped_and_counted_by_reason() -> None:
     bench = Bench()
     step = bench.begin()[0]
     (done,) = bench.give(step)
@@ -372,7 +374,7 @@ def test_r27_messages_from_elsewhere_are_dropped_and_counted() -> None:
     assert reasons == {"run", "zone", "incarnation", "kind", "episode"}
 
 
-def test_r32_the_digest_of_a_world_does_not_know_its_zones() -> None:
+def test_r32_the_digest_of_a_world_does_not_depend_on_its_zones() -> None:
     rows = {vehicle: version(vehicle, 3) for vehicle in range(20)}
     whole = world_digest(row_hash(vehicle, row) for vehicle, row in rows.items())
     for zones in (1, 2, 7):
@@ -384,7 +386,7 @@ def test_r32_the_digest_of_a_world_does_not_know_its_zones() -> None:
         assert world_digest(parts) == store.world() == whole
 
 
-def test_r33_what_a_network_does_is_a_function_of_its_seed() -> None:
+def test_r33_the_faults_of_the_network_depend_only_on_its_seed() -> None:
     def arrivals(seed: int) -> list[tuple[int, int]]:
         network = Network(FaultPlan(seed=seed, otherwise=Rates(0.2, 0.3, 0.3, 0.3)))
         seen = []
@@ -400,7 +402,7 @@ def test_r33_what_a_network_does_is_a_function_of_its_seed() -> None:
     assert not plain.in_flight()
 
 
-class Untouchable(dict[int, tuple[int, int]]):
+class NotIterable(dict[int, tuple[int, int]]):
     """A table of owners that allows look-ups, but no iteration."""
 
     def __iter__(self) -> Iterator[int]:
@@ -409,10 +411,10 @@ class Untouchable(dict[int, tuple[int, int]]):
     keys = values = items = __iter__  # type: ignore[assignment]
 
 
-def test_r34_a_tick_costs_what_changes_in_it() -> None:
+def test_r34_a_tick_visits_only_the_vehicles_that_change() -> None:
     bench = Bench()
     bench.tick(births=[(vehicle, vehicle % 2) for vehicle in range(50)], offers=[(0, 1)])
-    owners = Untouchable(bench.directory.table.owners)
+    owners = NotIterable(bench.directory.table.owners)
     bench.directory.table.owners = owners
     bench.tick(movers=[(0, 1)], births=[(99, 0)], offers=[(99, 1)])
     assert (owners[0], owners[99], len(owners)) == ((1, 1), (0, 0), 51)

@@ -1,4 +1,4 @@
-"""AT7: whole runs of the real parties under seeded faults equal the undivided world."""
+"""Whole runs under seeded faults equal the undivided world (acceptance test AT7)."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ FAULTS = {
 
 @pytest.mark.parametrize("layout", ["corner", "thin"])
 @pytest.mark.parametrize("faults", FAULTS)
-def test_faults_of_messages_are_invisible(faults: str, layout: str) -> None:
+def test_faults_of_messages_change_no_result(faults: str, layout: str) -> None:
     simulator = Simulator(world(layout), plan=FaultPlan(seed=1, otherwise=FAULTS[faults]))
     simulator.run(TICKS)
     assert simulator.digests == world(layout).undivided(TICKS)
@@ -57,7 +57,7 @@ def test_faults_of_messages_are_invisible(faults: str, layout: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["Prepare", "Ack"])
-def test_without_any_offer_or_answer_every_hand_off_is_forced(kind: str) -> None:
+def test_every_hand_off_is_forced_if_all_offers_or_answers_are_lost(kind: str) -> None:
     simulator = Simulator(world("corner"), plan=FaultPlan(rates={kind: Rates(drop=1.0)}))
     simulator.run(TICKS)
     assert simulator.digests == world("corner").undivided(TICKS)
@@ -69,7 +69,7 @@ POINTS += [(point, zone) for point in ZONE_POINTS for zone in (0, 2)]
 
 
 @pytest.mark.parametrize(("point", "party"), POINTS)
-def test_a_crash_at_any_point_is_invisible(point: str, party: int) -> None:
+def test_a_crash_at_any_point_changes_no_result(point: str, party: int) -> None:
     simulator = Simulator(
         world("corner"),
         crashes=lambda tick, at, who: tick % 3 == 2 and at == point and who == party,
@@ -80,7 +80,7 @@ def test_a_crash_at_any_point_is_invisible(point: str, party: int) -> None:
 
 
 def campaign(seed: int, layout: str) -> Simulator:
-    """Run a campaign in which all faults occur, also several times in a tick."""
+    """Return a run in which all faults occur, even several times in a tick."""
 
     def crashes(tick: int, point: str, party: int) -> bool:
         return number(seed, "crash", tick, point, party) % 100 < 2
@@ -91,7 +91,7 @@ def campaign(seed: int, layout: str) -> Simulator:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_seeded_campaign_is_invisible_and_repeats_itself(seed: int) -> None:
+def test_a_run_with_all_faults_changes_no_result_and_can_be_repeated(seed: int) -> None:
     layout = list(LAYOUTS)[seed % len(LAYOUTS)]
     first, second = campaign(seed, layout), campaign(seed, layout)
     first.run(TICKS)
@@ -101,8 +101,7 @@ def test_a_seeded_campaign_is_invisible_and_repeats_itself(seed: int) -> None:
     assert first.trace.text() == second.trace.text()
 
 
-def test_every_open_hand_off_ends_after_the_last_fault() -> None:
-    """Liveness: D + 2 ticks after the last fault, no vehicle waits that had crossed before."""
+def test_every_open_hand_off_ends_within_d_plus_2_ticks_after_the_last_fault() -> None:
     limits = Limits()
     for seed in range(6):
         plan = FaultPlan(seed=seed, otherwise=Rates(drop=0.6, delay=0.3), until=150)
@@ -136,7 +135,7 @@ def test_a_reset_in_the_middle_of_transfers_begins_an_empty_episode(seed: int) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("block", range(20))
-def test_many_seeded_campaigns_are_invisible(block: int) -> None:
+def test_many_runs_with_all_faults_change_no_result(block: int) -> None:
     for seed in range(100 + 50 * block, 150 + 50 * block):
         layout = list(LAYOUTS)[seed % len(LAYOUTS)]
         simulator = campaign(seed, layout)

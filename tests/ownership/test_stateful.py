@@ -1,4 +1,4 @@
-"""AT9: any sequence of births, moves, removals, deaths, restarts, resets and lost messages."""
+"""Any sequence of events and faults keeps the owners of a simple model (acceptance test AT9)."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ FATES = st.sampled_from(["arrives", "arrives", "is lost", "is doubled", "is late
 
 
 class Ownership(RuleBasedStateMachine):
-    """The model is a dictionary of the zone of each living vehicle."""
+    """A state machine whose model is a dictionary: vehicle → zone."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -132,5 +132,5 @@ Ownership.TestCase.settings = settings(max_examples=120, stateful_step_count=30,
 test_any_sequence_keeps_the_owners_of_the_model = Ownership.TestCase
 
 
-def test_all_kinds_of_messages_may_be_lost() -> None:
+def test_messages_include_all_kinds_that_may_be_lost() -> None:
     assert {Step, Prepare, Abort, Ack, Nack} <= set(Message.__subclasses__())

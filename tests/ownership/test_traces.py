@@ -1,6 +1,6 @@
-"""Readable traces of runs, and the checker of traces (AT6).
+"""Readable traces of runs, and the checker of traces (acceptance test AT6).
 
-`CAVMARL_REWRITE=1` rewrites the files; read the difference before you commit it.
+`CAVMARL_REWRITE=1` rewrites the files; read the difference before you commit the files.
 """
 
 from __future__ import annotations
@@ -103,22 +103,22 @@ TICKS: dict[str, tuple[int, list[dict[str, Any]]]] = {
         {"offers": [(7, 1)]}, {"movers": [(7, 1)], "removed": [7]}, {},
     ]),
 }  # fmt: skip
-TOLD = {
-    story.__name__: story
-    for story in (
+SCRIPTS = {
+    script.__name__: script
+    for script in (
         target_dies_after_its_ack, target_dies_after_begin, source_dies_in_its_step,
         coordinator_restarts, reset_in_a_switch,
     )
 }  # fmt: skip
 
 
-@pytest.mark.parametrize("name", [*TICKS, *TOLD])
+@pytest.mark.parametrize("name", [*TICKS, *SCRIPTS])
 def test_the_text_of_a_trace_equals_its_file(name: str) -> None:
     zones, ticks = TICKS.get(name, (2, []))
     bench = Bench(zones)
     for number, tick in enumerate(ticks):
         bench.tick(births=() if number else [(7, 0)], **tick)
-    TOLD.get(name, lambda _: None)(bench)
+    SCRIPTS.get(name, lambda _: None)(bench)
     bench.judge()
     path = TRACES / f"{name}.txt"
     if os.environ.get("CAVMARL_REWRITE"):
@@ -126,8 +126,8 @@ def test_the_text_of_a_trace_equals_its_file(name: str) -> None:
     assert bench.trace.text() == path.read_text(encoding="utf-8")
 
 
-def test_every_trace_file_has_a_scenario() -> None:
-    assert sorted(path.stem for path in TRACES.glob("*.txt")) == sorted([*TICKS, *TOLD])
+def test_every_trace_file_has_a_test() -> None:
+    assert sorted(path.stem for path in TRACES.glob("*.txt")) == sorted([*TICKS, *SCRIPTS])
 
 
 @pytest.fixture(scope="module")
@@ -141,24 +141,24 @@ def judge(entries: list[TraceEntry]) -> None:
     check_trace(entries, Limits().deferral, Limits().lifetime)
 
 
-def places(
+def positions_of(
     entries: tuple[TraceEntry, ...], kind: type, where: Callable[[TraceEntry], bool]
 ) -> list[int]:
     return [k for k, entry in enumerate(entries) if type(entry.item) is kind and where(entry)]
 
 
-def switching(entry: TraceEntry) -> bool:
+def has_switch(entry: TraceEntry) -> bool:
     return isinstance(entry.item, Begin) and bool(entry.item.switches)
 
 
 def first_switch(entries: tuple[TraceEntry, ...]) -> tuple[int, Begin, Switch]:
-    k = places(entries, Begin, switching)[0]
+    k = positions_of(entries, Begin, has_switch)[0]
     begin = entries[k].item
     assert isinstance(begin, Begin)
     return k, begin, begin.switches[0]
 
 
-def changed_switch(entries: tuple[TraceEntry, ...], **change: object) -> list[TraceEntry]:
+def change_first_switch(entries: tuple[TraceEntry, ...], **change: object) -> list[TraceEntry]:
     k, begin, switch = first_switch(entries)
     lie = replace(begin, switches=(switch._replace(**change), *begin.switches[1:]))  # type: ignore[arg-type]
     return [*entries[:k], TraceEntry(LOG, lie), *entries[k + 1 :]]
@@ -167,7 +167,7 @@ def changed_switch(entries: tuple[TraceEntry, ...], **change: object) -> list[Tr
 def without(
     entries: tuple[TraceEntry, ...], kind: type, where: Callable[[TraceEntry], bool]
 ) -> list[TraceEntry]:
-    gone = set(places(entries, kind, where))
+    gone = set(positions_of(entries, kind, where))
     assert gone
     return [entry for k, entry in enumerate(entries) if k not in gone]
 
@@ -189,7 +189,7 @@ def test_the_checker_refuses_another_switch(
     entries: tuple[TraceEntry, ...], change: dict[str, object], why: str
 ) -> None:
     with pytest.raises(ProtocolError, match=why):
-        judge(changed_switch(entries, **change))
+        judge(change_first_switch(entries, **change))
 
 
 @pytest.mark.parametrize(
@@ -229,7 +229,7 @@ def test_the_checker_refuses_a_switch_without_its_ack(entries: tuple[TraceEntry,
 
 def test_the_checker_refuses_a_step_before_its_record(entries: tuple[TraceEntry, ...]) -> None:
     k, begin, _ = first_switch(entries)
-    (after, *_) = places(entries, Step, lambda entry: entry.item.tick == begin.tick)
+    (after, *_) = positions_of(entries, Step, lambda entry: entry.item.tick == begin.tick)
     swapped = list(entries)
     swapped[k], swapped[after] = swapped[after], swapped[k]
     with pytest.raises(ProtocolError, match="before it was logged"):
@@ -250,7 +250,7 @@ def test_the_checker_refuses_a_done_without_its_confirmation(
 
 
 def test_the_checker_refuses_a_wrong_ledger(entries: tuple[TraceEntry, ...]) -> None:
-    k = places(entries, Commit, lambda entry: True)[3]
+    k = positions_of(entries, Commit, lambda entry: True)[3]
     commit = entries[k].item
     assert isinstance(commit, Commit)
     zone = commit.zones[0]
@@ -273,10 +273,10 @@ def test_the_checker_refuses_a_stale_acknowledgement() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 3, 4])
-def test_the_checker_accepts_campaigns_unless_a_record_is_missing(seed: int) -> None:
+def test_the_checker_refuses_runs_in_which_a_record_is_missing(seed: int) -> None:
     simulator = campaign(seed, "corner")
     simulator.run(15)
     entries = tuple(simulator.trace.entries)
-    for k in places(entries, Begin, lambda entry: True):
+    for k in positions_of(entries, Begin, lambda entry: True):
         with pytest.raises(ProtocolError):
             judge([*entries[:k], *entries[k + 1 :]])

@@ -1,4 +1,4 @@
-"""Each change of owner has a row in the table of transfers."""
+"""Each change of owner adds a row to the table of transfers."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from tests.ownership.test_simulator import campaign
 from tests.support.held_entries import held_entries
 
 
-def followed(trace: Trace) -> TransferLog:
+def transfers_of(trace: Trace) -> TransferLog:
     log = TransferLog(Limits().lifetime)
     for destination, item in trace.entries:
         if isinstance(item, Record):
@@ -24,59 +24,59 @@ def followed(trace: Trace) -> TransferLog:
     return log
 
 
-def test_a_prepared_transfer_has_its_row() -> None:
+def test_a_prepared_transfer_has_a_row() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)], offers=[(7, 1)])
     bench.tick(offers=[(7, 1)])
     bench.tick(movers=[(7, 1)])
-    log = followed(bench.trace)
+    log = transfers_of(bench.trace)
     assert list(log.rows) == [Transfer(0, 3, 7, 0, 1, 1, False, False, 1, 0, 2, 16)]
     assert log.counts == {"switched": 1, "acknowledged": 2, "deferred": 0}
 
 
-def test_a_forced_transfer_has_its_deferral() -> None:
+def test_the_row_of_a_forced_transfer_has_its_deferred_ticks() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0)])
     for _ in range(2):
         bench.tick(movers=[(7, 1)])
     bench.tick(movers=[(7, 1)], removed=[7])
-    log = followed(bench.trace)
+    log = transfers_of(bench.trace)
     assert list(log.rows) == [Transfer(0, 4, 7, 0, 1, 1, True, True, -1, 2, 0, 0)]
     assert log.counts == {"forced": 1, "deferred": 2, "removed": 1}
 
 
-def test_ended_approaches_are_counted_and_take_no_memory() -> None:
+def test_withdrawn_offers_are_counted_and_take_no_memory() -> None:
     bench = Bench(3)
     bench.tick(births=[(7, 0), (8, 0)], offers=[(7, 1), (8, 2)])
     bench.tick(offers=[(8, 2)])
     bench.endpoints[0].offers.open.clear()
     for _ in range(bench.limits.lifetime + 3):
         bench.tick()
-    log = followed(bench.trace)
+    log = transfers_of(bench.trace)
     assert log.counts["aborted"] == 1
     assert not log.rows
     quiet = Bench(3)
     quiet.tick(births=[(7, 0), (8, 0)])
     for _ in range(bench.limits.lifetime + 4):
         quiet.tick()
-    without = followed(quiet.trace)
+    without = transfers_of(quiet.trace)
     assert held_entries(log) - len(log.counts) == held_entries(without) - len(without.counts)
 
 
-def test_the_rows_of_a_campaign_are_the_switches_of_its_log() -> None:
+def test_a_run_with_all_faults_has_one_row_per_switch_in_its_log() -> None:
     simulator = campaign(3, "corner")
     simulator.run(25)
-    log = followed(simulator.trace)
+    log = transfers_of(simulator.trace)
     assert len(log.rows) == simulator.switches == log.counts["switched"] + log.counts["forced"]
     assert log.counts["deferred"] == simulator.deferred
     assert all(row.waited <= Limits().deferral for row in log.rows)
     assert all(row.forced or row.offers for row in log.rows)
 
 
-def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
+def test_the_number_of_rows_is_limited_and_take_removes_the_rows() -> None:
     simulator = campaign(3, "corner")
     simulator.run(25)
-    log = followed(simulator.trace)
+    log = transfers_of(simulator.trace)
     rows = list(log.rows)
     assert log.rows.maxlen == KEPT_ROWS
     assert log.take() == rows
@@ -84,7 +84,7 @@ def test_rows_do_not_grow_for_ever_and_can_be_taken_away() -> None:
     assert log.counts["switched"] + log.counts["forced"] == len(rows)
 
 
-def test_rows_of_the_newest_changes_are_stored() -> None:
+def test_only_the_rows_of_the_newest_transfers_are_computed() -> None:
     log = TransferLog(Limits().lifetime)
     made = []
 
@@ -102,7 +102,7 @@ def test_rows_of_the_newest_changes_are_stored() -> None:
     for first in range(0, 6 * batch, batch):
         later(first, batch)
     assert log.counts == {"switched": 6 * batch, "removed": 6}
-    assert made == [], "no row was read"
+    assert made == [], "rows are computed before they are read"
     assert [row.tick for row in log.rows] == list(range(2 * batch, 6 * batch))
     assert made == [2 * batch, 3 * batch, 4 * batch, 5 * batch]
     later(6 * batch, 3)
@@ -110,7 +110,7 @@ def test_rows_of_the_newest_changes_are_stored() -> None:
     assert not log.rows
 
 
-def test_the_summary_counts_and_ranks() -> None:
+def test_the_summary_has_counts_and_percentiles() -> None:
     rows = [
         Transfer(
             0, 20, n, 0, 1, 1, n == 5, False, 20 - n, 0, 1, 100 + n, -1.0 * n, 2.0, 2.0 + n, 0.5 * n
@@ -128,7 +128,7 @@ def test_the_summary_counts_and_ranks() -> None:
     assert found.release_depth_m == (52.0, 97.0, 102.0)
 
 
-def test_the_summary_without_transfers_has_no_figures() -> None:
+def test_the_summary_without_transfers_has_no_percentiles() -> None:
     found = TransferSummary.of([], {})
     assert (found.transfers, found.failure_rate) == (0, None)
     assert found.latency_ticks == (None, None, None)

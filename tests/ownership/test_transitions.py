@@ -1,4 +1,4 @@
-"""The transition table is complete, and other transitions are errors."""
+"""The transition table is complete, and all other transitions are errors."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_transitions_outside_of_the_table_raise() -> None:
             after(party, state, event)
 
 
-def test_a_host_receives_only_foreign_vehicles_and_releases_only_its_own() -> None:
+def test_a_host_cannot_receive_its_own_vehicles_or_release_other_vehicles() -> None:
     bench = Bench()
     bench.tick(births=[(7, 0), (8, 1)])
     step = bench.begin()[0]
@@ -52,7 +52,7 @@ def test_a_host_receives_only_foreign_vehicles_and_releases_only_its_own() -> No
 
 
 @pytest.mark.parametrize("party", Party)
-def test_every_state_is_reached_from_the_beginning(party: Party) -> None:
+def test_every_state_can_be_reached_from_the_initial_state(party: Party) -> None:
     reached = {BEGINNINGS[party]}
     for _ in State:
         reached |= {to for (whose, at, _), to in TABLE.items() if whose is party and at in reached}
@@ -61,7 +61,7 @@ def test_every_state_is_reached_from_the_beginning(party: Party) -> None:
     assert len(reached) >= 2
 
 
-def test_only_removed_is_final() -> None:
+def test_only_the_state_removed_is_final() -> None:
     left = {(whose, at) for (whose, at, _) in TABLE}
     reached = {(whose, to) for (whose, _, _), to in TABLE.items()}
     assert reached - left == {(Party.VEHICLE, State.REMOVED)}

@@ -1,7 +1,7 @@
-"""A toy world for the protocol: vehicles on a torus of whole numbers.
+"""A toy world for the protocol: vehicles on a torus with integer positions.
 
-A vehicle's next state is a hash of its own state and of all states near it. A state that is
-computed from an old, torn or foreign state therefore differs for ever.
+The next state of a vehicle is a hash of its own state and of all states near it. If one state is
+computed from a wrong state, it and later states therefore differ from the undivided world.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ def place(state: bytes) -> tuple[int, int]:
 
 
 def number(*parts: object) -> int:
-    """Return a 64-bit number that depends on its arguments only."""
+    """Return a 64-bit hash of the arguments."""
     return int.from_bytes(blake2b(repr(parts).encode(), digest_size=8).digest(), "little")
 
 
 @dataclass(frozen=True)
 class ToyWorld:
-    """Size, zones and entering vehicles; zones begin at 0, `cuts_x` and `cuts_y`."""
+    """The size, the entering vehicles and the zones of the world, cut at `cuts_x` and `cuts_y`."""
 
     size: int = 24
     cuts_x: tuple[int, ...] = (12,)
@@ -55,7 +55,7 @@ class ToyWorld:
         return self._zone_at(*place(state))
 
     def near(self, state: bytes, distance: int) -> set[int]:
-        """Return the zones that the square around a vehicle touches."""
+        """Return the zones that a square around a vehicle overlaps."""
         x, y = place(state)
         offsets = range(-distance, distance + 1)
         columns = {bisect_right(self.cuts_x, (x + d) % self.size) for d in offsets}
@@ -88,7 +88,7 @@ class ToyWorld:
         )
 
     def undivided(self, ticks: int) -> list[int]:
-        """Return the digests of the undivided world, tick by tick."""
+        """Return the digest of the undivided world after each tick."""
         states: dict[int, bytes] = {}
         digests, next_id = [], 0
         for tick in range(1, ticks + 1):

@@ -1,4 +1,4 @@
-"""Parsing of the argument `backend` and of its short forms."""
+"""Parse the argument `backend` and the arguments that stand for it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from cavmarl.parallel.placement.backend_name import BackendName, read_backend
         ("moon:3", BackendName("moon", 3)),
     ],
 )
-def test_each_form_is_read_and_written(text: str, name: BackendName) -> None:
+def test_each_form_of_a_backend_name_is_read_and_written(text: str, name: BackendName) -> None:
     assert read_backend(text, registered={"moon"}) == name
     assert str(name) == text
 
@@ -44,7 +44,9 @@ def test_each_form_is_read_and_written(text: str, name: BackendName) -> None:
         ({"workers": 0, "backend": "local"}, "local"),
     ],
 )
-def test_short_forms_stand_for_backends(arguments: dict[str, Any], text: str) -> None:
+def test_workers_and_nodes_are_short_forms_of_backends(
+    arguments: dict[str, Any], text: str
+) -> None:
     assert str(read_backend(**{"backend": None, **arguments})) == text
 
 

@@ -1,4 +1,4 @@
-"""Checkpoint logs: alone, and of workers that die while the log restarts."""
+"""Checkpoint logs by themselves, and in workers that die while the log restarts."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ def test_a_worker_that_dies_when_the_log_is_full_changes_no_result(
     vec = make("grid4x4", workers=2, **wanted)
     at = {STEPS - 1, STEPS, STEPS + 1, STEPS + 2, 2 * STEPS, 2 * STEPS + 1}
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in at:
             os.kill(pool_of(vec).pids[worker], signal.SIGKILL)
 
-    assert same(drive(vec, steps=steps, before=strike), whole)
+    assert same(drive(vec, steps=steps, before=kill_in_step), whole)
     assert [death.worker for death in pool_of(vec).deaths] == [worker] * len(at)
 
 
@@ -81,7 +81,7 @@ def commands_like(entry: Commands, value: int) -> Commands:
     )
 
 
-def noted(checkpoint_log: CheckpointLog) -> list[float]:
+def noted_values(checkpoint_log: CheckpointLog) -> list[float]:
     return [float(entry.controls.flat[0]) for entry in checkpoint_log.steps()]
 
 
@@ -100,13 +100,13 @@ def test_a_committed_state_stays_until_the_next_commit(checkpoint_log: Checkpoin
     checkpoint_log.prepare([np.full(3, 2.0)])
     assert checkpoint_log.is_prepared
     assert (state_of(checkpoint_log), len(checkpoint_log)) == ([1.0] * 3, STEPS), (
-        "the log has not restarted yet"
+        "the log has restarted before begin()"
     )
     checkpoint_log.begin()
     checkpoint_log.note(commands_like(checkpoint_log.entries[0], 99))
-    assert (state_of(checkpoint_log), noted(checkpoint_log)) == ([2.0] * 3, [99.0])
-    checkpoint_log.go_to(committed)  # the first command of the new log was not committed
-    assert (state_of(checkpoint_log), noted(checkpoint_log)) == (
+    assert (state_of(checkpoint_log), noted_values(checkpoint_log)) == ([2.0] * 3, [99.0])
+    checkpoint_log.go_to(committed)  # as if the pool died before it committed the new log
+    assert (state_of(checkpoint_log), noted_values(checkpoint_log)) == (
         [1.0] * 3,
         [float(k) for k in range(STEPS)],
     )

@@ -1,4 +1,4 @@
-"""Each feature of a world works with each way to host it, bit for bit, or is refused by name."""
+"""Each feature works on each backend bit for bit, or is refused by name."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ PLACES: dict[str, Keywords] = {
     "worlds on Ray": {"num_envs": 2, "backend": "ray:2"},
     "nodes on Ray": {"zones": 3, "backend": "ray:2"},
 }
-# Settings that are left out in the undivided world of a comparison.
+# The undivided world of a comparison does not have these settings.
 ONLY_DIVIDED = (
     "zones.journal", "zones.check_invariants", "zones.repartition_steps",
     "workers.balance_steps", "workers.monitor_cpu", "zones.simulators",
@@ -115,8 +115,8 @@ REFUSED = {
 }
 
 
-class _Odd:
-    """A network simulator in which stations receive messages of vehicles with odd ids only."""
+class _OddIdsNetwork:
+    """A network simulator that delivers only messages of vehicles with odd ids."""
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         odd = np.flatnonzero(sent.packets["sender"] % 2).tolist()
@@ -127,17 +127,17 @@ class _Odd:
 def _run(vec: CavVectorEnv) -> Run:
     v2x = vec.config.v2x
     if v2x.enabled and v2x.channel.external:
-        vec.worlds.connect_network(_Odd())
+        vec.worlds.connect_network(_OddIdsNetwork())
     return drive(vec, steps=8)
 
 
-def _idle(workers: Mapping[int, Any]) -> LoadSnapshot:
-    """Return an idle machine, since workers on busy machines are refused."""
+def _idle_machine(workers: Mapping[int, Any]) -> LoadSnapshot:
+    """Return the load of an idle machine, because worlds refuse workers on busy machines."""
     return idle_snapshot(len(workers))
 
 
 def check(make: Make, folder: Path, feature: str, place: str) -> None:
-    """Compare worlds with the undivided one bit for bit, or expect the refusal of the table."""
+    """Compare worlds with the undivided world bit for bit; expect an error if `REFUSED` says so."""
     keywords, where = FEATURES[feature](folder), PLACES[place]
     if words := REFUSED.get((feature, place)):
         with pytest.raises(ConfigError, match=words):
@@ -148,18 +148,20 @@ def check(make: Make, folder: Path, feature: str, place: str) -> None:
     alone = {**keywords, "overrides": plain, "num_envs": where.get("num_envs", 1)}
     alone.pop("sensor_workers", None)
     whole = _run(make(**alone))
-    with patch.object(probe, "take_snapshot", _idle):
+    with patch.object(probe, "take_snapshot", _idle_machine):
         vec = make(**keywords, **where)
     assert same(_run(vec), whole)
 
 
 @pytest.mark.parametrize("feature", FEATURES)
-def test_features_in_zones(make: Make, tmp_path: Path, feature: str) -> None:
+def test_each_feature_works_in_zones_or_is_refused(
+    make: Make, tmp_path: Path, feature: str
+) -> None:
     check(make, tmp_path, feature, "zones")
 
 
-def hosted(*elsewhere: str) -> pytest.MarkDecorator:
-    """Return the features as variants; those that other tests compare, too, are slow tests."""
+def each_feature(*elsewhere: str) -> pytest.MarkDecorator:
+    """Parametrize a test with all features; features that another test covers become slow tests."""
     slow = (*elsewhere, *(feature for feature in FEATURES if feature.startswith("SUMO")))
     return pytest.mark.parametrize(
         "feature",
@@ -170,19 +172,24 @@ def hosted(*elsewhere: str) -> pytest.MarkDecorator:
     )
 
 
-# SUMO over workers: `tests/traffic/test_sumo_processes.py`; over nodes: `test_node_parts.py`.
-@hosted()
-def test_features_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+# `tests/traffic/test_sumo_processes.py` tests SUMO over workers, `test_node_parts.py` over nodes.
+@each_feature()
+def test_each_feature_works_over_workers_or_is_refused(
+    make: Make, tmp_path: Path, feature: str
+) -> None:
     check(make, tmp_path, feature, "workers")
 
 
-@hosted()
-def test_features_of_zones_over_workers(make: Make, tmp_path: Path, feature: str) -> None:
+@each_feature()
+def test_each_feature_works_in_zones_over_workers_or_is_refused(
+    make: Make, tmp_path: Path, feature: str
+) -> None:
     check(make, tmp_path, feature, "zones over workers")
 
 
-# While a node dies: `test_node_parts.py`, `test_node_network.py` and `test_node_cuts.py`.
-@hosted(
+# `test_node_parts.py`, `test_node_network.py` and `test_node_cuts.py` test these features while
+# a node dies.
+@each_feature(
     "mounted sensors",
     "messages",
     "a network simulator",
@@ -190,16 +197,20 @@ def test_features_of_zones_over_workers(make: Make, tmp_path: Path, feature: str
     "rerouting",
     "repartitions",
 )
-def test_features_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+def test_each_feature_works_in_zones_over_nodes_or_is_refused(
+    make: Make, tmp_path: Path, feature: str
+) -> None:
     check(make, tmp_path, feature, "nodes")
 
 
-@hosted()
-def test_features_of_whole_worlds_over_nodes(make: Make, tmp_path: Path, feature: str) -> None:
+@each_feature()
+def test_each_feature_works_in_whole_worlds_over_nodes_or_is_refused(
+    make: Make, tmp_path: Path, feature: str
+) -> None:
     check(make, tmp_path, feature, "worlds over nodes")
 
 
-def test_the_page_has_the_same_table() -> None:
+def test_the_page_has_the_table_of_these_tests() -> None:
     rows = [
         (feature, *("refused" if (feature, place) in REFUSED else "yes" for place in PLACES))
         for feature in FEATURES

@@ -1,4 +1,4 @@
-"""Workers that were seen on one core are separated."""
+"""Processes that run on the same core are assigned to different cores."""
 
 from __future__ import annotations
 
@@ -23,7 +23,9 @@ from cavmarl.parallel.processes.process_barrier import usable_cores
         ([0, 1], {0, 1}, [0, 1]),
     ],
 )
-def test_each_process_has_a_core(cores: list[int], usable: set[int], expected: list[int]) -> None:
+def test_each_process_gets_its_own_core_if_there_are_enough(
+    cores: list[int], usable: set[int], expected: list[int]
+) -> None:
     assert homes(cores, usable) == expected
 
 
@@ -38,7 +40,7 @@ def sleepers() -> Iterator[list[int]]:
         process.wait()
 
 
-@pytest.mark.skipif(len(usable_cores()) < 2, reason="one core")
+@pytest.mark.skipif(len(usable_cores()) < 2, reason="this machine has one core")
 def test_processes_on_one_core_are_separated(sleepers: list[int]) -> None:
     usable = usable_cores()
     first, second, *_ = sorted(usable)

@@ -1,4 +1,4 @@
-"""Bad frames with correct checksums: the sender counts as lost, and the run goes on."""
+"""A node that sends an invalid frame with a correct checksum is lost, and the run continues."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ from cavmarl.verify.simulated_nodes import verify_simulated_nodes
 SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 6}
 HUGE = np.full(400, 1 << 40, dtype=np.int64).tobytes()
 GARBAGE = (b"[[[1]]]", b"\xff" * 64, b"[" * 99_999, HUGE)
-# Frames that are sent beside, or in place of, a frame of a kind: from a node to the caller, from
-# the caller to a node, and from a node to another one.
+# Kind of a valid frame → kinds of forged frames that are sent before it or instead of it.
+# The keys are sent from a node to the caller, from the caller to a node, and between nodes.
 FORGED = {
     FrameKind.REPORT: (
         FrameKind.REPORT, FrameKind.SHARE, FrameKind.RESULT, FrameKind.PONG, FrameKind.NOT_MINE,
@@ -42,7 +42,7 @@ FORGED = {
 def forge(
     monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, kind: FrameKind, data: bytes
 ) -> list[bool]:
-    """Send a frame once before a frame of the kind `carrier`, or in its place."""
+    """Send one forged frame before a frame of the kind `carrier`, or instead of that frame."""
     send, forged = Links.send, [False]
     seen = 0
 
@@ -63,10 +63,9 @@ def forge(
 
 @pytest.mark.parametrize("carrier", FORGED)
 @pytest.mark.parametrize("data", GARBAGE, ids=lambda data: f"{data[:4]!r}x{len(data)}")
-def test_a_run_survives_forged_frames(
+def test_a_forged_frame_loses_at_most_its_sender_and_changes_no_result(
     monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, data: bytes
 ) -> None:
-    """The results stay the same, and at most the sender is lost."""
     wrong = []
     for kind in FORGED[carrier]:
         with monkeypatch.context() as patch:
@@ -74,7 +73,7 @@ def test_a_run_survives_forged_frames(
             found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **SMALL)
         (line,) = found.lines
         assert forged[0]
-        # The check reports lost nodes as errors; here, the sender of the forged frame may be lost.
+        # The check reports each lost node as an error. In this test, the sender may be lost.
         others = [text for text in line.wrong if "must be tolerated" not in text]
         if others or line.lost > 1:
             wrong.append((kind, line))
@@ -115,7 +114,7 @@ def test_rows_with_an_index_out_of_range_are_refused(
     "error",
     [ValueError("x"), KeyError(1), IndexError(), TypeError(), ProtocolError("x"), OverflowError()],
 )
-def test_an_error_while_a_frame_is_read_is_the_fault_of_its_sender(error: Exception) -> None:
+def test_an_error_in_reading_a_frame_counts_as_loss_of_its_sender(error: Exception) -> None:
     with pytest.raises(LinkLostError, match="node 7") as lost, reading(7):
         raise error
     assert lost.value.peer == 7

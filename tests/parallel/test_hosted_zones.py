@@ -1,4 +1,4 @@
-"""Zones in other simulators, over worker processes and nodes: no bit changes."""
+"""Zones that other simulators run, over worker processes and nodes: the results stay the same."""
 
 from __future__ import annotations
 
@@ -19,14 +19,14 @@ SEEN: dict[str, Any] = {"agents": 4, "background": 40, "seed": 3}
 BACKENDS = ["processes:1", "processes:2", "nodes:2"]
 
 
-def hosted(
+def make_hosted(
     name: str,
     *zones: int,
     backend: str,
     overrides: Mapping[str, Any] | None = None,
     **keys: Any,
 ) -> cavmarl.CavVectorEnv:
-    """Create worlds of four zones, some of which a simulator runs."""
+    """Create worlds of four zones; the simulator `name` runs some of the zones."""
     return cavmarl.make_vec(
         ENV,
         zones=4,
@@ -38,14 +38,14 @@ def hosted(
 
 
 def changes_to(vec: cavmarl.CavVectorEnv, *zones: int) -> int:
-    """Return how many vehicles nodes have handed over to these zones."""
+    """Return the number of vehicles that were handed over to these zones."""
     return sum(row.target in zones for row in vec.worlds.transfers[0].rows)  # type: ignore[attr-defined]
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_exact_simulators_give_the_undivided_world_although_a_process_dies(backend: str) -> None:
+def test_exact_simulators_give_the_undivided_world_even_if_a_process_dies(backend: str) -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
-    vec = hosted(EXACT, 1, 2, backend=backend, overrides={"zones.check_invariants": True})
+    vec = make_hosted(EXACT, 1, 2, backend=backend, overrides={"zones.check_invariants": True})
     whole.reset(), vec.reset()
     steps_alike(whole, vec, 20)
     os.kill(next(iter(vec.worlds.worker_pids.values())), signal.SIGKILL)
@@ -59,9 +59,9 @@ def test_exact_simulators_give_the_undivided_world_although_a_process_dies(backe
 
 
 @pytest.mark.parametrize("backend", ["local", *BACKENDS])
-def test_simulators_are_filled_from_a_loaded_state(backend: str) -> None:
+def test_simulators_get_their_vehicles_from_a_loaded_state(backend: str) -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
-    vec = hosted(EXACT, 0, 3, backend=backend)
+    vec = make_hosted(EXACT, 0, 3, backend=backend)
     whole.reset(), vec.reset()
     steps_alike(whole, vec, 20)
     saved, of_whole = vec.save_state(), whole.save_state()
@@ -76,11 +76,11 @@ def test_simulators_are_filled_from_a_loaded_state(backend: str) -> None:
     vec.close()
 
 
-def test_several_ticks_per_lease_and_several_worlds_work_over_nodes() -> None:
+def test_simulators_over_nodes_work_with_several_worlds_and_several_ticks_per_lease() -> None:
     settings = {"clock.ctrl_dt_s": 0.2, "zones.max_deferred_ticks": 4}
     whole = cavmarl.make_vec(ENV, num_envs=2, overrides=settings, **SEEN)
     for nodes in (2, 3):
-        vec = hosted(HESITANT, 1, 2, backend=f"nodes:{nodes}", num_envs=2, overrides=settings)
+        vec = make_hosted(HESITANT, 1, 2, backend=f"nodes:{nodes}", num_envs=2, overrides=settings)
         whole.reset(seed=3), vec.reset(seed=3)
         steps_alike(whole, vec, 40)
         vec.close()
@@ -89,7 +89,7 @@ def test_several_ticks_per_lease_and_several_worlds_work_over_nodes() -> None:
 def test_refused_vehicles_enter_later_over_nodes() -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {"zones.check_invariants": True, "zones.max_deferred_ticks": 6}
-    vec = hosted(HESITANT, 1, 2, backend="nodes:2", overrides=settings)
+    vec = make_hosted(HESITANT, 1, 2, backend="nodes:2", overrides=settings)
     whole.reset(), vec.reset()
     steps_alike(whole, vec, 80)
     counts = vec.worlds.transfers[0].counts  # type: ignore[attr-defined]
@@ -103,7 +103,7 @@ def test_refused_vehicles_enter_later_over_nodes() -> None:
 
 @pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
 def test_a_vehicle_that_is_refused_for_too_long_is_an_error(backend: str) -> None:
-    vec = hosted(UNWILLING, 1, 2, backend=backend)
+    vec = make_hosted(UNWILLING, 1, 2, backend=backend)
     vec.reset()
     message = r"zone \d: its simulator has refused vehicle \d+.*the place is occupied"
     with pytest.raises(ZoneSimulatorError, match=message) as caught:
@@ -116,7 +116,7 @@ def test_a_vehicle_that_is_refused_for_too_long_is_an_error(backend: str) -> Non
 def test_cavmarl_takes_a_zone_back_that_refuses_vehicles_for_too_long(backend: str) -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
     settings = {"zones.simulator_failure": "return", "zones.check_invariants": True}
-    vec = hosted(UNWILLING, 1, 2, backend=backend, overrides=settings)
+    vec = make_hosted(UNWILLING, 1, 2, backend=backend, overrides=settings)
     whole.reset(), vec.reset()
     steps_alike(whole, vec, 80)
     vec.close()
@@ -125,7 +125,7 @@ def test_cavmarl_takes_a_zone_back_that_refuses_vehicles_for_too_long(backend: s
 @pytest.mark.parametrize("backend", BACKENDS)
 def test_a_step_whose_simulator_fails_can_be_repeated(backend: str) -> None:
     whole = cavmarl.make_vec(ENV, **SEEN)
-    vec = hosted(FAILING, 1, backend=backend)
+    vec = make_hosted(FAILING, 1, backend=backend)
     whole.reset(), vec.reset()
     before = ""
     message = r"zone 1: its simulator.*cannot run a tick: OSError"
@@ -157,7 +157,7 @@ def test_settings_that_need_one_process_are_refused_by_name(
     keys: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
-        hosted(EXACT, 1, **keys)
+        make_hosted(EXACT, 1, **keys)
 
 
 def test_a_carla_server_runs_one_world_on_each_backend() -> None:

@@ -1,4 +1,4 @@
-"""Worlds with a journal on workers: the same results, and the same journal."""
+"""Worlds with a journal over workers have the results and the journal of one process."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from tests.support.replayed import BUSY
 from tests.support.vec_runs import Make
 
-STEPS = 40  # more than two images of the checkpoint log
+STEPS = 40  # long enough for more than two restarts of the checkpoint log
 
 
 @pytest.fixture(autouse=True)
 def _same_runs(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Give runs predictable names, so that their journals can be compared."""
+    """Give all runs the same random name, so that their journals can be compared."""
     monkeypatch.setattr("secrets.token_bytes", lambda size: bytes(range(size)))
 
 
 def _drive(vec: CavVectorEnv, kills: bool = False) -> list[Any]:
-    """Return the results of a run with a reset without a seed, and a reset of some worlds."""
+    """Return the results of a run that resets the first world in step 6."""
     found: list[Any] = [vec.reset(seed=3)[0].tobytes()]
     struck = itertools.count(1)
     for step in range(STEPS):
@@ -92,7 +92,7 @@ def test_a_journal_is_locked_until_its_world_is_closed(
     Journal(path, resume=True).close()
 
 
-def test_a_successor_resumes_with_repartitioned_zones(make: Make, tmp_path: Path) -> None:
+def test_a_replaced_worker_resumes_with_repartitioned_zones(make: Make, tmp_path: Path) -> None:
     def run(name: str, workers: int, kills: bool = False) -> tuple[list[Any], dict[str, bytes]]:
         folder = tmp_path / name
         folder.mkdir()
@@ -107,7 +107,7 @@ def test_a_successor_resumes_with_repartitioned_zones(make: Make, tmp_path: Path
     assert run("killed", 1, kills=True) == alone
 
 
-def test_worlds_that_move_and_are_repartitioned_are_refused(make: Make) -> None:
+def test_balancing_and_repartitioning_at_once_are_refused_with_a_journal(make: Make) -> None:
     overrides = {
         "zones.journal": "x.jsonl",
         "workers.balance_steps": 5,

@@ -34,7 +34,7 @@ WAIT_S = 0.1
 
 @pytest.mark.parametrize("ticks", range(1, 2 * MOST + 2))
 def test_a_lease_covers_the_ticks_of_a_step(ticks: int) -> None:
-    config = stepped(ticks)
+    config = config_with_ticks(ticks)
     each = lease_ticks(config)
     assert each <= MOST
     assert (leases_of(ticks, each) - 1) * each < ticks <= leases_of(ticks, each) * each
@@ -42,14 +42,14 @@ def test_a_lease_covers_the_ticks_of_a_step(ticks: int) -> None:
     assert late_ticks(config) == each - 1
 
 
-def stepped(ticks: int) -> EnvConfig:
+def config_with_ticks(ticks: int) -> EnvConfig:
     """Return settings with this number of ticks per step."""
     overrides = {"clock.ctrl_dt_s": 0.05 * ticks, "clock.sim_dt_s": 0.05}
     overrides["horizon_s"] = 5.0 * ticks
     return load_config("grid4x4", zones=2, overrides=overrides)[0]
 
 
-def test_zones_see_as_far_as_vehicles_drive_in_a_lease() -> None:
+def test_the_halo_grows_with_the_ticks_of_a_lease() -> None:
     config, base_dir = load_config("grid4x4", zones=2, agents=1)
     world = make_world(config, base_dir)
     halos = [
@@ -61,7 +61,7 @@ def test_zones_see_as_far_as_vehicles_drive_in_a_lease() -> None:
 
 
 class Wires:
-    """Links that keep what is sent, and deliver it at once to the coordinator."""
+    """Links that store each sent frame and deliver it at once to the coordinator."""
 
     def __init__(self) -> None:
         self.reports: list[list[Report]] = []
@@ -84,8 +84,8 @@ class Wires:
         return 0.0
 
 
-def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
-    """Return endpoints of two zones at one node, before the report of a new episode."""
+def make_endpoints() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
+    """Return the endpoints of two zones of one node, before they report a new episode."""
     config, base_dir = load_config("grid4x4", zones=2, agents=1, background=20)
     worlds = LocalWorlds(make_world(config, base_dir), 1)
     worlds.arrays.chosen[:] = True
@@ -104,14 +104,14 @@ def begun() -> tuple[ZoneEndpoints, NodeCoordinator, ZonedShards, Any]:
     return hosts, coordinator, division, wires
 
 
-def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_no_ticks() -> None:
-    hosts, coordinator, division, wires = begun()
+def test_a_new_vehicle_beyond_the_border_is_offered_in_a_lease_of_no_ticks() -> None:
+    hosts, coordinator, division, wires = make_endpoints()
     row = division.owned(0, 0)[0]
     there = division.owned(0, 1)[0]
     row["x"], row["y"] = (
         there["x"],
         there["y"],
-    )  # zone 0 owns it on record, but it is far beyond the border
+    )  # zone 0 owns the vehicle on record, but it is far beyond the border
 
     hosts.report()
     ((report,),) = wires.reports
@@ -125,7 +125,7 @@ def test_a_vehicle_that_crosses_before_it_has_a_record_is_offered_in_a_lease_of_
 
 
 def test_an_offer_before_the_lease_of_its_episode_is_answered_after_the_lease() -> None:
-    hosts, coordinator, division, wires = begun()
+    hosts, coordinator, division, wires = make_endpoints()
     hosts.report()
     table = coordinator.worlds[0].directory.table
     vehicle = int(division.owned(0, 0)[0]["id"])

@@ -1,4 +1,4 @@
-"""A listener admits callers that know the secret, and disconnects all others."""
+"""A listener admits callers that know the secret, and disconnects other callers."""
 
 from __future__ import annotations
 
@@ -15,8 +15,8 @@ from cavmarl.core.errors import MessageError
 from cavmarl.parallel.network.listener import MAGIC, VERSION, Listener, PendingConnection, call
 
 
-class Caller:
-    """The end that listens: accepts one connection, in a thread."""
+class ListeningEnd:
+    """The listening end: accepts one connection in a thread."""
 
     def __init__(self, busy_s: float = 0.0) -> None:
         self.secret = b"of this test"
@@ -58,7 +58,7 @@ def test_a_caller_with_the_secret_is_admitted(
     monkeypatch: pytest.MonkeyPatch, busy_s: float
 ) -> None:
     monkeypatch.setattr(listener_module, "CALL_S", 0.1)
-    caller = Caller(busy_s)
+    caller = ListeningEnd(busy_s)
     wire = call(caller.place, caller.secret, 5)
     number, connection = caller.join()
     assert number == 5
@@ -70,7 +70,7 @@ def test_a_caller_with_the_secret_is_admitted(
 
 
 def test_a_listener_with_another_secret_is_refused() -> None:
-    caller = Caller()
+    caller = ListeningEnd()
     with pytest.raises(MessageError, match="does not know the secret"):
         call(caller.place, b"another", 5)
     assert isinstance(caller.join(), EOFError)
@@ -85,8 +85,8 @@ def test_a_listener_with_another_secret_is_refused() -> None:
         (b"ca", EOFError),
     ],
 )
-def test_strangers_are_refused(said: bytes, error: type[Exception]) -> None:
-    caller = Caller()
+def test_callers_with_invalid_bytes_are_refused(said: bytes, error: type[Exception]) -> None:
+    caller = ListeningEnd()
     stranger = socket.create_connection(caller.place)
     stranger.sendall(said)
     stranger.shutdown(socket.SHUT_WR)
@@ -104,9 +104,9 @@ def test_silent_callers_are_dropped_before_callers_that_have_sent_hello(
     for _ in range(3):
         assert door.admit() == []
     known.settimeout(5.0)
-    assert len(known.recv(48)) == 48, "a random number and a proof"
+    assert len(known.recv(48)) == 48, "the listener does not send its random number and its proof"
     silent.settimeout(5.0)
-    assert silent.recv(1) == b"", "disconnected"
+    assert silent.recv(1) == b"", "the listener does not disconnect the caller"
     for one in (known, third):
         one.setblocking(False)
         with pytest.raises(BlockingIOError):
@@ -116,7 +116,9 @@ def test_silent_callers_are_dropped_before_callers_that_have_sent_hello(
     door.close()
 
 
-def test_each_part_of_the_handshake_has_five_seconds(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_caller_has_five_seconds_for_each_part_of_the_handshake(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     now = SimpleNamespace(s=0.0)
     monkeypatch.setattr(listener_module, "time", SimpleNamespace(monotonic=lambda: now.s))
     door = Listener("127.0.0.1", b"of this test")
@@ -125,23 +127,23 @@ def test_each_part_of_the_handshake_has_five_seconds(monkeypatch: pytest.MonkeyP
     now.s = 4.0
     known.sendall(listener_module.HELLO.pack(MAGIC, VERSION, 0, bytes(16)))
     door.admit()
-    assert len(known.recv(48)) == 48, "a random number and a proof"
+    assert len(known.recv(48)) == 48, "the listener does not send its random number and its proof"
     now.s = 8.0
     door.admit()
-    assert silent.recv(1) == b"", "disconnected"
+    assert silent.recv(1) == b"", "the listener does not disconnect the caller"
     known.setblocking(False)
     with pytest.raises(BlockingIOError):
         known.recv(1)
     now.s = 9.1
     door.admit()
     known.settimeout(5.0)
-    assert known.recv(1) == b"", "disconnected"
+    assert known.recv(1) == b"", "the listener does not disconnect the caller"
     known.close()
     silent.close()
     door.close()
 
 
-def test_no_process_listens() -> None:
+def test_a_call_to_a_closed_listener_is_an_error() -> None:
     door = Listener("127.0.0.1")
     door.close()
     with pytest.raises(OSError, match="refused"):

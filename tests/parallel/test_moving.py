@@ -23,7 +23,7 @@ from cavmarl.parallel.placement.step_placement import StepPlacement
 from cavmarl.parallel.processes.worker_pool import Pool
 from cavmarl.parallel.workers.pooled_worlds import PooledWorlds
 from cavmarl.parallel.worlds.tasks import Task
-from tests.support.pools import strike_soon
+from tests.support.pools import signal_later
 from tests.support.replayed import BUSY
 from tests.support.rerouting import CARS, DEVICE, FLOW, make_map, write_demand
 from tests.support.sumo_worlds import write_stops
@@ -31,42 +31,42 @@ from tests.support.vec_runs import Make, drive, pool_of, same
 
 pytestmark = pytest.mark.filterwarnings("ignore:workers = :RuntimeWarning")
 
-# Small environments come first, and so are part of each run.
+# Small environments come first, because every test run uses the first parameters.
 SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
 RESTLESS = {"workers.balance_steps": 2, "workers.imbalance_tolerance": 0.0, "workers.max_moves": 64}
 
 
 @pytest.fixture
-def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Replace measured costs by random ones; the list gets the number of moves of each round."""
+def moves_per_round(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Replace measured costs by random costs; return the list of the number of moves per round."""
     rng = np.random.default_rng(3)
     moved: list[int] = []
     round_ = StepPlacement.round
 
-    def lie(self: StepPlacement, spent_s: Any, steps: int, pids: Any) -> bool:
+    def round_with_random_costs(self: StepPlacement, spent_s: Any, steps: int, pids: Any) -> bool:
         wrong = self._before_s + rng.exponential(1.0, spent_s.shape) ** 3
         result = round_(self, wrong, steps, pids)
         moved.append(sum(len(plan.moves) for plan in self.plans))
         return result
 
-    monkeypatch.setattr(StepPlacement, "round", lie)
+    monkeypatch.setattr(StepPlacement, "round", round_with_random_costs)
     return moved
 
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
-def test_worlds_that_move_are_the_same(
-    make: Make, uneven: list[int], number: int, env: str
+def test_moving_worlds_changes_no_result(
+    make: Make, moves_per_round: list[int], number: int, env: str
 ) -> None:
-    """Numbers of zones and workers change from entry to entry."""
+    """The numbers of zones and workers depend on the number of the environment."""
     wanted = {"num_envs": 6, "max_cycles": 8, "zones": (1, 4)[number % 2]}
     whole = drive(make(env, **wanted))
     vec = make(env, workers=(2, 2, 3, 3)[number % 4], overrides=RESTLESS, **wanted)
     assert same(drive(vec), whole)
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
 def test_worlds_keep_their_journals(
-    make: Make, uneven: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    make: Make, moves_per_round: list[int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("secrets.token_bytes", lambda size: bytes(range(size)))
 
@@ -89,24 +89,26 @@ def test_worlds_keep_their_journals(
     whole = run("alone", 0)
     assert run("moving", 2) == whole
     assert run("killed", 2, kills=True) == whole
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
 STACKED = {"sensors.stack": 3, "population.mode": "respawn", "action.kind": "discrete"}
 
 
 @pytest.mark.parametrize("more", [{"autoreset_mode": "NextStep"}, {"overrides": STACKED}])
-def test_worlds_that_move_are_the_same_with_other_settings(
-    make: Make, uneven: list[int], more: dict[str, Any]
+def test_moving_worlds_with_other_settings_changes_no_result(
+    make: Make, moves_per_round: list[int], more: dict[str, Any]
 ) -> None:
     wanted = {"num_envs": 5, "agents": 3, "background": 10, "max_cycles": 5, **more}
     whole = drive(make("merge", **wanted), steps=20)
     wanted["overrides"] = {**wanted.get("overrides", {}), **RESTLESS}
     assert same(drive(make("merge", workers=3, **wanted), steps=20), whole)
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
-def test_rerouted_vehicles_keep_their_routes(make: Make, uneven: list[int], tmp_path: Path) -> None:
+def test_rerouted_vehicles_keep_their_routes(
+    make: Make, moves_per_round: list[int], tmp_path: Path
+) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -122,13 +124,13 @@ def test_rerouted_vehicles_keep_their_routes(make: Make, uneven: list[int], tmp_
     before = drive(whole, steps=400)
     assert whole.traffic_stats()["rerouted"] > 0
     assert same(drive(make(net, workers=2, **wanted), steps=400), before)
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
 def test_worlds_with_sumo_demand_keep_their_routes(
-    make: Make, uneven: list[int], tmp_path: Path
+    make: Make, moves_per_round: list[int], tmp_path: Path
 ) -> None:
-    """Vehicles drive or wait; each worker stores routes and stops at other indices."""
+    """Each worker stores the routes and stops of the demand at its own indices."""
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     overrides: dict[str, Any] = {
         "traffic.source": "sumo-demand",
@@ -141,10 +143,10 @@ def test_worlds_with_sumo_demand_keep_their_routes(
     whole = drive(make("merge", overrides=overrides, **wanted), steps=40)
     vec = make("merge", workers=2, overrides=overrides | RESTLESS, **wanted)
     assert same(drive(vec, steps=40), whole)
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
-def test_chosen_worlds_are_reset_in_any_worker(make: Make, uneven: list[int]) -> None:
+def test_some_worlds_are_reset_in_any_worker(make: Make, moves_per_round: list[int]) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for workers in (0, 2):
@@ -154,13 +156,17 @@ def test_chosen_worlds_are_reset_in_any_worker(make: Make, uneven: list[int]) ->
         vec.step(vec.suggest_actions())
         found.append([observations, infos["mask"], *(vec.state_hash(w) for w in range(5))])
     assert same(*found)
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
 @pytest.mark.parametrize("split", [False, True])
 def test_workers_that_die_during_a_move_change_no_result(
-    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch, how: signal.Signals, split: bool
+    make: Make,
+    moves_per_round: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+    how: signal.Signals,
+    split: bool,
 ) -> None:
     wanted = {"num_envs": 1 if split else 5, "agents": 5, "background": 30, "max_cycles": 9}
     whole = drive(make("grid4x4", **wanted), steps=40)
@@ -168,38 +174,38 @@ def test_workers_that_die_during_a_move_change_no_result(
     rng = random.Random(2)
     run, timers = Pool.run, []
 
-    def strike(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
+    def run_and_signal(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task in (Task.PACK, Task.UNPACK, Task.HOST) and len(timers) < 8:
             pid = self.pids[rng.randrange(2)]
-            timers.append(strike_soon(pid, rng.uniform(0.0, 0.003), how))
+            timers.append(signal_later(pid, rng.uniform(0.0, 0.003), how))
         return run(self, task, payload, commits)
 
-    monkeypatch.setattr(Pool, "run", strike)
+    monkeypatch.setattr(Pool, "run", run_and_signal)
     assert same(drive(vec, steps=40, before=lambda _: [t.join() for t in timers]), whole)
     assert len(pool_of(vec).deaths) > 3
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
 @pytest.mark.parametrize("split", [False, True])
-def test_a_worker_that_dies_later_resumes_with_its_present_worlds(
-    make: Make, uneven: list[int], split: bool
+def test_a_worker_that_dies_after_moves_resumes_with_its_present_worlds(
+    make: Make, moves_per_round: list[int], split: bool
 ) -> None:
     wanted = {"num_envs": 1 if split else 5, "agents": 3, "background": 20, "max_cycles": 30}
     whole = drive(make("grid4x4", **wanted), steps=45)
     vec = make("grid4x4", zones=4, workers=2, overrides=RESTLESS, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step % 9 == 8:
             os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL)
         if step == 30:
             os.kill(pool_of(vec).server_pid, signal.SIGKILL)
 
-    assert same(drive(vec, steps=45, before=strike), whole)
-    assert sum(uneven) > 0
+    assert same(drive(vec, steps=45, before=kill_in_step), whole)
+    assert sum(moves_per_round) > 0
 
 
 def test_a_failed_move_changes_nothing(
-    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
+    make: Make, moves_per_round: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = {"num_envs": 5, "agents": 3}
     whole = drive(make("ring", **wanted))
@@ -209,14 +215,14 @@ def test_a_failed_move_changes_nothing(
     def interrupt(self: Pool, task: int, payload: Any = None, commits: bool = True) -> Any:
         if task == Task.UNPACK and not failed:
             failed.append(task)
-            self._open = self._all  # as if the interrupt came during the move
+            self._open = self._all  # as if the interrupt came while the world moves
             raise KeyboardInterrupt
         return run(self, task, payload, commits)
 
     monkeypatch.setattr(Pool, "run", interrupt)
     step = type(vec).step
 
-    def again(self: Any, actions: Any) -> Any:
+    def step_again(self: Any, actions: Any) -> Any:
         before = self.worlds.plans
         try:
             return step(self, actions)
@@ -224,14 +230,14 @@ def test_a_failed_move_changes_nothing(
             assert self.worlds.plans == before
             return step(self, actions)
 
-    monkeypatch.setattr(type(vec), "step", again)
+    monkeypatch.setattr(type(vec), "step", step_again)
     assert same(drive(vec), whole)
     assert failed
-    assert sum(uneven) > 0
+    assert sum(moves_per_round) > 0
 
 
-def test_worlds_move_by_their_costs(make: Make) -> None:
-    """Half of the worlds are crowded, so their worker gives some away."""
+def test_worlds_are_assigned_by_their_measured_costs(make: Make) -> None:
+    """Measured costs replace the number of worlds as the cost of a plan."""
     overrides = {"workers.balance_steps": 10, "workers.imbalance_tolerance": 0.05}
     vec = make("merge", num_envs=8, agents=1, background=60, workers=2, overrides=overrides)
     assert isinstance(vec.worlds, PooledWorlds)
@@ -280,11 +286,13 @@ def test_workers_on_busy_machines_are_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("env", ["grid4x4", "merge", "town"])
-def test_zones_that_move_are_the_same(make: Make, uneven: list[int], env: str) -> None:
+def test_moving_zones_to_other_workers_changes_no_result(
+    make: Make, moves_per_round: list[int], env: str
+) -> None:
     wanted = {"agents": 8, "background": 30, "max_cycles": 8}
     whole = drive(make(env, **wanted))
     for zones, workers in ((4, 2), (9, 3)):
-        uneven.clear()
+        moves_per_round.clear()
         vec = make(env, zones=zones, workers=workers, overrides=RESTLESS, **wanted)
         assert same(drive(vec), whole), (zones, workers)
-        assert sum(uneven) > 0
+        assert sum(moves_per_round) > 0

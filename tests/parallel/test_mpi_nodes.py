@@ -1,4 +1,4 @@
-"""Worlds over the ranks of an MPI run: equal results, and the end when a rank is lost."""
+"""Worlds over the ranks of an MPI run have equal results; a lost rank ends the run."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ print("equal:", same(found, drive(whole)), flush=True)
 
 
 def mpirun(*words: str) -> subprocess.CompletedProcess[str]:
-    """Return the output of an MPI run, which ends in time and leaves no shared memory behind."""
+    """Run a program with MPI and return its output; check that no shared memory remains."""
     before = set(Path("/dev/shm").glob("mpich*"))
     done = subprocess.run(
         [str(MPIRUN), *words],
@@ -71,14 +71,14 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> str:
     return str(path)
 
 
-def test_the_ranks_of_a_run_are_the_nodes(program: str) -> None:
+def test_separate_mpi_ranks_are_the_nodes_of_a_program(program: str) -> None:
     done = mpirun("-n", "1", sys.executable, program, ":", "-n", "2", *NODE)
     assert done.returncode == 0, done.stdout
     assert "equal: True" in done.stdout
     assert done.stdout.count("the caller has ended") == 2
 
 
-def test_rank_0_of_nodes_runs_a_program(program: str) -> None:
+def test_rank_0_runs_the_program_and_other_ranks_are_nodes(program: str) -> None:
     done = mpirun("-n", "3", *NODE, program)
     assert done.returncode == 0, done.stdout
     assert "equal: True" in done.stdout
@@ -86,7 +86,7 @@ def test_rank_0_of_nodes_runs_a_program(program: str) -> None:
 
 @pytest.mark.parametrize("loss", ["lost", "killed"])
 def test_a_lost_rank_ends_the_run(program: str, loss: str) -> None:
-    """The run ends with a typed error, or by MPI itself; no process waits for ever."""
+    """A typed error or MPI itself ends the run, so that no process waits forever."""
     done = mpirun("-n", "3", *NODE, program, loss)
     assert done.returncode != 0, done.stdout
     assert "equal" not in done.stdout
@@ -101,7 +101,7 @@ def test_a_run_without_a_caller_ends() -> None:
 
 
 def test_more_nodes_than_ranks_are_refused(program: str) -> None:
-    """Rank 0 ends before it listens, and the other ranks end with it."""
+    """Rank 0 ends before it listens, and the other ranks end, too."""
     done = mpirun("-n", "2", *NODE, program)
     assert done.returncode != 0
     assert "there are 1 other ranks" in done.stdout

@@ -1,4 +1,4 @@
-"""Worlds over workers run inside the daemonic workers of other libraries."""
+"""Worlds with worker processes run inside the daemonic workers of other libraries."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl import make_vec
 
 
 class WithWorkers(gymnasium.Env[Any, Any]):
-    """A single-agent environment that steps worlds over a worker of its own."""
+    """A single-agent environment that steps worlds in its own worker process."""
 
     def __init__(self) -> None:
         self._vec = make_vec("ring", num_envs=1, workers=1, agents=1, background=2)
@@ -34,7 +34,7 @@ class WithWorkers(gymnasium.Env[Any, Any]):
 ACTIONS = np.zeros((2, 2), dtype=np.float32)
 
 
-def test_worlds_over_workers_run_in_workers_of_gymnasium() -> None:
+def test_worlds_with_workers_run_in_workers_of_gymnasium() -> None:
     vec = gymnasium.vector.AsyncVectorEnv([WithWorkers] * 2, context="spawn")
     observations, _ = vec.reset(seed=[1, 1])
     assert np.array_equal(observations[0], observations[1])
@@ -43,7 +43,7 @@ def test_worlds_over_workers_run_in_workers_of_gymnasium() -> None:
     assert not np.array_equal(moved, observations)
 
 
-def test_worlds_over_workers_run_in_workers_of_stable_baselines3() -> None:
+def test_worlds_with_workers_run_in_workers_of_stable_baselines3() -> None:
     pytest.importorskip("stable_baselines3")
     from stable_baselines3.common.vec_env import SubprocVecEnv
 

@@ -1,4 +1,4 @@
-"""Repartitioned worlds over nodes equal undivided worlds, whichever node is lost."""
+"""Repartitioned worlds over nodes equal undivided worlds, even if nodes are lost."""
 
 from __future__ import annotations
 
@@ -57,8 +57,8 @@ def test_repartitioning_changes_no_result(
     assert worlds.pool.recoveries == 0
 
 
-@pytest.mark.slow  # `test_node_parts.py` lets vehicles reroute over nodes in each run
-def test_rerouting_vehicles_keep_their_places(make: Make, tmp_path: Path) -> None:
+@pytest.mark.slow  # `test_node_parts.py` tests rerouting over nodes in every test run
+def test_repartitioning_does_not_change_rerouted_vehicles(make: Make, tmp_path: Path) -> None:
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     named = {
         "traffic.demand": [str(path) for path in files],
@@ -75,21 +75,21 @@ def test_rerouting_vehicles_keep_their_places(make: Make, tmp_path: Path) -> Non
 def test_nodes_that_are_lost_around_a_repartitioning_change_no_result(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """All nodes return to the zones of the kept state, and repartition again."""
+    """After each loss, all nodes return to the zones of the kept state and repartition again."""
     monkeypatch.setattr(
         "cavmarl.parallel.nodes.node_pool.KEEP_S", 1e6
-    )  # keep a state only at the start
+    )  # nodes keep a state only at the start
     wanted = {**WANTED, "max_cycles": 40}
     whole = drive(make("grid4x4", **wanted), steps=24)
     vec = make("grid4x4", zones=4, nodes=4, overrides=OFTEN, **wanted)
     worlds = over_nodes(vec)
     first = worlds.pool.zones
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (5, 7, 18):
             os.kill(worlds.pool.pids[step % len(worlds.pool.pids)], signal.SIGKILL)
 
-    assert same(drive(vec, steps=24, before=strike), whole)
+    assert same(drive(vec, steps=24, before=kill_in_step), whole)
     assert (worlds.pool.losses, worlds.pool.recoveries > 2) == (3, True)
     assert len(worlds.repartitions) > 1
     assert worlds.pool.zones != first or worlds.pool.replacements
@@ -132,11 +132,13 @@ def test_repartitioning_starts_an_episode_in_the_journal(make: Make, tmp_path: P
     vec.close()
     episodes = [record.episode for record in JournalReader(path) if isinstance(record, Reset)]
     assert episodes == sorted(set(episodes))
-    assert len(episodes) == cuts + 2  # one more before the first reset, and one at the reset
+    assert len(episodes) == cuts + 2  # two more episodes: before the first reset, and at the reset
     assert cuts > 1
 
 
-def test_frames_show_the_present_zones(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_rendered_frames_show_the_present_zones(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     vec = make("grid4x4", zones=4, nodes=2, overrides=OFTEN, render_mode="rgb_array", **WANTED)
     drive(vec, steps=8)
     before, now = vec.worlds.world.partition, over_nodes(vec).partition
@@ -153,7 +155,7 @@ def test_frames_show_the_present_zones(make: Make, monkeypatch: pytest.MonkeyPat
     assert set(drawn) == {now.content_hash} != {before.content_hash}
 
 
-def test_zones_are_sent_exactly(make: Make) -> None:
+def test_zones_and_neighbours_are_sent_without_changes(make: Make) -> None:
     vec = make("grid4x4", agents=1, background=0)
     partition = cut_map(vec.simulation.network, "bisection", 7)
     assert read_zones(zones_as_json(partition)).content_hash == partition.content_hash
@@ -161,16 +163,16 @@ def test_zones_are_sent_exactly(make: Make) -> None:
 
 
 @pytest.mark.parametrize("mix", ["kill", "kill_in_recovery"])
-def test_simulated_nodes_fail_during_repartitioning(
+def test_failures_of_simulated_nodes_during_repartitioning_change_no_result(
     monkeypatch: pytest.MonkeyPatch, mix: str
 ) -> None:
     cuts, ran = [0], node_process.cut_worlds
 
-    def counted(*told: Any) -> None:
+    def count_and_cut(*told: Any) -> None:
         cuts[0] += 1
         ran(*told)
 
-    monkeypatch.setattr(node_process, "cut_worlds", counted)
+    monkeypatch.setattr(node_process, "cut_worlds", count_and_cut)
     found = verify_simulated_nodes(
         "merge", [3], mixes=[mix], seeds=6, agents=3, background=20, zones=3, steps=10,
         overrides={"zones.repartition_steps": 2, "zones.repartition_tolerance": 0.0},

@@ -1,4 +1,4 @@
-"""Whole worlds over nodes have the results of one process, also when nodes are killed."""
+"""Whole worlds over nodes have the results of one process, even if nodes are killed."""
 
 from __future__ import annotations
 
@@ -34,13 +34,13 @@ def pids_of(vec: CavVectorEnv) -> list[int]:
 
 
 def kill(vec: CavVectorEnv, at: dict[int, list[int]]) -> Callable[[int], None]:
-    """Kill the nodes of some groups before some steps."""
+    """Return a function that kills the node of each group in `at[step]`."""
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         for group in at.get(step, ()):
             os.kill(groups_of(vec)[group].pool.pids[0], signal.SIGKILL)
 
-    return strike
+    return kill_in_step
 
 
 @pytest.mark.parametrize(
@@ -109,17 +109,17 @@ def test_repeatedly_killed_nodes_end_the_run(make: Make) -> None:
     pool = groups_of(vec)[0].pool
     tell = pool.send_zones
 
-    def strike_and_tell(*told: Any, **more: Any) -> None:
+    def send_and_kill(*told: Any, **more: Any) -> None:
         tell(*told, **more)
         os.kill(pool.pids[0], signal.SIGKILL)
 
-    pool.send_zones = strike_and_tell  # type: ignore[method-assign]
+    pool.send_zones = send_and_kill  # type: ignore[method-assign]
     os.kill(pool.pids[0], signal.SIGKILL)
     with pytest.raises(WorkerDeathError, match=r"zones 0"):
         drive(vec, steps=2)
 
 
-def test_a_step_that_fails_for_one_node_is_undone_by_all(
+def test_all_nodes_undo_a_step_that_fails_for_one_node(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     vecs = [make(**WANTED), make(backend="nodes:3", **WANTED)]
@@ -197,8 +197,8 @@ RESTLESS = {"workers.balance_steps": 3, "workers.imbalance_tolerance": 0.0}
 
 
 @pytest.fixture
-def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
-    """Let worlds have other costs in each round of balancing."""
+def changing_costs(monkeypatch: pytest.MonkeyPatch) -> list[int]:
+    """Make another world the most expensive one in each round of balancing."""
     spent, rounds = StepPlacement.round, list[int]()
 
     def turn(self: StepPlacement, spent_s: Any, steps: int, seen: LoadSnapshot) -> bool:
@@ -220,8 +220,8 @@ def uneven(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         ({"env": "town", "num_envs": 4, "overrides": {"sensors.stack": 3}}, {6: [1]}),
     ],
 )
-def test_worlds_that_move_are_the_same(
-    make: Make, uneven: list[int], arguments: dict[str, Any], at: dict[int, list[int]]
+def test_moving_worlds_changes_no_result(
+    make: Make, changing_costs: list[int], arguments: dict[str, Any], at: dict[int, list[int]]
 ) -> None:
     wanted = WANTED | arguments
     whole = drive(make(**wanted | {"zones": 1}), steps=20)
@@ -235,7 +235,7 @@ def test_worlds_that_move_are_the_same(
 
 
 def test_an_interrupted_move_is_undone(
-    make: Make, uneven: list[int], monkeypatch: pytest.MonkeyPatch
+    make: Make, changing_costs: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = WANTED | {"num_envs": 6}
     whole = make(**wanted)

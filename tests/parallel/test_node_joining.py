@@ -1,4 +1,4 @@
-"""Nodes that join a run from anywhere: which are accepted, and what they send."""
+"""Nodes that join a run from any machine: which nodes are accepted, and which bytes they send."""
 
 from __future__ import annotations
 
@@ -35,14 +35,14 @@ from cavmarl.parallel.nodes.node_files import WorldFile
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.node_starters import read_key
 from cavmarl.parallel.nodes.zone_moves import moves_of
-from tests.parallel.test_moving import RESTLESS, uneven
+from tests.parallel.test_moving import RESTLESS, moves_per_round
 from tests.parallel.test_nodes import over_nodes
 from tests.support.actuated import actuated_grid
 from tests.support.local_actors import FORKS, LocalActors
 from tests.support.vec_runs import Make, drive, same
 from tests.support.wires import Proxy, free_port, own_address
 
-__all__ = ["uneven"]
+__all__ = ["moves_per_round"]
 
 WANTED: dict[str, Any] = {"agents": 6, "background": 40, "max_cycles": 20}
 KEY = secrets.token_hex(32)
@@ -50,7 +50,7 @@ WAIT_S = 60.0
 
 
 def join(place: tuple[str, int], key: bytes, keeps_files: bool = False) -> None:
-    """Run a node, which may have no access to the files of the caller."""
+    """Run a node; with `keeps_files`, the node cannot read the files of the caller."""
     if keeps_files:
         found = WorldFile.found
 
@@ -67,7 +67,7 @@ def join(place: tuple[str, int], key: bytes, keeps_files: bool = False) -> None:
 
 
 class Crowd:
-    """Nodes that were started by hand."""
+    """Nodes that the test starts itself, like a user on another machine."""
 
     def __init__(self) -> None:
         self.processes: list[Any] = []
@@ -101,34 +101,34 @@ def key_file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture(scope="module")
-def whole() -> Any:
+def undivided_run() -> Any:
     with closing(make_vec("grid4x4", **WANTED)) as vec:
         return drive(vec, steps=20)
 
 
-def keyed(key_file: Path, **more: Any) -> dict[str, Any]:
+def key_settings(key_file: Path, **more: Any) -> dict[str, Any]:
     return {"overrides": {"workers.key_file": str(key_file), **more}}
 
 
-def elsewhere() -> str:
+def outside_address() -> str:
     address = own_address()
     if address is None:
-        pytest.skip("this machine has no address but its own")
+        pytest.skip("this machine has only its loopback address")
     return address
 
 
 @pytest.mark.parametrize("is_elsewhere", [False, True])
 def test_frames_between_machines_are_encrypted(
-    make: Make, crowd: Crowd, key_file: Path, whole: Any, is_elsewhere: bool
+    make: Make, crowd: Crowd, key_file: Path, undivided_run: Any, is_elsewhere: bool
 ) -> None:
-    """Frames to other machines are encrypted, and a damaged frame loses its node."""
-    address = elsewhere() if is_elsewhere else "127.0.0.1"
+    """A damaged frame loses its sender, and a replayed handshake is refused."""
+    address = outside_address() if is_elsewhere else "127.0.0.1"
     place = (address, free_port(address))
     wire = Proxy(place)
     crowd.call(place)
     crowd.call(wire.place, keeps_files=True)
     backend = "nodes:2@{}:{}".format(*place)
-    vec = make("grid4x4", zones=4, backend=backend, **keyed(key_file), **WANTED)
+    vec = make("grid4x4", zones=4, backend=backend, **key_settings(key_file), **WANTED)
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"grid4x4" in said) == (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
@@ -137,13 +137,13 @@ def test_frames_between_machines_are_encrypted(
         if step == 12:
             wire.spoiler = bytes(100)
 
-    assert same(drive(vec, steps=20, before=spoil), whole)
+    assert same(drive(vec, steps=20, before=spoil), undivided_run)
     assert over_nodes(vec).pool.losses == 1
     said = bytes(wire.said) + b"".join(wire.heard)
     assert (b"cavN" in said) == (not is_elsewhere)
     assert KEY.encode() not in said
     joining_nodes = over_nodes(vec).pool.joining_nodes
-    for heard in wire.heard:  # a replayed handshake is refused
+    for heard in wire.heard:  # replay each handshake
         with socket.create_connection(place) as stranger, suppress(OSError):
             stranger.sendall(heard)
             for _ in range(3):
@@ -161,7 +161,11 @@ def test_a_node_that_joins_later_replaces_a_lost_one(
     crowd.call(place, 2)
     one = make("grid4x4", **WANTED)
     vec = make(
-        "grid4x4", zones=4, backend="nodes:2@{}:{}".format(*place), **keyed(key_file), **WANTED
+        "grid4x4",
+        zones=4,
+        backend="nodes:2@{}:{}".format(*place),
+        **key_settings(key_file),
+        **WANTED,
     )
     worlds = over_nodes(vec)
     for each in (one, vec):
@@ -171,14 +175,14 @@ def test_a_node_that_joins_later_replaces_a_lost_one(
     lost = step_alike(one, vec, lambda: bool(worlds.pool.replacements))
     assert (worlds.pool.losses, worlds.pool.recoveries, worlds.pool.replacements) == (1, 1, 1)
     assert worlds.pool.zones == [[0, 1], [2, 3]]
-    os.kill(worlds.pool.pids[1], signal.SIGKILL)  # the new node takes over all zones
+    os.kill(worlds.pool.pids[1], signal.SIGKILL)  # the node that remains takes over all zones
     step_alike(one, vec, lambda: worlds.pool.zones[1] == [])
     assert worlds.pool.zones == [[0, 1, 2, 3], []]
     assert lost > 1
 
 
 def step_alike(one: CavVectorEnv, vec: CavVectorEnv, is_done: Callable[[], bool]) -> int:
-    """Step both environments until a condition holds, and a little further."""
+    """Step both environments until `is_done()` and four steps more; return the number of steps."""
     until_s, steps, more = time.monotonic() + WAIT_S, 0, 5
     while more:
         assert time.monotonic() < until_s
@@ -192,7 +196,7 @@ def step_alike(one: CavVectorEnv, vec: CavVectorEnv, is_done: Callable[[], bool]
     return steps
 
 
-def test_a_node_of_this_machine_is_restarted(make: Make) -> None:
+def test_a_lost_node_of_this_machine_is_restarted(make: Make) -> None:
     one, vec = (make("grid4x4", **WANTED, **more) for more in ({}, {"zones": 4, "nodes": 2}))
     worlds = over_nodes(vec)
     for each in (one, vec):
@@ -204,24 +208,26 @@ def test_a_node_of_this_machine_is_restarted(make: Make) -> None:
 
 @pytest.mark.parametrize("is_lost", [False, True])
 def test_zones_that_move_to_another_node_change_no_result(
-    make: Make, uneven: list[int], is_lost: bool
+    make: Make, moves_per_round: list[int], is_lost: bool
 ) -> None:
     wanted = {"agents": 8, "background": 30, "max_cycles": 8}
-    whole = drive(make("town", **wanted), steps=20)
+    undivided_run = drive(make("town", **wanted), steps=20)
     vec = make("town", zones=4, nodes=3, overrides=RESTLESS, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if is_lost and step == 9:
             os.kill(over_nodes(vec).pool.pids[1], signal.SIGKILL)
 
-    assert same(drive(vec, steps=20, before=strike), whole)
+    assert same(drive(vec, steps=20, before=kill_in_step), undivided_run)
     mover = over_nodes(vec).mover
     assert mover is not None
-    assert mover.moves == sum(uneven) > 0
-    assert over_nodes(vec).pool.generation == sum(moves > 0 for moves in uneven) + is_lost
+    assert mover.moves == sum(moves_per_round) > 0
+    assert over_nodes(vec).pool.generation == sum(moves > 0 for moves in moves_per_round) + is_lost
 
 
-def test_actors_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_actors_of_ray_serve_as_nodes_and_are_replaced(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(node_starters, "RayActors", LocalActors)
     one = make("grid4x4", **WANTED)
     vec = make("grid4x4", zones=4, backend="ray:2", **WANTED)
@@ -233,10 +239,10 @@ def test_actors_of_ray_are_nodes(make: Make, monkeypatch: pytest.MonkeyPatch) ->
     assert worlds.pool.zones == [[0, 1], [2, 3]]
 
 
-def test_a_node_that_two_others_cannot_reach_is_lost(
-    make: Make, monkeypatch: pytest.MonkeyPatch, whole: Any
+def test_a_node_that_two_other_nodes_cannot_reach_is_lost(
+    make: Make, monkeypatch: pytest.MonkeyPatch, undivided_run: Any
 ) -> None:
-    """The node counts as lost although its process lives."""
+    """Cut the connections of a node while its process runs."""
     wires: list[Proxy] = []
     take = JoiningNodes.take
 
@@ -254,13 +260,13 @@ def test_a_node_that_two_others_cannot_reach_is_lost(
         if step == 9:
             max(wires, key=lambda wire: len(wire.heard)).cut()
 
-    assert same(drive(vec, steps=20, before=cut), whole)
+    assert same(drive(vec, steps=20, before=cut), undivided_run)
     assert over_nodes(vec).pool.losses == 1
     for wire in wires:
         wire.close()
 
 
-def test_many_strangers_do_not_disturb_a_run(make: Make, whole: Any) -> None:
+def test_many_unknown_callers_do_not_disturb_a_run(make: Make, undivided_run: Any) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     worlds = over_nodes(vec)
     address, port = worlds.pool.joining_nodes.place.split(":")
@@ -273,7 +279,7 @@ def test_many_strangers_do_not_disturb_a_run(make: Make, whole: Any) -> None:
             if n % 2:
                 strangers[-1].sendall(secrets.token_bytes(100))
 
-    assert same(drive(vec, steps=20, before=call_often), whole)
+    assert same(drive(vec, steps=20, before=call_often), undivided_run)
     assert worlds.pool.losses == 0
     assert psutil.Process().num_fds() <= before + len(strangers) + MAX_CALLERS
     for stranger in strangers:
@@ -284,9 +290,9 @@ def test_many_strangers_do_not_disturb_a_run(make: Make, whole: Any) -> None:
     assert not any(map(psutil.pid_exists, pids))
 
 
-def test_a_caller_waits_up_to_a_limit(key_file: Path) -> None:
+def test_a_caller_waits_for_nodes_up_to_a_limit(key_file: Path) -> None:
     port = free_port("127.0.0.1")
-    limited = keyed(key_file, **{"workers.join_timeout_s": 1.0})
+    limited = key_settings(key_file, **{"workers.join_timeout_s": 1.0})
     with closing(Listener("127.0.0.1", b"", port)):
         with pytest.raises(WorkerError, match=f"cannot listen on 127.0.0.1:{port}"):
             make_vec("grid4x4", zones=2, backend=f"nodes:2@127.0.0.1:{port}", **limited)
@@ -335,7 +341,9 @@ def test_a_node_can_be_started_from_the_command_line(
     process = subprocess.Popen(
         [sys.executable, "-m", "cavmarl", *words], stdout=subprocess.PIPE, text=True
     )
-    vec = make(net, zones=2, backend=f"nodes:1@127.0.0.1:{port}", **keyed(key_file), agents=2)
+    vec = make(
+        net, zones=2, backend=f"nodes:1@127.0.0.1:{port}", **key_settings(key_file), agents=2
+    )
     vec.reset(seed=1)
     vec.close()
     said, _ = process.communicate(timeout=WAIT_S)
@@ -354,5 +362,5 @@ def test_zones_are_assigned_to_living_nodes_after_losses_and_joins() -> None:
     with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4") as caught:
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
     assert "make the environment again" in str(caught.value)
-    assert "SIGKILL" not in str(caught.value)  # no record says that a process was killed
+    assert "SIGKILL" not in str(caught.value)  # nothing shows that a process was killed
     assert json.dumps(again)  # nodes get the moves as JSON

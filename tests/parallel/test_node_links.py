@@ -1,4 +1,4 @@
-"""Frames between nodes: their bytes, bad frames, and frames that a node may not send."""
+"""Frames between nodes: their bytes, invalid frames, and frames that a node must not send."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ def frame(kind: FrameKind, data: bytes | memoryview) -> bytes:
 
 
 def head(kind: int, size: int) -> bytes:
-    """Return the head of a first frame."""
+    """Return the head of the first frame on a connection."""
     found = b"cavN\x07\x00" + kind.to_bytes(2, "little") + bytes(8) + size.to_bytes(8, "little")
     found += bytes(8)
     return found + xxh3_64_intdigest(found, 1).to_bytes(8, "little")
@@ -79,8 +79,7 @@ def test_a_bad_frame_ends_the_connection(said: bytes, words: str) -> None:
         _ = [links.receive([0], WAIT_S) for _ in range(3)]
 
 
-def test_a_node_may_send_for_its_own_zones_only() -> None:
-    """A node that sends a message about a zone of another node is disconnected."""
+def test_a_node_that_sends_for_a_zone_of_another_node_is_disconnected() -> None:
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0, 2)), frozenset((1,)))))
@@ -105,8 +104,8 @@ def test_a_node_may_send_for_its_own_zones_only() -> None:
 
 
 @pytest.mark.parametrize(("size", "bits"), [(3, None), (9999, 99)])
-def test_each_changed_bit_of_a_frame_is_noticed(size: int, bits: int | None) -> None:
-    """No changed bit makes another frame, or lets the receiver wait for more bytes."""
+def test_a_frame_with_any_changed_bit_ends_the_connection(size: int, bits: int | None) -> None:
+    """Check also that the receiver does not wait for more bytes."""
     drawn = np.random.default_rng(size)
     sent = frame(FrameKind.SYNC, drawn.bytes(size))
     every = 8 * len(sent)
@@ -126,7 +125,7 @@ def test_an_array_of_words_is_sent_as_its_bytes() -> None:
 
 
 @pytest.mark.parametrize("is_encrypted", [False, True])
-def test_bytes_that_the_system_does_not_accept_are_sent_later(is_encrypted: bool) -> None:
+def test_bytes_that_the_socket_does_not_accept_at_once_are_sent_later(is_encrypted: bool) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
         ends = socket.create_connection(server.getsockname()), server.accept()[0]
     if is_encrypted:
@@ -144,7 +143,7 @@ def test_bytes_that_the_system_does_not_accept_are_sent_later(is_encrypted: bool
         near.send(0, FrameKind.SYNC, 2, [b"small"])
     alone = parts[0, :-1].copy()
     near.send(0, FrameKind.SHARE, 3, [alone.data])
-    alone[:] = 0  # the sender reuses its memory
+    alone[:] = 0  # the sender reuses its memory before the bytes are sent
     with ThreadPoolExecutor() as pool:
         flushed = pool.submit(near.flush)
         for part in parts:
@@ -180,7 +179,7 @@ def test_a_call_of_an_earlier_generation_is_rejected() -> None:
     listener = MACHINE.listen("127.0.0.1", b"secret")
 
     def call(generation: int) -> int:
-        """Return the number of bytes, at most 1, until the connection ends."""
+        """Return the number of bytes received before the connection ends, at most 1."""
         room = memoryview(bytearray(1))
         with closing(call_node(MACHINE, listener.place, b"secret", 2, generation, of=1)) as found:
             poll = MACHINE.poll()
@@ -192,7 +191,7 @@ def test_a_call_of_an_earlier_generation_is_rejected() -> None:
     with closing(listener), ThreadPoolExecutor() as callers:
         earlier = callers.submit(call, 6)
         (found,) = accept_nodes(MACHINE, listener, [2], 6, WAIT_S, lambda: None).values()
-        found.close()  # the first attempt to start nodes has failed
+        found.close()  # the first attempt to start the nodes fails
         assert earlier.result() == 0
         earlier = callers.submit(call, 6)
         present: list[object] = []
@@ -213,7 +212,7 @@ def watch(links: Links) -> NodeWatch:
     return NodeWatch(links, set, lambda agent: [0, 1][agent])
 
 
-def test_the_sender_of_a_bad_frame_is_lost_and_not_its_receiver() -> None:
+def test_a_bad_frame_loses_its_sender_and_not_its_receiver() -> None:
     links, far = pair()
     with far:
         seen = watch(links)
@@ -225,7 +224,7 @@ def test_the_sender_of_a_bad_frame_is_lost_and_not_its_receiver() -> None:
     links.close()
 
 
-def test_two_nodes_that_cannot_reach_each_other_are_lost_in_turn() -> None:
+def test_nodes_that_cannot_reach_each_other_are_lost_alternately() -> None:
     links, far = pair()
     with far:
         found = []
@@ -238,8 +237,8 @@ def test_two_nodes_that_cannot_reach_each_other_are_lost_in_turn() -> None:
     assert found == [3, 0, 3, 0]
 
 
-def test_a_node_that_keeps_an_action_of_another_node_is_lost() -> None:
-    """A node waits for an action that another node has received and not refused."""
+def test_a_node_that_does_not_return_an_action_of_another_node_is_lost() -> None:
+    """A node waits for an action that another node has received and has not returned."""
     links, far = pair()
     seen = watch(links)
 
@@ -263,8 +262,8 @@ def test_a_node_that_keeps_an_action_of_another_node_is_lost() -> None:
     others.close()
 
 
-def test_a_node_is_late_only_once() -> None:
-    """After a late report, a lease of no ticks records the new vehicles of all nodes."""
+def test_a_node_that_reports_late_twice_in_a_row_is_lost() -> None:
+    """After a late report, a lease of no ticks lets all nodes report their new vehicles."""
     links, far = pair()
     coordinator = NodeCoordinator([bytes(16)], [0, 1], Limits(), links, [None])
     coordinator.host(Neighbours((frozenset((1,)), frozenset((0,)))))

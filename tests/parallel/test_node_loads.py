@@ -1,4 +1,4 @@
-"""Loads that nodes report of themselves and of their machines, and zones that move by them."""
+"""Nodes report the loads of their processes and machines; zones move by these loads."""
 
 from __future__ import annotations
 
@@ -44,7 +44,9 @@ def test_nodes_report_their_loads(make: Make) -> None:
     assert all(load.ticks == 0 for load in over_nodes(vec).node_loads())
 
 
-def test_pages_show_the_loads_of_machines(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_viewer_shows_the_loads_of_nodes_on_other_machines(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     drive(vec, steps=2)
     nodes = over_nodes(vec)
@@ -57,7 +59,7 @@ def test_pages_show_the_loads_of_machines(make: Make, monkeypatch: pytest.Monkey
     monkeypatch.setattr(audience, "send_all", told.append)
     loads = RunLoads(nodes, audience)
     loads.look()
-    assert not told  # no page is open
+    assert not told  # no page is open, so nothing is sent
     audience.wishes = Wishes(watchers=1)
     loads.look()
     time.sleep(0.3)
@@ -77,7 +79,7 @@ def test_zones_leave_nodes_on_busy_machines(make: Make, monkeypatch: pytest.Monk
     said: list[LoadSnapshot] = []
     ask, spent = NodeWorlds.node_snapshot, StepPlacement.round
 
-    def busy_first(self: NodeWorlds, purpose: str = TO_SHOW) -> LoadSnapshot:
+    def report_first_as_busy(self: NodeWorlds, purpose: str = TO_SHOW) -> LoadSnapshot:
         found = ask(self, purpose)
         assert [one.worker for one in found.workers] == [0, 1]
         assert all(0.0 <= one.use.cpu <= 1.0 < 100.0 * one.use.ram for one in found.workers)
@@ -86,11 +88,11 @@ def test_zones_leave_nodes_on_busy_machines(make: Make, monkeypatch: pytest.Monk
         workers = (replace(first, use=Utilisation(0.95, 0.1)), replace(second, use=IDLE))
         return replace(found, workers=workers)
 
-    def dear(self: StepPlacement, spent_s: Any, steps: int, seen: LoadSnapshot) -> bool:
+    def round_with_costs(self: StepPlacement, spent_s: Any, steps: int, seen: LoadSnapshot) -> bool:
         return spent(self, self._before_s + np.array([[1.0, 1.0, 1e-3, 1e-3]]), steps, seen)
 
-    monkeypatch.setattr(NodeWorlds, "node_snapshot", busy_first)
-    monkeypatch.setattr(StepPlacement, "round", dear)
+    monkeypatch.setattr(NodeWorlds, "node_snapshot", report_first_as_busy)
+    monkeypatch.setattr(StepPlacement, "round", round_with_costs)
     vec = make("grid4x4", zones=4, nodes=2, overrides=watched, **WANTED)
     worlds = over_nodes(vec)
     assert worlds.pool.zones == [[0, 1], [2, 3]]

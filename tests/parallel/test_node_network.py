@@ -1,4 +1,4 @@
-"""A network simulator of the caller: worlds over nodes receive the bytes of one process."""
+"""A network simulator in the caller: worlds over nodes get the receptions of one process."""
 
 from __future__ import annotations
 
@@ -23,8 +23,8 @@ EXTERNAL = {"v2x.enabled": True, "v2x.channel.external": True, "v2x.channel.late
 WANTED: dict[str, Any] = {"env": "grid4x4", "agents": 6, "background": 30, "max_cycles": 10}
 
 
-class Delayed:
-    """Delivers packets after 0 to 2 ticks, from its own memory, and counts calls."""
+class DelayedNetwork:
+    """A network simulator that delivers packets after 0 to 2 ticks and counts its calls."""
 
     def __init__(self) -> None:
         self.calls = 0
@@ -56,39 +56,39 @@ def over_nodes(vec: CavVectorEnv) -> NodeWorlds:
 
 @pytest.mark.parametrize("more", [{"num_envs": 2}, {"overrides": {"zones.repartition_steps": 3}}])
 def test_receptions_equal_those_of_one_process(make: Make, more: dict[str, Any]) -> None:
-    here, there = Delayed(), Delayed()
+    here, there = DelayedNetwork(), DelayedNetwork()
     alone = {**more, "overrides": {}}
     whole = drive(with_network(make, here, **alone))
     assert same(drive(with_network(make, there, zones=4, nodes=3, **more)), whole)
     assert here.calls == there.calls > 20
-    silent = drive(with_network(make, Nothing(), **alone))
+    silent = drive(with_network(make, SilentNetwork(), **alone))
     assert not same(silent, whole)
 
 
-class Nothing:
-    """No station receives anything."""
+class SilentNetwork:
+    """A network simulator that delivers no packet."""
 
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         return np.zeros(0, RECEPTION)
 
 
 def test_a_repeated_step_does_not_ask_the_simulator_again(make: Make) -> None:
-    here, there = Delayed(), Delayed()
+    here, there = DelayedNetwork(), DelayedNetwork()
     whole = drive(with_network(make, here), steps=20)
     vec = with_network(make, there, zones=4, nodes=3)
     worlds = over_nodes(vec)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (4, 11):
             os.kill(worlds.pool.pids[0 if step == 4 else 1], signal.SIGKILL)
 
-    assert same(drive(vec, steps=20, before=strike), whole)
+    assert same(drive(vec, steps=20, before=kill_in_step), whole)
     assert worlds.pool.losses == 2
     assert here.calls == there.calls
 
 
-class Failing(Delayed):
-    """Fails at one call, and otherwise ignores that call."""
+class FailingNetwork(DelayedNetwork):
+    """A network simulator that fails at call `at`, and does not count that call."""
 
     def __init__(self, at: int, how: Exception | NDArray[Any]) -> None:
         super().__init__()
@@ -115,8 +115,8 @@ class Failing(Delayed):
 def test_a_failing_simulator_loses_no_node(
     make: Make, how: Any, error: type[Exception], words: str
 ) -> None:
-    vec = with_network(make, Failing(0, how), zones=2, nodes=2)
-    alone = with_network(make, Delayed())
+    vec = with_network(make, FailingNetwork(0, how), zones=2, nodes=2)
+    alone = with_network(make, DelayedNetwork())
     for one in (vec, alone):
         one.reset(seed=3)
     actions = alone.suggest_actions()
@@ -130,21 +130,21 @@ def test_a_failing_simulator_loses_no_node(
     assert over_nodes(vec).pool.losses == 0
 
 
-def test_bad_connections_are_refused(make: Make) -> None:
+def test_a_network_simulator_is_refused_where_it_cannot_be_used(make: Make) -> None:
     vec = make(**WANTED, zones=2, nodes=2, overrides=EXTERNAL)
     vec.reset(seed=1)
     with pytest.raises(ConfigError, match="connect a network simulator before the first step"):
         vec.step(vec.suggest_actions())
-    vec.worlds.connect_network(Delayed())
+    vec.worlds.connect_network(DelayedNetwork())
     vec.step(vec.suggest_actions())
     own = make(**WANTED, zones=2, nodes=2, overrides={"v2x.enabled": True})
     with pytest.raises(ConfigError, match="external is off"):
-        own.worlds.connect_network(Delayed())
+        own.worlds.connect_network(DelayedNetwork())
     with pytest.raises(ConfigError, match="use backend='local', or nodes"):
         make_vec("grid4x4", workers=1, overrides=EXTERNAL)
 
 
-def test_requests_are_sent_exactly() -> None:
+def test_requests_to_the_network_simulator_are_sent_without_changes() -> None:
     packets, receivers = np.zeros(3, PACKET), np.zeros(2, RECEIVER)
     packets["sender"], receivers["id"] = [4, 5, 6], [7, -1]
     pieces = request_of(Exchange(1, 12, packets, receivers), np.array([3, 0, 2]))

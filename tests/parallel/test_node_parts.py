@@ -1,4 +1,4 @@
-"""Sensors, messages, scenes and SUMO have the same results over nodes, also over killed ones."""
+"""Sensors, messages, scenes and SUMO have the same results over nodes, even if a node is killed."""
 
 from __future__ import annotations
 
@@ -31,16 +31,16 @@ def lose_one(vec: CavVectorEnv, at: int) -> Callable[[int], None]:
     """Return a function that kills a node a random time after the start of a step."""
     worlds, drawn = over_nodes(vec), random.Random(at)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == at:
             pid = drawn.choice(worlds.pool.pids)
             Timer(drawn.uniform(0.0, 0.01), os.kill, (pid, signal.SIGKILL)).start()
 
-    return strike
+    return kill_in_step
 
 
 @pytest.mark.parametrize("mode", ["ground_truth", "sensors"])
-def test_rigs_give_the_same_samples(make: Make, mode: str) -> None:
+def test_sensors_over_nodes_give_the_samples_of_one_process(make: Make, mode: str) -> None:
     overrides = {"rig": "ten_sensors", "observation.mode": mode}
     wanted = {"agents": 5, "background": 60, "max_cycles": 8, "overrides": overrides}
     one = make("town", **wanted)
@@ -63,7 +63,7 @@ def test_samples_follow_agents_to_another_node(make: Make) -> None:
     assert over_nodes(vec).migrations > 0
 
 
-def test_messages_between_vehicles_are_the_same(make: Make) -> None:
+def test_messages_between_vehicles_over_nodes_are_those_of_one_process(make: Make) -> None:
     overrides = {"v2x.enabled": True, "v2x.perception.rate_hz": 2.0}
     wanted = {**WANTED, "overrides": overrides}
     whole = drive(make("grid4x4", **wanted))
@@ -72,7 +72,7 @@ def test_messages_between_vehicles_are_the_same(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 1
 
 
-def test_scripted_scenes_are_the_same(make: Make) -> None:
+def test_scripted_scenes_over_nodes_are_those_of_one_process(make: Make) -> None:
     wanted = {
         "agents": 1,
         "background": 10,
@@ -84,7 +84,7 @@ def test_scripted_scenes_are_the_same(make: Make) -> None:
     assert over_nodes(vec).pool.recoveries == 1
 
 
-def test_rerouting_vehicles_take_the_same_routes(make: Make, tmp_path: Path) -> None:
+def test_vehicles_over_nodes_are_rerouted_as_in_one_process(make: Make, tmp_path: Path) -> None:
     net = make_map(tmp_path)
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
@@ -103,7 +103,9 @@ def test_rerouting_vehicles_take_the_same_routes(make: Make, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("source", MODES)
-def test_worlds_with_sumo_are_the_same(make: Make, tmp_path: Path, source: str) -> None:
+def test_worlds_with_sumo_over_nodes_are_those_of_one_process(
+    make: Make, tmp_path: Path, source: str
+) -> None:
     overrides = {
         "traffic.source": source,
         "traffic.demand": [str(path) for path in write_stops(tmp_path)],

@@ -1,4 +1,4 @@
-"""Callers that do not belong to the run, or that it does not need, over real sockets."""
+"""Callers that do not belong to a run, or that the run does not need, over real sockets."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from cavmarl.parallel.nodes.link import FrameKind
 from cavmarl.parallel.nodes.links import Links
 from cavmarl.parallel.nodes.node_process import run_node
 from cavmarl.parallel.nodes.peer_faults import LinkLostError
-from tests.parallel.test_node_joining import WAIT_S, elsewhere
+from tests.parallel.test_node_joining import WAIT_S, outside_address
 
 
-class Door:
-    """The end that nodes call, in a thread."""
+class JoinServer:
+    """The end to which nodes connect, in a thread."""
 
     def __init__(self, key: bytes, address: str = "127.0.0.1", room: int = 1) -> None:
         self.listener = TcpListener(address, key)
@@ -45,14 +45,14 @@ class Door:
 
 
 def test_a_node_with_another_key_is_refused() -> None:
-    for address in ("127.0.0.1", elsewhere()):
-        with closing(Door(b"a" * 32, address)) as door:
+    for address in ("127.0.0.1", outside_address()):
+        with closing(JoinServer(b"a" * 32, address)) as door:
             with pytest.raises(MessageError, match="give both the same key"):
                 run_node(door.listener.place, b"b" * 32, ANYONE)
 
 
 def answer(server: socket.socket, said: bytes) -> threading.Thread:
-    """Start a process that answers the first caller, and ends."""
+    """Start a thread that sends `said` to the first caller and ends."""
 
     def run() -> None:
         connection, _ = server.accept()
@@ -66,30 +66,30 @@ def answer(server: socket.socket, said: bytes) -> threading.Thread:
 
 
 def test_a_peer_without_encryption_is_refused() -> None:
-    with closing(Door(b"a" * 32, elsewhere())) as door:
+    with closing(JoinServer(b"a" * 32, outside_address())) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
             stranger.sendall(secrets.token_bytes(100))
             with suppress(ConnectionResetError):
                 assert b"cav" not in stranger.recv(100)
-    with socket.create_server((elsewhere(), 0)) as server:
+    with socket.create_server((outside_address(), 0)) as server:
         answering = answer(server, bytes(100))
         with pytest.raises(MessageError, match="does not use the encryption of cavmarl"):
             call(server.getsockname()[:2], b"a" * 32, ANYONE)
         answering.join()
 
 
-def test_a_missing_library_for_encryption_is_noticed_at_the_start(
+def test_a_missing_library_for_encryption_is_an_error_at_the_start(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "cryptography", None)
     with pytest.raises(MissingExtraError, match="nodes"):
-        Listener(elsewhere(), secrets.token_bytes(32))
+        Listener(outside_address(), secrets.token_bytes(32))
     Listener("127.0.0.1").close()
 
 
 def test_another_version_of_the_handshake_is_refused() -> None:
-    with closing(Door(b"a" * 32)) as door:
+    with closing(JoinServer(b"a" * 32)) as door:
         with socket.create_connection(door.listener.place) as stranger:
             stranger.settimeout(5.0)
             stranger.sendall(b"cavW" + (VERSION + 1).to_bytes(2, "little") + bytes(20))
@@ -108,19 +108,19 @@ def test_another_version_of_the_handshake_is_refused() -> None:
         ("", 0, "no more nodes are needed"),
     ],
 )
-def test_nodes_that_are_not_needed_are_refused(
+def test_nodes_with_other_code_and_superfluous_nodes_are_refused(
     monkeypatch: pytest.MonkeyPatch, code: str, room: int, words: str
 ) -> None:
     if code:
         monkeypatch.setattr(joining_nodes, "code_stamp", code_stamp)
         monkeypatch.setattr("cavmarl.parallel.nodes.node_process.code_stamp", lambda: code)
-    with closing(Door(b"a" * 32, room=room)) as door:
+    with closing(JoinServer(b"a" * 32, room=room)) as door:
         with pytest.raises(NodeRefusedError, match=words):
             run_node(door.listener.place, b"a" * 32, ANYONE)
 
 
 def test_an_admitted_caller_with_bad_frames_is_disconnected() -> None:
-    with closing(Door(b"a" * 32)) as door:
+    with closing(JoinServer(b"a" * 32)) as door:
         for said in (b"no JSON", b"[]", b"{}"):
             links = Links(lambda number, frame: None)
             links.add(COORDINATOR, TcpConnection(call(door.listener.place, b"a" * 32, ANYONE)))

@@ -1,4 +1,4 @@
-"""Worlds over nodes equal undivided worlds, whichever node is lost."""
+"""Worlds over nodes equal undivided worlds, even if nodes are lost."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ def test_worlds_over_nodes_equal_those_of_one_process(
     assert over_nodes(vec).pool.recoveries == 0
 
 
-def test_an_action_at_the_wrong_node_is_forwarded_to_the_owner(
+def test_an_action_at_the_wrong_node_is_forwarded_to_the_node_of_its_agent(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
@@ -106,7 +106,7 @@ def test_bad_actions_and_actions_for_other_nodes_are_refused() -> None:
     told = bytes(Actions.of(arrays).some(np.array([0, 1])))
     wrong, _ = taken.read(memoryview(told), 0, owner)
     assert wrong.tolist() == [1]
-    assert taken.are_due, "agent 2 is missing"
+    assert taken.are_due, "the actions are complete without agent 2"
     taken.read(memoryview(bytes(Actions.of(arrays).some(np.array([2])))), 0, owner)
     assert not taken.are_due
     words = np.frombuffer(told, np.int64)
@@ -120,13 +120,13 @@ def test_bad_actions_and_actions_for_other_nodes_are_refused() -> None:
 @pytest.mark.parametrize(
     "found", [bytes(8), np.array([4, 1]).tobytes(), np.array([0, 7]).tobytes()]
 )
-def test_a_bad_refusal_is_refused(found: bytes) -> None:
+def test_an_invalid_refusal_of_actions_is_an_error(found: bytes) -> None:
     assert read_refusal(memoryview(np.array([3, 1]).tobytes()), 4, {0, 1}).tolist() == [[3], [1]]
     with pytest.raises(MessageError, match="refusal"):
         read_refusal(memoryview(found), 4, {0, 1})
 
 
-def test_a_fork_neither_steps_nor_ends_the_nodes(make: Make) -> None:
+def test_a_forked_process_cannot_step_or_end_the_nodes(make: Make) -> None:
     vec, whole = make(zones=4, nodes=2, env="grid4x4", **WANTED), make(env="grid4x4", **WANTED)
     assert "the nodes belong to process" in said_in_fork(lambda: drive(vec), vec.close)
     assert same(drive(vec), drive(whole))
@@ -141,8 +141,7 @@ def test_actuated_signals_and_demand_give_the_same_results(make: Make, tmp_path:
     assert over_nodes(vec).migrations > 0
 
 
-def test_no_memory_is_shared(make: Make) -> None:
-    """No node shares writable memory with another process."""
+def test_nodes_share_no_writable_memory_with_other_processes(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=2, **WANTED)
     drive(vec, steps=3)
     for pid in over_nodes(vec).pool.pids:
@@ -155,7 +154,7 @@ def test_no_memory_is_shared(make: Make) -> None:
 
 
 class Killer:
-    """Kills a node at a random time of some steps."""
+    """A function that kills a node at a random time in each of some steps."""
 
     def __init__(self, vec: CavVectorEnv, seed: int, *steps: int) -> None:
         self._worlds, self._steps = over_nodes(vec), steps
@@ -185,36 +184,36 @@ def test_a_stopped_node_counts_as_lost(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=3, **WANTED)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == 5:
             os.kill(over_nodes(vec).pool.pids[1], signal.SIGSTOP)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
     assert over_nodes(vec).pool.losses == 1
 
 
-def test_two_nodes_that_are_not_neighbours_are_lost_at_once(make: Make) -> None:
+def test_two_lost_nodes_that_are_not_neighbours_change_no_result(make: Make) -> None:
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     worlds = over_nodes(vec)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == 5:
             for number in (0, 2):
                 os.kill(worlds.pool.pids[number], signal.SIGKILL)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
     assert worlds.pool.losses == 2
 
 
-def test_repeated_equal_commands_are_all_carried_out(make: Make) -> None:
+def test_equal_actions_in_many_steps_are_all_applied(make: Make) -> None:
     wanted = {**WANTED, "max_cycles": 100}
     vecs = [make("grid4x4", **wanted), make("grid4x4", zones=4, nodes=3, **wanted)]
     for vec in vecs:
         vec.reset(seed=2)
     still = np.zeros_like(vecs[0].suggest_actions())
     for step in range(60):
-        if step == 50:  # several states were kept before this step
+        if step == 50:  # by now, the nodes have kept several states
             os.kill(over_nodes(vecs[1]).pool.pids[0], signal.SIGKILL)
         for vec in vecs:
             vec.step(still)
@@ -224,7 +223,7 @@ def test_repeated_equal_commands_are_all_carried_out(make: Make) -> None:
 def test_an_interrupted_step_can_be_repeated(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         "cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0
-    )  # keep a state before each step
+    )  # nodes keep a state before each step
     vecs = [make("grid4x4", **WANTED), make("grid4x4", zones=4, nodes=2, **WANTED)]
     for vec in vecs:
         vec.reset(seed=2)
@@ -252,7 +251,7 @@ def test_an_interrupted_step_can_be_repeated(make: Make, monkeypatch: pytest.Mon
 def test_nodes_that_are_lost_while_states_are_kept_change_no_result(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After the nodes return to an older state, newer states do not displace it."""
+    """After the nodes return to an older state, that state remains available."""
     monkeypatch.setattr("cavmarl.parallel.nodes.node_pool.KEEP_S", 0.0)
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
@@ -260,20 +259,20 @@ def test_nodes_that_are_lost_while_states_are_kept_change_no_result(
     doomed = {5: worlds.pool.pids[0], 6: worlds.pool.pids[2]}
     commit, steps = worlds.pool.commit, [0]
 
-    def strike_and_commit() -> list[memoryview]:
-        if steps[0] in doomed:  # during a step in which all nodes keep a state
+    def kill_and_commit() -> list[memoryview]:
+        if steps[0] in doomed:  # all nodes keep a state in this step
             os.kill(doomed.pop(steps[0]), signal.SIGKILL)
         return commit()
 
     def note(step: int) -> None:
         steps[0] = step
 
-    monkeypatch.setattr(worlds.pool, "commit", strike_and_commit)
+    monkeypatch.setattr(worlds.pool, "commit", kill_and_commit)
     assert same(drive(vec, before=note), whole)
     assert (worlds.pool.losses, worlds.pool.recoveries) == (2, 2)
 
 
-def test_a_lost_node_and_the_lost_node_with_its_replica_change_no_result(make: Make) -> None:
+def test_the_loss_of_a_node_and_of_its_replica_is_an_error(make: Make) -> None:
     vec = make("grid4x4", zones=4, nodes=4, **WANTED)
     vec.reset(seed=1)
     for number in (1, 2):
@@ -286,20 +285,20 @@ def test_a_lost_node_and_the_lost_node_with_its_replica_change_no_result(make: M
     again.step(again.suggest_actions())
 
 
-def test_a_lost_only_node_changes_no_result(make: Make) -> None:
-    """The caller keeps replicas of its states, and another node takes its place."""
+def test_the_loss_of_the_only_node_changes_no_result(make: Make) -> None:
+    """The caller keeps replicas of the states of the node, and a new node replaces it."""
     whole = drive(make("grid4x4", **WANTED))
     vec = make("grid4x4", zones=2, nodes=1, **WANTED)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (2, 6):
             os.kill(over_nodes(vec).pool.pids[0], signal.SIGKILL)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
     assert (over_nodes(vec).pool.losses, over_nodes(vec).pool.recoveries) == (2, 2)
 
 
-def test_nothing_is_left_behind(make: Make) -> None:
+def test_no_process_or_descriptor_remains(make: Make) -> None:
     vec = make("grid4x4", zones=2, nodes=2, **WANTED)
     vec.reset(seed=1)
     pids = over_nodes(vec).pool.pids
@@ -376,14 +375,14 @@ def test_a_node_that_is_killed_or_stopped_before_it_begins_is_replaced(
     whole = drive(make("grid4x4", **WANTED))
     start, started = LocalNodes.start, []
 
-    def start_and_strike(self: LocalNodes, number: int) -> Any:
+    def start_and_signal(self: LocalNodes, number: int) -> Any:
         process = start(self, number)
         started.append(number)
         if len(started) <= 2:
             os.kill(process.pid, how)
         return process
 
-    monkeypatch.setattr(LocalNodes, "start", start_and_strike)
+    monkeypatch.setattr(LocalNodes, "start", start_and_signal)
     vec = make("grid4x4", zones=4, nodes=2, overrides={"workers.join_timeout_s": 60.0}, **WANTED)
     assert sorted(started) == [0, 0, 1, 1]
     assert same(drive(vec), whole)
@@ -406,14 +405,14 @@ def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch, nodes: int, how: signal.Signals, is_told: bool
 ) -> None:
     whole = drive(make("grid4x4", **WANTED))
-    tell, struck = NodePool.send_zones, list[int]()  # killed processes
+    tell, struck = NodePool.send_zones, list[int]()  # pids of the signaled processes
 
-    def tell_and_strike(self: NodePool, *told: Any, **more: Any) -> None:
+    def send_and_signal(self: NodePool, *told: Any, **more: Any) -> None:
         process = psutil.Process(self.pids[-1 if struck else 0])
         strikes = len(struck) < 2
         if is_told:
             if strikes:
-                process.suspend()  # a suspended process cannot answer before it is killed
+                process.suspend()  # the suspended process cannot answer before the signal
             tell(self, *told, **more)
         if strikes:
             struck.append(process.pid)
@@ -423,7 +422,7 @@ def test_a_node_that_is_lost_while_zones_are_assigned_is_replaced(
         if not is_told:
             tell(self, *told, **more)
 
-    monkeypatch.setattr(NodePool, "send_zones", tell_and_strike)
+    monkeypatch.setattr(NodePool, "send_zones", send_and_signal)
     vec = make("grid4x4", zones=4, nodes=nodes, **WANTED)
     assert len(set(struck)) == 2
     assert same(drive(vec), whole)

@@ -1,4 +1,4 @@
-"""`CavEnv` over worker processes equals that of one process, also when workers die."""
+"""`CavEnv` over worker processes gives the results of one process, even if workers die."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ def settings(mode: str, kind: str = "flat") -> dict[str, Any]:
 
 
 def drive(env: CavEnv, before: Callable[[int], None] = lambda step: None) -> list[str]:
-    """Return all results of two episodes, as exact text."""
+    """Return all results of two episodes as text with exact numbers."""
     found: list[str] = []
     rng = np.random.default_rng(3)
     with np.printoptions(threshold=10**9, floatmode="unique"):
@@ -57,7 +57,7 @@ def test_worlds_over_workers_equal_those_of_one_process(mode: str, kind: str, wo
     env.close()
 
 
-@pytest.mark.slow  # `test_workers.py` and `test_split.py` kill workers of the same pool
+@pytest.mark.slow  # similar tests in every run: test_workers.py, test_split.py
 def test_dead_workers_change_no_result() -> None:
     whole = drive(parallel_env("grid4x4", **settings("open")))
     env = parallel_env("grid4x4", workers=2, **settings("open"))

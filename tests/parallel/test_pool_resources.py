@@ -1,4 +1,4 @@
-"""Resources of a pool: processes, memory and descriptors, and that nothing is left behind."""
+"""A pool frees its processes, memory and descriptors."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def make() -> Iterator[Make]:
         yield make_pool
 
 
-def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None:
+def test_a_pool_that_a_thread_made_ends_with_the_process_and_not_with_the_thread() -> None:
     text = LONER.format(root=str(ROOT), then="").replace(
         "pool = Pool(program(2), 60.0, 3)",
         "from concurrent.futures import Future\nfrom threading import Thread\nmade = Future()\n"
@@ -58,7 +58,7 @@ def test_a_pool_of_another_thread_ends_with_the_process_and_not_before() -> None
     pids = [int(word) for word in loner.stdout.split()]
     assert loner.returncode == -signal.SIGKILL, loner.stderr
     assert len(pids) == 3
-    assert gone_soon(pids)  # also the stopped process
+    assert gone_soon(pids)  # including the stopped process
 
 
 def maps(pid: int) -> list[str]:
@@ -66,9 +66,9 @@ def maps(pid: int) -> list[str]:
 
 
 @pytest.mark.parametrize("way", ["close", "forget"])
-def test_nothing_is_left_behind(way: str) -> None:
-    Pool(program(1), 60.0, 3).close()  # the fork server of the tests stays
-    gc.collect()  # free what other tests have left
+def test_no_process_or_descriptor_remains(way: str) -> None:
+    Pool(program(1), 60.0, 3).close()  # start the fork server, which outlives each pool
+    gc.collect()  # free objects of other tests
     files = len(os.listdir("/proc/self/fd"))
     pool = Pool(program(3), 60.0, 3)
     pool.run(ADD)
@@ -95,7 +95,7 @@ def test_a_stopped_pool_is_closed() -> None:
 
 
 def test_a_program_that_does_not_start_is_reported() -> None:
-    Pool(program(1), 60.0, 3).close()  # the fork server of the tests stays
+    Pool(program(1), 60.0, 3).close()  # start the fork server, which outlives each pool
     gc.collect()
     files = len(os.listdir("/proc/self/fd"))
     with pytest.raises(WorkerFailureError, match="no jobs today") as caught:
@@ -145,7 +145,9 @@ def test_too_few_descriptors_are_reported(room: int) -> None:
 
 @pytest.mark.parametrize("then", ["time.sleep(60)", "pool.run(TOIL, PLACE)"])
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM, signal.SIGINT])
-def test_no_process_outlives_the_pools(how: signal.Signals, then: str, tmp_path: Path) -> None:
+def test_no_worker_outlives_the_process_of_its_pool(
+    how: signal.Signals, then: str, tmp_path: Path
+) -> None:
     text = LONER.format(root=str(ROOT), then=then.replace("PLACE", repr(str(tmp_path))))
     loner = subprocess.Popen(
         [sys.executable, "-c", text], stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True
@@ -174,14 +176,14 @@ def test_a_pool_works_without_compiled_loops() -> None:
     assert f"[[3.0, {MORE}], [3.0, {MORE}]] []" in done.stdout
 
 
-def test_a_fork_of_the_pools_process_leaves_the_workers_alone(make: Make) -> None:
+def test_closing_a_pool_in_a_forked_process_does_not_end_its_workers(make: Make) -> None:
     pool = make(workers=1)
     assert said_in_fork(pool.close) == ""
     pool.run(ADD)
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_a_fork_of_the_pools_process_cannot_command_its_workers(make: Make) -> None:
+def test_a_forked_process_cannot_command_the_workers_of_a_pool(make: Make) -> None:
     pool = make(workers=1)
     said = said_in_fork(lambda: pool.run(ADD))
     assert f"process {os.getpid()}" in said
@@ -211,12 +213,12 @@ def test_a_pool_works_with_more_descriptors_than_select_accepts(make: Make) -> N
         resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
 
 
-def test_a_thread_may_start_workers_and_end(make: Make) -> None:
+def test_workers_outlive_the_thread_that_started_them(make: Make) -> None:
     pools: list[Pool] = []
     thread = threading.Thread(target=lambda: pools.append(make(workers=1)))
     thread.start()
     thread.join()
     while Path(f"/proc/self/task/{thread.native_id}").exists():
-        time.sleep(0.001)  # the system ends the thread a little later
+        time.sleep(0.001)  # the kernel removes the thread a little later
     pools[0].run(ADD)
     assert pools[0].deaths == []

@@ -1,4 +1,4 @@
-"""The choice of nodes for actors, and missing clusters."""
+"""Choose nodes of a Ray cluster for actors; report missing clusters."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from cavmarl.parallel.network.ray_cluster import Node, choose_nodes
 IDLE = Utilisation(0.0, 0.0)
 
 
-def test_actors_go_to_the_nodes_in_turn() -> None:
+def test_actors_are_placed_on_idle_nodes_in_turn() -> None:
     known = [Node("a", 2, IDLE), Node("b", 4, IDLE)]
     assert choose_nodes(known, 5) == ["a", "b", "a", "b", "b"]
 
 
-def test_actors_go_where_the_score_is_lowest() -> None:
+def test_actors_are_placed_on_nodes_with_the_lowest_load() -> None:
     known = [Node("a", 2, Utilisation(0.5, 0.1)), Node("b", 2, Utilisation(0.2, 0.1))]
     assert choose_nodes(known, 3) == ["b", "b", "a"]
 

@@ -1,4 +1,4 @@
-"""The table of combinations on a Ray cluster of this machine: whole worlds, and nodes."""
+"""Test each feature on a Ray cluster on this machine, with whole worlds and with nodes."""
 
 from __future__ import annotations
 
@@ -22,7 +22,8 @@ def cluster() -> Iterator[None]:
     ray.shutdown()
 
 
-# In every run: a start of actors, a library of an actor's own, a file on its machine, a refusal.
+# Features in every test run: they cover the start of actors, a library that only the actor loads, a
+# file on its machine, and a refusal.
 OFTEN = ("frames, discrete actions, seats", "SUMO's traffic", "a journal", "sensor workers")
 
 
@@ -35,5 +36,7 @@ OFTEN = ("frames, discrete actions, seats", "SUMO's traffic", "a journal", "sens
         for often in (place == "nodes on Ray" and feature in OFTEN,)
     ],
 )
-def test_features_on_ray(make: Make, tmp_path: Path, place: str, feature: str) -> None:
+def test_each_feature_works_on_ray_or_is_refused(
+    make: Make, tmp_path: Path, place: str, feature: str
+) -> None:
     check(make, tmp_path, feature, place)

@@ -1,4 +1,4 @@
-"""Clusters that are started for some worlds, and missing clusters."""
+"""Ray clusters that start with the first world and end with the last one; missing clusters."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ if __name__ == "__main__":
 """
 
 
-def test_a_cluster_that_was_started_for_worlds_ends_with_the_last_of_them() -> None:
+def test_a_cluster_that_worlds_started_ends_with_the_last_world() -> None:
     done = subprocess.run(
         [sys.executable, "-c", ALONE], cwd=ROOT, capture_output=True, text=True, timeout=120
     )
     assert done.returncode == 0, done.stderr
-    assert done.stdout.strip() == "left: []"  # Ray has not complained
+    assert done.stdout.strip() == "left: []"  # no process is left, and Ray has printed nothing
     assert not done.stderr.strip()
 
 
@@ -86,7 +86,7 @@ def test_a_missing_cluster_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
         make_vec("ring", backend="ray:1")
 
 
-def test_ray_understands_the_file_of_machines() -> None:
+def test_the_cluster_file_is_valid_for_ray() -> None:
     from ray.autoscaler._private.util import prepare_config, validate_config
 
     path = ROOT / "configs/cluster/machines.yaml"

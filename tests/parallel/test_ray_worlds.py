@@ -1,4 +1,4 @@
-"""Worlds on a Ray cluster of two nodes equal those of one process, whichever node dies."""
+"""Worlds on a Ray cluster of two nodes give the results of one process, even if a node dies."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ import pytest
 from cavmarl import CapacityError, ConfigError, parallel_env
 from cavmarl.env.vector import CavVectorEnv
 from cavmarl.parallel.nodes.node_worlds import NodeWorlds
-from tests.parallel.test_node_groups import RESTLESS, groups_of, pids_of, uneven
+from tests.parallel.test_node_groups import RESTLESS, changing_costs, groups_of, pids_of
 from tests.parallel.test_parallel_worlds import drive as drive_view
 from tests.parallel.test_parallel_worlds import settings
 from tests.support.vec_runs import STEPS, Make, drive, same
 
 ray = pytest.importorskip("ray", reason="needs the extra: ray")
 
-__all__ = ["uneven"]
+__all__ = ["changing_costs"]
 
 pytestmark = pytest.mark.filterwarnings("ignore")  # Ray warns about its own code
 
 ROOT = Path(__file__).resolve().parents[2]
-# Nodes of cavmarl's own show the same in each run, in `test_node_groups.py`.
+# Slow tests: `test_node_groups.py` tests the same code in every run, without Ray.
 slow = pytest.mark.slow
 WANTED = {"num_envs": 5, "agents": 4, "background": 12, "max_cycles": 8}
 
@@ -51,13 +51,13 @@ def two_nodes() -> Iterator[Any]:
 
 @pytest.fixture
 def cluster(two_nodes: Any) -> Any:
-    """Yield the cluster, once closed worlds have released their CPUs."""
+    """Return the cluster after closed worlds have released their CPUs."""
     await_true(lambda: ray.available_resources().get("CPU") == 3.0)
     return two_nodes
 
 
 @pytest.fixture
-def whole(make: Make) -> Any:
+def undivided_run(make: Make) -> Any:
     return drive(make("grid4x4", **WANTED))
 
 
@@ -66,7 +66,7 @@ def losses_of(vec: CavVectorEnv) -> list[int]:
 
 
 def nodes_of(pids: list[int]) -> list[int]:
-    """Return the raylets that have started these processes."""
+    """Return the pid of the raylet (the process of a Ray node) that started each process."""
     return [psutil.Process(pid).ppid() for pid in pids]
 
 
@@ -81,7 +81,9 @@ def nodes_of(pids: list[int]) -> list[int]:
         ),
     ],
 )
-def test_machines_change_no_result(make: Make, cluster: Any, arguments: dict[str, Any]) -> None:
+def test_worlds_over_two_ray_nodes_give_the_results_of_one_process(
+    make: Make, cluster: Any, arguments: dict[str, Any]
+) -> None:
     wanted = WANTED | arguments
     here = drive(make(**wanted))
     vec = make(backend="ray:2", **wanted)
@@ -91,7 +93,7 @@ def test_machines_change_no_result(make: Make, cluster: Any, arguments: dict[str
     assert len(set(nodes_of(pids_of(vec)))) == 2
 
 
-def test_chosen_worlds_are_reset_on_their_machines(make: Make, cluster: Any) -> None:
+def test_some_worlds_are_reset_on_their_ray_nodes(make: Make, cluster: Any) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for arguments in ({}, {"backend": "ray"}):
@@ -107,38 +109,40 @@ def test_chosen_worlds_are_reset_on_their_machines(make: Make, cluster: Any) -> 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, pytest.param(signal.SIGSTOP, marks=slow)])
 def test_a_dead_actor_changes_no_result(
-    make: Make, cluster: Any, whole: Any, how: signal.Signals
+    make: Make, cluster: Any, undivided_run: Any, how: signal.Signals
 ) -> None:
     vec = make("grid4x4", backend="ray:2", overrides={"workers.timeout_s": 2.0}, **WANTED)
     struck: list[int] = []
     times: list[float] = []
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step % 6 == 3:
             struck.append(pids_of(vec)[step // 6])
             times.append(time.time())
             os.kill(struck[-1], how)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     assert losses_of(vec) == [1, 1]
-    assert psutil.Process(pids_of(vec)[0]).create_time() < times[0]  # a spare actor
+    assert (
+        psutil.Process(pids_of(vec)[0]).create_time() < times[0]
+    )  # the new actor was started in advance
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in struck), for_s=20.0)
 
 
 @slow
 def test_an_actor_that_dies_during_a_step_changes_no_result(
-    make: Make, cluster: Any, whole: Any
+    make: Make, cluster: Any, undivided_run: Any
 ) -> None:
     vec = make("grid4x4", backend="ray:2", **WANTED)
     timers: list[Timer] = []
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (2, 9):
             pid = pids_of(vec)[step % 2]
             timers.append(Timer(0.001 * step, os.kill, (pid, signal.SIGKILL)))
             timers[-1].start()
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     for timer in timers:
         timer.join()
     drive(vec, steps=1)
@@ -148,8 +152,10 @@ def test_an_actor_that_dies_during_a_step_changes_no_result(
 @pytest.mark.parametrize(
     "more", [{"backend": "ray:1"}, pytest.param({"backend": "ray"}, marks=slow)]
 )
-def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict[str, Any]) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+def test_the_pettingzoo_environment_on_ray_gives_the_results_of_one_process(
+    cluster: Any, more: dict[str, Any]
+) -> None:
+    undivided_run = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", **settings("open", "dict"), **more)
     pools = [group.pool for group in getattr(env.worlds, "groups", [env.worlds])]
 
@@ -157,7 +163,7 @@ def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict
         if step % 9 == 4:
             os.kill(pools[0].pids[0], signal.SIGKILL)
 
-    assert drive_view(env, before=kill) == whole
+    assert drive_view(env, before=kill) == undivided_run
     assert pools[0].losses > 0
     with pytest.raises(ConfigError, match="backend='local'"):
         _ = env.simulation
@@ -167,29 +173,29 @@ def test_the_pettingzoo_view_equals_that_of_one_process(cluster: Any, more: dict
 
 
 @slow
-def test_worlds_that_move_between_nodes_are_the_same(
-    make: Make, cluster: Any, uneven: list[int]
+def test_worlds_that_move_between_ray_nodes_give_the_same_results(
+    make: Make, cluster: Any, changing_costs: list[int]
 ) -> None:
-    """When the actor dies, it has other worlds than at its start."""
-    whole = drive(make("grid4x4", **WANTED), steps=16)
+    """Worlds move before an actor dies, so that it no longer runs its first worlds."""
+    undivided_run = drive(make("grid4x4", **WANTED), steps=16)
     vec = make("grid4x4", backend="ray:3", overrides=RESTLESS, **WANTED)
     vec.reset(seed=0)
     assert len(set(nodes_of(pids_of(vec)))) == 2
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (5, 11):
             os.kill(pids_of(vec)[step % 3], signal.SIGKILL)
 
-    assert same(drive(vec, steps=16, before=strike), whole)
+    assert same(drive(vec, steps=16, before=kill_in_step), undivided_run)
     assert sum(losses_of(vec)) == 2
-    assert sum(uneven) > 0
+    assert sum(changing_costs) > 0
 
 
-def test_zones_of_one_world_are_hosted_by_nodes(cluster: Any) -> None:
-    whole = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
+def test_ray_actors_run_the_zones_of_one_world(cluster: Any) -> None:
+    undivided_run = drive_view(parallel_env("grid4x4", **settings("open", "dict")))
     env = parallel_env("grid4x4", backend="ray:2", **settings("open", "dict"))
     assert isinstance(env.worlds, NodeWorlds)
-    assert drive_view(env) == whole
+    assert drive_view(env) == undivided_run
     env.close()
 
 
@@ -203,7 +209,7 @@ def test_errors_equal_those_of_one_process(make: Make, cluster: Any) -> None:
         _ = vec.simulation
 
 
-def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) -> None:
+def test_closing_worlds_ends_their_actors_but_not_the_cluster(make: Make, cluster: Any) -> None:
     vec = make("ring", num_envs=2, backend="ray:2")
     vec.reset(seed=0)
     pids = pids_of(vec)
@@ -213,8 +219,8 @@ def test_nothing_is_left_behind_and_the_cluster_stays(make: Make, cluster: Any) 
     assert ray.is_initialized()
 
 
-def test_a_dead_node_changes_no_result(make: Make, cluster: Any, whole: Any) -> None:
-    """All its processes die at once; its worlds resume at the other node."""
+def test_a_dead_node_changes_no_result(make: Make, cluster: Any, undivided_run: Any) -> None:
+    """All processes of the node die at once, and its worlds resume on the other node."""
     node = cluster.add_node(num_cpus=1)
     vec = make("grid4x4", backend="ray:4", **WANTED)
     raylet = node.all_processes["raylet"][0].process.pid
@@ -222,14 +228,14 @@ def test_a_dead_node_changes_no_result(make: Make, cluster: Any, whole: Any) -> 
     pids = pids_of(vec)
     victim = nodes_of(pids).index(raylet)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == STEPS // 2:
             cluster.remove_node(node, allow_graceful=False)
             await_true(
                 lambda: not psutil.pid_exists(pids[victim])
-            )  # the actor ends with its raylet
+            )  # the actor ends with the raylet that started it
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), undivided_run)
     assert losses_of(vec)[victim] == 1
     assert raylet not in nodes_of(pids_of(vec))
 
@@ -256,7 +262,7 @@ def test_a_killed_program_leaves_nothing_behind(cluster: Any) -> None:
         text=True,
         timeout=120,
     )
-    said = re.search(r"^pids (\d+) (\d+)$", done.stdout, re.MULTILINE)  # beside Ray's own lines
+    said = re.search(r"^pids (\d+) (\d+)$", done.stdout, re.MULTILINE)  # Ray prints other lines
     assert said, done.stderr
     pids = [int(word) for word in said.groups()]
     await_true(lambda: not any(psutil.pid_exists(pid) for pid in pids))

@@ -1,4 +1,4 @@
-"""Ghosts between two nodes arrive as they were sent, after any changes of rows."""
+"""Ghosts and agents arrive at another node unchanged, after any changes of rows."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from tests.support.traffic import network
 
 CAPACITY = 40
 WORLDS = 2
-ROOM = 6  # room for vehicles that pass a departure queue
+ROOM = 6  # capacity for vehicles that go to the departure queue of another node
 ROADS = network("merge")
 MINE, THEIRS = np.array([0]), np.array([1, 2])
-GHOSTS = 1 + 3 * WORLDS  # word of a frame at which the numbers of ghosts start
-LIKE = GHOSTS + 2 * WORLDS * len(THEIRS)  # word at which their kinds start
+GHOSTS = 1 + 3 * WORLDS  # index of the first word with a number of ghosts
+LIKE = GHOSTS + 2 * WORLDS * len(THEIRS)  # index of the first word that says how a ghost is encoded
 
 
 class Node:
-    """The part of one of two nodes."""
+    """The zone states and the row stream of one of two nodes."""
 
     def __init__(self, zones: NDArray[np.int64], others: NDArray[np.int64]) -> None:
         self.zoned = make_zone_state(3, WORLDS, CAPACITY)
@@ -53,7 +53,7 @@ def nodes() -> tuple[Node, Node]:
 
 
 def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -> None:
-    """Return ghosts of these vehicles in random order, with many unchanged words."""
+    """Fill the zones with ghosts of these vehicles in random order; many words stay unchanged."""
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
             chosen = drawn.permutation(ids)[: drawn.integers(len(ids) + 1)]
@@ -72,13 +72,13 @@ def fill(zoned: ZoneState, drawn: np.random.Generator, ids: NDArray[np.int64]) -
 
 
 def clear(zoned: ZoneState) -> None:
-    """Do the part of a tick before ghosts arrive: owned rows stay."""
+    """Remove all ghosts, as at the start of a tick, and keep two owned rows per zone."""
     zoned.num_owned[THEIRS] = 2
     zoned.num_rows[THEIRS] = zoned.num_near[THEIRS] = 2
 
 
-def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
-    """Return the ghosts of each zone and world as sets; near ghosts are in separate sets."""
+def ghosts_of(zoned: ZoneState, first: int) -> list[list[bytes]]:
+    """Return the sorted ghosts of each zone and world: near ghosts, then other ghosts."""
     parts = []
     for zone in THEIRS.tolist():
         for w in range(WORLDS):
@@ -96,14 +96,14 @@ def found(zoned: ZoneState, first: int) -> list[list[bytes]]:
 
 
 def leave(node: Node, drawn: np.random.Generator) -> None:
-    """Let some vehicles leave, and some take another route."""
+    """Let random vehicles leave the node, and random numbers of vehicles change their routes."""
     departures = node.departures
     departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
     departures.passing["id"] = drawn.integers(1000, size=departures.passing.shape)
     departures.counts[:, COUNT_REROUTED] += drawn.integers(3, size=WORLDS)
 
 
-def test_ghosts_arrive_as_they_were_sent() -> None:
+def test_received_ghosts_equal_sent_ghosts() -> None:
     near, far = nodes()
     drawn = np.random.default_rng(1)
     for tick in range(30):
@@ -115,7 +115,7 @@ def test_ghosts_arrive_as_they_were_sent() -> None:
         first = far.departures.num_passing[:] = drawn.integers(ROOM // 2 + 1, size=WORLDS)
         counted = far.departures.counts[:, COUNT_REROUTED].copy()
         far.read(near.packed())
-        assert found(far.zoned, 2) == found(near.zoned, 0)
+        assert ghosts_of(far.zoned, 2) == ghosts_of(near.zoned, 0)
         assert far.running.tolist() == [100 + tick, 107]
         more = near.departures.counts[:, COUNT_REROUTED] - near.rerouted
         assert (far.departures.counts[:, COUNT_REROUTED] - counted == more).all()
@@ -126,8 +126,8 @@ def test_ghosts_arrive_as_they_were_sent() -> None:
             assert sent.tobytes() == near.departures.passing[w, :num].tobytes()
 
 
-def test_forecast_words_are_not_sent() -> None:
-    """For a moving vehicle, few words other than acceleration and position are sent."""
+def test_words_that_the_receiver_can_forecast_are_not_sent() -> None:
+    """After the first tick, a moving vehicle needs only a few words, such as its acceleration."""
     near, far = nodes()
     vec = make_vec("merge", agents=1, background=20, overrides={"clock.ctrl_dt_s": 0.05}, seed=0)
     vec.reset()
@@ -143,36 +143,36 @@ def test_forecast_words_are_not_sent() -> None:
         clear(far.zoned)
         data = near.packed()
         far.read(data)
-        assert found(far.zoned, 2) == found(near.zoned, 0)
+        assert ghosts_of(far.zoned, 2) == ghosts_of(near.zoned, 0)
         sizes.append((len(data) // 8 - LIKE) / ghosts - 2)
     vec.close()
     assert sizes[0] > VEHICLE.itemsize // 8
-    assert np.median(sizes) < 4, "words of a vehicle"
+    assert np.median(sizes) < 4, "too many words per vehicle"
 
 
-def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
-    """Return a changed frame without leaving vehicles."""
+def damage(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
+    """Return a frame without leaving vehicles, damaged as `harm` says."""
     ghosts = int(words[GHOSTS:LIKE:2].sum())
     if harm == "cut short":
         return words[:-1]
-    if harm == "one word more":
+    if harm == "one additional word":
         words = np.append(words, 0)
-    elif harm == "ghosts like none before":
+    elif harm == "first ghost without a predecessor":
         words[LIKE] = 0
-    elif harm == "ghosts in part like none before":
+    elif harm == "part of a ghost without a predecessor":
         words[LIKE + ghosts] = 0
-    elif harm == "more ghosts than there is room for":
+    elif harm == "more ghosts than the capacity":
         words[GHOSTS] = CAPACITY - 1
-    elif harm == "less than no ghost":
+    elif harm == "negative number of ghosts":
         words[GHOSTS] = -1
-    elif harm == "more that can touch than there are":
+    elif harm == "more near ghosts than ghosts":
         words[GHOSTS + 1] = words[GHOSTS] + 1
-    elif harm == "more that leave than there is room for":
+    elif harm == "more leaving vehicles than the capacity":
         words[1 + 2 * WORLDS] = ROOM + 1
         words = np.concatenate([words, np.zeros(7 * (ROOM + 1), dtype=np.int64)])
-    elif harm == "less than none that leave":
+    elif harm == "negative number of leaving vehicles":
         words[1 + 2 * WORLDS] = -1
-    elif harm == "less than no change of route":
+    elif harm == "negative number of route changes":
         words[1 + WORLDS] = -1
     else:
         return words[:0]
@@ -183,27 +183,27 @@ def harmed(words: NDArray[np.int64], harm: str) -> NDArray[np.int64]:
 @pytest.mark.parametrize(
     "harm",
     [
-        "nothing",
+        "empty frame",
         "cut short",
-        "one word more",
-        "ghosts like none before",
-        "ghosts in part like none before",
-        "more ghosts than there is room for",
-        "less than no ghost",
-        "more that can touch than there are",
-        "more that leave than there is room for",
-        "less than none that leave",
-        "less than no change of route",
+        "one additional word",
+        "first ghost without a predecessor",
+        "part of a ghost without a predecessor",
+        "more ghosts than the capacity",
+        "negative number of ghosts",
+        "more near ghosts than ghosts",
+        "more leaving vehicles than the capacity",
+        "negative number of leaving vehicles",
+        "negative number of route changes",
     ],
 )
 def test_bad_frames_are_refused(harm: str) -> None:
     near, far = nodes()
     fill(near.zoned, np.random.default_rng(3), np.arange(30))
-    data = harmed(np.frombuffer(near.packed(), np.int64).copy(), harm).tobytes()
+    data = damage(np.frombuffer(near.packed(), np.int64).copy(), harm).tobytes()
     clear(far.zoned)
     with pytest.raises(MessageError, match=f"^{len(data)} bytes are no"):
         far.read(data)
-    assert (far.zoned.num_rows[THEIRS] == 2).all(), "no part of the frame was used"
+    assert (far.zoned.num_rows[THEIRS] == 2).all(), "a part of the frame was used"
     assert not far.departures.num_passing.any()
     assert not far.departures.counts.any()
 
@@ -221,7 +221,7 @@ def packed(here: Sequence[NDArray[Any]], mine: NDArray[np.bool_]) -> memoryview:
     return memoryview(told)
 
 
-def test_agents_arrive_as_they_were_sent() -> None:
+def test_received_agents_equal_sent_agents() -> None:
     here, there = tables(4), tables(4)
     drawn = np.random.default_rng(4)
     here[0][...], here[1][...] = drawn.random((WORLDS, 4, 3)), True
@@ -249,8 +249,8 @@ def test_bad_frames_about_agents_are_refused(change: bytes | None) -> None:
 
 
 @pytest.mark.parametrize("taken", [2, 3])
-def test_an_agent_has_one_node(taken: int) -> None:
-    """A frame names an agent twice, or the agent of another node."""
+def test_a_frame_with_a_repeated_or_foreign_agent_is_refused(taken: int) -> None:
+    """Change a frame so that it names an agent twice, or an agent of another node."""
     here, there = tables(4), tables(4)
     mine = np.array([False, False, True, True, False, False, False, False])
     owner = np.full(8, -1, dtype=np.int32)
@@ -263,7 +263,7 @@ def test_an_agent_has_one_node(taken: int) -> None:
         AgentStream(there).read(memoryview(data), 5, owner)
 
 
-def test_flags_of_agents_are_true_or_false() -> None:
+def test_an_agent_flag_that_is_neither_true_nor_false_is_refused() -> None:
     here, there = tables(4), tables(4)
     data = bytearray(packed(here, np.ones(8, dtype=np.bool_)))
     owner = np.full(8, -1, dtype=np.int32)

@@ -1,4 +1,4 @@
-"""Shares of sensor workers: they are complete, and sharing by cost is not slower."""
+"""Shares of sensor workers are complete, and sharing by cost is not slower."""
 
 from __future__ import annotations
 
@@ -43,7 +43,8 @@ def test_sharing_by_cost_is_never_slower_than_round_robin(costs_s: list[float], 
     by_cost = share_by_cost(units, costs_s, count)
     assert by_cost.units == in_turn.units
     assert all(0 <= home < count for home in by_cost.homes)
-    # Graham's bound for longest processing time first, against a lower bound of any schedule.
+    # Graham's bound for longest-processing-time-first scheduling; `least` is a lower bound for any
+    # schedule.
     least = max(max(costs_s), sum(costs_s) / count)
     assert max(by_cost.loads_s) <= (4.0 / 3.0) * least + 1e-12 or max(by_cost.loads_s) <= max(
         in_turn.loads_s
@@ -51,14 +52,14 @@ def test_sharing_by_cost_is_never_slower_than_round_robin(costs_s: list[float], 
     assert sum(by_cost.loads_s) == pytest.approx(sum(costs_s))
 
 
-def test_unequal_sensors_finish_together() -> None:
+def test_sharing_by_cost_balances_unequal_sensors() -> None:
     units = [Unit(sensor, 0, 1) for sensor in range(6)]
     costs_s = [6.0, 1.0, 5.0, 1.0, 4.0, 1.0]
     assert share_in_turn(units, costs_s, 2).loads_s == [15.0, 3.0]
     assert max(share_by_cost(units, costs_s, 2).loads_s) == 9.0
 
 
-def test_more_workers_than_sensors() -> None:
+def test_workers_without_a_sensor_have_no_load() -> None:
     shares = share_by_cost([Unit(3, 0, 1)], [1.0], 4)
     assert shares.loads_s == [1.0, 0.0, 0.0, 0.0]
 
@@ -89,7 +90,7 @@ def test_every_line_of_divided_frames_is_written_once(
         assert (written[sensor, :, most:] == 0).all()
 
 
-def test_one_large_frame_is_divided_and_all_finish_together() -> None:
+def test_one_large_frame_is_divided_to_balance_all_workers() -> None:
     units = [Unit(0, 0, 1, 0, 4096), Unit(1, 0, 1, 0, 1000), Unit(2, 0, 1)]
     costs_s = [16e-3, 4e-3, 1e-3]
     shares = divide(share_by_cost(units, costs_s, 3), LineCosts([4096, 1000, 1]))
@@ -104,8 +105,11 @@ def test_frames_are_not_divided_without_a_gain() -> None:
     assert divide(whole, LineCosts([100, 100])) == whole
 
 
-def test_expensive_lines_are_found_by_repeated_division() -> None:
-    """The lower half costs four times the upper one: half the cost is 3/8 into the lower half."""
+def test_the_costs_of_lines_are_learned_from_measured_parts() -> None:
+    """Each line of the lower half costs four times as much as one of the upper half.
+
+    Half of the total cost is reached at 3/8 of the lower half, so at line 687.
+    """
     true = np.repeat([1.0, 4.0], 500) / 2500.0
     found = LineCosts([1000])
     for _ in range(12):

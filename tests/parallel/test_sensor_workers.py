@@ -1,4 +1,4 @@
-"""Sensor workers: the same bytes for any number and placement, also when workers die."""
+"""Sensor workers give the same bytes for any number and placement, even if workers die."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def _results(vec: CavVectorEnv) -> list[bytes | str]:
 
 
 def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
-    """Return all frames and hashes, starting with the reset."""
+    """Return the frames and state hashes after the reset and after each step."""
     vec = _make(**keywords)
     try:
         vec.reset(seed=7)
@@ -85,7 +85,7 @@ def _drive(steps: int = STEPS, **keywords: Any) -> list[list[bytes | str]]:
 
 @pytest.fixture(scope="module")
 def alone() -> list[list[bytes | str]]:
-    """Return the samples of this process without sensor workers."""
+    """Return the results without sensor workers."""
     return _drive()
 
 
@@ -124,10 +124,10 @@ def test_results_do_not_depend_on_the_number_of_workers_or_their_shares(
 def test_results_do_not_depend_on_the_division_of_frames(
     monkeypatch: pytest.MonkeyPatch, agents: int, sensor_workers: int
 ) -> None:
-    """Frames as small as these are not divided without force; the results are the same.
+    """Force the division of small frames, which would otherwise stay undivided.
 
-    The test sets the costs of frames, because measured costs depend on the machine: each time,
-    another frame is so expensive that all workers must write parts of it.
+    The test sets the costs of frames, because measured costs depend on the machine. In each
+    division, another frame is so expensive that all workers must write parts of it.
     """
     divided, turn = set[int](), count()
 
@@ -151,7 +151,7 @@ def test_results_do_not_depend_on_the_division_of_frames(
 
 
 @pytest.mark.parametrize("zones", [2, 4, 9])
-def test_rows_of_all_zones_equal_own_rows_and_ghosts(
+def test_zones_with_and_without_sensor_workers_give_the_results_of_one_world(
     alone: list[list[bytes | str]], zones: int
 ) -> None:
     assert _drive(zones=zones) == alone
@@ -171,7 +171,7 @@ def test_sensor_workers_of_whole_worlds_give_the_same_results() -> None:
 
 
 @pytest.mark.slow
-def test_ten_thousand_steps_without_a_frame_of_another_tick() -> None:
+def test_each_frame_of_ten_thousand_steps_belongs_to_its_tick() -> None:
     settings = {"horizon_s": 2000.0, "clock.ctrl_dt_s": 0.05}
     vec = _make(SMALL, sensor_workers=1, overrides=settings)
     try:
@@ -186,7 +186,7 @@ def test_ten_thousand_steps_without_a_frame_of_another_tick() -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGSTOP])
-def test_a_dead_worker_is_replaced_and_senses_the_same(
+def test_a_replaced_sensor_worker_gives_the_same_samples(
     alone: list[list[bytes | str]], how: signal.Signals
 ) -> None:
     vec = _make(sensor_workers=2)
@@ -212,7 +212,9 @@ def test_a_worker_that_dies_while_it_senses_changes_no_result(
 
     def kill() -> None:
         while not stop.wait(0.03):
-            if may_kill.is_set():  # once per step: four deaths in one step are an error
+            if (
+                may_kill.is_set()
+            ):  # at most one kill per step, because four deaths in one step are an error
                 may_kill.clear()
                 with suppress(ProcessLookupError):
                     os.kill(_pids(vec)[1], signal.SIGKILL)
@@ -236,7 +238,7 @@ def test_a_worker_that_dies_while_it_senses_changes_no_result(
         vec.close()
 
 
-def test_a_late_worker_is_awaited() -> None:
+def test_the_world_waits_for_a_late_sensor_worker() -> None:
     vec = _make(SMALL, sensor_workers=2)
     try:
         vec.reset(seed=7)
@@ -270,7 +272,7 @@ def test_a_frame_of_another_tick_is_refused() -> None:
         vec.close()
 
 
-def test_closing_and_forgetting_leave_no_process_behind() -> None:
+def test_no_process_remains_after_worlds_are_closed_or_deleted() -> None:
     for forgets in (False, True):
         vec = _make(SMALL, sensor_workers=2)
         vec.reset(seed=0)
@@ -288,10 +290,10 @@ def test_closing_and_forgetting_leave_no_process_behind() -> None:
 
 
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT])
-def test_no_worker_outlives_the_process_of_the_worlds(how: signal.Signals) -> None:
+def test_no_sensor_worker_outlives_the_process_of_its_worlds(how: signal.Signals) -> None:
     text = (
         "import signal, cavmarl\n"
-        # A program in the background ignores Ctrl-C.
+        # A background program ignores Ctrl-C unless it sets this handler.
         "signal.signal(signal.SIGINT, signal.default_int_handler)\n"
         f"settings = {{'rig': {SMALL}}}\n"
         "vec = cavmarl.make_vec('grid4x4', agents=2, sensor_workers=2, overrides=settings)\n"

@@ -23,14 +23,14 @@ ROW = np.dtype([("id", np.int64), ("place", np.float32, (3,))], align=True)
 
 
 def mapped(address: int) -> dict[str, int]:
-    """Return the figures of the system for the mapping at an address; empty: there is none."""
+    """Return the entries of smaps for the mapping at an address; empty if there is no mapping."""
     text = Path("/proc/self/smaps").read_text(encoding="ascii")
     found = re.search(rf"^{address:x}-.*\n((?:\w+: .*\n)+)", text, re.MULTILINE)
     lines = re.findall(r"^(\w+): +(\d+) kB$", "" if found is None else found[1], re.MULTILINE)
     return {name: 1024 * int(number) for name, number in lines}
 
 
-def test_a_large_array_is_zeros_at_a_boundary_of_huge_pages() -> None:
+def test_a_large_array_is_zero_and_aligned_to_huge_pages() -> None:
     array = huge_shared_zeros((2, 3, HUGE_BYTES // 8), ROW)
     assert array.shape == (2, 3, HUGE_BYTES // 8)
     assert array.dtype == ROW
@@ -47,9 +47,11 @@ def test_arrays_of_any_size_keep_their_content(size: int) -> None:
     assert array.tobytes() == expected.tobytes()
 
 
-@pytest.mark.parametrize("can", [True, False])
-def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    if not can:  # as on a system without MADV_COLLAPSE
+@pytest.mark.parametrize("can_collapse", [True, False])
+def test_a_forked_process_writes_to_the_same_array(
+    can_collapse: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    if not can_collapse:  # as on a system without MADV_COLLAPSE
         monkeypatch.setattr(shared_huge_pages, "COLLAPSE", -1)
     array = huge_shared_zeros(HUGE_BYTES, np.int64)
     pid = os.fork()
@@ -58,7 +60,7 @@ def test_a_fork_writes_the_same_array(can: bool, monkeypatch: pytest.MonkeyPatch
         os._exit(0)
     assert os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1]) == 0
     assert (array == 7).all()
-    if not can:
+    if not can_collapse:
         assert mapped(array.ctypes.data)["ShmemPmdMapped"] == 0
 
 
@@ -66,10 +68,10 @@ def test_all_pages_of_an_array_are_huge_or_none() -> None:
     array = huge_shared_zeros(3 * HUGE_BYTES + 9, np.uint8)
     array[:] = 1
     large = mapped(array.ctypes.data)["ShmemPmdMapped"]
-    assert large == (3 * HUGE_BYTES if lays_together() else 0)
+    assert large == (3 * HUGE_BYTES if has_huge_pages() else 0)
 
 
-def lays_together() -> bool:
+def has_huge_pages() -> bool:
     """Return whether this system gives huge pages on request."""
     setting = Path("/sys/kernel/mm/transparent_hugepage/shmem_enabled")
     version = tuple(map(int, os.uname().release.split(".")[:2]))
@@ -105,7 +107,7 @@ def test_missing_memory_is_reported(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_heap_in_huge_pages_keeps_its_content() -> None:
     words = [bytes([n % 251]) * 100 for n in range(100_000)]  # small objects are in the heap
     collapse_heap()
-    if lays_together():
+    if has_huge_pages():
         heap = int(re.search(r"^(\w+)-.*\[heap\]$", MAPS.read_text(), re.MULTILINE)[1], 16)
         assert mapped(heap)["AnonHugePages"] >= HUGE_BYTES
     assert words == [bytes([n % 251]) * 100 for n in range(100_000)]

@@ -1,4 +1,4 @@
-"""A world that several workers run together equals the undivided one, whichever worker dies."""
+"""A world that several workers run together equals the undivided world, even if workers die."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_split_worlds_equal_the_undivided_one(
     assert same(drive(make(env, zones=zones, workers=workers, **wanted)), whole)
 
 
-def test_rows_change_their_side_for_all_workers(make: Make) -> None:
+def test_a_long_run_over_workers_equals_the_undivided_one(make: Make) -> None:
     wanted = {"agents": 3, "background": 60, "max_cycles": 50}
     whole = drive(make("grid4x4", **wanted), steps=80)
     assert same(drive(make("grid4x4", zones=4, workers=2, **wanted), steps=80), whole)
@@ -62,7 +62,7 @@ def test_worlds_with_next_step_autoreset_are_equal(make: Make) -> None:
     assert same(drive(make("town", zones=4, workers=2, **wanted)), whole)
 
 
-def test_a_step_with_divided_and_undivided_worlds_is_equal(make: Make) -> None:
+def test_worlds_over_three_workers_equal_undivided_worlds(make: Make) -> None:
     wanted = {"num_envs": 2, "agents": 4, "background": 10, "max_cycles": 6}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=3, **wanted)
@@ -91,11 +91,11 @@ def test_a_worker_that_dies_between_steps_changes_no_result(
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=2, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step % 5 == 2:
             os.kill(pool_of(vec).pids[worker], how)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
     assert [death.worker for death in pool_of(vec).deaths] == [worker] * 2
 
 
@@ -108,7 +108,7 @@ def test_workers_that_die_at_any_time_change_no_result(make: Make, env: str) -> 
     timers: list[Timer] = []
     rng = random.Random(7)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         pids.update(pool_of(vec).pids)
         if step % 4 == 1:
             pid = pool_of(vec).pids[rng.randrange(3)]
@@ -117,27 +117,27 @@ def test_workers_that_die_at_any_time_change_no_result(make: Make, env: str) -> 
         elif timers:
             timers[-1].join()
 
-    assert same(drive(vec, steps=36, before=strike), whole)
+    assert same(drive(vec, steps=36, before=kill_in_step), whole)
     assert len(pool_of(vec).deaths) == len(timers)
     left = pool_of(vec).pids
     vec.close()
     assert alive([*pids, *left]) == []
 
 
-def test_the_process_that_forks_may_die(make: Make) -> None:
+def test_a_killed_fork_server_changes_no_result(make: Make) -> None:
     wanted = {"agents": 3, "background": 20}
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", zones=4, workers=2, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == STEPS // 2:
             os.kill(pool_of(vec).server_pid, signal.SIGKILL)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
 
 
 @pytest.mark.parametrize("phase", ["move", "resolve"])
-def test_an_exception_in_one_worker_of_a_team_changes_no_world(
+def test_an_exception_in_one_worker_undoes_the_step_of_all_workers(
     make: Make, phase: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     wanted = {"agents": 5, "background": 20}
@@ -156,7 +156,7 @@ def test_an_exception_in_one_worker_of_a_team_changes_no_world(
         return step(actions)
 
     monkeypatch.setattr(vec, "step", step_again)
-    assert same(drive(vec), whole), "all worlds are unchanged"
+    assert same(drive(vec), whole), "a world has changed"
     (failure,) = failures
     assert (failure.kind, failure.worker) == ("ZeroDivisionError", 1)
     assert "world 0, zone" in str(failure)
@@ -196,11 +196,11 @@ def test_rerouting_vehicles_take_equal_routes(make: Make, tmp_path: Path) -> Non
     whole = drive(one, steps=300)
     vec = make(net, zones=3, workers=2, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step in (140, 221):
             os.kill(pool_of(vec).pids[step % 2], signal.SIGKILL)
 
-    assert same(drive(vec, steps=300, before=strike), whole)
+    assert same(drive(vec, steps=300, before=kill_in_step), whole)
     assert len(pool_of(vec).deaths) == 2
     assert one.traffic_stats()["rerouted"] > 0, "no vehicle has taken another route"
 

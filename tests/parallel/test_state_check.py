@@ -1,4 +1,4 @@
-"""Forged states are refused with a typed error, and worlds do not change."""
+"""A forged state is refused with a typed error and does not change the worlds."""
 
 from __future__ import annotations
 
@@ -31,7 +31,11 @@ Array = NDArray[Any]
 State: TypeAlias = list[Array]
 Forge = Callable[[State], None]
 
-LATER = {"tick": (MANY,), "departed": (MANY,), "last_change": (MANY,)}  # than the world's tick
+LATER = {
+    "tick": (MANY,),
+    "departed": (MANY,),
+    "last_change": (MANY,),
+}  # values later than the tick of the world
 
 
 def _busy(make: Make, **more: Any) -> CavVectorEnv:
@@ -47,8 +51,8 @@ def _worlds(vec: CavVectorEnv) -> LocalWorlds:
     return vec.worlds
 
 
-def _refused(vec: CavVectorEnv, forge: Forge) -> None:
-    """Expect the refusal of the present state with a change by `forge`."""
+def _check_refusal(vec: CavVectorEnv, forge: Forge) -> None:
+    """Check that the worlds refuse their present state after a change by `forge`."""
     worlds = _worlds(vec)
     before = _forged(worlds, lambda state: None)
     forged = _forged(worlds, forge)
@@ -68,7 +72,7 @@ def _same(one: State, other: State) -> bool:
 
 
 def _content(array: Array) -> list[bytes]:
-    """Return the bytes of each field, without padding."""
+    """Return the bytes of each field of a record array, without padding."""
     names = array.dtype.names
     return [array.tobytes()] if names is None else [array[name].tobytes() for name in names]
 
@@ -86,10 +90,10 @@ def test_rows_with_an_index_out_of_range_are_refused(make: Make) -> None:
             def forge(state: State, name: str = name, value: float = value) -> None:
                 state[_index(state, VEHICLE, last=True)][name][-1] = value
 
-            _refused(vec, forge)
+            _check_refusal(vec, forge)
 
 
-def test_ways_whose_sums_overflow(make: Make) -> None:
+def test_rows_whose_way_overflows_with_the_lane_are_refused(make: Make) -> None:
     vec = _busy(make)
     rows = vec.network.edges[~vec.network.edges["internal"]]
     for edge in rows[:3]:
@@ -99,7 +103,7 @@ def test_ways_whose_sums_overflow(make: Make) -> None:
             row = state[_index(state, VEHICLE, last=True)]
             row["lane"][-1], row["way"][-1] = lane, MOST - lane
 
-        _refused(vec, forge)
+        _check_refusal(vec, forge)
 
 
 def test_waiting_vehicles_with_an_index_out_of_range_are_refused(make: Make) -> None:
@@ -114,10 +118,10 @@ def test_waiting_vehicles_with_an_index_out_of_range_are_refused(make: Make) -> 
             def forge(state: State, name: str = name, value: float = value) -> None:
                 state[_index(state, DEPARTURE)][name][world, 0] = value
 
-            _refused(vec, forge)
+            _check_refusal(vec, forge)
 
 
-def test_other_shapes_and_numbers_of_arrays_are_refused(make: Make) -> None:
+def test_states_with_arrays_of_other_shapes_or_types_are_refused(make: Make) -> None:
     vec = _busy(make)
     count = len(_worlds(vec).save())
     for n in range(count):
@@ -129,12 +133,12 @@ def test_other_shapes_and_numbers_of_arrays_are_refused(make: Make) -> None:
             state[n] = np.zeros(state[n].shape, dtype=np.complex128)
 
         if n < count - 4:  # a zone may have no vehicles
-            _refused(vec, shorten)
+            _check_refusal(vec, shorten)
         if n > 3:
-            _refused(vec, retype)
-    _refused(vec, lambda state: state.append(np.zeros(1)))
-    _refused(vec, State.clear)
-    _refused(vec, lambda state: state.__delitem__(-1))
+            _check_refusal(vec, retype)
+    _check_refusal(vec, lambda state: state.append(np.zeros(1)))
+    _check_refusal(vec, State.clear)
+    _check_refusal(vec, lambda state: state.__delitem__(-1))
 
 
 def test_two_vehicles_with_one_id_are_refused(make: Make) -> None:
@@ -147,7 +151,7 @@ def test_two_vehicles_with_one_id_are_refused(make: Make) -> None:
         return forge
 
     vec = _busy(make)
-    _refused(vec, twice("id"))
+    _check_refusal(vec, twice("id"))
     worlds = _worlds(vec)
     while not (worlds.simulation.departures.num_queue > 0).any():
         vec.step(vec.suggest_actions())
@@ -157,13 +161,13 @@ def test_two_vehicles_with_one_id_are_refused(make: Make) -> None:
     def enters_twice(state: State) -> None:
         state[_index(state, DEPARTURE)]["id"][world, 0] = driving
 
-    _refused(vec, enters_twice)
+    _check_refusal(vec, enters_twice)
     agent = int(worlds.simulation.vehicles(world)["agent"].max())
 
     def drives_twice(state: State) -> None:
         state[_index(state, DEPARTURE)]["agent"][world, 0] = agent
 
-    _refused(vec, drives_twice)
+    _check_refusal(vec, drives_twice)
 
 
 def test_invalid_states_of_overridden_signals_are_refused(make: Make) -> None:
@@ -184,7 +188,7 @@ def test_invalid_states_of_overridden_signals_are_refused(make: Make) -> None:
         def forge(state: State, column: int = column, value: int = value) -> None:
             state[place][1, column] = value
 
-        _refused(vec, forge)
+        _check_refusal(vec, forge)
 
 
 def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Path) -> None:
@@ -215,27 +219,27 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
             def forge(state: State, place: int = place, value: float = value) -> None:
                 state[place][...] = value
 
-            _refused(vec, forge)
+            _check_refusal(vec, forge)
     controllers = simulation.shards[0].worlds.controllers
     place = next(n for n, saved in enumerate(worlds.save()) if saved is controllers)
     assert controllers.size
-    _refused(vec, lambda state: state[place]["phase"].fill(MANY))
+    _check_refusal(vec, lambda state: state[place]["phase"].fill(MANY))
     now_ms = int(simulation.ticks()[0] * simulation.config.clock.sim_dt_s * 1e3)
-    # Checks that are overdue would all be made in the next tick, one by one.
+    # Without this check, the next tick would run all overdue checks of the controller one by one.
     for name, value in (("next_ms", 0), ("next_ms", 1 << 40), ("since_ms", now_ms + 9_000)):
 
         def mistime(state: State, name: str = name, value: int = value) -> None:
             state[place][name] = value
 
-        _refused(vec, mistime)
+        _check_refusal(vec, mistime)
     ticks = next(
         n for n, array in enumerate(worlds.save()) if array is simulation.shards[0].worlds.ticks
     )
-    _refused(vec, lambda state: state[ticks].fill(1 << 62))
+    _check_refusal(vec, lambda state: state[ticks].fill(1 << 62))
     words = len(worlds.save()) - 2 * 2 - 2
     rng = np.random.default_rng(0)
     size = worlds.save()[words].shape[1]
-    for n in range(9):  # the lengths of the parts of the saved ownership
+    for n in range(9):  # the first nine words are the lengths of the parts of the saved ownership
 
         def lengthen(state: State, n: int = n) -> None:
             state[words][0, n] = MANY
@@ -243,9 +247,9 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
         def deny(state: State, n: int = n) -> None:
             state[words][0, n] = -1
 
-        _refused(vec, lengthen)
-        _refused(vec, deny)
-    for _ in range(200):  # each change is refused, or does not matter for the vehicles
+        _check_refusal(vec, lengthen)
+        _check_refusal(vec, deny)
+    for _ in range(200):  # each random change is refused or does not affect the vehicles
         state = [array.copy() for array in worlds.save()]
         state[words][0, rng.integers(size)] = rng.integers(-MANY, MANY)
         hashes = [vec.state_hash(w) for w in range(2)]
@@ -259,7 +263,7 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
 
 
 def _with_demand(make: Make, tmp_path: Path, **more: Any) -> CavVectorEnv:
-    """Return two worlds whose vehicles look for faster routes."""
+    """Return two worlds with rerouted vehicles after 400 steps."""
     files = write_demand(tmp_path, CARS.format(device=DEVICE) + FLOW)
     overrides = {
         "traffic.demand": [str(path) for path in files],
@@ -279,7 +283,7 @@ def _with_demand(make: Make, tmp_path: Path, **more: Any) -> CavVectorEnv:
     return vec
 
 
-def test_found_routes_out_of_range_are_refused(make: Make, tmp_path: Path) -> None:
+def test_routes_of_rerouted_vehicles_out_of_range_are_refused(make: Make, tmp_path: Path) -> None:
     vec = _with_demand(make, tmp_path)
     worlds = _worlds(vec)
     steps = next(n for n, a in enumerate(worlds.save()) if "turnarounds" in (a.dtype.names or ()))
@@ -288,7 +292,7 @@ def test_found_routes_out_of_range_are_refused(make: Make, tmp_path: Path) -> No
         def forge(state: State, name: str = name, value: int = value) -> None:
             state[steps][name] = value
 
-        _refused(vec, forge)
+        _check_refusal(vec, forge)
 
     def circle(state: State) -> None:
         state[steps]["next"] = state[steps]["shift"] = 0
@@ -308,8 +312,8 @@ def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make)
     arrays = _worlds(vec).save()
     (at,) = [n for n, array in enumerate(arrays) if _content(array) == _content(ids_of(vec))]
     for value in (-2, MANY, int(ids[1])):
-        _refused(vec, with_id(at, value))
-    # An id that the world may give to another vehicle, in the slot and in the row alike.
+        _check_refusal(vec, with_id(at, value))
+    # Slot and row agree, but the world may give this id to another vehicle.
     for other in (MANY, int(ids[0]) + 1):
 
         def renumber(state: State, other: int = other) -> None:
@@ -318,11 +322,11 @@ def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make)
                 if rows.dtype == VEHICLE:
                     rows["id"][rows["id"] == ids[0]] = other
 
-        _refused(vec, renumber)
+        _check_refusal(vec, renumber)
     for name, wrong in (
         ("kind", 0.0), ("kind", 3.0), ("x", np.nan), ("vtype", 9.5), ("length", 50.0),
     ):  # fmt: skip
-        _refused(vec, with_command(at - 1, name, wrong))
+        _check_refusal(vec, with_command(at - 1, name, wrong))
     for name, value in (("order", 2), ("order", 9), ("order", -1), ("way", 0), ("goal", 0)):
 
         def forge(state: State, name: str = name, value: int = value) -> None:
@@ -330,9 +334,9 @@ def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make)
                 if rows.dtype == VEHICLE:
                     rows[name][rows["id"] == ids[0]] = value
 
-        _refused(vec, forge)
+        _check_refusal(vec, forge)
 
-    # A node keeps the vehicles of its own zones alone.
+    # The state of one node has only the vehicles of its own zones.
     part = _forged(_worlds(vec), lambda state: None)
     for n, rows in enumerate(part):
         if rows.dtype == VEHICLE and np.isin(ids[:2], rows["id"]).any():
@@ -358,21 +362,21 @@ def test_wrong_greens_times_and_counts_of_signals_are_refused(make: Make) -> Non
     found = outputs.states, outputs.observations, outputs.counts, outputs.history
     at, seen, counts, history = map(place, found)
     for column, value in ((0, -1), (0, 2), (1, 2), (1, MANY), (2, -1), (2, 1 << 41), (3, -1)):
-        _refused(vec, with_value(at, (1, 3, column), value))
-    _refused(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting times
+        _check_refusal(vec, with_value(at, (1, 3, column), value))
+    _check_refusal(vec, with_value(at + 1, (0, 2), -1))  # sums of waiting times
     for wrong in (-0.5, 1.5, np.nan):
-        _refused(vec, with_value(seen, (0, 0, 0), wrong))
-    _refused(vec, with_value(counts, (0, 0, 0), -1))
+        _check_refusal(vec, with_value(seen, (0, 0, 0), wrong))
+    _check_refusal(vec, with_value(counts, (0, 0, 0), -1))
     for column, least in ((lanes.RED_TICKS, 0), (lanes.PASSED, 0), (lanes.FLOW, -1)):
-        _refused(vec, with_value(history, (1, 2, column), least - 1))
-    _refused(vec, with_value(counts + 2, (0, 0, 0, 0), -1))  # state of the loops
-    _refused(vec, with_value(place(outputs.loops), (1, 3, 1, 2), 1 << 41))
+        _check_refusal(vec, with_value(history, (1, 2, column), least - 1))
+    _check_refusal(vec, with_value(counts + 2, (0, 0, 0, 0), -1))  # state of the loops
+    _check_refusal(vec, with_value(place(outputs.loops), (1, 3, 1, 2), 1 << 41))
     controllers = place(common_of_worlds(_worlds(vec).simulation).controllers)
 
     def due(state: State) -> None:
         state[controllers]["next_ms"][0, 0] = 5000
 
-    _refused(vec, due)
+    _check_refusal(vec, due)
 
 
 def with_value(at: int, place: tuple[int, ...], value: float) -> Forge:
@@ -429,11 +433,11 @@ def test_messages_with_missing_reports_are_refused(make: Make) -> None:
     for array in (mail.num_packets, mail.num_reports, mail.num_last):
         place = saved.get(id(array))
         if place is not None:
-            _refused(vec, lambda state, place=place: state[place].fill(-1))
-            _refused(vec, lambda state, place=place: state[place].fill(MANY))
+            _check_refusal(vec, lambda state, place=place: state[place].fill(-1))
+            _check_refusal(vec, lambda state, place=place: state[place].fill(MANY))
     if id(mail.packets) in saved:
         place = saved[id(mail.packets)]
-        _refused(vec, lambda state: state[place]["first"].fill(MANY))
+        _check_refusal(vec, lambda state: state[place]["first"].fill(MANY))
 
 
 def test_forged_states_of_single_worlds_are_refused(make: Make) -> None:
@@ -469,7 +473,7 @@ def test_forged_rows_of_vehicles_that_change_their_zone_are_refused(make: Make) 
                 codec.unpack(codec.pack(forged, 0, 0, tick), vehicle, tick, rows.copy(), 0, 0)
 
 
-def test_a_departure_that_comes_back_is_refused(make: Make, tmp_path: Path) -> None:
+def test_a_state_that_repeats_a_departure_is_refused(make: Make, tmp_path: Path) -> None:
     vec = _with_demand(make, tmp_path)
     worlds = _worlds(vec)
     place = next(
@@ -478,7 +482,7 @@ def test_a_departure_that_comes_back_is_refused(make: Make, tmp_path: Path) -> N
         if array is worlds.simulation.departures.next_order
     )
     assert (worlds.save()[place] > 3).all()
-    _refused(vec, lambda state: state[place].fill(1))
+    _check_refusal(vec, lambda state: state[place].fill(1))
 
 
 @pytest.mark.parametrize("at", [b"'shape': (2,", b"'descr': '<i8'", b"'fortran_order': False"])
@@ -511,16 +515,18 @@ def test_flags_that_are_neither_true_nor_false_are_refused() -> None:
 def test_a_clock_that_is_far_ahead_is_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
-    assert not worlds.simulation.shards[0].worlds.controllers.size, "their times would be refused"
+    assert not worlds.simulation.shards[0].worlds.controllers.size, (
+        "the state of a controller would be refused first"
+    )
     ticks = next(
         n
         for n, array in enumerate(worlds.save())
         if array is worlds.simulation.shards[0].worlds.ticks
     )
-    _refused(vec, lambda state: state[ticks].fill(1 << 62))
+    _check_refusal(vec, lambda state: state[ticks].fill(1 << 62))
 
 
-def test_a_saved_ownership_of_another_number_of_vehicles_is_refused(make: Make) -> None:
+def test_a_saved_ownership_with_a_wrong_number_of_vehicles_is_refused(make: Make) -> None:
     vec = _busy(make)
     worlds = _worlds(vec)
     place = len(worlds.save()) - 2 * 2 - 2
@@ -532,4 +538,4 @@ def test_a_saved_ownership_of_another_number_of_vehicles_is_refused(make: Make) 
     def disown(state: State) -> None:
         state[place][0, : len(forged)] = forged
 
-    _refused(vec, disown)
+    _check_refusal(vec, disown)

@@ -1,4 +1,4 @@
-"""Arrays are read from an image as they were written, for any earlier content of the image."""
+"""Arrays that are read from an image equal the written arrays, whatever the image held before."""
 
 from __future__ import annotations
 
@@ -14,11 +14,13 @@ from cavmarl.core.errors import WorkerError
 from cavmarl.parallel.memory.shared_memory import Segment
 from cavmarl.parallel.state.state_image import Image
 
-RECORD = np.dtype([("a", np.float64), ("b", np.int32)])  # 12 bytes, no whole number of words
+RECORD = np.dtype(
+    [("a", np.float64), ("b", np.int32)]
+)  # 12 bytes, which is not a whole number of words
 
 
 def arrays(lengths: list[int], seed: int) -> list[NDArray[Any]]:
-    """Return arrays of these lengths, with three dtypes in turn."""
+    """Return arrays of these lengths with three dtypes in turn: records, booleans and floats."""
     rng = np.random.default_rng(seed)
     found: list[NDArray[Any]] = []
     for n, length in enumerate(lengths):
@@ -41,7 +43,7 @@ def arrays(lengths: list[int], seed: int) -> list[NDArray[Any]]:
         )
     )
 )
-def test_arrays_are_read_as_they_were_written(rounds: list[list[int]]) -> None:
+def test_read_arrays_equal_written_arrays(rounds: list[list[int]]) -> None:
     segment = Segment.make(64)
     image, successor = Image(segment), Image(segment)
     for seed, lengths in enumerate(rounds):
@@ -53,7 +55,7 @@ def test_arrays_are_read_as_they_were_written(rounds: list[list[int]]) -> None:
     segment.close()
 
 
-def test_arrays_with_new_values_are_read_as_written() -> None:
+def test_arrays_with_changed_values_are_read_as_written() -> None:
     segment = Segment.make(64)
     image, successor = Image(segment), Image(segment)
     written = arrays([3, 4, 5], 0)
@@ -89,7 +91,7 @@ def test_an_array_of_more_dimensions_is_read_as_written() -> None:
     segment.close()
 
 
-def test_a_changed_image_is_noticed() -> None:
+def test_a_damaged_image_is_an_error() -> None:
     segment = Segment.make(64)
     image = Image(segment)
     image.write(arrays([30], 0))

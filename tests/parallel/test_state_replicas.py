@@ -1,4 +1,4 @@
-"""Kept states of a node: at most two, and only one when the newest has arrived everywhere."""
+"""A node keeps at most two states, and one when all replicas of the newest state have arrived."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.parallel.state.world_bytes import from_bytes, to_bytes
 
 
 class Worlds:
-    """Worlds with two zones. Their state has numbers, and rows of each zone."""
+    """Worlds with two zones; their state is an array of numbers and the rows of each zone."""
 
     simulation = SimpleNamespace(num_worlds=1)
     world = SimpleNamespace(partition=SimpleNamespace(count=2))
@@ -54,7 +54,7 @@ def replica(state: int, arrays: list[np.ndarray[Any, Any]]) -> NodeFrame:
 THEIRS = [np.arange(3), np.ones(5), np.zeros(0)]
 
 
-def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> None:
+def test_older_states_are_deleted_when_all_replicas_of_the_newest_have_arrived() -> None:
     worlds, wires = Worlds(), Wires()
     kept = StateReplicas(worlds, (), wires, 1)  # type: ignore[arg-type]
     for state in (1, 2, 3):
@@ -64,9 +64,11 @@ def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> No
     assert wires.sent == [(4, 1), (4, 2), (4, 3)]
     assert (list(kept.own), list(kept.others[0])) == ([2, 3], [2, 3])
     kept.settle()
-    kept.receive(0, replica(4, THEIRS))  # the other node is ahead of this node
+    kept.receive(0, replica(4, THEIRS))  # the other node has already kept the next state
     kept.settle()
-    assert (list(kept.own), list(kept.others[0])) == ([3], [3]), "nodes may return to state 3"
+    assert (list(kept.own), list(kept.others[0])) == ([3], [3]), (
+        "state 3 is missing, to which nodes may have to return"
+    )
     kept.await_replica(4, ZONES, saved)
     assert list(kept.others[0]) == [3, 4]
 
@@ -80,7 +82,7 @@ def test_older_states_are_dropped_when_the_newest_has_arrived_everywhere() -> No
         (1, [np.arange(3), np.ones(5), np.ones(2)], r"vehicles of zones \[1\]"),
     ],
 )
-def test_a_wrong_replica_is_the_fault_of_its_sender(
+def test_a_wrong_replica_counts_as_loss_of_its_sender(
     state: int, arrays: list[np.ndarray[Any, Any]], words: str
 ) -> None:
     kept = StateReplicas(Worlds(), (), Wires(), 1)  # type: ignore[arg-type]
@@ -91,7 +93,7 @@ def test_a_wrong_replica_is_the_fault_of_its_sender(
     assert not kept.others
 
 
-def test_arrays_have_the_format_of_numpy() -> None:
+def test_a_state_is_a_sequence_of_arrays_in_the_format_of_numpy() -> None:
     rows = np.zeros(5, dtype=np.dtype([("id", np.int64), ("is_near", np.bool_)], align=True))
     rows["id"] = np.arange(5)
     arrays = [rows, rows[:0], np.zeros((2, 0)), np.arange(6).reshape(2, 3).T, np.ones(1, np.bool_)]

@@ -1,4 +1,4 @@
-"""Copies of SUMO logs, in memory that outlives a process: only additions are copied."""
+"""Copies of SUMO logs in memory that outlives a process; each update copies only new entries."""
 
 from __future__ import annotations
 
@@ -11,8 +11,8 @@ from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.traffic.sumo.sumo_history import MOVED, ToldLog
 
 
-def told(number: int, vehicles: int) -> np.ndarray:
-    """Return MOVED of a tick with distinct values."""
+def moved_in_tick(number: int, vehicles: int) -> np.ndarray:
+    """Return the MOVED records of a tick, with values that depend on `number`."""
     moved = np.zeros(vehicles, dtype=MOVED)
     moved["id"] = np.arange(vehicles)
     moved["x"], moved["y"], moved["angle"] = 0.1 * number, -number, number / 7.0
@@ -23,7 +23,7 @@ def told(number: int, vehicles: int) -> np.ndarray:
 def log_of(ticks: int, most_bytes: int = 1 << 20, first: int = 0) -> ToldLog:
     log = ToldLog(most_bytes)
     for number in range(ticks):
-        log.note(told(first + number, number % 5))
+        log.note(moved_in_tick(first + number, number % 5))
     return log
 
 
@@ -31,20 +31,22 @@ def bytes_of(log: ToldLog, ticks: int) -> list[bytes]:
     return [moved.tobytes() for moved in log.ticks(ticks)]
 
 
-def test_a_log_has_the_commands() -> None:
+def test_a_log_returns_the_noted_ticks() -> None:
     log = log_of(500)
-    assert bytes_of(log, 500) == [told(n, n % 5).tobytes() for n in range(500)]
+    assert bytes_of(log, 500) == [moved_in_tick(n, n % 5).tobytes() for n in range(500)]
     assert bytes_of(log, 3) == bytes_of(log, 500)[:3]
     assert bytes_of(log, 0) == []
 
 
-def test_a_restarted_log_leaves_returned_words_alone() -> None:
+def test_a_restarted_log_does_not_change_returned_ticks() -> None:
     log = log_of(40)
     before = log.ticks(40)
     log.begin()
     for number in range(40):
-        log.note(told(100 + number, 4))
-    assert [moved.tobytes() for moved in before] == [told(n, n % 5).tobytes() for n in range(40)]
+        log.note(moved_in_tick(100 + number, 4))
+    assert [moved.tobytes() for moved in before] == [
+        moved_in_tick(n, n % 5).tobytes() for n in range(40)
+    ]
 
 
 def test_more_ticks_than_were_logged_are_refused() -> None:
@@ -66,13 +68,13 @@ def test_a_copy_equals_the_log_after_any_number_of_updates() -> None:
     segment = Segment.make(FIRST_LOG_BYTES)
     kept, log = KeptLog(segment), log_of(10)
     for number in range(200):
-        log.note(told(number, 7))
+        log.note(moved_in_tick(number, 7))
         if number % 13 == 0:
             kept.write(log)
             other = ToldLog(1 << 20)
             other.take_up(KeptLog(Segment(segment.fd, 0)).read())
             assert other.words.tobytes() == log.words.tobytes()
-    other.note(told(3, 2))  # the other log adds a command of its own
+    other.note(moved_in_tick(3, 2))  # the other log gets its own entry
     assert other.words.size != kept.read().size
     segment.close()
 
@@ -82,11 +84,11 @@ def test_a_copy_of_another_episode_is_rewritten() -> None:
     kept, log = KeptLog(segment), log_of(50)
     kept.write(log)
     log.begin()
-    for number in range(60):  # this log is longer than the first copy, and has other content
-        log.note(told(1000 + number, number % 5))
+    for number in range(60):  # the log is now longer than its copy and has other content
+        log.note(moved_in_tick(1000 + number, number % 5))
     kept.write(log)
     assert kept.read().tobytes() == log.words.tobytes()
-    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # like another process
+    KeptLog(Segment(segment.fd, 0)).write(log_of(55, first=7))  # as another process would do
     assert kept.read().tobytes() == log_of(55, first=7).words.tobytes()
     segment.close()
 

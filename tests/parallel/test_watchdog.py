@@ -1,4 +1,4 @@
-"""A process that waits for a working child does not count as asleep."""
+"""The watchdog of a worker treats a worker that waits for a working child as working."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ subprocess.run([sys.executable, "-c", sys.argv[1]])
 
 
 def verdict(child: str) -> str | None:
-    """Return the verdicts on a process that waits for a process that runs `child`."""
+    """Return the verdict on a process whose child runs the code `child`."""
     words = [sys.executable, "-c", PARENT, f"print(flush=True)\n{child}"]
     with subprocess.Popen(words, stdout=subprocess.PIPE) as process:
         assert process.stdout is not None
@@ -34,21 +34,21 @@ def verdict(child: str) -> str | None:
             process.kill()
 
 
-def test_a_process_that_waits_for_its_own_working_child_is_left_alone() -> None:
+def test_a_process_that_waits_for_its_working_child_is_not_asleep() -> None:
     assert verdict("import os\nwhile os.getppid() > 1: sum(range(100_000))") is None
 
 
-def test_a_process_that_sleeps_with_its_child_is_noticed() -> None:
+def test_a_process_that_sleeps_like_its_child_is_asleep() -> None:
     found = verdict("import time; time.sleep(8)")
     assert found is not None
     assert "asleep" in found
 
 
 @pytest.mark.parametrize(("state", "is_at_work"), [("R", True), ("D", True), ("S", False)])
-def test_a_child_that_waits_for_the_processor_is_at_work(
+def test_a_child_that_waits_for_the_processor_is_not_asleep(
     monkeypatch: pytest.MonkeyPatch, state: str, is_at_work: bool
 ) -> None:
-    """Other programs may take the processor for seconds, but the child does not sleep."""
+    """A child in state R may not run for seconds if other programs use the processor."""
     monkeypatch.setattr(watchdog, "read_state", lambda pid: ("S" if pid == 1 else state, 7))
     monkeypatch.setattr(watchdog, "descendants", lambda pid: [2])
     dog = Watchdog(1, 60.0)

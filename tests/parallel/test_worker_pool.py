@@ -1,4 +1,4 @@
-"""Processes that are killed, stopped, interrupted or left behind: the pool survives."""
+"""A pool of workers survives killed, stopped and interrupted processes."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ from tests.support.toy_job import ADD, DIE, DOZE, FAIL, FALL, POINTS, RUN_OUT, T
 
 @pytest.fixture
 def interruptible() -> Iterator[None]:
-    """Let Ctrl-C arrive, also if these tests run in the background of a shell."""
+    """Enable Ctrl-C, which is disabled if the tests run in the background of a shell."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -54,7 +54,7 @@ def interrupt() -> None:
     signal.raise_signal(signal.SIGINT)
 
 
-def test_all_workers_work_and_answer(make: Make) -> None:
+def test_all_workers_run_commands_and_answer(make: Make) -> None:
     pool = make(workers=2)
     for _ in range(3):
         pool.run(ADD)
@@ -81,7 +81,7 @@ def test_a_worker_that_dies_before_the_first_command_is_replaced(make: Make) -> 
     assert totals(pool) == [[3.0, MORE]]
 
 
-def test_workers_that_all_die_at_work_are_replaced(make: Make, tmp_path: Path) -> None:
+def test_workers_that_all_die_during_a_command_are_replaced(make: Make, tmp_path: Path) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     pids = pool.pids
@@ -117,12 +117,14 @@ def test_a_damaged_image_is_refused(make: Make) -> None:
         pool.run(ADD)
 
 
-def test_the_answer_of_a_worker_that_dies_after_it_is_kept(make: Make, tmp_path: Path) -> None:
+def test_a_worker_that_dies_while_another_worker_answers_is_replaced(
+    make: Make, tmp_path: Path
+) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     first, second = pool.pids
     with toiling(tmp_path, 1, lambda: os.kill(first, signal.SIGKILL)) as place:
-        pool.ask(1, TOIL, place)  # the command runs in the second worker only, and is not committed
+        pool.ask(1, TOIL, place)  # only the second worker runs this command, which is not committed
     assert pool.pids[1] == second
     assert pool.ask(0, TOTAL) == [3.0, MORE]
 
@@ -140,7 +142,7 @@ def test_a_team_is_replaced_as_a_whole(make: Make, dying: int, tmp_path: Path) -
     assert alive(before[:2]) == []
 
 
-def test_a_worker_without_a_command_gets_none_when_its_team_is_replaced(make: Make) -> None:
+def test_a_replaced_team_repeats_a_command_only_in_the_workers_that_had_it(make: Make) -> None:
     pool = make(workers=2, teams=((0, 1),))
     pool.run(ADD)
     os.kill(pool.pids[1], signal.SIGKILL)
@@ -198,7 +200,7 @@ def test_a_task_that_repeatedly_kills_workers_is_an_error(
         pool.run(ADD)
 
 
-def test_an_exception_arrives_completely_and_changes_nothing(make: Make) -> None:
+def test_an_exception_has_its_traceback_and_changes_no_state(make: Make) -> None:
     pool = make(workers=2)
     pool.run(ADD)
     with pytest.raises(WorkerFailureError, match="as told: so it goes") as caught:
@@ -220,7 +222,7 @@ def test_an_interrupted_command_is_not_committed(make: Make, tmp_path: Path) -> 
     assert pool.deaths == []
 
 
-def test_the_process_that_forks_may_die_or_be_stopped(
+def test_a_killed_or_stopped_fork_server_is_replaced(
     make: Make, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(fork_server, "ANSWER_MS", 500)
@@ -236,16 +238,16 @@ def test_the_process_that_forks_may_die_or_be_stopped(
     assert totals(pool) == [[9.0, 3 * MORE]] * 2
 
 
-def test_a_server_whose_pool_has_gone_prints_nothing() -> None:
-    """Ctrl-C ends the pool while the server starts, which shows no traceback."""
+def test_a_fork_server_without_its_pool_ends_silently() -> None:
+    """If Ctrl-C ends the pool while the fork server starts, no traceback is printed."""
     pool, server = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     pool.close()
     worker_loop.send_to_pool(server, {"ready": 1})
-    assert server.recv(10) == b""  # then the server ends
+    assert server.recv(10) == b""  # an empty message makes the server end
     server.close()
 
 
-def test_a_killed_start_is_repeated(tmp_path: Path) -> None:
+def test_the_start_of_workers_is_repeated_if_a_process_is_killed(tmp_path: Path) -> None:
     files = [str(tmp_path / name) for name in "abc"]
     for file in files[:2]:
         Path(file).touch()
@@ -264,7 +266,7 @@ def test_a_killed_start_is_repeated(tmp_path: Path) -> None:
     assert len(os.listdir("/proc/self/fd")) < descriptors
 
 
-def test_a_stopped_start_is_repeated(tmp_path: Path) -> None:
+def test_the_start_of_workers_is_repeated_if_a_process_is_stopped(tmp_path: Path) -> None:
     file = tmp_path / "a"
     file.touch()
     start = program(2, dies_while=[str(file)], dies_by=signal.SIGSTOP)
@@ -278,7 +280,9 @@ def test_a_stopped_start_is_repeated(tmp_path: Path) -> None:
     pool.close()
 
 
-def test_no_wake_up_is_missed(make: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sleeping_workers_receive_every_wake_signal(
+    make: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(barrier, "SHORT_S", 0.0)
     monkeypatch.setattr(barrier, "LONG_S", 0.0)
     monkeypatch.setattr(barrier, "look", lambda theirs, number, yields: False)
@@ -295,7 +299,7 @@ def test_idle_workers_take_no_processor_time(make: Make) -> None:
     for _ in range(1000):
         pool.ping()
     while any(stat_of(pid)[0] != "S" for pid in pool.pids):
-        time.sleep(0.001)  # workers poll for a while before they sleep
+        time.sleep(0.001)  # workers poll before they sleep
     before = [ticks(pid) for pid in pool.pids]
     time.sleep(0.5)
     assert [ticks(pid) for pid in pool.pids] == before
@@ -306,5 +310,5 @@ def ticks(pid: int) -> int:
 
 
 def stat_of(pid: int) -> list[str]:
-    """Return the figures of a process: state, parent and so on."""
+    """Return the fields of /proc/PID/stat from the state on."""
     return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()

@@ -1,4 +1,4 @@
-"""Worlds over worker processes equal those of one process, whichever worker dies."""
+"""Worlds over worker processes give the results of one process, even if workers die."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.support.vec_runs import STEPS, Make, drive, pool_of, same
 pytestmark = pytest.mark.filterwarnings("ignore:workers = 3:RuntimeWarning")
 
 
-# Small environments come first, and so are part of each run.
+# Small environments come first, because every test run uses the first parameters.
 SMALL_FIRST = sorted(entries(), key=lambda env: (env not in ("grid4x4", "merge", "ring"), env))
 
 
 @pytest.mark.parametrize(("number", "env"), list(enumerate(SMALL_FIRST)))
 def test_workers_change_no_result(make: Make, number: int, env: str) -> None:
-    """The number of workers changes from entry to entry, with and without zones."""
+    """The number of workers depends on the number of the environment."""
     wanted = {"num_envs": 5, "max_cycles": 8}
     whole = drive(make(env, **wanted))
     for zones, workers in ((1, 1 + number % 3), (4, 2)):
@@ -63,7 +63,7 @@ def drive_once(vec: CavVectorEnv) -> None:
     vec.step(vec.suggest_actions())
 
 
-def test_worlds_are_reset_in_the_next_step_although_workers_die(make: Make) -> None:
+def test_autoreset_in_the_next_step_works_while_workers_die(make: Make) -> None:
     wanted = {"num_envs": 3, "agents": 2, "max_cycles": 3, "autoreset_mode": "NextStep"}
     whole = drive(make("merge", **wanted))
     vec = make("merge", workers=2, **wanted)
@@ -72,7 +72,7 @@ def test_worlds_are_reset_in_the_next_step_although_workers_die(make: Make) -> N
     assert len(pool.deaths) == STEPS
 
 
-def test_chosen_worlds_are_reset_in_their_workers(make: Make) -> None:
+def test_some_worlds_are_reset_in_their_workers(make: Make) -> None:
     chosen = np.array([False, True, False, True, True])
     found = []
     for workers in (0, 2):
@@ -83,7 +83,7 @@ def test_chosen_worlds_are_reset_in_their_workers(make: Make) -> None:
     assert same(*found)
 
 
-def test_observations_without_a_copy_are_the_same(make: Make) -> None:
+def test_observations_without_a_copy_share_the_memory_of_the_worlds(make: Make) -> None:
     vec = make("ring", num_envs=2, workers=2, copy=False)
     observations, _ = vec.reset(seed=1)
     assert not observations.flags.writeable
@@ -93,7 +93,7 @@ def test_observations_without_a_copy_are_the_same(make: Make) -> None:
     assert not np.array_equal(observations, before)
 
 
-def test_a_tensor_of_the_same_memory_shows_each_step(make: Make) -> None:
+def test_a_tensor_on_the_shared_memory_has_the_observations_of_each_step(make: Make) -> None:
     torch = pytest.importorskip("torch")
     vec = make("ring", num_envs=2, workers=2)
     tensor = torch.from_numpy(vec.worlds.arrays.observations)
@@ -121,11 +121,11 @@ def test_a_worker_that_dies_between_steps_changes_no_result(
     whole = drive(make("grid4x4", **wanted))
     vec = make("grid4x4", workers=2, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step % 5 == 2:
             os.kill(pool_of(vec).pids[step % 2], how)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
     assert len(pool_of(vec).deaths) == 2
     assert all(death.done_s - death.noticed_s < 5.0 for death in pool_of(vec).deaths)
 
@@ -140,16 +140,16 @@ def test_a_worker_is_replaced_before_every_step(make: Make, env: str) -> None:
     assert len(pool_of(vec).deaths) == STEPS
 
 
-def test_the_process_that_forks_may_die(make: Make) -> None:
+def test_a_killed_fork_server_changes_no_result(make: Make) -> None:
     wanted = {"num_envs": 3, "agents": 3, "background": 3}
     whole = drive(make("ring", **wanted))
     vec = make("ring", workers=2, **wanted)
 
-    def strike(step: int) -> None:
+    def kill_in_step(step: int) -> None:
         if step == 4:
             os.kill(pool_of(vec).server_pid, signal.SIGKILL)
 
-    assert same(drive(vec, before=strike), whole)
+    assert same(drive(vec, before=kill_in_step), whole)
 
 
 def test_an_action_that_is_refused_changes_nothing(make: Make) -> None:
@@ -198,7 +198,7 @@ def test_more_workers_than_cores_cause_a_warning(make: Make) -> None:
         make("ring", num_envs=cores + 1, workers=cores + 1)
 
 
-def test_workers_may_have_cores_of_their_own(make: Make) -> None:
+def test_pinned_workers_have_one_core_each(make: Make) -> None:
     cores = sorted(os.sched_getaffinity(0))
     vec = make("ring", num_envs=2, workers=2, overrides={"workers.pin": True})
     vec.reset(seed=0)

@@ -1,4 +1,4 @@
-"""Frames of a valid form with wrong content: their sender is lost, and the run stays equal."""
+"""A node that sends a valid frame with wrong content is lost, and the results stay the same."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from tests.support.forged_states import ROW
 BUSY: dict[str, Any] = {
     "agents": 12, "background": 20, "zones": 8, "steps": 16, "overrides": {"clock.ctrl_dt_s": 0.4},
 }  # fmt: skip
-# A row of a frame about agents
+# The record of an agent in a frame about agents.
 AGENT = np.dtype([
     ("terms", "<f4", len(TERMS)), ("terminated", "?"), ("present", "?"), ("acted", "?"),
     ("events", "<i4"), ("vehicle_id", "<i8"), ("place", "<f8", 2),
 ])  # fmt: skip
-NEW = -1  # number of a node that has not begun
+NEW = -1  # stands for a node that has not sent its number yet
 REFUSED = "the state is damaged or belongs to different worlds"
-SENDER = 1  # the node whose frame is changed, unless a test names another node
+SENDER = 1  # default number of the node whose frame is changed
 
 
 class Sent(NamedTuple):
@@ -46,17 +46,17 @@ class Sent(NamedTuple):
 
 
 Change = Callable[[Sent], Sent | None]
-"""Returns another frame; None: the frame stays as it is, and the next one is tried."""
+"""A function that returns a changed frame, or None to try the next frame instead."""
 
-DROPPED = Sent(0, FrameKind.END, 0, b"")  # a frame that is not sent
+DROPPED = Sent(0, FrameKind.END, 0, b"")  # stands for a frame that must not be sent
 
 
 class Forger:
-    """Changes one frame of a node, and notes which nodes are lost.
+    """Changes one frame that a node sends, and records which nodes are lost.
 
     Attributes:
         frame: the changed frame.
-        lost: node → why it is lost.
+        lost: number of a lost node → reason.
     """
 
     def __init__(
@@ -69,8 +69,8 @@ class Forger:
     ) -> None:
         self.frame: Sent | None = None
         self.lost: dict[int, str] = {}
-        self._numbers: dict[int, int] = {}  # link → number of each node that has begun
-        self._left = after  # number of frames of the kind that are sent unchanged
+        self._numbers: dict[int, int] = {}  # id of the links of a node → number of the node
+        self._left = after  # matching frames that are still to be sent unchanged
         make, send = NodePeers.__init__, Links.send
 
         def made(
@@ -117,17 +117,17 @@ def check(
     nodes: int = 3,
     **overrides: Any,
 ) -> None:
-    """Check that a run stays equal if one node sends one wrong frame, and that this node is lost.
+    """Check that one wrong frame of a node loses only that node and changes no result.
 
     Args:
-        patch: undoes the change.
-        kind: of the frame.
-        change: makes the frame wrong.
-        words: part of the reason why the node is lost.
-        after: number of frames that could be changed, and are sent as they are.
-        sender: the node.
+        patch: undoes the changes of the code after the test.
+        kind: kind of the changed frame.
+        change: function that makes the frame wrong.
+        words: part of the expected reason of the loss.
+        after: number of matching frames to send unchanged before the changed one.
+        sender: number of the node that sends the frame.
         nodes: number of nodes.
-        overrides: of the configuration.
+        overrides: settings of the environment.
     """
     forger = Forger(patch, kind, change, after, sender)
     keys = {**BUSY, "overrides": BUSY["overrides"] | overrides}
@@ -139,18 +139,18 @@ def check(
     assert words in forger.lost[sender]
 
 
-def renumbered(value: int) -> Change:
-    """Return a change of the number of a frame by a value."""
+def add_number(value: int) -> Change:
+    """Return a change that adds a value to the number of a frame."""
     return lambda frame: frame._replace(number=frame.number + value)
 
 
 def as_kind(other: FrameKind) -> Change:
-    """Return a change of the kind of a frame."""
+    """Return a change that sets the kind of a frame."""
     return lambda frame: frame._replace(kind=other)
 
 
-def content(data: bytes) -> Change:
-    """Return a change of the content of a frame."""
+def replace_content(data: bytes) -> Change:
+    """Return a change that replaces the content of a frame."""
     return lambda frame: frame._replace(data=data)
 
 
@@ -164,14 +164,14 @@ def drop(frame: Sent) -> Sent:
 @pytest.mark.parametrize(
     ("of", "change", "words"),
     [
-        (FrameKind.REPORT, renumbered(1), "a frame of kind REPORT is of generation 1, not 0"),
-        (FrameKind.REPORT, renumbered(1 << 40), "of generation"),
-        (FrameKind.RESULT, renumbered(1), "a frame of kind RESULT is of generation 1, not 0"),
+        (FrameKind.REPORT, add_number(1), "a frame of kind REPORT is of generation 1, not 0"),
+        (FrameKind.REPORT, add_number(1 << 40), "of generation"),
+        (FrameKind.RESULT, add_number(1), "a frame of kind RESULT is of generation 1, not 0"),
         (FrameKind.REPORT, as_kind(FrameKind.RESULT), "RESULT, not REPORT"),
         (FrameKind.REPORT, as_kind(FrameKind.END), "must not send frames of kind END"),
         (FrameKind.REPORT, as_kind(FrameKind.REFUSED), "must not send frames of kind REFUSED"),
         (FrameKind.REPORT, as_kind(FrameKind.KEEP), "must not send frames of kind KEEP"),
-        (FrameKind.MESSAGES, renumbered(1), "a frame of kind MESSAGES is of generation 1, not 0"),
+        (FrameKind.MESSAGES, add_number(1), "a frame of kind MESSAGES is of generation 1, not 0"),
         (FrameKind.SHARE, as_kind(FrameKind.REFUSED), "must not send frames of kind REFUSED"),
         (FrameKind.SHARE, as_kind(FrameKind.GIVE), "a frame of kind GIVE is of generation"),
         (FrameKind.SHARE, as_kind(FrameKind.SYNC), "it claims an order to recover"),
@@ -198,7 +198,7 @@ def test_a_node_that_does_not_send_a_frame_is_lost(
     check(monkeypatch, of, drop, words, after, sender=0)
 
 
-@pytest.mark.parametrize("change", [drop, renumbered(1), content(b"more")])
+@pytest.mark.parametrize("change", [drop, add_number(1), replace_content(b"more")])
 def test_the_sender_of_a_wrong_sync_is_lost(
     monkeypatch: pytest.MonkeyPatch, change: Change
 ) -> None:
@@ -209,8 +209,8 @@ def test_the_sender_of_a_wrong_sync_is_lost(
     assert list(forger.lost) == [SENDER]
 
 
-def absent(frame: Sent) -> Sent | None:
-    """Change the flag of an agent that says whether it is present, in a frame about agents."""
+def mark_absent(frame: Sent) -> Sent | None:
+    """Mark all agents of a frame about agents as absent."""
     num = int.from_bytes(frame.data[:8], "little")
     row = AGENT.itemsize
     if not num or len(frame.data) != 8 + num * (8 + row):
@@ -224,14 +224,14 @@ def absent(frame: Sent) -> Sent | None:
 
 
 def test_the_sender_of_a_wrong_presence_flag_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    check(monkeypatch, FrameKind.SHARE, absent, "it sends agents that are absent", after=0)
+    check(monkeypatch, FrameKind.SHARE, mark_absent, "it sends agents that are absent", after=0)
 
 
 # Kept states
 
 
-def other_zone(frame: Sent) -> Sent | None:
-    """Move the vehicles of a kept state to a zone of another node."""
+def move_to_foreign_zone(frame: Sent) -> Sent | None:
+    """Move the vehicles of a zone, in a kept state, to a zone of another node."""
     found = read_arrays(frame.data)
     own = next((n for n in range(len(found) - 8, len(found)) if len(found[n])), None)
     if own is None:
@@ -252,22 +252,22 @@ def read_arrays(data: bytes) -> list[NDArray[Any]]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (content(b""), "the state is one of other worlds"),
+        (replace_content(b""), "the state is one of other worlds"),
         (lambda frame: frame._replace(data=frame.data[:-8]), "the state is one of other worlds"),
-        (renumbered(1), "it sends SHARE before an awaited frame"),
-        (renumbered(1 << 40), "it sends SHARE before an awaited frame"),
-        (other_zone, "its state has vehicles of zones"),
+        (add_number(1), "it sends SHARE before an awaited frame"),
+        (add_number(1 << 40), "it sends SHARE before an awaited frame"),
+        (move_to_foreign_zone, "its state has vehicles of zones"),
     ],
 )
-def test_a_wrong_replica_is_noticed_when_it_is_kept(
+def test_the_sender_of_a_wrong_replica_is_lost_when_the_replica_arrives(
     monkeypatch: pytest.MonkeyPatch, change: Change, words: str
 ) -> None:
-    """When the replica is needed, it is too late to find its sender at fault."""
+    """A replica must be checked early: when it is needed, its sender may be lost already."""
     check(monkeypatch, FrameKind.KEEP, change, words, after=1)
 
 
-def forged(dtype: np.dtype[Any], name: str, value: float) -> Change:
-    """Return a change of a field of the last record of a type in a kept state."""
+def set_field(dtype: np.dtype[Any], name: str, value: float) -> Change:
+    """Return a change that sets a field in the last record of a dtype in a kept state."""
 
     def changed(frame: Sent) -> Sent | None:
         found = read_arrays(frame.data)
@@ -281,7 +281,7 @@ def forged(dtype: np.dtype[Any], name: str, value: float) -> Change:
 
 
 NAMES = ("lane", "link", "vtype", "goal", "stop", "way", "id", "x", "length")
-# The worlds of these runs have more than 6 agents, and departures.
+# Agent 6 and order 0 are valid, because these worlds have more than 6 agents, and departures.
 FORGED = [
     (name, value) for name, values in ROW.items() for value in values
     if (name, value) not in (("agent", 6), ("order", 0))
@@ -290,20 +290,20 @@ FORGED = [
 
 @pytest.mark.parametrize("name", NAMES)
 def test_a_forged_replica_loses_its_sender(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
-    """A node knows the key and sends a state with a number that no table allows."""
-    check(monkeypatch, FrameKind.KEEP, forged(VEHICLE, name, ROW[name][-1]), REFUSED, after=1)
+    """Set a field to a value that is out of range."""
+    check(monkeypatch, FrameKind.KEEP, set_field(VEHICLE, name, ROW[name][-1]), REFUSED, after=1)
 
 
-@pytest.mark.slow  # the same for each field and value
+@pytest.mark.slow  # all fields and values
 @pytest.mark.parametrize(("name", "value"), FORGED)
 def test_each_forged_replica_loses_its_sender(
     monkeypatch: pytest.MonkeyPatch, name: str, value: float
 ) -> None:
-    check(monkeypatch, FrameKind.KEEP, forged(VEHICLE, name, value), REFUSED, after=1)
+    check(monkeypatch, FrameKind.KEEP, set_field(VEHICLE, name, value), REFUSED, after=1)
 
 
 def test_forged_arrays_of_a_replica_lose_their_sender(monkeypatch: pytest.MonkeyPatch) -> None:
-    """All integers of an array out of all ranges."""
+    """Set all numbers of an array to the least value of their type."""
 
     def forge(n: int) -> Change:
         def changed(frame: Sent) -> Sent | None:
@@ -321,12 +321,12 @@ def test_forged_arrays_of_a_replica_lose_their_sender(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", ["lane", "way", "goal"])
-def test_a_forged_state_of_moving_zones_loses_its_sender(
+def test_a_forged_state_of_zones_that_move_loses_its_sender(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
-    """Node 1 is lost first. The node that has its zones gives them to the next node 1."""
-    first = Forger(monkeypatch, FrameKind.KEEP, content(b""), after=1)
-    giver = Forger(monkeypatch, FrameKind.GIVE, forged(VEHICLE, name, ROW[name][-1]), sender=2)
+    """Node 1 is lost, and node 2 takes its zones. Node 2 then gives the zones to the new node 1."""
+    first = Forger(monkeypatch, FrameKind.KEEP, replace_content(b""), after=1)
+    giver = Forger(monkeypatch, FrameKind.GIVE, set_field(VEHICLE, name, ROW[name][-1]), sender=2)
     keys = {**BUSY, "steps": 40}
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **keys)
     assert first.frame is not None
@@ -339,8 +339,8 @@ def test_a_forged_state_of_moving_zones_loses_its_sender(
 # Reports
 
 
-def reported(change: Callable[[list[tuple[int, Message]], list[Any]], bool]) -> Change:
-    """Return a change of the messages and the worlds of a report; False: try the next one."""
+def change_report(change: Callable[[list[tuple[int, Message]], list[Any]], bool]) -> Change:
+    """Return a change of the messages and worlds of a report; `change` returns False to skip it."""
 
     def changed(frame: Sent) -> Sent | None:
         messages, reports, more = read_report(memoryview(frame.data), 1)
@@ -384,8 +384,8 @@ def other_incarnation(messages: list[tuple[int, Message]], worlds: list[Any]) ->
     return True
 
 
-def old_birth(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
-    """Report the birth of a vehicle that already existed in the episode."""
+def report_as_new(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
+    """Report a vehicle of the episode as new."""
     if not worlds or not worlds[0][0]:
         return False
     (vehicle, zone, _), *_ = worlds[0][0]
@@ -423,7 +423,7 @@ def another_episode(messages: list[tuple[int, Message]], worlds: list[Any]) -> b
         (other_tally, "vehicles"),
         (other_tick, "a Done of tick"),
         (other_incarnation, "a Done of tick"),
-        (old_birth, "at most once in an episode"),
+        (report_as_new, "at most once in an episode"),
         (other_mover, "which it does not own"),
         (other_digest, "it has offered another state of vehicle"),
         (another_episode, "an episode has begun: True"),
@@ -434,11 +434,11 @@ def test_the_sender_of_a_wrong_report_is_lost(
     change: Callable[[list[tuple[int, Message]], list[Any]], bool],
     words: str,
 ) -> None:
-    check(monkeypatch, FrameKind.REPORT, reported(change), words, after=0)
+    check(monkeypatch, FrameKind.REPORT, change_report(change), words, after=0)
 
 
 def test_the_sender_of_a_wrong_count_of_vehicles_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The report with the first difference from the records counts as the wrong one."""
+    """The node whose report first differs from the records is at fault."""
 
     def one_more_vehicle(messages: list[tuple[int, Message]], worlds: list[Any]) -> bool:
         (zone, num, total), *rest = worlds[0][3]
@@ -446,7 +446,7 @@ def test_the_sender_of_a_wrong_count_of_vehicles_is_lost(monkeypatch: pytest.Mon
         return True
 
     check(
-        monkeypatch, FrameKind.REPORT, reported(one_more_vehicle), "or epochs differ",
+        monkeypatch, FrameKind.REPORT, change_report(one_more_vehicle), "or epochs differ",
         **{"zones.check_invariants": True},
     )  # fmt: skip
 
@@ -457,10 +457,10 @@ def test_an_only_node_that_does_not_send_its_state_is_lost(monkeypatch: pytest.M
     )  # fmt: skip
 
 
-# Messages about offers
+# Messages of ownership transfers
 
 
-def message(of: type[Message], **changes: Any) -> Change:
+def change_message(of: type[Message], **changes: Any) -> Change:
     """Return a change of the fields of the first message of a class."""
 
     def changed(frame: Sent) -> Sent | None:
@@ -473,7 +473,7 @@ def message(of: type[Message], **changes: Any) -> Change:
     return changed
 
 
-def dropped(of: type[Message], to_coordinator: bool) -> Change:
+def drop_message(of: type[Message], to_coordinator: bool) -> Change:
     """Return a change that drops a message of a class."""
 
     def changed(frame: Sent) -> Sent | None:
@@ -491,15 +491,23 @@ def one_more(value: int) -> int:
 @pytest.mark.parametrize(
     ("sender", "change", "words"),
     [
-        (0, message(Prepare, tick=lambda tick: tick + 5), "a Prepare of tick"),
-        (0, message(Prepare, episode=lambda episode: episode + 2), "a Prepare of tick"),
-        (0, message(Prepare, source=lambda zone: 7), "it sends for zone 7, which it does not host"),
-        (0, message(Prepare, target=lambda zone: 0), "it sends for zones (0,) to another node"),
-        (0, dropped(Prepare, to_coordinator=False), "it has not offered vehicle"),
-        (1, message(Ack, tick=one_more), "a Ack of tick"),
-        (1, message(Ack, incarnation=one_more), "a Ack of tick"),
-        (1, message(Ack, zone=lambda zone: 0), "sends for zone 0, which it does not host"),
-        (1, dropped(Ack, to_coordinator=True), "its answer to an offer is missing"),
+        (0, change_message(Prepare, tick=lambda tick: tick + 5), "a Prepare of tick"),
+        (0, change_message(Prepare, episode=lambda episode: episode + 2), "a Prepare of tick"),
+        (
+            0,
+            change_message(Prepare, source=lambda zone: 7),
+            "it sends for zone 7, which it does not host",
+        ),
+        (
+            0,
+            change_message(Prepare, target=lambda zone: 0),
+            "it sends for zones (0,) to another node",
+        ),
+        (0, drop_message(Prepare, to_coordinator=False), "it has not offered vehicle"),
+        (1, change_message(Ack, tick=one_more), "a Ack of tick"),
+        (1, change_message(Ack, incarnation=one_more), "a Ack of tick"),
+        (1, change_message(Ack, zone=lambda zone: 0), "sends for zone 0, which it does not host"),
+        (1, drop_message(Ack, to_coordinator=True), "its answer to an offer is missing"),
     ],
 )
 def test_the_sender_of_a_wrong_message_is_lost(
@@ -514,8 +522,8 @@ def test_the_sender_of_a_wrong_message_is_lost(
 @pytest.mark.parametrize(
     "change",
     [
-        content(b"]"),
-        content(b'["node", 100000, [], false]'),
+        replace_content(b"]"),
+        replace_content(b'["node", 100000, [], false]'),
         as_kind(FrameKind.RESULT),
         lambda frame: frame._replace(data=frame.data.replace(b'"node", 1', b'"node", 2')),
     ],
@@ -523,7 +531,7 @@ def test_the_sender_of_a_wrong_message_is_lost(
 def test_a_node_that_joins_with_a_wrong_frame_is_restarted_or_lost(
     monkeypatch: pytest.MonkeyPatch, change: Change
 ) -> None:
-    """A node with a wrong address is lost because the other nodes cannot reach it."""
+    """A node that gives a wrong address is lost, because the other nodes cannot reach it."""
     forger = Forger(monkeypatch, FrameKind.READY, change, sender=NEW)
     found = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **BUSY)
     assert forger.frame is not None

@@ -1,4 +1,4 @@
-"""Files that users upload: hashes, kinds, quotas, lifetimes; worlds and drivers made of them."""
+"""Files that users upload: hashes, kinds, quotas, lifetimes, and worlds and drivers from files."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def test_a_file_of_another_kind_is_refused(name: str, content: bytes, words: str
     assert refused.value.problem == "refused"
 
 
-def test_files_may_include_others_of_their_folder() -> None:
+def test_uploaded_xml_files_may_refer_to_other_files() -> None:
     for inner in ("<include href='b/c.rou.xml'/>", "<e1Detector file='/dev/null'/>"):
         content = f"<additional>{inner}</additional>".encode()
         check_content("a.add.xml", hashlib.sha256(content).hexdigest(), content)
@@ -123,7 +123,7 @@ def test_quotas_count_files_and_bytes_of_each_identity(fleet: Fleet) -> None:
         put(fleet, "map.net.xml", NET + b" " * 950)
     assert refused.value.problem == "quota"
     put(fleet, "map.net.xml", NET + b" " * 3)
-    put(fleet, "map.net.xml", NET)  # it is there already
+    put(fleet, "map.net.xml", NET)  # this file is already stored
     with pytest.raises(ServiceError, match="4 of at most 4"):
         put(fleet, "map.net.xml", NET + b" " * 4)
     fleet.other = fleet.identity("bob", "client")  # type: ignore[attr-defined]
@@ -131,7 +131,7 @@ def test_quotas_count_files_and_bytes_of_each_identity(fleet: Fleet) -> None:
     assert len(fleet.broker.artefacts.of(fleet.client.id)) == 4
 
 
-def test_content_is_kept_as_long_as_an_owner_has_it(fleet: Fleet, tmp_path: Path) -> None:
+def test_content_is_stored_until_its_last_owner_deletes_it(fleet: Fleet, tmp_path: Path) -> None:
     fleet.other = fleet.identity("bob", "client")  # type: ignore[attr-defined]
     sha256 = put(fleet, "map.net.xml", NET)
     with pytest.raises(ServiceError, match="of yours"):
@@ -177,7 +177,9 @@ def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
         fleet.broker.artefacts.delete(fleet.client, files["map.net.xml"])
     for _ in range(2):
         fleet.now_s += 86_400.0
-        session = fleet.broker.resolve(fleet.client, session.id)  # it is not idle
+        session = fleet.broker.resolve(
+            fleet.client, session.id
+        )  # a request, so that the session does not count as idle
         fleet.beat("a")
         fleet.broker.sweep()
         fleet.now_s += 1.0
@@ -211,7 +213,9 @@ def test_an_unused_file_is_deleted_after_its_lifetime(fleet: Fleet) -> None:
         (b"map: {sauce: map.net.xml}", "map.sauce"),
     ],
 )
-def test_an_environment_names_only_its_own_files(fleet: Fleet, env: bytes, words: str) -> None:
+def test_an_environment_that_refers_to_a_file_outside_of_its_upload_is_refused(
+    fleet: Fleet, env: bytes, words: str
+) -> None:
     files = put_world(fleet, b"name: mine\n" + env)
     with pytest.raises(ServiceError, match=words) as refused:
         configure(fleet, files)
@@ -227,7 +231,9 @@ def test_an_environment_names_only_its_own_files(fleet: Fleet, env: bytes, words
         (["env.yaml", "drivers/idm/config.json", "drivers/idm/model.safetensors"], "driver 'idm'"),
     ],
 )
-def test_files_have_their_places(fleet: Fleet, places: list[str], words: str) -> None:
+def test_a_file_at_a_place_that_is_not_allowed_is_refused(
+    fleet: Fleet, places: list[str], words: str
+) -> None:
     sha256 = put(fleet, "env.yaml", ENV)
     kinds = {place: Path(place).suffix for place in places}
     files = {place: put(fleet, f"a{kind}", kind.encode()) for place, kind in kinds.items()}
@@ -247,7 +253,9 @@ def test_files_have_their_places(fleet: Fleet, places: list[str], words: str) ->
         ("drivers/a/config.json", "uploaded as rig.yaml"),
     ],
 )
-def test_a_file_has_the_kind_as_which_it_was_checked(fleet: Fleet, place: str, words: str) -> None:
+def test_a_file_cannot_be_used_as_another_kind_than_it_was_checked_for(
+    fleet: Fleet, place: str, words: str
+) -> None:
     code = put(fleet, "rig.yaml", b'x: int = __import__("os").system("id")\n')
     with pytest.raises(ServiceError, match=words) as refused:
         configure(fleet, {**put_world(fleet), place: code})
@@ -255,7 +263,7 @@ def test_a_file_has_the_kind_as_which_it_was_checked(fleet: Fleet, place: str, w
     assert is_same_kind("map.net.xml", "map.osm")
 
 
-def test_a_file_in_many_places_is_not_read_for_each(
+def test_a_file_at_many_places_is_not_read_many_times(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     files = put_world(fleet)
@@ -277,7 +285,7 @@ def test_a_file_in_many_places_is_not_read_for_each(
         configure(fleet, files | {f"{k}.yaml": files["env.yaml"] for k in range(9)})
 
 
-def test_a_configuration_needs_files_of_its_owner(fleet: Fleet) -> None:
+def test_a_configuration_with_files_of_another_owner_is_refused(fleet: Fleet) -> None:
     files = put_world(fleet)
     fleet.client = fleet.identity("bob", "client")
     with pytest.raises(ServiceError, match="of yours: upload it"):
@@ -310,7 +318,7 @@ def own_world(folder: Path) -> Path:
     return path
 
 
-def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
+def test_an_uploaded_world_continues_after_its_node_is_killed(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     world = own_world(tmp_path)
@@ -338,14 +346,14 @@ def test_a_world_of_one_s_own_continues_when_its_node_is_killed(
     own = {one["name"] for one in client.get("/artefacts")["artefacts"]}
     assert own >= {"env.yaml", "config.json", "model.safetensors"}
     before = client.get("/events", limit=1000)["events"][-1]["sequence"]
-    client.open(world, wait_s=30.0, **keys).close()  # nothing is uploaded again
+    client.open(world, wait_s=30.0, **keys).close()  # no file is uploaded again
     kinds = [one["kind"] for one in client.get("/events", limit=1000, after=before)["events"]]
     assert "artefact.added" not in kinds
     remote.close()
     local.close()
 
 
-def test_an_evaluation_of_one_s_own_driver_equals_the_local_one(
+def test_an_evaluation_of_an_uploaded_driver_equals_the_local_evaluation(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     world, driver = own_world(tmp_path), tmp_path / "trained"
@@ -367,7 +375,7 @@ def test_an_evaluation_of_one_s_own_driver_equals_the_local_one(
     assert "env.yaml" in shown.output
 
 
-def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
+def test_a_job_restarts_on_another_node_if_its_node_dies(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     cluster.start("late")
@@ -391,7 +399,7 @@ def test_a_job_restarts_elsewhere_if_its_node_dies_while_it_evaluates(
         assert (tmp_path / "there" / name).read_bytes() == (tmp_path / "here" / name).read_bytes()
 
 
-def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> None:
+def test_a_node_refuses_a_file_that_was_changed_in_the_store(tmp_path: Path) -> None:
     with loopback_service(tmp_path / "store.sqlite") as service:
         link = service.start_node("a", "node")
         path = f"/artefacts/{hashlib.sha256(NET).hexdigest()}?name=map.net.xml"
@@ -405,7 +413,9 @@ def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> No
         assert folder is not None
         assert (Path(folder.name) / "map.net.xml").read_bytes() == NET
         folder.cleanup()
-        more = NET + b" "  # the log forgets what it has written when it writes something else
+        more = (
+            NET + b" "
+        )  # a further file, because the log caches the last content that it has written
         path = f"/artefacts/{hashlib.sha256(more).hexdigest()}?name=map.net.xml"
         assert service.ask("client", "PUT", path, content=more).status_code == 200
         service.run(service.events.settle())
@@ -418,7 +428,7 @@ def test_a_node_refuses_a_file_that_does_not_have_its_hash(tmp_path: Path) -> No
         assert refused.value.problem == "damaged"
 
 
-def test_a_node_checks_files_of_a_service_that_does_not(
+def test_a_node_refuses_a_file_whose_hash_the_service_did_not_check(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     with loopback_service(tmp_path / "store.sqlite") as service:

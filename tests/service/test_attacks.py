@@ -57,7 +57,7 @@ def title_of(answer: httpx.Response) -> str:
 
 
 def change(path: Path, statement: str, **values: Any) -> None:
-    """Change a store as another program could do."""
+    """Change the file of a store as another program could."""
     engine = create_engine(f"sqlite:///{path}")
     with engine.begin() as connection:
         connection.execute(text(statement), values)
@@ -86,7 +86,7 @@ def save(service: LoopbackService, opened: dict[str, Any], content: bytes) -> No
 
 
 @pytest.mark.parametrize("what", ["session", "number", "content", "node", "use", "key", "absent"])
-def test_a_node_reads_no_state_that_the_service_did_not_sign_for_it(
+def test_a_node_refuses_a_state_that_the_service_has_not_signed_for_it(
     service: LoopbackService, monkeypatch: pytest.MonkeyPatch, what: str
 ) -> None:
     opened, other = open_session(service), open_session(service)["session"]
@@ -95,7 +95,7 @@ def test_a_node_reads_no_state_that_the_service_did_not_sign_for_it(
     assert service.run(link.saved_state(opened["session"])) == (b"state", 1)
     sign = service.access.state_token
 
-    def forged(session: Any, number: int, content: bytes) -> str:
+    def forge_token(session: Any, number: int, content: bytes) -> str:
         good = sign(session, number, content)
         claims = jwt.decode(good, options={"verify_signature": False})
         if what == "absent":
@@ -117,13 +117,13 @@ def test_a_node_reads_no_state_that_the_service_did_not_sign_for_it(
         kid = jwt.get_unverified_header(good)["kid"]
         return jwt.encode(claims, "k" * 32, "HS256", headers={"kid": kid})
 
-    monkeypatch.setattr(service.access, "state_token", forged)
+    monkeypatch.setattr(service.access, "state_token", forge_token)
     with pytest.raises(ServiceError) as refused:
         service.run(link.saved_state(opened["session"]))
     assert refused.value.problem == "damaged"
 
 
-def test_a_state_that_cannot_be_used_ends_its_session_alone(service: LoopbackService) -> None:
+def test_a_state_that_cannot_be_used_ends_only_its_session(service: LoopbackService) -> None:
     good, bad, changed = (open_session(service) for _ in range(3))
     save(service, bad, b"no state of any world")
     save(service, changed, b"a state that is changed in the store")
@@ -141,8 +141,8 @@ def test_a_state_that_cannot_be_used_ends_its_session_alone(service: LoopbackSer
     assert not [line for line in service.log.lines if "Traceback" in line]
 
 
-def test_a_changed_state_is_refused_as_damaged_or_can_be_used() -> None:
-    """Nodes do not sign states, so a state from another node may be any bytes."""
+def test_a_randomly_changed_state_is_refused_or_can_be_used() -> None:
+    """Nodes do not sign states, so the state from another node may consist of any bytes."""
     document = {**WORLD, "max_cycles": None, "num_envs": 2, "seed": 0, "overrides": {}}
     world = SessionWorld(document, None, 0, {})
     world.command(1, lambda: world.reset(0), is_quiet=False)
@@ -169,7 +169,7 @@ def problem_of_state(document: dict[str, Any], state: bytes) -> str:
     return ""
 
 
-def test_the_signature_of_a_state_is_no_session_token(service: LoopbackService) -> None:
+def test_the_token_of_a_state_is_refused_as_a_session_token(service: LoopbackService) -> None:
     opened = open_session(service)
     session = service.broker.log.state.sessions[opened["session"]]
     opened["token"] = service.access.state_token(session, 0, b"")
@@ -181,8 +181,8 @@ def test_the_signature_of_a_state_is_no_session_token(service: LoopbackService) 
 
 
 @pytest.mark.parametrize("how", ["state", "result", "closed", "forgotten"])
-def test_shared_content_is_kept_for_its_other_users(fleet: Fleet, how: str) -> None:
-    """A node stores the bytes of a configuration, and then its reference to them ends."""
+def test_content_is_kept_while_a_configuration_uses_it(fleet: Fleet, how: str) -> None:
+    """A node stores content with the bytes of a configuration, and its own reference then ends."""
     found = fleet.add_configuration(ConfigurationBody(environment="merge"))
     fleet.log.flush()
     content = fleet.log.content(found["hash"])
@@ -228,7 +228,7 @@ def test_content_without_users_is_deleted(fleet: Fleet) -> None:
     assert stored() == set()
 
 
-def test_a_node_cannot_fill_the_memory_of_the_service(fleet: Fleet) -> None:
+def test_the_results_and_transfers_of_a_node_are_limited(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     for k in range(MOST_RESULTS):
@@ -245,8 +245,8 @@ def test_a_node_cannot_fill_the_memory_of_the_service(fleet: Fleet) -> None:
 # Bodies
 
 
-def test_a_forged_heartbeat_does_not_shut_a_node_out(tmp_path: Path) -> None:
-    """The node's own heartbeats are refused after it, so the node registers again."""
+def test_a_node_registers_again_after_a_forged_heartbeat(tmp_path: Path) -> None:
+    """The service refuses the real heartbeats after the forged one, so the node registers again."""
     with loopback_service(tmp_path / "store.sqlite") as service:
         link = service.start_node("a", "node")
         service.ask("operator", "POST", "/nodes/a/drain")
@@ -266,7 +266,7 @@ def test_a_forged_heartbeat_does_not_shut_a_node_out(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("depth", [33, 100, 500, 900, 1000, 30_000])
 @pytest.mark.parametrize("key", ["environment", "overrides", "new"])
-def test_deep_bodies_are_refused_in_one_line(
+def test_deeply_nested_bodies_are_refused_with_one_log_line(
     service: LoopbackService, depth: int, key: str
 ) -> None:
     service.log.lines.clear()
@@ -290,20 +290,20 @@ def test_deep_bodies_are_refused_in_one_line(
         '{"environment": "merge", "name": "\xff"}'.encode("latin-1"),
     ],
 )
-def test_text_that_json_does_not_allow_is_refused(
+def test_bodies_that_are_not_valid_json_are_refused(
     service: LoopbackService, body: str | bytes
 ) -> None:
     answer = service.ask("client", "POST", "/configurations", content=body, headers=JSON)
     assert (answer.status_code, title_of(answer)) == (422, "bad-body")
 
 
-def test_without_a_token_no_body_is_read(service: LoopbackService) -> None:
+def test_the_body_of_a_request_without_a_token_is_not_read(service: LoopbackService) -> None:
     for body in (b"[" * 200_000, b"x" * 300_000, b"{"):
         answer = service.ask("", "POST", "/configurations", content=body, headers=JSON)
         assert title_of(answer) == "bad-token"
 
 
-def test_a_fault_is_one_line_after_its_first_traceback(
+def test_a_repeated_internal_error_is_one_log_line_after_the_first_traceback(
     service: LoopbackService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def fails(_: object) -> None:
@@ -322,7 +322,7 @@ def test_a_fault_is_one_line_after_its_first_traceback(
 # Rates
 
 
-def test_no_flood_from_an_address_locks_an_identity_out(tmp_path: Path) -> None:
+def test_a_flood_from_an_address_does_not_lock_an_identity_out(tmp_path: Path) -> None:
     with loopback_service(tmp_path / "store.sqlite", address_hz=2.0) as service:
         for attack in ("/health", "/keys"):
             found = [service.ask("", "GET", attack).status_code for _ in range(15)]
@@ -336,7 +336,7 @@ def test_no_flood_from_an_address_locks_an_identity_out(tmp_path: Path) -> None:
             assert last.status_code == 429
         for _ in range(15):
             refused = service.ask("", "GET", "/nodes", headers={"Authorization": "Bearer x"})
-            # 401 makes a client with an old token get another one.
+            # The answer is 401 instead of 429, so that a client with an old token gets a new token.
             assert refused.status_code == 401
         secret = {"secret": service.secrets["client"]}
         tokens = service.ask("", "POST", "/token", json=secret)
@@ -345,7 +345,7 @@ def test_no_flood_from_an_address_locks_an_identity_out(tmp_path: Path) -> None:
         assert service.ask("", "POST", "/token", json=again).status_code == 200
 
 
-def test_each_identity_has_a_rate_for_exchanging_its_secret(tmp_path: Path) -> None:
+def test_the_rate_of_token_requests_is_limited_for_each_identity(tmp_path: Path) -> None:
     with loopback_service(tmp_path / "store.sqlite", rate_hz=5.0) as service:
         for _ in range(30):
             last = service.ask("", "POST", "/token", json={"secret": service.secrets["viewer"]})
@@ -353,7 +353,7 @@ def test_each_identity_has_a_rate_for_exchanging_its_secret(tmp_path: Path) -> N
         assert service.ask("client", "GET", "/nodes").status_code == 200
 
 
-def test_unknown_keys_make_a_node_ask_at_most_once_per_second(service: LoopbackService) -> None:
+def test_a_node_asks_for_unknown_keys_at_most_once_per_second(service: LoopbackService) -> None:
     opened = open_session(service)
     url = f"{service.nodes['a'][1]}/v1/worlds/{opened['session']}/hash"
     assert open_on_node(service, opened).status_code == 200
@@ -371,7 +371,7 @@ def test_unknown_keys_make_a_node_ask_at_most_once_per_second(service: LoopbackS
     assert httpx.get(url, headers=bearer).status_code != 401
 
 
-def test_a_node_forgets_keys_that_the_service_has_replaced(
+def test_a_node_drops_keys_that_the_service_has_replaced(
     service: LoopbackService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     link = service.nodes["a"][0]
@@ -379,13 +379,13 @@ def test_a_node_forgets_keys_that_the_service_has_replaced(
     service.run(link.public_key(old, 0.0))
     for _ in range(2):
         service.ask("admin", "POST", "/keys")
-    service.run(link.public_key(old))  # the node knows the old key until its next look-up of keys
+    service.run(link.public_key(old))  # the node keeps the old key until it asks for keys again
     monkeypatch.setattr("cavmarl.service.node_link.KEYS_KEPT_S", 0.0)
     with pytest.raises(KeyError):
         service.run(link.public_key(old))
 
 
-def test_a_new_key_signs_states_at_once(service: LoopbackService) -> None:
+def test_states_are_signed_with_a_new_key_at_once(service: LoopbackService) -> None:
     opened = open_session(service)
     save(service, opened, b"state")
     link = service.nodes["a"][0]
@@ -394,8 +394,8 @@ def test_a_new_key_signs_states_at_once(service: LoopbackService) -> None:
         assert service.run(link.saved_state(opened["session"])) == (b"state", 1)
 
 
-def test_a_node_reports_that_it_cannot_ask_for_keys() -> None:
-    """The client then asks the service for the session again, until the service is back."""
+def test_a_node_answers_503_if_it_cannot_ask_the_service_for_keys() -> None:
+    """The client repeats its request to the service until the service answers again."""
     body = {"name": "a", "address": "127.0.0.1", "client_port": 1, "simulator_port": 1}
     link = NodeLink("http://127.0.0.1:1", "x", body)
     token = jwt.encode({"sub": "x"}, "k" * 32, "HS256", headers={"kid": "key-00000000"})
@@ -412,7 +412,7 @@ def test_a_node_reports_that_it_cannot_ask_for_keys() -> None:
     assert (answer.status_code, title_of(answer)) == (503, "unreachable")
 
 
-# The log
+# The event log
 
 
 def make_store(tmp_path: Path) -> Path:
@@ -428,7 +428,7 @@ def make_store(tmp_path: Path) -> Path:
 
 
 def recompute(path: Path) -> None:
-    """Recompute all digests of a store, so that they are consistent."""
+    """Recompute all digests of a store, as an attacker could after a change."""
     store = EventStore(path)
     lines, last = list(store.read()), ""
     store.close()
@@ -466,7 +466,7 @@ def test_a_service_does_not_start_on_a_changed_log(tmp_path: Path, statements: l
 
 
 @pytest.mark.parametrize("statement", ["UPDATE blobs SET content = x'78'", "DELETE FROM blobs"])
-def test_changed_content_is_not_read(tmp_path: Path, statement: str) -> None:
+def test_changed_content_is_refused(tmp_path: Path, statement: str) -> None:
     path = make_store(tmp_path)
     change(path, statement)
     log = EventLog(EventStore(path))
@@ -477,10 +477,10 @@ def test_changed_content_is_not_read(tmp_path: Path, statement: str) -> None:
     log.store.close()
 
 
-# The store's file
+# The file of the store
 
 
-def test_a_store_has_one_service_also_through_links(tmp_path: Path) -> None:
+def test_a_second_service_cannot_open_a_store_through_a_link(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     store = EventStore(path)
     (tmp_path / "soft.sqlite").symlink_to(path)
@@ -492,7 +492,9 @@ def test_a_store_has_one_service_also_through_links(tmp_path: Path) -> None:
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(tmp_path / "hard.sqlite")
     store.close()
-    with pytest.raises(ServiceError, match="has 2 names"):  # SQLite's own log has only one name
+    with pytest.raises(
+        ServiceError, match="has 2 names"
+    ):  # SQLite derives the name of its own log from the name of the store
         EventStore(tmp_path / "hard.sqlite")
     (tmp_path / "hard.sqlite").unlink()
     EventStore(tmp_path / "soft.sqlite").close()
@@ -502,7 +504,7 @@ def test_a_store_has_one_service_also_through_links(tmp_path: Path) -> None:
     "where",
     [":memory:", "sqlite://", "sqlite:///:memory:", "sqlite:///file:x?mode=memory&uri=true"],
 )
-def test_a_store_that_is_lost_at_its_end_is_refused(
+def test_a_store_in_memory_is_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, where: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
@@ -525,7 +527,7 @@ def test_a_store_that_others_can_read_is_refused(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "overrides", [{"population.types": "x"}, {"agents": 1}, {"sensors.lidar.rays": -1}]
 )
-def test_answers_name_no_path_of_the_installation(
+def test_answers_do_not_contain_local_paths(
     service: LoopbackService, overrides: dict[str, Any]
 ) -> None:
     body = {"environment": "merge", "overrides": overrides}
@@ -537,7 +539,7 @@ def test_answers_name_no_path_of_the_installation(
 
 
 def drive(flow: Flow[Any], *answers: dict[str, Any]) -> None:
-    """Answer the requests of a flow as a malicious server could."""
+    """Run a flow with the answers of a malicious server."""
     said: Any = None
     for answer in answers:
         assert isinstance(flow.send(said), Ask)
@@ -557,7 +559,7 @@ def test_a_result_name_that_leaves_the_folder_is_refused(name: str) -> None:
 
 
 @pytest.mark.parametrize("job", ["../../x", "..", "", "s-1/../../x"])
-def test_the_id_of_a_job_is_no_path(job: str) -> None:
+def test_a_job_id_that_is_a_path_is_refused(job: str) -> None:
     flow = ServiceFlows("http://127.0.0.1:1", "").submit("merge")
     with pytest.raises(ServiceError, match="is not a name"):
         drive(flow, TOKENS, {"hash": "0" * 64}, {"id": job})

@@ -1,4 +1,4 @@
-"""Nodes join and leave, and sessions move; the test sets the time."""
+"""Nodes join and leave, and sessions move; the tests set the clock."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def test_nodes_report_the_progress_of_their_jobs(fleet: Fleet) -> None:
         fleet.beat_of("a", jobs={job.id: [30]})
 
 
-def test_all_scores_of_a_watched_node_are_sent(fleet: Fleet) -> None:
+def test_a_node_with_a_watcher_receives_the_scores_of_all_nodes(fleet: Fleet) -> None:
     fleet.join("a", "b")
     fleet.register("c")
     session = fleet.open()
@@ -75,16 +75,16 @@ def test_all_scores_of_a_watched_node_are_sent(fleet: Fleet) -> None:
     assert fleet.beat("a")["scores"] == []
 
 
-def test_the_steps_of_a_job_count_all_its_runs_and_drivers(
+def test_the_progress_of_a_job_counts_the_steps_of_all_runs_and_drivers(
     monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
-    def drives(*_: Any, progress: Any, **more: Any) -> None:
+    def evaluate_steps(*_: Any, progress: Any, **more: Any) -> None:
         for policy in ("idm", "random") * more["repeats"]:
             for step in (1, 2):
                 progress(policy, step, 4)
 
     told: list[tuple[int, int]] = []
-    monkeypatch.setattr("cavmarl.service.node_host.evaluate", drives)
+    monkeypatch.setattr("cavmarl.service.node_host.evaluate", evaluate_steps)
     monkeypatch.setattr("cavmarl.service.node_host.TELL_S", 0.0)
     world = {"environment": "ring", "seed": 1, "overrides": {}}
     world |= dict.fromkeys(("agents", "background", "max_cycles"))
@@ -95,7 +95,7 @@ def test_the_steps_of_a_job_count_all_its_runs_and_drivers(
 
 def test_a_node_with_an_old_or_missing_load_gets_no_session(fleet: Fleet) -> None:
     fleet.join("a")
-    fleet.now_s += 3.5  # no sweep has run yet
+    fleet.now_s += 3.5  # the load is old, but no sweep has run yet
     assert reasons(fleet) == {"a": "stale"}
     fleet.register("b")  # b has reported no load yet
     assert reasons(fleet) == {"a": "stale", "b": "stale"}
@@ -114,11 +114,11 @@ def test_a_node_with_slightly_less_load_does_not_get_all_sessions(fleet: Fleet) 
     assert found == {"a": 10, "b": 10}
 
 
-def test_a_new_session_counts_as_one_slots_share_of_the_processor(fleet: Fleet) -> None:
+def test_a_new_session_counts_as_the_load_of_one_slot(fleet: Fleet) -> None:
     fleet.join("a", "b", slots=16)
     fleet.beat("a", cpu=0.05)
     fleet.beat("b", cpu=0.35)
-    # Each session adds 1 / 16: with five, a has 0.3625, more than b.
+    # Each session adds 1 / 16 to the load. With five sessions, a has 0.3625, which is more than b.
     assert [fleet.open().node for _ in range(6)] == ["a"] * 5 + ["b"]
 
 
@@ -165,7 +165,7 @@ def test_a_waiting_job_names_the_limit_that_it_waits_for(fleet: Fleet) -> None:
     assert fleet.broker.limits_of("a")[0].startswith("has sent no load lately")
 
 
-def test_thresholds_and_weights_are_rules(tmp_path: Path) -> None:
+def test_a_broker_uses_the_given_thresholds_and_weights(tmp_path: Path) -> None:
     rule = LoadRule(weights=(1.0, 0.0, 0.0), thresholds=(0.98, 0.9, 0.95))
     fleet = Fleet(tmp_path / "store.sqlite", load=rule)
     fleet.join("a")
@@ -189,13 +189,13 @@ def test_capacity_capability_and_access_exclude_nodes(fleet: Fleet) -> None:
     assert reasons(fleet) == {"full": "capacity", "plain": "capacity", "others": "access"}
 
 
-def test_a_node_serves_those_it_allows_and_has_all_that_they_need(fleet: Fleet) -> None:
+def test_a_node_serves_an_allowed_client_if_it_has_all_needed_capabilities(fleet: Fleet) -> None:
     fleet.join("own", capabilities=["gpu", "tls"], allowed=["bob", "ada"])
     assert fleet.open(needs=["gpu", "tls"]).node == "own"
     assert reasons(fleet, needs=["gpu", "sumo"]) == {"own": "capability"}
 
 
-def test_a_job_that_no_node_serves_does_not_hold_up_another_client(fleet: Fleet) -> None:
+def test_a_job_that_no_node_serves_does_not_delay_another_client(fleet: Fleet) -> None:
     bob = fleet.identity("bob", "client")
     job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
     first = fleet.open(job=job)
@@ -208,7 +208,10 @@ def test_a_session_is_redirected_by_the_rule_of_the_paper(fleet: Fleet) -> None:
     fleet.join("a", "b", "c")
     fleet.beat("b", cpu=0.12)
     kept = fleet.open(preferred="b")
-    assert (kept.node, kept.reason) == ("b", "preferred")  # the score is 0.012 above the best
+    assert (kept.node, kept.reason) == (
+        "b",
+        "preferred",
+    )  # the score of b is only 0.012 above the best score
     fleet.beat("b", cpu=0.5)
     moved = fleet.open(preferred="b")
     assert (moved.node, moved.reason) == ("a", "preferred above margin")
@@ -220,7 +223,7 @@ def test_a_session_is_redirected_by_the_rule_of_the_paper(fleet: Fleet) -> None:
     assert fleet.kinds().count("session.redirected") == 4
 
 
-def test_a_session_moves_when_its_node_is_drained_gone_or_out_of_reach(fleet: Fleet) -> None:
+def test_a_session_moves_if_its_node_is_drained_has_left_or_cannot_be_reached(fleet: Fleet) -> None:
     fleet.join("a", "b")
     session = fleet.open()
     assert session.node == "a"
@@ -237,7 +240,7 @@ def test_a_session_moves_when_its_node_is_drained_gone_or_out_of_reach(fleet: Fl
     assert fleet.broker.live["b"].hosted == set()
 
 
-def test_a_state_is_stored_again_after_a_change_between_two_commands(fleet: Fleet) -> None:
+def test_a_second_state_of_the_same_command_replaces_the_first(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     for content in (b"state", b"state with another vehicle"):
@@ -249,7 +252,7 @@ def test_a_state_is_stored_again_after_a_change_between_two_commands(fleet: Flee
         fleet.broker.save(session, 2, b"older")
 
 
-def test_a_superseded_process_is_notified(fleet: Fleet) -> None:
+def test_the_heartbeat_of_a_superseded_process_is_refused(fleet: Fleet) -> None:
     assert fleet.register("a") == 1
     old = fleet.beat_of("a")
     assert fleet.register("a") == 2
@@ -258,7 +261,7 @@ def test_a_superseded_process_is_notified(fleet: Fleet) -> None:
     assert refused.value.problem == "superseded"
 
 
-def test_a_beat_from_the_past_is_refused(fleet: Fleet) -> None:
+def test_a_heartbeat_with_an_old_sequence_number_is_refused(fleet: Fleet) -> None:
     fleet.join("a")
     late = fleet.beat_of("a", sequence=0)
     with pytest.raises(ServiceError) as refused:
@@ -293,7 +296,7 @@ def test_a_wrong_clock_is_reported_once(fleet: Fleet) -> None:
     ]
 
 
-def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet) -> None:
+def test_a_job_waits_for_a_node_and_runs_again_if_the_node_is_lost(fleet: Fleet) -> None:
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
     assert job.state == "queued"
     fleet.join("a")
@@ -309,7 +312,7 @@ def test_a_job_waits_for_a_node_and_is_run_again_when_that_is_lost(fleet: Fleet)
     assert (job.state, fleet.beat("b")["jobs"]) == ("done", [])
 
 
-def test_unused_sessions_end_and_are_forgotten(fleet: Fleet) -> None:
+def test_unused_sessions_are_closed_and_later_deleted(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     fleet.broker.save(session, 3, b"state")
@@ -339,7 +342,7 @@ def test_the_number_of_sessions_of_an_identity_is_limited(tmp_path: Path) -> Non
     fleet.close()
 
 
-def test_a_replay_of_the_log_gives_the_same(fleet: Fleet, tmp_path: Path) -> None:
+def test_a_replay_of_the_log_gives_the_same_state(fleet: Fleet, tmp_path: Path) -> None:
     fleet.join("a", "b")
     sessions = [fleet.open() for _ in range(3)]
     fleet.broker.save(sessions[0], 7, b"content")
@@ -409,7 +412,7 @@ def test_expired_tokens_are_refused(fleet: Fleet) -> None:
         fleet.access.refresh(tokens["refresh_token"])
 
 
-def test_jobs_that_no_node_can_take_cost_little_time_and_delay_no_other_job(fleet: Fleet) -> None:
+def test_jobs_that_no_node_can_take_delay_no_other_job(fleet: Fleet) -> None:
     asked = 0
 
     def count(_: float) -> None:
@@ -422,7 +425,7 @@ def test_jobs_that_no_node_can_take_cost_little_time_and_delay_no_other_job(flee
         fleet.open(job=job, needs=[f"none-{k % 60}"])
     possible = fleet.open(job=job)
     asked = 0
-    fleet.join("a")  # one pass tries each kind of job once, up to the limit of failures
+    fleet.join("a")  # a pass searches a node once for each kind of job, and stops after 50 failures
     for _ in range(100):
         fleet.beat("a")
     assert asked <= 52
@@ -430,17 +433,17 @@ def test_jobs_that_no_node_can_take_cost_little_time_and_delay_no_other_job(flee
         fleet.now_s += 0.5
         fleet.beat("a")
     assert possible.node == "a"
-    assert asked <= 1100  # at most a hundred searches per second
+    assert asked <= 1100  # at most 100 searches per second
 
 
-def test_the_next_pass_continues_with_the_jobs_that_were_not_tried(fleet: Fleet) -> None:
+def test_a_pass_continues_after_the_last_job_of_the_previous_pass(fleet: Fleet) -> None:
     job = {"policies": ["idm"], "episodes": 1, "repeats": 1}
     early = fleet.open(job=job, needs=["x"])
     for k in range(60):
         fleet.open(job=job, needs=[f"none-{k}"])
     fleet.register("a", capabilities=["x"])
     fleet.now_s += 1.0
-    fleet.broker.jobs.place()  # after 50 failed searches, this pass stops
+    fleet.broker.jobs.place()  # this pass stops after 50 failed searches
     fleet.now_s += 1.0
     fleet.beat("a")
     assert early.node == "a"
@@ -453,7 +456,7 @@ def test_jobs_are_placed_in_their_order(fleet: Fleet) -> None:
     assert [one.node for one in jobs] == ["a"] * 8 + [None] * 4
 
 
-def test_a_job_that_nodes_do_not_survive_fails(fleet: Fleet) -> None:
+def test_a_job_with_which_ten_nodes_were_lost_fails(fleet: Fleet) -> None:
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
     for k in range(10):
         fleet.join(f"n{k}")
@@ -462,7 +465,7 @@ def test_a_job_that_nodes_do_not_survive_fails(fleet: Fleet) -> None:
     assert (job.state, job.message) == ("failed", "10 nodes were lost with it")
 
 
-def test_nodes_that_are_gone_for_a_day_are_forgotten(fleet: Fleet) -> None:
+def test_nodes_that_have_left_are_deleted_after_a_day(fleet: Fleet) -> None:
     fleet.join("a", "b")
     session = fleet.open(zone_nodes=2)
     fleet.broker.leave(fleet.nodes, "b")
@@ -480,7 +483,7 @@ def test_nodes_that_are_gone_for_a_day_are_forgotten(fleet: Fleet) -> None:
     assert numbers == sorted(set(numbers))
 
 
-def test_the_answer_and_the_log_have_the_reasons_against_others(fleet: Fleet) -> None:
+def test_a_session_stores_why_other_nodes_were_excluded(fleet: Fleet) -> None:
     fleet.join("a", "b")
     fleet.beat("a", cpu=0.9)
     session = fleet.open()
@@ -488,7 +491,7 @@ def test_the_answer_and_the_log_have_the_reasons_against_others(fleet: Fleet) ->
     assert (session.excluded, session.excluded_count) == (reasons, 1)
 
 
-def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
+def test_the_rate_of_requests_of_a_caller_is_limited(fleet: Fleet) -> None:
     limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
     for _ in range(3):
         limit.take("ada")
@@ -504,7 +507,7 @@ def test_requests_of_one_caller_have_a_rate(fleet: Fleet) -> None:
     limit.take("ada")
 
 
-def test_the_caller_that_asked_longest_ago_is_forgotten_first(
+def test_the_rate_limit_drops_the_caller_that_asked_longest_ago(
     fleet: Fleet, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(rate_limit, "MOST_BUCKETS", 2)
@@ -516,7 +519,7 @@ def test_the_caller_that_asked_longest_ago_is_forgotten_first(
     assert not limit.has("cy")
 
 
-def test_a_pause_allows_at_most_one_burst(fleet: Fleet) -> None:
+def test_a_caller_has_at_most_one_burst_after_a_pause(fleet: Fleet) -> None:
     limit = RateLimit(2.0, 3.0, lambda: fleet.now_s)
     limit.take("ada")
     fleet.now_s += 3600.0

@@ -1,6 +1,6 @@
 """Guarantees of the event store, on SQLite and on a real PostgreSQL.
 
-A real service is killed in each run of the tests, since no cheaper test shows which data survive.
+Every test run kills a real service, because no cheaper test shows which data survive.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ def empty_postgresql(postgresql: str) -> str:
 
 
 def history(where: str | Path) -> tuple[list[str], EventLog]:
-    """Return the kinds of events of one day at a service, and its log."""
+    """Run a service through typical events; return their kinds, and the log read again."""
     fleet = Fleet(where)
     fleet.join("a", "b")
     session = fleet.open(preferred="b")
@@ -64,7 +64,7 @@ def history(where: str | Path) -> tuple[list[str], EventLog]:
     return kinds, again
 
 
-def test_postgresql_keeps_the_same_data_as_sqlite(empty_postgresql: str, tmp_path: Path) -> None:
+def test_postgresql_stores_the_same_data_as_sqlite(empty_postgresql: str, tmp_path: Path) -> None:
     kinds, log = history(empty_postgresql)
     with pytest.raises(ServiceError, match="is in use by another service"):
         EventStore(empty_postgresql)
@@ -82,7 +82,7 @@ def test_a_store_has_only_one_service(tmp_path: Path) -> None:
     EventStore(tmp_path / "store.sqlite").close()
 
 
-def test_a_store_of_another_version_is_left_alone(tmp_path: Path) -> None:
+def test_a_store_of_another_version_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "store.sqlite"
     EventStore(path).close()
     damage(path, "UPDATE about SET schema = 'cavmarl.service/9'")
@@ -119,7 +119,7 @@ def test_a_file_without_a_store_is_refused(tmp_path: Path) -> None:
         "DELETE FROM events WHERE sequence = 2",
     ],
 )
-def test_a_changed_log_is_noticed(tmp_path: Path, change: str) -> None:
+def test_a_changed_log_is_refused(tmp_path: Path, change: str) -> None:
     path = tmp_path / "store.sqlite"
     history(path)[1].store.close()
     damage(path, change)
@@ -129,7 +129,7 @@ def test_a_changed_log_is_noticed(tmp_path: Path, change: str) -> None:
     store.close()
 
 
-def test_the_store_s_file_is_its_owner_s_alone(tmp_path: Path) -> None:
+def test_only_the_owner_can_read_the_file_of_a_store(tmp_path: Path) -> None:
     EventStore(tmp_path / "store.sqlite").close()
     assert (tmp_path / "store.sqlite").stat().st_mode & 0o077 == 0
 
@@ -155,7 +155,7 @@ def test_acknowledged_requests_survive_a_kill(
             one.start()
         while len(acknowledged) < 20 and any(one.is_alive() for one in askers):
             time.sleep(0.001)
-        service.kill()  # while requests are in progress
+        service.kill()  # requests are in progress now
         for one in askers:
             one.join()
         service.start_again()  # the service prints no secret, because an admin exists
@@ -165,7 +165,7 @@ def test_acknowledged_requests_survive_a_kill(
     assert known >= set(acknowledged)
 
 
-def test_a_secret_is_shown_once(tmp_path: Path) -> None:
+def test_the_secret_of_the_first_admin_is_shown_only_once(tmp_path: Path) -> None:
     for is_new in (True, False):
         fleet = Fleet(tmp_path / "store.sqlite", identities=is_new)
         assert (first_admin(fleet.log, fleet.access) is not None) == is_new

@@ -1,4 +1,4 @@
-"""While a page pauses a session, its client repeats the command until it is answered."""
+"""While a page pauses a session, its client repeats a command until it gets an answer."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The document of the interface is correct for all kinds of requests; Schemathesis makes them.
+"""The OpenAPI document of the service is correct for requests that Schemathesis generates.
 
 Answers have the status, type and fields of the document. Requests that the document does not allow
 are refused. No request causes an internal error.
@@ -37,7 +37,7 @@ OPERATIONS = sorted(RULES.keys() - {ENDLESS})
 
 
 class Served:
-    """A service in this process with a node, a session and a job, and its document."""
+    """A service in this process with a node and a session, and its OpenAPI document."""
 
     def __init__(self, store: Path) -> None:
         self.fleet = Fleet(store, max_nodes=50, max_sessions=20)
@@ -51,7 +51,7 @@ class Served:
         self.operations = {one.ok().label: one.ok() for one in document.get_all_operations()}
 
     def known(self) -> dict[str, str]:
-        """Return values for the parameters of paths, after creating node and session again."""
+        """Create node and session again; return values for the parameters of paths."""
         fleet = self.fleet
         fleet.join("a", slots=1000)
         for one in list(fleet.log.state.sessions.values()):
@@ -78,7 +78,7 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
 
 
 def plain(value: Any) -> Any:
-    """Write whole numbers as 3, because 3.0 is refused."""
+    """Replace whole floats by integers, because the service refuses 3.0 for an integer."""
     if isinstance(value, dict):
         return {key: plain(one) for key, one in value.items()}
     if isinstance(value, list):
@@ -121,7 +121,7 @@ def check(served: Served, name: str, mode: GenerationMode, examples: int) -> Non
 
 
 @pytest.mark.parametrize("name", OPERATIONS)
-def test_answers_agree_with_the_document(served: Served, name: str) -> None:
+def test_answers_to_valid_requests_agree_with_the_document(served: Served, name: str) -> None:
     check(served, name, GenerationMode.POSITIVE, 8)
 
 
@@ -138,8 +138,8 @@ def test_requests_that_the_document_does_not_allow_are_refused(served: Served, n
     check(served, name, GenerationMode.NEGATIVE, 8)
 
 
-def test_each_answer_has_its_fields_in_the_document(served: Served) -> None:
-    """A client can be written from the document alone."""
+def test_the_document_names_the_fields_of_each_answer(served: Served) -> None:
+    """Check that each JSON answer refers to a schema."""
     for name, operation in served.operations.items():
         for status, answer in operation.definition.raw["responses"].items():
             for kind, content in answer.get("content", {}).items():

@@ -33,7 +33,7 @@ def tokens(service: RunningService) -> dict[str, dict[str, Any]]:
     return {role: token_of(service, service.grant(f"a-{role}", role)).json() for role in ROLES}
 
 
-def test_large_and_slow_and_deep_bodies_are_refused(service: RunningService) -> None:
+def test_large_and_deeply_nested_bodies_are_refused(service: RunningService) -> None:
     token = token_of(service, service.secret).json()
     headers = {"Content-Type": "application/json"}
     large = ask(service, token, "POST", "/configurations", content=b"x" * 300_000, headers=headers)
@@ -45,7 +45,7 @@ def test_large_and_slow_and_deep_bodies_are_refused(service: RunningService) -> 
     assert problem_of(long) == "bad-body"
 
 
-def test_only_content_of_nodes_may_be_larger(
+def test_only_the_content_of_states_and_results_may_be_larger(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     path, headers = "/sessions/s-" + "0" * 24, {"Content-Type": "application/json"}
@@ -55,7 +55,7 @@ def test_only_content_of_nodes_may_be_larger(
         assert (answer.status_code, problem_of(answer)) == (413, "too-large"), name
     large = ask(service, tokens["node"], "PUT", f"{path}/state?at=1", content=b"x" * 300_000)
     assert problem_of(large) == "lost"
-    secret = {"secret": "x" * 100_000}  # the body is read before the sender is known
+    secret = {"secret": "x" * 100_000}  # this route reads the body before it knows the caller
     assert httpx.post(f"{service.url}/v1/token", json=secret).status_code == 413
 
 
@@ -76,7 +76,7 @@ def test_the_number_of_streams_of_an_identity_is_limited(service: RunningService
     with service.client() as admin:
         while ask(service, token, "GET", "/nodes").status_code != 200:
             time.sleep(0.1)
-        for k in range(100):  # closed streams are noticed at the next event
+        for k in range(100):  # the service detects closed streams at the next event
             admin.post("/identities", {"name": f"heard-{k}", "role": "viewer"})
             with httpx.stream(
                 "GET", f"{service.url}/v1/events/stream",
@@ -96,7 +96,7 @@ def test_a_world_that_no_node_could_hold_is_refused(
     assert "at most 200000" in answer.json()["detail"]
 
 
-def test_vehicles_that_pages_may_insert_count_for_the_size_of_a_world(tmp_path: Path) -> None:
+def test_vehicles_that_pages_may_insert_count_towards_the_size_of_a_world(tmp_path: Path) -> None:
     fleet = Fleet(tmp_path / "store.sqlite")
     keys: dict[str, Any] = {"environment": "merge", "agents": 5, "background": 0, "num_envs": 1000}
     for insertions in (195, 196):
@@ -155,7 +155,7 @@ def test_slow_heads_and_bodies_end_the_connection(service: RunningService) -> No
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(b"GET /v1/health HTTP/1.1\r\nX-Slow: ")
         line.settimeout(20.0)
-        assert line.recv(4096) == b""  # the connection ends also for a head that does not end
+        assert line.recv(4096) == b""  # the connection ends although the head is incomplete
     with socket.create_connection((place.hostname, place.port)) as line:
         line.sendall(
             b"POST /v1/configurations HTTP/1.1\r\nHost: x\r\nContent-Type: application/json\r\n"

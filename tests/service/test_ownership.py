@@ -1,4 +1,4 @@
-"""Owners of vehicles and members of sessions are restored from the log; the test sets the time."""
+"""The service restores owners of vehicles and members of sessions from its log."""
 
 from __future__ import annotations
 
@@ -38,11 +38,11 @@ def test_owners_and_members_are_restored_from_the_log(fleet: Fleet) -> None:
         replayed.apply(line)
     assert asdict(replayed.sessions[session.id]) == asdict(session)
     fleet.broker.hand_over(session, TransfersBody(at=4, transfers=[[0, 2, 1, 1, 0, 1, 1]]))
-    assert session.owners["0"].zones == {1: [1, 1]}  # owners in the new episode
+    assert session.owners["0"].zones == {1: [1, 1]}  # only the owners of the new episode
     assert fleet.broker.prepared[session.id] == []
 
 
-def test_the_newest_owners_are_kept(fleet: Fleet) -> None:
+def test_only_the_newest_owners_are_stored(fleet: Fleet) -> None:
     fleet.join("a")
     session = fleet.open()
     rows = [[0, 0, 1, vehicle, 0, 1, 1] for vehicle in range(KEPT_OWNERS + 5)]
@@ -72,7 +72,7 @@ def test_lost_members_are_replaced_and_get_the_address_of_their_leader(fleet: Fl
     assert all(not live.zones_of for live in fleet.broker.live.values())
 
 
-def test_a_single_node_may_have_all_parts(fleet: Fleet) -> None:
+def test_a_node_may_have_several_parts_of_a_session(fleet: Fleet) -> None:
     fleet.join("a", slots=3)
     session = fleet.open(zone_nodes=4)
     assert session.members == ["a", "a"]  # the leader takes the third slot of a
@@ -81,7 +81,7 @@ def test_a_single_node_may_have_all_parts(fleet: Fleet) -> None:
     assert session.members == ["a", "a", "b", "b"]
 
 
-def test_a_request_that_is_repeated_is_carried_out_once(fleet: Fleet) -> None:
+def test_a_repeated_request_with_the_same_key_is_executed_once(fleet: Fleet) -> None:
     fleet.join("a", slots=8)
     session = fleet.open(key="k-1")
     assert fleet.open(key="k-1").id == session.id
@@ -97,7 +97,7 @@ def test_a_request_that_is_repeated_is_carried_out_once(fleet: Fleet) -> None:
         fleet.open(key="k-1")
 
 
-def test_a_world_reports_each_transfer_once_and_prepared_transfers() -> None:
+def test_a_session_reports_prepared_transfers_and_each_transfer_once() -> None:
     document = {"environment": "grid4x4", "num_envs": 1, "seed": 0, "overrides": {}}
     document |= {"zones": 4, "agents": 4, "background": 40, "max_cycles": None}
     world = SessionWorld(document, None, 0, {})

@@ -1,4 +1,4 @@
-"""A client that uses the documents of the interfaces, and not cavmarl's own client."""
+"""A client written only from the OpenAPI documents, without the client of cavmarl."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ WORLD = {"environment": "ring", "agents": 2, "background": 2, "seed": 0}
 
 
 class Document:
-    """Send requests by the summaries of an OpenAPI document."""
+    """Sends requests that are found by their summaries in an OpenAPI document."""
 
     def __init__(self, base: str) -> None:
         self.base = base

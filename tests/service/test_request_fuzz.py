@@ -1,4 +1,4 @@
-"""Almost valid requests cause no internal error, traceback or wait, and show no local path."""
+"""Almost valid requests cause no internal error, traceback or wait, and get no local paths."""
 
 from __future__ import annotations
 
@@ -28,12 +28,12 @@ from tests.support.request_fuzz import (
 ROOT = Path(__file__).resolve().parents[2]
 PLACES = [str(ROOT), sys.prefix, str(Path.home())]
 RENEWED_EVERY = 100  # number of requests
-LONGEST_LINE = 500  # characters of a log line for one request
+LONGEST_LINE = 500  # longest log line in characters
 WORLD = {"environment": "ring", "agents": 1, "background": 1}
 
 
 def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
-    """Renew the tokens and ids of the fuzz, which earlier requests may have invalidated."""
+    """Renew tokens and ids, which earlier random requests may have invalidated."""
     link = service.nodes["a"][0]
     state = service.events.state
     for role in ROLES:
@@ -54,7 +54,7 @@ def renew(service: LoopbackService, fuzz: RequestFuzz) -> None:
     bearer = {"Authorization": f"Bearer {opened[0]['token']}"}
     world = f"{service.nodes['a'][1]}/v1/worlds/{opened[0]['session']}"
     for command in ("", "/reset?number=1&seed=0"):
-        until_s = time.monotonic() + 20.0  # the node gets new keys
+        until_s = time.monotonic() + 20.0  # until the node has the new keys
         while (answer := service.http.post(world + command, headers=bearer)).status_code != 200:
             assert time.monotonic() < until_s, answer.text
             time.sleep(0.05)
@@ -84,7 +84,7 @@ def check(request: RawRequest, answer: Answer) -> None:
 
 
 def run_fuzz(store: Path, count: int, seed: int) -> Counter[int]:
-    """Send requests; return the number of answers by status."""
+    """Send random requests and check the answers; return the number of answers by status."""
     fuzz, found = RequestFuzz(Random(seed)), Counter[int]()
     with loopback_service(store, max_nodes=50) as service:
         service.start_node("a", "node", slots=1000)
@@ -113,7 +113,7 @@ def test_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     assert min(found[status] for status in (200, 401, 404, 405, 422)) >= 10
 
 
-@pytest.mark.slow  # the same test with more requests
+@pytest.mark.slow  # the test above with more requests
 def test_many_almost_valid_requests_are_refused(tmp_path: Path) -> None:
     found = run_fuzz(tmp_path / "store.sqlite", 25_000, seed=2)
     print(f"answers by status, 0 for a closed connection: {dict(sorted(found.items()))}")

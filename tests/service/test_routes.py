@@ -1,4 +1,4 @@
-"""The interface over a real socket: permissions, and errors of refused requests."""
+"""The interface over a real socket: permissions and error answers."""
 
 from __future__ import annotations
 
@@ -24,9 +24,9 @@ ALL = {*ROLES}
 READERS = ALL - {"node"}
 WATCHERS = {"viewer", "operator", "admin"}
 CLIENTS = {"client", "operator", "admin"}
-OPEN = None  # a route that needs no token
+OPEN = None  # marks a route that needs no token
 
-# Each route has a row here; the test fails for a route without a row.
+# Route → roles that may use it. A test fails if a route is missing here.
 MATRIX: dict[str, set[str] | None] = {
     "GET /v1/health": OPEN,
     "GET /v1/keys": OPEN,
@@ -110,12 +110,12 @@ def problem_of(answer: httpx.Response) -> str:
     return str(found["title"])
 
 
-def test_the_matrix_has_each_route_once() -> None:
+def test_the_matrix_lists_all_routes() -> None:
     assert set(all_routes()) == set(MATRIX)
 
 
 @pytest.mark.parametrize("name", MATRIX)
-def test_a_role_may_do_what_the_matrix_says(
+def test_a_role_may_use_a_route_if_and_only_if_the_matrix_says_so(
     service: RunningService, tokens: dict[str, dict[str, Any]], name: str
 ) -> None:
     method, path = name.split()
@@ -126,7 +126,7 @@ def test_a_role_may_do_what_the_matrix_says(
     refused = set()
     for role in ROLES:
         if name in ("DELETE /v1/token", "GET /v1/events/stream") and role in (allowed or ()):
-            continue  # the first would end sessions of other tests; the second would not end
+            continue  # the first one would end sessions of other tests; the second never ends
         answer = ask(service, tokens[role], method, path)
         assert answer.status_code != 401
         refused |= {role} if answer.status_code == 403 else set()
@@ -203,7 +203,7 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
         ("/sessions", {"configuration": "x"}, 422, "bad-body", "configuration"),
     ],
 )  # fmt: skip
-def test_bad_input_is_refused_with_its_cause(
+def test_bad_input_is_refused_with_the_cause(
     service: RunningService, tokens: dict[str, Any],
     path: str, body: Any, status: int, title: str, words: str,
 ) -> None:  # fmt: skip
@@ -212,7 +212,7 @@ def test_bad_input_is_refused_with_its_cause(
     assert words in answer.json()["detail"]
 
 
-def test_a_driver_is_named_and_never_a_path(
+def test_a_path_instead_of_the_name_of_a_driver_is_refused(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     found = ask(service, tokens["client"], "POST", "/configurations", json={"environment": "merge"})
@@ -223,7 +223,7 @@ def test_a_driver_is_named_and_never_a_path(
     assert ask(service, tokens["client"], "POST", "/jobs", json=body).status_code == 422
 
 
-def test_the_same_configuration_is_the_same_version(
+def test_an_equal_configuration_gets_the_same_version(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     body = {"environment": "merge", "name": "mine", "agents": 3}
@@ -254,7 +254,7 @@ def test_without_a_node_the_answer_is_503_with_a_time_to_retry(
     assert told[1]["data"] == {"of": "request for a node", "after_s": 0.5}
 
 
-def test_a_percentage_is_refused_with_the_share_to_give(
+def test_a_load_in_percent_is_refused_and_the_error_names_the_fraction(
     service: RunningService, tokens: dict[str, Any]
 ) -> None:
     beat = {"incarnation": 1, "sequence": 1, "cpu": 85.0, "ram": 0.1, "sent_s": 0.0}
@@ -294,12 +294,14 @@ def test_a_refresh_token_can_be_used_once(service: RunningService) -> None:
     assert ask(service, second, "GET", "/nodes").status_code == 200
     again = httpx.post(f"{service.url}/v1/token", json=body)
     assert problem_of(again) == "bad-token"
-    for stolen in (first, second):  # all tokens of the identity are invalid
+    for stolen in (first, second):  # the repeated use invalidates all tokens of the identity
         assert ask(service, stolen, "GET", "/nodes").status_code == 401
     assert token_of(service, secret).status_code == 200
 
 
-def test_a_revoked_identity_is_out_at_once(service: RunningService, tokens: dict[str, Any]) -> None:
+def test_a_revoked_identity_is_refused_at_once(
+    service: RunningService, tokens: dict[str, Any]
+) -> None:
     secret = service.grant("guest", "viewer")
     token = token_of(service, secret).json()
     path = f"/identities/{token['identity']}"
@@ -308,7 +310,7 @@ def test_a_revoked_identity_is_out_at_once(service: RunningService, tokens: dict
     assert token_of(service, secret).status_code == 401
 
 
-def test_tokens_outlive_one_rotation_of_the_key_and_not_two(
+def test_a_token_is_valid_after_one_key_rotation_but_not_after_two(
     service: RunningService, secrets: dict[str, str]
 ) -> None:
     admin = token_of(service, secrets["admin"]).json()
@@ -320,7 +322,7 @@ def test_tokens_outlive_one_rotation_of_the_key_and_not_two(
     assert ask(service, old, "GET", "/nodes").status_code == 401
 
 
-def test_neither_events_nor_nodes_nor_errors_show_a_secret(
+def test_no_answer_and_no_file_of_the_store_contains_a_secret(
     service: RunningService, secrets: dict[str, str], tokens: dict[str, Any]
 ) -> None:
     admin = token_of(service, service.secret).json()
@@ -336,7 +338,7 @@ def test_neither_events_nor_nodes_nor_errors_show_a_secret(
     assert "private" not in ask(service, admin, "GET", "/events").json()["events"][0]
 
 
-def test_answers_have_headers_of_safety_and_no_traceback(service: RunningService) -> None:
+def test_answers_have_security_headers(service: RunningService) -> None:
     answer = httpx.get(f"{service.url}/v1/nothing")
     assert problem_of(answer) == "not-found"
     assert answer.headers["x-content-type-options"] == "nosniff"
@@ -353,7 +355,7 @@ def test_the_document_of_the_interface_has_each_route(service: RunningService) -
     assert found == set(MATRIX)
 
 
-def test_streams_of_events_resume_after_an_event(service: RunningService) -> None:
+def test_a_stream_of_events_can_start_after_a_given_event(service: RunningService) -> None:
     with service.client() as client:
         last = client.get("/health")["events"]
         following = client.follow(after=last - 1)
@@ -363,7 +365,7 @@ def test_streams_of_events_resume_after_an_event(service: RunningService) -> Non
         assert (found["kind"], found["data"]["name"]) == ("identity.added", "seen")
 
 
-def test_a_page_of_events_is_filled_with_events_of_the_client(service: RunningService) -> None:
+def test_a_page_of_events_has_only_events_that_the_client_may_read(service: RunningService) -> None:
     secret = service.grant("quiet", "client")
     with service.client() as admin, service.client(secret) as quiet:
         after = admin.get("/health")["events"]
@@ -387,9 +389,7 @@ def test_the_error_for_a_wrong_method_lists_allowed_methods(service: RunningServ
     assert httpx.put(f"{service.url}/v1/nodes").headers["allow"] == "GET, POST"
 
 
-def test_metrics_are_as_prometheus_reads_them(
-    service: RunningService, secrets: dict[str, str]
-) -> None:
+def test_prometheus_can_read_the_metrics(service: RunningService, secrets: dict[str, str]) -> None:
     from prometheus_client.parser import text_string_to_metric_families
 
     viewer = token_of(service, secrets["viewer"]).json()

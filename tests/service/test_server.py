@@ -1,4 +1,4 @@
-"""Starting a service: quickly, and only for this machine unless TLS is used."""
+"""A service starts quickly, and without TLS it serves only this machine."""
 
 from __future__ import annotations
 
@@ -24,24 +24,24 @@ ROOT = Path(__file__).resolve().parents[2]
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::", "192.168.1.5", "example.org"])
-def test_without_tls_other_machines_cannot_reach_the_service(host: str) -> None:
+def test_an_address_for_other_machines_is_refused_without_tls(host: str) -> None:
     with pytest.raises(ServiceError, match="--certificate and --key"):
         check_transport(host, None, None)
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.0.0.2", "::1", "localhost"])
-def test_this_machine_needs_no_tls(host: str) -> None:
+def test_a_loopback_address_needs_no_tls(host: str) -> None:
     check_transport(host, None, None)
 
 
-def test_half_of_tls_is_refused(tmp_path: Path) -> None:
+def test_a_certificate_without_a_key_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ServiceError, match="both"):
         check_transport("127.0.0.1", tmp_path / "cert.pem", None)
     with pytest.raises(ServiceError, match="does not exist"):
         check_transport("0.0.0.0", tmp_path / "cert.pem", tmp_path / "key.pem")
 
 
-def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
+def test_a_client_checks_the_certificate_of_the_service(tmp_path: Path) -> None:
     certificate, key = make_certificate(tmp_path)
     options = ("--certificate", str(certificate), "--key", str(key))
     with running_service(tmp_path / "store.sqlite", *options) as service:
@@ -56,7 +56,7 @@ def test_with_tls_the_certificate_is_checked(tmp_path: Path) -> None:
 
 
 def test_the_service_starts_without_kernels(tmp_path: Path) -> None:
-    """Compilers and learning libraries would take most of the time of its start."""
+    """Check that the process has not loaded compilers and learning libraries, which are slow."""
     with running_service(tmp_path / "store.sqlite", fresh=True) as service:
         assert httpx.get(f"{service.url}/v1/health").status_code == 200
         mapped = {
@@ -76,8 +76,8 @@ def test_the_benchmark_measures_and_its_replay_is_equal() -> None:
     assert found.facts["beats_share"] > 0.0
 
 
-def test_the_service_has_no_client_of_its_own() -> None:
-    """A service never calls an address of a request: only nodes and clients import HTTP clients."""
+def test_the_service_itself_imports_no_http_client() -> None:
+    """Check that the service cannot connect to an address in a request; only its nodes use HTTP."""
     for path in (ROOT / "cavmarl" / "service").glob("*.py"):
         text = path.read_text(encoding="utf-8")
         calls = re.search(

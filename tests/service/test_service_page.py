@@ -1,6 +1,6 @@
-"""`docs/guides/service.md`: its commands run, its tests exist, and its containers can run.
+"""The commands of `docs/guides/service.md` run, its tests exist, and its containers can start.
 
-The commands are tested in each run, although they start a service and two nodes, because readers
+Every test run executes the commands, although they start a service and two nodes, because readers
 try them first.
 """
 
@@ -31,7 +31,7 @@ def commands() -> list[str]:
     return [line.split("  #")[0].strip() for line in block[1].splitlines()]
 
 
-def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_commands_of_the_page_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     said = {}
     with running_service(tmp_path / "store.sqlite", "--beat-s", "0.5") as service:
@@ -61,8 +61,8 @@ def test_the_page_s_session_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert [json.loads(line)["kind"] for line in told][:2] == ["session.opened", "session.assigned"]
 
 
-@pytest.mark.slow  # test_sessions.py tests the same with smaller worlds
-def test_the_page_s_example_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.slow  # in every run: test_sessions.py, with smaller worlds
+def test_the_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)
     assert block
@@ -107,7 +107,7 @@ def test_the_containers_run_existing_commands() -> None:
 
 
 def parse(words: list[str]) -> None:
-    """Parse a command; wrong names and values raise an error."""
+    """Parse a command; raise an error for wrong names and values."""
     group = typer.main.get_command(app)
     assert isinstance(group, click.Group) or hasattr(group, "get_command")
     context = group.make_context("cavmarl", list(words), resilient_parsing=False)

@@ -1,4 +1,4 @@
-"""Commands of a session beside reset and step: changes, frames, saved states and recordings."""
+"""Other commands of a session than reset and step: changes, frames, saved states, recordings."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def client(cluster: Cluster) -> Iterator[Client]:
         yield made
 
 
-def test_changes_are_made_at_their_command_and_repeated_after_a_loss(
+def test_changes_take_effect_at_their_command_and_are_repeated_after_a_loss(
     cluster: Cluster, client: Client, tmp_path: Path
 ) -> None:
     remote = client.open("grid4x4", node="victim", wait_s=30.0, **WORLD)
@@ -98,7 +98,7 @@ def assert_recorded(folder: Path) -> None:
         assert one.asked == other.asked
 
 
-def test_a_state_continues_in_a_process_of_one_s_own(client: Client) -> None:
+def test_a_saved_state_continues_in_a_local_world(client: Client) -> None:
     remote = client.open("merge", agents=3, background=8, wait_s=30.0)
     local = cavmarl.make_vec("merge", agents=3, background=8)
     with pytest.raises(ServiceError, match="reset"):
@@ -158,7 +158,7 @@ def test_a_scenario_is_set_by_a_command(cluster: Cluster, client: Client) -> Non
         (lambda world: world.scenario("../a.py"), ServiceError, "pattern"),
     ],
 )
-def test_a_change_that_is_refused_changes_nothing(
+def test_a_refused_change_has_no_effect(
     open_world: RemoteWorld, ask: Callable[[RemoteWorld], None], error: type[Exception], words: str
 ) -> None:
     number, before = open_world.flows.number, open_world.state_hash()

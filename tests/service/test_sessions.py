@@ -1,7 +1,7 @@
-"""Worlds and evaluations on nodes in processes of their own; nodes and the service are killed.
+"""Worlds and evaluations on nodes in separate processes; tests kill nodes and the service.
 
-Three nodes serve all tests; their processor time counts for the last test. It is part of each run,
-since no cheaper test shows that sessions outlive their nodes.
+Three nodes serve all tests, and their processor time counts for the last test. This test is in
+every run, because no cheaper test shows that sessions outlive their nodes.
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def make_local() -> cavmarl.CavVectorEnv:
     return cavmarl.make_vec("merge", agents=AGENTS, background=8)
 
 
-def test_a_session_continues_bit_for_bit_when_its_node_is_killed(
+def test_a_session_continues_bit_for_bit_after_its_node_is_killed(
     cluster: Cluster, client: Client
 ) -> None:
     remote, local = open_world(client, node="victim"), make_local()
@@ -84,7 +84,7 @@ def test_a_session_continues_bit_for_bit_when_its_node_is_killed(
     cluster.processes["victim"].kill()
     assert_same(remote, local, range(60, 75))
     assert remote.flows.moves == 1
-    events = client.get("/events", limit=1000)["events"]  # a client gets only its own events
+    events = client.get("/events", limit=1000)["events"]  # a client can read only its own events
     kinds = [one["kind"] for one in events]
     assert kinds == [
         "configuration.added", "session.opened", "session.assigned", "session.saved",
@@ -122,7 +122,7 @@ def test_another_client_resumes_a_session(cluster: Cluster, client: Client) -> N
     assert refused.value.problem == "not-found"
 
 
-def test_a_node_opens_worlds_to_the_token_of_their_lease_alone(client: Client) -> None:
+def test_a_node_opens_a_world_only_with_the_token_of_its_lease(client: Client) -> None:
     remote = open_world(client)
     other = open_world(client)
     remote.reset(seed=0)
@@ -171,7 +171,7 @@ def test_the_async_client_gives_the_same_results(cluster: Cluster) -> None:
     assert sequence > 0
 
 
-def test_a_job_gives_the_results_of_an_evaluation_here(client: Client, tmp_path: Path) -> None:
+def test_a_job_gives_the_results_of_a_local_evaluation(client: Client, tmp_path: Path) -> None:
     world = {"agents": 2, "background": 4, "seed": 3}
     job = client.submit("ring", episodes=1, max_cycles=20, **world)
     done = client.wait(job, tmp_path / "there", timeout_s=120.0)
@@ -213,7 +213,7 @@ def test_a_job_that_cannot_run_fails_with_its_cause(client: Client) -> None:
         client.wait(job, timeout_s=120.0)
 
 
-@pytest.mark.slow  # every run has tests of each kind of kill alone
+@pytest.mark.slow  # tests in every run cover each kind of kill by itself
 def test_kills_of_nodes_and_of_the_service_change_no_bit(tmp_path: Path) -> None:
     options = ("--lease-s", "2", "--beat-s", "0.3")
     with running_service(tmp_path / "store.sqlite", *options) as service:
@@ -265,7 +265,9 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
                 message = page.recv(timeout=10)
                 told_of = json.loads(message) if isinstance(message, str) else {}
                 rows = told_of.get("rows", rows)
-                if len(rows) > 1 and rows[-1]["score"] is not None:  # None if the heartbeat is late
+                if (
+                    len(rows) > 1 and rows[-1]["score"] is not None
+                ):  # the score is None if the heartbeat is late
                     break
             assert "node of the service" in rows[-1]["name"]
             assert rows[-1]["score"] is not None
@@ -276,8 +278,8 @@ def test_a_session_is_shown_on_a_page_of_its_node(client: Client) -> None:
         httpx.get(told["address"])
 
 
-def heard(page: Any, kind: str) -> None:
-    """Wait for an event of a kind."""
+def wait_for_event(page: Any, kind: str) -> None:
+    """Wait until a page receives an event of a kind."""
     for _ in range(1000):
         message = page.recv(timeout=20)
         if isinstance(message, str) and (told := json.loads(message))["kind"] == "events":
@@ -286,7 +288,7 @@ def heard(page: Any, kind: str) -> None:
     raise AssertionError(kind)
 
 
-def test_changes_by_a_page_remain_when_the_session_moves(cluster: Cluster, client: Client) -> None:
+def test_changes_by_a_page_are_kept_if_the_session_moves(cluster: Cluster, client: Client) -> None:
     keys: dict[str, Any] = {"agents": AGENTS, "background": 8}
     keys["overrides"] = {"population.insertions": 4}
     cluster.start("controlled")
@@ -307,7 +309,7 @@ def test_changes_by_a_page_remain_when_the_session_moves(cluster: Cluster, clien
         actions = local.suggest_actions()
         held = pool.submit(remote.step, actions)
         page.send(json.dumps({"kind": "insert", "x": x, "y": y}))
-        heard(page, "inserted")
+        wait_for_event(page, "inserted")
         assert not held.done()
         page.send('{"kind": "play"}')
         held.result(timeout=60)
@@ -316,7 +318,7 @@ def test_changes_by_a_page_remain_when_the_session_moves(cluster: Cluster, clien
         local.step(actions)
         assert_same(remote, local, range(2))
         page.send('{"kind": "reset"}')
-        heard(page, "episode")
+        wait_for_event(page, "episode")
     local.reset(options={"reset_mask": np.array([True])})
     actions = local.suggest_actions()
     assert remote.step(actions)[4]["begun_anew"].tolist() == [True]

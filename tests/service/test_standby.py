@@ -1,4 +1,4 @@
-"""A standby takes over from a killed service, and nothing that was acknowledged is lost."""
+"""A standby takes over from a killed service, and no acknowledged request is lost."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ TAKEOVER_S = 5.0
 
 @contextmanager
 def running_standby(store: str) -> Iterator[str]:
-    """Yield the URL of a standby, a process that ends with the block."""
+    """Run a standby process within the block, and yield its URL."""
     words = ["-m", "cavmarl", "serve", "--standby", "--port", "0", "--store", store]
     process = ForkedProcess([*words, "--beat-s", "0.6"], stdout=subprocess.PIPE, text=True)
     assert process.stdout is not None
@@ -47,7 +47,9 @@ def running_standby(store: str) -> Iterator[str]:
         process.stdout.close()
 
 
-def test_a_standby_takes_over_within_5_s_and_loses_nothing(empty_postgresql: str) -> None:
+def test_a_standby_takes_over_within_5_s_and_loses_no_acknowledged_request(
+    empty_postgresql: str,
+) -> None:
     acknowledged: list[str] = []
     with (
         running_service(empty_postgresql, "--beat-s", "0.6") as service,
@@ -79,13 +81,15 @@ def test_a_standby_takes_over_within_5_s_and_loses_nothing(empty_postgresql: str
                 time.sleep(0.001)
             service.kill()
             began_s, count = time.monotonic(), len(acknowledged) + len(askers)
-            while len(acknowledged) <= count:  # answers that were on their way do not count
+            while len(acknowledged) <= count:  # answers of the killed service may still arrive
                 assert time.monotonic() < began_s + TAKEOVER_S
                 time.sleep(0.001)
             is_over.append(True)
             for one in askers:
                 one.join()
-            assert_same(remote, local, range(3, 60))  # a state is saved with the new service
+            assert_same(
+                remote, local, range(3, 60)
+            )  # enough steps for a state to be saved at the new service
             assert client.get(f"/sessions/{remote.flows.session}")["saved_number"] > 0
             assert client.flows.url == other != primary
             with service.client() as admin:
@@ -118,7 +122,7 @@ def test_a_standby_follows_the_log_until_the_store_is_free(empty_postgresql: str
     store.close()
 
 
-def test_a_changed_log_is_noticed_when_a_standby_takes_over(empty_postgresql: str) -> None:
+def test_a_standby_refuses_a_changed_log_when_it_takes_over(empty_postgresql: str) -> None:
     fleet = Fleet(empty_postgresql)
     fleet.join("a")
     fleet.close()
@@ -131,12 +135,14 @@ def test_a_changed_log_is_noticed_when_a_standby_takes_over(empty_postgresql: st
     store.close()
 
 
-def test_a_service_that_lost_its_connection_writes_nothing_more(empty_postgresql: str) -> None:
+def test_a_service_that_loses_its_connection_to_the_store_stops_writing(
+    empty_postgresql: str,
+) -> None:
     fleet = Fleet(empty_postgresql)
     fleet.log.flush()
     others = "SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE pid <> pg_backend_pid()"
     change(empty_postgresql, f"{others} AND datname = current_database()")
-    for _ in range(2):  # a new connection would not have the lock
+    for _ in range(2):  # twice, because a new connection would not have the lock
         with pytest.raises(ServiceError, match="does not answer"):
             fleet.log.store.check_lock()
     fleet.register("a")
@@ -176,7 +182,7 @@ def change(url: str, statement: str) -> None:
     engine.dispose()
 
 
-def test_a_standby_needs_a_store_that_two_services_can_use(tmp_path: Path) -> None:
+def test_a_standby_with_an_sqlite_store_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ServiceError, match="postgresql://"):
         EventStore(tmp_path / "store.sqlite", is_standby=True)
     assert not (tmp_path / "store.sqlite").exists()

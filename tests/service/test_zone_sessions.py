@@ -1,4 +1,4 @@
-"""A session whose zones are at several nodes of the service; members and leader are killed."""
+"""A session whose zones are on several nodes; the tests kill members and the leader."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ def test_a_session_over_nodes_survives_kills_of_its_nodes(cluster: Cluster, clie
     remote.reset(seed=3)
     local.reset(seed=3)
     assert_same(remote, local, range(55))  # until a state has been saved
-    assert_told(client, session, remote, local)
+    check_reported_owners(client, session, remote, local)
     found = client.get(session)
     assert len(set(found["members"])) == 2
     victim = next(name for name in found["members"] if name != found["node"])
@@ -70,10 +70,10 @@ def test_a_session_over_nodes_survives_kills_of_its_nodes(cluster: Cluster, clie
     remote.close()
 
 
-def assert_told(
+def check_reported_owners(
     client: Client, session: str, remote: RemoteWorld, local: cavmarl.CavVectorEnv
 ) -> None:
-    """Check that the service reports the owners of vehicles that have changed their zone."""
+    """Check that the service reports the owners of vehicles that have changed their zones."""
     rows = local.simulation.transfers[0].rows
     last = {row.vehicle: {"zone": row.target, "epoch": row.epoch} for row in rows}
     assert last
@@ -97,12 +97,14 @@ def test_closing_a_job_ends_its_process(cluster: Cluster, client: Client) -> Non
     node = next(one for one in cluster.processes.values() if one.poll() is None)
 
     def is_over() -> bool:
-        return not [one for one in psutil.Process(node.pid).children() if "fresh" in told(one)]
+        return not [
+            one for one in psutil.Process(node.pid).children() if "fresh" in command_line_of(one)
+        ]
 
     wait_for(is_over)
 
 
-def told(process: psutil.Process) -> str:
+def command_line_of(process: psutil.Process) -> str:
     try:
         return " ".join(process.cmdline())
     except psutil.NoSuchProcess:

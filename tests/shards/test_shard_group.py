@@ -1,4 +1,4 @@
-"""The results of shards do not depend on the groups in which they are called."""
+"""The results of shards do not depend on their division into groups."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ Parting = Callable[[Sequence[Shard]], list[Sequence[Shard]]]
 
 
 class Groups(PhaseExecutor):
-    """Several groups of shards, called one after the other like those of several processes."""
+    """An executor that calls several groups of shards in turn, as several processes would."""
 
     def __init__(self, parts: Sequence[Sequence[Shard]]) -> None:
         self._groups = [ShardGroup(part) for part in parts]
@@ -43,7 +43,7 @@ def divided(**overrides: Any) -> Simulation:
 
 
 def all_rows(simulation: Simulation) -> bytes:
-    """Return the bytes of all rows of all zones, and the counts."""
+    """Return the bytes of all rows and counts of all zones."""
     zoned = simulation.division.zoned
     numbers = (zoned.num_owned, zoned.num_rows, zoned.num_near, zoned.num_contacts)
     rows = [
@@ -62,7 +62,7 @@ def all_rows(simulation: Simulation) -> bytes:
     ],
     ids=["alone", "in twos"],
 )
-def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
+def test_one_group_of_all_shards_gives_the_results_of_several_groups(part: Parting) -> None:
     together, apart = divided(), divided()
     use_executor(apart, Groups(part(apart.shards)))
     for step in range(STEPS):
@@ -74,7 +74,7 @@ def test_a_group_of_all_shards_equals_its_parts(part: Parting) -> None:
     assert together.traffic_stats().departed > 64, "no vehicle has left and been replaced"
 
 
-def test_a_shard_can_be_stepped_alone() -> None:
+def test_a_shard_can_be_advanced_by_itself() -> None:
     simulation = divided()
     shard = simulation.shards[2]
     others = [other for other in simulation.shards if other is not shard]

@@ -1,4 +1,4 @@
-"""A vehicle's state as bytes: transferred vehicles continue exactly; wrong bytes are refused."""
+"""The state of a vehicle as bytes: vehicles continue exactly, and wrong bytes are refused."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def hilly(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
 
 
 def rough_world(files: tuple[Path, Path], **overrides: Any) -> Simulation:
-    """Make worlds with delayed actions, stacked frames, generated agents, a demand, long steps."""
+    """Make worlds with delayed actions, stacked frames, agents, a demand and long steps."""
     roads, demand = files
     settings = {
         "clock.sim_dt_s": 0.1,
@@ -104,7 +104,7 @@ def carry_all(simulation: Simulation) -> None:
 
 
 class Carrier(PhaseLog):
-    """Pack and unpack all vehicles after the last phase that moves them, and store their rows."""
+    """An executor that packs and unpacks all vehicles after their last motion."""
 
     def __init__(self, simulation: Simulation) -> None:
         super().__init__(executor_of(simulation))
@@ -140,7 +140,7 @@ def test_vehicles_that_are_packed_every_tick_continue_bit_for_bit(
     use_executor(carried, carrier)
     assert trace(carried) == expected
     seen = carrier.seen
-    assert len(np.unique(seen["vtype"])) >= 4  # cars of the generator and of the demand
+    assert len(np.unique(seen["vtype"])) >= 4  # cars from the generator and from the demand file
     assert len(np.unique(seen["length"])) >= 3
     assert np.ptp(seen["z"]) > 1.0
     assert (seen["pitch"] > 0.03).any()
@@ -194,7 +194,7 @@ Arrays = tuple[TransferCodec, NDArray[np.void], NDArray[np.float64], NDArray[np.
 
 
 def arrays(record: np.dtype[np.void] = VEHICLE, agents: int = AGENTS) -> Arrays:
-    """Return a codec of two worlds of four rows, and its rows, commands and frames of garbage."""
+    """Return a codec for two worlds of four rows, with rows, commands and frames of garbage."""
     rows = np.empty((2, 4), dtype=record)
     commands = np.empty((2, agents, TICKS, 2))
     frames = np.empty((2, agents, NUMBERS), dtype=np.float32)
@@ -203,8 +203,8 @@ def arrays(record: np.dtype[np.void] = VEHICLE, agents: int = AGENTS) -> Arrays:
     return TransferCodec(record, commands, frames), rows, commands, frames
 
 
-def filled(record: np.dtype[np.void], agent: int) -> Arrays:
-    """Fill row 2 of world 1 with another value in every field."""
+def fill_row(record: np.dtype[np.void], agent: int) -> Arrays:
+    """Return `arrays` in which row 2 of world 1 has a different value in each field."""
     codec, rows, commands, frames = arrays(record)
     for k, name in enumerate(record.names or ()):
         rows[name][1, 2] = 10 + k
@@ -214,13 +214,13 @@ def filled(record: np.dtype[np.void], agent: int) -> Arrays:
     return codec, rows, commands, frames
 
 
-def a_state() -> tuple[bytes, int]:
-    """Return a state of tick `TICK`, and its vehicle."""
-    codec, rows, _, _ = filled(VEHICLE, agent=1)
+def make_state() -> tuple[bytes, int]:
+    """Return a packed state of tick `TICK`, and the id of its vehicle."""
+    codec, rows, _, _ = fill_row(VEHICLE, agent=1)
     return codec.pack(rows, 1, 2, TICK), int(rows[1, 2]["id"])
 
 
-def unpacked(state: bytes, vehicle: int, tick: int) -> np.void:
+def unpack_state(state: bytes, vehicle: int, tick: int) -> np.void:
     codec, rows, _, _ = arrays()
     codec.unpack(state, vehicle, tick, rows, 0, 3)
     row: np.void = rows[0, 3]
@@ -228,8 +228,8 @@ def unpacked(state: bytes, vehicle: int, tick: int) -> np.void:
 
 
 @pytest.mark.parametrize("agent", [-1, 0, 2])
-def test_every_field_arrives_and_other_rows_do_not_change(agent: int) -> None:
-    codec, rows, commands, frames = filled(VEHICLE, agent)
+def test_unpacking_sets_every_field_and_changes_no_other_row(agent: int) -> None:
+    codec, rows, commands, frames = fill_row(VEHICLE, agent)
     state = codec.pack(rows, 1, 2, TICK)
     sent = rows[1, 2].copy()
     other, there, their_commands, their_frames = arrays()
@@ -253,7 +253,9 @@ def test_every_field_arrives_and_other_rows_do_not_change(agent: int) -> None:
 @given(record=st.binary(min_size=VEHICLE.itemsize, max_size=VEHICLE.itemsize),
        apart=st.binary(min_size=8 * 2 * TICKS + 4 * NUMBERS, max_size=8 * 2 * TICKS + 4 * NUMBERS),
        agent=st.integers(-1, AGENTS - 1))  # fmt: skip
-def test_any_record_is_unpacked_as_it_was_packed(record: bytes, apart: bytes, agent: int) -> None:
+def test_any_unpacked_record_equals_the_packed_record(
+    record: bytes, apart: bytes, agent: int
+) -> None:
     codec, rows, commands, frames = arrays()
     rows[1, 2] = np.frombuffer(record, VEHICLE)[0]
     rows["agent"][1, 2], rows["transfer"][1, 2] = agent, 0
@@ -272,46 +274,46 @@ RECORD_AT = 44
 
 
 def test_invalid_bytes_are_refused_with_the_reason() -> None:
-    state, vehicle = a_state()
+    state, vehicle = make_state()
     header, other = bytearray(state), RECORD_VERSION + 1
     for length in range(len(state)):
         with pytest.raises(MessageError):
-            unpacked(state[:length], vehicle, TICK)
+            unpack_state(state[:length], vehicle, TICK)
     with pytest.raises(MessageError, match=f"{len(state) + 1} bytes"):
-        unpacked(state + b"\0", vehicle, TICK)
+        unpack_state(state + b"\0", vehicle, TICK)
     with pytest.raises(MessageError, match="begins with"):
-        unpacked(b"CVMO" + state[4:], vehicle, TICK)
+        unpack_state(b"CVMO" + state[4:], vehicle, TICK)
     with pytest.raises(
         MessageError, match=rf"version {other}\.0, but this build reads {RECORD_VERSION}\."
     ):
-        unpacked(state[:4] + struct.pack("<H", other) + state[6:], vehicle, TICK)
+        unpack_state(state[:4] + struct.pack("<H", other) + state[6:], vehicle, TICK)
     with pytest.raises(MessageError, match=f"expected vehicle {vehicle + 1}"):
-        unpacked(state, vehicle + 1, TICK)
+        unpack_state(state, vehicle + 1, TICK)
     with pytest.raises(MessageError, match=f"at tick {TICK + 1}"):
-        unpacked(state, vehicle, TICK + 1)
+        unpack_state(state, vehicle, TICK + 1)
     header[16:24] = struct.pack("<q", vehicle + 1)
     with pytest.raises(MessageError, match="the header names"):
-        unpacked(bytes(header), vehicle + 1, TICK)
+        unpack_state(bytes(header), vehicle + 1, TICK)
 
 
-def patched(state: bytes, field: str, value: int) -> bytes:
-    """Return a state with another value of an int32 field of its record."""
+def set_record_field(state: bytes, field: str, value: int) -> bytes:
+    """Return a state with another value in an int32 field of its record."""
     at = RECORD_AT + int((VEHICLE.fields or {})[field][1])
     return state[:at] + struct.pack("<i", value) + state[at + 4 :]
 
 
 def test_an_unknown_status_and_a_foreign_agent_are_refused() -> None:
-    state, vehicle = a_state()
+    state, vehicle = make_state()
     with pytest.raises(MessageError, match="unknown transfer status 7"):
-        unpacked(patched(state, "transfer", 7), vehicle, TICK)
+        unpack_state(set_record_field(state, "transfer", 7), vehicle, TICK)
     with pytest.raises(MessageError, match=f"agent {AGENTS}, but there are {AGENTS}"):
-        unpacked(patched(state, "agent", AGENTS), vehicle, TICK)
+        unpack_state(set_record_field(state, "agent", AGENTS), vehicle, TICK)
     with pytest.raises(MessageError, match="control_latency_ticks and sensors"):
-        unpacked(patched(state, "agent", -1), vehicle, TICK)
+        unpack_state(set_record_field(state, "agent", -1), vehicle, TICK)
 
 
 def test_another_record_or_environment_is_refused() -> None:
-    state, vehicle = a_state()
+    state, vehicle = make_state()
     renamed = np.dtype([(name if name != "lane_stood" else "recall", kind)
                         for name, kind in VEHICLE.descr])  # fmt: skip
     codec, rows, _, _ = arrays(renamed)
@@ -331,10 +333,14 @@ def test_another_record_or_environment_is_refused() -> None:
         TransferCodec(padded, commands, frames)
 
 
-def test_a_refused_state_changes_nothing() -> None:
-    state, vehicle = a_state()
+def test_a_refused_state_changes_no_row() -> None:
+    state, vehicle = make_state()
     codec, rows, commands, frames = arrays()
-    for wrong in (state[:-1], patched(state, "transfer", 7), patched(state, "agent", 9)):
+    for wrong in (
+        state[:-1],
+        set_record_field(state, "transfer", 7),
+        set_record_field(state, "agent", 9),
+    ):
         with pytest.raises(MessageError):
             codec.unpack(wrong, vehicle, TICK, rows, 0, 0)
     for array in (rows, commands, frames):
@@ -360,9 +366,9 @@ def golden() -> dict[str, Any]:
 
 
 def test_a_state_of_version_one_is_read() -> None:
-    """The file states the layout of its record."""
+    """Read a golden file, which states the layout of its record."""
     if os.environ.get("CAVMARL_REWRITE"):
-        state, vehicle = a_state()
+        state, vehicle = make_state()
         content = {
             "version": [RECORD_VERSION, 0],
             "vehicle": vehicle,
@@ -378,7 +384,7 @@ def test_a_state_of_version_one_is_read() -> None:
     header = codec.header(state)
     assert [header.major, header.minor] == content["version"]
     codec.unpack(state, content["vehicle"], content["tick"], rows, 0, 0)
-    _, expected, their_commands, their_frames = filled(record, 1)
+    _, expected, their_commands, their_frames = fill_row(record, 1)
     assert rows[0, 0] == expected[1, 2]
     np.testing.assert_array_equal(commands[0, 1], their_commands[1, 1])
     np.testing.assert_array_equal(frames[0, 1], their_frames[1, 1])
@@ -394,9 +400,9 @@ def test_a_changed_record_needs_another_version() -> None:
 
 @pytest.mark.parametrize(("minor", "more"), [(0, b""), (1, b""), (7, b"what a newer one adds")])
 def test_every_minor_version_is_read(minor: int, more: bytes) -> None:
-    state, vehicle = a_state()
+    state, vehicle = make_state()
     newer = state[:6] + struct.pack("<H", minor) + state[8:] + more
-    assert unpacked(newer, vehicle, TICK) == unpacked(state, vehicle, TICK)
+    assert unpack_state(newer, vehicle, TICK) == unpack_state(state, vehicle, TICK)
 
 
 # The contract

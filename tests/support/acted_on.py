@@ -1,4 +1,4 @@
-"""State hashes of a world that a caller changes between steps, for comparisons of divisions."""
+"""Run a world that a test changes between steps, and return its state hashes."""
 
 from __future__ import annotations
 
@@ -12,14 +12,14 @@ from cavmarl import parallel_env
 
 
 def hashes_of(
-    act: Callable[[Any, int], None],  # commands of the caller before a step
+    act: Callable[[Any, int], None],  # called before each step with the environment and the step
     *,
     steps: int,
     every: int,
     kill_at: tuple[int, ...] = (),
     **world: Any,
 ) -> list[str]:
-    """Return the state hash after each `every` steps; at some steps, a worker dies.
+    """Return the state hash after every `every` steps; kill a worker before the steps `kill_at`.
 
     `world`: arguments of `parallel_env` on the map grid4x4.
     """

@@ -20,9 +20,10 @@ def bent_street(
     lanes: int = 1,
     attributes: str = "",
 ) -> Path:
-    """Make a street at 50 km/h whose middle edges, `ab` and `ba`, turn after each leg but the last.
+    """Make a street with corners inside its middle edges `ab` and `ba`; the limit is 50 km/h.
 
-    At its ends, cars turn round. `attributes`: further attributes of all edges.
+    Each leg but the last is followed by a corner. Cars turn around at the ends of the street.
+    `attributes`: further attributes of all edges.
     """
     places, heading = [(0.0, 0.0)], 0.0
     for leg, turn in zip(legs_m, (*turns_deg, 0.0), strict=True):

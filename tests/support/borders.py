@@ -44,7 +44,7 @@ def write_roads(path: Path, roads: Sequence[tuple[Place, Place]], speed_mps: flo
 
 
 def write_platoon(path: Path, roads: int, place_m: float, speed_mps: float) -> Path:
-    """Write one car per road without imperfection; all cars have the same position at any time."""
+    """Write one car per road; all cars drive alike, so they cross a border in the same tick."""
     cars = "".join(
         f'<vehicle id="{k}" type="car" depart="0" departPos="{place_m}" '
         f'departSpeed="{speed_mps}"><route edges="road{k}"/></vehicle>'
@@ -65,7 +65,7 @@ def bounds_around(network: RoadNetwork) -> Bounds:
 
 
 def cut_at(path: Path, bounds: Bounds, xs: Sequence[float], ys: Sequence[float] = ()) -> Path:
-    """Write a zone file of all cells between cuts at some x and some y."""
+    """Write a zone file of a grid of zones with borders at these x and y."""
     columns = list(pairwise([bounds[0], *xs, bounds[2]]))
     rows = list(pairwise([bounds[1], *ys, bounds[3]]))
     rects = [[x, y, end_x, end_y] for x, end_x in columns for y, end_y in rows]

@@ -1,4 +1,4 @@
-"""Polylines and vehicles for the kernels' tests."""
+"""Polylines and vehicles for tests of kernels."""
 
 from __future__ import annotations
 
@@ -51,7 +51,7 @@ def polylines(draw: st.DrawFn) -> NDArray[np.float64]:
 
 
 def vehicles(places: Sequence[tuple[float, ...]], **fields: object) -> NDArray[np.void]:
-    """Return cars of 5 m by 2 m by 1.5 m at (x, y, heading), by rising id; `fields` set columns."""
+    """Return cars of 5 m by 2 m by 1.5 m at (x, y, heading), sorted by id; `fields` set columns."""
     rows = np.zeros(len(places), VEHICLE)
     rows["id"] = np.arange(len(places))
     rows["length"], rows["width"], rows["height"] = 5.0, 2.0, 1.5

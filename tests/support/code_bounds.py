@@ -1,4 +1,4 @@
-"""Count properties of code that make it hard to follow: wide classes and calls, and lines."""
+"""Count what makes code hard to follow: methods, attributes, parameters and lines."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ class PackageCode:
         }
 
     def functions(self) -> Iterator[tuple[str, Function, bool]]:
-        """Yield functions and methods outside of cavmarl.cli, and whether they have a `self`."""
+        """Yield each function and method outside of cavmarl.cli, and whether it has a `self`."""
         for module, tree in self._trees.items():
             if not module.startswith("cavmarl.cli"):
                 yield from _functions_of(tree.body, module, is_class=False)

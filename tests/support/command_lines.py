@@ -1,4 +1,4 @@
-"""Checks that commands in pages and in help texts exist and take their options."""
+"""Check that commands in pages and in help texts exist and accept their options."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ USAGE: Any = typer.BadParameter.__base__  # errors of an invalid command line
 
 
 def check_command(line: str) -> None:
-    """Parse a command line down to the options of its command, without running it."""
+    """Parse a command line, including the options of its command, without running it."""
     command = whole_command()
     context = command.make_context("cavmarl", [], resilient_parsing=True)
     words = shlex.split(line.replace("…", ""), comments=True)[1:]
@@ -41,5 +41,5 @@ def check_options(command: Any, words: Sequence[str], context: Any = None) -> No
 
 @cache
 def whole_command() -> Any:
-    """Return the group of all commands."""
+    """Return the command `cavmarl` with all its subcommands."""
     return typer.main.get_command(app)

@@ -1,7 +1,7 @@
 """The processor time of tests, including ended children and forks.
 
-Processor time does not depend on other programs, unlike wall time. `tests/costs.txt` has the times
-of expensive tests at the time of its recording:
+Processor time does not depend on other programs, unlike wall time. `tests/costs.txt` has the
+processor times of expensive tests. This command records it:
 
     CAVMARL_TEST_COSTS=tests/costs.txt pytest -n 3 --dist loadfile -m "not alone"
 """
@@ -32,10 +32,10 @@ __all__ = [
 ]
 
 LISTED_AT_END_S = 2.0  # tests above this time are listed at the end of a run
-ARGUED_S = 2.0  # tests above this time are slow, except tests in argued.txt
+ARGUED_S = 2.0  # tests above this time are slow, unless argued.txt lists them
 LISTED_S = 0.5  # tests below this time are not in costs.txt
-OFTEN_S = 0.5  # total time of a test's variants in every run; at least the cheapest runs
-TURNS = 30  # runs of `make rotation` after which each slow test that is not long has run
+OFTEN_S = 0.5  # time for the variants of a test in every run; the cheapest variant always runs
+TURNS = 30  # turns of `make rotation` in which each slow test runs once, except long tests
 CHEAP_S = 0.05  # assumed time of a test that is not in costs.txt
 COSTS = Path(__file__).resolve().parents[1] / "costs.txt"
 ARGUED = COSTS.with_name("argued.txt")
@@ -44,14 +44,14 @@ LONG = COSTS.with_name("long.txt")
 
 @cache
 def known_costs() -> dict[str, float]:
-    """Return the processor time in s of each test in the file."""
+    """Return the processor times in s by test, as in costs.txt."""
     lines = COSTS.read_text(encoding="utf-8").splitlines() if COSTS.exists() else []
     return {name: float(cost_s) for cost_s, name in (line.split(" ", 1) for line in lines)}
 
 
 @cache
 def argued() -> frozenset[str]:
-    """Return the expensive tests of every run; `[*]` marks tests whose variants all are."""
+    """Return the expensive tests of every run; `[*]` stands for all variants of a test."""
     return _listed(ARGUED)
 
 
@@ -72,9 +72,9 @@ def rare_tests(
     """Return the tests that are too expensive for every run.
 
     Args:
-        names: of all tests; variants of a test differ after the bracket.
+        names: names of all tests; the names of variants of a test differ after the bracket.
         costs: known processor times in s by name.
-        kept: expensive tests that are in every run; `[*]` after a test: all its variants.
+        kept: expensive tests that are in every run; `[*]` stands for all variants of a test.
     """
     spent: dict[str, float] = {}
     rare = set()
@@ -90,12 +90,13 @@ def rare_tests(
 
 
 def is_due(name: str, turn: int, long: frozenset[str]) -> bool:
-    """Return whether `make rotation` runs a slow test in a turn: one of `TURNS` in a row.
+    """Return whether `make rotation` runs a slow test in a turn.
 
-    The tests of a file come up in different turns, so that no turn has all of an expensive file.
+    Each test is due in one of `TURNS` consecutive turns. The tests of a file are spread over the
+    turns, so that no turn runs all tests of an expensive file.
 
     Args:
-        name: of the test.
+        name: name of the test.
         turn: number of the turn.
         long: files and tests, without variants, that no turn runs.
     """
@@ -106,13 +107,13 @@ def is_due(name: str, turn: int, long: frozenset[str]) -> bool:
 
 @cache
 def files_due(turn: int) -> frozenset[str]:
-    """Return the files with a test in costs.txt whose turn it is."""
+    """Return the files with a test in costs.txt that is due in a turn."""
     due = (name for name in known_costs() if is_due(name, turn, long_tests()))
     return frozenset(name.partition("::")[0] for name in due)
 
 
 def costs_of_files(names: Iterable[str], costs: Mapping[str, float]) -> dict[str, float]:
-    """Return the processor time in s by file, of tests in every run, including cheap tests."""
+    """Return the processor time in s of tests, by file; unknown costs are `CHEAP_S`."""
     found: dict[str, float] = defaultdict(float)
     for name in names:
         found[name.partition("::")[0]] += costs.get(name, CHEAP_S)
@@ -132,7 +133,7 @@ class CpuTimes:
 
     @pytest.hookimpl(wrapper=True)
     def pytest_runtest_makereport(self) -> Iterator[Any]:
-        """Store the time of a phase in its report, for the process that sums."""
+        """Store the processor time of a phase in its report."""
         report = yield
         now_s = _used_s()
         report.cpu_s, self._last_s = now_s - self._last_s, now_s
@@ -140,11 +141,11 @@ class CpuTimes:
 
     def pytest_runtest_logreport(self, report: Any) -> None:
         """Add the time of a report."""
-        # A crashed process of pytest-xdist has not reported its time.
+        # Reports of crashed processes of pytest-xdist have no time.
         self.seconds[report.nodeid] += getattr(report, "cpu_s", 0.0)
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        """Print the sum, and the most expensive tests."""
+        """Print the total time and the most expensive tests."""
         if not self.seconds:
             return
         if path := os.environ.get("CAVMARL_TEST_COSTS"):
@@ -168,7 +169,7 @@ def _used_s() -> float:
 
 
 def _forks_s() -> float:
-    """Return the time of the process that forks for tests, and of its ended forks."""
+    """Return the processor time of the fork server of the tests and of its ended forks."""
     server: Any = forkserver._forkserver  # type: ignore[attr-defined]
     if server._forkserver_pid is None:
         return 0.0

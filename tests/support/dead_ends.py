@@ -23,12 +23,12 @@ DEAD_END = {
 
 
 def before_dead_end(folder: Path, length_m: float) -> tuple[Simulation, int, int, int]:
-    """Return a world with two agents, its right and left lane, and the goal edge.
+    """Return a world with two agents, the right and the left lane, and the goal edge.
 
     Args:
         folder: folder for the map.
-        length_m: length of the dead end, in which a car cannot turn. If it is short, the route from
-        the right lane leads through it, else over a lane change.
+        length_m: length of the dead end. If it is short, the route from the right lane leads
+            through the dead end, otherwise over a lane change.
     """
     for kind, text in DEAD_END.items():
         (folder / f"m.{kind}.xml").write_text(text.format(length_m=length_m))

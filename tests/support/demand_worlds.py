@@ -9,8 +9,8 @@ from typing import Any
 from cavmarl.engine.simulation import Simulation
 from tests.support.driving import make_simulation
 
-# Short demands with all features of files: words for lane, position and speed, random types and
-# routes, flows of all kinds, stops, trips without a route.
+# Short demands with all features of demand files: symbolic values of lane, position and speed,
+# random types and routes, all kinds of flows, stops, and trips without a route.
 MERGE = """<routes>
   <vType id="car" sigma="0.6" speedFactor="normc(1,0.1,0.8,1.2)"/>
   <vType id="idm" carFollowModel="IDM" length="4.2"/>
@@ -49,7 +49,7 @@ def make(
     agents: int = 0,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Make worlds with the vehicles of the files only, before their first reset."""
+    """Make worlds whose only vehicles are those of the files; the worlds are not reset."""
     wanted = {"traffic.demand": [str(path) for path in files], "horizon_s": 120.0}
     return make_simulation(
         env,
@@ -62,7 +62,7 @@ def make(
 
 
 def tiny(env: str, folder: Path, **options: Any) -> Simulation:
-    """Make the worlds of a file of `TINY`."""
+    """Make worlds with the demand of an environment in `TINY`."""
     path = folder / f"{env}.rou.xml"
     path.write_text(TINY[env], encoding="utf-8")
     return make(env, [path], **options)

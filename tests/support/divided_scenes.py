@@ -18,19 +18,19 @@ from tests.support.junction_scenes import ARM_M, NODES
 from tests.support.traffic import on_lane
 
 CLASSES = {"car": "passenger", "bus": "bus"}
-MARGIN_M = 20.0  # beyond the arms' ends, within the zones
+MARGIN_M = 20.0  # margin of the zones around the ends of the arms
 TICK_S = 0.05
-# The vehicles of the file depart after the scene; they define types and routes.
+# The vehicles of the demand file depart after the scene. They only define types and routes.
 LATE_S = 900
 CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 1000.0}
-# Zones see only as far as bodies can touch, except for vehicles that drivers look at.
+# With few ticks, zones see only as far as bodies can touch, besides vehicles that drivers watch.
 CLOCK |= {"zones.approach_ticks": 2}
 
 
 class DividedScene:
-    """The same vehicles in one zone, and in four zones that meet `at` (m from the middle).
+    """The same vehicles in one zone, and in four zones that meet at `corner_m` from the crossing.
 
-    `departs`: further lines of the demand file by name, for vehicles that depart in the scene.
+    `departs`: lines of the demand file for vehicles that depart during the scene, by name.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class DividedScene:
             + "".join(departs.values())
             + "</routes>"
         )
-        self.kinds = ("generated", *kinds)  # by VEHICLE_TYPE row
+        self.kinds = ("generated", *kinds)  # by index of VEHICLE_TYPE
         x, y = (ARM_M + middle for middle in corner_m)
         low, high = -MARGIN_M, 2.0 * ARM_M + MARGIN_M
         rects = [[low, low, x, y], [x, low, high, y], [low, y, x, high], [x, y, high, high]]
@@ -74,7 +74,7 @@ class DividedScene:
         self.departs = list(departs)
 
     def put(self, name: str, way: str, front_m: float, kind: str = "car", **fields: Any) -> None:
-        """Put a vehicle on a route like "W_in_0 N_out_0", its front `front_m` beyond its line."""
+        """Put a vehicle on a route like "W_in_0 N_out_0", its front `front_m` beyond the line."""
         network, plans = self.whole.network, self.whole.plans
         travel = self.whole.travel
         before, after = (network.lane_ids.index(lane) for lane in way.split())
@@ -104,7 +104,9 @@ class DividedScene:
             simulation.departures.next_id[0] = len(rows)
             saved = [array.copy() for array in simulation.save()]
             zones = simulation.division.count
-            saved[-zones - 2][...] = 0  # the log has no owners of these vehicles
+            saved[-zones - 2][...] = (
+                0  # clear the saved ownership, which does not know these vehicles
+            )
             saved[-zones:] = [rows, *(rows[:0] for _ in range(1, zones))]
             simulation.load(saved)
 
@@ -115,11 +117,11 @@ class DividedScene:
                 drive(simulation)
             assert self.divided.state_hash() == self.whole.state_hash(), f"tick {tick}"
             vehicles = self.whole.vehicles()
-            assert (vehicles["hit"] < 0).all(), "vehicles touch"
+            assert (vehicles["hit"] < 0).all(), "vehicles collide"
             yield {self.names[row["id"]]: row for row in vehicles}
 
     def ghosts(self, name: str) -> set[str]:
-        """Return the names of the ghosts in the zone of a vehicle."""
+        """Return the names of the ghosts in the zone that owns a vehicle."""
         division, own = self.divided.division, self.names.index(name)
         for zone in range(division.count):
             worlds = division._shards[zone].worlds

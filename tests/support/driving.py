@@ -25,7 +25,7 @@ def make_simulation(
     num_worlds: int = 1,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Make worlds of an environment with a population mode, before their first reset."""
+    """Make worlds of an environment with a population mode; the worlds are not reset."""
     config, network, demand, partition = load_world(
         env,
         agents=agents,
@@ -43,7 +43,7 @@ def make_traffic(
     renewed: bool = True,
     overrides: Mapping[str, Any] | None = None,
 ) -> Simulation:
-    """Make worlds without agents; `renewed`: whether arrived vehicles are replaced."""
+    """Make worlds without agents; with `renewed`, new vehicles replace arrived ones."""
     simulation = make_simulation(
         env, mode="respawn", background=background, num_worlds=num_worlds, overrides=overrides
     )
@@ -53,7 +53,7 @@ def make_traffic(
 
 
 def start(simulation: Simulation, seed: int) -> None:
-    """Begin the first episode of `seed`."""
+    """Reset the worlds with a seed."""
     simulation.seed(seed)
     simulation.reset()
 

@@ -1,6 +1,6 @@
-"""A plugin: simulators of zones that worker processes and nodes can import.
+"""Simulators of zones in a module that worker processes and nodes can import.
 
-Importing it registers `exact_zone`, which moves vehicles as cavmarl does, and three simulators that
+The import registers `exact_zone`, which moves vehicles as cavmarl does, and three simulators that
 refuse vehicles or fail.
 """
 
@@ -46,7 +46,10 @@ class Unwilling(Hesitant):
 
 
 class Failing(OwnKinematics):
-    """A simulator that fails in its 100th tick: after a failed step, a worker repeats up to 64."""
+    """A simulator that fails in its 100th tick.
+
+    A worker repeats up to 64 steps after a failure, so it reaches tick 100 only once.
+    """
 
     def read(self) -> NDArray[np.void]:
         self.counts["read"] += 1

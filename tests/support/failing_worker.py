@@ -1,4 +1,4 @@
-"""A program for workers of a team, which fail once in the phase that FAILING_PHASE names."""
+"""A program for worker processes that fail once, in the phase that FAILING_PHASE names."""
 
 from __future__ import annotations
 

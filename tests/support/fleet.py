@@ -1,4 +1,4 @@
-"""A service in this process without a socket; the test advances its clock."""
+"""A coordination service in this process without a socket; the test advances its clock."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Processes as forks of a process with loaded kernels: each starts in milliseconds.
+"""Processes that are forks of a process with loaded kernels, so they start in milliseconds.
 
-Outside of tests, each process is a new interpreter, which takes more than a second. Tests of that
-use the fixture `fresh_processes`.
+Outside of tests, each process is a new interpreter, whose start takes more than a second. Tests of
+such starts use the fixture `fresh_processes`.
 """
 
 from __future__ import annotations
@@ -32,9 +32,9 @@ _SET_BY_LIBSUMO = ("SUMO_HOME", "PROJ_LIB", "PROJ_DATA")
 class ForkedProcess:
     """The part of `subprocess.Popen` that pools and tests use.
 
-    `words`: arguments of an interpreter: `-m` and a module, `-c` and a program, or a file, and
-    others.
-    `env`: environment variables; None: those of this process.
+    `words`: arguments of a Python interpreter: `-m` and a module, `-c` and a program, or a file;
+    then the arguments of the program.
+    `env`: environment variables; None means the variables of this process.
     """
 
     def __init__(
@@ -103,7 +103,7 @@ class ForkedProcess:
 
 
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
-    """Replace `start_python`; programs that do not use cavmarl are passed on to it."""
+    """Start programs of cavmarl or of the tests as forks, others with `start_python`."""
     ours = words[0] == "-m" and words[1].startswith(("cavmarl.", "tests."))
     if ours or words == ["-c", PROGRAM] or words[0] == sumo_child.__file__:
         return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)
@@ -138,7 +138,7 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     os.environ.clear()
     os.environ.update(of_libsumo | variables)
     own, asked = os.getpid(), os.getppid
-    # The parent of this process is the process that forks; report the caller as the parent.
+    # The real parent is the fork server; report the caller instead.
     os.getppid = lambda: caller if os.getpid() == own else asked()
     sys.stdin = open(0, closefd=False)
     sys.stdout = sys.__stdout__ = open(1, "w", closefd=False)  # type: ignore[misc]
@@ -158,5 +158,7 @@ def _run(words: list[str], passed: dict[int, Any], variables: dict[str, str], ca
     assert spec.origin is not None
     sys.argv = [spec.origin, *arguments]
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)  # the module was imported before
+        warnings.simplefilter(
+            "ignore", RuntimeWarning
+        )  # runpy warns because the module is already imported
         runpy.run_module(what, run_name="__main__")

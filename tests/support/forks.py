@@ -1,4 +1,4 @@
-"""Errors of calls in a fork of this process."""
+"""Collect errors of calls in a fork of this process."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cavmarl.core.errors import CavmarlError
 
 
 def said_in_fork(*calls: Callable[[], object]) -> str:
-    """Make calls in a fork that ends without cleanup; return the messages of refused calls."""
+    """Make calls in a fork that ends without cleanup; return the messages of the raised errors."""
     reading, writing = os.pipe()
     child = os.fork()
     if child == 0:

@@ -1,4 +1,4 @@
-"""Blocks of Markdown that are generated from the code: between `<!-- NAME -->` and `<!-- end -->`.
+"""Blocks of Markdown, between `<!-- NAME -->` and `<!-- end -->`, that tests generate from code.
 
 With `CAVMARL_REWRITE=1` in the environment, a test writes the blocks; otherwise it compares them.
 """
@@ -21,7 +21,7 @@ def table(header: Sequence[str], rows: Iterable[Sequence[str]], *, is_right: boo
 
 
 def check_block(path: Path, name: str, expected: str) -> None:
-    """Check that the block `name` of the file is `expected`, or write it."""
+    """Check that the block `name` of a file is `expected`, or write the block."""
     if os.environ.get("CAVMARL_REWRITE"):
         write_block(path, name, expected)
         return
@@ -34,7 +34,7 @@ def read_block(path: Path, name: str) -> str:
 
 
 def write_block(path: Path, name: str, content: str) -> None:
-    """Replace the content of a block; the file is always whole."""
+    """Replace the content of a block without leaving a partly written file."""
     found = _block(path, name)
     text = found.string[: found.end(1)] + content + "\n" + found.string[found.start(3) :]
     write_whole(path, text.encode())

@@ -1,4 +1,4 @@
-"""The number of entries in containers of an object, to check that its memory does not grow."""
+"""Count the entries in the containers of an object, to check that its memory does not grow."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 def held_entries(root: Any) -> int:
-    """Return the entries of all containers that objects of the package hold, from `root` on."""
+    """Return the number of entries in the containers of `root` and of its package objects."""
     seen: set[int] = set()
     stack, entries = [root], 0
     while stack:

@@ -1,7 +1,7 @@
 """Roads, vehicles and observations of highway-env as records of cavmarl.
 
-The y axis of highway-env points down, so lanes, positions and headings are mirrored. Each of its
-lanes becomes a polyline; vehicles get ids in the order of its list.
+The y axis of highway-env points down, so lanes, positions and headings are mirrored. Each lane of
+highway-env becomes a polyline. Vehicles get ids in the order of the list in highway-env.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from cavmarl.roads.network import LANE
 from tests.support.builders import points_of
 
 SAMPLES = 64  # number of points of a curved lane
-# Attributes that highway-env's intersection overwrites in the class of all drivers.
+# Class attributes of drivers that the intersection environment of highway-env overwrites.
 OVERWRITTEN = ("DISTANCE_WANTED", "COMFORT_ACC_MAX", "COMFORT_ACC_MIN")
 
 
 def make(name: str, seed: int, **config: Any) -> Any:
-    """Return an environment of highway-env, a second after its reset."""
+    """Return an environment of highway-env one second after its reset."""
     pytest.importorskip("highway_env", reason="needs cavmarl[bench]")
     import gymnasium
     import highway_env
@@ -43,7 +43,7 @@ def make(name: str, seed: int, **config: Any) -> Any:
 
 
 def lanes(env: Any) -> dict[tuple[Any, ...], Any]:
-    """Return the lanes of highway-env by index; LANE rows are in this order."""
+    """Return the lanes of highway-env in the order of the LANE rows."""
     found: dict[tuple[Any, ...], Any] = env.road.network.lanes_dict()
     return found
 
@@ -98,7 +98,7 @@ def destinations(env: Any) -> NDArray[np.float64]:
 
 
 def grid_of(rows: NDArray[np.void]) -> Grid:
-    """Return the spatial index over the rows."""
+    """Return a spatial index of the vehicles."""
     grid = make_grid((-100.0, -100.0, 500.0, 100.0), 25.0, len(rows))
     fill_grid(rows, len(rows), grid)
     return grid

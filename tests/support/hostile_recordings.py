@@ -30,7 +30,7 @@ from cavmarl.viewer.map_geometry import map_origin
 from cavmarl.viewer.vehicle_details import vehicle_state
 from fuzz.mutations import mutated
 
-MEMORY_BYTES = 3 << 30  # address space that reading one recording may need
+MEMORY_BYTES = 3 << 30  # additional address space for reading a recording
 _ODD_NUMBERS = (
     0, -1, 1, -2, 127, 2**15 - 1, -(2**15), 2**31 - 1, -(2**31), 2**32, 2**53, 2**63 - 1,
     -(2**63), 0.5, -0.0, float("nan"), float("inf"), float("-inf"), 1e300, 1e13, 5e-324,
@@ -40,7 +40,7 @@ _ODD_VALUES = (*_ODD_NUMBERS, *_ODD_TEXTS, None, True, [], {}, [[]], [0] * 300, 
 
 
 def make_recording(path: Path, steps: int = 5) -> Path:
-    """Record a small divided world with everything that can be recorded."""
+    """Record a small divided world with all kinds of data."""
     options = RecordOptions(path, include=("observations", "samples", "messages"))
     rig = {"lidar": {"type": "lidar", "rate_hz": 5.0, "rays": 8}}
     world: dict[str, Any] = {"zones": 2, "agents": 2, "background": 4, "overrides": {"rig": rig}}
@@ -53,13 +53,13 @@ def make_recording(path: Path, steps: int = 5) -> Path:
 
 @dataclass(frozen=True)
 class Use:
-    """The ways in which a recording is used."""
+    """Which parts of the package a test uses on a recording, besides the reader."""
 
     pictures: bool = False
     page: bool = False
 
     def read(self, path: Path, scratch: Path) -> None:
-        """Read everything that a recording has."""
+        """Read all data of a recording, and use it as `use` says."""
         recording = Recording.open(path)
         network = recording.network
         for world in recording.worlds:
@@ -99,7 +99,7 @@ def _draw(recording: Recording, frames: list[Any]) -> None:
 
 @contextmanager
 def limited_memory(size: int = MEMORY_BYTES) -> Iterator[None]:
-    """Let allocations of much more memory fail within the block."""
+    """Limit the memory that this process can allocate within the block."""
     before = resource.getrlimit(resource.RLIMIT_AS)
     present = psutil.Process().memory_info().vms
     resource.setrlimit(resource.RLIMIT_AS, (present + size, before[1]))
@@ -110,7 +110,7 @@ def limited_memory(size: int = MEMORY_BYTES) -> Iterator[None]:
 
 
 class Forger:
-    """Changes copies of one recording in ways that keep most of it valid."""
+    """Writes changed copies of a recording; most of each copy stays valid."""
 
     def __init__(self, good: Path, folder: Path, seed: int) -> None:
         self._rng = random.Random(seed)
@@ -146,7 +146,7 @@ class Forger:
         rng = self._rng
         name = rng.choice(sorted(self._tables))
         content = bytearray(self._files[name])
-        if rng.random() < 0.5:  # without checksums, readers check more than the checksum
+        if rng.random() < 0.5:  # a file without checksums tests the other checks of the reader
             content = bytearray(_parquet(self._tables[name], rng))
         start = max(0, len(content) - 3000) if rng.random() < 0.6 else 0
         for _ in range(rng.randint(1, 4)):
@@ -247,7 +247,7 @@ class Forger:
 
 
 def put_map(path: Path, network: RoadNetwork) -> None:
-    """Replace the map of a recording, with the checksum in its head."""
+    """Replace the map of a recording, and the checksum of the map in the head."""
     content = pack_network(network)
     head = json.loads((path / "recording.json").read_text())
     head["network"]["sha256"] = hashlib.sha256(content).hexdigest()

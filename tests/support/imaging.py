@@ -38,7 +38,7 @@ def mounts(draw: st.DrawFn) -> NDArray[np.float64]:
     """Draw level and tilted mounts on all sides of a car."""
     place = draw(st.tuples(st.floats(-2.5, 2.5), st.floats(-1.0, 1.0), st.floats(0.1, 1.6)))
     yaw = draw(st.sampled_from([0.0, RIGHT, math.pi]) | st.floats(-math.pi, math.pi))
-    # Without the compiler, NumPy warns of overflow at angles like 1e-308.
+    # In uncompiled kernels, NumPy warns of overflow at angles like 1e-308.
     tilted = st.tuples(st.floats(-1.0, 1.0), st.floats(-3.0, 3.0))
     tilts = draw(st.just((0.0, 0.0)) | tilted.map(lambda tilt: tuple(round(a, 9) for a in tilt)))
     return mount(place, (yaw, *tilts))
@@ -46,7 +46,7 @@ def mounts(draw: st.DrawFn) -> NDArray[np.float64]:
 
 @st.composite
 def wall_sets(draw: st.DrawFn) -> NDArray[np.void]:
-    """Draw up to six walls, some very low, some through the vehicle."""
+    """Draw up to six walls; some are low, and some cross the vehicle."""
     ends = st.tuples(*(coordinates(40.0) for _ in range(4)))
     height = st.sampled_from([0.5, 3.0, 20.0])
     found = draw(st.lists(st.tuples(ends, height, st.integers(0, 2)), max_size=6))
@@ -56,7 +56,7 @@ def wall_sets(draw: st.DrawFn) -> NDArray[np.void]:
 
 
 def one_cell(num: int) -> Grid:
-    """Return an index whose only cell has all bodies."""
+    """Return a spatial index whose only cell has all bodies."""
     index = make_grid((0.0, 0.0, 1.0, 1.0), 1.0, 0)
     index.start[:] = 0, num
     index.largest[0] = 1e3
@@ -85,7 +85,7 @@ def backdrop(
 def look_around(
     rows: NDArray[np.void], row: int = 0, scenery: Backdrop | None = None, reach_m: float = 100.0
 ) -> tuple[Panorama, Counts]:
-    """Return the scene around a vehicle."""
+    """Return the scene around a vehicle as a sensor sees it, and its counts."""
     scenery = scenery or backdrop()
     grid = make_grid((-40.0, -40.0, 40.0, 40.0), 10.0, len(rows))
     fill_grid(rows, len(rows), grid)

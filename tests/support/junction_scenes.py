@@ -26,7 +26,7 @@ NODES = {"W": (-ARM_M, 0), "E": (ARM_M, 0), "S": (0, -ARM_M), "N": (0, ARM_M)}
 def build_crossing(folder: Path, kind: str, side_lanes: int = 1, only_in: str = "") -> Path:
     """Build a crossing of a west-east main road and a south-north side road.
 
-    `kind`: SUMO's type of the node. The arms `only_in` have no outgoing road.
+    `kind`: SUMO's type of the junction. The arms named in `only_in` have no outgoing road.
     """
     target = folder / f"{kind}_{side_lanes}{only_in}.net.xml"
     if target.exists():
@@ -55,7 +55,7 @@ def build_crossing(folder: Path, kind: str, side_lanes: int = 1, only_in: str = 
 
 
 def with_shorter_lane(path: Path, lane: str, by_m: float) -> Path:
-    """Return the same map with a shortened straight lane, at whose end the junction begins."""
+    """Return the same map with one lane shortened by `by_m` and its junction extended to it."""
     tree = ElementTree.parse(path)
     edge, index = lane.rsplit("_", 1)
     rows = {row.get("id"): row for row in tree.iter("lane")}
@@ -91,7 +91,7 @@ class Scene:
         self.names: list[str] = []
 
     def put(self, name: str, lane: str, to_line_m: float, goal: str, **fields: Any) -> None:
-        """Put a car with its front `to_line_m` before a lane's end and the goal edge `goal`."""
+        """Put a car on a lane, its front `to_line_m` before the end; `goal` is an edge."""
         network, worlds = self.simulation.network, self.simulation.shards[0].worlds
         row = network.lane_ids.index(lane)
         s = float(network.lanes[row]["length_m"]) - to_line_m - 2.5
@@ -114,7 +114,7 @@ class Scene:
         self.names.clear()
 
     def __getitem__(self, name: str) -> Any:
-        """Return the record of a car that has not left."""
+        """Return the record of a car in the scene."""
         vehicles = self.simulation.vehicles()
         return vehicles[vehicles["id"] == self.names.index(name)][0]
 
@@ -123,7 +123,7 @@ class Scene:
         for _ in range(round(seconds / 0.05)):
             drive(self.simulation)
             vehicles = self.simulation.vehicles()
-            assert (vehicles["hit"] < 0).all(), "vehicles touch"
+            assert (vehicles["hit"] < 0).all(), "vehicles collide"
             yield float(self.simulation.ticks()[0]) * 0.05
 
     def entries(self, seconds: float) -> dict[str, float]:

@@ -1,6 +1,6 @@
-"""Networks of real maps, cached between runs, and built again if the sources change.
+"""Networks of real maps, which are cached between runs and built again if the sources change.
 
-Tests of networks need not run netconvert and the reader each time; only tests of these two do.
+Only tests of netconvert and of the reader need to run them each time; other tests use this cache.
 """
 
 from __future__ import annotations
@@ -26,11 +26,11 @@ __all__ = ["built", "network_of"]
 
 _FOLDER = cache_dir() / "tests"
 _PACKAGE = Path(__file__).parents[2] / "cavmarl"
-_OLD_S = 2 * 24 * 3600.0  # networks of other sources are removed after this time
+_OLD_S = 2 * 24 * 3600.0  # networks from older sources are removed after this time
 
 
 def built(source: Path) -> Path:
-    """Return the SUMO network of a map, built tolerantly."""
+    """Return the SUMO network of a map, built with `tolerant`."""
     digest = hashlib.sha256(source.read_bytes() + version("eclipse-sumo").encode()).hexdigest()
 
     def build(target: Path) -> None:
@@ -40,7 +40,7 @@ def built(source: Path) -> Path:
 
 
 def network_of(path: Path) -> RoadNetwork:
-    """Return a SUMO network as the reader reads it."""
+    """Return the road network of a SUMO network file."""
     digest = source_hash(path)
 
     def read(target: Path) -> None:
@@ -53,7 +53,7 @@ def network_of(path: Path) -> RoadNetwork:
 
 
 def _kept(domain: str, name: str, make: Callable[[Path], None]) -> Path:
-    """Return a file in the folder for the sources of a domain; make it if it is missing."""
+    """Return a cached file that depends on the sources of a domain; make it if it is missing."""
     folder = _FOLDER / f"{domain}-{_sources(domain)}"
     folder.mkdir(parents=True, exist_ok=True)
     target = folder / name
@@ -66,7 +66,7 @@ def _kept(domain: str, name: str, make: Callable[[Path], None]) -> Path:
 
 @cache
 def _sources(domain: str) -> str:
-    """Return the hash of the sources of `core`, `roads` and a domain."""
+    """Return a hash of the source files of `core`, `roads` and a domain."""
     digest = hashlib.sha256()
     for part in ("core", "roads", domain):
         for path in sorted((_PACKAGE / part).rglob("*.py")):

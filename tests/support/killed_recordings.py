@@ -12,12 +12,12 @@ from tests.support.forked_processes import ForkedProcess
 
 
 def killed_recording(path: Path, program: str, parts: int) -> Recording:
-    """Return the recording of a program that is killed once it has written some parts.
+    """Kill a recording program after it has written some parts, and return the recording.
 
     Args:
-        path: its first argument.
-        program: its text; it prints `begun`, and never ends.
-        parts: number of parts of the first world.
+        path: path of the recording, the first argument of the program.
+        program: text of the program, which prints `begun` and never ends.
+        parts: number of parts of the first world before the kill.
     """
     with ForkedProcess(["-c", program, str(path)], stdout=subprocess.PIPE) as process:
         assert process.stdout is not None

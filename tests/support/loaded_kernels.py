@@ -1,4 +1,4 @@
-"""Loads the kernels of worlds and libsumo when it is imported, for forks of the process."""
+"""Load the kernels of worlds and libsumo on import, so that forks of the process have them."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Nodes as processes of this machine, instead of `RayActors`."""
+"""Processes of this machine that replace the actors of `RayActors`."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any
 
 __all__ = ["FORKS", "LocalActors"]
 
-# Each process is a fork of one process that has loaded the kernels: a fresh start takes seconds.
+# Each process is a fork of a process with loaded kernels, because a fresh start takes seconds.
 FORKS = multiprocessing.get_context("forkserver")
 FORKS.set_forkserver_preload(["tests.support.loaded_kernels"])
 
 
 class LocalActors:
-    """At most two processes and one spare process; dead processes are started again."""
+    """At most two processes and one spare process. Dead processes are started again."""
 
     address = "127.0.0.1"
 

@@ -1,4 +1,4 @@
-"""Small logged scenes: a crossing of four roads with some road users, in both file formats."""
+"""A small logged scene in both file formats: a crossing of four roads with some road users."""
 
 from __future__ import annotations
 
@@ -21,10 +21,12 @@ SIZES = {"VEHICLE": (4.5, 2.0, 1.6), "PEDESTRIAN": (0.5, 0.5, 1.7), "CYCLIST": (
 
 
 def lane_lines() -> dict[str, Numbers]:
-    """Return the lanes (n, 3): `inE` towards the crossing, `outE`, and `tEW` over it."""
+    """Return lanes (n, 3): `inE` leads to the crossing, `outE` away from it, `tEW` over it."""
     lines = {}
     for name, (east, north) in ARMS.items():
-        aside = ASIDE_M * np.array([-north, east])  # on the right, towards the crossing
+        aside = ASIDE_M * np.array(
+            [-north, east]
+        )  # offset to the right of a vehicle that drives to the crossing
         far, near = (metres * np.array([east, north]) for metres in (ARM_M, INNER_M))
         lines[f"in{name}"] = _line(far + aside, near + aside)
         lines[f"out{name}"] = _line(near - aside, far - aside)
@@ -46,7 +48,7 @@ def _line(start: Numbers, end: Numbers) -> Numbers:
 
 
 def edge_lines() -> list[Numbers]:
-    """Return the road edges (n, 2): one corner of the crossing between two arms each."""
+    """Return the road edges (n, 2); each one is the corner of the crossing between two arms."""
     half = 2.0 * ASIDE_M
     corner = np.array([(ARM_M, half), (half, half), (half, ARM_M)])
     turned = []
@@ -82,7 +84,7 @@ def track(
 
 
 def scenario() -> dict[str, Any]:
-    """Return a scene of ScenarioNet; the vehicle `7` has logged it."""
+    """Return a scene of ScenarioNet that vehicle `7` has logged."""
     features: dict[str, Any] = {}
     for name, line in lane_lines().items():
         exits = [f"out{name[2]}"] if name.startswith("t") else []
@@ -121,7 +123,7 @@ def scenario() -> dict[str, Any]:
 
 
 def gpudrive(in_degrees: bool = False) -> dict[str, Any]:
-    """Return the same scene as a document of GPUDrive, which states no exits and limits."""
+    """Return the same scene as a document of GPUDrive, which has no lane exits and speed limits."""
     scene = scenario()
     objects = []
     for number, entry in enumerate(scene["tracks"].values()):

@@ -1,6 +1,6 @@
-"""A service and nodes on loopback sockets, in a thread of this process; their logs are collected.
+"""A service and its nodes on loopback sockets, in a thread of this process.
 
-This is cheaper than separate processes, and a test can read the store and the log.
+The thread is cheaper than separate processes, and a test can read the store and the log.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ BEAT_S = 0.2
 
 
 class Lines(logging.Handler):
-    """The records of the service's loggers, formatted as in its log."""
+    """A handler that collects the log lines of the service and its nodes."""
 
     def __init__(self) -> None:
         super().__init__()
@@ -58,7 +58,7 @@ class LoopbackService:
 
     Attributes:
         log: log lines of the service and the nodes.
-        nodes: the link and the URL of each node, by name.
+        nodes: name → link and URL of the node.
     """
 
     url: str
@@ -68,7 +68,7 @@ class LoopbackService:
     log: Lines
     loop: asyncio.AbstractEventLoop
     http: httpx.Client
-    secrets: dict[str, str] = field(default_factory=dict)  # by name of the identity
+    secrets: dict[str, str] = field(default_factory=dict)  # name of the identity → secret
     nodes: dict[str, tuple[NodeLink, str]] = field(default_factory=dict)
     worlds: dict[str, SessionWorlds] = field(default_factory=dict)
     servers: list[uvicorn.Server] = field(default_factory=list)
@@ -95,13 +95,13 @@ class LoopbackService:
         return Client(self.url, self.secrets[name])
 
     def ask(self, name: str, method: str, path: str, **given: Any) -> httpx.Response:
-        """Send a request with the token of an identity; without a name, none."""
+        """Send a request with the token of an identity, or without a token if the name is empty."""
         headers = {"Authorization": f"Bearer {self.token(name)}"} if name else {}
         headers |= given.pop("headers", {})
         return self.http.request(method, f"{self.url}/v1{path}", headers=headers, **given)
 
     def start_node(self, name: str, identity: str, slots: int = 4) -> NodeLink:
-        """Start a node, whose heartbeats are sent until `stop_node`."""
+        """Start a node that sends heartbeats until the service ends."""
         found: NodeLink = self.run(self._start_node(name, identity, slots))
         self.wait_for_beat(name)
         return found
@@ -114,9 +114,10 @@ class LoopbackService:
             time.sleep(0.02)
 
     def wait_until_ready(self, name: str) -> None:
-        """Wait until a node is admitted, accepts sessions, and its heartbeats are accepted.
+        """Wait until the service has admitted a node, accepts its heartbeats, and can use it.
 
-        Other processes may have drained it, registered it, or sent heartbeats in its name.
+        Requests of the test may have drained the node, registered it again, or sent heartbeats in
+        its name.
         """
         link = self.nodes[name][0]
         until_s = time.monotonic() + 60.0
@@ -167,7 +168,7 @@ async def _beat(link: NodeLink, worlds: SessionWorlds) -> None:
 def loopback_service(
     store: str | Path, *, rate_hz: float = 1e9, address_hz: float = 1e9, **rules: Any
 ) -> Iterator[LoopbackService]:
-    """Start a service with an identity for each role, named like the role."""
+    """Start a service with one identity per role, which has the name of the role."""
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever, name="loopback service")
     thread.start()

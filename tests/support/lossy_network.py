@@ -1,8 +1,8 @@
 """A network in memory whose faults are determined by a seed.
 
-The fate of a message depends on the seed and on the message's key, never on timing: a message that
-is sent in phase k arrives in phase k + 1, unless the plan drops or delays it. Runs with faults can
-therefore be repeated bit for bit.
+Whether a message has a fault depends on the seed and on the key of the message, never on timing. A
+message that is sent in phase k arrives in phase k + 1, unless the plan drops or delays it. Runs
+with faults can therefore be repeated bit for bit.
 """
 
 from __future__ import annotations
@@ -23,16 +23,16 @@ class Rates:
     """Probabilities of faults of one kind of message.
 
     Attributes:
-        drop: it never arrives.
-        delay: it arrives 1 to `longest_delay` phases later.
-        duplicate: it arrives once more, later.
-        reorder: it arrives after others of its phase.
-        corrupt: a bit flips on the way, and the receiver refuses it.
+        drop: the message never arrives.
+        delay: the message arrives 1 to `longest_delay` phases late.
+        duplicate: the message arrives again in a later phase.
+        reorder: the message arrives after other messages of its phase.
+        corrupt: a bit of the message flips, and the receiver refuses the message.
         refuse: the target of a PREPARE answers with a NACK.
-        longest_delay: in phases.
+        longest_delay: longest delay in phases.
 
     Raises:
-        ConfigError: not a probability.
+        ConfigError: a rate is not a probability, or the delay is not a positive whole number.
     """
 
     drop: float = 0.0
@@ -69,12 +69,12 @@ FAULTLESS = Rates()
 class FaultPlan:
     """The faults of messages."""
 
-    seed: int = 0  # seed of all choices
-    # name of the kind (`"Prepare"`, `"Ack"`, …) → its rates; others have `otherwise`
+    seed: int = 0  # seed of all random choices
+    # kind of message (`"Prepare"`, `"Ack"`, …) → rates; `otherwise` holds for other kinds
     rates: Mapping[str, Rates] = field(default_factory=dict)
     otherwise: Rates = FAULTLESS
-    until: int | None = None  # the first phase without faults; None: there is none
-    # the first tick whose messages have no faults; None: there is none
+    until: int | None = None  # the first phase without faults; None means that faults never end
+    # the first tick whose messages have no faults; None means that faults never end
     until_tick: int | None = None
 
     def of(self, kind: str, phase: int, tick: int = 0) -> Rates:
@@ -92,7 +92,7 @@ class FaultPlan:
 
 
 class Delivery(NamedTuple):
-    """A message at its destination; `refused` asks a target to answer a PREPARE with a NACK."""
+    """A message at its destination; with `refused`, the target answers a PREPARE with a NACK."""
 
     destination: int
     message: Message
@@ -119,7 +119,7 @@ class Network:
         self._sequence = 0
 
     def send(self, messages: Iterable[Message]) -> None:
-        """Send messages to all of their destinations."""
+        """Send each message to all its destinations."""
         for message in messages:
             for destination in message.destinations():
                 self._send(message, destination)
@@ -144,22 +144,22 @@ class Network:
         key = (*place, self._copies[place])
         rates = self.plan.of(kind, self.phase, message.tick)
         self.sent[kind] += 1
-        if self._strikes(kind, key, "drop", rates.drop):
+        if self._has_fault(kind, key, "drop", rates.drop):
             return
-        if self._strikes(kind, key, "corrupt", rates.corrupt) and self._damaged(message, key):
+        if self._has_fault(kind, key, "corrupt", rates.corrupt) and self._damaged(message, key):
             return
         at, rank = self.phase + 1, 0.0
-        if self._strikes(kind, key, "delay", rates.delay):
+        if self._has_fault(kind, key, "delay", rates.delay):
             at += self._later(key, "how long", rates)
-        if self._strikes(kind, key, "reorder", rates.reorder):
+        if self._has_fault(kind, key, "reorder", rates.reorder):
             rank = self.plan.chance(key, "place")
-        refused = kind == "Prepare" and self._strikes(kind, key, "refuse", rates.refuse)
+        refused = kind == "Prepare" and self._has_fault(kind, key, "refuse", rates.refuse)
         delivery = Delivery(destination, message, refused)
         self._fly(at, rank, delivery)
-        if self._strikes(kind, key, "duplicate", rates.duplicate):
+        if self._has_fault(kind, key, "duplicate", rates.duplicate):
             self._fly(at + self._later(key, "the copy", rates), rank, delivery)
 
-    def _strikes(self, kind: str, key: tuple[object, ...], fault: str, rate: float) -> bool:
+    def _has_fault(self, kind: str, key: tuple[object, ...], fault: str, rate: float) -> bool:
         if rate <= 0.0 or self.plan.chance(key, fault) >= rate:
             return False
         self.faults[kind, fault] += 1

@@ -10,7 +10,7 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.sumo_net.reader import read_network
 
 _LANE = '<lane id="{id}" type="driving"><width sOffset="0" a="3.5" b="0" c="0" d="0"/></lane>'
-# A straight road of 200 m with a lane in each direction; `<type/>` is replaced by its types.
+# A straight road of 200 m with a lane in each direction; tests replace `<type/>`.
 ROAD = (
     '<road name="" length="200" id="1" junction="-1"><type/><planView>'
     '<geometry s="0" x="0" y="0" hdg="0" length="200"><line/></geometry></planView>'
@@ -43,8 +43,8 @@ ROUNDABOUT = (
     | {300 + k: ([200 + k, 100 + k], {"highway": "secondary"}) for k in range(0, 8, 2)},
 )
 
-Nodes = dict[int, tuple[float, float]]  # (metres to the east, metres to the north) by id
-Ways = dict[int, tuple[list[int], dict[str, str]]]  # nodes and tags, by id
+Nodes = dict[int, tuple[float, float]]  # node id → (metres to the east, metres to the north)
+Ways = dict[int, tuple[list[int], dict[str, str]]]  # way id → (nodes, tags)
 
 
 def osm_file(roads: tuple[Nodes, Ways], latitude: float, longitude: float) -> str:

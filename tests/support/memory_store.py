@@ -1,7 +1,7 @@
 """The committed store in memory, as a minimal implementation of the contract of stores.
 
-The store has the state of each vehicle at the committed tick, and room for the next tick. Each
-process writes to its own segment, and only `commit` makes segments valid.
+The store has the state of each vehicle at the committed tick, and segments for the next tick. Each
+process writes to its own segment, and only `commit` makes the segments valid.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ from cavmarl.ownership.ledger import row_hash, state_digest, world_digest
 
 
 class MemoryStore:
-    """States as bytes, by vehicle.
+    """The committed state of each vehicle, as bytes.
 
     Attributes:
         segments: (zone, incarnation) → states that the process has written for the next tick.
@@ -30,11 +30,11 @@ class MemoryStore:
         return state_digest(self.committed[vehicle])
 
     def write(self, zone: int, incarnation: int, vehicle: int, state: bytes) -> None:
-        """Write a row of the next tick for the process of this incarnation."""
+        """Write the next state of a vehicle to the segment of a process."""
         self.segments.setdefault((zone, incarnation), {})[vehicle] = state
 
     def clear(self, zone: int, incarnation: int) -> None:
-        """Discard the rows of a process."""
+        """Discard the segment of a process."""
         self.segments.pop((zone, incarnation), None)
 
     def digest(self, zone: int, incarnation: int) -> int:
@@ -44,8 +44,8 @@ class MemoryStore:
     def commit(self, tick: int, incarnations: Mapping[int, int]) -> None:
         """Make the segments of the living hosts the state of `tick`.
 
-        After a COMMIT that was logged but not carried out, a restarted coordinator calls this
-        function again; the segments still exist.
+        If a coordinator dies after it has logged a COMMIT, the restarted coordinator calls this
+        function again. The segments still exist then.
         """
         self.committed = {
             vehicle: state

@@ -1,4 +1,4 @@
-"""SUMO networks mirrored in the x axis: driving on the right becomes driving on the left."""
+"""Mirror SUMO networks in the x axis, so that vehicles drive on the left."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Maps with little room: a lane drop, close signals, close U-turns, and paths that meet again."""
+"""Maps with little space: a lane drop, close signals, close U-turns, and paths that cross."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def zipper(folder: Path, per_h: int = 500, vehicle_type: str = "car") -> tuple[P
 def signal_pair(
     folder: Path, apart_m: float = 24.0, second: str = "traffic_light"
 ) -> tuple[Path, Path]:
-    """Make two crossings with signals; opposing left turns share the short road between them.
+    """Make two crossings with signals; opposing left turns share the short road between both.
 
     `second`: SUMO's type of the second crossing.
     """
@@ -98,12 +98,12 @@ def signal_pair(
 
 
 def turning_pair(folder: Path) -> tuple[Path, Path]:
-    """Make a road of 11 m with room for one car, at both ends of which vehicles turn round."""
+    """Make a road of 11 m, with space for one car; vehicles turn around at both of its ends."""
     return _made(folder, TURNS_NODES, TURNS_EDGES, TURNS_CONNECTIONS, TURNS_DEMAND)
 
 
 def looping_turn(folder: Path) -> tuple[Path, Path]:
-    """Make a right turn that begins to the left, and crosses the way straight on from its lane."""
+    """Make a right turn that begins to the left and crosses the straight path from its lane."""
     return _made(folder, LOOP_NODES, LOOP_EDGES, LOOP_CONNECTIONS, LOOP_DEMAND)
 
 

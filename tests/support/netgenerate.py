@@ -1,4 +1,4 @@
-"""Maps that SUMO's netgenerate makes, and that netconvert makes of plain roads."""
+"""Make maps with SUMO's netgenerate, and with netconvert from plain nodes and edges."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def _made(program: str, path: Path, *options: str) -> Path:
 
 
 def random_map(folder: Path, number: int) -> Path:
-    """Make the map with this number: random, grid or spider, with each kind of junction."""
+    """Make one of several maps by number: random, grid or spider, with different junctions."""
     common = ["-L", str(1 + number % 2), "-j", JUNCTIONS[number // 3 % 4], "--seed", str(number)]
     kinds = (
         ["--rand", "--rand.iterations", "40"],

@@ -1,4 +1,4 @@
-"""Divisions of the plane, and critical points of them."""
+"""Partitions of the plane, and points close to their borders."""
 
 from __future__ import annotations
 

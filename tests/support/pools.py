@@ -17,7 +17,7 @@ from tests.support.toy_job import TASKS, TOTAL
 
 MODULE = "tests.support.toy_job"
 ROOT = Path(__file__).resolve().parents[2]
-MORE = 1000  # the numbers that each task adds
+MORE = 1000  # number of elements that each task appends
 Make = Callable[..., Pool]
 
 
@@ -52,7 +52,7 @@ def totals(pool: Pool) -> list[list[float]]:
 
 
 def committed_image(pool: Pool) -> memoryview:
-    """Return the memory with the last committed state of the workers, for damaging it."""
+    """Return the memory with the last committed state of the workers, for tests that damage it."""
     return pool._processes._resources.segments[2 + pool._committed].map()
 
 
@@ -61,14 +61,14 @@ def alive(pids: list[int]) -> list[int]:
     return [pid for pid in pids if Path(f"/proc/{pid}").exists()]
 
 
-def strike_soon(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
-    """Send a signal some time later; the process may have died by then."""
+def signal_later(pid: int, in_s: float, how: signal.Signals = signal.SIGKILL) -> Timer:
+    """Send a signal after `in_s`; ignore a process that has ended by then."""
 
-    def strike() -> None:
+    def send() -> None:
         with suppress(ProcessLookupError):
             os.kill(pid, how)
 
-    timer = Timer(in_s, strike)
+    timer = Timer(in_s, send)
     timer.start()
     return timer
 
@@ -81,7 +81,7 @@ def gone(pids: list[int], limit_s: float = 60.0) -> bool:
 
 
 def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """Return the result of `work`; SIGALRM ends it after the limit."""
+    """Return the result of `work`; raise TimeoutError after the limit."""
 
     def give_up(*_: object) -> None:
         raise TimeoutError(f"not done after {limit_s:g} s")
@@ -96,7 +96,7 @@ def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
 
 
 def gone_soon(pids: list[int]) -> bool:
-    """Return whether all processes have ended, including zombies."""
+    """Return whether all processes end within a minute; zombies count as ended."""
     for pid in pids:
         try:
             pidfd = os.pidfd_open(pid)

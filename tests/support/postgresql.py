@@ -1,4 +1,4 @@
-"""A real PostgreSQL for tests, with a folder and a port of its own."""
+"""A real PostgreSQL server for tests, with its own folder and port."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ import pytest
 
 __all__ = ["running_postgresql"]
 
-DEBIAN = Path("/usr/lib/postgresql")  # the package puts no server in the path
+DEBIAN = Path("/usr/lib/postgresql")  # the Debian package does not add the server to PATH
 
 
 def find_programs() -> Path | None:
-    """Return the folder of initdb, postgres and pg_ctl: in the path, or Debian's newest."""
+    """Return the folder of initdb, postgres and pg_ctl from PATH, or the newest one of Debian."""
     if (found := shutil.which("initdb")) and shutil.which("postgres") and shutil.which("pg_ctl"):
         return Path(found).parent
     folders = sorted(DEBIAN.glob("*/bin"), key=lambda one: float(one.parent.name))
@@ -28,14 +28,16 @@ def find_programs() -> Path | None:
 
 @contextmanager
 def running_postgresql() -> Iterator[str]:
-    """Yield the URL of a server that ends with the block; skip the test if it is not installed."""
+    """Run a server within the block and yield its URL; skip the test if it is not installed."""
     programs = find_programs()
     if programs is None:
         pytest.skip(
             "no PostgreSQL on this machine, so stores are tested on SQLite alone; on Debian: "
             "apt-get install postgresql"
         )
-    folder = Path(tempfile.mkdtemp(prefix="cavmarl-pg-"))  # a folder that every user can read
+    folder = Path(
+        tempfile.mkdtemp(prefix="cavmarl-pg-")
+    )  # unlike tmp_path, every user can reach this folder
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]

@@ -1,4 +1,4 @@
-"""Find dotted names and files in docstrings and comments of the package that do not exist."""
+"""Find references to missing names and files in docstrings and comments of the package."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from cavmarl.config.io import dotted_keys
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# First parts of names outside of the package: libraries, highway-env, a logger.
+# First parts of dotted names that are not of the package: libraries and classes of highway-env.
 OTHERS = frozenset(
     """
     copy defusedxml dtype flags gymnasium httpx numba numpy ray select socket sumolib time
@@ -39,7 +39,7 @@ _DATA = (
 
 
 class _Members:
-    """The names inside of a class with its attributes, and its bases."""
+    """The names of the members of a class, and its bases."""
 
     def __init__(self, node: ast.ClassDef) -> None:
         self.bases = [base.id for base in node.bases if isinstance(base, ast.Name)]
@@ -50,7 +50,7 @@ class _Members:
 
 
 def _defined(body: list[ast.stmt]) -> Iterator[str]:
-    """Yield the names that statements define or import, also under an `if`."""
+    """Yield the names that statements define or import, including statements under an `if`."""
     for node in body:
         match node:
             case ast.FunctionDef() | ast.AsyncFunctionDef() | ast.ClassDef():
@@ -86,7 +86,9 @@ class Package:
     def __init__(self) -> None:
         self.sources: dict[str, str] = {}
         self._classes: dict[str, list[_Members]] = defaultdict(list)
-        self._modules: dict[str, list[str]] = defaultdict(list)  # names by their last part
+        self._modules: dict[str, list[str]] = defaultdict(
+            list
+        )  # last part of a module name → full names
         self._keys = dotted_keys(EnvConfig)
         trees: dict[str, ast.Module] = {}
         for path in sorted((ROOT / "cavmarl").rglob("*.py")):
@@ -101,7 +103,7 @@ class Package:
         self._tops = {name: set(_defined(tree.body)) for name, tree in trees.items()}
 
     def dead(self) -> list[str]:
-        """Return place and name of each dead reference."""
+        """Return the module and the text of each dead reference."""
         return [
             f"{module}: `{name}`"
             for module, source in self.sources.items()
@@ -109,7 +111,7 @@ class Package:
         ]
 
     def dead_in(self, source: str) -> Iterator[str]:
-        """Yield names and files in docstrings and comments of a source that do not exist."""
+        """Yield each missing name and file that docstrings and comments of a source refer to."""
         text = "\n".join([*_DOCSTRING.findall(source), *_COMMENT.findall(source)])
         for name in _FILE.findall(text):
             if "NAME" not in name and not self._is_file(name):
@@ -136,7 +138,7 @@ class Package:
         )
 
     def _is_name(self, parts: list[str]) -> bool:
-        """Return whether parts name a module by its last names, a name in it, or a class member."""
+        """Return whether a dotted name means a module, a name in a module, or a class member."""
         if self._has(parts[0], parts[1]):
             return True
         for size in range(1, len(parts) + 1):

@@ -1,4 +1,4 @@
-"""Divided worlds, compared step by step with a recorded run of the undivided one."""
+"""Compare divided worlds step by step with a recorded run of the undivided world."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ class Checked:
 
 @dataclass
 class Recorded:
-    """An undivided run: actions, and results after the reset and after each step."""
+    """The actions of an undivided run, and its results after the reset and after each step."""
 
     env: str | Path
     settings: dict[str, Any]
@@ -72,9 +72,9 @@ def record(
 
 
 def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None) -> CavVectorEnv:
-    """Repeat the run in a divided world, which must be equal after each step.
+    """Repeat a recorded run in a divided world; check that both are equal after each step.
 
-    The trace of each world is checked, too, and vehicles must change their zones.
+    Check also the ownership trace of each world, and that vehicles have changed their zones.
     """
     wanted = run.settings | dict(settings or {})
     vec = make_vec(run.env, num_envs=run.worlds, zones=zones, overrides=wanted)
@@ -86,7 +86,7 @@ def replay(run: Recorded, zones: int, settings: Mapping[str, Any] | None = None)
 
 
 def follow(run: Recorded, vec: CavVectorEnv) -> None:
-    """Repeat the run in other worlds, which must be equal after each step."""
+    """Repeat a recorded run in other worlds; check that both are equal after each step."""
     same(run, vec, 0, {"observations": vec.reset(seed=run.seed)[0]})
     for step, actions in enumerate(run.actions, start=1):
         same(run, vec, step, step_results(vec.step(actions), actions))

@@ -12,9 +12,9 @@ from typing import Any, NamedTuple
 from urllib.parse import quote, urlsplit
 
 JSON = "application/json"
-TIMEOUT_S = 20.0  # longer than any request of these may take
+TIMEOUT_S = 20.0  # longer than any of these requests should take
 
-# Method, path, role, body. `{…}` in paths and "{…}" in bodies stand for known values.
+# Method, path, role and body. `{NAME}` in a path or body stands for a value of `known`.
 TEMPLATES: list[tuple[str, str, str, Any]] = [
     ("GET", "/v1/health", "", None),
     ("GET", "/v1/keys", "", None),
@@ -107,7 +107,7 @@ QUERIES = ["after=-1", "after=9007199254740993", "after=1e3", "limit=0", "limit=
 
 
 class Answer(NamedTuple):
-    """An answer; `status` is 0 if the connection was closed without one."""
+    """An HTTP answer; `status` is 0 if the server closed the connection without an answer."""
 
     status: int
     head: bytes
@@ -116,10 +116,11 @@ class Answer(NamedTuple):
 
 @dataclass
 class RawRequest:
-    """A request as it is sent.
+    """A request as bytes on a socket.
 
     Attributes:
-        is_cut: whether the server may wait for more of it; the connection is then half closed.
+        is_cut: whether the request may be incomplete. The client then closes its direction, so that
+            the server does not wait for more bytes.
     """
 
     method: str
@@ -136,12 +137,12 @@ class RawRequest:
 
 @dataclass
 class RequestFuzz:
-    """Makes requests from templates by one to four changes.
+    """Makes requests from templates by up to four random changes.
 
     Args:
-        random: source of all choices.
-        known: values for the places of templates.
-        tokens: by roles; `lease` is that of the session on the node.
+        random: generator of all random choices.
+        known: values for `{NAME}` in templates.
+        tokens: role → token; the role `lease` has the token of the session on the node.
     """
 
     random: Random
@@ -222,7 +223,7 @@ def is_json(template: tuple[str, str, str, Any]) -> bool:
 
 
 def _clamped(document: Any) -> bytes:
-    """Return JSON in which no request asks the service to wait."""
+    """Return a document as JSON, with any waiting time limited to 0.01 s."""
     if isinstance(document, dict) and isinstance(document.get("wait_s"), int | float):
         wait_s = document["wait_s"]
         document = {**document, "wait_s": min(wait_s, 0.01) if wait_s == wait_s else wait_s}
@@ -284,7 +285,7 @@ def change_head_bytes(fuzz: RequestFuzz, request: RawRequest) -> RawRequest:
 
 
 def change_body_bytes(fuzz: RequestFuzz, request: RawRequest) -> RawRequest:
-    if b"wait_s" in request.body:  # a changed digit could be a long wait
+    if b"wait_s" in request.body:  # a changed digit could ask for a long wait
         return request
     body = request.body
     for _ in range(fuzz.random.randint(1, 4)):
@@ -321,10 +322,12 @@ CHANGES: list[Change] = [
 
 
 def send(url: str, request: RawRequest) -> Answer:
-    """Return the answer to a request; raise TimeoutError if there is none in time."""
+    """Send a request and return the answer; raise TimeoutError if no answer arrives in time."""
     place = urlsplit(url)
     with socket.create_connection((place.hostname, place.port), timeout=TIMEOUT_S) as line:
-        with suppress(ConnectionError):  # the server may refuse it before reading it
+        with suppress(
+            ConnectionError
+        ):  # the server may refuse the request before it has read all bytes
             line.sendall(request.content())
         if request.is_cut:
             with suppress(OSError):  # the server has closed the connection
@@ -336,7 +339,9 @@ def _read(line: socket.socket, request: RawRequest) -> Answer:
     content = b""
     while True:
         head, end, body = content.partition(b"\r\n\r\n")
-        if end and head.split(b" ", 2)[1][:1] == b"1":  # 100: go on
+        if (
+            end and head.split(b" ", 2)[1][:1] == b"1"
+        ):  # skip an interim answer such as 100 Continue
             content = body
             continue
         if end and (request.method == "HEAD" or len(body) >= _length(head)):
@@ -351,7 +356,7 @@ def _read(line: socket.socket, request: RawRequest) -> Answer:
 
 
 def _length(head: bytes) -> int:
-    """Return the length of a body; a stream is not read."""
+    """Return the length of the body that the head states, or 0 for a stream."""
     for row in head.lower().split(b"\r\n"):
         if row.startswith(b"content-length:"):
             return int(row.split(b":")[1])

@@ -13,8 +13,8 @@ from cavmarl.engine.simulation import Simulation
 from tests.support.demand_worlds import make
 from tests.support.driving import drive, start
 
-# in → short → narrow → out, or in → long → out. The narrow edge is slow and 40 m long; vehicles
-# that do not fit there queue on the short edge.
+# The routes are in → short → narrow → out, and in → long1 → long2 → out. The narrow edge is slow
+# and 40 m long. Vehicles that do not fit on it queue on the short edge.
 NODES = """<nodes>
   <node id="A" x="0" y="0"/><node id="B" x="300" y="0"/><node id="C" x="700" y="0"/>
   <node id="D" x="740" y="0"/><node id="E" x="1040" y="0"/><node id="X" x="520" y="-350"/>
@@ -48,7 +48,7 @@ def sumo_binary(name: str) -> str:
 
 
 def make_map(folder: Path) -> Path:
-    """Make the two routes as a SUMO network."""
+    """Make a SUMO network with the two routes."""
     parts = {"nodes": NODES, "edges": EDGES, "connections": CONNECTIONS}
     options = []
     for name, content in parts.items():
@@ -62,7 +62,7 @@ def make_map(folder: Path) -> Path:
 
 
 def write_demand(folder: Path, body: str, additional: str = "") -> list[Path]:
-    """Write files of a demand: routes, and additional elements."""
+    """Write the files of a demand: one with routes, and one with additional elements."""
     files = [folder / "x.rou.xml", folder / "x.add.xml"]
     for path, root, content in zip(
         files, ("routes", "additional"), (body, additional), strict=True
@@ -80,7 +80,7 @@ def two_ways(
     num_worlds: int = 1,
     seed: int | None = 1,
 ) -> Simulation:
-    """Make worlds on that map; reset them unless the seed is None."""
+    """Make worlds on this map; reset the worlds unless the seed is None."""
     clock = {"clock.sim_dt_s": 0.2, "clock.ctrl_dt_s": 1.0, "horizon_s": 1200.0}
     simulation = make(
         net, write_demand(folder, body, additional), num_worlds=num_worlds, overrides=clock
@@ -91,12 +91,12 @@ def two_ways(
 
 
 def rerouter(inside: str, attrs: str = "", span: str = 'begin="100" end="500"') -> str:
-    """Return a <rerouter> on the first edge."""
+    """Return a <rerouter> element on the first edge."""
     return f'<rerouter id="x" edges="in" {attrs}><interval {span}>{inside}</interval></rerouter>'
 
 
 def passed(simulation: Simulation, seconds: int) -> dict[str, int]:
-    """Return the number of vehicles that are seen on each edge in the next seconds."""
+    """Return the number of vehicles that are on each edge during the next seconds."""
     network = simulation.network
     found: set[tuple[int, int]] = set()
     for _ in range(seconds):

@@ -15,7 +15,7 @@ def small_vec(**overrides: Any) -> CavVectorEnv:
 
 
 def save_driver(folder: Path, vec: CavVectorEnv, **form: Any) -> Path:
-    """Save a driver for an environment; `form`: fields of its `NetworkConfig`. Needs torch."""
+    """Save an untrained driver for an environment; `form` sets fields of `NetworkConfig`."""
     import torch
 
     from cavmarl.learning.actor_critic import ActorCritic, save_network

@@ -1,4 +1,4 @@
-"""Worlds that are saved in the middle of a run, and resumed with other zones."""
+"""Save worlds in the middle of a run, and resume them with other zones."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ from cavmarl import make_vec
 
 
 def check_resumed(
-    act: Callable[[Any, int], None],  # commands of the caller in a step
+    act: Callable[[Any, int], None],  # called before each step with the environment and the step
     overrides: dict[str, Any],
-    at: int,  # step before which the state is saved
+    at: int,  # the state is saved before this step
     steps: int,
 ) -> None:
-    """Assert that a saved state, also with other zones, leads to the state of the whole run."""
+    """Check that resumed runs, with one and with two zones, end in the state of the whole run."""
 
     def finished(first: int, saved: bytes | None, zones: int) -> tuple[str, bytes]:
         with closing(

@@ -1,4 +1,4 @@
-"""A service and its nodes in processes of their own."""
+"""A coordination service and its nodes, each in its own process."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ __all__ = ["Cluster", "RunningService", "running_service"]
 
 @dataclass
 class RunningService:
-    """`cavmarl serve` in a process of its own."""
+    """The command `cavmarl serve` in its own process."""
 
     process: Any
     url: str
@@ -58,9 +58,9 @@ class RunningService:
 def running_service(
     store: str | Path, *options: str, fresh: bool = False
 ) -> Iterator[RunningService]:
-    """Run a service on a socket with a new store; it ends with the block.
+    """Run a service with a new store within the block.
 
-    It is a fork of a process with loaded kernels, or a new interpreter if `fresh` is true.
+    The process is a fork of a process with loaded kernels, or a new interpreter if `fresh` is true.
     """
     words = ["-m", "cavmarl", "serve", "--port", "0", "--store", str(store), *options]
     process: Any
@@ -81,7 +81,7 @@ def running_service(
 
 @dataclass
 class Cluster:
-    """Node processes of a running service by name, as forks of a process with loaded kernels."""
+    """The node processes of a running service, which are forks of a process with loaded kernels."""
 
     service: RunningService
     processes: dict[str, ForkedProcess] = field(default_factory=dict)

@@ -1,4 +1,4 @@
-"""Access of tests to the signals of worlds."""
+"""Access to internal signal data of worlds for tests."""
 
 from __future__ import annotations
 

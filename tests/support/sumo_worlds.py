@@ -1,4 +1,4 @@
-"""Worlds that are coupled with SUMO, and SUMO's own run of the same files."""
+"""Worlds that are coupled with SUMO, and runs of the same files by SUMO alone."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ from tests.support.driving import start
 
 MODES = ("sumo-traffic", "sumo-demand")
 
-# A bus stop in an additional file, a stop at a lane position, a stop at a position from the lane's
-# end, and a stop of a route.
+# The files have a bus stop in an additional file, a stop at a position on a lane, a stop at a
+# position before the end of a lane, and a stop that belongs to a route.
 STOPPING_PLACES = """<additional>
   <busStop id="market" lane="main_in_0" startPos="80" endPos="110" lines="1"/>
 </additional>"""
@@ -43,14 +43,14 @@ STOPPING = """<routes>
 
 
 def tiny_file(folder: Path, env: str = "grid4x4") -> Path:
-    """Write the demand of an entry of `TINY`."""
+    """Write the demand file of an environment in `TINY`."""
     path = folder / f"{env}.rou.xml"
     path.write_text(TINY[env], encoding="utf-8")
     return path
 
 
 def write_stops(folder: Path) -> list[Path]:
-    """Write a demand on `merge` with stops of vehicles and routes."""
+    """Write the files of a demand on `merge` with stops of vehicles and of routes."""
     paths = [folder / "stops.add.xml", folder / "stops.rou.xml"]
     for path, text in zip(paths, (STOPPING_PLACES, STOPPING), strict=True):
         path.write_text(text, encoding="utf-8")
@@ -67,7 +67,7 @@ def coupled(
     overrides: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Iterator[Simulation]:
-    """Yield coupled worlds, reset unless the seed is None; check that their processes end."""
+    """Yield worlds coupled with SUMO, reset unless the seed is None; close them after the block."""
     wanted = {"traffic.source": source, "sensors.signal.timing": False, **(overrides or {})}
     simulation = make(env, files, overrides=wanted, **options)
     try:
@@ -85,7 +85,7 @@ def demand_of(simulation: Simulation) -> SumoDemand:
 
 @contextmanager
 def alone(simulation: Simulation, folder: Path, begin: int = 0) -> Iterator[Any]:
-    """Yield libsumo in this process, at the start of the run of the first world's SUMO."""
+    """Yield libsumo, started in this process with the files and the seed of the first world."""
     libsumo: Any = free_libsumo()
     seed = int(simulation.worlds.keys[0]) >> 33
     demand = demand_of(simulation)

@@ -1,4 +1,4 @@
-"""Generated terrain models as GeoTIFF and HGT, and towns of OpenStreetMap on them."""
+"""Generated terrain models as GeoTIFF and HGT files, and a town of OpenStreetMap."""
 
 from __future__ import annotations
 
@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, TiffImagePlugin
 
-WEST, SOUTH = 11.0, 48.0  # position of the town
-M_PER_DEG = 111_195.0  # metres per degree of latitude, approximately
+WEST, SOUTH = 11.0, 48.0  # longitude and latitude of the town in degrees
+M_PER_DEG = 111_195.0  # approximate length of a degree of latitude
 
 Ground = Callable[[NDArray[Any], NDArray[Any]], NDArray[Any]]
 
-# A crossing of two roads, each 1 km; the second crosses a third on a bridge.
+# Two roads of 1 km cross each other. The second road crosses a third one on a bridge.
 TOWN = """<osm version="0.6">
   <node id="1" lat="48.000" lon="11.000"/><node id="2" lat="48.004" lon="11.000"/>
   <node id="3" lat="48.009" lon="11.000"/><node id="4" lat="48.004" lon="11.005"/>
@@ -32,7 +32,7 @@ TOWN = """<osm version="0.6">
 
 
 def plane(east: float, north: float, base: float = 500.0) -> Ground:
-    """Return a plane with these slopes, as ratios."""
+    """Return the height of a plane with these slopes (ratios) to the east and to the north."""
     scale = M_PER_DEG * np.cos(np.radians(SOUTH))
 
     def height(lon: NDArray[Any], lat: NDArray[Any]) -> NDArray[Any]:
@@ -51,7 +51,7 @@ def write_geotiff(
     keys: tuple[int, ...] = (1024, 0, 1, 2, 1025, 0, 1, 2, 2048, 0, 1, 4326),
     holes: Callable[[NDArray[Any]], None] = lambda heights: None,
 ) -> Path:
-    """Write a model with heights in the middle of its cells; -9999 marks voids."""
+    """Write a GeoTIFF with the height at the middle of each cell; -9999 marks voids."""
     west, south, east, north = box
     lon = np.arange(west, east + step / 2, step)
     lat = np.arange(north, south - step / 2, -step)
@@ -70,7 +70,7 @@ def write_geotiff(
 
 
 def write_hgt(path: Path, ground: Ground) -> Path:
-    """Write a tile of SRTM with 1201 by 1201 heights: N48E011, or as the name states."""
+    """Write the SRTM tile N48E011 with 1201 by 1201 heights."""
     lon = np.linspace(11.0, 12.0, 1201)
     lat = np.linspace(49.0, 48.0, 1201)
     path.write_bytes(np.round(ground(*np.meshgrid(lon, lat))).astype(">i2").tobytes())

@@ -1,9 +1,9 @@
 """Tiers of tests: unit, integration, slow, and tests that must run alone.
 
-A test is `integration` if its file imports or calls parts that start processes or read SUMO, or if
-a fixture makes a map. It is `slow` if it is marked so or expensive (`cpu_time.py`). All others are
-unit tests. A test is `alone` if it measures time, memory or cores, or kills processes: no other
-test may run at the same time.
+A test is `integration` if its file imports or calls code that starts processes or reads SUMO, or if
+one of its fixtures makes a map. A test is `slow` if it has this mark or is expensive
+(`cpu_time.py`). All other tests are unit tests. A test is `alone` if it measures time, memory or
+cores, or kills processes, so that no other test may run at the same time.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ RAY_FILES = (
     "tests/parallel/test_ray_worlds.py",
 )
 
-_IN_RAY = "test_worlds_run_in_a_ray_actor"  # prefix of names of tests that start a cluster
+_IN_RAY = "test_worlds_run_in_a_ray_actor"  # prefix of the names of tests that start a Ray cluster
 
 # These tests measure time, memory or cores, or need a free core.
 ALONE_FILES: tuple[str, ...] = (
@@ -53,7 +53,7 @@ ALONE_FILES: tuple[str, ...] = (
     "tests/test_memory.py",
 )
 
-# Kernels in these tests use unsigned products; NumPy warns when such a product overflows.
+# Kernels in these tests use products of unsigned integers, for which NumPy warns of overflow.
 _COMPILED_ONLY = (
     "tests/sensors/test_gnss.py",
     "tests/sensors/test_heard_conflicts.py",
@@ -64,7 +64,7 @@ _COMPILED_ONLY = (
 
 
 def mark(item: pytest.Item) -> None:
-    """Mark a test with its tier, and whether it runs alone."""
+    """Mark a test with its tier, and with `alone` if it must run alone."""
     path = item.path.relative_to(item.config.rootpath).as_posix()
     of_maps = _MAP_FIXTURES & set(getattr(item, "fixturenames", ()))
     if of_maps or path.startswith(_DEAR_FOLDERS) or _starts_processes(item.path):
@@ -80,13 +80,14 @@ def mark(item: pytest.Item) -> None:
 
 
 def is_needed(path: Path, root: Path, expression: str, turn: int | None = None) -> bool:
-    """Return whether a file may have tests for `-m`; for a small tier, most files are not read.
+    """Return whether a file may have tests of a tier, so that pytest need not import other files.
 
     Args:
-        path: of the file.
-        root: of the repository.
-        expression: of `-m`, such as `twin and not slow`; in other forms, any file may have some.
-        turn: of `make rotation`; slow tests are marked, or expensive according to costs.txt.
+        path: path of the file.
+        root: folder of the repository.
+        expression: argument of `-m`, such as `twin and not slow`. For expressions that do not begin
+            with a small tier, the answer is true.
+        turn: turn of `make rotation`, in which only slow tests run.
     """
     if path.suffix != ".py" or not path.name.startswith("test_"):
         return True
@@ -114,23 +115,23 @@ def _has_twin(path: Path) -> bool:
 
 
 class TimeLimit:
-    """A plugin for `make quick` that skips tests after a time, but never those of the first file.
+    """A plugin for `make quick`: after a time limit, it skips tests of all files but the first.
 
-    The time begins with the first test of a process, so reading the tests does not count.
+    The time starts with the first test of a process, so the collection of tests does not count.
     """
 
     def __init__(self, limit_s: float) -> None:
         self._limit_s = limit_s
-        self._end_s = 0.0  # of `time.monotonic`; 0: no test has begun
+        self._end_s = 0.0  # end in terms of `time.monotonic`; 0 until the first test begins
         self._first_file = Path()
 
     def pytest_collection_finish(self, session: pytest.Session) -> None:
-        """Note the first file."""
+        """Store the path of the first file."""
         if session.items:
             self._first_file = session.items[0].path
 
     def pytest_runtest_setup(self, item: pytest.Item) -> None:
-        """Skip the test if it is too late for it."""
+        """Skip the test if the time is over."""
         now = time.monotonic()
         self._end_s = self._end_s or now + self._limit_s
         if now > self._end_s and item.path != self._first_file:
@@ -138,7 +139,7 @@ class TimeLimit:
 
 
 class ProcessWatch:
-    """A plugin that lists unit tests that have started a process."""
+    """A plugin that reports unit tests that start a process."""
 
     def __init__(self) -> None:
         self.found: set[str] = set()
@@ -158,12 +159,14 @@ class ProcessWatch:
         return report
 
     def pytest_runtest_logreport(self, report: Any) -> None:
-        """Collect the names of such tests."""
-        if getattr(report, "is_no_unit", False):  # missing from a crashed process
+        """Collect the names of unit tests that have started a process."""
+        if getattr(
+            report, "is_no_unit", False
+        ):  # reports of crashed processes do not have this attribute
             self.found.add(report.nodeid)
 
     def pytest_terminal_summary(self, terminalreporter: Any) -> None:
-        """Print the tests."""
+        """Print the names of these tests."""
         for name in sorted(self.found):
             terminalreporter.write_line(f"a unit test has started a process: {name}")
 

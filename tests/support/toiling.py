@@ -1,4 +1,4 @@
-"""A toy task that runs until the test has acted on it, independently of the machine's speed."""
+"""Run the toy task TOIL until a test has acted, so that no test depends on the machine's speed."""
 
 from __future__ import annotations
 
@@ -15,12 +15,12 @@ from tests.support.toy_job import AT_WORK, ENOUGH
 def toiling(
     folder: Path, workers: int, act: Callable[[], object], *, ends: bool = True
 ) -> Iterator[str]:
-    """Yield the payload of TOIL; call `act` once all of these workers run the task.
+    """Yield the payload of TOIL; call `act` when this number of workers run the task.
 
-    The workers then finish; without `ends`, they finish at the end of the block.
+    The workers finish the task after `act`, or at the end of the block if `ends` is false.
     """
     os.mkfifo(folder / AT_WORK)
-    # Opening for both directions waits for no other process.
+    # If a FIFO is opened for reading and writing, open() does not wait for another process.
     heard = os.open(folder / AT_WORK, os.O_RDWR)
     given_up = False
 

@@ -1,7 +1,7 @@
-"""`make quick`: the unit tests that a change affects, the closest first.
+"""Run the unit tests that a change affects, the closest first (`make quick`).
 
-A test file is affected if it imports a changed module, directly or over other modules. Changes are
-those of the working tree since its branch left `main`, according to git.
+A test file is affected if it imports a changed module, directly or over other modules. A file is
+changed if it differs from the commit at which the branch left `main`, according to git.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ import grimp
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-LIMIT_S = 50.0  # from the first test on; later, no other test begins
+LIMIT_S = 50.0  # no test begins later than this after the first test
 
-# Folders outside of the package whose Python files are parsed for imports.
+# Folders whose Python files are searched for imports, besides the package.
 BESIDE = ("tests", "benchmarks", "fuzz", "docs")
 
-# Files that tests read without importing them, and these tests.
+# Folders whose files tests read without importing them → these tests.
 READ = {
     "envs": ("tests/test_envs_data.py", "tests/test_cards.py", "tests/config/test_registry.py"),
     "agents": ("tests/policies/test_policies.py", "tests/test_cards.py"),
@@ -36,7 +36,7 @@ ALWAYS = ("tests/test_tidy.py",)
 
 
 def changed_files() -> set[str]:
-    """Return the paths that differ from where this branch left `main`, including new files."""
+    """Return the paths that have changed since the branch left `main`, including new files."""
     base = _git("merge-base", "HEAD", "main") or ["HEAD"]
     new = _git("ls-files", "--others", "--exclude-standard")
     return {*_git("diff", "--name-only", base[0]), *new}
@@ -65,7 +65,7 @@ def touched_tests(changed: Iterable[str]) -> list[str]:
 
 
 def _importers(files: set[str]) -> dict[str, set[str]]:
-    """Return for each module the files that import it directly."""
+    """Return the files that import each module directly."""
     graph = grimp.build_graph("cavmarl")
     found: dict[str, set[str]] = {}
     for module in graph.modules:
@@ -81,7 +81,7 @@ def _importers(files: set[str]) -> dict[str, set[str]]:
 
 
 def _imports(path: str) -> set[str]:
-    """Return the modules that a file imports; for `from a import b`, both a and a.b."""
+    """Return the modules that a file imports; `from a import b` counts as a and as a.b."""
     found = set()
     for node in ast.walk(ast.parse((ROOT / path).read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -114,7 +114,7 @@ def _git(*words: str) -> list[str]:
 
 
 class RunCount:
-    """A plugin that counts the tests that ran to their end."""
+    """A plugin that counts the tests that ran and were not skipped."""
 
     def __init__(self) -> None:
         self.tests = 0
@@ -125,14 +125,14 @@ class RunCount:
 
 
 def main() -> int:
-    """Run the affected tests in two processes; skip and report tests for which there is no time."""
+    """Run the affected tests, and return the exit code."""
     tests = touched_tests(changed_files())
     print(f"{len(tests)} test files are affected")
     return run(tests, "not slow and not integration and not alone")
 
 
 def run(tests: list[str], tier: str) -> int:
-    """Run the tests of a tier in these files; return an exit code that is 0 only if one ran."""
+    """Run the tests of a tier in these files; the exit code is not 0 if no test ran."""
     os.environ["CAVMARL_QUICK_S"] = str(LIMIT_S)
     order = ("-n", "2", "--dist", "loadfile", "--no-loadscope-reorder")
     count = RunCount()

@@ -1,4 +1,4 @@
-"""A job that adds numbers, for the processes of a pool; run as a program."""
+"""A job that adds numbers in the worker processes of a pool; workers run this file as a program."""
 
 from __future__ import annotations
 
@@ -14,17 +14,21 @@ from numpy.typing import NDArray
 
 from cavmarl.parallel.processes.worker_loop import serve
 
+# DOZE sleeps, TOIL computes, FALL kills the worker at one of `POINTS`, RUN_OUT runs out of memory.
 TASKS = ("add", "total", "fail", "die", "doze", "toil", "run out", "fall")
 ADD, TOTAL, FAIL, DIE, DOZE, TOIL, RUN_OUT, FALL = range(len(TASKS))
 
 POINTS = ("begun", "half done", "done", "image begun")
 
 
-AT_WORK, ENOUGH = "at work", "enough"  # files by which TOIL reports its start and learns of its end
+AT_WORK, ENOUGH = (
+    "at work",
+    "enough",
+)  # TOIL writes to the first file, and ends when the second exists
 
 
 def toil(payload: Any) -> None:
-    """Run for some seconds; with a folder: report the start, and run until the test ends it."""
+    """Compute for `payload` s, or, if it is a folder, until a file there ends the task."""
     if isinstance(payload, str):
         with open(os.path.join(payload, AT_WORK), "wb", buffering=0) as heard:
             heard.write(b".")
@@ -46,7 +50,7 @@ class Fatal(np.ndarray[Any, Any]):
 class Adder:
     def __init__(self) -> None:
         self.numbers = np.zeros(3, dtype=[("a", np.float64), ("b", np.int32)])
-        self.more = np.zeros(0)  # replaced by another array in each task
+        self.more = np.zeros(0)  # each task replaces this array by a longer one
         self.falls_at = ""
 
     def on_idle(self) -> None:
@@ -60,7 +64,7 @@ class Adder:
             return [float(self.numbers["a"].sum()), len(self.more)]
         if task == FALL:
             self.falls_at = ""
-            with suppress(FileNotFoundError):  # only the first process falls
+            with suppress(FileNotFoundError):  # only the first worker that removes the file dies
                 os.unlink(payload[1])
                 self.falls_at = POINTS[payload[0]]
         self.pass_by("begun")
@@ -98,7 +102,7 @@ def make_jobs(message: Mapping[str, Any]) -> list[Adder]:
     if "fails" in message:
         raise RuntimeError(message["fails"])
     for file in message.get("dies_while", ()):
-        with suppress(FileNotFoundError):  # each of these files makes one start fail
+        with suppress(FileNotFoundError):  # each of these files makes one start of a worker fail
             os.unlink(file)
             os.kill(os.getpid(), message.get("dies_by", signal.SIGKILL))
     if "ends" in message:

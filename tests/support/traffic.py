@@ -1,4 +1,4 @@
-"""Vehicles on lanes of bundled maps, for kernels that need roads."""
+"""Vehicles on lanes of bundled maps, for tests of kernels that need roads."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def network(name: str) -> RoadNetwork:
 
 @cache
 def plans(name: str) -> NDArray[np.void]:
-    """Return PLAN (4, L): plans to four goals, spread over the edges outside of junctions."""
+    """Return PLAN (4, L): plans to four goals, which are edges spread over the network."""
     roads = network(name)
     outside = np.flatnonzero(~roads.edges["internal"])
     picks = np.linspace(0, len(outside) - 1, 4).astype(int)
@@ -45,7 +45,7 @@ def travel_by(
     types: NDArray[np.void] | None = None,
     stops: NDArray[np.void] | None = None,
 ) -> TripTables:
-    """Return tables with plans of any shape, and by default the generator's type and no stops."""
+    """Return trip tables with these plans; the defaults are the generator's type and no stops."""
     return TripTables(
         generated_types() if types is None else types,
         steps.reshape(-1),
@@ -62,12 +62,12 @@ def travel_by(
 
 @cache
 def travel(name: str) -> TripTables:
-    """Return tables with the generator's type and the four plans of `plans`."""
+    """Return trip tables with the type of the generator and the four plans of `plans`."""
     return travel_by(plans(name))
 
 
 def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
-    """Return scratch memory; before vehicles are listed, each junction may have buses."""
+    """Return scratch memory in which each junction may have vehicles of any size."""
     room = make_shard_scratch(roads, capacity)
     room.largest[:] = len(SIZE_LENGTHS_M)
     return room
@@ -76,7 +76,7 @@ def scratch(roads: RoadNetwork, capacity: int) -> Scratch:
 def on_lane(
     roads: RoadNetwork, lane: int, s: float, travel: TripTables | None = None, **fields: object
 ) -> NDArray[np.void]:
-    """Return VEHICLE (1,): a car on a lane, on its plan if it has a goal; `fields` override."""
+    """Return VEHICLE (1,): a car on a lane, on the plan to its goal if `travel` is given."""
     row = blank_vehicle()
     row["lane"], row["target_lane"], row["s"] = lane, lane, s
     for field, value in fields.items():
@@ -95,7 +95,7 @@ def on_lane(
 
 @st.composite
 def crowds_on_lanes(draw: st.DrawFn, name: str, most: int = 24) -> NDArray[np.void]:
-    """Draw cars on a few lanes of an environment, many at equal positions, ids in random order."""
+    """Draw cars on a few lanes; many cars have equal positions, and ids are in random order."""
     roads = network(name)
     lanes = draw(st.lists(st.integers(0, len(roads.lanes) - 1), min_size=1, max_size=5))
     places = draw(

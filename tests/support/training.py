@@ -1,4 +1,4 @@
-"""The training programs as modules."""
+"""Load the training programs as modules."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ TRAIN = Path(__file__).resolve().parents[2] / "train"
 
 
 def load_program(name: str) -> ModuleType:
-    """Return a program as a module; it is loaded from its file, since `train` is no package."""
+    """Load a program from its file, because `train` is not a package."""
     spec = importlib.util.spec_from_file_location(name, TRAIN / f"{name}.py")
     assert spec
     assert spec.loader
     module = importlib.util.module_from_spec(spec)
-    sys.modules[spec.name] = module  # dataclasses look up their module
+    sys.modules[spec.name] = module  # dataclasses look up their module in sys.modules
     spec.loader.exec_module(module)
     return module

@@ -1,4 +1,4 @@
-"""Results of steps, for tests that compare them."""
+"""Run vector environments and compare their results."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def drive(
     seed: int = 5,
     before: Callable[[int], None] = lambda step: None,
 ) -> Run:
-    """Return all results of the first steps of an episode in which agents drive badly."""
+    """Return all results of an episode's first steps; random noise is added to the actions."""
     observations, infos = vec.reset(seed=seed, options={"first_world": 3})
     found: Run = [observations, *infos.values()]
     rng = np.random.default_rng(seed)

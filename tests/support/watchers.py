@@ -1,4 +1,4 @@
-"""Parts of lanes that each zone watches."""
+"""The parts of lanes that each zone watches, as LOOK records."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ __all__ = ["blank_looks", "looks_of"]
 
 
 def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
-    """Return LOOK records of drivers that look at no lane."""
+    """Return LOOK records that watch no part of a lane."""
     looks = np.zeros(shape, dtype=LOOK)
     looks["head"] = -np.inf
     for place in ("tail", "back", "line", "room", "merge"):
@@ -20,7 +20,7 @@ def blank_looks(shape: int | tuple[int, ...]) -> NDArray[np.void]:
 
 
 def looks_of(halo: Halo, zone: int) -> NDArray[np.void]:
-    """Return LOOK (L,) of one zone."""
+    """Return LOOK (L,), the parts of lanes that a zone watches."""
     looks = blank_looks(len(halo.watcher_start) - 1)
     for lane, look in enumerate(looks):
         watchers = halo.watchers[halo.watcher_start[lane] : halo.watcher_start[lane + 1]]

@@ -12,7 +12,7 @@ __all__ = ["Proxy", "free_port", "own_address"]
 
 
 def own_address() -> str | None:
-    """Return an address of this machine that other machines can reach, if it has one."""
+    """Return an address of this machine that other machines can reach, or None."""
     for addresses in psutil.net_if_addrs().values():
         for each in addresses:
             if each.family == socket.AF_INET and not each.address.startswith("127."):
@@ -27,12 +27,12 @@ def free_port(address: str) -> int:
 
 
 class Proxy:
-    """A proxy that forwards and stores bytes."""
+    """A proxy that forwards and stores the bytes of connections."""
 
     def __init__(self, target: tuple[str, int]) -> None:
-        self.heard: list[bytearray] = []  # bytes of each caller
-        self.said = bytearray()  # bytes to all callers
-        self.spoiler = b""  # replaces the next bytes of a caller to the target
+        self.heard: list[bytearray] = []  # bytes that each caller has sent
+        self.said = bytearray()  # bytes that the target has sent, over all connections
+        self.spoiler = b""  # bytes that replace the next bytes from a caller
         self._target = target
         self._server = socket.create_server((target[0], 0))
         self.place: tuple[str, int] = self._server.getsockname()[:2]

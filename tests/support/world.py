@@ -1,4 +1,4 @@
-"""Access of tests to parts of a running world that are not public."""
+"""Access to internal parts of a running world for tests."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class PhaseLog(PhaseExecutor):
 
 
 def tick_of(simulation: Simulation) -> Tick:
-    """Return the phases of a tick, to run some of them alone."""
+    """Return the tick of a simulation, whose phases a test can run one by one."""
     return simulation._tick
 
 
@@ -34,7 +34,7 @@ def traffic_of(simulation: Simulation) -> NativeTraffic:
 
 
 def coordination_of(simulation: Simulation) -> Any:
-    """Return the coordination of ownership."""
+    """Return the part of the tick that coordinates ownership."""
     return simulation._tick.coordination
 
 
@@ -49,7 +49,7 @@ def use_executor(simulation: Simulation, executor: Executor) -> None:
 
 
 def log_phases(simulation: Simulation) -> PhaseLog:
-    """Return a log of the phases; steps of the world are run phase by phase from now on."""
+    """Let the world run phase by phase, and return a log of its phases."""
     log = PhaseLog(executor_of(simulation))
     use_executor(simulation, log)
     return log

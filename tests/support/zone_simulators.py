@@ -1,4 +1,4 @@
-"""Simulators of zones for tests. They keep a state of their own, and refuse wrong calls."""
+"""Zone simulators for tests, which have their own state and check the calls that they get."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from cavmarl.handoff.simulators.zone_simulator import MOTION, ZoneSetup
 
 
 class OwnKinematics:
-    """A simulator that moves vehicles like cavmarl: agents by the model, others as requested.
+    """A zone simulator that moves agents by the kinematic model, and other vehicles as requested.
 
     Attributes:
-        made: all simulators that have been made, in their order.
+        made: all simulators in the order of their creation.
     """
 
     made: list[OwnKinematics] = []  # noqa: RUF012 - emptied by `registered`
@@ -64,7 +64,7 @@ class OwnKinematics:
             self.counts["moved"] += 1
 
     def moved(self, row: np.void, wanted: np.void) -> np.void:
-        """Return a vehicle after a tick, from its own state before."""
+        """Return the state of a vehicle after a tick, from the state `row` before the tick."""
         if wanted["agent"] < 0 or row["events"] & EVENTS_THAT_END:
             return wanted
         x, y, heading, speed, _ = bicycle_step(
@@ -96,7 +96,7 @@ class OwnKinematics:
 
 @contextmanager
 def registered(kind: type[OwnKinematics], tolerance_m: float = 0.0) -> Iterator[str]:
-    """Register a simulator for a test; yield its name."""
+    """Register a zone simulator within the block, and yield its name."""
     name = "simulator_of_a_test"
     OwnKinematics.made.clear()
     cavmarl.register_zone_simulator(name, kind, tolerance_m=tolerance_m)
@@ -107,7 +107,7 @@ def registered(kind: type[OwnKinematics], tolerance_m: float = 0.0) -> Iterator[
 
 
 def steps_alike(whole: cavmarl.CavVectorEnv, divided: cavmarl.CavVectorEnv, steps: int) -> None:
-    """Step both; all results and all states are equal, bit for bit."""
+    """Step both environments; check that all results and states are equal, bit for bit."""
     for _ in range(steps):
         actions = whole.suggest_actions()
         of_whole: tuple[Any, ...] = whole.step(actions)
@@ -119,6 +119,6 @@ def steps_alike(whole: cavmarl.CavVectorEnv, divided: cavmarl.CavVectorEnv, step
 
 
 def step_on(vec: cavmarl.CavVectorEnv, steps: int) -> None:
-    """Let the built-in driver drive all agents."""
+    """Step an environment with the actions of the built-in driver."""
     for _ in range(steps):
         vec.step(vec.suggest_actions())

@@ -1,4 +1,4 @@
-"""Rows of several zones, for kernels that move rows between zones."""
+"""Rows of several zones, for tests of kernels that move rows between zones."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ NO_BORDERS = Borders(0.0, 0.0, 0.0)
 
 
 def zoned_of(parts: Sequence[NDArray[np.void]], room: int = 0) -> ZoneState:
-    """Return one world whose zones own these rows; garbage follows the rows.
+    """Return the state of a world whose zones own these rows; unused rows have invalid values.
 
     Args:
         parts: the rows of each zone.
-        room: rows of a zone; default: enough for ghosts of all vehicles.
+        room: capacity of a zone; by default, enough for all vehicles.
     """
     zoned = make_zone_state(len(parts), 1, room or max(1, sum(map(len, parts))))
     zoned.rows["id"] = zoned.border[:] = -7
@@ -44,7 +44,7 @@ def exchanged(
     borders: Borders = NO_BORDERS,
     book: BorderRecords | None = None,
 ) -> ZoneState:
-    """Return the same world after the zones have exchanged their ghosts."""
+    """Return the state of a world like `zoned_of`, after its zones have exchanged ghosts."""
     zoned = zoned_of(parts)
     if book is None:
         book = make_book(1, zoned.rows.shape[-1] * partition.count)

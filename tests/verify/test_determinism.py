@@ -1,4 +1,4 @@
-"""Runs in three processes are equal; otherwise, the first difference is reported."""
+"""Runs in three processes are compared, and the first difference is reported."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import pytest
 from cavmarl.core.errors import ConfigError, EvaluationError, PolicyError
 from cavmarl.verify.determinism import verify_determinism
 
-# A driver whose action depends on the hash seed of the process, in one step for one agent.
+# A driver whose action for one agent in one step depends on the hash seed of the process.
 HASHING = """
 from cavmarl.policies.policy import Policy
 
@@ -35,7 +35,7 @@ SMALL: dict[str, Any] = {
 }
 
 
-def test_the_built_in_driver_is_the_same_in_every_process() -> None:
+def test_the_built_in_driver_gives_the_same_run_in_every_process() -> None:
     found = verify_determinism("merge", "idm", steps=20, **SMALL)
     assert found.difference is None
     assert (found.steps, found.ticks) == (20, 20 * TICKS_PER_STEP)

@@ -1,4 +1,4 @@
-"""The first place where two runs differ."""
+"""Find the first difference between two runs."""
 
 from __future__ import annotations
 
@@ -20,21 +20,21 @@ def state(**fields: object) -> dict[str, np.ndarray]:
     return {"vehicles": vehicles, "rewards": np.zeros((1, 2), np.float32)}
 
 
-def test_the_smallest_id_and_the_first_field_come_first() -> None:
+def test_the_first_difference_has_the_smallest_id_and_the_first_field() -> None:
     one, other = state(), state(speed=[2.0, 1.0], x=[0.0, 3.0])
     found = find_difference(5, 10, one, other)
     assert (found.vehicle, found.field, found.values) == (4, "speed", (0.0, 2.0))
     assert (found.step, found.tick) == (5, 10)
 
 
-def test_a_vehicle_of_only_one_run_is_named() -> None:
+def test_a_vehicle_that_only_one_run_has_is_a_difference() -> None:
     other = state()
     other["vehicles"] = other["vehicles"][1:]
     found = find_difference(5, 10, state(), other)
     assert (found.vehicle, found.field, found.values) == (4, "id", (4, None))
 
 
-def test_signs_of_zero_are_a_difference_and_nan_is_none() -> None:
+def test_signs_of_zero_differ_and_equal_nans_do_not() -> None:
     same = find_difference(1, 2, state(accel=np.nan), state(accel=np.nan))
     assert same.what == "hidden state"
     other = state()
@@ -71,7 +71,7 @@ def test_a_difference_at_any_place_of_any_array_is_found(name: str, place: tuple
     assert not same_bytes(results(0.0), results(1.0))
 
 
-def test_a_snapshot_is_of_one_world_with_its_vehicles_in_order() -> None:
+def test_a_snapshot_has_the_vehicles_of_one_world_sorted_by_id() -> None:
     vec = make_vec("merge", num_envs=2, zones=4)
     observations, infos = vec.reset(seed=1)
     results = {"observations": observations, "episode": np.array([3, 8])}

@@ -1,4 +1,4 @@
-"""A network with injected faults, and worlds over nodes that tolerate them."""
+"""A network with injected faults, and worlds over nodes that tolerate these faults."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SMALL: dict[str, Any] = {"agents": 4, "background": 20}
 
 @pytest.fixture
 def ends() -> Iterator[tuple[FaultyNetwork, socket.socket, socket.socket]]:
-    """Yield a network, and both ends of a connection through it."""
+    """Yield a network and the two ends of a connection through the network."""
     network = FaultyNetwork(seed=0)
     with socket.create_server(("127.0.0.1", 0)) as server:
         host, port = network.route(server.getsockname())
@@ -47,8 +47,8 @@ def test_a_connection_carries_both_directions(
     assert other.recv(100) == b""
 
 
-def exchanged(one: socket.socket, other: socket.socket) -> list[bytes]:
-    """Send a word in each direction; return the received words, or None."""
+def exchange_words(one: socket.socket, other: socket.socket) -> list[bytes]:
+    """Send a word in each direction; return the received words, empty if nothing arrives."""
     found = []
     for source, target in ((one, other), (other, one)):
         source.sendall(b"word")
@@ -65,35 +65,35 @@ def test_bytes_are_delayed_or_damaged(
 ) -> None:
     network, one, other = ends
     network.inject(fault)
-    first = exchanged(one, other)
+    first = exchange_words(one, other)
     bits = sum(
         (mine ^ theirs).bit_count()
         for came in first
         for mine, theirs in zip(came, b"word", strict=True)
     )
     assert bits == wanted
-    assert exchanged(one, other) == [b"word", b"word"]
+    assert exchange_words(one, other) == [b"word", b"word"]
     assert network.done == {fault: 1}
 
 
-def test_one_direction_is_silent_for_good(
+def test_a_silenced_direction_stays_silent(
     ends: tuple[FaultyNetwork, socket.socket, socket.socket],
 ) -> None:
     network, one, other = ends
     for end in (one, other):
         end.settimeout(0.2)
     network.inject(NetworkFault.SILENCE)
-    assert sorted(exchanged(one, other)) == [b"", b"word"]
-    assert sorted(exchanged(one, other)) == [b"", b"word"]
+    assert sorted(exchange_words(one, other)) == [b"", b"word"]
+    assert sorted(exchange_words(one, other)) == [b"", b"word"]
 
 
-def test_a_cut_ends_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.socket]) -> None:
+def test_a_cut_closes_both_ends(ends: tuple[FaultyNetwork, socket.socket, socket.socket]) -> None:
     network, one, other = ends
     network.inject(NetworkFault.CUT)
     assert one.recv(100) == other.recv(100) == b""
 
 
-def test_delays_of_pieces_do_not_add_up() -> None:
+def test_the_delays_of_consecutive_pieces_overlap() -> None:
     num, apart_s, latency_s = 20, 0.005, 0.05
     network = FaultyNetwork(seed=0, latency_s=latency_s)
     try:
@@ -140,8 +140,7 @@ def test_worlds_over_the_faulty_network_are_equal(fault: str) -> None:
     assert 1 <= line.lost <= 2
 
 
-def test_processes_are_killed_one_after_the_other() -> None:
-    """Each node is replaced before the next node is killed, so the run continues."""
+def test_each_killed_node_is_replaced_before_the_next_one_is_killed() -> None:
     found = verify_node_faults("merge", [2], faults=[KILL], seeds=1, per_run=3, zones=2, **SMALL)
     assert found.holds
     told = found.to_dict()

@@ -1,4 +1,4 @@
-"""`cavmarl verify nodes`: nodes compared with undivided worlds."""
+"""Compare worlds over nodes with undivided worlds (`cavmarl verify nodes`)."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from cavmarl.verify.node_losses import verify_nodes
 from tests.cli.test_main import run
 
 
-def test_nodes_change_nothing_while_some_are_killed() -> None:
+def test_worlds_over_nodes_are_equal_while_nodes_are_killed() -> None:
     found = verify_nodes("grid4x4", nodes=(1, 3), kills=2, steps=30, agents=4, background=30)
     assert found.holds
     assert [run.nodes for run in found.runs] == [1, 3]
@@ -46,6 +46,6 @@ def test_bad_input_is_refused(arguments: dict[str, object], words: str) -> None:
 
 
 def test_the_command_prints_and_writes_its_result(capsys: pytest.CaptureFixture[str]) -> None:
-    words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # too short for kills
+    words = ("--nodes", "2", "--steps", "5", "--zones", "2")  # the run is too short for kills
     assert run("verify", "nodes", "grid4x4", *words) == 0
     assert "equal" in capsys.readouterr().out

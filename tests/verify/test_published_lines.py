@@ -1,4 +1,4 @@
-"""Published numbers have lines, and lines have numbers of pages, commands and tolerances."""
+"""Every published number has a line in lines.yaml; every line has a page and a command."""
 
 from __future__ import annotations
 
@@ -38,12 +38,12 @@ PAGES = ["README.md", *(page for page in FIGURES if not page.endswith("README.md
 
 
 @pytest.mark.parametrize("name", PUBLISHED.lines)
-def test_a_line_has_numbers_of_its_page(name: str) -> None:
+def test_a_line_finds_its_numbers_on_its_page(name: str) -> None:
     line = PUBLISHED.lines[name]
     cells = cells_of(name, line, ROOT)
     assert any(cell.numbers for cell in cells)
     if not line.by_hand:
-        assert any(any(cell.expressions) for cell in cells), "compares nothing"
+        assert any(any(cell.expressions) for cell in cells), "the line compares no number"
 
 
 def test_the_command_of_a_line_is_on_its_page() -> None:
@@ -52,7 +52,7 @@ def test_the_command_of_a_line_is_on_its_page() -> None:
     assert [name for name, one in lines if shown(one.command) not in texts[one.page]] == []
 
 
-def test_each_condition_is_in_its_page() -> None:
+def test_each_condition_is_on_its_page() -> None:
     for page, patterns in PUBLISHED.conditions.items():
         text = (ROOT / page).read_text("utf-8")
         assert [one for one in patterns if not compile_pattern(one).search(text)] == []
@@ -64,7 +64,7 @@ BENCHMARK = re.compile(r"python -m benchmarks[. ](\w+)(.*)")
 @pytest.mark.parametrize(
     "command", sorted({one.command for one in PUBLISHED.lines.values() if one.command})
 )
-def test_a_command_has_its_options(command: str) -> None:
+def test_each_command_exists_with_its_options(command: str) -> None:
     if found := BENCHMARK.search(command):
         app = typer.Typer()
         app.command()(report_command(import_module(f"benchmarks.{found[1]}").measure))
@@ -77,19 +77,19 @@ def test_a_command_has_its_options(command: str) -> None:
 
 
 def shown(command: str) -> str:
-    """Return a command as the pages show it."""
+    """Return a command in the form in which the pages show it."""
     command = re.sub(r"--agents (25|50|100) --background 0", "--agents N --background 0", command)
     return re.sub(r"--seed [56]000$", "--seed SEED", command)
 
 
 @pytest.mark.parametrize("page", PAGES)
-def test_no_number_is_outside_of_lines(page: str) -> None:
+def test_every_number_of_a_page_belongs_to_a_line_or_condition(page: str) -> None:
     assert list(uncovered(page, (ROOT / page).read_text("utf-8"), PUBLISHED)) == []
 
 
 def uncovered(page: str, text: str, published: PublishedLines) -> Iterator[str]:
-    """Yield the numbers of a page that no line and no condition has, with the text around them."""
-    headings = re.compile("^#.*", re.MULTILINE)  # names of sections
+    """Yield numbers of a page that belong to no line and no condition, with their context."""
+    headings = re.compile("^#.*", re.MULTILINE)  # headings may contain any numbers
     seen = headings.sub(lambda found: " " * len(found[0]), without_code(text))
     spans = [span for span, _ in covered(page, text, published)]
     for number in re.finditer(FREE_NUMBER, seen):
@@ -101,7 +101,7 @@ def uncovered(page: str, text: str, published: PublishedLines) -> Iterator[str]:
 def covered(
     page: str, text: str, published: PublishedLines
 ) -> Iterator[tuple[tuple[int, int], str]]:
-    """Yield the places of a page that are compared, told by hand, or conditions."""
+    """Yield the spans of a page that belong to lines and conditions, with their names."""
     for pattern in published.conditions.get(page, ()):
         for match in compile_pattern(pattern).finditer(text):
             yield match.span(), pattern
@@ -118,7 +118,7 @@ def covered(
 
 
 def text_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
-    """Yield the places of compared numbers, or all patterns of a line with by_hand."""
+    """Yield the spans of the compared numbers of a line, or of its patterns if it has by_hand."""
     size = 2 if line.tolerance.startswith("range") else 1
     expressions = [each for each in line.values for _ in range(size)]
     for pattern in line.text:
@@ -132,7 +132,7 @@ def text_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int,
 
 
 def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int, int]]:
-    """Yield the places of the cells of a line, of the label of each row and of the heads."""
+    """Yield the spans of the table cells of a line, of its row labels and of the column heads."""
     table = find_table(name, line, text)
     wanted = {place for place, head in enumerate(table.heads) if head in line.columns}
     section = 0 if not table.section else text.index(f"# {table.section}\n")
@@ -149,7 +149,7 @@ def table_spans(name: str, line: PublishedLine, text: str) -> Iterator[tuple[int
                     start += len(cell) + 1
 
 
-def test_a_number_that_no_line_has_is_found() -> None:
+def test_a_number_without_a_line_is_found() -> None:
     page = (
         "# A\n\nIt takes 3 s on 2 cores.\n\n| a | b |\n|---|---|\n| x | 4 |\n| y 7 | 5 |\n\n`8`\n"
     )
@@ -183,7 +183,7 @@ def test_only_compared_numbers_are_covered(
     assert all(number in one for number, one in zip(left, found, strict=True))
 
 
-def test_quick_lines_need_nothing_and_are_exact() -> None:
+def test_quick_lines_have_no_requirements_and_exact_tolerances() -> None:
     for name, line in PUBLISHED.lines.items():
         if line.is_quick:
             assert (line.needs, line.tolerance, line.by_hand) == ((), "exact", ""), name
@@ -216,12 +216,12 @@ def cells(tmp_path: Path, quick: bool = False, **keys: object) -> list[tuple[str
     ]
 
 
-def test_numbers_of_prose_are_found_over_breaks_of_lines(tmp_path: Path) -> None:
+def test_numbers_in_prose_are_found_across_line_breaks(tmp_path: Path) -> None:
     found = cells(tmp_path, text=("is {} times as fast, and {} to {} m",), values=("a", "", "b"))
     assert found == [("cavmarl NAME NAME_ippo", "1,234.5", "7", "9", "/", "a", "", "b")]
 
 
-def test_a_range_has_one_expression(tmp_path: Path) -> None:
+def test_a_range_of_two_numbers_has_one_expression(tmp_path: Path) -> None:
     found = cells(tmp_path, text=("and {} to {} m",), values=("b",), tolerance="range")
     assert found == [("cavmarl NAME NAME_ippo", "7", "9", "/", "b")]
 
@@ -275,13 +275,13 @@ def test_wrong_lines_are_refused(keys: dict[str, object], message: str, tmp_path
         cells(tmp_path, **keys)
 
 
-def test_lines_need_a_checkout(tmp_path: Path) -> None:
+def test_published_lines_outside_of_a_checkout_are_an_error(tmp_path: Path) -> None:
     assert repository_root() == ROOT
     with pytest.raises(ConfigError, match=r"has no docs/figures/lines\.yaml.*from one with"):
         repository_root(tmp_path)
 
 
-def test_a_page_must_exist(tmp_path: Path) -> None:
+def test_a_line_with_a_missing_page_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ConfigError, match=r"line: there is no page gone\.md"):
         cells_of("line", PublishedLine("gone.md", "cavmarl list", text=("a",)), tmp_path)
 
@@ -294,11 +294,11 @@ def test_unknown_keys_of_lines_are_refused(tmp_path: Path) -> None:
         read_lines(tmp_path)
 
 
-def test_words_are_replaced_as_words() -> None:
+def test_only_whole_words_are_replaced() -> None:
     assert with_row("N --n N NAME N_ippo", "N", "u-turn") == "u-turn --n u-turn NAME u_turn_ippo"
 
 
-def test_tables_in_code_are_none() -> None:
+def test_tables_in_code_blocks_are_ignored() -> None:
     text = "# A\n```\n| a |\n|---|\n| 1 |\n```\n## B\n| b | c |\n|---|---|\n| 1 | x \\| y |\n"
     (table,) = tables_of(text)
     assert (table.section, table.heads, table.rows) == ("B", ("b", "c"), (("1", "x \\| y"),))

@@ -1,4 +1,4 @@
-"""A run with clients is repeated from its recording, without them."""
+"""A run with clients is repeated from its recording without the clients."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.verify.recorded_runs import repeat_recording
 from tests.cosim.test_client_actors import SETTINGS
 
-pytestmark = pytest.mark.integration  # a recording asks git for the commit
+pytestmark = pytest.mark.integration  # a recording starts git to read the commit
 
 SPEC = WorldSpec(env="grid4x4", agents=2, background=12, overrides=SETTINGS)
 STEP_S = 0.05
@@ -36,7 +36,7 @@ STEP_S = 0.05
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[str]]:
-    """A recording of two episodes with a client, and the hash of each state."""
+    """Return a recording of two episodes with a client, and the hash of each state."""
     folder = tmp_path_factory.mktemp("recorded")
     address = folder / "s"
     env = cavmarl.parallel_env(
@@ -84,7 +84,7 @@ def test_the_recording_has_the_inputs_of_each_step(recorded: tuple[Path, list[st
     drivers = {
         int(row["driver"]) for frame in Recording.open(path).frames() for row in frame.vehicles
     }
-    assert DRIVER_EXTERNAL in drivers  # its frames can be read, too
+    assert DRIVER_EXTERNAL in drivers  # the frames of the recording contain external vehicles
 
 
 @pytest.mark.parametrize("zones", [1, 3])
@@ -98,7 +98,7 @@ def test_a_run_is_repeated_without_its_clients(
     assert repeated.state_hash == found[-1]
 
 
-def test_a_changed_command_is_found(
+def test_a_changed_command_is_reported_as_the_first_difference(
     recorded: tuple[Path, list[str]], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = Recording.extra
@@ -113,7 +113,9 @@ def test_a_changed_command_is_found(
     assert repeated.first_difference == (30, 4)
 
 
-def test_another_world_is_refused_by_its_keys(recorded: tuple[Path, list[str]]) -> None:
+def test_another_world_is_refused_with_the_keys_that_differ(
+    recorded: tuple[Path, list[str]],
+) -> None:
     other = replace(SPEC, overrides={**SETTINGS, "population.external": 2}, background=11)
     with pytest.raises(
         ConfigError,
@@ -124,7 +126,7 @@ def test_another_world_is_refused_by_its_keys(recorded: tuple[Path, list[str]]) 
         repeat_recording(recorded[0], replace(SPEC, env="ring"))
 
 
-def test_keys_that_are_newer_than_a_recording_have_their_defaults(
+def test_settings_newer_than_a_recording_get_their_defaults(
     recorded: tuple[Path, list[str]], tmp_path: Path
 ) -> None:
     path, found = recorded
@@ -148,7 +150,7 @@ def test_a_recording_without_commands_cannot_be_repeated(tmp_path: Path) -> None
         repeat_recording(tmp_path / "a", WorldSpec(env="ring", agents=1))
 
 
-def test_a_recording_from_the_middle_cannot_be_repeated(tmp_path: Path) -> None:
+def test_a_recording_that_starts_during_an_episode_cannot_be_repeated(tmp_path: Path) -> None:
     with closing(cavmarl.parallel_env("ring", agents=1)) as env:
         env.reset(seed=0)
         env.record(RecordOptions(tmp_path / "a", (INPUTS,)))
@@ -214,8 +216,8 @@ VTYPE = (EXTERNAL.names or ()).index("vtype")
 
 
 @pytest.fixture(scope="module")
-def with_every_command(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, WorldSpec]:
-    """A recording whose first step has a command of most kinds."""
+def recording_of_commands(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, WorldSpec]:
+    """Return a recording whose first step has commands of almost all kinds, and its world."""
     more = {"signals.overrides": 4, "population.external": 2}
     overrides = {**EVERY_INPUT, **more, "signals.agents": "all"}
     spec = WorldSpec(env="grid4x4", agents=2, background=4, overrides=overrides)
@@ -246,7 +248,7 @@ def with_every_command(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, 
     ],
 )
 def test_a_forged_command_is_refused(
-    with_every_command: tuple[Path, WorldSpec],
+    recording_of_commands: tuple[Path, WorldSpec],
     monkeypatch: pytest.MonkeyPatch,
     name: str,
     place: tuple[int, ...],
@@ -255,19 +257,19 @@ def test_a_forged_command_is_refused(
 ) -> None:
     forge(monkeypatch, name, (1, *place), value)
     with pytest.raises((RecordingError, ActionError), match=reason):
-        repeat_recording(*with_every_command)
+        repeat_recording(*recording_of_commands)
 
 
 def test_a_forged_seed_is_refused(
-    with_every_command: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
+    recording_of_commands: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     forge(monkeypatch, "seed", (0,), "4x")
     with pytest.raises(RecordingError, match=r"seed = '4x': must be a whole number; get the"):
-        repeat_recording(*with_every_command)
+        repeat_recording(*recording_of_commands)
 
 
 def test_commands_with_another_dtype_are_refused(
-    with_every_command: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
+    recording_of_commands: tuple[Path, WorldSpec], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     read = Recording.extra
 
@@ -277,11 +279,11 @@ def test_commands_with_another_dtype_are_refused(
 
     monkeypatch.setattr(Recording, "extra", changed)
     with pytest.raises(RecordingError, match="another column controls than this world"):
-        repeat_recording(*with_every_command)
+        repeat_recording(*recording_of_commands)
 
 
 def forge(monkeypatch: pytest.MonkeyPatch, name: str, place: tuple[int, ...], value: Any) -> None:
-    """Let recordings have another value at a place of a column."""
+    """Replace a value in a column of each recording that is read."""
     read = Recording.extra
 
     def changed(self: Recording, table: str, *arguments: Any) -> Any:

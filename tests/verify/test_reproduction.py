@@ -1,4 +1,4 @@
-"""Commands behind published numbers are repeated, and their results compared with the pages."""
+"""Repeat the commands behind published numbers, and compare the results with the pages."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.verify.published_lines import PublishedLine, read_lines
 from cavmarl.verify.reproduction import CommandRunner, LineResult, reproduce
 from cavmarl.verify.result_paths import numbers_at
 
-pytestmark = pytest.mark.integration  # commands are processes
+pytestmark = pytest.mark.integration  # these tests start processes
 
 ROOT = Path(__file__).resolve().parents[2]
 PROGRAM = """
@@ -79,7 +79,7 @@ def text(
         ("makes {} steps", "0.97 rate", "2 %", "differs"),
         ("makes {} steps", "0.99 rate", "20", "same"),
         ("makes {} steps", "0.97 rate", "20", "differs"),
-        ("in {} s", "rows[n=1].x", "exact", "differs"),  # 0.2, as halves are rounded to even
+        ("in {} s", "rows[n=1].x", "exact", "differs"),  # 0.2, because halves are rounded to even
         ("or {} to {} on others", "rate", "range", "differs"),
         ("or {} to {} on others", "rate", "range 5 %", "same"),
         ("or {} to {} on others", "0.7 rate", "range 5 %", "differs"),
@@ -109,7 +109,7 @@ def test_rows_of_a_table_are_compared_and_a_command_runs_once(checkout: Path) ->
     assert (checkout / "calls.txt").read_text().splitlines() == ["speed", "speed"]
 
 
-def test_a_wrong_number_of_a_page_is_found(checkout: Path) -> None:
+def test_a_wrong_number_on_a_page_is_reported(checkout: Path) -> None:
     (checkout / "page.md").write_text(PAGE.replace("4.0", "4.1"))
     line = PublishedLine(
         "page.md", "python -m benchmarks speed", table="n", row="rows[n=ROW]", columns={"x": "1 x"}
@@ -119,7 +119,9 @@ def test_a_wrong_number_of_a_page_is_found(checkout: Path) -> None:
     assert [one.published for one in found.comparisons if not one.is_same] == ["4.1"]
 
 
-def test_lines_are_skipped_with_the_reason(checkout: Path, monkeypatch: Any) -> None:
+def test_a_line_with_a_missing_requirement_is_skipped_with_the_reason(
+    checkout: Path, monkeypatch: Any
+) -> None:
     monkeypatch.delenv("NOT_SET", raising=False)
     needs = ("module:not_installed", "program:not_there", "variable:NOT_SET", "file:MAPS")
     lines = [text("sometimes {} %", values=("rate",), needs=(need,)) for need in needs]
@@ -136,7 +138,7 @@ def test_lines_are_skipped_with_the_reason(checkout: Path, monkeypatch: Any) -> 
     assert not (checkout / "calls.txt").exists()
 
 
-def test_failures_are_told(checkout: Path) -> None:
+def test_a_failed_command_is_reported_with_the_reason(checkout: Path) -> None:
     lines = [
         text("sometimes {} %", values=("rate",), name="fails"),
         text("sometimes {} %", values=("speed",)),
@@ -151,7 +153,7 @@ def test_failures_are_told(checkout: Path) -> None:
     assert "has written a result that is no JSON" in found[3].reason
 
 
-def test_words_of_a_command_are_replaced_by_files(checkout: Path) -> None:
+def test_names_of_files_in_a_command_are_replaced_by_paths(checkout: Path) -> None:
     line = text("sometimes {} %", values=("len words",), name="speed MAPS/a.xml MAPS2")
     assert line.command.endswith("MAPS/a.xml MAPS2")
     maps = checkout / "with a space"
@@ -163,7 +165,9 @@ def test_words_of_a_command_are_replaced_by_files(checkout: Path) -> None:
         CommandRunner(checkout, {"MAPS": Path("gone")})
 
 
-def test_a_command_that_hangs_is_ended_with_its_children(checkout: Path, monkeypatch: Any) -> None:
+def test_a_command_that_takes_too_long_is_ended_with_its_children(
+    checkout: Path, monkeypatch: Any
+) -> None:
     monkeypatch.setattr("cavmarl.verify.reproduction.LEAST_S", 1.0)
     line = text("sometimes {} %", values=("rate",), name="hangs", minutes=0.0)
     (found,) = results(checkout, line)
@@ -218,7 +222,7 @@ FOUND: dict[str, Any] = {
         ("policies.idm.delay_s", [3]),
     ],
 )
-def test_expressions_name_numbers(expression: str, numbers: list[float]) -> None:
+def test_an_expression_selects_numbers_of_a_result(expression: str, numbers: list[float]) -> None:
     assert numbers_at(expression, FOUND) == pytest.approx(numbers)
 
 
@@ -253,7 +257,7 @@ def test_a_published_number_is_reproduced(name: str, runner: CommandRunner) -> N
     assert found.verdict == "same", found
 
 
-def test_the_test_of_processes_sees_them() -> None:
+def test_is_running_finds_a_running_process() -> None:
     program = subprocess.Popen(["sleep", "60"])
     assert is_running(program.pid)
     program.kill()

@@ -1,4 +1,4 @@
-"""Faults on a simulated machine: each is injected and counted; runs stay equal or end."""
+"""Faults on a simulated machine are injected and counted; runs stay equal or end with an error."""
 
 from __future__ import annotations
 
@@ -48,7 +48,7 @@ def world() -> World:
 def exchange(
     world: World, seed: int, change: Callable[[SimulatedSocket], None] = lambda end: None
 ) -> tuple[list[str], float]:
-    """Let two processes exchange messages; return the messages and the duration."""
+    """Let two simulated processes exchange messages; return the messages and the end time in s."""
     machine = SimulatedMachine(seed, world)
     listener = SimulatedListener(machine, machine.caller)
     heard: list[str] = []
@@ -77,14 +77,14 @@ def exchange(
     return heard, machine.now_s
 
 
-def test_the_order_of_events_is_a_function_of_the_seed(world: World) -> None:
+def test_the_order_of_events_depends_only_on_the_seed(world: World) -> None:
     heard, took_s = exchange(world, 3)
     assert (heard, took_s) == exchange(world, 3)
     assert 0.0 < took_s < 0.05
     assert exchange(world, 4) != (heard, took_s)
 
 
-def test_bytes_that_change_on_the_way_are_noticed(world: World) -> None:
+def test_bytes_that_arrive_twice_end_the_connection(world: World) -> None:
     def double(end: SimulatedSocket) -> None:
         end.due = lambda data: [data, data]
 
@@ -92,7 +92,7 @@ def test_bytes_that_change_on_the_way_are_noticed(world: World) -> None:
         exchange(world, 3, double)
 
 
-def test_bytes_that_are_held_arrive_in_the_order_in_which_they_were_sent(world: World) -> None:
+def test_delayed_bytes_arrive_in_the_order_of_sending(world: World) -> None:
     machine = SimulatedMachine(0, world)
     sender, receiver = (SimulatedSocket(machine, machine.caller) for _ in range(2))
     sender.other, receiver.other = receiver, sender
@@ -110,7 +110,7 @@ def test_a_connection_without_answers_ends(world: World) -> None:
         exchange(world, 3, SimulatedSocket.fall_silent)
 
 
-def test_processes_that_wait_for_each_other_are_noticed(world: World) -> None:
+def test_a_machine_whose_processes_all_wait_is_an_error(world: World) -> None:
     machine = SimulatedMachine(0, world)
     with pytest.raises(AssertionError, match="wait forever"):
         machine.wait(machine.caller, lambda: False, None)
@@ -124,30 +124,32 @@ def one_line(mix: str, nodes: int = 3, seeds: int = 1, **keys: Any) -> Simulated
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_is_injected_and_counted_and_the_run_is_equal(fault: Fault) -> None:
+def test_each_fault_is_injected_and_counted_and_changes_no_result(fault: Fault) -> None:
     line = one_line(fault, seeds=4)
     assert not line.wrong
     assert set(line.injected) == {fault}
     assert (line.runs, line.equal + line.ended) == (4, 4)
-    if fault is not Fault.KILL_IN_RECOVERY:  # both nodes with the state may die
+    if (
+        fault is not Fault.KILL_IN_RECOVERY
+    ):  # a run may end, because both nodes with a state may die
         assert (line.equal, line.injected[fault] <= 4) == (4, True)
     assert line.deaths == (line.injected[fault] if fault in DEATHS else 0)
     if fault in TOLERATED:
         assert line.lost == line.recoveries == 0
-    elif fault is not Fault.STOP:  # a short silence is tolerated
+    elif fault is not Fault.STOP:  # a short stop is tolerated
         assert line.lost == line.injected[fault]
 
 
 @pytest.mark.parametrize("fault", CALLER_DEATHS)
-def test_nodes_end_after_their_caller(fault: Fault) -> None:
+def test_nodes_end_if_their_caller_dies(fault: Fault) -> None:
     line = one_line(fault, seeds=4)
     assert not line.wrong
     assert line.caller_ended == line.injected[fault] > 0
     assert line.equal == 4 - line.caller_ended
 
 
-def test_a_run_is_a_function_of_its_seed() -> None:
-    """A single run of a campaign can be repeated."""
+def test_a_run_depends_only_on_its_seed() -> None:
+    """Repeat a single run of a campaign."""
     lines = [one_line("many", 2, first_seed=seed) for seed in (5, 6, 5)]
     assert lines[0] == lines[2] != lines[1]
     both = one_line("many", 2, seeds=2, first_seed=5)
@@ -167,12 +169,12 @@ def test_faults_drawn_for_each_frame_are_tolerated() -> None:
     assert every.deaths > 0
 
 
-def test_a_lost_only_node_resumes_from_the_state_at_the_caller() -> None:
+def test_the_only_node_resumes_from_the_state_at_the_caller() -> None:
     line = one_line("kill", nodes=1, seeds=2)
     assert (line.wrong, line.equal, line.ended, line.deaths) == ([], 2, 0, 2)
 
 
-def test_another_error_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unexpected_error_counts_as_wrong(monkeypatch: pytest.MonkeyPatch) -> None:
     def other(*arguments: Any) -> Any:
         raise WorkerError("the zones of lost nodes")
 
@@ -182,8 +184,10 @@ def test_another_error_is_not_accepted(monkeypatch: pytest.MonkeyPatch) -> None:
     assert "WorkerError: the zones of lost nodes" in line.wrong[0]
 
 
-def test_a_world_that_is_given_up_too_soon_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The next node has the state of the lost one."""
+def test_a_run_that_ends_although_a_state_exists_is_detected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Another node has the state of the lost node, so the run must not end."""
 
     def give_up(*arguments: Any) -> Any:
         raise WorkerDeathError(0, "zone 0", 1, "step", ["it was lost"])
@@ -193,38 +197,39 @@ def test_a_world_that_is_given_up_too_soon_is_detected(monkeypatch: pytest.Monke
     assert "ended after 1 losses in a row" in line.wrong[0]
 
 
-def test_a_node_that_is_given_up_without_need_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A node that answers late is not lost."""
+def test_the_loss_of_a_node_that_only_answers_late_is_detected(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr("cavmarl.parallel.nodes.node_watch.PONG_S", 0.01)
     line = one_line("stale_heartbeat")
     assert "nodes were lost to faults that must be tolerated" in line.wrong[0]
 
 
 def test_nodes_that_ignore_a_rollback_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Such nodes wait for ever for a node that only the caller has lost."""
+    """Without a rollback, nodes wait forever for a node that only the caller has lost."""
     monkeypatch.setattr(Links, "check_recovery", lambda self: None)
     assert one_line("partition", seeds=3).wrong
 
 
 @pytest.mark.slow
 def test_frames_without_a_checksum_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Without a checksum, damaged or repeated frames pass for other frames.
+    """Without a checksum, damaged or repeated frames are taken for valid frames.
 
-    The content of frames is checked, too, so most of these frames are refused.
+    Nodes also check the content of frames, so they refuse most of these frames.
     """
     monkeypatch.setattr("cavmarl.parallel.nodes.link.xxh3_64_intdigest", lambda data, seed=0: 0)
     assert one_line("damage", seeds=12).wrong or one_line("duplicate", seeds=40).wrong
 
 
 def test_frames_without_a_sequence_number_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """A frame arrives twice. Missing frames are detected by the content of other frames."""
+    """Send frames twice. Missing frames would be detected by the content of other frames."""
     checksum = "cavmarl.parallel.nodes.link.xxh3_64_intdigest"
     monkeypatch.setattr(checksum, lambda data, seed=0: xxh3_64_intdigest(data))
     assert one_line("duplicate", seeds=8).wrong
 
 
 def test_a_missing_rollback_is_detected(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Nodes continue from their present states, and run steps twice."""
+    """Without a rollback, nodes continue from their present states and run steps twice."""
 
     def present(data: Bytes, like: list[Any]) -> list[Any]:
         return [array.copy() for array in like]
@@ -233,7 +238,7 @@ def test_a_missing_rollback_is_detected(monkeypatch: pytest.MonkeyPatch) -> None
     assert one_line("kill", seeds=3).wrong
 
 
-def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list[int]:
+def silence_connection(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list[int]:
     """Let a connection between two nodes drop all data from the nth frame of a kind on."""
     send = SimulatedSocket.send
     seen: list[int] = []
@@ -256,7 +261,11 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
         (FrameKind.KEEP, 1, "stop_caller"),  # the first state, before any tick
         (FrameKind.SYNC, 2, "stop_caller"),
         (FrameKind.SHARE, 5, "stop_caller"),
-        (FrameKind.MESSAGES, 2, "stop_caller"),  # an offer, after which no other frame is sent
+        (
+            FrameKind.MESSAGES,
+            2,
+            "stop_caller",
+        ),  # an offer, which is the last frame before the nodes wait
         (FrameKind.AGENT, 1, "stop_caller"),
         (FrameKind.GIVE, 1, "kill"),
     ],
@@ -264,8 +273,8 @@ def silenced(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int) -> list
 def test_a_silent_connection_between_two_nodes_loses_one_of_them(
     monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int, mix: str
 ) -> None:
-    """All nodes answer the caller. One of the two is given up, whichever frame the other awaits."""
-    seen = silenced(monkeypatch, kind, nth)
+    """All nodes answer the caller. Whichever frame is missing, one of the two must be lost."""
+    seen = silence_connection(monkeypatch, kind, nth)
     keys: dict[str, Any] = {"agents": 12, "background": 20, "zones": 8, "steps": 24}
     found = verify_simulated_nodes(
         "merge", [4], mixes=[mix], seeds=1, overrides={"clock.ctrl_dt_s": 0.4}, **keys
@@ -276,8 +285,8 @@ def test_a_silent_connection_between_two_nodes_loses_one_of_them(
     assert [text for text in line.wrong if "must be tolerated" not in text] == []
 
 
-def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An epoch that no record has is detected, although the vehicles move correctly."""
+def test_a_wrong_epoch_of_a_vehicle_is_detected_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The vehicles move correctly, but one has an epoch that no record has."""
     checked: dict[str, Any] = {**SMALL, "steps": 30, "overrides": {CHECKED: True}}
     assert verify_simulated_nodes("merge", [3], mixes=["kill"], seeds=1, **checked).holds
     take_over = OwnerChanges.take_over
@@ -295,10 +304,10 @@ def test_owners_are_checked_over_nodes(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.parametrize("stream", [RowStream, AgentStream])
-def test_a_node_with_an_impossible_report_is_lost(
+def test_a_node_that_sends_an_invalid_frame_is_lost(
     monkeypatch: pytest.MonkeyPatch, stream: type[RowStream] | type[AgentStream]
 ) -> None:
-    """An intact frame has impossible content: its connection ends, and no node fails."""
+    """A frame with a valid checksum has invalid content. Its connection ends, and no node fails."""
     packed: Any = stream.packed
     send = Links.send
     calls = 0
@@ -308,13 +317,13 @@ def test_a_node_with_an_impossible_report_is_lost(
         kinds.add(kind)
         send(self, to, kind, *rest)
 
-    def cut_short(self: object, *arguments: Any) -> Bytes:
+    def truncate(self: object, *arguments: Any) -> Bytes:
         nonlocal calls
         calls += 1
         data: memoryview = packed(self, *arguments)
         return data[:-8] if calls == 20 else data
 
-    monkeypatch.setattr(stream, "packed", cut_short)
+    monkeypatch.setattr(stream, "packed", truncate)
     monkeypatch.setattr(Links, "send", note)
     (line,) = verify_simulated_nodes("merge", [3], mixes=["none"], seeds=1, **SMALL).lines
     assert calls > 20
@@ -325,7 +334,7 @@ def test_a_node_with_an_impossible_report_is_lost(
 
 
 @pytest.mark.slow
-def test_many_runs_of_each_mix_hold(tmp_path: Path) -> None:
+def test_many_runs_of_each_mix_of_faults_change_no_result(tmp_path: Path) -> None:
     words = (
         "verify",
         "nodes",

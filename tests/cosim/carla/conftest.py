@@ -1,9 +1,10 @@
 """Servers for CARLA's clients, in this process and on ports, and programs with the official client.
 
-The client can abort its process, so programs with it run in a process of their own. The Python of
-client 0.9.16 is `CAVMARL_CARLA_PYTHON`, or this one if it has the package `carla`. Those of other
-versions are `CAVMARL_CARLA_PYTHON_0_9_15` (package `carla-0-9-15`) and `..._0_10_0`. With
-`CAVMARL_CARLA_VERSION`, all tests use the client of another version.
+The client can abort its process, so each program that uses the client runs in its own process.
+`CAVMARL_CARLA_PYTHON` names a Python with client 0.9.16; the default is the Python of the tests, if
+it has the package `carla`. `CAVMARL_CARLA_PYTHON_0_9_15` (package `carla-0-9-15`) and
+`CAVMARL_CARLA_PYTHON_0_10_0` name Pythons with other versions of the client. If
+`CAVMARL_CARLA_VERSION` is set, all tests use the client of that version.
 """
 
 from __future__ import annotations
@@ -47,7 +48,7 @@ def session() -> Iterator[CarlaSession]:
 
 @pytest.fixture(scope="module")
 def call(session: CarlaSession) -> Call:
-    """Call as a client does; return the value, or raise RuntimeError with the message."""
+    """Return a function that calls the server like a client, and raises its errors."""
     caller = Caller("test")
 
     def send(name: str, *arguments: Any) -> Any:
@@ -113,7 +114,7 @@ _END = "\nprint('FOUND' + json.dumps(found), flush=True)\n"
 
 
 def run_client(port: int, program: str, version: str = VERSION) -> dict[str, Any]:
-    """Run a program with `client` and `world`; return the dict `found` that it has filled."""
+    """Run a program that uses `client` and `world`, and return the dict `found` that it fills."""
     done = subprocess.run(
         [client_python(version), "-c", _START + program + _END, str(port)],
         capture_output=True,

@@ -40,12 +40,12 @@ class Recorder:
 
 @pytest.fixture
 def recorder(session: CarlaSession, monkeypatch: pytest.MonkeyPatch) -> Iterator[Recorder]:
-    yield recorded(monkeypatch)
+    yield record_frames(monkeypatch)
     for actor in list(session.actors.attached()):
         session.destroy(actor.number)
 
 
-def recorded(monkeypatch: pytest.MonkeyPatch) -> Recorder:
+def record_frames(monkeypatch: pytest.MonkeyPatch) -> Recorder:
     """Record the frames of all servers of this process."""
     found = Recorder()
     hub = "cavmarl.cosim.carla.carla_streams.StreamHub"
@@ -73,7 +73,7 @@ def newest(recorder: Recorder, actor: CarlaActor) -> bytes:
     return recorder.frames[stream_of(actor)][-1][1]
 
 
-def test_poses_compose_and_are_undone() -> None:
+def test_a_relative_pose_inverts_a_composed_pose() -> None:
     outer = CarlaPose(1.0, -2.0, 3.0, 10.0, 50.0, -20.0)
     inner = CarlaPose(0.5, 0.2, 1.0, -5.0, 170.0, 30.0)
     assert relative(outer, compose(outer, inner)) == pytest.approx(inner)
@@ -127,7 +127,7 @@ def test_a_lidar_hits_the_road_below_and_the_vehicles_around(
     session.tick()
     counts, points = points_of(newest(recorder, plain), "<4f4")
     assert sum(counts) == len(points)
-    assert counts[-1] == 360  # the lowest channel meets the road all around
+    assert counts[-1] == 360  # the lowest channel hits the road in all directions
     semantic_counts, tagged = points_of(newest(recorder, semantic), SEMANTIC_POINT)
     assert semantic_counts == counts
     assert tagged["place"] == pytest.approx(points[:, :3], abs=1e-4)
@@ -161,11 +161,14 @@ def test_cameras_see_the_road_and_the_sky(session: CarlaSession, recorder: Recor
     coded = np.frombuffer(newest(recorder, depth), np.uint8, offset=12).reshape(32, 64, 4)
     metres = coded[..., :3] @ [65536.0, 256.0, 1.0] / (2**24 - 1) * 1000.0
     assert metres[0, 32] == pytest.approx(1000.0)
-    # The last row looks down by 15.5 of 32 pixels to the horizon: 2 m below, 2 · 32 / 15.5 m ahead.
+    # The camera is 2 m above the road, and its focal length is 32 pixels. The last row is
+    # 15.5 pixels below the horizon.
     assert metres[31, 32] == pytest.approx(2.0 * 32.0 / 15.5, rel=1e-3)
 
 
-def test_a_camera_outside_of_its_vehicle_sees_it(session: CarlaSession, recorder: Recorder) -> None:
+def test_a_camera_behind_its_vehicle_sees_the_vehicle(
+    session: CarlaSession, recorder: Recorder
+) -> None:
     behind = CarlaPose(-7.0, 0.0, 3.0, -15.0)
     camera = attach(
         session, "camera.instance_segmentation", behind, image_size_x=32, image_size_y=32
@@ -180,7 +183,7 @@ def test_a_camera_outside_of_its_vehicle_sees_it(session: CarlaSession, recorder
 SIZE = {"image_size_x": 96, "image_size_y": 64}
 
 
-def test_optical_flow_leads_to_the_same_vehicle_in_the_last_picture(
+def test_optical_flow_points_to_the_same_vehicle_in_the_previous_picture(
     session: CarlaSession, recorder: Recorder
 ) -> None:
     behind = CarlaPose(-8.0, 0.0, 3.0, -12.0)
@@ -189,7 +192,9 @@ def test_optical_flow_leads_to_the_same_vehicle_in_the_last_picture(
         for kind in ("optical_flow", "instance_segmentation")
     )
     session.tick()
-    assert not np.frombuffer(newest(recorder, flow), "<f4", offset=12).any(), "the first picture"
+    assert not np.frombuffer(newest(recorder, flow), "<f4", offset=12).any(), (
+        "the first picture has no flow"
+    )
     row, column = np.mgrid[:64, :96]
     others, roads = [], []
     for _ in range(30):
@@ -207,14 +212,14 @@ def test_optical_flow_leads_to_the_same_vehicle_in_the_last_picture(
         inside = (0 <= was[0]) & (was[0] < 64) & (0 <= was[1]) & (was[1] < 96)
         inside &= (shown > 0) & ~own
         others.append(shown[inside] == before[was[0][inside], was[1][inside]])
-    assert max(roads) > 2.0, "the vehicle drives"
+    assert max(roads) > 2.0, "the vehicle does not drive"
     found = np.concatenate(others)
     assert len(found) > 50
     assert found.mean() > 0.9
 
 
 def numbers_in(picture: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Return the number of the actor at each pixel of an instance camera; 0: none."""
+    """Return the number of the actor at each pixel of an instance camera; 0 means no actor."""
     return picture[..., 1].astype(np.int64) + 256 * picture[..., 0].astype(np.int64)
 
 
@@ -222,10 +227,10 @@ def picture_of(recorder: Recorder, actor: CarlaActor) -> NDArray[np.uint8]:
     return np.frombuffer(newest(recorder, actor), np.uint8, offset=12).reshape(64, 96, 4)
 
 
-def test_optical_flow_of_the_road_has_the_size_of_the_way_of_the_camera(
+def test_optical_flow_of_the_road_matches_the_motion_of_the_camera(
     session: CarlaSession, recorder: Recorder
 ) -> None:
-    """The flow of a row has a closed form if the camera drives straight on over a flat road."""
+    """If the camera moves straight ahead over a flat road, the flow of each row has a formula."""
     flow = attach(session, "camera.optical_flow", ROOF, **SIZE)
     depth = attach(session, "camera.depth", ROOF, **SIZE)
     session.tick()
@@ -245,13 +250,17 @@ def test_optical_flow_of_the_road_has_the_size_of_the_way_of_the_camera(
     # A point of the road, 2 m below the camera, is 48 · 2 / depth pixels below the middle.
     for row in (56, 60, 63):
         below = (row + 0.5 - 32.0) / 48.0  # tangent of the angle
-        assert depth_m[row, 48] == pytest.approx(2.0 / below, rel=1e-3), "it shows the road"
+        assert depth_m[row, 48] == pytest.approx(2.0 / below, rel=1e-3), (
+            "the pixel does not show the road"
+        )
         d, before_d = depth_m[row, 48], depth_m[row, 48] + way[0]
         down = 48.0 * (2.0 / d - 2.0 / before_d)
         assert moved[row, 48, 1] * 32.0 == pytest.approx(-down, rel=0.01)
 
 
-def test_a_radar_measures_within_its_cone(session: CarlaSession, recorder: Recorder) -> None:
+def test_a_radar_detects_targets_only_inside_its_cone(
+    session: CarlaSession, recorder: Recorder
+) -> None:
     radar = attach(session, "other.radar", CarlaPose(2.4, 0.0, 1.0), points_per_second=20_000)
     session.tick()
     found = np.frombuffer(newest(recorder, radar), "<4f4")
@@ -261,7 +270,7 @@ def test_a_radar_measures_within_its_cone(session: CarlaSession, recorder: Recor
     assert (found[:, 3] <= 100.0).all()
 
 
-def test_sensors_leave_with_their_vehicle(session: CarlaSession, recorder: Recorder) -> None:
+def test_sensors_are_removed_with_their_vehicle(session: CarlaSession, recorder: Recorder) -> None:
     parent = ego(session)
     attached = attach(session, "other.imu")
     gone = session.actors.remove(parent.number)
@@ -272,7 +281,7 @@ def test_sensors_leave_with_their_vehicle(session: CarlaSession, recorder: Recor
 def test_a_collision_is_reported_with_the_last_frame_of_its_vehicle(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    found = recorded(monkeypatch)
+    found = record_frames(monkeypatch)
     with make_server(agents=1, background=150) as server:
         session = server.session
         agent = session.actors.of_agent(0)
@@ -280,7 +289,7 @@ def test_a_collision_is_reported_with_the_last_frame_of_its_vehicle(
         sensor = session.spawn("sensor.other.collision", {}, ROOF, agent.number)
         steering_rad = session.world.env.config.action.steering_rad
         for _ in range(1000):
-            # An agent's wheelbase is its length; CARLA's vehicles have a shorter wheelbase.
+            # The wheelbase of an agent equals its length; CARLA's vehicles have a shorter one.
             angle = steering_rad * float(session.world.env.suggest_actions()["car_0"][1])
             steer = -same_turn(angle, WHEELBASE_SHARE) / FULL_STEER_RAD
             session.world.controls[0] = CarlaControl(throttle=0.7, steer=steer)

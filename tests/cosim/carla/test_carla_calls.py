@@ -1,4 +1,4 @@
-"""Each call answers in CARLA's form for any arguments, and faults change nothing."""
+"""Each call has an answer in CARLA's format, and calls with errors do not change the world."""
 
 from __future__ import annotations
 
@@ -28,7 +28,9 @@ def car_0(session: CarlaSession) -> int:
 
 
 @pytest.mark.parametrize("name", sorted(CALLS))
-def test_wrong_counts_are_errors_of_the_form_of_the_call(session: CarlaSession, name: str) -> None:
+def test_a_wrong_number_of_arguments_is_an_error_in_the_format_of_the_call(
+    session: CarlaSession, name: str
+) -> None:
     known = CALLS[name]
     error, result = answer(Caller("test"), session, name, [None] * (len(known.checks) + 1))
     assert error is None
@@ -38,7 +40,9 @@ def test_wrong_counts_are_errors_of_the_form_of_the_call(session: CarlaSession, 
 
 
 @pytest.mark.parametrize("name", sorted(name for name in CALLS if CALLS[name].checks))
-def test_wrong_types_are_answered(session: CarlaSession, name: str) -> None:
+def test_arguments_of_wrong_types_have_an_answer_and_change_nothing(
+    session: CarlaSession, name: str
+) -> None:
     known = CALLS[name]
     before, frame = session.world.env.state_hash(), session.frame
     for value in WRONG:
@@ -48,13 +52,13 @@ def test_wrong_types_are_answered(session: CarlaSession, name: str) -> None:
     assert (session.world.env.state_hash(), session.frame) == (before, frame)
 
 
-def test_an_unknown_call_has_the_error_of_rpclib(session: CarlaSession) -> None:
+def test_an_unknown_call_returns_the_error_of_rpclib(session: CarlaSession) -> None:
     error, result = answer(Caller("test"), session, "fly", [1, 2])
     assert error == "rpclib: server could not find function 'fly' with argument count 3."
     assert result is None
 
 
-def test_a_fault_of_the_server_is_an_answer_and_a_log_line(
+def test_an_internal_error_is_returned_to_the_client_and_logged(
     session: CarlaSession,
     call: Call,
     monkeypatch: pytest.MonkeyPatch,
@@ -134,7 +138,7 @@ def test_vehicles_of_the_world_are_not_moved_or_destroyed(
         call("set_actor_transform", number, POSE)
 
 
-def test_an_unknown_actor_is_named(call: Call) -> None:
+def test_a_call_for_an_unknown_actor_is_an_error(call: Call) -> None:
     with pytest.raises(RuntimeError, match="Actor could not be found in the registry"):
         call("apply_control_to_vehicle", 10**6, [0.0, 0.0, 0.0, False, False, False, 0])
 
@@ -187,7 +191,7 @@ def test_settings_are_kept_and_impossible_steps_refused(session: CarlaSession, c
 
 
 @pytest.mark.parametrize("other_ticks", ["obey", "refuse", "follow"])
-def test_ticks_of_a_second_client_are_noticed(
+def test_ticks_of_a_second_client_are_detected(
     other_ticks: OtherTicks, caplog: pytest.LogCaptureFixture
 ) -> None:
     with make_server(agents=1, background=0, other_ticks=other_ticks) as server:
@@ -217,7 +221,9 @@ def test_ticks_of_a_second_client_are_noticed(
         assert master.own_ticks == 1
 
 
-def test_a_step_that_does_not_fit_restarts_the_world(session: CarlaSession, call: Call) -> None:
+def test_a_step_shorter_than_that_of_the_world_restarts_the_world(
+    session: CarlaSession, call: Call
+) -> None:
     rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
     episode, lights = session.episode, session.actors.lights["id"].tolist()
     call("set_episode_settings", [True, False, [True, 0.02], *rest])
@@ -245,7 +251,7 @@ def test_a_map_is_loaded_by_its_name(session: CarlaSession, call: Call) -> None:
     }
 
 
-def test_managers_are_listed(call: Call) -> None:
+def test_the_server_lists_traffic_managers(call: Call) -> None:
     assert call("get_traffic_manager_running", 8000) == ["", 0]
     assert call("add_traffic_manager_running", ["10.0.0.1", 8000])
     assert not call("add_traffic_manager_running", ["10.0.0.2", 8000])

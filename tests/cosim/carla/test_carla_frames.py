@@ -1,4 +1,4 @@
-"""Sensors of agents in a hosted zone give the frames of the CARLA server."""
+"""Agents in a zone that a CARLA server runs get the frames of that server."""
 
 from __future__ import annotations
 
@@ -40,8 +40,11 @@ RIG: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("backend", ["local", "nodes:2"])
-def test_sensors_in_a_hosted_zone_give_the_frames_of_the_server(backend: str) -> None:
-    """The server of the test has cavmarl's own sensors, so its frames must be nearly equal."""
+def test_agents_in_a_hosted_zone_get_the_frames_of_the_server(backend: str) -> None:
+    """Compare the frames with those of a world without a server.
+
+    The server of this test is a cavmarl server, so the frames are nearly equal.
+    """
     overrides = {"rig": RIG, "traffic.endless": True}
     own = cavmarl.make_vec("grid4x4", agents=4, background=40, seed=3, overrides=overrides)
     own.reset()
@@ -62,7 +65,7 @@ def test_sensors_in_a_hosted_zone_give_the_frames_of_the_server(backend: str) ->
             assert (sample == due).mean() > 0.85
             sample, due = (one["colours"].data[0, agent, -1] for one in (found, model))
             assert np.abs(sample.astype(int) - due).mean() < 25.0
-            assert not np.array_equal(sample, due), "it is the server's picture"
+            assert not np.array_equal(sample, due), "the picture is not from the server"
             for lidar in ("roof", "ahead"):
                 sample, due = (one[lidar].data[0, agent, -1] for one in (found, model))
                 range_m = float(due.max())
@@ -107,7 +110,7 @@ def data(rows: list[tuple[float, ...]]) -> str:
 
 
 @pytest.mark.parametrize(("rays", "fov_deg"), [(8, 360.0), (5, 360.0), (5, 80.0), (1, 80.0)])
-def test_points_become_the_distances_of_their_rays(rays: int, fov_deg: float) -> None:
+def test_each_point_becomes_the_distance_of_its_ray(rays: int, fov_deg: float) -> None:
     config = LidarRigConfig(rate_hz=10.0, rays=rays, fov_deg=fov_deg, layers=3, range_m=50.0)
     step = 360.0 / rays if fov_deg == 360.0 or rays == 1 else fov_deg / (rays - 1)
     first = 0.0 if fov_deg == 360.0 or rays == 1 else -0.5 * fov_deg
@@ -135,10 +138,10 @@ def test_points_become_the_distances_of_their_rays(rays: int, fov_deg: float) ->
 
 
 def test_echoes_become_targets() -> None:
-    """Speed, azimuth to the right, altitude, distance; the wall is one target, and so is a car."""
+    """Echoes are (speed, azimuth to the right, altitude, distance); wall and car are targets."""
     wall = [(-5.0, math.radians(a), 0.0, 10.0 - a) for a in (-20.0, -19.0, -18.0)]
     car = [(2.0, math.radians(a), 0.0, 12.0 + 0.1 * a) for a in (-17.5, -17.0, -16.5)]
-    beside = [(9.0, math.radians(-16.0), 0.0, 12.0)]  # as near, but faster
+    beside = [(9.0, math.radians(-16.0), 0.0, 12.0)]  # at the distance of the car, but faster
     ground = [(-5.0, math.radians(10.0), -0.1, 5.0)]
     config = RadarConfig(rate_hz=10.0, z_m=0.5, targets=4)
     found = sample_of(config, data([*beside, *ground, *wall, *car]))
@@ -167,7 +170,7 @@ def test_echoes_become_targets() -> None:
         ),
     ],
 )
-def test_sensors_without_such_frames_are_refused_by_name(
+def test_sensors_that_carla_cannot_provide_are_refused_by_name(
     sensor: dict[str, Any], message: str
 ) -> None:
     with pytest.raises(ConfigError, match=message):
@@ -179,6 +182,6 @@ def test_sensors_without_such_frames_are_refused_by_name(
         )
 
 
-def test_the_option_is_checked() -> None:
+def test_an_invalid_option_for_frames_is_refused() -> None:
     with pytest.raises(ConfigError, match="frames = 'yes': must be own"):
         cavmarl.make_vec("grid4x4", zones=2, zone_simulators={1: "carla://a:1?frames=yes"})

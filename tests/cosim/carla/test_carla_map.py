@@ -39,7 +39,9 @@ def root(carla_map: CarlaMap) -> Element:
     return fromstring(carla_map.document)
 
 
-def test_each_approach_has_one_signal_of_carlas_type(carla_map: CarlaMap, root: Element) -> None:
+def test_each_approach_has_one_signal_of_the_type_that_carla_uses(
+    carla_map: CarlaMap, root: Element
+) -> None:
     signals = list(root.iter("signal"))
     assert {signal.get("type") for signal in signals} == {LIGHT_TYPE}
     assert sorted(str(one.get("id")) for one in signals) == sorted(
@@ -92,7 +94,7 @@ def test_junctions_connect_only_lanes_for_cars() -> None:
     assert [link.get("to") for link in connection] == ["-2"]
 
 
-def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
+def test_the_header_has_a_geographic_reference(root: Element) -> None:
     header = root.find("header")
     assert header is not None
     assert header.get("revMinor") == "4"
@@ -100,8 +102,8 @@ def test_the_header_has_a_place_on_the_earth(root: Element) -> None:
     assert f"+lat_0={DEFAULT_ORIGIN[0]:.9f} +lon_0={DEFAULT_ORIGIN[1]:.9f}" in place
 
 
-def test_the_origin_of_a_map_needs_no_files_of_heights(network: RoadNetwork) -> None:
-    """CARLA's towns name a geoid, for which PROJ would need a file."""
+def test_the_origin_of_a_map_with_a_geoid_needs_no_geoid_file(network: RoadNetwork) -> None:
+    """The projection of CARLA's towns names a geoid, for which PROJ would need a file."""
     pytest.importorskip("pyproj", reason="needs the extra 'maps'")
     projection = (
         "+proj=tmerc +lat_0=49 +lon_0=8 +k=1 +x_0=0 +y_0=0 +datum=WGS84 +units=m "
@@ -111,13 +113,13 @@ def test_the_origin_of_a_map_needs_no_files_of_heights(network: RoadNetwork) -> 
     assert origin_of(there) == pytest.approx((49.0, 8.0))
 
 
-def test_the_file_for_carla_has_the_same_roads(tmp_path: Path) -> None:
+def test_the_map_file_for_carla_has_the_same_roads(tmp_path: Path) -> None:
     trip = write_opendrive(find_map("grid4x4"), tmp_path / "map.xodr", for_carla=True)
     assert trip.same
     assert trip.read.links == trip.map.links
 
 
-def test_a_light_is_green_only_if_all_of_its_movements_are(
+def test_a_light_is_green_only_if_all_of_its_movements_are_green(
     carla_map: CarlaMap, network: RoadNetwork
 ) -> None:
     seen = set()
@@ -135,7 +137,9 @@ def test_a_light_is_green_only_if_all_of_its_movements_are(
     assert {RED, YELLOW, GREEN} <= seen <= {RED, YELLOW, GREEN, OFF}
 
 
-def test_the_times_of_a_light_fill_its_cycle(carla_map: CarlaMap, network: RoadNetwork) -> None:
+def test_the_times_of_a_light_add_up_to_its_cycle(
+    carla_map: CarlaMap, network: RoadNetwork
+) -> None:
     for approach, times in zip(carla_map.approaches, carla_map.times_s, strict=True):
         program = network.programs[network.signals["program"][approach.signal]]
         assert times.sum() == pytest.approx(program["cycle_s"])
@@ -158,8 +162,10 @@ def test_spawn_points_are_on_lanes_in_their_direction(
         assert math.remainder(heading + pose.yaw, 360.0) == pytest.approx(0.0, abs=0.1)
 
 
-def test_spawn_points_lead_to_each_other(carla_map: CarlaMap, network: RoadNetwork) -> None:
-    """Lanes that lead out of the map, or come from outside, have no spawn points."""
+def test_every_spawn_point_can_reach_every_other_spawn_point(
+    carla_map: CarlaMap, network: RoadNetwork
+) -> None:
+    """Lanes that lead into the map or out of it have no spawn points."""
     lanes = [
         lane
         for lane in np.flatnonzero(~network.lanes["internal"]).tolist()

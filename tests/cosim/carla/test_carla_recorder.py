@@ -1,4 +1,4 @@
-"""Clients record the world, read what was recorded, and show it again."""
+"""Clients record the world, read the recordings, and replay them."""
 
 from __future__ import annotations
 
@@ -50,19 +50,21 @@ def own_session(folder: Path) -> Iterator[CarlaSession]:
         yield server.session
 
 
-def places(session: CarlaSession) -> dict[int, list[float]]:
-    """Return the places of the actors in the next snapshot, by number."""
+def positions_of(session: CarlaSession) -> dict[int, list[float]]:
+    """Return the positions of the actors in the next snapshot, by actor number."""
     states = session.actors.vehicle_states
     return dict(zip(states["id"].tolist(), states["place"].tolist(), strict=True))
 
 
-def recorded(session: CarlaSession, call: Call, name: str = "test1.log") -> list[dict[int, Any]]:
-    """Record some ticks; return the places of each frame."""
+def record_ticks(
+    session: CarlaSession, call: Call, name: str = "test1.log"
+) -> list[dict[int, Any]]:
+    """Record `TICKS` ticks; return the positions of the actors in each frame."""
     call("start_recorder", name, True)
-    found = [places(session)]
+    found = [positions_of(session)]
     for _ in range(TICKS):
         session.tick()
-        found.append(places(session))
+        found.append(positions_of(session))
     call("stop_recorder")
     return found
 
@@ -73,24 +75,24 @@ def test_a_replay_shows_the_recorded_vehicles_and_then_the_world(
     session, call = own_session, calls_of(own_session)
     for _ in range(5):
         session.tick()
-    due = recorded(session, call)
+    due = record_ticks(session, call)
     session.tick()
     left = session.world.env.state_hash()
-    last = places(session)
+    last = positions_of(session)
     text = call("replay_file", "test1.log", 0.5, 0.75, 0, False, [[0.0] * 3, [0.0] * 3])
     assert "Replaying from 0.5 s - 1.25 s (1.5 s)" in text
-    # The recording has the numbers of the actors, since it is of this session.
-    assert places(session) == due[10]
+    # This session made the recording, so the actors keep their numbers.
+    assert positions_of(session) == due[10]
     for k in range(11, 26):
         session.tick()
-        assert places(session) == due[k]
-    assert session.world.env.state_hash() == left, "the world is paused"
+        assert positions_of(session) == due[k]
+    assert session.world.env.state_hash() == left, "the world moves during the replay"
     session.tick()
-    assert places(session) == last, "the replay is over"
+    assert positions_of(session) == last, "the replay does not end"
     session.tick()
-    assert places(session) != last
+    assert positions_of(session) != last
     assert session.world.env.state_hash() != left
-    # The recording is one of cavmarl.
+    # The recording has the format of cavmarl.
     recording = Recording.open(folder / "test1.log")
     assert recording.is_whole
     assert len(recording.ticks()) == TICKS + 1
@@ -114,7 +116,7 @@ def by_number(session: CarlaSession) -> NDArray[np.void]:
     return states[np.argsort(states["id"])].copy()
 
 
-def test_states_of_lights_and_speeds_are_those_of_the_recording(own_session: CarlaSession) -> None:
+def test_a_replay_has_the_recorded_lights_and_speeds(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
     call("start_recorder", "lights", False)
     due = []
@@ -122,7 +124,7 @@ def test_states_of_lights_and_speeds_are_those_of_the_recording(own_session: Car
         session.tick()
         due.append((session.actors.lights["light_state"].copy(), by_number(session)))
     call("stop_recorder")
-    for _ in range(400):  # until the lights are others
+    for _ in range(400):  # until the lights differ from the first frame
         session.tick()
         if (session.actors.lights["light_state"] != due[0][0]).any():
             break
@@ -138,7 +140,7 @@ def test_states_of_lights_and_speeds_are_those_of_the_recording(own_session: Car
 
 def test_clients_cannot_change_the_vehicles_of_a_replay(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
-    recorded(session, call)
+    record_ticks(session, call)
     call("replay_file", "test1.log", 0.0, 0.0, 0, False)
     number = session.actors.vehicles[0].number
     control = [0.5, 0.0, 0.0, False, False, False, 0]
@@ -157,24 +159,24 @@ def test_clients_cannot_change_the_vehicles_of_a_replay(own_session: CarlaSessio
 
 def test_a_sensor_can_be_attached_during_a_replay(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
-    recorded(session, call)
+    record_ticks(session, call)
     call("replay_file", "test1.log", 0.0, 0.0, 0, False)
     parent = session.actors.vehicles[0]
     kind = [1, "sensor.other.gnss", []]
     number = call("spawn_actor_with_parent", kind, POSE, parent.number, 0, "")[0]
     session.tick()
-    there = places(session)[parent.number]
+    there = positions_of(session)[parent.number]
     assert session.actors.actors[number].pose.place[:2] == pytest.approx(there[:2], abs=0.1)
     call("stop_replayer", True)
     assert number in session.actors.actors
-    there = places(session)[parent.number]
+    there = positions_of(session)[parent.number]
     assert session.actors.actors[number].pose.place[:2] == pytest.approx(there[:2], abs=0.1)
     call("destroy_actor", number)
 
 
 def test_the_spectator_follows_an_actor_of_the_replay(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
-    due = recorded(session, call)
+    due = record_ticks(session, call)
     followed = session.actors.of_agent(0)
     assert followed is not None
     offset = [[0.0, 0.0, 20.0], [-90.0, 0.0, 0.0]]
@@ -186,38 +188,38 @@ def test_the_spectator_follows_an_actor_of_the_replay(own_session: CarlaSession)
         call("replay_file", "test1.log", 0.0, 0.0, 99999, False)
 
 
-def test_a_time_factor_changes_the_pace(own_session: CarlaSession) -> None:
+def test_a_time_factor_changes_the_speed_of_a_replay(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
-    due = recorded(session, call)
+    due = record_ticks(session, call)
     call("set_replayer_time_factor", 2.0)
     assert "at 2.0x" in call("replay_file", "test1.log", 0.0, 0.0, 0, False)
     session.tick()
     session.tick()
-    assert places(session) == due[4]
+    assert positions_of(session) == due[4]
     with pytest.raises(RuntimeError, match="must be above 0"):
         call("set_replayer_time_factor", 0.0)
 
 
-def test_another_server_replays_with_other_numbers(folder: Path) -> None:
+def test_another_server_replays_with_new_actor_numbers(folder: Path) -> None:
     with make_server(recordings=folder) as server:
-        due = recorded(server.session, calls_of(server.session))
+        due = record_ticks(server.session, calls_of(server.session))
     with make_server(recordings=folder, agents=1, background=20) as server:
         session, call = server.session, calls_of(server.session)
         before = set(session.actors.actors)
         call("replay_file", "test1.log", 0.0, 0.0, 0, False)
         session.tick()
-        found = places(session)
-        assert not before & found.keys(), "clients know other actors by these numbers"
+        found = positions_of(session)
+        assert not before & found.keys(), "a replayed actor has the number of an actor of the world"
         assert sorted(found.values()) == sorted(due[1].values())
         roles = {one.attributes["role_name"] for one in session.actors.vehicles}
         assert {"car_0", "car_1", "car_2"} <= roles
 
 
-def test_reports_list_actors_collisions_and_actors_that_stand(own_session: CarlaSession) -> None:
+def test_reports_list_actors_collisions_and_blocked_actors(own_session: CarlaSession) -> None:
     session, call = own_session, calls_of(own_session)
     number = call("spawn_actor", [1, "static.prop.kiosk_01", []], spawn_point(session))[0]
     session.tick()
-    recorded(session, call)
+    record_ticks(session, call)
     info = call("show_recorder_file_info", "test1.log", False)
     assert f"Map: {session.map.name}\n" in info
     assert "Frame 1 at 0 seconds\n" in info
@@ -239,7 +241,7 @@ def test_reports_list_actors_collisions_and_actors_that_stand(own_session: Carla
 
 def spawn_point(session: CarlaSession) -> list[Any]:
     """Return a free spawn point."""
-    taken = np.array(list(places(session).values()))[:, :2]
+    taken = np.array(list(positions_of(session).values()))[:, :2]
     for pose in session.map.spawn_points:
         if np.linalg.norm(taken - pose.place[:2], axis=1).min() > 30.0:
             return pose.packed()
@@ -316,7 +318,7 @@ def test_other_files_are_refused(own_session: CarlaSession, folder: Path) -> Non
 
 def test_a_recording_of_the_same_name_is_replaced(own_session: CarlaSession, folder: Path) -> None:
     session, call = own_session, calls_of(own_session)
-    recorded(session, call)
+    record_ticks(session, call)
     call("start_recorder", "test1.log", False)
     session.tick()
     call("stop_recorder")
@@ -325,7 +327,7 @@ def test_a_recording_of_the_same_name_is_replaced(own_session: CarlaSession, fol
 
 def test_a_recording_of_another_map_is_refused(folder: Path) -> None:
     with make_server(recordings=folder) as server:
-        recorded(server.session, calls_of(server.session))
+        record_ticks(server.session, calls_of(server.session))
     with make_server(recordings=folder, env="ring") as server:
         call = calls_of(server.session)
         with pytest.raises(RuntimeError, match=r"load_world\('grid4x4'\)"):
@@ -335,13 +337,13 @@ def test_a_recording_of_another_map_is_refused(folder: Path) -> None:
 def test_a_long_recording_ends(folder: Path, caplog: pytest.LogCaptureFixture) -> None:
     limits = SessionLimits(max_recorded=50)
     with make_server(recordings=folder, limits=limits) as server:
-        recorded(server.session, calls_of(server.session))
+        record_ticks(server.session, calls_of(server.session))
     assert "it has reached its limit of 50 rows" in caplog.text
     assert len(Recording.open(folder / "test1.log").ticks()) == 5
 
 
 class FullDisk(io.StringIO):
-    """A file on a disk that has room for some lines."""
+    """A file on a disk that has room for `lines` lines."""
 
     def __init__(self, lines: int) -> None:
         super().__init__()
@@ -377,7 +379,7 @@ def test_a_full_disk_ends_the_recording_but_not_the_server(
             with pytest.raises(RuntimeError, match=r"full: cannot be written \(No space left on"):
                 call("start_recorder", "full", False)
         session.tick()
-    recorded(session, call)  # another recording can be made
+    record_ticks(session, call)  # another recording can be made
 
 
 def test_without_a_folder_nothing_is_recorded() -> None:

@@ -1,4 +1,4 @@
-"""The ports of a server: bad input harms neither the world nor other clients."""
+"""The ports of a server: invalid input does not affect the world or other clients."""
 
 from __future__ import annotations
 
@@ -69,11 +69,11 @@ def listen_to(port: int, stream: int) -> socket.socket:
 
 
 def frame_of(connection: socket.socket) -> bytes:
-    (size,) = struct.unpack("<I", exactly(connection, 4))
-    return exactly(connection, size)
+    (size,) = struct.unpack("<I", receive_bytes(connection, 4))
+    return receive_bytes(connection, size)
 
 
-def exactly(connection: socket.socket, size: int) -> bytes:
+def receive_bytes(connection: socket.socket, size: int) -> bytes:
     found = b""
     while len(found) < size:
         more = connection.recv(size - len(found))
@@ -85,7 +85,7 @@ def exactly(connection: socket.socket, size: int) -> bytes:
 @pytest.mark.parametrize(
     "data", [b"GET / HTTP/1.1\r\n\r\n", b"\xc1\xc1", msgpack.packb([0, 1, 2, 3]), b"\x91" * 4000]
 )
-def test_garbage_ends_its_connection_only(port: int, data: bytes) -> None:
+def test_an_invalid_message_closes_only_its_own_connection(port: int, data: bytes) -> None:
     with Wire(port) as good, Wire(port) as bad:
         bad.socket.sendall(data)
         assert bad.is_closed()
@@ -116,7 +116,7 @@ def test_a_snapshot_has_all_actors_and_the_time(port: int) -> None:
     assert len(states) // VEHICLE_STATE.itemsize >= 1 + 64 + 8 + 1  # spectator, lights, vehicles
 
 
-def test_calls_before_and_after_wrong_ones_are_answered_in_order(port: int) -> None:
+def test_valid_and_invalid_calls_are_answered_in_order(port: int) -> None:
     with Wire(port) as wire:
         assert wire.call("fly").startswith("rpclib: server could not find function 'fly'")
         assert wire.call("get_sensor_token")[0][0] == 0
@@ -124,7 +124,7 @@ def test_calls_before_and_after_wrong_ones_are_answered_in_order(port: int) -> N
         assert wire.call("tick_cue")[0][0] == 1
 
 
-def test_a_client_that_stops_reading_is_left_out_and_then_dropped() -> None:
+def test_a_client_that_stops_reading_is_disconnected() -> None:
     over: list[bool] = []
     with make_server(limits=SessionLimits(max_unsent=1 << 18)) as server:
         began = time.monotonic()
@@ -138,7 +138,7 @@ def test_a_client_that_stops_reading_is_left_out_and_then_dropped() -> None:
             with listen_to(server.port, EPISODE_STREAM) as deaf:
                 deaf.setsockopt(
                     socket.SOL_SOCKET, socket.SO_RCVBUF, 1
-                )  # it is full after few ticks
+                )  # the buffer is full after a few ticks
                 rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
                 wire.call("set_episode_settings", [True, False, [False], *rest])
                 while server.session.streams.connections and not is_over():
@@ -168,7 +168,7 @@ def test_only_this_machine_can_connect_without_a_flag(caplog: pytest.LogCaptureF
     assert "every program that reaches this address controls the world" in caplog.text
 
 
-def test_a_served_world_without_clients_is_the_same_bit_for_bit(env: cavmarl.CavEnv) -> None:
+def test_a_server_without_clients_does_not_change_the_world(env: cavmarl.CavEnv) -> None:
     env.reset(seed=3)
     alone = []
     for _ in range(100):
@@ -182,22 +182,22 @@ def test_a_served_world_without_clients_is_the_same_bit_for_bit(env: cavmarl.Cav
             server.session.tick()
             served.append(env.state_hash())
     assert served == alone
-    env.step(env.suggest_actions())  # the time master has released the environment
+    env.step(env.suggest_actions())  # closing the server releases the environment
 
 
-def test_an_environment_must_have_continuous_actions() -> None:
+def test_an_environment_with_discrete_actions_is_refused() -> None:
     made = cavmarl.parallel_env("grid4x4", overrides={"action.kind": "discrete"})
     with pytest.raises(ConfigError, match=r"set action\.kind = continuous"):
         CarlaServer(GivenWorld(made, find_map("grid4x4")), port=0, step_s=made.step_s)
     made.close()
 
 
-def test_another_map_is_refused(env: cavmarl.CavEnv) -> None:
+def test_a_server_refuses_a_map_that_is_not_of_its_environment(env: cavmarl.CavEnv) -> None:
     with pytest.raises(ConfigError, match="not the map of grid4x4"):
         GivenWorld(env, find_map("intersection"))
 
 
-def test_values_of_a_served_world_are_allowed() -> None:
+def test_settings_of_a_served_world_are_valid() -> None:
     made = cavmarl.parallel_env("merge", overrides=SERVED_WORLD)
     assert made.config.action.kind == "continuous"
     made.close()

@@ -1,4 +1,4 @@
-"""Zones that CARLA servers run: the official client in processes of its own, against our server."""
+"""Zones that CARLA servers run: the official client, in its own process, connects to our server."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from cavmarl.handoff.simulators.carla_zone import PYTHON, CarlaZone
 from tests.cosim.carla.conftest import VERSION, client_python, run_client, running_server
 from tests.support.zone_simulators import step_on
 
-# At first no client ticks, so this program waits until a snapshot has vehicles.
+# No snapshot has vehicles before the first tick, so this program waits for one that has vehicles.
 DESTROY = """
 import time
 until = time.monotonic() + 10.0
@@ -110,7 +110,7 @@ def test_vehicles_cross_the_borders_of_carla_zones_and_none_is_lost(
         gone = stats["arrived"] - before["arrived"]
         assert stats["running"] == before["running"] + entered - gone
         assert stats["contacts"] <= 2
-        assert np.quantile(far, 0.9) < 0.5, "they drive on the middle of their lanes"
+        assert np.quantile(far, 0.9) < 0.5, "the vehicles do not drive in the middle of their lanes"
     assert not any(map(is_running, pids))
     # The client sets CARLA's traffic lights to the states of this world without an error.
     assert "set_traffic_light_state" not in caplog.text
@@ -126,7 +126,7 @@ def test_a_reset_uses_the_same_client() -> None:
         assert clients_of(vec) == [first]
 
 
-def test_a_client_that_dies_ends_in_an_error_or_gives_its_zone_back() -> None:
+def test_a_dead_client_is_an_error_or_returns_its_zone_to_cavmarl() -> None:
     with carla_zones(2, 1, background=10) as vec:
         vec.reset()
         (client,) = clients_of(vec)
@@ -150,7 +150,7 @@ def test_a_client_that_dies_ends_in_an_error_or_gives_its_zone_back() -> None:
         assert not clients_of(vec)
 
 
-def test_a_client_that_hangs_ends_in_an_error() -> None:
+def test_a_client_that_does_not_answer_is_an_error() -> None:
     with carla_zones(2, 1, background=10, options="?timeout_s=0.5") as vec:
         vec.reset()
         (client,) = clients_of(vec)
@@ -174,8 +174,8 @@ def test_an_actor_that_another_client_destroys_is_an_error() -> None:
             step_on(vec, 3)
 
 
-def test_a_server_that_has_no_room_for_a_vehicle_refuses_it() -> None:
-    # The server has room for external vehicles of its own, and for fewer than the zone needs.
+def test_a_server_with_no_place_for_a_vehicle_is_an_error() -> None:
+    # The server's limit of external vehicles is below the number of vehicles in the zone.
     with carla_zones(2, 1, background=150, overrides={"zones.max_deferred_ticks": 3}) as vec:
         vec.reset()
         with pytest.raises(ZoneSimulatorError, match=r"refused vehicle .*all 64 places of"):
@@ -212,7 +212,7 @@ def test_a_server_with_another_map_is_refused(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("backend", ["processes:2", "nodes:2"])
-def test_carla_zones_belong_to_a_process_and_survive_it(backend: str) -> None:
+def test_a_carla_zone_survives_the_death_of_its_process(backend: str) -> None:
     with carla_zones(2, 1, background=20, backend=backend) as vec:
         vec.reset()
         step_on(vec, 40)

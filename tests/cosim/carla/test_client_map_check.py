@@ -22,7 +22,7 @@ from tests.cosim.carla.conftest import VERSION, client_python
 pytest.importorskip("sumo", reason="needs the extra 'sumo'")
 
 SEVERAL_MAPS = {"cities", "cities_sensed", "cities_test", "cities_test_left", "cities_validation"}
-ENVS = sorted(set(entries()) - SEVERAL_MAPS - {"rush"})  # rush has the map of town
+ENVS = sorted(set(entries()) - SEVERAL_MAPS - {"rush"})  # rush uses the map of town
 
 
 @pytest.fixture
@@ -43,8 +43,8 @@ def test_carlas_library_reads_the_export_of_each_map(env: str) -> None:
 
 
 @pytest.mark.usefixtures("client")
-def test_carlas_library_reads_the_exports_of_a_family_of_maps() -> None:
-    """Movements, junctions and lanes with lights are complete."""
+def test_carlas_library_reads_the_export_of_each_city() -> None:
+    """Check that the library finds all movements, junctions and lanes with lights."""
     totals = dict.fromkeys(("movements", "junctions", "lanes with lights"), 0)
     for path in resolve_maps(*load_config("cities")):
         found = check_with_client(load_network(path), path, path)
@@ -76,7 +76,7 @@ def test_the_command_reads_files_and_names_missing_parts(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("found", ["", "/nowhere/python", "here"])
-def test_an_absent_client_is_an_error_before_any_work(
+def test_a_missing_client_is_an_error_before_the_program_runs(
     monkeypatch: pytest.MonkeyPatch, found: str, tmp_path: Path
 ) -> None:
     python = tmp_path / "python"

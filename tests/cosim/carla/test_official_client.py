@@ -260,7 +260,7 @@ found["frames"] = [frames[1] - frames[0], frames[2] - frames[1]]
 
 
 def test_the_client_reads_the_answer_of_each_of_its_methods(port: int) -> None:
-    """A wrong answer is `std::bad_cast`; a refused call has a reason, or no answer at all."""
+    """Call each method; a wrong answer would raise `std::bad_cast` in the client."""
     found = run_client(
         port,
         SYNCHRONOUS
@@ -347,7 +347,7 @@ found["batch"] = [one.error for one in client.apply_batch_sync(commands, True)]
     if HAS_REASONS:
         assert len(found["errors"]) == 3
         assert all("no folder for recordings" in one for one in found["errors"])
-    else:  # physics are refused, too
+    else:  # this version refuses calls about physics, too
         assert len(found["errors"]) >= 2
     assert VERSION != "0.9.16" or not found["absent"]
     assert found["batch"][:3] == ["", "", ""]

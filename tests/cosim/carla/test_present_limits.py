@@ -1,4 +1,4 @@
-"""Clients read the present speed limits, also where the world has changed them."""
+"""Clients read the present speed limits, including limits that the world has changed."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from cavmarl.cosim.carla.carla_server import CarlaServer
 from cavmarl.cosim.carla.hosted_world import LoadedWorlds
 
 
-def test_the_limit_of_a_damaged_road_is_that_of_its_vehicles() -> None:
+def test_vehicles_on_a_damaged_road_have_its_speed_limit() -> None:
     spec = WorldSpec.of("grid4x4", agents=3, background=30, overrides={"map.changed_lanes": 8})
     with CarlaServer(LoadedWorlds(spec), port=0) as server:
         session = server.session

@@ -49,7 +49,7 @@ def port() -> Iterator[int]:
         yield found
 
 
-def started(words: list[str], where: Path, **more: str) -> subprocess.Popen[str]:
+def start_program(words: list[str], where: Path, **more: str) -> subprocess.Popen[str]:
     quiet = {"SDL_VIDEODRIVER": "dummy", "SDL_AUDIODRIVER": "dummy", "MPLBACKEND": "Agg"}
     agents = str(folder("PythonAPI", "carla"))
     return subprocess.Popen(
@@ -62,7 +62,7 @@ def started(words: list[str], where: Path, **more: str) -> subprocess.Popen[str]
     )
 
 
-def ended(process: subprocess.Popen[str]) -> str:
+def interrupt(process: subprocess.Popen[str]) -> str:
     """Interrupt a program, as a user does, and return its output."""
     process.send_signal(signal.SIGINT)
     try:
@@ -72,7 +72,7 @@ def ended(process: subprocess.Popen[str]) -> str:
 
 
 def output_after(process: subprocess.Popen[str], mark: str) -> str:
-    """Read the output of a program until a line has a mark, interrupt it, and return all output."""
+    """Interrupt a program once its output contains `mark`; return all its output."""
     watch = threading.Timer(ENDS_S, process.kill)
     watch.start()
     seen = ""
@@ -82,10 +82,10 @@ def output_after(process: subprocess.Popen[str], mark: str) -> str:
         if mark in line:
             break
     watch.cancel()
-    return seen + ended(process)
+    return seen + interrupt(process)
 
 
-def test_config(port: int) -> None:
+def test_config_runs(port: int) -> None:
     where = folder("PythonAPI", "util")
     for words, told in (
         (["--inspect"], "vehicles:                    8"),
@@ -93,33 +93,33 @@ def test_config(port: int) -> None:
         (["--map", "intersection"], "load map 'intersection'"),
         (["--map", "grid4x4", "--delta-seconds", "0.05"], "set fixed frame rate 50.00"),
     ):
-        process = started(["config.py", "--port", str(port), *words], where)
+        process = start_program(["config.py", "--port", str(port), *words], where)
         text, _ = process.communicate(timeout=ENDS_S)
         assert told in text
         assert process.returncode == 0
 
 
-def test_generate_traffic(port: int) -> None:
+def test_generate_traffic_runs(port: int) -> None:
     words = ["generate_traffic.py", "--port", str(port), "-n", "10", "-w", "0", "--seed", "1"]
     where = folder("PythonAPI", "examples")
-    text = output_after(started(words, where), "press Ctrl+C to exit")
+    text = output_after(start_program(words, where), "press Ctrl+C to exit")
     assert "spawned 10 vehicles and 0 walkers" in text
     assert "destroying 10 vehicles" in text
     assert "Traceback" not in text.partition("KeyboardInterrupt")[0]
 
 
 @pytest.mark.parametrize("name", ["synchronous_mode.py", "sensor_synchronization.py"])
-def test_frames_of_sensors_come_with_their_ticks(name: str, tmp_path: Path) -> None:
+def test_programs_get_the_sensor_frames_of_each_tick(name: str, tmp_path: Path) -> None:
     """The programs drive random routes, so they need a map without dead ends."""
     where = folder("PythonAPI", "examples")
     copy = tmp_path / name
     with running_server(agents=1, background=0, env="ring") as port:
         copy.write_text((where / name).read_text("utf-8").replace("2000", str(port)), "utf-8")
         for _ in range(5):
-            process = started([str(copy)], where)
+            process = start_program([str(copy)], where)
             with suppress(subprocess.TimeoutExpired):  # the program runs until it is interrupted
                 process.wait(8.0)
-            text = ended(process)
+            text = interrupt(process)
             if "Spawn failed because of collision" not in text:  # the random place is occupied
                 break
     assert "Cancelled by user. Bye!" in text or "Exited by user." in text, text
@@ -165,7 +165,7 @@ def test_sumo_and_the_world_show_each_other_their_vehicles(port: int, tmp_path: 
         encoding="utf-8",
     )
     words = ["-c", RUN_WITH_SUMO, str(tmp_path / "grid.sumocfg"), "--carla-port", str(port)]
-    process = started([*words, "--step-length", "0.05"], where, SUMO_HOME=sumo.SUMO_HOME)
+    process = start_program([*words, "--step-length", "0.05"], where, SUMO_HOME=sumo.SUMO_HOME)
     try:
         found = run_client(
             port,
@@ -193,7 +193,7 @@ found["speed"] = moved
 """,
         )
     finally:
-        text = ended(process)
+        text = interrupt(process)
     assert found["vehicles"] >= 5, text
     assert found["away"] < 0.5
     assert found["speed"] > 3.0
@@ -205,7 +205,7 @@ def test_a_run_is_recorded_shown_and_replayed(tmp_path: Path) -> None:
     with running_server(env="town", agents=1, background=2, recordings=tmp_path) as port:
 
         def run(name: str, *words: str) -> str:
-            process = started([name, "--port", str(port), *words], where)
+            process = start_program([name, "--port", str(port), *words], where)
             text, _ = process.communicate(timeout=ENDS_S)
             assert process.returncode == 0, text
             assert "Traceback" not in text

@@ -63,14 +63,14 @@ def test_any_bytes_are_read_or_refused(data: bytes) -> None:
     assert all(isinstance(request, Request) for request in found)
 
 
-def test_a_truncated_request_waits_for_its_rest() -> None:
+def test_an_incomplete_request_is_kept_until_it_is_complete() -> None:
     data = packed(1, "version")
     reader = RequestReader(MOST)
     assert list(reader.read(data[:-1])) == []
     assert list(reader.read(data[-1:])) == [Request(1, "version", [])]
 
 
-def test_the_bytes_that_wait_for_the_rest_of_a_message_are_limited() -> None:
+def test_the_buffer_for_an_incomplete_message_is_limited() -> None:
     reader = RequestReader(MOST)
 
     def send_text_of_4_gb() -> int:

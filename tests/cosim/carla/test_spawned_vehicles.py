@@ -101,7 +101,7 @@ found["onward"] = car.get_location().distance(start.location)
     assert found["jumped"] < 1.0
     assert found["same"] == [True, 1]
     assert found["back"] < 0.5
-    assert found["onward"] > found["back"], "its control is still in force"
+    assert found["onward"] > found["back"], "the vehicle does not use its last control"
 
 
 def test_the_traffic_manager_drives_spawned_vehicles() -> None:
@@ -188,7 +188,7 @@ found["stopped"] = car.get_velocity().length()
     assert found["backward"] < found["forward"] - 2.0
     assert found["control"] == [True, -1]
     assert found["speed"] < -2.0
-    assert found["turned"] < -2.0, "backwards, steering to the right turns the car to the left"
+    assert found["turned"] < -2.0, "a car that drives backward and steers right does not turn left"
     assert found["stopped"] == pytest.approx(0.0, abs=0.02)
 
 

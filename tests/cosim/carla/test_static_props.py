@@ -12,7 +12,7 @@ from cavmarl.cosim.carla.attached_imaging import SEMANTIC_POINT
 from cavmarl.cosim.carla.carla_geometry import CarlaPose
 from cavmarl.cosim.carla.carla_session import CarlaSession
 from tests.cosim.carla.conftest import Call, make_server, run_client, running_server
-from tests.cosim.carla.test_attached_sensors import newest, recorded
+from tests.cosim.carla.test_attached_sensors import newest, record_frames
 from tests.cosim.carla.test_official_client import SYNCHRONOUS
 
 CONE, BARRIER = "static.prop.trafficcone01", "static.prop.streetbarrier"
@@ -41,7 +41,7 @@ def test_a_prop_stands_and_can_be_moved_and_destroyed(session: CarlaSession, cal
     assert (row["length"], row["width"], row["height"]) == pytest.approx((0.4, 0.4, 0.9))
     state = session.actors.state_of(session.actors.actors[number])
     assert state is not None
-    assert not state.tobytes()[65:].strip(b"\0"), "a prop has no controls"
+    assert not state.tobytes()[65:].strip(b"\0"), "a prop accepts controls"
     with pytest.raises(RuntimeError, match="is not a vehicle"):
         call("apply_control_to_vehicle", number, [1.0, 0.0, 0.0, False, False, False, 0])
     call("set_actor_transform", number, [[61.0, -9.0, 0.0], [0.0, 0.0, 0.0]])
@@ -60,7 +60,7 @@ def test_a_prop_stands_and_can_be_moved_and_destroyed(session: CarlaSession, cal
 def test_sensors_show_the_tag_and_the_number_of_a_prop(
     session: CarlaSession, call: Call, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    recorder = recorded(monkeypatch)
+    recorder = record_frames(monkeypatch)
     number = call("spawn_actor", [0, BARRIER, []], [[66.0, -60.0, 0.0], [0.0, 0.0, 0.0]])[0]
     behind = [[60.0, -60.0, 1.0], [0.0, 0.0, 0.0]]
     lidar = call("spawn_actor", [0, "sensor.lidar.ray_cast_semantic", LIDAR], behind)[0]
@@ -109,8 +109,8 @@ def test_traffic_brakes_before_a_prop_and_passes_it() -> None:
             apart_m = np.hypot(rows["x"] - x, rows["y"] - y)
             nearest_m = min(nearest_m, float(apart_m.min()))
             slowest_mps = min([slowest_mps, *rows["speed"][apart_m < 12.0].tolist()])
-        assert slowest_mps < 1.0, "a vehicle brakes before the barrier"
-        assert 1.5 < nearest_m < 8.0, "vehicles pass it on the other lane"
+        assert slowest_mps < 1.0, "no vehicle brakes before the barrier"
+        assert 1.5 < nearest_m < 8.0, "no vehicle passes the barrier on the other lane"
         assert row_of(session, number)["speed"] == 0.0
 
 

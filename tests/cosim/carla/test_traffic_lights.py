@@ -21,8 +21,8 @@ def own_session() -> Iterator[CarlaSession]:
         yield server.session
 
 
-def ticks(session: CarlaSession, number: int) -> list[list[int]]:
-    """Return the states of all lights after each of some ticks."""
+def run_ticks(session: CarlaSession, number: int) -> list[list[int]]:
+    """Advance `number` ticks; return the states of all lights after each tick."""
     found = []
     for _ in range(number):
         session.tick()
@@ -30,36 +30,36 @@ def ticks(session: CarlaSession, number: int) -> list[list[int]]:
     return found
 
 
-def test_a_light_shows_a_state_for_its_time_and_then_follows_its_group(
+def test_a_light_keeps_a_set_state_for_its_time_and_then_follows_its_group(
     own_session: CarlaSession,
 ) -> None:
     lights = own_session.world.lights
-    ticks(own_session, 2)
+    run_ticks(own_session, 2)
     before = lights.states().tolist()
     light = before.index(RED)
     lights.set_time(light, GREEN, 1.0)
     lights.set_state(light, GREEN)
-    shown = [states[light] for states in ticks(own_session, 30)]
+    shown = [states[light] for states in run_ticks(own_session, 30)]
     assert shown[:18] == [GREEN] * 18
     assert shown[-5:] == [RED] * 5
     others = [k for k in range(len(before)) if k != light]
     assert [lights.states()[k] for k in others] == [before[k] for k in others]
     lights.set_state(light, OFF)
-    assert {states[light] for states in ticks(own_session, 40)} == {OFF}
+    assert {states[light] for states in run_ticks(own_session, 40)} == {OFF}
 
 
 def test_frozen_lights_keep_their_states_and_their_times(own_session: CarlaSession) -> None:
     lights = own_session.world.lights
-    plain = [state.copy() for state in ticks(own_session, 3)][-1]
+    plain = [state.copy() for state in run_ticks(own_session, 3)][-1]
     lights.freeze(True)
-    frozen = ticks(own_session, 1200)  # a minute
+    frozen = run_ticks(own_session, 1200)  # a minute
     assert {tuple(states) for states in frozen} == {tuple(plain)}
     states = own_session.actors.lights
     assert states["is_frozen"].all()
     elapsed_s = states["elapsed_s"].copy()
     light = plain.index(RED)
     lights.set_state(light, GREEN)
-    assert [one[light] for one in ticks(own_session, 40)] == [GREEN] * 40
+    assert [one[light] for one in run_ticks(own_session, 40)] == [GREEN] * 40
     lights.freeze(False)
     own_session.tick()
     assert not states["is_frozen"].any()
@@ -70,11 +70,11 @@ def test_frozen_lights_keep_their_states_and_their_times(own_session: CarlaSessi
 def test_a_released_group_continues_its_program(own_session: CarlaSession) -> None:
     lights = own_session.world.lights
     with make_server() as other:
-        wanted = ticks(other.session, 900)
-    shown = ticks(own_session, 100)
+        wanted = run_ticks(other.session, 900)
+    shown = run_ticks(own_session, 100)
     lights.freeze(True)
     lights.freeze(False)
-    assert shown + ticks(own_session, 800) == wanted
+    assert shown + run_ticks(own_session, 800) == wanted
 
 
 def test_times_scale_the_cycle_of_a_group(own_session: CarlaSession) -> None:
@@ -88,7 +88,7 @@ def test_times_scale_the_cycle_of_a_group(own_session: CarlaSession) -> None:
     shown = own_session.actors.lights
     assert shown["times_s"][light].tolist()[:2] == [2.0, 0.5]
     assert shown["times_s"][light][2] == pytest.approx(lights.times_s[light][2])
-    states = [one[light] for one in ticks(own_session, 60)]
+    states = [one[light] for one in run_ticks(own_session, 60)]
     assert states.count(GREEN) == pytest.approx(39, abs=2)
     assert states.count(YELLOW) == pytest.approx(10, abs=1)
     lights.reset()

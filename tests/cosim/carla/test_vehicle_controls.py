@@ -70,7 +70,7 @@ def test_actions_are_within_the_bounds_of_the_agent() -> None:
     assert steer == pytest.approx(-7.0, abs=1e-4)
 
 
-def test_a_longer_vehicle_turns_as_fast() -> None:
+def test_vehicles_with_different_wheelbases_get_the_same_yaw_rate() -> None:
     for angle in (-1.0, 0.05, 0.6):
         longer = same_turn(angle, 1.4)
         yaw_rates = [

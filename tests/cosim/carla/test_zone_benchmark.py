@@ -1,4 +1,4 @@
-"""Hand-overs between zones with CARLA's client: the figures of a small run."""
+"""Measure hand-overs between two zones with CARLA's client in a small run."""
 
 from __future__ import annotations
 

@@ -12,8 +12,8 @@ from cavmarl.core.errors import ZoneSimulatorError
 from cavmarl.handoff.simulators import carla_zone
 
 
-def python_that(folder: Path, command: str) -> str:
-    """Return a program in place of the Python that has CARLA's client."""
+def fake_python(folder: Path, command: str) -> str:
+    """Write a program that replaces the Python of CARLA's client; return its path."""
     program = folder / "python"
     program.write_text(f"#!/bin/sh\n{command}\n")
     program.chmod(0o755)
@@ -33,10 +33,10 @@ def python_that(folder: Path, command: str) -> str:
         ("exec sleep 60", r"its client has not answered in time \(timeout_s = 0.2\)"),
     ],
 )
-def test_a_client_that_does_not_work_is_an_error(
+def test_a_client_that_fails_is_an_error(
     command: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setenv(carla_zone.PYTHON, python_that(tmp_path, command))
+    monkeypatch.setenv(carla_zone.PYTHON, fake_python(tmp_path, command))
     monkeypatch.setattr(carla_zone, "GRACE_S", 0.1)
     simulators = {1: "carla://127.0.0.1:9?timeout_s=0.2"}
     vec = cavmarl.make_vec("ring", zones=2, zone_simulators=simulators, agents=2, background=4)
@@ -58,10 +58,10 @@ def test_a_python_that_is_missing_is_an_error(
     vec.close()
 
 
-def test_cavmarl_runs_a_zone_whose_simulator_cannot_start(
+def test_cavmarl_runs_a_zone_if_its_simulator_cannot_start(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setenv(carla_zone.PYTHON, python_that(tmp_path, "exit 3"))
+    monkeypatch.setenv(carla_zone.PYTHON, fake_python(tmp_path, "exit 3"))
     vec = cavmarl.make_vec(
         "ring",
         zones=2,

@@ -1,4 +1,4 @@
-"""Worlds with a ROS 2 bridge, and the other end of its topics."""
+"""Worlds with a ROS 2 bridge, and a node that uses its topics."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def types() -> RosTypes:
 
 @pytest.fixture
 def domain() -> int:
-    """Return a DDS domain for this process; tests in other processes run at the same time."""
+    """Return a DDS domain for this process; tests in other processes may run at the same time."""
     return 10 + os.getpid() % 80
 
 
@@ -61,7 +61,7 @@ Run = Callable[..., tuple[dict[str, Any], str]]
 
 @pytest.fixture
 def run_bridge(tmp_path: Path) -> Iterator[Run]:
-    """Return a function that runs a world with a bridge; it returns the report and the hash."""
+    """Return a function that runs a world with a bridge and returns its report and state hash."""
     threads: list[threading.Thread] = []
 
     def run(
@@ -101,7 +101,7 @@ def run_bridge(tmp_path: Path) -> Iterator[Run]:
 
 
 class Driver:
-    """A node that answers each clock message with a command of the same time until it is closed."""
+    """A node that answers each clock message with a command of the same time."""
 
     def __init__(
         self,

@@ -47,7 +47,7 @@ KINDS = {
 }
 CONTROL = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
 
-# Letters of SUMO with color, shape and status of each element.
+# Each letter of SUMO's signal states, with the (color, shape, status) of Autoware's elements.
 SHOWN = {
     "r": [(1, 5, 14)],
     "u": [(1, 5, 14), (2, 5, 14)],
@@ -70,18 +70,18 @@ def vehicle(**more: float) -> dict[str, float]:
     return {**row, **more}
 
 
-def held(stamp: int) -> dict[str, Any]:
+def control_fields(stamp: int) -> dict[str, Any]:
     time_ = {"sec": stamp // 10**9, "nanosec": stamp % 10**9}
     return {"stamp": time_, "longitudinal": {"acceleration": 1.0, "is_defined_acceleration": True}}
 
 
-def sent_back(types: RosTypes, kind: str, fields: dict[str, Any]) -> Any:
+def encode_and_decode(types: RosTypes, kind: str, fields: dict[str, Any]) -> Any:
     return types.decode(kind, types.encode(kind, fields))
 
 
-def test_each_state_of_a_signal_has_its_elements(types: RosTypes) -> None:
+def test_each_state_of_a_signal_becomes_its_light_elements(types: RosTypes) -> None:
     codes = np.array([*range(len(SIGNAL_STATES)), SIGNAL_NONE], dtype=np.uint8)
-    found = sent_back(types, KINDS[LIGHTS], light_groups(codes, 5 * 10**9 + 7))
+    found = encode_and_decode(types, KINDS[LIGHTS], light_groups(codes, 5 * 10**9 + 7))
     assert (found.stamp.sec, found.stamp.nanosec) == (5, 7)
     groups = found.traffic_light_groups
     # a link without a signal has no group
@@ -95,7 +95,7 @@ def test_each_state_of_a_signal_has_its_elements(types: RosTypes) -> None:
 
 def test_objects_have_class_shape_and_path(types: RosTypes) -> None:
     rows = [vehicle(), vehicle(id=301, vclass=0, speed=0.0, heading=0.0, pitch=0.1)]
-    found = sent_back(types, KINDS[OBJECTS], predicted_objects(rows, 10**9))
+    found = encode_and_decode(types, KINDS[OBJECTS], predicted_objects(rows, 10**9))
     bus, car = found.objects
     assert found.header.frame_id == "map"
     assert (bus.classification[0].label, car.classification[0].label) == (3, 1)
@@ -113,14 +113,14 @@ def test_objects_have_class_shape_and_path(types: RosTypes) -> None:
     assert (path.time_step.sec, path.time_step.nanosec) == (0, 500_000_000)
     np.testing.assert_allclose(places, np.stack([10.0 + 0 * times_s, 20.0 + 8.0 * times_s], 1))
     assert path.path[-1].orientation.z == pytest.approx(begin.orientation.z)
-    detected = sent_back(types, KINDS[DETECTED], detected_objects(rows, 10**9)).objects
+    detected = encode_and_decode(types, KINDS[DETECTED], detected_objects(rows, 10**9)).objects
     assert [one.kinematics.pose_with_covariance.pose for one in detected] == [
         one.kinematics.initial_pose_with_covariance.pose for one in found.objects
     ]
     assert detected[0].kinematics.orientation_availability == 2
 
 
-def test_a_turning_object_goes_around_a_circle() -> None:
+def test_the_predicted_path_of_a_turning_object_is_a_circle() -> None:
     row = vehicle(steering=0.3, length=4.5)
     (found,) = predicted_objects([row], 0)["objects"]
     kinematics = found["kinematics"]
@@ -131,16 +131,16 @@ def test_a_turning_object_goes_around_a_circle() -> None:
     slip = math.atan(0.5 * math.tan(0.3))
     course = row["heading"] + slip
     middle = places[0] + radius_m * np.array([-math.sin(course), math.cos(course)])
-    # chords as long as arcs: the polygon is a little larger than the circle
+    # each chord has the length of an arc, so the polygon is a little larger than the circle
     np.testing.assert_allclose(np.hypot(*(places - middle).T), radius_m, rtol=0.2)
     turned = 2.0 * math.asin(path["path"][1]["orientation"]["z"]) - row["heading"]
     assert turned == pytest.approx(PATH_STEP_S * yaw_rate)
 
 
-def test_lights_objects_and_destination_are_those_of_the_world(
+def test_messages_have_the_lights_objects_and_destination_of_the_world(
     types: RosTypes, domain: int, run_bridge: Run
 ) -> None:
-    with Driver(types, domain, KINDS, held, CONTROL) as driver:
+    with Driver(types, domain, KINDS, control_fields, CONTROL) as driver:
         options = RosOptions(domain=domain, profile="autoware", truth=True)
         report, _ = run_bridge(options, 30)
         for topic in KINDS:
@@ -177,7 +177,7 @@ def test_lights_objects_and_destination_are_those_of_the_world(
     x, y = goal.pose.position.x, goal.pose.position.y
     assert min(x, y, 600.0 - x, 600.0 - y) < 5.0
     course = 2.0 * math.atan2(goal.pose.orientation.z, goal.pose.orientation.w)
-    # outwards
+    # the destination points out of the grid
     assert (x - 300.0) * math.cos(course) + (y - 300.0) * math.sin(course) > 290.0
     assert heard[POSE][-1].pose.pose.position == own
     assert [one.state for one in heard[STATE]] == [3]
@@ -220,7 +220,7 @@ def test_requests_are_accepted_or_refused(
     assert (counts.accepted, counts.refused) == (int(not refusal), int(bool(refusal)))
 
 
-def test_lights_of_the_vehicle_are_reported_as_commanded(types: RosTypes) -> None:
+def test_the_vehicle_reports_its_turn_and_hazard_lights_as_commanded(types: RosTypes) -> None:
     requests = AutowareRequests(types, truth=False)
     assert "/initialpose" not in requests.topics
     topic = "/control/command/turn_indicators_cmd"
@@ -232,7 +232,7 @@ def test_lights_of_the_vehicle_are_reported_as_commanded(types: RosTypes) -> Non
     assert (requests.counts[topic].accepted, requests.counts[topic].invalid) == (4, 2)
 
 
-def test_a_refusal_is_said_once(
+def test_a_repeated_refusal_is_logged_once(
     types: RosTypes, domain: int, run_bridge: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
     sent = {"/initialpose": POSES, "/control/command/turn_indicators_cmd": TURNS}
@@ -243,7 +243,7 @@ def test_a_refusal_is_said_once(
         def answer(stamp: int) -> dict[str, Any]:
             rviz.publish("/initialpose", place)
             rviz.publish("/control/command/turn_indicators_cmd", left)
-            return held(stamp)
+            return control_fields(stamp)
 
         with (
             caplog.at_level(logging.WARNING),

@@ -1,7 +1,7 @@
-"""Real ROS 2: `rclpy` from its wheels, in a Python that `CAVMARL_RCLPY_PYTHON` names.
+"""Real ROS 2: a node with `rclpy`, in each Python that `CAVMARL_RCLPY_PYTHON` names.
 
-Several Pythons, such as one of Jazzy and one of Kilted, are separated by colons. `make ros2` makes
-them.
+Colons separate several Pythons, for example one with Jazzy and one with Kilted. `make ros2`
+creates these Pythons.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ def start(python: str, domain: int) -> subprocess.Popen[str]:
 @pytest.mark.integration
 @pytest.mark.skipif(not PYTHONS, reason="rclpy is not installed: set CAVMARL_RCLPY_PYTHON")
 @pytest.mark.parametrize("python", PYTHONS)
-def test_a_node_of_ros_drives_in_lock_step(python: str, domain: int, run_bridge: Run) -> None:
+def test_an_rclpy_node_drives_in_lock_step(python: str, domain: int, run_bridge: Run) -> None:
     steps = 400
     with start(python, domain) as node:
         options = RosOptions(domain=domain, truth=True, deadline_s=10.0)

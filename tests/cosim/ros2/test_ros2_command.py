@@ -116,7 +116,7 @@ def test_a_bag_has_the_metadata_that_its_distribution_reads(
     read = yaml.safe_load((bag / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
     assert read["version"] == version
     (topic,) = read["topics_with_message_count"]
-    # up to version 8, profiles are text; Humble reads no others
+    # up to version 8, QoS profiles are text; Humble reads only these versions
     assert isinstance(topic["topic_metadata"]["offered_qos_profiles"], str) == (version == 8)
     with Reader(bag) as reader:
         ((_, when_ns, data),) = reader.messages()

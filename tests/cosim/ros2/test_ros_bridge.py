@@ -63,7 +63,7 @@ def test_a_node_drives_in_lock_step(types: RosTypes, domain: int, run_bridge: Ru
             assert math.isclose(measured[stamp_ns(one)], one.twist.twist.linear.x, abs_tol=0.3)
 
 
-def test_the_world_equals_that_of_a_follower_with_the_same_controls(
+def test_a_bridge_drives_bit_for_bit_like_a_follower_with_the_same_controls(
     types: RosTypes, domain: int, run_bridge: Run, tmp_path: Path
 ) -> None:
     with Driver(types, domain):
@@ -94,11 +94,11 @@ def test_the_world_equals_that_of_a_follower_with_the_same_controls(
     thread.join(10.0)
 
 
-def test_a_follower_of_autowares_topics_drives_bit_for_bit_as_one_of_the_socket(
+def test_a_bridge_with_autowares_topics_drives_bit_for_bit_like_a_follower(
     types: RosTypes, domain: int, run_bridge: Run, tmp_path: Path
 ) -> None:
     def wave(tick: int) -> tuple[float, float]:
-        """Return acceleration and angle as a message has them, in single precision."""
+        """Return acceleration and steering angle, rounded to single precision as in a message."""
         return float(np.float32(math.sin(0.7 * tick))), float(np.float32(0.1 * math.cos(tick)))
 
     def control(stamp: int) -> dict[str, Any]:
@@ -139,30 +139,32 @@ def test_without_commands_the_vehicle_brakes_and_a_warning_is_logged(
     counts = report["controls"]["car_0"]
     assert (counts["held"], counts["used"], counts["received"]) == (6, 0, 0)
     assert "no node publishes commands for car_0" in caplog.text
-    # No node listens. Only messages for late subscribers and their time are sent.
+    # No node listens, so the bridge sends only the clock and messages that it keeps for late nodes.
     assert report["sent"] == {"/tf_static": 1, "/car_0/goal": 1, "/clock": 1}
 
 
-def test_a_missing_command_is_awaited_until_the_deadline_and_counted(
+def test_the_bridge_waits_for_a_missing_command_until_the_deadline(
     types: RosTypes, domain: int, run_bridge: Run
 ) -> None:
-    def old(stamp: int) -> dict[str, Any]:
+    def answer_with_time_0(stamp: int) -> dict[str, Any]:
         return cruise(0)
 
-    with Driver(types, domain, answer=old):
+    with Driver(types, domain, answer=answer_with_time_0):
         began_s = time.monotonic()
         report, _ = run_bridge(RosOptions(domain=domain, deadline_s=0.1), 5)
         assert time.monotonic() - began_s > 0.5
     counts = report["controls"]["car_0"]
     assert counts["late"] == counts["held"] == 5
-    assert counts["used"] == 1  # the command of time 0
+    assert counts["used"] == 1  # the command with time 0
 
 
-def test_a_lag_allows_older_commands(types: RosTypes, domain: int, run_bridge: Run) -> None:
-    def last(stamp: int) -> dict[str, Any]:
+def test_a_lag_of_one_step_allows_the_command_of_the_previous_step(
+    types: RosTypes, domain: int, run_bridge: Run
+) -> None:
+    def answer_previous(stamp: int) -> dict[str, Any]:
         return cruise(max(stamp - 50_000_000, 0))
 
-    with Driver(types, domain, answer=last):
+    with Driver(types, domain, answer=answer_previous):
         report, _ = run_bridge(RosOptions(domain=domain, lag_steps=1), 10)
     assert report["controls"]["car_0"]["used"] == 11
     assert report["controls"]["car_0"]["late"] == 0
@@ -184,7 +186,9 @@ def test_in_mode_newest_the_bridge_never_waits(
     assert counts["late"] == 0
 
 
-def test_the_time_of_ros_never_goes_back(types: RosTypes, domain: int, tmp_path: Path) -> None:
+def test_the_time_of_ros_increases_over_a_new_episode(
+    types: RosTypes, domain: int, tmp_path: Path
+) -> None:
     with (
         Driver(types, domain, {"/car_0/truth": HEARD["/car_0/truth"]}) as driver,
         closing(make_env()) as env,
@@ -279,14 +283,16 @@ def test_two_vehicles_are_refused_by_a_profile_for_one(domain: int, run_bridge: 
 
 
 @pytest.mark.parametrize("key", ["deadline_s", "ready_s"])
-def test_options_that_are_not_numbers_or_negative_are_refused(key: str) -> None:
+def test_options_that_are_nan_or_negative_are_refused(key: str) -> None:
     with pytest.raises(ConfigError, match=f"{key} = nan: must be finite and at least 0"):
         RosOptions(**{key: math.nan})
     with pytest.raises(ConfigError, match="lag_steps = -1: must be at least 0"):
         RosOptions(lag_steps=-1)
 
 
-def test_topics_of_autoware_drive_a_vehicle(types: RosTypes, domain: int, run_bridge: Run) -> None:
+def test_commands_in_autowares_topics_drive_a_vehicle(
+    types: RosTypes, domain: int, run_bridge: Run
+) -> None:
     heard = {
         "/localization/kinematic_state": "nav_msgs/msg/Odometry",
         "/vehicle/status/velocity_status": "autoware_vehicle_msgs/msg/VelocityReport",
@@ -311,7 +317,7 @@ def test_topics_of_autoware_drive_a_vehicle(types: RosTypes, domain: int, run_br
     assert report["controls"]["car_0"]["used"] == 41
     velocities = driver.heard["/vehicle/status/velocity_status"]
     gained = velocities[-1].longitudinal_velocity - velocities[-21].longitudinal_velocity
-    assert gained == pytest.approx(1.5, abs=0.05)  # after 1 s
+    assert gained == pytest.approx(1.5, abs=0.05)  # the last 20 steps take 1 s
     angle = driver.heard["/vehicle/status/steering_status"][-1].steering_tire_angle
     assert angle == pytest.approx(0.05, abs=1e-3)
     assert driver.heard["/vehicle/status/gear_status"][-1].report == 2
@@ -339,7 +345,7 @@ def test_a_bag_has_the_messages_that_were_sent(
         assert kinds[topic] == kind
         assert hashes[topic] == types.type_hash(kind)
         known = {data for _, data in written[topic]}
-        # DDS pads data to a multiple of four bytes
+        # DDS pads messages to a multiple of four bytes
         assert all(any(got.startswith(one) for one in known) for got in driver.data[topic]), topic
     clocks = [when_ns for when_ns, _ in written["/clock"]]
     assert clocks == [50_000_000 * step for step in range(21)]

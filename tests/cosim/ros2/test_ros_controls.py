@@ -55,7 +55,7 @@ def test_a_speed_is_reached_with_a_time_constant(
     assert math.isclose(steering, 0.5, rel_tol=1e-6)
     assert math.isclose(controls.steering_rad, 0.4, rel_tol=1e-6)
     assert (controls.counts.used, controls.counts.limited) == (1, 0)
-    # the acceleration of an Ackermann command limits how fast the speed is approached
+    # the acceleration of an Ackermann command limits the change of speed
     take(controls, types, TOPICS["drive"], drive(0.0, 8.0, 0.5))
     assert math.isclose(controls.control(NOW_NS, 7.0)[0], 0.1)
     assert math.isclose(controls.control(NOW_NS, 9.0)[0], -0.1)
@@ -66,7 +66,7 @@ def test_a_twist_sets_the_yaw_rate_at_the_rear_axle(
 ) -> None:
     take(controls, types, TOPICS["twist"], twist(6.0, 0.5))
     controls.control(NOW_NS, 6.0)
-    # a circle of radius v / yaw rate of the rear axle: tan(steering) = wheelbase / radius
+    # the rear axle follows a circle of radius v / yaw rate; tan(steering) = wheelbase / radius
     assert math.isclose(math.tan(controls.steering_rad), WHEELBASE_M / 12.0, rel_tol=1e-6)
     take(controls, types, TOPICS["twist"], twist(0.0, -0.5))
     assert controls.control(NOW_NS, 0.0) == [0.0, -1.0]
@@ -75,7 +75,7 @@ def test_a_twist_sets_the_yaw_rate_at_the_rear_axle(
 
 
 @pytest.mark.parametrize("controls", [False], indirect=True)
-def test_autoware_commands_an_acceleration_or_a_speed(
+def test_a_command_of_autoware_sets_an_acceleration_or_a_speed(
     controls: VehicleControls, types: RosTypes
 ) -> None:
     given = {"velocity": 3.0, "acceleration": -2.0, "is_defined_acceleration": True}

@@ -1,4 +1,4 @@
-"""The world goes on with nodes of other types or domains, and with nodes that die or flood."""
+"""The world continues if nodes use other types or domains, die, or flood a topic."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from tests.cosim.ros2.conftest import DRIVE, TWIST, Driver, Run, cruise
 
 ROOT = Path(__file__).resolve().parents[3]
 
-# Answers some clocks, says so, and waits to be killed.
+# Answers ten clock messages, prints "heard", and waits to be killed.
 MORTAL = """
 import sys, time
 from cavmarl.cosim.ros2.ros_types import RosTypes
@@ -37,7 +37,7 @@ with Driver(RosTypes(), int(sys.argv[1]), answer=answer):
 """
 
 
-def test_another_type_of_a_topic_is_named_once_and_the_world_goes_on(
+def test_a_topic_with_another_type_is_logged_once_and_the_world_continues(
     types: RosTypes, domain: int, run_bridge: Run, caplog: pytest.LogCaptureFixture
 ) -> None:
     sent = {DRIVE: "geometry_msgs/msg/Twist"}
@@ -74,7 +74,7 @@ def test_a_node_of_another_domain_is_not_heard(
     assert f"no node publishes commands for car_0 on domain {domain}" in caplog.text
 
 
-def test_a_node_that_dies_is_counted_as_late(domain: int, run_bridge: Run) -> None:
+def test_commands_of_a_dead_node_count_as_late(domain: int, run_bridge: Run) -> None:
     command = [sys.executable, "-c", MORTAL, str(domain)]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=ROOT) as node:
 
@@ -91,11 +91,13 @@ def test_a_node_that_dies_is_counted_as_late(domain: int, run_bridge: Run) -> No
     assert report["steps"] == 31
     assert counts["used"] >= 10
     assert counts["late"] > 10
-    # The last command is held.
+    # The bridge repeats the last command.
     assert counts["held"] == counts["late"]
 
 
-def test_a_node_that_floods_delays_no_step(types: RosTypes, domain: int, run_bridge: Run) -> None:
+def test_a_node_that_floods_a_topic_does_not_delay_steps(
+    types: RosTypes, domain: int, run_bridge: Run
+) -> None:
     sent = {DRIVE: TWIST}
     past = types.encode(TWIST, cruise(0))
     broken = cruise(10**15)
@@ -113,7 +115,7 @@ def test_a_node_that_floods_delays_no_step(types: RosTypes, domain: int, run_bri
         thread = threading.Thread(target=pour)
         thread.start()
         try:
-            # The flood may push commands out of the buffer; then the last one is held.
+            # If the flood pushes commands out of the buffer, the bridge repeats the last command.
             options = RosOptions(domain=domain, deadline_s=0.2)
             began_s = time.monotonic()
             report, _ = run_bridge(options, 60)
@@ -131,7 +133,7 @@ def test_a_node_that_floods_delays_no_step(types: RosTypes, domain: int, run_bri
 
 
 @pytest.mark.parametrize(("limit", "is_told"), [("212992", True), ("4194304", False), ("", False)])
-def test_small_buffers_are_told_with_the_setting(
+def test_a_warning_names_the_setting_if_socket_buffers_are_small(
     limit: str,
     is_told: bool,
     domain: int,

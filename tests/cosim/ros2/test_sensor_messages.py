@@ -1,4 +1,4 @@
-"""Samples as ROS messages, against transforms and projections that are computed here."""
+"""Compare sensor samples in ROS messages with transforms and projections computed here."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.cosim.ros2.conftest import RIG
 PLACE = dict.fromkeys(("x_m", "y_m", "z_m", "yaw_deg", "pitch_deg", "roll_deg"), 0.0)
 
 
-def turned(quaternion: dict[str, float], point: Any) -> NDArray[np.float64]:
+def rotate(quaternion: dict[str, float], point: Any) -> NDArray[np.float64]:
     """Rotate a point as ROS does, by q · p · q*."""
     x, y, z, w = (quaternion[name] for name in "xyzw")
     axis, given = np.array([x, y, z]), np.asarray(point, dtype=np.float64)
@@ -46,20 +46,20 @@ def test_a_quaternion_rotates_points_by_its_angles(
     heading, pitch, roll = map(math.radians, (heading_deg, pitch_deg, roll_deg))
     found = quaternion_of(turn_of(heading, pitch, roll))
     assert math.isclose(sum(value * value for value in found.values()), 1.0)
-    # yaw, then pitch with the nose up, then roll with the left side up
+    # yaw, then pitch (nose up is positive), then roll (left side up is positive)
     c, s = math.cos, math.sin
     yaw_turn = np.array([[c(heading), -s(heading), 0], [s(heading), c(heading), 0], [0, 0, 1]])
     nose_up = np.array([[c(pitch), 0, -s(pitch)], [0, 1, 0], [s(pitch), 0, c(pitch)]])
     left_up = np.array([[1, 0, 0], [0, c(roll), -s(roll)], [0, s(roll), c(roll)]])
     for point in np.eye(3):
         want = yaw_turn @ nose_up @ left_up @ point
-        np.testing.assert_allclose(turned(found, point), want, atol=1e-12)
+        np.testing.assert_allclose(rotate(found, point), want, atol=1e-12)
 
 
 def test_pitch_is_positive_uphill_in_cavmarl_and_nose_down_in_ros() -> None:
     found = quaternion_of(turn_of(0.0, 0.1))
     assert found["y"] < 0.0
-    assert turned(found, (1.0, 0.0, 0.0))[2] > 0.0
+    assert rotate(found, (1.0, 0.0, 0.0))[2] > 0.0
 
 
 def test_sensors_are_placed_from_the_rear_axle() -> None:
@@ -68,7 +68,7 @@ def test_sensors_are_placed_from_the_rear_axle() -> None:
     move = found["transform"]
     assert (found["header"]["frame_id"], found["child_frame_id"]) == ("base_link", "imu")
     assert move["translation"] == {"x": 2.4, "y": -0.2, "z": 1.6}
-    np.testing.assert_allclose(turned(move["rotation"], (1, 0, 0)), (0, 1, 0), atol=1e-12)
+    np.testing.assert_allclose(rotate(move["rotation"], (1, 0, 0)), (0, 1, 0), atol=1e-12)
 
 
 def test_a_camera_has_an_optical_frame_with_z_forward() -> None:
@@ -76,12 +76,12 @@ def test_a_camera_has_an_optical_frame_with_z_forward() -> None:
     _, found = mount_transforms(settings, 5, "base_link", "front", 2.8)
     assert found["child_frame_id"] == "front_optical_link"
     turn = found["transform"]["rotation"]
-    np.testing.assert_allclose(turned(turn, (0, 0, 1)), (1, 0, 0), atol=1e-12)
-    np.testing.assert_allclose(turned(turn, (1, 0, 0)), (0, -1, 0), atol=1e-12)
-    np.testing.assert_allclose(turned(turn, (0, 1, 0)), (0, 0, -1), atol=1e-12)
+    np.testing.assert_allclose(rotate(turn, (0, 0, 1)), (1, 0, 0), atol=1e-12)
+    np.testing.assert_allclose(rotate(turn, (1, 0, 0)), (0, -1, 0), atol=1e-12)
+    np.testing.assert_allclose(rotate(turn, (0, 1, 0)), (0, 0, -1), atol=1e-12)
 
 
-def made(kind: str, sample: Any, **settings: Any) -> list[dict[str, Any]]:
+def make_messages(kind: str, sample: Any, **settings: Any) -> list[dict[str, Any]]:
     make = SENSORS[kind][0]
     given = PLACE | {"type": kind, "noise": [0.0]} | settings
     return [one.fields for one in make(given, np.asarray(sample), 1_250_000_000, "frame")]
@@ -92,7 +92,7 @@ def test_points_are_in_the_frame_of_the_lidar_and_rays_without_echo_are_left_out
     scan[1, 1] = 10.0  # upper layer, to the left
     scan[0, 2] = 5.0  # lower layer, behind
     keys = {"fov_deg": 360.0, "lower_deg": 0.0, "upper_deg": 30.0, "range_m": 50.0, "z_m": 1.6}
-    (fields,) = made("lidar", scan, **keys)
+    (fields,) = make_messages("lidar", scan, **keys)
     points = np.frombuffer(fields["data"].tobytes(), POINT)
     assert (fields["width"], fields["height"], fields["point_step"]) == (2, 1, 16)
     assert fields["row_step"] == len(fields["data"]) == 32
@@ -110,18 +110,18 @@ def test_points_are_in_the_frame_of_the_lidar_and_rays_without_echo_are_left_out
 def test_targets_of_a_radar_have_places_and_radial_speeds() -> None:
     rows = np.zeros((3, 3), dtype=np.float32)
     rows[0] = 20.0, math.pi / 2, -3.0
-    (fields,) = made("radar", rows)
+    (fields,) = make_messages("radar", rows)
     (target,) = np.frombuffer(fields["data"].tobytes(), TARGET)
     np.testing.assert_allclose(list(target), (0.0, 20.0, 0.0, -3.0), atol=1e-5)
 
 
 def test_a_camera_message_has_intrinsics_and_rows_from_the_top() -> None:
     picture = np.arange(2 * 4 * 3, dtype=np.uint8).reshape(2, 4, 3)
-    image, info = made("rgb_camera", picture, fov_deg=90.0)
+    image, info = make_messages("rgb_camera", picture, fov_deg=90.0)
     assert (image["encoding"], image["step"]) == ("rgb8", 12)
     assert image["data"].tobytes() == picture.tobytes()
     assert image["header"]["frame_id"] == info["header"]["frame_id"] == "frame_optical_link"
-    # At the right edge of a field of view of 90°, a point is as far to the side as ahead.
+    # With a field of view of 90°, a point at the right edge is as far to the side as ahead.
     k = np.reshape(info["k"], (3, 3))
     u, v, w = k @ np.array([1.0, 0.0, 1.0])
     assert (u / w, v / w) == (4.0, 1.0)
@@ -129,22 +129,24 @@ def test_a_camera_message_has_intrinsics_and_rows_from_the_top() -> None:
 
 
 def test_depths_are_floats_in_m_and_classes_are_bytes() -> None:
-    depth, _ = made("depth_camera", np.array([[1.5, 100.0]], dtype=np.float16), fov_deg=60.0)
+    depth, _ = make_messages(
+        "depth_camera", np.array([[1.5, 100.0]], dtype=np.float16), fov_deg=60.0
+    )
     assert depth["encoding"] == "32FC1"
     assert np.frombuffer(depth["data"].tobytes(), "<f4").tolist() == [1.5, 100.0]
-    classes, _ = made("semantic_camera", np.array([[3, 7]], dtype=np.uint8), fov_deg=60.0)
+    classes, _ = make_messages("semantic_camera", np.array([[3, 7]], dtype=np.uint8), fov_deg=60.0)
     assert (classes["encoding"], classes["data"].tobytes()) == ("mono8", b"\3\7")
 
 
 def test_inertial_and_satellite_measurements_keep_values_and_noise() -> None:
     noise = [0.1, 0.2, 0.3, 0.01, 0.02, 0.03]
-    (imu,) = made("imu", [0.5, -0.25, 9.81, 0.1, 0.2, -0.3], noise=noise)
+    (imu,) = make_messages("imu", [0.5, -0.25, 9.81, 0.1, 0.2, -0.3], noise=noise)
     assert imu["linear_acceleration"]["z"] == 9.81
     assert imu["angular_velocity"] == {"x": 0.1, "y": 0.2, "z": -0.3}
     assert imu["orientation_covariance"][0] == -1.0
     diagonal = np.diag(np.reshape(imu["angular_velocity_covariance"], (3, 3)))
     np.testing.assert_allclose(np.sqrt(diagonal), noise[3:])
-    (fix,) = made("gnss", [48.0, 11.5, 512.0], noise=[2.0])
+    (fix,) = make_messages("gnss", [48.0, 11.5, 512.0], noise=[2.0])
     assert (fix["latitude"], fix["longitude"], fix["altitude"]) == (48.0, 11.5, 512.0)
     assert fix["position_covariance"] == [4.0, 0.0, 0.0, 0.0, 4.0, 0.0, 0.0, 0.0, 4.0]
     assert fix["header"]["stamp"] == {"sec": 1, "nanosec": 250_000_000}
@@ -168,7 +170,7 @@ def test_the_velocity_at_the_rear_axle_has_no_lateral_part() -> None:
     assert (told["header"]["frame_id"], told["child_frame_id"]) == ("map", "base_link")
 
 
-def test_boxes_stand_on_the_road() -> None:
+def test_boxes_of_vehicles_stand_on_the_road() -> None:
     row = {"id": 2.0**32 + 5, "agent": -1.0, "x": 1.0, "y": 2.0, "z": 4.0, "heading": 0.0}
     row |= {"pitch": 0.0, "length": 5.0, "width": 2.0, "height": 1.6}
     (box,) = markers([row], 3, 10**8)["markers"]
@@ -181,7 +183,7 @@ def views(*names: str) -> list[SensorView]:
     return [SensorView(name, [], PLACE | RIG[name]) for name in names]
 
 
-def test_names_of_a_sensor_kit_come_from_a_file(tmp_path: Any) -> None:
+def test_the_names_of_sensors_are_read_from_a_file(tmp_path: Any) -> None:
     file = tmp_path / "kit.yaml"
     file.write_text("roof: {frame: velodyne_top, topic: /sensing/lidar/top/points}\n")
     topics = VehicleTopics("car_0", views("roof", "imu"), "autoware", read_names(file), False)
@@ -201,7 +203,7 @@ def test_two_sensors_cannot_have_one_topic() -> None:
         VehicleTopics("car_0", views("roof", "imu"), "plain", names, False)
 
 
-def test_sensors_without_a_message_are_named_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_sensors_without_a_ros_message_are_logged_once(caplog: pytest.LogCaptureFixture) -> None:
     grid = SensorView("grid", [], PLACE | {"type": "bev_grid"})
     topics = VehicleTopics("car_0", [grid, *views("imu")], "plain", {}, False)
     assert list(topics.kinds) == ["/car_0/imu", "/car_0/goal"]
@@ -222,7 +224,7 @@ def test_ros_time_increases_across_episodes_in_whole_ns() -> None:
 @pytest.mark.parametrize("distro", ["humble", "jazzy", "kilted"])
 def test_message_types_equal_the_distributions(distro: str) -> None:
     types = RosTypes(distro)
-    image, info = made("rgb_camera", np.zeros((2, 4, 3), np.uint8), fov_deg=90.0)
+    image, info = make_messages("rgb_camera", np.zeros((2, 4, 3), np.uint8), fov_deg=90.0)
     for kind, fields in (
         ("sensor_msgs/msg/Image", image),
         ("sensor_msgs/msg/CameraInfo", info),
