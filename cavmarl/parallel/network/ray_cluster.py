@@ -21,11 +21,11 @@ _joined = 0  # calls of `join` without their `leave`; 0 if the program itself ha
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster. Its use is the share of each resource that is reserved."""
+    """A node of the cluster, as Ray describes it."""
 
     name: str
     cpus: int  # free CPUs
-    use: Utilisation  # reserved shares
+    use: Utilisation  # reserved share of each resource
     hosted: int = 0  # actors that were assigned to it
 
 
@@ -72,7 +72,7 @@ def _call(address: str) -> None:
 
 
 def leave() -> None:
-    """Leave the cluster if no other part of this program uses it; one started here ends."""
+    """Leave the cluster if no other part of this program uses it; end it if `join` started it."""
     global _joined
     _joined -= 1
     ray = require("ray", "ray")

@@ -88,7 +88,7 @@ class ExchangeRequest(NamedTuple):
     """A request to the simulator, and what is needed to check the answer."""
 
     exchange: Exchange
-    num_packets: NDArray[np.int64]  # in flight, see `check_receptions`
+    num_packets: NDArray[np.int64]  # number of packets in flight, see `check_receptions`
 
 
 def request_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:

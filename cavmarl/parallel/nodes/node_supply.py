@@ -55,8 +55,8 @@ class NodeSupply:
             LocalWorlds(without_journals(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
-        self._are_complete = False  # the pools have once had all their nodes
-        self._begun: list[int] = []  # processes of the nodes of pools
+        self._are_complete = False  # whether the pools have had all their nodes at some time
+        self._begun: list[int] = []  # process ids of the nodes of pools
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
         self.count = self._starter.count
@@ -124,7 +124,7 @@ class NodeSupply:
         return None
 
     def _usable(self) -> list[int]:
-        """Return the ready nodes; spare ones count only once the pools were complete."""
+        """Return the ready nodes; spare nodes count only once the pools have been complete."""
         joining_nodes, spares = self.joining_nodes, range(self.count, ANYONE)
         ready = joining_nodes.ready
         return [n for n in ready if self._are_complete or joining_nodes.asked(n) not in spares]

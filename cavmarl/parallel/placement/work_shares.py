@@ -25,7 +25,7 @@ class Part(NamedTuple):
 
     first: int  # first world
     last: int  # world after the last one; a team of several workers has one world
-    zones: list[list[int]]  # of each worker
+    zones: list[list[int]]  # zones of each worker
 
     @property
     def names(self) -> list[str]:

@@ -25,7 +25,7 @@ class _Place(NamedTuple):
     """The place of an array in an image."""
 
     shape: tuple[int, ...]
-    end: int  # in words from the start of the image
+    end: int  # offset in words from the start of the image
     target: Array  # the place as an array of raw items
 
 
@@ -117,7 +117,7 @@ class Image:
             at = end
 
     def _make_room(self, size: int) -> bool:
-        """Grow to this number of bytes; return whether the image has moved for that."""
+        """Grow to this number of bytes; return whether the mapping of the image has changed."""
         if size <= _WORD * len(self._words):
             return False
         self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)
