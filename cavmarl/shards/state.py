@@ -1,7 +1,7 @@
 """The table of arrays that are the state of worlds, because they outlive a tick.
 
 Code that saves, moves or digests worlds takes the arrays from this table. The state also includes
-the owned rows, the arrays of rerouting and those of components (`Component.arrays`).
+the owned rows, the arrays of rerouting, and the arrays of components (`Component.arrays`).
 """
 
 from __future__ import annotations
