@@ -44,7 +44,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
         if problem.in_row:
             return _place(problem, workers)
         assign_longest_first(placement, [[shard] for shard in lost])
-    return _rebalance(placement, "those of lost workers" if lost else "as it was")
+    return _rebalance(placement, "shards of lost workers placed" if lost else "unchanged")
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
@@ -65,13 +65,13 @@ def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
         (row, "neighbours in a row"),
         (
             refine(whole.copy(), until_s=limit_s, slack_s=slack_s),
-            "worlds whole, but for a few shards",
+            "worlds whole, except a few shards",
         ),
         (
             refine(row.copy(), until_s=limit_s, slack_s=slack_s),
-            "neighbours in a row, but for a few shards",
+            "neighbours in a row, except a few shards",
         ),
-        (longest, "the costliest first"),
+        (longest, "costliest shards first"),
     ]
     good = [way for way in ways if way[0].makespan_s <= limit_s]
     return min(good, key=lambda way: (way[0].cut_pairs, way[0].makespan_s))

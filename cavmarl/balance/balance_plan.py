@@ -66,7 +66,7 @@ class Plan:
 
     @property
     def imbalance(self) -> float:
-        """Duration of the slowest worker's tick, divided by that of a perfect division."""
+        """Duration of the slowest worker's tick / duration with a perfect division."""
         return self.placement.imbalance
 
     @property

@@ -34,7 +34,7 @@ Outcome = Literal[
 
 
 def _check_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:  # NaN fails this check, too
+    if not 0.0 <= value <= 1.0:  # NaN also fails this check
         cure = f"; if this is a percentage, use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
         raise ConfigError(f"{name} = {value}: must be a share from 0 to 1{cure}")
 

@@ -39,7 +39,7 @@ class Watch:
 
     A worker's CPU use is the mean use of the cores on which its process may run, minus the use by
     this process and all workers: a run's own computation is no reason to move shards away. RAM use
-    is that of the machine. GPU use is that of the busiest GPU according to `nvidia-smi`; without
+    is measured for the machine, GPU use for the busiest GPU according to `nvidia-smi`; without
     `nvidia-smi` it is 0, and `gpu_source` is `none`.
     """
 

@@ -121,7 +121,7 @@ def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
             raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: the zone must be below {zones}"
             )
-        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN fails this check, too
+        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN also fails this check
             raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
                 f"seconds from 0 to {MAX_COST_S:g}; measure it again"

@@ -3,7 +3,7 @@
 A worker with LoadScore S, the share taken by other programs, has the speed 1 - S: shards that cost
 `load` seconds take load / (1 - S) on it. Before shards are placed, the fastest worker is thus the
 worker with the lowest LoadScore, as in eq. (2). The slowest worker determines the pace of all
-workers. The imbalance is the duration of its tick, divided by that of a perfect division.
+workers. The imbalance is the duration of its tick / the duration with a perfect division.
 """
 
 from __future__ import annotations

@@ -127,7 +127,7 @@ def our_turn(simulation: Simulation, steps: int) -> Turn:
 
 
 def load_sumo(job: SumoJob, folder: str) -> None:
-    """Load the job into the process that runs SUMO; libsumo keeps it there."""
+    """Load the job into the process that runs SUMO; libsumo keeps it in this process."""
     start_sumo(job, Path(folder))
 
 

@@ -52,7 +52,7 @@ class OwnerChanges:
         return [Near(*entry) for entry in division.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """Return the zone that owns a vehicle, and its committed row there."""
+        """Return the zone that owns a vehicle, and its committed row in this zone."""
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
@@ -71,7 +71,7 @@ class OwnerChanges:
         switch: Switch,  # the vehicle, its source and its target
         hint: int = 0,  # the probable row at the source
     ) -> int:  # the row at the target
-        """Change a vehicle's owner. The target gets a copy of the source's committed row."""
+        """Change a vehicle's owner. The target receives a copy of the source's committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._division.zoned, self._division.side, w,

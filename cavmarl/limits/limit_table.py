@@ -45,7 +45,7 @@ class LimitTable:
         self.sizes = limit_sizes(config)
 
     def limits_mps(self, choices: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the limit (W, L) of each lane for choices (W, U); lanes without a unit: infinite."""
+        """Return the limit (W, L) of each lane for choices (W, U); infinite without a unit."""
         found = np.full((len(choices), len(self.arrays.section)), np.inf)
         for u, lanes in enumerate(self.lanes):
             found[:, lanes] = self.speeds_mps[choices[:, u], None]

@@ -191,7 +191,7 @@ class Directory:
 
     def resend(
         self,
-        zones: Iterable[int] | None = None,  # zones that get their STEP again; None: all
+        zones: Iterable[int] | None = None,  # zones that receive their STEP again; None: all
         # zone → payload of its STEP, needed after `restore`; None: the payloads given to `begin`
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:

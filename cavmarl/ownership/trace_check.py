@@ -99,7 +99,7 @@ class TraceChecker:
         longest_deferral: int,  # ticks for which a vehicle may keep an owner whose zone it has left
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
         # whether zones and coordinator are in one process. The trace then has only records, and
-        # possibly only those of ticks with changes
+        # possibly only records of ticks with changes
         is_direct: bool = False,
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:

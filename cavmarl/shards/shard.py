@@ -121,7 +121,7 @@ class Shard:
         num_worlds, capacity = zoned.rows.shape[2:]
         self.optional = optional_arrays(config.sensors, network, plans[0], most_told, capacity)
         self.registered = RegisteredOutputs(config, network)
-        # Neural networks that drive background vehicles; shards share their scratch memory, too.
+        # Neural networks that drive background vehicles; shards also share their scratch memory.
         self.learned: tuple[LearnedDriver, ...] = (
             learned_drivers(config, network, plans[0], capacity) if first is None else first.learned
         )

@@ -112,7 +112,7 @@ def _check_inputs(path: str | Path, made: CavEnv, rows: Any) -> None:
     differing |= {name for name in wanted - differing if given[name] != expected[name]}
     if differing:
         raise RecordingError(
-            f"{path}: its commands have another column {min(differing)} than this world: it is "
+            f"{path}: the column {min(differing)} of its commands does not fit this world: it is "
             "damaged, or of another version of cavmarl; record the run again"
         )
     controlled, num_choices = made.config.controlled, None

@@ -68,7 +68,7 @@ class Coordinator(ABC):
         """True if a tick has begun and is not committed."""
 
     def watch(self, watcher: Watcher) -> None:
-        """Send all further records to this watcher, too."""
+        """Also send all further records to this watcher."""
         self._watchers = (*self._watchers, watcher)
 
     def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
@@ -141,7 +141,7 @@ class Coordinator(ABC):
             self.journal.close()
 
     def _check(self, births: Iterable[Birth], counts: list[int]) -> None:
-        """Compare the numbers of vehicles in the updated table with those in the zones' rows."""
+        """Compare the numbers of vehicles in the updated table with the rows of the zones."""
         owned = list(self._directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1

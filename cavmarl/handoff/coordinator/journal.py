@@ -249,7 +249,7 @@ class Journal:
             raise self._unwritable(error) from error
 
     def _read(self) -> None:
-        """Find the end of the last complete line, and truncate the file there."""
+        """Truncate the file after the last complete line."""
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass

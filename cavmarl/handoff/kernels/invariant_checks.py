@@ -159,7 +159,7 @@ def _record_missing(strays: Strays, vehicle: int, zone: int, row: int, num: int)
 
 @inlined_kernel
 def _record_finding(found: np.void, kind: int, vehicle: int) -> None:
-    """Record a finding, if its vehicle has a lower id than that of the recorded finding."""
+    """Record a finding, unless the recorded finding is about a vehicle with a lower id."""
     if found["kind"] == KIND_NONE or vehicle < found["vehicle"]:
         found["kind"] = kind
         found["vehicle"] = vehicle
@@ -172,7 +172,7 @@ def _check_motion(found: np.void, last: np.void, now: np.void, limit_m: float) -
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
         _record_finding(found, KIND_TICK, now["id"])
-    elif not dx * dx + dy * dy <= limit_m * limit_m:  # true for NaN, too
+    elif not dx * dx + dy * dy <= limit_m * limit_m:  # also true for NaN
         _record_finding(found, KIND_FAR, now["id"])
 
 

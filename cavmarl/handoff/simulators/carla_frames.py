@@ -105,7 +105,7 @@ def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedCo
 
 
 def mounts_of(rig: Mapping[str, MountedConfig], dt_s: float) -> dict[str, dict[str, Any]]:
-    """Return what the client needs to mount each sensor of a rig, in CARLA's frame.
+    """Return the blueprint, pose and attributes of each sensor of a rig, in CARLA's frame.
 
     `dt_s`: length of a tick; each sensor takes a whole frame in each tick.
     """

@@ -93,7 +93,7 @@ def hosted_zones(simulators: Mapping[int, str], num_zones: int) -> tuple[HostedZ
 
 
 def check_servers(hosted: Sequence[HostedZone], num_worlds: int) -> None:
-    """Raise ConfigError if a server that can run a zone of one world would get several worlds."""
+    """Raise ConfigError if a server for a single world would have to run several worlds."""
     if num_worlds > 1 and any(one.is_single for one in hosted):
         raise ConfigError(
             f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"

@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.parallel.memory.shared_memory import shared_zeros
 
 HUGE_BYTES = 1 << 21  # size of a huge page, on most processors
-MOST_BYTES = 1 << 28  # larger arrays get small pages
+MOST_BYTES = 1 << 28  # larger arrays have small pages
 
 _NO_ACCESS = 0  # PROT_NONE: reserves addresses only
 _AT_THIS_PLACE = 0x10  # MAP_FIXED

@@ -1,7 +1,7 @@
 """Memory that processes share. The memory has no name, so nothing is left behind.
 
-A process knows a segment by its descriptor alone, which it gets when it starts. The system frees a
-segment when the last process that has it open or mapped ends, whatever the cause.
+A process knows a segment only by its descriptor, which it receives when it starts. The system frees
+a segment when the last process that has it open or mapped ends, whatever the cause.
 """
 
 from __future__ import annotations

@@ -106,9 +106,7 @@ class PendingConnection:
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = HELLO.unpack(hello)
         if magic != MAGIC:
-            raise MessageError(
-                f"a caller sends {hello[:4]!r}, which starts no handshake of cavmarl"
-            )
+            raise MessageError(f"a caller sends {hello[:4]!r}, which is no handshake of cavmarl")
         if version != VERSION:
             self._socket.sendall(_VERSION.pack(MAGIC, VERSION))
             raise MessageError(

@@ -16,7 +16,7 @@ Main = Callable[[tuple[str, int], bytes, int], None]
 
 
 class NodeActor:
-    """The class of the actors. An actor gets a single call, which lasts for its life."""
+    """The class of the actors. An actor executes a single call, which lasts for its life."""
 
     def run(self, main: Main, place: tuple[str, int], secret: bytes, number: int) -> None:
         main(place, secret, number)

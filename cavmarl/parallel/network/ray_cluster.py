@@ -113,7 +113,7 @@ def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of 
     if workers > free:
         raise ConfigError(
             f"backend = 'ray:{workers}': the Ray cluster has {free} free CPUs on {len(known)} "
-            "nodes; use fewer, or add nodes (ray start --address=…); ray status shows their users"
+            "nodes; use fewer workers, or add nodes (ray start --address=…); see ray status"
         )
     left = list(known)
     chosen: list[str] = []

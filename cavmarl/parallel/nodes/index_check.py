@@ -42,7 +42,7 @@ class IndexCheck:
         """Refuse (n,) rows of VEHICLE with an index that is out of bounds. Raises MessageError."""
         words = np.ascontiguousarray(rows).view(np.int64).reshape(-1, ROW_WORDS)
         if not self._are_bounded(words, self.of_rows):
-            raise MessageError("a vehicle has an index that no table has")
+            raise MessageError("a vehicle has an index that is out of bounds")
 
     def check_state(self, record: bytes) -> None:
         """Refuse a row, given as bytes, with an index out of bounds. Raises MessageError."""

@@ -49,7 +49,7 @@ class FrameKind(IntEnum):
     JOIN = 2  # N → C: the code that the node runs
     COMMAND = 3  # C → N: a task and its arguments
     LEASE = 4  # C → N: STEP messages
-    REPORT = 5  # N → C: DONE messages, and what the next decision needs
+    REPORT = 5  # N → C: DONE messages, and the data that the next decision needs
     MESSAGES = 6  # N → N, N → C: other messages of the protocol
     RESULT = 7  # N → C: the result of a task
     FAILED = 8  # N → C: an error
@@ -258,7 +258,7 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
             "on all machines"
         )
     if not is_next:
-        return MessageError("the head of a frame is damaged, or not the next one")
+        return MessageError("the head of a frame is damaged or out of order")
     if code not in _KINDS:
         return MessageError(f"a frame has the unknown kind {code}")
     return MessageError(f"a frame has {size} bytes, more than {MAX_FRAME}")

@@ -51,7 +51,7 @@ class RecoveryOrderedError(Exception):
 
     Attributes:
         frame: the order, if it has been received.
-        witness: node that claims to have got the order.
+        witness: node that claims to have received the order.
     """
 
     def __init__(self, frame: NodeFrame | None, witness: int | None = None) -> None:

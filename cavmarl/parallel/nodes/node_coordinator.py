@@ -285,8 +285,8 @@ class NodeCoordinator:
         """Note whether a lease of 0 ticks is due.
 
         Raises:
-            LinkLostError: vehicles of a node have no record, although the previous lease was there
-                to create the missing records.
+            LinkLostError: vehicles of a node have no record, although the previous lease should
+                have created the missing records.
         """
         late = [number for number, report in reports.items() if any(one.is_late for one in report)]
         if late and self.is_late:

@@ -1,7 +1,7 @@
 """Repartitioning of zones that nodes host: the messages between the caller and the nodes.
 
 The first node temporarily receives the rows of all vehicles, and proposes new zones. Then all nodes
-repartition: each vehicle goes to the node of its zone, and ownership starts anew, as when worlds
+repartition: each vehicle goes to the node of its zone, and ownership starts again, as when worlds
 are loaded. The zones are a part of the kept state: if nodes are lost, the zones are restored too.
 """
 

@@ -322,7 +322,7 @@ class NodePeers(Peers):
         """Receive the present share of another node.
 
         Raises:
-            RecoveryOrderedError: the other node has already got an order to recover.
+            RecoveryOrderedError: the other node has already received an order to recover.
         """
         kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:

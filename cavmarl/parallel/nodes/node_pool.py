@@ -336,7 +336,7 @@ class NodePool:
     def _replace_lost(self) -> bool:  # whether the worlds go back to the newest state
         """Let nodes that have joined in the meantime replace lost ones.
 
-        The new nodes get the zones of the newest state from the nodes that host these zones now.
+        The new nodes receive the zones of the newest state from the nodes that now host the zones.
         With SUMO this is impossible, since no kept state has all commands to SUMO so far.
         """
         if not self._is_native:
@@ -509,7 +509,7 @@ class NodePool:
     def _recover(self) -> None:
         """Go back to the newest state of all nodes; living nodes take over zones of lost ones.
 
-        Zones whose home is another living node go there.
+        Zones whose home is another living node move to that node.
 
         Raises:
             LinkLostError: another node is lost.

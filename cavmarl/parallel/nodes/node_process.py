@@ -192,7 +192,7 @@ class NodeProgram:
         self._run_own()
 
     def _run_own(self) -> None:
-        """Run the phases of the zones of this node from now on."""
+        """From now on, run only the phases of the zones of this node."""
         simulation = self._worlds.simulation
         own = [simulation.shards[zone] for zone in self.zones]
         foreign = [shard for shard in simulation.shards if shard.zone not in self.zones]

@@ -70,7 +70,7 @@ class NodeWatch:
         check_indices("PING", [frame.number], self._pings + 1)
         pong = Pong(*read_list(frame))
         if not all(isinstance(part, list) for part in pong):
-            raise MessageError("a PONG has something else than lists")
+            raise MessageError("a PONG has values other than lists")
         peers = [peer for peer in (*pong.awaited, *pong.witnesses) if peer != COORDINATOR]
         check_indices("node", peers, MOST_NODES)
         for agent in pong.agents:
@@ -169,9 +169,9 @@ class NodeWatch:
     def most_missed(self, lost: LinkLostError, generation: int) -> LinkLostError:
         """Return the node that is lost, after nodes have reported lost connections.
 
-        The lost node is the one that has ended, or else the sender of bad frames to most nodes, or
-        else the node that most nodes cannot reach. If two nodes cannot reach each other, either may
-        be at fault, so they are given up in turn.
+        The lost node is a node that has ended; if none has, the node that has sent bad frames to
+        most nodes; if none has, the node that most nodes cannot reach. If two nodes cannot reach
+        each other, either may be at fault, so they are given up in turn.
 
         Args:
             lost: the first report.

@@ -225,7 +225,7 @@ class NodeWorlds(CommandedWorlds):
     def set_worlds(
         self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]
     ) -> None:
-        """Replace the worlds by saved ones. Raises the errors of `NodePool.begin_anew`."""
+        """Replace the worlds by saved worlds. Raises the errors of `NodePool.begin_anew`."""
         self._set_arrays(arrays)
         self.pool.begin_anew(runs)
         self.perform(Task.LOAD, saved)

@@ -1,9 +1,9 @@
 """A barrier of two processes: a waiting process polls for a moment, then it sleeps.
 
-Each of the two sides writes a cache line of 64-bit words of its own. Word `NUMBER` counts what the
-side has done; word `ASLEEP` says whether it has to be woken. A waiting side first polls the number
-of the other side in a compiled loop, which reacts within a fraction of a microsecond. Then the side
-sleeps on a socket, which takes no processor time.
+Each of the two sides writes its own cache line of 64-bit words. Word `NUMBER` counts the steps of
+its work; word `ASLEEP` says whether the side has to be woken. A waiting side first polls the number
+of the other side in a compiled loop, which reacts within a fraction of a microsecond. Then the
+waiting side sleeps on a socket, which takes no processor time.
 
 No wake-up is lost, because all accesses are sequentially consistent. Before it sleeps, a side
 writes `ASLEEP`, then reads the number of the other side. The other side writes its number, then

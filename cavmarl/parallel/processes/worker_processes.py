@@ -338,7 +338,7 @@ class WorkerProcesses:
         )
 
     def _clear(self) -> None:
-        """Free what a failed start has left."""
+        """Free the resources of a failed start."""
         for process in self.processes.values():
             if process.wire.fileno() in self._owners:
                 self._dismiss(process)

@@ -33,9 +33,9 @@ class Unit(NamedTuple):
 
     sensor: int  # number in the rig
     first: int  # first agent
-    last: int  # agent after the last one
+    last: int  # number after the last agent
     begin: int = 0  # first line of the agents' frames
-    end: int = 1  # line after the last one
+    end: int = 1  # number after the last line
 
 
 @dataclass(frozen=True)

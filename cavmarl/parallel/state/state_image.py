@@ -69,7 +69,7 @@ class Image:
     def _lay_out(self, arrays: Arrays, same: int) -> None:
         """Find the place of each array; the first `same` arrays keep their places.
 
-        Callers pass arrays of constant shapes before those whose shapes vary.
+        Callers pass arrays of constant shapes before arrays whose shapes vary.
         """
         head = [array.ndim for array in arrays]
         for array in arrays:

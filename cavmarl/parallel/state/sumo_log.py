@@ -18,7 +18,7 @@ _WORD = 8
 class KeptLog:
     """The log of one world as it was at the last `write`.
 
-    Within an episode a log only grows, so a write costs only what was added since the last one.
+    Within an episode a log only grows, so a write only copies the commands since the last write.
     """
 
     def __init__(self, segment: Segment) -> None:

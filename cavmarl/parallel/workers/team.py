@@ -189,7 +189,7 @@ class TeamMember:
         self._cores = usable_cores()
 
     def run_phases(self) -> None:
-        """Run what the leader announces until it ends the command."""
+        """Run the phases that the leader announces, until the leader ends the command."""
         line, leader = self._line, self._leader
         line[FAILED] = 0
         failure: Exception | None = None

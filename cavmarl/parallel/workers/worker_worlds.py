@@ -46,7 +46,7 @@ class WorkerWorlds:
         """See `Job.on_idle`."""
 
     def save(self) -> list[NDArray[Any]]:
-        """Return what a successor needs in order to resume the worlds."""
+        """Return the state from which a successor can resume the worlds."""
         return self.worlds.save()
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

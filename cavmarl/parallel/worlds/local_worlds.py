@@ -186,7 +186,7 @@ class LocalWorlds:
         self._waiting[chosen] = False
 
     def _show(self, chosen: NDArray[np.bool_], begins: bool = False) -> None:
-        """Write what the agents of the chosen worlds (W,) observe.
+        """Write the observations of the agents in the chosen worlds (W,).
 
         At the start of an episode, signals keep the rewards of the last step of the old episode.
         """
@@ -329,7 +329,7 @@ class LocalWorlds:
         return () if sumo is None else sumo.keep_logs()
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
-        """Return what `save` would return if there were only this world, as views."""
+        """Return, as views, the result of `save` if there were only this world."""
         only = slice(world, world + 1)
         return [self._steps[only], self._waiting[only], *self.simulation.share_of(world)]
 

@@ -1,4 +1,4 @@
-"""Errors of worlds in other processes: unsupported calls, and errors raised in those processes."""
+"""Errors of worlds in other processes: unsupported calls, and errors that workers have raised."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ def drive_by_network(
 ) -> None:
     """Set the commands of a step for all vehicles that one network drives.
 
-    Of the data that this kernel writes, an observation reads only those of its own vehicle.
+    An observation reads data that this kernel writes for its own vehicle, but for no other vehicle.
     """
     width = learned.observations.shape[0] // TILE_ROWS
     history_at, history_size = learned.optional.history.at, learned.optional.history.size

@@ -47,7 +47,7 @@ def exchange(
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and record vehicles near a border.
 
-    A zone needs a vehicle if and only if a driver there may consider it; see
+    A zone needs a vehicle if and only if a driver in the zone may consider it; see
     `visibility_tests.find_looks`. If a late transfer leaves a vehicle outside of its owner's zone,
     the vehicle is published as usual, even to the zone that contains it.
     """
@@ -253,7 +253,7 @@ def _take_ghost(
     """Append row i of a zone to another zone's ghosts.
 
     Ghosts that can touch a vehicle of the zone come before all other ghosts. The step of the row's
-    route is copied, too, because the table of routes is far away in memory.
+    route is also copied, because the table of routes is far away in memory.
     """
     rows = zoned.rows[side, zone, w]
     step = zoned.step[zone, w]

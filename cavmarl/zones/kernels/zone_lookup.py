@@ -1,4 +1,4 @@
-"""Lookup of the zone of a position, and of the zones that must see a vehicle there.
+"""Lookup of the zone of a position, and of the zones that must see a vehicle at the position.
 
 A zone is a rectangle [min_x, max_x) by [min_y, max_y); zones at the rim extend to infinity. The
 cuts of all zones form a table of cells, each of which belongs to one zone. Two searches among the
@@ -100,7 +100,7 @@ def _slot(cuts: NDArray[np.float64], value: float) -> int:
 def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
     """Return the zone of a position in metres, in O(log k).
 
-    A position on a border belongs to the zone that begins there.
+    A position on a border belongs to the zone that begins at the border.
     """
     return int(zones.cells[_slot(zones.cuts_y, y), _slot(zones.cuts_x, x)])
 
@@ -178,7 +178,7 @@ def is_seen(
     squared: float,  # m², the `squared_distance` of the row from the zone
 ) -> bool:
     """Return whether a zone must see a vehicle."""
-    if not squared <= halo.seen_m * halo.seen_m:  # false for NaN, too
+    if not squared <= halo.seen_m * halo.seen_m:  # also false for NaN
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True
