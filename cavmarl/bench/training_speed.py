@@ -171,7 +171,7 @@ def measure_training(
 
 @cache
 def training_program() -> Any:
-    """Load `train/ppo.py` as a module from its file, since `train` is no package."""
+    """Load `train/ppo.py` as a module from its file, since `train` is not a package."""
     spec = importlib.util.spec_from_file_location("ppo", programs()["ppo"])
     if spec is None or spec.loader is None:
         raise ConfigError("train/ppo.py: cannot be read as a module")
@@ -218,7 +218,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> Any:
 
 
 class _Side:
-    """A side of the comparison: the results and the timing of its updates.
+    """A side of the comparison: the measured results and durations of its updates.
 
     `update` collects and learns; it returns decisions and seconds by phase.
     """

@@ -265,7 +265,7 @@ class Reset(Record):
 class Begin(Record):
     """The decisions for `tick`. `inputs` is the digest of the actions.
 
-    `teleports` are the vehicles of `switches` whose new zone is not a neighbour of the old one.
+    `teleports` are the vehicles of `switches` whose new zone is not a neighbour of the old zone.
     """
 
     switches: tuple[Switch, ...] = ()

@@ -82,10 +82,10 @@ def read_table(path: Path, schema: Any) -> Any:
 
 
 def _check_file(path: Path) -> None:
-    """Raise OSError if a path is no regular file, such as a device, or is too large."""
+    """Raise OSError if a path is not a regular file (for example a device), or is too large."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        raise OSError("it is no file")
+        raise OSError("it is not a regular file")
     if found.st_size > MOST_FILE_BYTES:
         raise OSError(f"it has {found.st_size} bytes, and {MOST_FILE_BYTES} are allowed")
 

@@ -39,7 +39,7 @@ _INDEX = np.dtype([("episode", "<i4"), ("tick", "<i8"), ("part", "<i4"), ("row",
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Return the recordings at most three levels below a folder that is no recording itself."""
+    """Return the recordings at most three levels below a folder that is not itself a recording."""
     if (folder / HEAD_FILE).is_file():
         return []
     found = [file for depth in (1, 2, 3) for file in folder.glob(f"{'*/' * depth}{HEAD_FILE}")]

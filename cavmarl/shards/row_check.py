@@ -76,7 +76,7 @@ class ColumnCheck:
         if usual.all():
             return ""
         row, column = np.argwhere(~usual)[0].tolist()
-        return _of(rows[row], self._floats[column], f"is no allowed number up to ±{_LARGEST:g}")
+        return _of(rows[row], self._floats[column], f"is not an allowed number up to ±{_LARGEST:g}")
 
 
 class RowCheck:

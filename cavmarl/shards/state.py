@@ -19,8 +19,8 @@ from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState
 class Use(Enum):
     """The uses of an array of the state."""
 
-    SAVED = auto()  # in checkpoints, and with a world that changes its worker
-    DIGESTED = auto()  # in the hash of a world's state
+    SAVED = auto()  # stored in checkpoints, and sent with a world that moves to another worker
+    DIGESTED = auto()  # part of the hash of a world's state
 
 
 S, D = Use.SAVED, Use.DIGESTED

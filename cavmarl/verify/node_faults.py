@@ -141,7 +141,7 @@ def _run(
 
 
 class _PlannedFaults:
-    """The faults of a run. Each happens while all nodes live, some steps after the previous one."""
+    """The faults of a run. Each happens while all nodes live, some steps after the last fault."""
 
     def __init__(
         self,

@@ -111,7 +111,7 @@ class PublishedLine:
 
 @dataclass(frozen=True)
 class PublishedLines:
-    """All lines, and the numbers of pages that are no results.
+    """All lines, and the numbers on pages that are not results.
 
     Attributes:
         lines: lines by name.
@@ -159,7 +159,7 @@ def repository_root(start: Path | None = None) -> Path:
     """Return the folder of the checkout that contains the package, or `start`.
 
     Raises:
-        ConfigError: this is no checkout, as the pages with the numbers are missing.
+        ConfigError: this is not a checkout, since the pages with the numbers are missing.
     """
     root = start or Path(__file__).resolve().parents[2]
     if not (root / LINES_FILE).is_file():

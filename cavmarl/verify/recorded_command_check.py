@@ -27,7 +27,7 @@ def seed_of(row: np.void) -> int | None:
     """Return the seed in the row of a reset; None: the reset continues with an earlier seed.
 
     Raises:
-        ConfigError: the value is no valid seed.
+        ConfigError: the value is not a valid seed.
     """
     if not row["seed"]:
         return None

@@ -114,7 +114,7 @@ def _numbers(found: Any, path: str) -> list[float]:
             return [] if mean is None else [scale * value for value in values]
         case None:
             return []
-    raise EvaluationError(f"{path!r} is {found!r}, which is no number; correct the expression")
+    raise EvaluationError(f"{path!r} is {found!r}, which is not a number; correct the expression")
 
 
 def _scale_of(metric: str) -> float:

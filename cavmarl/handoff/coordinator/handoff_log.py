@@ -107,7 +107,7 @@ class HandoffLog:
         self._teleports.update(zip(far["tick"].tolist(), far["vehicle"].tolist(), strict=True))
 
     def teleports(self, switches: Iterable[Switch], tick: int) -> tuple[int, ...]:
-        """Return the vehicles whose new owner in a tick is not a neighbour of the old one."""
+        """Return the vehicles whose new owner in a tick is not a neighbour of the old owner."""
         if not self._teleports:
             return ()
         return tuple(s.vehicle for s in switches if (tick, s.vehicle) in self._teleports)

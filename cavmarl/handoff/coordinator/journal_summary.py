@@ -52,7 +52,7 @@ def summarize(path: Path) -> tuple[JournalSummary, Table]:
     """Return a journal's summary, and its final table of owners and hosts.
 
     Raises:
-        JournalError: the journal cannot be read, is damaged, or is no journal of a coordinator.
+        JournalError: the journal cannot be read, is damaged, or is not a coordinator's journal.
     """
     zones = _zones(path)
     summary, table = JournalSummary(), Table(zones)

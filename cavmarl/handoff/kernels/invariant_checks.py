@@ -113,7 +113,7 @@ def make_strays(zones: int, capacity: int) -> Strays:
 KIND_NONE = 0
 KIND_TICK = 1  # a vehicle was not advanced exactly once
 KIND_FAR = 2  # a vehicle is too far from its last position
-KIND_SUMS = 3  # zones own or see wrong vehicles
+KIND_SUMS = 3  # zones own or see the wrong vehicles
 
 
 @kernel

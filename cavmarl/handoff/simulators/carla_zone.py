@@ -201,7 +201,7 @@ class CarlaZone:
         return answer["result"]
 
     def _line(self, until_s: float) -> bytes:
-        """Wait for all answers still to come; return the last one."""
+        """Wait for all answers still to come; return the last answer."""
         line = b""
         while self._unread:
             line = self._next_line(until_s)

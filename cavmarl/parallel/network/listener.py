@@ -106,7 +106,7 @@ class PendingConnection:
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = HELLO.unpack(hello)
         if magic != MAGIC:
-            raise MessageError(f"a caller sends {hello[:4]!r}, which is no handshake of cavmarl")
+            raise MessageError(f"a caller sends {hello[:4]!r}, which is not cavmarl's handshake")
         if version != VERSION:
             self._socket.sendall(_VERSION.pack(MAGIC, VERSION))
             raise MessageError(
@@ -176,7 +176,7 @@ class Listener:
         return admitted
 
     def _welcome(self) -> Iterator[PendingConnection]:
-        """Accept new callers; if there are too many callers, disconnect silent ones first."""
+        """Accept new callers; if there are too many callers, disconnect silent callers first."""
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
@@ -224,7 +224,7 @@ class Listener:
             time.sleep(NO_DESCRIPTORS_S)
 
     def _disconnect_the_first(self) -> None:
-        """Disconnect the oldest caller that has sent no HELLO, or else the oldest caller."""
+        """Disconnect the oldest caller without a HELLO; if all have sent one, the oldest caller."""
         self._disconnect(min(self._callers, key=lambda each: (each.number >= 0, each.until_s)))
 
     def _disconnect(self, caller: PendingConnection) -> None:

@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError, WorkerError, require
 
 ADDRESS = "RAY_ADDRESS"  # environment variable that Ray itself reads
 CALL_S = 5.0
-RELEASE_S = 2.0  # Ray notices the end of an actor with a delay
+RELEASE_S = 2.0  # time to wait for CPUs, since Ray notices the end of an actor with a delay
 _RESOURCES = ("CPU", "memory", "GPU")
 _joined = 0  # calls of `join` without their `leave`; 0 if the program itself has joined
 

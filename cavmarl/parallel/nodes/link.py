@@ -131,7 +131,7 @@ class Link:
         self._filled = 0  # number of bytes in `_room`
         self._into = self._room  # target of the next bytes: `_room`, or an incomplete frame
         self._opened: tuple[NodeFrame, int] | None = None  # incomplete frame, and its checksum
-        self._num_sent = self._num_received = 0  # frames
+        self._num_sent = self._num_received = 0  # numbers of frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
         """Send as much as the connection accepts at once; keep a copy of the rest.

@@ -116,7 +116,7 @@ class Links:
 
     def receive(
         self,
-        wanted: Collection[int],  # senders
+        wanted: Collection[int],  # numbers of the senders
         timeout_s: float | None = None,  # None: no limit
     ) -> dict[int, NodeFrame]:
         """Receive the next frame of each sender.

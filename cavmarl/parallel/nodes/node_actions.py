@@ -63,7 +63,7 @@ class NodeCommand(NamedTuple):
 
     pieces: list[bytes]  # parts of its frame that are the same for all nodes
     changes: bool  # whether it changes the worlds
-    ticks: int  # simulated ticks; 0 if the command is no step
+    ticks: int  # simulated ticks; 0 unless the command is a step
     actions: Actions | None = None  # actions of the agents, if the command is a step
     cut: ZoneRects | None = None  # new zones of the worlds
     receptions: list[bytes] | None = None  # answers of a network simulator so far in this step

@@ -104,7 +104,7 @@ class NodeCoordinator:
 
     Attributes:
         worlds: ownership in each world.
-        switched: number of changes of owner.
+        switched: number of changes of owner so far.
         is_late: whether a vehicle without a record has crossed a border: a lease of 0 ticks is due.
     """
 

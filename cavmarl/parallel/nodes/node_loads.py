@@ -16,7 +16,7 @@ from cavmarl.balance.probe import Watch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.links import Links
 
-TOTALS = 7  # numbers that a node reports about itself
+TOTALS = 7  # count of the numbers that a node reports about itself
 TO_SHOW, TO_BALANCE = "to show", "to balance"  # purposes of requests about the load of machines
 LINKS = "links"  # purpose of a request about connections
 
@@ -59,7 +59,7 @@ class MachineWatch:
 
 
 def _watch(pids: Sequence[int]) -> Watch:
-    """Watch processes; this process is the first one."""
+    """Watch processes, starting with this process."""
     return Watch(dict(enumerate(dict.fromkeys((os.getpid(), *pids)))))
 
 

@@ -72,7 +72,7 @@ class NodePool:
         generation: number of changes of nodes.
         losses: number of lost nodes.
         recoveries: number of returns to a kept state because of lost nodes.
-        replacements: number of nodes that have replaced lost ones.
+        replacements: number of nodes that have replaced lost nodes.
         redirected: number of actions that were refused by a node and forwarded to the owner.
 
     Raises:
@@ -222,7 +222,7 @@ class NodePool:
         return self._cut.partition
 
     def _seat(self, num: int, waits: bool = True) -> None:
-        """Give ready nodes the numbers of missing ones, and so their home zones."""
+        """Give ready nodes the numbers, and thus the home zones, of missing nodes."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
         for joining_node, connection in self._supply.take(num, self._pump, waits):
             number = joining_node.asked if joining_node.asked in empty else empty[0]
@@ -272,7 +272,7 @@ class NodePool:
             what `read` returns for each node, the reporter first.
 
         Raises:
-            WorkerDeathError: no node has a replica of a lost one, or too many were lost.
+            WorkerDeathError: no node has a replica of a lost node, or too many were lost.
         """
         refuse_fork(self._pid, "the nodes")
         self._successions = 0
@@ -334,7 +334,7 @@ class NodePool:
         return found
 
     def _replace_lost(self) -> bool:  # whether the worlds go back to the newest state
-        """Let nodes that have joined in the meantime replace lost ones.
+        """Let nodes that have joined in the meantime replace lost nodes.
 
         The new nodes receive the zones of the newest state from the nodes that now host the zones.
         With SUMO this is impossible, since no kept state has all commands to SUMO so far.
@@ -481,7 +481,7 @@ class NodePool:
             self._links.send(owner, FrameKind.ACTIONS, self.generation, [actions.some(agents)])
 
     def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
-        """Remove a lost node, and start another one in its place.
+        """Remove a lost node, and start another node in its place.
 
         Raises:
             WorkerError: the node had not begun, and too many nodes were lost before they had begun.
@@ -507,7 +507,7 @@ class NodePool:
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
-        """Go back to the newest state of all nodes; living nodes take over zones of lost ones.
+        """Go back to the newest state of all nodes; living nodes take over zones of lost nodes.
 
         Zones whose home is another living node move to that node.
 

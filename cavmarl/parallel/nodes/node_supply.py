@@ -21,7 +21,7 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.world_message import make_world_message
 
-SPARES = 1  # additional nodes that may wait to replace a lost one
+SPARES = 1  # additional nodes that may wait to replace a lost node
 
 
 class NodeSupply:
@@ -130,7 +130,7 @@ class NodeSupply:
         return [n for n in ready if self._are_complete or joining_nodes.asked(n) not in spares]
 
     def replace(self, node: JoiningNode, is_silent: bool) -> None:
-        """Start another node in the place of a lost one."""
+        """Start another node in place of a lost node."""
         with self._lock:
             self._begun.remove(node.pid)
             self._starter.replace(node.asked, is_silent)

@@ -322,7 +322,7 @@ class NodeWorlds(CommandedWorlds):
     def node_loads(self) -> list[NodeLoad]:
         """Return the load of each node since the previous call, in rising order.
 
-        The load of a node that has replaced a lost one counts from its start.
+        The load of a node that has replaced a lost node counts from the start of the new node.
         """
         found = []
         ticks, self._ticks_reported = self._ticks_done - self._ticks_reported, self._ticks_done
@@ -374,7 +374,7 @@ class NodeWorlds(CommandedWorlds):
         self._command(Task.LOAD, saved)
 
     def check_worlds(self, saved: Sequence[bytes]) -> None:
-        """Raise ConfigError if the worlds cannot resume from saved ones."""
+        """Raise ConfigError if the worlds cannot resume from the saved worlds."""
         if refusal := self.ask(Task.CHECK, worlds_payload(saved)):
             raise ConfigError(refusal)
 

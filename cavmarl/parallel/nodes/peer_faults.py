@@ -59,7 +59,7 @@ def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) ->
     """Check indices into a table with `count` rows before they are used.
 
     Raises:
-        MessageError: an index is no whole number, or out of range.
+        MessageError: an index is not a whole number, or is out of range.
     """
     if isinstance(found, np.ndarray):
         if found.size and not 0 <= int(found.min()) <= int(found.max()) < count:

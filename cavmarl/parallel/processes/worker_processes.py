@@ -258,7 +258,7 @@ class WorkerProcesses:
                 self._statuses[j][NUMBER] = self.number(j) - 1  # the worker is dead
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
-        """Give a new process the mail from the old one, or else the payload again."""
+        """Give a new process the unread messages of the old process, or else the payload again."""
         if self.has(k):
             self.processes[k].mail = old.mail
         else:

@@ -429,7 +429,7 @@ def kept_elsewhere(config: EnvConfig) -> str:
 def missing_in_states(config: EnvConfig) -> str:
     """Return a key whose value puts state outside of the saved arrays; empty: no such key.
 
-    `zones.simulators` is no such key: simulators of zones receive the loaded state.
+    `zones.simulators` is not such a key: simulators of zones receive the loaded state.
     """
     kept = {
         "traffic.source = sumo-traffic": config.traffic.source == "sumo-traffic",

@@ -132,7 +132,7 @@ def pass_on(
 ) -> int:
     """Change a vehicle's owner: the old row becomes a ghost, and the target's ghost becomes a row.
 
-    The new row is a copy of the old one; only its owner and its epoch differ.
+    The new row is a copy of the old row; only its owner and its epoch differ.
 
     Returns:
         The vehicle's row at the target; -1 if the source does not own the vehicle; -2 if the target

@@ -64,7 +64,7 @@ def write_forecast(
     found: Floats,  # output: a copy of the row one tick ago, or `row` itself
     found_words: Words,  # the same memory
 ) -> None:
-    """Write the words that change in every tick, each after the words that it depends on."""
+    """Write the words that change in every tick, each word after the words on which it depends."""
     dt = forecast.dt
     if not is_known(known, SPEED):
         speed = before[SPEED] + row[THROTTLE] * dt
