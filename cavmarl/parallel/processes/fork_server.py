@@ -51,7 +51,7 @@ class Process:
     pid: int  # not reused until the process is reaped
     pidfd: int  # readable when the process has ended
     wire: socket.socket  # connection to the process
-    mail: list[bytes] = field(default_factory=list)  # received messages that nobody has read
+    mail: list[bytes] = field(default_factory=list)  # received messages that are still unread
 
     def collect(self) -> None:
         """Receive all messages that have come, and drop messages that are only wake-ups."""
