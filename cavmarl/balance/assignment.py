@@ -1,4 +1,4 @@
-"""Assigns the shards of all worlds to workers: the first plan, and later moves."""
+"""Assigns the shards of all worlds to workers, for the first plan and for later plans."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ def workers_of(problem: Problem) -> tuple[Workers, tuple[Rejection, ...]]:
 def assign(problem: Problem) -> tuple[Placement, str]:
     """Place all shards, or move some of them; return the placement and a short description.
 
-    Shards without a worker (none yet, or it does not answer) go where they finish first. Other
-    shards move, at most `max_moves` of them, only if the slowest worker exceeds a perfect division
-    by more than the tolerance. The gain must exceed both the tolerance's share of a tick and the
-    price of the moves in time. An excluded worker keeps its shards until balancing moves them.
+    Shards without an answering worker go to the worker that finishes them first. Of the other
+    shards, at most `max_moves` move, and only if the slowest worker exceeds a perfect division by
+    more than the tolerance. The gain must exceed both the tolerance's share of a tick and the time
+    that the moves take. An excluded worker keeps its shards until balancing moves them.
 
     Raises:
         NoAdmissibleWorkerError: there are shards to be placed and all workers are excluded.
@@ -44,7 +44,7 @@ def assign(problem: Problem) -> tuple[Placement, str]:
         if problem.in_row:
             return _place(problem, workers)
         assign_longest_first(placement, [[shard] for shard in lost])
-    return _rebalance(placement, "those of lost workers" if lost else "as it was")
+    return _rebalance(placement, "shards of lost workers placed" if lost else "unchanged")
 
 
 def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
@@ -65,13 +65,13 @@ def _place(problem: Problem, workers: Workers) -> tuple[Placement, str]:
         (row, "neighbours in a row"),
         (
             refine(whole.copy(), until_s=limit_s, slack_s=slack_s),
-            "worlds whole, but for a few shards",
+            "worlds whole, except a few shards",
         ),
         (
             refine(row.copy(), until_s=limit_s, slack_s=slack_s),
-            "neighbours in a row, but for a few shards",
+            "neighbours in a row, except a few shards",
         ),
-        (longest, "the costliest first"),
+        (longest, "costliest shards first"),
     ]
     good = [way for way in ways if way[0].makespan_s <= limit_s]
     return min(good, key=lambda way: (way[0].cut_pairs, way[0].makespan_s))

@@ -30,10 +30,10 @@ class WorkerLoad(NamedTuple):
     """The load of an answering worker under a plan."""
 
     worker: int
-    score: float  # LoadScore before
+    score: float  # LoadScore before the plan
     shards: int  # number of hosted shards
     load_s: float  # cost of its shards, s per tick
-    tick_s: float  # duration of its tick beside other programs
+    tick_s: float  # duration of its tick, including the slowdown by other programs
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Plan:
 
     problem: Problem  # the input of the plan
     homes: tuple[int, ...]  # worker of each shard, in the order of `problem.shards`
-    method: str  # description of how it was found
+    method: str  # how the placement was found
 
     def __post_init__(self) -> None:
         answering = {one.worker for one in self.problem.snapshot.workers if one.available}
@@ -66,7 +66,7 @@ class Plan:
 
     @property
     def imbalance(self) -> float:
-        """The slowest worker's tick divided by that of a perfect division."""
+        """Duration of the slowest worker's tick / duration with a perfect division."""
         return self.placement.imbalance
 
     @property
@@ -131,5 +131,5 @@ def make_plan(problem: Problem) -> Plan:
 
 
 def replan(plan: Plan, snapshot: LoadSnapshot) -> Plan:
-    """Return the plan for another snapshot, or again for the same snapshot."""
+    """Return the plan of the same problem with another snapshot."""
     return make_plan(replace(plan.problem, snapshot=snapshot))

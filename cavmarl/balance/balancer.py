@@ -46,12 +46,12 @@ class Balancer:
 
     def round(
         self,
-        snapshot: LoadSnapshot,  # of the present workers
+        snapshot: LoadSnapshot,  # load of the present workers
         *,
         costs: tuple[ShardCost, ...] | None = None,  # default: the measured costs
-        rule: BalanceRule | None = None,  # default: that of the present plan
+        rule: BalanceRule | None = None,  # default: the rule of the present plan
     ) -> Plan:
-        """Make the next plan: place lost shards, and move a few others if it is worth it.
+        """Make the next plan: place lost shards, and move a few other shards if that saves time.
 
         Raises:
             NoAdmissibleWorkerError: a worker is lost, and all others are excluded.

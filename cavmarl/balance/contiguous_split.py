@@ -26,7 +26,7 @@ def divide_row(
             rejections,
         )
     costs = [shard.cost_s for shard in problem.shards]
-    costs = costs if any(costs) else [1.0 for _ in costs]  # without costs, all are equal
+    costs = costs if any(costs) else [1.0 for _ in costs]  # without costs, all shards are equal
     ends = np.array([0.0, *accumulate(costs)])
     shares = np.cumsum(workers.speeds) / workers.speeds.sum()
     first, count = 0, len(workers)
@@ -42,13 +42,13 @@ def shift_ends(
     placement: Placement,  # changed and returned
     *,
     until_s: float,  # a makespan that is good enough
-    max_moves: int,  # of shards
+    max_moves: int,  # maximum number of moved shards
 ) -> Placement:
     """Shorten the piece of the slowest worker repeatedly.
 
-    The slowest worker gives the shard at one of its ends to the adjacent worker. This worker may
-    pass a shard on to the next worker, and so on, until all are faster than the slowest was. The
-    change with the shortest makespan is made; on a tie, the change that moves fewer shards.
+    The slowest worker gives the shard at one of its ends to the adjacent worker. That worker may
+    pass a shard on to the next worker, and so on, until all are faster than the slowest was. Of the
+    possible changes, the one with the shortest makespan is made; on a tie, with the fewest moves.
     """
     left = max_moves
     while left > 0 and placement.makespan_s > until_s:
@@ -73,7 +73,7 @@ def shift_ends(
 
 
 def _towards(source: int, step: int, count: int) -> range:
-    """Return the workers that may pass a shard on in a direction, from `source` on."""
+    """Return the workers that may pass a shard on in a direction, starting with `source`."""
     return range(source, count - 1) if step > 0 else range(source, 0, -1)
 
 

@@ -15,7 +15,7 @@ class SmoothCosts:
 
     def __init__(
         self,
-        # weight of the newest measurement; the first one of a shard counts fully
+        # weight of the newest measurement; the first measurement of a shard has the weight 1
         newest: float = NEWEST,
     ) -> None:
         if not 0.0 < newest <= 1.0:

@@ -7,7 +7,7 @@ from collections.abc import Iterable, Sequence
 
 from cavmarl.balance.shard_placement import Placement
 
-HALVINGS = 60  # halvings of an interval, to beyond the precision of a float
+HALVINGS = 60  # halvings of an interval; more than a float's precision needs
 
 
 def assign_longest_first(

@@ -19,7 +19,7 @@ from typing import Literal, NamedTuple
 from cavmarl.core.errors import ConfigError, NoAdmissibleWorkerError
 
 RESOURCES = ("cpu", "ram", "gpu")
-WEIGHTS = (0.6, 0.2, 0.2)  # empirical in the paper: the processor carries most of the load
+WEIGHTS = (0.6, 0.2, 0.2)  # empirical weights of the paper: the processor carries most of the load
 THRESHOLDS = (0.85, 0.90, 0.95)
 UNAVAILABLE = "unavailable"
 SUM_ERROR = 1e-9  # tolerance for the sum of decimal weights
@@ -34,7 +34,7 @@ Outcome = Literal[
 
 
 def _check_share(name: str, value: float) -> None:
-    if not 0.0 <= value <= 1.0:  # NaN fails this check, too
+    if not 0.0 <= value <= 1.0:  # NaN also fails this check
         cure = f"; if this is a percentage, use {value / 100.0:g}" if 1.0 < value <= 100.0 else ""
         raise ConfigError(f"{name} = {value}: must be a share from 0 to 1{cure}")
 
@@ -86,7 +86,7 @@ class LoadRule:
 
 
 def load_score(use: Utilisation, weights: tuple[float, float, float] = WEIGHTS) -> float:
-    """Return eq. (1): from 0, if all is free, to 1, if all is used."""
+    """Return eq. (1), from 0 (all resources are free) to 1 (all are used)."""
     pairs = zip(weights, (use.cpu, use.ram, use.gpu), strict=True)
     return math.fsum(weight * share for weight, share in pairs)
 
@@ -100,9 +100,9 @@ class Candidate:
 
     worker: int
     use: Utilisation  # used shares of its resources
-    # number of its shards; on equal scores, the worker with fewer is chosen
+    # number of its shards; on equal scores, the worker with fewer shards is chosen
     hosted: int = 0
-    available: bool = True  # whether it answers and its data are recent
+    available: bool = True  # whether the worker answers and its data are recent
 
 
 class Rejection(NamedTuple):
@@ -175,9 +175,9 @@ def select(
     candidates: Sequence[Candidate],  # all workers
     # weights, thresholds, and the margin of a preferred worker
     rule: LoadRule = DEFAULT_RULE,
-    preferred: int | None = None,  # chosen if it is admissible and within the margin
+    preferred: int | None = None,  # worker that is chosen if admissible and within the margin
 ) -> Selection:
-    """Return the admissible worker with the lowest score, or the preferred one if about as good.
+    """Return the admissible worker with the lowest score, or the preferred one if it is close.
 
     On equal scores, the worker that hosts fewer shards is chosen, then the worker with the lower
     number. The order of `candidates` has no effect.

@@ -1,6 +1,6 @@
 """`LoadSnapshot`: the resource use of each worker at one time.
 
-A placement depends on live measurements only through a snapshot: a snapshot stored in a manifest
+A placement depends on live measurements only through a snapshot, so a snapshot stored in a manifest
 gives the same plan again. `probe` takes a snapshot of this machine.
 """
 
@@ -20,7 +20,7 @@ SUPPOSED_IDLE = "supposed idle"
 class LoadSnapshot:
     """Utilisation of all workers."""
 
-    workers: tuple[Candidate, ...]  # by number; at least one
+    workers: tuple[Candidate, ...]  # at least one worker, by number
     gpu_source: str  # source of the use of GPUs; `none`: there is no GPU, and its use counts as 0
     origin: str  # source of the shares: `measured`, `supposed idle`, `generated`
 

@@ -11,23 +11,23 @@ from cavmarl.balance.problem import Problem
 from cavmarl.balance.shard_placement import Placement
 
 Floats = NDArray[np.float64]
-LEAST_GAIN = 1e-9  # share of a tick; smaller differences may be rounding
-MOVES_A_SHARD = 4  # safety limit, not reached: every change speeds up the slowest pair
+LEAST_GAIN = 1e-9  # minimum gain as a share of a tick; smaller differences may be rounding errors
+MOVES_A_SHARD = 4  # safety limit of moves per shard; not reached, since every change saves time
 
 
 def refine(
     placement: Placement,  # changed and returned
     *,
     until_s: float = 0.0,  # a makespan that is good enough
-    # a change that separates fewer neighbours is preferred to the best change, if its makespan is
-    # longer by at most this
+    # a change that separates fewer neighbours is preferred to the fastest change, if its makespan
+    # is longer by at most this
     slack_s: float = 0.0,
-    max_moves: int | None = None,  # maximum number of shards; a swap counts as two. None: no limit
+    max_moves: int | None = None,  # limit of moved shards; a swap counts as two. None: no limit
 ) -> Placement:
-    """Move a shard off the slowest worker, or swap it with another worker's, while that helps.
+    """Move shards off the slowest worker, or swap them with other workers' shards, while it helps.
 
     A change helps if both workers are then faster than the slowest was. No shard moves to an
-    excluded worker, and no worker loses its last shard if the rule says so.
+    excluded worker. If the rule `keeps_one` is set, no worker loses its last shard.
     """
     left = MOVES_A_SHARD * len(placement.homes) if max_moves is None else max_moves
     touching = _touching(placement.problem)
@@ -44,7 +44,7 @@ def refine(
 
 
 def _touching(problem: Problem) -> NDArray[np.int64]:
-    """Return (n, n) 1 where two shards are neighbours."""
+    """Return (n, n), which is 1 where two shards are neighbours."""
     touching = np.zeros((len(problem.shards), len(problem.shards)), dtype=np.int64)
     for a, b in problem.pairs:
         touching[a, b] = touching[b, a] = 1
@@ -64,8 +64,8 @@ def _best_change(
     others = np.flatnonzero(homes != source)
     if not (may_swap and workers.is_open[source]):
         others = others[:0]
-    # Columns: a move to each worker, then a swap with each other shard. `back` is the cost that the
-    # slowest worker gets in return.
+    # Columns: a move to each worker, then a swap with each other shard. `back` is the cost of the
+    # shard that the slowest worker receives in return.
     targets = np.concatenate([np.arange(count), homes[others]])
     back = np.concatenate([np.zeros(count), costs[others]])
     change = costs[own][:, None] - back[None, :]
@@ -92,7 +92,7 @@ def _more_cut(
     near: NDArray[np.int64],  # (n, m) neighbours of each shard on each worker
     touching: NDArray[np.int64],  # (n, n) 1 where two shards are neighbours
     own: NDArray[np.int64],  # shards of the source
-    others: NDArray[np.int64],  # shards to swap for; they are the last columns
+    others: NDArray[np.int64],  # shards that can be received in a swap; they are the last columns
     source: int,  # the giving worker
     targets: NDArray[np.int64],  # the receiving worker of each column
 ) -> NDArray[np.int64]:

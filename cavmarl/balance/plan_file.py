@@ -19,7 +19,7 @@ from cavmarl.core.errors import ConfigError
 # Keys of a manifest: the plans at the start and at the end of the run.
 PLACEMENT, PLACEMENT_AT_END = "placement", "placement_at_end"
 
-Count = Annotated[int, Field(ge=0, le=1 << 53)]  # larger ones are not exact in every JSON reader
+Count = Annotated[int, Field(ge=0, le=1 << 53)]  # some JSON readers round larger numbers
 
 
 @dataclass(frozen=True)
@@ -62,7 +62,7 @@ def read_plan(path: Path) -> Plan:
 
 
 def read_plans(path: Path) -> list[Plan]:
-    """Return the plan of a file, or the plans of a manifest: at the start, then at the end."""
+    """Return the plan of a file, or the plans at the start and the end of a manifest's run."""
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError, RecursionError) as error:

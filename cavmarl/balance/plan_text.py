@@ -34,7 +34,7 @@ def describe_plan(plan: Plan) -> str:
         + ("" if unit else f"; costs by {problem.cost_source}"),
         f"slowest worker {_cost(plan, placement.makespan_s)}{unit}, "
         f"{plan.imbalance:.3f} times a perfect division; "
-        f"neighbours apart: {placement.cut_pairs} of {len(problem.pairs)}",
+        f"separated neighbours: {placement.cut_pairs} of {len(problem.pairs)}",
         f"costliest {what[:-1]} {_cost(plan, max(costs))}{unit}, "
         f"{_over_mean(costs):.3f} times the mean",
         f"score = {weights}; workers {snapshot.origin}, GPU: {snapshot.gpu_source}",

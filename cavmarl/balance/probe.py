@@ -37,10 +37,10 @@ def take_snapshot(
 class Watch:
     """A measurement of the machine from its construction until it is read.
 
-    A worker's CPU use is the mean use of the cores that its process may run on, less the use by
-    this process and all workers: a run's own computation is no reason to move shards away. RAM is
-    that of the machine. GPU is that of its busiest GPU by `nvidia-smi`; without `nvidia-smi` it
-    is 0 and `gpu_source` is `none`.
+    A worker's CPU use is the mean use of the cores on which its process may run, minus the use by
+    this process and all workers: a run's own computation is no reason to move shards away. RAM use
+    is measured for the machine, GPU use for the busiest GPU according to `nvidia-smi`; without
+    `nvidia-smi` it is 0, and `gpu_source` is `none`.
     """
 
     def __init__(self, workers: Mapping[int, int | None]) -> None:
@@ -51,7 +51,7 @@ class Watch:
         self._before = _busy_s()
 
     def snapshot(self) -> LoadSnapshot:
-        """Return the use by other programs since the start. Raises ConfigError without workers."""
+        """Return the use by other programs since the start. Raises ConfigError: no workers."""
         elapsed_s = max(time.perf_counter() - self._began_s, SHORTEST_S)
         foreign = [
             (after - before) / elapsed_s
@@ -73,10 +73,10 @@ class Watch:
 
 
 class _Watched:
-    """The processor time of a process from the construction on.
+    """The processor time of a process since the construction of this object.
 
     Attributes:
-        cores: cores that it may run on.
+        cores: cores on which the process may run.
     """
 
     def __init__(self, pid: int | None) -> None:

@@ -14,7 +14,7 @@ from cavmarl.core.errors import ConfigError
 
 MEASURED_COSTS = "measured"
 
-MAX_COST_S = 1e6  # per tick; keeps sums finite
+MAX_COST_S = 1e6  # limit of a cost per tick, which keeps sums finite
 
 
 class ShardCost(NamedTuple):
@@ -36,10 +36,10 @@ class BalanceRule:
 
     load: LoadRule = field(default_factory=LoadRule)  # how workers are scored and excluded
     # share of a perfect division's tick. Shards move only if the slowest worker exceeds a perfect
-    # division by more than this, and if the gain exceeds it. To keep neighbours together, a tick
-    # may be longer by this share.
+    # division by more than this share, and if the gain exceeds this share. To keep neighbours
+    # together, a tick may be longer by this share.
     tolerance: float = 0.1
-    # maximum number of shards that move in a round, without shards of lost workers
+    # maximum number of shards that move in a round, not counting shards of lost workers
     max_moves: int = 4
     move_s: float = 0.01  # s, cost of one move
     # shards move only if all workers together save the cost of the moves within this many ticks
@@ -62,12 +62,12 @@ class Problem:
 
     shards: tuple[ShardCost, ...]  # all worlds, sorted by world and zone
     neighbors: tuple[tuple[int, ...], ...]  # zones that share a side with each zone
-    snapshot: LoadSnapshot  # of the workers
+    snapshot: LoadSnapshot  # load of the workers
     rule: BalanceRule = field(default_factory=BalanceRule)  # rules for moving shards
     # present worker of each shard, in the order of `shards`; None: none is placed yet
     present: tuple[int, ...] | None = None
-    # whether each worker hosts one or more consecutive shards, in the order of workers, because the
-    # results of all worlds are in one array
+    # whether each worker must host one or more consecutive shards, in the order of workers, because
+    # the results of all worlds are in one array
     in_row: bool = False
     # source of the costs; unless it is `measured`, only their ratios count
     cost_source: str = MEASURED_COSTS
@@ -121,7 +121,7 @@ def _check_shards(shards: Sequence[ShardCost], zones: int) -> None:
             raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: the zone must be below {zones}"
             )
-        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN fails this check, too
+        if not 0.0 <= shard.cost_s <= MAX_COST_S:  # NaN also fails this check
             raise ConfigError(
                 f"world {shard.world}, zone {shard.zone}: cost_s = {shard.cost_s}: must be "
                 f"seconds from 0 to {MAX_COST_S:g}; measure it again"

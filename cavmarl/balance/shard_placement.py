@@ -2,8 +2,8 @@
 
 A worker with LoadScore S, the share taken by other programs, has the speed 1 - S: shards that cost
 `load` seconds take load / (1 - S) on it. Before shards are placed, the fastest worker is thus the
-worker with the lowest LoadScore, as in eq. (2). The slowest worker determines the pace of all. Its
-tick divided by that of a perfect division is the imbalance.
+worker with the lowest LoadScore, as in eq. (2). The slowest worker determines the pace of all
+workers. The imbalance is the duration of its tick / the duration with a perfect division.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Workers:
     """The workers that answer, by number.
 
     Attributes:
-        scores: their LoadScores.
+        scores: LoadScore of each worker.
         speeds: free share of each worker.
         is_open: whether each worker may receive shards.
     """
@@ -34,7 +34,7 @@ class Workers:
         self,
         candidates: Sequence[Candidate],  # the workers
         rejections: Sequence[Rejection],  # reasons why workers are excluded
-        weights: tuple[float, float, float],  # of the score
+        weights: tuple[float, float, float],  # weights of the score
     ) -> None:
         self.numbers = tuple(candidate.worker for candidate in candidates)  # numbers of the workers
         self.scores = tuple(load_score(candidate.use, weights) for candidate in candidates)

@@ -1,4 +1,4 @@
-"""The measurements of `cavmarl bench`; others are in `benchmarks/` outside the package.
+"""The benchmarks of `cavmarl bench`; further benchmarks are in `benchmarks/` outside the package.
 
 The package uses `evaluate` and is run by `cli`.
 """

@@ -31,12 +31,12 @@ Taken = TypeVar("Taken")
 
 
 def silent(text: str) -> None:
-    """Print nothing; the argument `say` of silent runs."""
+    """Print nothing; silent runs pass this function as `say`."""
 
 
 @dataclass(frozen=True)
 class Spread:
-    """The least, median and largest result of one side."""
+    """The smallest, median and largest result of one side."""
 
     low: float
     median: float
@@ -44,7 +44,7 @@ class Spread:
 
 
 def spread(values: Iterable[float]) -> Spread:
-    """Return the least, median and largest value."""
+    """Return the smallest, median and largest value."""
     found = tuple(values)
     return Spread(min(found), median(found), max(found))
 
@@ -58,7 +58,7 @@ class BenchmarkReport:
         columns: column head → `key` or `key:format` of the rows, left to right. The first column is
             text.
         rows: one row per side, with all its measurements.
-        notes: lines below the tables, with rich markup.
+        notes: lines below the tables, with markup of the library rich.
         facts: figures that belong to no row.
         holds: whether the requested bound holds; if not, the exit code is 1.
         caption: a line below the table.
@@ -125,8 +125,8 @@ def paired_ratio(ones: Sequence[float], others: Sequence[float]) -> float:
 def paired_interval(ones: Sequence[float], others: Sequence[float]) -> tuple[float, float]:
     """Return the mean ratio of two sides, turn by turn, and half of its confidence interval.
 
-    The mean is geometric, without the outer tenths. The interval of 95 % is two standard errors, by
-    Yuen's (1974) estimate; for a single turn it is infinite.
+    The mean is geometric, without the lowest and the highest tenth. Half of the 95 % interval is
+    two standard errors by Yuen's (1974) estimate; for a single turn it is infinite.
     """
     logs = sorted(math.log(one / other) for one, other in zip(ones, others, strict=True))
     cut = len(logs) // 10
@@ -179,7 +179,7 @@ def numbers_of(option: str, text: str) -> list[int]:
 
 @contextmanager
 def measuring(console: Console) -> Iterator[Say]:
-    """Show the current measurement; a text like `3 of 7` adds a bar and the remaining time."""
+    """Show the current measurement; a text like `3 of 7` adds a progress bar and the time left."""
     with progress_bar(console) as bar:
         task = bar.add_task("", total=None)
 
@@ -197,9 +197,9 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """Build a table whose first column is text and the others numbers; a row None is a line.
+    """Build a table with text in the first column and numbers in the others; a row None is a line.
 
-    On a narrow terminal, text is wrapped and numbers stay whole.
+    On a narrow terminal, text is wrapped but numbers are not.
     """
     close = (0, 1, 0, 0)  # fits ten columns on a terminal of 80 characters
     table = Table(

@@ -17,7 +17,7 @@ from cavmarl.core.errors import require
 
 
 class HighwayRows(VecEnvWrapper):
-    """A `VecEnv` with a row per controlled vehicle; rows of a world end together.
+    """A `VecEnv` with one row per controlled vehicle; the rows of a world end together.
 
     The rows of a world have equal rewards. Each world runs in its own process, has no other
     vehicles, and restarts after `horizon_s`.
@@ -37,7 +37,7 @@ class HighwayRows(VecEnvWrapper):
         )
         self._agents = agents
         self.num_envs = worlds * agents
-        self.simulated_s = 0.0  # total of all steps, including communication between processes
+        self.simulated_s = 0.0  # time of all steps, including communication between processes
 
     def reset(self) -> NDArray[np.float32]:
         """Restart all worlds; return observations (W · A, D)."""

@@ -1,6 +1,6 @@
 """Equal worlds for both sides of a comparison: cavmarl's and highway-env's.
 
-N controlled vehicles stand on a straight road of four lanes at highway-env's initial density; there
+N controlled vehicles are on a straight road of four lanes at highway-env's initial density; there
 is no other traffic. All vehicles use the meta-action IDLE, at 20 Hz with 10 decisions per second.
 """
 
@@ -22,8 +22,8 @@ SPEED_MPS = 30.0
 RUN_OUT_M = 1500.0
 IDLE = 1
 
-# Sensors of cavmarl in addition to ego and signal. highway-env has no neighbours with the lidar, no
-# route, and four neighbours by default.
+# Sensors of cavmarl in addition to ego and signal. In highway-env, the lidar observation has no
+# neighbours, no observation has a route, and `Kinematics` has four neighbours by default.
 LIDAR: dict[str, Any] = {
     "sensors.route.points": 0,
     "sensors.neighbors.count": NEIGHBORS,
@@ -81,7 +81,7 @@ def straight_road(folder: Path, road_m: float) -> Path:
     """Write a SUMO net: a straight `road`, and an `end` that no vehicle reaches."""
     whole_m = road_m + RUN_OUT_M
 
-    # Centres of the lanes; lane 0 is the rightmost one, and the road goes east.
+    # Centres of the lanes; lane 0 is the rightmost lane, and the road goes east.
     ys = [f"{(k - LANES) * LANE_WIDTH_M:.2f}" for k in range(LANES)]
 
     def lanes(edge: str, begin_m: float, end_m: float) -> str:

@@ -1,7 +1,7 @@
 """Speed of worlds whose signals follow max pressure, compared with sumo-rl on libsumo.
 
-Both sides decide every 5 s. A step of ours has 25 ticks of 0.2 s, one of sumo-rl five steps of 1 s.
-They take turns on the same core; processor time counts.
+Both sides decide every 5 s. A step of cavmarl has 25 ticks of 0.2 s; a step of sumo-rl has five
+simulation steps of 1 s. The sides take turns on the same core; processor time counts.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ class SignalSpeed:
     map_name: str
     signals: int
     after_s: int  # simulated seconds before the first turn
-    turn: int  # decisions of a turn
+    turn: int  # number of decisions of a turn
     repeats: int
     ours: dict[int, Spread]  # number of worlds → rates
     sumo_rl: Spread
@@ -124,7 +124,7 @@ def _world(sumo_config: Path, worlds: int, horizon_s: float, seed: int) -> Simul
 
 
 def _stepper(simulation: Simulation) -> Callable[[int], float]:
-    """Return a function that makes decisions, and returns the seconds of processor time."""
+    """Return a function that makes a number of decisions, and returns its processor time in s."""
     view, controller = simulation.signal_view(), MaxPressure()
     commands = idle_commands(simulation)
 
@@ -138,7 +138,7 @@ def _stepper(simulation: Simulation) -> Callable[[int], float]:
 
 
 def _answer(process: subprocess.Popen[str], wanted: str) -> str:
-    """Return the next line that sumo-rl's side prints, without lines of SUMO."""
+    """Return the next line that sumo-rl's side prints, skipping lines of SUMO."""
     assert process.stdout is not None and process.stderr is not None  # noqa: PT018
     for line in process.stdout:
         word = line.strip()

@@ -81,8 +81,8 @@ class StepSpeed:
     rows: tuple[Row, ...]  # all measurements
     ratio: float  # `batched` over `highway_env`, with lidar
     ratio_kinematics: float  # `batched` over `highway_env`, with its default observation
-    ratio_kinematics_raw: float  # the same, with its observation without normalisation
-    cost_of_more: float  # cost per agent with `MORE` times as many agents, over that of `batched`
+    ratio_kinematics_raw: float  # like `ratio_kinematics`, but without normalisation
+    cost_of_more: float  # cost per agent with `MORE` times the agents, over the cost of `batched`
     dict_us: float  # cost of the dict API per agent and step, over `single`, in µs
 
 

@@ -1,8 +1,8 @@
 """The program that times sumo-rl. It runs in a Python that has sumo-rl and libsumo.
 
-It imports nothing of this package. Arguments: network, route file, decisions before the timing,
-decisions of a turn. For each line of standard input it runs a turn, and prints the seconds of
-processor time.
+The program imports nothing of this package. Arguments: network, route file, number of decisions
+before the timing, number of decisions per turn. For each line of standard input, the program runs a
+turn and prints its processor time in s.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _step(environment: Any, count: int) -> None:
 
 
 def _max_pressure(sumo: Any, signal: Any) -> int:
-    """Return the green whose movements have most vehicles before and fewest behind them."""
+    """Return the green whose movements have the largest sum of vehicles before minus behind."""
     count = sumo.lane.getLastStepVehicleNumber
     links = sumo.trafficlight.getControlledLinks(signal.id)
     best, best_score = signal.green_phase, None

@@ -1,7 +1,7 @@
 """Speed of a traffic tick compared with libsumo: same map, demand and step length; no output.
 
 Both sides run the demand up to the same second, then take turns of equal simulated length on the
-same core: cavmarl in this process, SUMO in a separate one.
+same core: cavmarl in this process, SUMO in a separate process.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class TrafficSpeed:
     dt_s: float  # step length of both sides
     after_s: int  # simulated seconds before the first turn
     repeats: int  # turns of each side
-    our_vehicles: float  # mean number in cavmarl's world over all turns
-    sumo_vehicles: float  # mean number in SUMO's world
+    our_vehicles: float  # mean number of vehicles in cavmarl's world over all turns
+    sumo_vehicles: float  # mean number of vehicles in SUMO's world over all turns
     ours: Spread  # rates of cavmarl
     sumo: Spread  # rates of libsumo
     ratio: float  # cavmarl's median over libsumo's
@@ -50,7 +50,7 @@ class TrafficSpeed:
 
 @dataclass(frozen=True)
 class Turn:
-    """Steps of a world: vehicles times steps, processor time and wall-clock time."""
+    """One turn: number of vehicles times steps, processor time and wall-clock time."""
 
     vehicle_steps: int
     cpu_s: float
@@ -71,7 +71,7 @@ def measure_traffic_speed(
     check_range(after=(after_s, 1, 3600), repeats=(repeats, 1, 100))
     path = find_map(map_name)
     given = read_input(demand)
-    # cavmarl first, since its errors name file and line of unsupported demand.
+    # Start with cavmarl, since its errors name file and line of unsupported demand.
     simulation = make_world(path, demand, after_s + repeats * TURN_S, seed, dt_s)
     if isinstance(simulation.demand, DemandFile):
         given = replace(given, begin_s=simulation.demand.begin_ms / 1000.0)
@@ -127,12 +127,12 @@ def our_turn(simulation: Simulation, steps: int) -> Turn:
 
 
 def load_sumo(job: SumoJob, folder: str) -> None:
-    """Load the job into the process that runs SUMO; libsumo keeps it there."""
+    """Load the job into the process that runs SUMO; libsumo keeps it in this process."""
     start_sumo(job, Path(folder))
 
 
 def turn_of_sumo(steps: int) -> Turn:
-    """Run steps of the SUMO that is loaded in this process."""
+    """Time some steps of the SUMO simulation that is loaded in this process."""
     libsumo = require("libsumo", "sumo")
 
     def step() -> int:

@@ -43,7 +43,7 @@ if TYPE_CHECKING:
 _Update = tuple[int, dict[str, float]]
 
 HORIZON_S = 40.0
-OUR_STEPS = 32  # per world between two updates
+OUR_STEPS = 32  # steps of each world between two updates
 EPOCHS = 4
 MINIBATCHES = 8
 HIDDEN = 64
@@ -83,7 +83,7 @@ class TrainingRow:
 
 @dataclass(frozen=True)
 class TrainingSpeed:
-    """Results of two kinds of benchmark, whose numbers must not be mixed."""
+    """Results of two benchmarks, training and stepping, whose numbers must not be compared."""
 
     agents: int  # number of agents per world
     workers: int  # number of workers per side
@@ -95,7 +95,7 @@ class TrainingSpeed:
 
     @property
     def ratio(self) -> float:
-        """Ratio of agent-steps per second to stable-baselines3; median of the turns."""
+        """Ratio of cavmarl's to stable-baselines3's agent-steps per second; median of the turns."""
         return self._over("cavmarl", "stable_baselines3")
 
     @property
@@ -113,7 +113,7 @@ class TrainingSpeed:
         return paired_ratio(rates[one], rates[other])
 
     def facts(self) -> dict[str, Any]:
-        """Return plain values for a report: all but the rows of `end_to_end`."""
+        """Return plain values for a report: everything except the rows of `end_to_end`."""
         return {
             "agents": self.agents,
             "workers": self.workers,
@@ -132,7 +132,7 @@ class TrainingSpeed:
 def measure_training(
     agents: int = 20, worlds: int = 16, workers: int = 2, repeats: int = 3, say: Say = silent
 ) -> TrainingSpeed:
-    """Update both sides in turn, after one update of each that is not measured."""
+    """Update both sides in turn, after one unmeasured update of each side."""
     check_range(
         agents=(agents, 1, math.inf), workers=(workers, 1, math.inf), repeats=(repeats, 1, math.inf)
     )
@@ -171,7 +171,7 @@ def measure_training(
 
 @cache
 def training_program() -> Any:
-    """Load `train/ppo.py` as a module from its file, since `train` is no package."""
+    """Load `train/ppo.py` as a module from its file, since `train` is not a package."""
     spec = importlib.util.spec_from_file_location("ppo", programs()["ppo"])
     if spec is None or spec.loader is None:
         raise ConfigError("train/ppo.py: cannot be read as a module")
@@ -218,7 +218,7 @@ def _settings(folder: Path, agents: int, worlds: int, workers: int) -> Any:
 
 
 class _Side:
-    """A side of the comparison: the results and the timing of its updates.
+    """A side of the comparison: the measured results and durations of its updates.
 
     `update` collects and learns; it returns decisions and seconds by phase.
     """

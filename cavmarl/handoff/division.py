@@ -1,8 +1,8 @@
 """`ZonedShards`: the shards of W worlds, and the rows that are exchanged between them.
 
-In each tick, every zone gets ghosts of the vehicles that it may see (decision 012). A coordinator
-decides changes of owner between two ticks. The old shard keeps the vehicle as a ghost. The new
-shard has a ghost already, and continues from the state that it receives.
+In each tick, every zone receives ghosts of the vehicles that it may see (decision 012). A
+coordinator decides changes of owner between two ticks. The old shard keeps the vehicle as a ghost.
+The new shard already has a ghost of the vehicle, and continues from the state that it receives.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class ZonedShards:
         gathering: (touching_m, border_m), the arguments of the phase `gather`. A ghost farther than
             `touching_m` outside of a zone touches no vehicle of the zone. A vehicle is at a border
             if its distance to the border is at most `border_m`.
-        neighbours: (k, k) whether vehicles change their owner between two zones.
-        row_count: the call that sets the numbers of rows in an undivided world.
+        neighbours: (k, k) whether vehicles can change their owner between two zones.
+        row_count: sets the numbers of rows in an undivided world.
         changes: finds vehicles near borders and changes their owners.
     """
 
@@ -62,12 +62,12 @@ class ZonedShards:
         shards: Sequence[Shard],  # one per zone, in the order of zones
         zoned: ZoneState,  # the rows of all shards
         partition: ZonePartition,
-        halo: Halo,  # of this partition
-        sight: Visibility,  # computes the halo of other partitions
+        halo: Halo,  # halo of this partition
+        sight: Visibility,  # computes the halos of other partitions
         touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
         borders: Borders,
-        codec: TransferCodec,  # of vehicles' states
-        row_check: RowCheck,  # of rows from outside
+        codec: TransferCodec,  # encodes and decodes the states of vehicles
+        row_check: RowCheck,  # checks rows from outside
         may_teleport: bool,  # whether vehicles may jump to any place between two ticks
     ) -> None:
         self.zones: ZoneArrays = partition.arrays
@@ -120,7 +120,7 @@ class ZonedShards:
     def cut(self, partition: ZonePartition) -> None:
         """Change the zones between two ticks. Vehicles keep their owners, and ghosts are renewed.
 
-        A vehicle outside of its owner's new zone changes its owner later, as at any border.
+        A vehicle outside of its owner's new zone changes its owner later, as at a crossed border.
         """
         self.divide(partition)
         self._zoned.num_outer[...] = -1
@@ -132,7 +132,7 @@ class ZonedShards:
         book.tick[:] = tick  # the rows are still those of this tick
 
     def divide(self, partition: ZonePartition) -> None:
-        """Set the zones. The caller must set owners and ghosts anew."""
+        """Set the zones. The caller must then set owners and ghosts."""
         zones, halo = partition.arrays, self._sight.halo(partition)
         self.zones, self._halo = zones, halo
         self.neighbours = partition.within(self._sight.outside_m)
@@ -140,14 +140,14 @@ class ZonedShards:
             shard.cut(zones, halo)
 
     def _forget_offers(self, w: int) -> None:
-        """Forget vehicles near a border, so that they are not counted as turned away."""
+        """Forget vehicles near a border, so that they do not count as turned away."""
         for known in (self.book.num_near, self.book.num_coming, self.book.known):
             known[w] = 0
 
     def exchange(self) -> None:
         """Renew all ghosts from the owned `next_rows`.
 
-        If shards `gather` them, `note_gathered` must follow before the tick ends.
+        If shards renew them in `gather`, `note_gathered` must follow before the tick ends.
         """
         if self._gatherers is not None:
             self._gatherers.gather(*self.gathering)
@@ -160,10 +160,9 @@ class ZonedShards:
         self.row_count()
 
     def let_gather(self, executor: Executor) -> bool:
-        """Let the shards renew their ghosts in the phase `gather`. Return whether they do.
+        """Let the shards renew their ghosts in the phase `gather`, if possible; return whether so.
 
-        A shard that gathers reads all other shards. So this is used only if all zones see each
-        other.
+        A shard that gathers reads all other shards. So this requires that all zones see each other.
         """
         if len(self._halo.near) == self.count**2:
             self._gatherers = executor
@@ -197,7 +196,7 @@ class ZonedShards:
     ) -> None:
         """Give every vehicle to the zone that contains it, independent of its former owner."""
         first = self._shards[0].worlds
-        # Steps of an unfinished tick may belong to other rows.
+        # The `step` entries of an unfinished tick may belong to other rows.
         self._zoned.step_at[...] = 0
         for w, rows in enumerate(vehicles):
             first.rows[w, : len(rows)] = rows
@@ -236,7 +235,7 @@ class ZonedShards:
         return np.asarray(self._zoned.num_contacts.sum(axis=0), dtype=np.int64)
 
     def align(self) -> None:
-        """Let all shards use the first buffer of rows, after a tick that was abandoned."""
+        """Let all shards use the first buffer of rows after an abandoned tick."""
         for shard in self._shards:
             shard.align()
 
@@ -297,7 +296,7 @@ class ZonedShards:
         return ZoneLoads(owned, rows - owned, self._halo.halo_m)
 
     def vehicles(self, world: int) -> NDArray[np.void]:
-        """Return all vehicles of a world: a copy of several shards, or a view of one shard."""
+        """Return all vehicles of a world: a copy if there are several shards, else a view."""
         parts = [s.worlds.rows[world, : s.worlds.num_owned[world]] for s in self._shards]
         return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
@@ -324,7 +323,7 @@ class ZonedShards:
                 place += len(part)
 
     def whole(self) -> Worlds:
-        """Return all zones as one shard, without `next_rows`; of several shards, a copy."""
+        """Return all zones as one shard, without `next_rows`; several shards are copied."""
         first = self._shards[0].worlds
         if len(self._shards) == 1:
             return first

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class OwnerChanges:
-    """A search for vehicles near borders, and moves of their rows from owner to owner.
+    """Finds vehicles near borders, and moves their rows from owner to owner.
 
     Attributes:
         hand_over_all: the kernel `hand_over`, for the arrays of these worlds.
@@ -39,7 +39,7 @@ class OwnerChanges:
         self.release_all = specialized(release)
 
     def near(self, w: int, check_all: bool) -> list[Near]:
-        """Return vehicles near a border, by committed rows. `check_all`: search all rows anew."""
+        """Return vehicles near a border in the committed rows; `check_all`: search all rows."""
         division = self._division
         if check_all:
             self._look(
@@ -52,7 +52,7 @@ class OwnerChanges:
         return [Near(*entry) for entry in division.book.near[w, :num].tolist()]
 
     def find(self, w: int, vehicle: int) -> tuple[int, int]:
-        """Return the zone that owns a vehicle, and its committed row there."""
+        """Return the zone that owns a vehicle, and its committed row in this zone."""
         for shard in self._shards:
             worlds = shard.worlds
             found = np.flatnonzero(worlds.rows["id"][w, : worlds.num_owned[w]] == vehicle)
@@ -71,7 +71,7 @@ class OwnerChanges:
         switch: Switch,  # the vehicle, its source and its target
         hint: int = 0,  # the probable row at the source
     ) -> int:  # the row at the target
-        """Change a vehicle's owner. The target gets a copy of the source's committed row."""
+        """Change a vehicle's owner. The target receives a copy of the source's committed row."""
         place = self._pass_on(
             switch.vehicle, switch.source, hint, switch.target, switch.epoch,
             self._division.zoned, self._division.side, w,
@@ -88,7 +88,7 @@ class OwnerChanges:
             raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
 
     def take_over(self, w: int, zone: int, vehicle: int, epoch: int, state: bytes) -> None:
-        """Take a vehicle over from another zone. The state replaces its ghost in this zone."""
+        """Take over a vehicle from another zone. Its state replaces its ghost in this zone."""
         place = self._take_over(vehicle, zone, epoch, self._division.zoned, self._division.side, w)
         if place < 0:
             raise self.unseen(vehicle, zone)

@@ -29,12 +29,12 @@ class Proposal:
     partition: ZonePartition  # with as many zones as before
     before: float  # present imbalance of the zones' costs, maximum / mean
     after: float  # imbalance with the proposed zones
-    moved: int  # vehicles whose zone would have a different number
+    moved: int  # number of vehicles whose zone would have a different number
 
 
 def vehicle_costs(
-    zones: NDArray[np.int32],  # (n,) of each vehicle
-    costs_s: Sequence[float],  # measured, of each zone; the cost of empty zones is ignored
+    zones: NDArray[np.int32],  # (n,) zone of each vehicle
+    costs_s: Sequence[float],  # measured cost of each zone; the cost of empty zones is ignored
 ) -> Floats:
     """Return the cost (n,) of each vehicle: an equal share of its zone's cost."""
     counts = np.bincount(zones, minlength=len(costs_s))
@@ -46,9 +46,9 @@ def propose_zones(
     network: RoadNetwork,
     partition: ZonePartition,  # the present zones
     positions: Floats,  # (n, 2) x and y of vehicles in m
-    costs_s: Sequence[float],  # measured, of each zone, seconds per tick
+    costs_s: Sequence[float],  # measured cost of each zone in seconds per tick
     *,
-    tolerance: float = 0.1,  # least decrease of the imbalance
+    tolerance: float = 0.1,  # required decrease of the imbalance
 ) -> Proposal | None:
     """Return zones of about equal cost; None if the gain is within the tolerance."""
     if len(costs_s) != partition.count or not all(

@@ -1,7 +1,7 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
-This is off by default. The zones change between two ticks. In the next tick, each vehicle outside
-of its owner's new zone is handed over as at any border. So no result depends on repartitioning.
+Repartitioning is off by default. The zones change between two ticks. In the next tick, each vehicle
+outside of its owner's new zone is handed over as at any border. So the results do not change.
 """
 
 from __future__ import annotations
@@ -24,15 +24,15 @@ class Repartition(NamedTuple):
     step: int  # number of steps that the worlds had made before
     before: float  # imbalance of the zones' vehicles, maximum / mean
     after: float  # imbalance in the new zones
-    moved: int  # vehicles whose zone has a different number now
-    ms: float  # duration, without the transfers of vehicles in the next tick
+    moved: int  # number of vehicles whose zone now has a different number
+    ms: float  # duration in ms, without the transfers of vehicles in the next tick
 
 
 def propose_cut(
     network: RoadNetwork,
-    division: ZonedShards,  # with the vehicles of all zones
+    division: ZonedShards,  # has the vehicles of all zones
     partition: ZonePartition,  # the present zones
-    tolerance: float,  # least decrease of the imbalance
+    tolerance: float,  # required decrease of the imbalance
 ) -> Proposal | None:
     """Return zones with a better balance of vehicles; None if the gain is within the tolerance."""
     rows = [division.vehicles(w) for w in range(division.num_worlds)]
@@ -56,9 +56,9 @@ class Repartitioner:
         division: ZonedShards,
         coordination: WorldCoordinators,
         every: int,  # steps between checks
-        tolerance: float,  # least decrease of the imbalance
+        tolerance: float,  # required decrease of the imbalance
     ) -> None:
-        self.repartitions: list[Repartition] = []  # so far
+        self.repartitions: list[Repartition] = []  # all changes so far
         self.steps = 0  # number of steps begun
         self._network = network
         self._division = division
@@ -67,7 +67,7 @@ class Repartitioner:
         self._tolerance = tolerance
 
     def before_step(self, partition: ZonePartition) -> ZonePartition | None:
-        """Count a step that begins. Return new zones if the zones change before it.
+        """Count a step that begins. Return new zones if the zones change before this step.
 
         After a change, vehicles may be far from their owners' zones until the next tick hands them
         over. No caller may read vehicles before that.

@@ -30,7 +30,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 from cavmarl.zones.reach import driving_reach_m, longest_move_m
 from cavmarl.zones.visibility import Visibility
 
-# Added to the halo, so that rounding cannot make it too narrow.
+# This margin is added to the halo, so that rounding cannot make it too narrow.
 _ROUNDING_M = 1e-6
 
 
@@ -39,7 +39,7 @@ def divide(
     network: RoadNetwork,
     partition: ZonePartition,
     traffic: NativeTraffic,  # departures and routes
-    outputs: Outputs,  # of all agents
+    outputs: Outputs,  # outputs of all agents
     num_worlds: int,  # W
     zeros: Zeros = huge_zeros,  # allocates the arrays that shards write
     late_ticks: int = 0,  # extra ticks that a vehicle across a border may stay with its owner
@@ -62,7 +62,7 @@ def divide(
     fastest_mps = longest_move_m(network, traffic.travel, dt) / dt
     wide_m = halo_m(config, reach_m, partition.count, fastest_mps, late_ticks)
     touching_m = _needed_m(config, 2.0 * radius_m, fastest_mps, late_ticks)
-    # Background vehicles without a network have no sensors.
+    # Background vehicles have sensors only if a learned policy drives them.
     own_m = max(sensing_m if config.population.agents > 0 else 0.0, learned_m)
     sensed_m = _needed_m(config, own_m, fastest_mps, late_ticks) if own_m > 0.0 else 0.0
     near_m = max(touching_m, sensed_m, _approach_m(config, fastest_mps))
@@ -111,15 +111,15 @@ def divide(
 
 def halo_m(
     config: EnvConfig,  # its `zones.halo_m` is used if it is set
-    reach_m: float,  # the farthest look of any driver
+    reach_m: float,  # the longest distance at which a driver considers anything
     zones: int,  # number of zones
-    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick, jumps included, over its duration
+    fastest_mps: float = MAX_SPEED_MPS,  # longest move in a tick (with jumps) / length of a tick
     late_ticks: int = 0,  # see `divide`
 ) -> float:
     """Return how far zones see beyond their borders, in m.
 
     Raises:
-        ConfigError: this is too small for exact results; the message has all numbers.
+        ConfigError: `zones.halo_m` is too small for exact results; the message has all numbers.
     """
     settings, dt = config.zones, config.clock.sim_dt_s
     wide_m = settings.halo_m
@@ -162,14 +162,14 @@ def limits_of(settings: ZonesConfig, schema: int = 1) -> Limits:
 
 
 def _limits_at_borders(settings: ZonesConfig, late_ticks: int) -> Limits:
-    """Return the deadlines of transfers without lost messages: those of leases (decision 013)."""
+    """Return the deadlines if no message is lost: the deadlines of leases (decision 013)."""
     return replace(limits_of(settings), deferral=late_ticks)
 
 
 def _approach_m(config: EnvConfig, fastest_mps: float) -> float:
     """Return the distance to a border within which a vehicle is offered.
 
-    It is as far as the vehicle drives in `approach_ticks`, or jumps in one tick.
+    The vehicle can drive that far in `approach_ticks`, or jump that far in one tick.
     """
     dt = config.clock.sim_dt_s
     return max(config.zones.approach_ticks * MAX_SPEED_MPS * dt, fastest_mps * dt)

@@ -18,7 +18,7 @@ class TransferInFlight(NamedTuple):
 
     vehicle: int
     source: int  # the zone that owns the vehicle
-    target: int  # the zone to which it is offered or switched
+    target: int  # the zone to which the vehicle is offered or switched
     state: str  # state in the protocol, for display
 
 
@@ -30,7 +30,7 @@ class ZoneView:
     halo_m: float  # how far each zone sees beyond its borders
     # (n,) the owner of each vehicle, in the order of `Simulation.vehicles`
     owners: NDArray[np.int64]
-    ghosts: tuple[NDArray[np.int64], ...]  # of each zone, the ids of its ghosts
+    ghosts: tuple[NDArray[np.int64], ...]  # ids of the ghosts of each zone
     transfers: tuple[TransferInFlight, ...] = ()
 
 

@@ -1,4 +1,4 @@
-"""Controllers of speed limits: they choose from what agents know of the sections."""
+"""Controllers of speed limits, which choose limits from the observations of agents."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from cavmarl.signals.kernels.green_choices import GREEN, KEEP
 
 
 class LimitView(NamedTuple):
-    """What controllers know, in W worlds.
+    """The inputs of controllers, in W worlds.
 
     Attributes:
         config: speeds and kind of action.
         table: the U units and their sections.
-        observations: (W, U, D) as agents get them.
-        ticks: (W,) since the reset.
-        states: (W, U, HELD) of the units; see `LimitOutputs`.
+        observations: (W, U, D) observations of the agents.
+        ticks: (W,) ticks since the reset.
+        states: (W, U, HELD) states of the units; see `LimitOutputs`.
         masks: (W, U, C) allowed choices.
         decides: (W,) whether it is time for a decision.
     """
@@ -45,16 +45,16 @@ class LimitController(Protocol):
 
 
 class Feedback:
-    """Sets the lowest limit above the wanted density; otherwise, raises the limit by one place.
+    """Sets the lowest limit if the density is above the target; otherwise, raises it by one place.
 
     A low limit before a queue reduces the inflow for a while, so that the queue dissolves.
 
     Source of the principle: Hegyi, Hoogendoorn, Schreuder, Stoelhorst, Viti, "SPECIALIST: A dynamic
-    speed limit control algorithm based on shock wave theory", IEEE ITSC 2008. The rule is ours.
+    speed limit control algorithm based on shock wave theory", IEEE ITSC 2008. The rule is our own.
     """
 
     def choose(self, view: LimitView) -> NDArray[np.int64]:
-        """Return the lowest allowed place, or the next higher one."""
+        """Return the lowest allowed choice, or the next higher choice."""
         names = view.table.sections
         section = names.index(view.config.watched) if view.config.watched else len(names) - 1
         column = len(view.table.speeds_mps) + section * OF_SECTION
@@ -66,7 +66,7 @@ class Feedback:
 
 
 def make_limit_controller(name: str) -> LimitController:
-    """Return the controller of a name of `LIMIT_CONTROLLERS`."""
+    """Return the controller with this name in `LIMIT_CONTROLLERS`."""
     if name != "feedback":
         raise ConfigError(f"limits.controller = {name!r}: must be feedback, or agents")
     return Feedback()

@@ -1,4 +1,4 @@
-"""`LimitTable`: the units that set speed limits, with their lanes and the sections they know."""
+"""`LimitTable`: the units that set speed limits, with their lanes and their observed sections."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class LimitTable:
         ids: names of the units (U,).
         sections: names of the sections (M,).
         speeds_mps: (C,) the limits to choose from.
-        lanes: for each unit, the LANE rows on which its limit holds.
+        lanes: for each unit, the LANE rows to which its limit applies.
         arrays: the sections for kernels.
         sizes: sizes of the arrays.
 
@@ -45,7 +45,7 @@ class LimitTable:
         self.sizes = limit_sizes(config)
 
     def limits_mps(self, choices: NDArray[np.int64]) -> NDArray[np.float64]:
-        """Return the limit (W, L) on each lane for choices (W, U); infinite where no unit is."""
+        """Return the limit (W, L) of each lane for choices (W, U); infinite without a unit."""
         found = np.full((len(choices), len(self.arrays.section)), np.inf)
         for u, lanes in enumerate(self.lanes):
             found[:, lanes] = self.speeds_mps[choices[:, u], None]
@@ -53,7 +53,7 @@ class LimitTable:
 
 
 def limit_sizes(config: LimitsConfig) -> SignalSizes:
-    """Return the sizes of the arrays about units with a limit."""
+    """Return the sizes of the arrays of the units."""
     choices = len(config.speeds_mps)
     features = choices + OF_SECTION * len(config.sections)
     return SignalSizes(len(config.chosen), choices, 0, features, len(LIMIT_TERMS))

@@ -3,7 +3,7 @@
     4 bytes  "CVMO"      2 bytes  version      1 byte  kind      1 byte  zero
     the message's fields: integers of 8 bytes (digests of rows: 16), flags of 1 byte, byte strings
     and lists after their length in 4 bytes
-    4 bytes  CRC-32 of all bytes before
+    4 bytes  CRC-32 of all preceding bytes
 
 All numbers are little-endian. Bytes in any other form are refused, never repaired.
 """
@@ -55,7 +55,7 @@ def encode(message: Message) -> bytes:
 
 def decode(
     data: bytes,  # one complete message
-    run: bytes | None = None,  # of the receiver; None accepts all runs
+    run: bytes | None = None,  # run of the receiver; None: accept all runs
 ) -> Message:
     """Decode a message. Raises MessageError if it is damaged, or of another version or run."""
     if len(data) < _HEADER.size + _CRC.size:

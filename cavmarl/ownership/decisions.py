@@ -24,7 +24,7 @@ class CommittedStates(Protocol):
 
 
 class Neighbours(NamedTuple):
-    """The zones between which vehicles may change."""
+    """Pairs of zones between which vehicles may change their owner."""
 
     near: tuple[frozenset[int], ...]  # zone → zones that its vehicles can reach in one tick
     may_teleport: bool = False  # whether vehicles may jump to other zones; jumps are logged
@@ -75,7 +75,7 @@ class Decisions:
     def switches(
         self, table: Table, movers: Iterable[tuple[int, int]]
     ) -> tuple[tuple[Switch, ...], tuple[Deferral, ...], tuple[int, ...]]:
-        """Decide on movers, (vehicle, zone that contains it).
+        """Decide about movers: pairs of a vehicle and the zone that contains it.
 
         Returns:
             The switches, the deferrals, and the ids of switches between zones that are not

@@ -49,7 +49,7 @@ class ZonesError(ProtocolError):
     """Zones have sent no DONE, or a wrong one.
 
     Attributes:
-        zones: these zones.
+        zones: the zones at fault.
     """
 
     def __init__(self, text: str, zones: tuple[int, ...]) -> None:
@@ -115,7 +115,7 @@ class Directory:
         return directory
 
     def set_neighbours(self, neighbours: Neighbours) -> None:
-        """Set the zones between which vehicles may change."""
+        """Set the zones between which vehicles may change their owner."""
         self._decisions.neighbours = neighbours
 
     # Episodes and hosts
@@ -131,7 +131,7 @@ class Directory:
     def host(self, zone: int, worker: int) -> Output:
         """Give a zone to a new process of `worker`, which must be loaded with `hosting(zone)`.
 
-        During a tick, the zone must be fenced first. Its STEP is sent again.
+        During a tick, the zone must be fenced first. The new process receives the STEP again.
         """
         table = self.table
         if table.plan is not None:
@@ -163,8 +163,8 @@ class Directory:
 
     def begin(
         self,
-        # (vehicle, zone that contains it) of exactly the vehicles that are outside of their owner's
-        # zone by more than the hysteresis
+        # (vehicle, zone that contains it) of all vehicles, and no others, that are outside of their
+        # owner's zone by more than the hysteresis
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),
         inputs: bytes = b"",  # digest of the actions
@@ -191,8 +191,8 @@ class Directory:
 
     def resend(
         self,
-        zones: Iterable[int] | None = None,  # zones that get their STEP again; None: all
-        # zone → payload of its STEP, needed after `restore`; None: those given to `begin`
+        zones: Iterable[int] | None = None,  # zones that receive their STEP again; None: all
+        # zone → payload of its STEP, needed after `restore`; None: the payloads given to `begin`
         payloads: Mapping[int, bytes] | None = None,
     ) -> Output:
         """Return the STEPs of zones that have not answered, to send them again."""
@@ -267,7 +267,7 @@ class Directory:
         return Output(self.begin(()).records)
 
     def answer_for_silent(self) -> None:
-        """Add a DONE without changes for each zone that has not answered in a former quiet tick."""
+        """Add a DONE without changes for each zone without an answer, after `break_quiet`."""
         table, plan = self.table, self.table.planned
         for zone in self.waiting_for():
             self.dones[zone] = Done(
@@ -276,7 +276,7 @@ class Directory:
             )  # fmt: skip
 
     def on_message(self, message: Message) -> Output:
-        """Process a message. Late and foreign messages are dropped and counted."""
+        """Process a message. Late messages and messages of other runs are dropped and counted."""
         reason = self._reason_to_drop(message)
         if reason is not None:
             self.dropped[type(message).__name__, reason] += 1
@@ -353,7 +353,7 @@ class Directory:
 
 
 def make_step(table: Table, zone: int, store: CommittedStates, payload: bytes) -> Step:
-    """Return the lease of a zone's present host for the tick in progress.
+    """Return the STEP for a zone's present host in the tick in progress.
 
     States are attached for vehicles whose switch is forced or whose state must be sent again.
     """

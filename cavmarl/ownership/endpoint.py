@@ -2,8 +2,8 @@
 
 A host may advance its vehicles only while it has a lease. A STEP is a lease for one tick:
 `on_message` returns an `Advance` for the shard, `complete` ends the lease with a DONE, and `offer`
-then offers approaching vehicles to neighbours. All state here is volatile: after a host dies, a new
-host is loaded from the committed store.
+then offers approaching vehicles to neighbours. An endpoint stores nothing permanently: after a host
+dies, a new host is loaded from the committed store.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class Endpoint:
         return State.RETAINED if vehicle in self.retained else State.NONE
 
     def on_message(self, message: Message) -> Reaction:
-        """Process a message. Late and foreign messages are dropped and counted."""
+        """Process a message. Late messages and messages of other runs are dropped and counted."""
         reason = self._reason_to_drop(message)
         if reason is not None:
             return self._drop(message, reason)
@@ -94,7 +94,7 @@ class Endpoint:
         self._hold(self.tick + 1, ())
 
     def rest(self) -> None:
-        """End a lease of `go_on` without a DONE, if no vehicle has left the world."""
+        """End a lease of `go_on` without a DONE; not allowed if a vehicle has left the world."""
         if self.lease is None:
             raise ProtocolError(f"zone {self.zone} has no lease after tick {self.tick}")
         self._end_lease(self.lease)
@@ -103,7 +103,7 @@ class Endpoint:
         self,
         rows: int,  # digest of the stored rows (`world_digest` of their `row_hash`)
         removed: Sequence[Removed] = (),  # vehicles that left the world in this tick
-        payload: bytes = b"",  # for the runtime
+        payload: bytes = b"",  # data that only the runtime reads
     ) -> Done:
         """End the lease, after the result is in the store. Return the DONE."""
         if self.lease is None:
@@ -133,7 +133,7 @@ class Endpoint:
         return aborts + tuple(self._prepare(target, offers[target]) for target in offers)
 
     def offer_again(self) -> tuple[Message, ...]:
-        """Repeat offers without an answer; none after the last attempt of the tick."""
+        """Return unanswered offers to be sent again; none after the last attempt of the tick."""
         offers = self.offers.again()
         return tuple(self._prepare(target, offers[target]) for target in offers)
 

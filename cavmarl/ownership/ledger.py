@@ -84,7 +84,7 @@ def tally(run: bytes, owned: Mapping[int, int]) -> OwnedTally:
 
 
 class SeenIds:
-    """The ids that have been in an episode: all ids below `floor`, and those in `above`.
+    """The ids that have been used in an episode: all ids below `floor`, and the ids in `above`.
 
     The set is small if ids are assigned roughly in rising order.
     """

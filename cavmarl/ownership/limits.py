@@ -16,7 +16,7 @@ class Limits:
     deferral: int = 2
     lifetime: int = 16  # ticks after which a replica that is not refreshed is dropped (K)
     attempts: int = 3  # number of times that a PREPARE is sent in one tick (A)
-    repeats: int = 3  # number of new hosts for one tick of one zone (R_max)
+    repeats: int = 3  # limit of new hosts for one tick of one zone (R_max)
     backoff: int = 4  # ticks without an offer to a target that refused
     capacity: int = 100_000  # number of replicas that one host keeps
     schema: int = 1  # version of the vehicles' states

@@ -2,7 +2,7 @@
 
 A line is an object with the keys `schema` ("cavmarl.ownership/5"), `sequence` (0, 1, 2, …),
 `kind` (RESET, BEGIN, COMMIT, FENCE, HOST), `episode`, `tick`, the fields of that kind, and
-`checksum`. The checksum is BLAKE2b of 8 bytes, in hex, over the checksum of the line before, if
+`checksum`. The checksum is BLAKE2b of 8 bytes, in hex, over the checksum of the previous line, if
 any, and the line without the key `checksum`. So lines of another log are detected. Bytes and the
 digests of rows and sets are in hex. A list of entries is a list of lists.
 """
@@ -38,7 +38,7 @@ class LogChain:
 
     Attributes:
         sequence: the number of the next line.
-        last: the checksum of the line before; empty before the first line.
+        last: the checksum of the previous line; empty before the first line.
     """
 
     def __init__(self) -> None:
@@ -119,7 +119,7 @@ def _content(record: Record, sequence: int) -> dict[str, Any]:
 
 
 def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
-    """Return a function from a field's values to JSON values; None: they are the same."""
+    """Return a function that converts a field's values to JSON values; None: no conversion."""
     if hint is bytes:
         return bytes.hex
     if hint is int and name in _WIDE:
@@ -138,7 +138,7 @@ def _plain(name: str, hint: Any) -> Callable[[Any], Any] | None:
 
 
 def _parse(name: str, hint: Any) -> Callable[[Any], Any]:
-    """Return a function from JSON values to a field's values."""
+    """Return a function that converts JSON values to a field's values."""
     if hint is bytes:
         return bytes.fromhex
     if hint is int and name in _WIDE:

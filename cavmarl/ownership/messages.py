@@ -46,7 +46,7 @@ class In(NamedTuple):
 
 
 class Out(NamedTuple):
-    """An order to give up the vehicle; `epoch` is that of the ownership that ends."""
+    """An order to give up the vehicle; `epoch` is the epoch of the ownership that ends."""
 
     vehicle: int
     epoch: int
@@ -111,7 +111,7 @@ class Message:
 
     run: bytes  # 16 random bytes of this run
     episode: int  # counts the resets; messages of earlier episodes are void
-    tick: int  # of the state that the message is about
+    tick: int  # tick of the state that the message is about
 
     def destinations(self) -> tuple[int, ...]:
         """Return the destinations: zones or COORDINATOR."""
@@ -205,7 +205,7 @@ class Nack(Message):
 
 @dataclass(slots=True, unsafe_hash=True)
 class Need(Message):
-    """Z → C: there are no replicas for these vehicles of IN; send their states."""
+    """Z → C: the zone has no replicas of these vehicles of IN; send their states."""
 
     zone: int
     incarnation: int
@@ -213,7 +213,7 @@ class Need(Message):
 
 
 class Switch(NamedTuple):
-    """A change of owner; `epoch` is that of the new ownership."""
+    """A change of owner; `epoch` is the epoch of the new ownership."""
 
     vehicle: int
     source: int
@@ -223,7 +223,7 @@ class Switch(NamedTuple):
 
 
 class Deferral(NamedTuple):
-    """A crossed vehicle stays with its source, for the `ticks`-th tick in a row."""
+    """A vehicle beyond a border stays with its source, for the `ticks`-th tick in a row."""
 
     vehicle: int
     ticks: int
@@ -265,7 +265,7 @@ class Reset(Record):
 class Begin(Record):
     """The decisions for `tick`. `inputs` is the digest of the actions.
 
-    `teleports` are the vehicles of `switches` whose new zone is not a neighbour of the old one.
+    `teleports` are the vehicles of `switches` whose new zone is not a neighbour of the old zone.
     """
 
     switches: tuple[Switch, ...] = ()

@@ -1,7 +1,7 @@
-"""The source's side of an approach: its offers to other zones, answered or not.
+"""The source's side of an approach: its offers to other zones.
 
-For each vehicle and target, a tick has at most one PREPARE or ABORT. A PREPARE without an answer is
-sent at most A times in its tick. After a refusal, the target gets no offer for some ticks.
+For each vehicle and target, a tick has at most one PREPARE or ABORT. An unanswered PREPARE is sent
+at most A times in its tick. After a refusal, the target receives no offer for some ticks.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ class Offers:
 
     Attributes:
         open: (vehicle, target) → epoch of the last offer, if it has not been withdrawn.
-        unanswered: (vehicle, target) → offer of this tick without an answer.
+        unanswered: (vehicle, target) → unanswered offer of this tick.
         refused_until: (vehicle, target) → first tick in which the vehicle may be offered again.
     """
 
@@ -73,7 +73,7 @@ class Offers:
             del self.open[pair]
 
     def again(self) -> dict[int, tuple[Offer, ...]]:
-        """Return offers without an answer, target → offers; none after the last attempt."""
+        """Return unanswered offers, target → offers; empty after the last attempt."""
         if self.attempts >= self._limits.attempts:
             return {}
         self.attempts += 1

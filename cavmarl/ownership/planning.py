@@ -28,7 +28,7 @@ class OwnershipPlan:
     attach: set[int] = field(default_factory=set)  # vehicles whose state is attached to STEP
 
     def changes(self, zone: int) -> bool:
-        """Return whether a vehicle enters or leaves the zone, or is new there."""
+        """Return whether a vehicle enters or leaves the zone, or is new in it."""
         return zone in self.enter or zone in self.leave or zone in self.spawn
 
     def owner(self, vehicle: int, committed: Mapping[int, tuple[int, int]]) -> tuple[int, int]:

@@ -30,7 +30,7 @@ class Advance:
     leave: tuple[int, ...]  # rows that are frozen and kept
     enter: tuple[tuple[int, bytes], ...]  # (vehicle, state) of rows that enter the zone
     spawn: tuple[Spawn, ...]  # new rows
-    payload: bytes  # of the STEP, for the runtime
+    payload: bytes  # payload of the STEP, for the runtime
 
 
 @dataclass(slots=True)

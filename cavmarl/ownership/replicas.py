@@ -1,8 +1,8 @@
 """The replicas that a zone host keeps of vehicles that may enter, and their fences.
 
-A fence is the newest (epoch, tick) of a vehicle in any PREPARE or ABORT so far. Only newer messages
-count, in any order of arrival. Messages older than the lifetime are ignored, so that older fences
-can be forgotten.
+A fence is the newest (epoch, tick) of a vehicle in any PREPARE or ABORT so far. Messages that are
+not newer than the fence are ignored, so the order of arrival does not matter. Messages older than
+the lifetime are ignored as well, so that older fences can be forgotten.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.ownership.transitions import Event, Party, State, after
 
 
 class Replica(NamedTuple):
-    """The state of a vehicle at a tick, which is not advanced."""
+    """A copy of the state of a vehicle at a tick; it is never advanced."""
 
     epoch: int
     tick: int
@@ -47,7 +47,7 @@ class Replicas:
         if not self._newer(offer.vehicle, offer.epoch, tick):
             return held is not None and held[:3] == (offer.epoch, tick, offer.digest)
         if state_digest(offer.state) != offer.digest:
-            return Refusal.DIGEST  # damaged in transit: no fence, so it may be sent again
+            return Refusal.DIGEST  # damaged in transit; without a fence, it may be sent again
         if schema != self._limits.schema:
             return self.refuse(offer, tick, Refusal.SCHEMA)
         if held is None and len(self.held) >= self._limits.capacity:

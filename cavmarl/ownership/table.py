@@ -1,7 +1,7 @@
 """The table of owners and hosts, which results from the log.
 
 Only records change the table. So a coordinator that replays its log restores its former table, and
-any other reader that replays the log gets all owners.
+any other reader that replays the log obtains all owners.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Table:
         tick: the committed tick. It never decreases, not even at a reset.
         episode: the number of resets - 1; -1 before the first reset.
         owners: vehicle → (zone, epoch) at the committed tick.
-        deferred: vehicle → ticks with an owner whose zone does not contain it.
+        deferred: vehicle → ticks since it left its owner's zone.
         hosts: zone → (worker, incarnation); incarnation 0: never hosted.
         counts: zone → number of owned vehicles at the committed tick.
     """
@@ -50,9 +50,9 @@ class Table:
         self.deferred: dict[int, int] = {}
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
-        self.seen = SeenIds()  # ids that have been in the episode
+        self.seen = SeenIds()  # vehicle ids that have been used in the episode
         self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the present tick
-        self.plan: OwnershipPlan | None = None  # of the tick in progress, or None
+        self.plan: OwnershipPlan | None = None  # plan of the tick in progress, if any
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())
         self._moves: list[_Move] = []  # moves that the tallies do not include yet
@@ -121,8 +121,8 @@ class Table:
             zone, epoch = owners.pop(vehicle)
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
-        # With more moves than vehicles, `tallies` counts anew and ignores the moves. One surplus
-        # move is kept, so that `tallies` notices this: every new vehicle adds a move.
+        # If there are more moves than vehicles, `tallies` counts all vehicles and ignores the
+        # moves. One surplus move is kept as a mark: every new vehicle also adds a move.
         del moves[len(owners) + 1 :]
         self.tick = tick
 

@@ -1,9 +1,9 @@
 """Check of a trace by the rules of docs/explanation/ownership.md, without the protocol's code.
 
-It accepts the traces of correct runs. It refuses a trace in which a vehicle has two owners or none,
-a switch begins without the exact state at its target (PREPARE < ACK < SWITCH < CONFIRM < RELEASE),
-a message is sent before its record is logged, or a tick is committed that a present host has not
-computed.
+The check accepts the traces of correct runs. It refuses a trace in which a vehicle has two owners
+or none, a switch begins although its target does not have the exact state (PREPARE < ACK < SWITCH <
+CONFIRM < RELEASE), a message is sent before its record is logged, or a tick is committed that a
+present host has not computed.
 
 The cost of a tick grows with its changes: vehicles that keep their owner are not visited.
 """
@@ -70,7 +70,7 @@ Owner = tuple[int, int]
 
 
 class OwnerStep(NamedTuple):
-    """The change of a vehicle's owner in a tick; None: it is not in the world."""
+    """The owner of a vehicle before and after a tick; None: the vehicle is not in the world."""
 
     vehicle: int
     before: Owner | None
@@ -96,10 +96,10 @@ class TraceChecker:
 
     def __init__(
         self,
-        longest_deferral: int,  # ticks that a vehicle may have an owner whose zone it has left
+        longest_deferral: int,  # ticks for which a vehicle may keep an owner whose zone it has left
         lifetime: int,  # ticks after which a state that is not refreshed is forgotten
         # whether zones and coordinator are in one process. The trace then has only records, and
-        # possibly only those of ticks with changes
+        # possibly only records of ticks with changes
         is_direct: bool = False,
         near: Sequence[Container[int]] | None = None,  # zone → its neighbours; None: all
     ) -> None:
@@ -251,7 +251,7 @@ class TraceChecker:
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
         if self._incarnations.get(message.zone) != message.incarnation:
-            return  # from a replaced process, whose further messages are not in the trace
+            return  # from a replaced process; the trace has no further messages of that process
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, digest)
             known = holding in self._holdings.get(message.tick, ())

@@ -11,7 +11,7 @@ from cavmarl.ownership.transfers import Transfer
 
 
 class Spread(NamedTuple):
-    """Nearest-rank percentiles; all are None without values."""
+    """Nearest-rank percentiles; all are None if there are no values."""
 
     p50: float | None
     p95: float | None
@@ -35,20 +35,20 @@ class TransferSummary:
     transfers: int  # number of changes of owner
     forced: int  # transfers with the state attached, because no acknowledgement came in time
     removed: int  # transfers of vehicles that left the world in the same tick
-    deferred: int  # sum over vehicles of ticks with the old owner after the crossing
+    deferred: int  # ticks that vehicles stayed with the old owner after crossing, summed
     refused: int  # states that a target refused
     aborted: int  # approaches that ended without a transfer
-    # phase → number of timeouts. `acknowledge`: no answer by the end of the tick (same as
-    # `deferred`); `switch`: no answer by the deadline (same as `forced`); `replica`: states that
-    # were neither used nor withdrawn in their lifetime
+    # phase → number of timeouts. `acknowledge`: no answer by the end of the tick (same number as
+    # `deferred`); `switch`: no answer by the deadline (same number as `forced`); `replica`: states
+    # that were neither used nor withdrawn in their lifetime
     timeouts: Mapping[str, int]
     latency_ticks: Spread  # ticks from the first state at the target to its confirmation
     waited_ticks: Spread  # the part of `latency_ticks` after the crossing
-    latency_ms: Spread  # the same as `latency_ticks`, by the clock
+    latency_ms: Spread  # same duration as `latency_ticks`, in ms of real time
     state_bytes: Spread  # size of a vehicle's state
-    # distance outside of the owner's zone at the first state; negative inside
+    # distance outside of the owner's zone at the first state; negative: inside
     prepare_depth_m: Spread
-    switch_depth_m: Spread  # the same at the switch
+    switch_depth_m: Spread  # distance outside of the owner's zone at the switch
     release_depth_m: Spread  # distance outside of the old zone at the commit of the switch
     failure_rate: float | None  # share of forced transfers; None without transfers
 

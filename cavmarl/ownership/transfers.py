@@ -36,26 +36,26 @@ class Transfer(NamedTuple):
     vehicle: int
     source: int  # the old owner
     target: int  # the new owner
-    epoch: int  # of the new ownership
+    epoch: int  # epoch of the new ownership
     forced: bool  # whether the state was attached, because the target was not ready in time
     removed: bool  # whether the vehicle left the world in tick `tick`
     approached: int  # tick of the first state that arrived at the target, or -1
     waited: int  # ticks for which the source kept the vehicle after the crossing
     offers: int  # number of states that arrived at the target, including repeats
     state_bytes: int  # size of the last state; 0 if both zones are in one process
-    # distance outside of the owner's zone when the first state arrived; negative inside;
-    # None: unknown
+    # distance outside of the owner's zone when the first state arrived; negative: inside; None:
+    # unknown
     prepare_depth_m: float | None = None
-    switch_depth_m: float | None = None  # the same when the switch was decided
+    switch_depth_m: float | None = None  # same distance when the switch was decided
     # distance outside of the old zone when the switch was committed; None: unknown, or the vehicle
     # has left the world
     release_depth_m: float | None = None
-    # from the first state, or from BEGIN without one, to the target's confirmation; None: no clock
+    # ms from the first state (if none: from BEGIN) to the target's confirmation; None: no clock
     ms: float | None = None
 
     @property
     def ticks(self) -> int:
-        """Ticks from the first state at the target, or from BEGIN without one, to DONE."""
+        """Ticks from the first state at the target (if none: from BEGIN) to DONE."""
         return self.tick - self.approached if self.approached >= 0 else 1 + self.waited
 
 
@@ -117,7 +117,7 @@ class TransferLog:
 
     def logged(self, records: Iterable[Record]) -> None:
         for record in records:
-            match record:  # the frequent ones first
+            match record:  # frequent records first
                 case Begin():
                     self._begin(record)
                 case Commit():

@@ -1,7 +1,7 @@
 """The state machines of the protocol. `TABLE` has all transitions.
 
 Rule 1: a transition that is not in the table is an error: `after` raises.
-Rule 2: the receiver drops and counts late messages before they get here.
+Rule 2: the receiver drops and counts late messages before it looks up a transition.
 
 A host has two independent slots for a vehicle: its ROW, which the host may advance while it is
 AUTHORITATIVE, and its REPLICA, which is never advanced.
@@ -20,7 +20,7 @@ class _Word(StrEnum):
 
 
 class Party(_Word):
-    """The kinds of things that have a state."""
+    """The kinds of state machines."""
 
     VEHICLE = "a vehicle, at the coordinator"
     ZONE = "a zone, at the coordinator"
@@ -67,7 +67,7 @@ P, S, E = Party, State, Event
 
 # fmt: off
 TABLE: dict[tuple[Party, State, Event], State] = {
-    (P.VEHICLE, S.UNKNOWN, E.SPAWN): S.OWNED,             # BEGIN names it for the first time
+    (P.VEHICLE, S.UNKNOWN, E.SPAWN): S.OWNED,             # BEGIN first names the vehicle
     (P.VEHICLE, S.OWNED, E.SWITCH): S.SWITCHING,          # BEGIN with IN and OUT; irrevocable
     (P.VEHICLE, S.SWITCHING, E.COMMIT): S.OWNED,          # the target has confirmed; epoch + 1
     (P.VEHICLE, S.OWNED, E.REMOVE): S.REMOVED,            # final

@@ -45,8 +45,8 @@ def register_backend(name: str, make: MakeWorlds) -> None:
     """Register a backend for the argument `backend` of `make_vec` and `parallel_env`.
 
     Args:
-        name: of the backend.
-        make: makes its worlds, which must behave like worlds of this process.
+        name: name of the backend.
+        make: function that makes worlds; they must behave like worlds of this process.
 
     Raises:
         ConfigError: the name is not an identifier, or is taken.
@@ -57,7 +57,7 @@ def register_backend(name: str, make: MakeWorlds) -> None:
 def find_backend(
     backend: str | None = None, workers: int | None = None, nodes: int | None = None
 ) -> BackendName:
-    """Read where worlds run. Arguments and errors are as in `read_backend`."""
+    """Return the backend that the arguments name. Arguments and errors: see `read_backend`."""
     return read_backend(backend, workers, nodes, REGISTERED_BACKENDS)
 
 
@@ -88,7 +88,7 @@ def make_worlds(
     if backend.kind == PROCESSES:
         return PooledWorlds(world, base_dir, num_worlds, count or 1, in_next_step)
     if backend.kind in (NODES, RAY):
-        # Groups of whole worlds have a thread each, but MPI supports a single thread.
+        # `NodeGroups` needs one thread per group, but MPI supports a single thread.
         by_zones = count == 1 or backend.is_mpi or backend.is_split(num_worlds)
         make = NodeWorlds if by_zones else NodeGroups
         system = system_of(backend)
@@ -101,7 +101,7 @@ def _check_simulators(world: World, num_worlds: int, backend: BackendName) -> No
     """Check that the processes of a backend can run zones in other simulators.
 
     Raises:
-        ConfigError: a setting does not work with such zones there, or their servers are too few.
+        ConfigError: the backend does not support a setting of such zones, or servers are missing.
     """
     config = world.config
     check_servers(hosted_zones(config.zones.simulators, world.partition.count), num_worlds)

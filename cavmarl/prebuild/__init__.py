@@ -1,4 +1,4 @@
 """Builds the library of compiled kernels for a wheel.
 
-Builds on `core`.
+This package depends on `core`.
 """

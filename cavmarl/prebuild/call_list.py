@@ -1,8 +1,8 @@
 """`kernel_calls.json`: each kernel that Python calls, with the argument types of these calls.
 
 Programs and tests that run with `CAVMARL_KERNEL_CALLS` record their calls, and `python -m
-cavmarl.prebuild record FOLDER` merges them into the file. A bundle that occurs in several calls is
-written once.
+cavmarl.prebuild record FOLDER` merges them into the file. A bundle (a named tuple of arguments)
+that occurs in several calls is written once.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ class KernelCall(NamedTuple):
 
     name: str
     signature: str  # as JSON
-    is_plain: bool = False  # called in the first step of a plain world
+    is_plain: bool = False  # whether the first step of a plain world makes this call
 
     @property
     def kinds(self) -> list[Any]:
@@ -42,7 +42,7 @@ def read_manifest(path: Path = MANIFEST) -> list[KernelCall]:
         return []  # no calls have been recorded yet
     document = json.loads(path.read_text("utf-8"))
     bundles: list[Any] = []
-    for bundle in document["bundles"]:  # bundles may contain bundles before them
+    for bundle in document["bundles"]:  # a bundle may contain earlier bundles
         bundles.append(_expand(bundle, bundles))
     return [
         KernelCall(name, json.dumps(_expand(kinds, bundles)), is_plain)
@@ -82,7 +82,7 @@ def recorded_calls(folder: Path) -> set[KernelCall]:
 
 
 def can_be_made(call: KernelCall) -> bool:
-    """Return whether a kernel still accepts these arguments, and their types are up to date."""
+    """Return whether a kernel accepts these arguments, and their types are up to date."""
     module, _, name = call.name.rpartition(".")
     try:
         kernel = getattr(importlib.import_module(module), name)

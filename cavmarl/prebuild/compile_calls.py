@@ -27,7 +27,7 @@ def kernel_file(call: KernelCall) -> KernelFile:
 
 
 def widest(calls: Iterable[KernelCall]) -> list[KernelCall]:
-    """Return the calls, except calls that the code of another one also serves.
+    """Return the calls, except calls for which the code of another call can be used.
 
     Code for an array of any layout, for example, also serves calls with a contiguous array.
     """

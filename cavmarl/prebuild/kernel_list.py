@@ -18,7 +18,7 @@ def called_kernels() -> frozenset[str]:
     """Return the names of all kernels that modules of the package call from Python.
 
     The sources are searched for kernels that a module outside of the folders of kernels imports or
-    defines, and for kernels called by plain functions beside them
+    defines, and for kernels that plain functions in the same file call
     (`roads.kernels.plans.plan_goal`).
     """
     trees = {_module_of(path): ast.parse(path.read_bytes()) for path in _PACKAGE.rglob("*.py")}
@@ -74,7 +74,7 @@ def _is_made(statement: ast.stmt) -> TypeGuard[ast.Assign]:
 
 
 def _imported(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """Yield module and name of all that a file imports, or uses of a module that it imports."""
+    """Yield (module, name) of each name that a file imports, or uses from an imported module."""
     modules: dict[str, str] = {}
     for node in ast.walk(tree):
         if isinstance(node, ast.ImportFrom) and node.module and not node.level:

@@ -61,7 +61,7 @@ def link(kernels: Sequence[CompiledKernel], folder: Path) -> None:
     Raises:
         KernelError: there is no linker, or it failed.
     """
-    for kernel in kernels:  # modules that use tables of addresses also define them
+    for kernel in kernels:  # a module that uses tables of addresses also defines these tables
         importlib.import_module(kernel.name.rpartition(".")[0])
     folder.mkdir(parents=True, exist_ok=True)
     library = folder / LIBRARY_FILE
@@ -107,7 +107,7 @@ def _index_of(kernels: Iterable[CompiledKernel]) -> dict[str, Any]:
 def _common_object() -> bytes:
     """Return the common object: tables of addresses, and a function that queries the processor.
 
-    It targets the oldest x86-64, because it runs before the processor is known.
+    Its code targets the oldest x86-64, because it runs before the processor is known.
     """
     module = ir.Module("common")
     module.triple = binding.get_process_triple()

@@ -1,8 +1,8 @@
-"""Optional tables of a recording: rows of one dtype per table.
+"""Optional tables of a recording: each table has rows of one dtype.
 
-Rows begin with `tick`. A float32 column with one axis is stored as a list, any other column with
-axes as bytes, and objects as text. `recording.json` has the dtypes, so rows are read back
-unchanged.
+The first field of a row is `tick`. A float32 column with one axis is stored as a list, any other
+column with axes as bytes, and objects as text. `recording.json` has the dtypes, so rows are read
+back unchanged.
 """
 
 from __future__ import annotations
@@ -28,8 +28,7 @@ class RecordOptions:
 
     Attributes:
         path: a new folder.
-        include: additional tables to record, of `observations`, `samples`, `messages` and
-            `commands`.
+        include: additional tables to record: `observations`, `samples`, `messages` or `commands`.
     """
 
     path: str | Path
@@ -42,7 +41,7 @@ class RecordOptions:
 
     @classmethod
     def of(cls, record: Self | str | Path) -> RecordOptions:
-        """Return options as they are, or make them from a path."""
+        """Return options unchanged, or make options from a path."""
         return record if isinstance(record, RecordOptions) else cls(record)
 
     def at(self, path: str | Path) -> RecordOptions:
@@ -58,7 +57,7 @@ class ExtraRows(NamedTuple):
 
 
 def extra_table(parts: Sequence[ExtraRows], dtype: np.dtype[Any]) -> Any:
-    """Build a table of the rows of some frames, including rows from before the frame's reset."""
+    """Build a table of the rows of some frames, including rows before a frame's reset."""
     pa = arrow()
     rows = np.concatenate([np.zeros(0, dtype), *(part.rows for part in parts)])
     counts = [len(part.rows) for part in parts]
@@ -99,7 +98,7 @@ def extra_schema(dtype: np.dtype[Any]) -> Any:
 
 
 def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArray[np.void]]:
-    """Return (episodes (n,), rows (n,)) of a table of `extra_schema`.
+    """Return (episodes (n,), rows (n,)) of a table with an `extra_schema`.
 
     Raises RecordingError: the rows need too much memory.
     """
@@ -124,7 +123,7 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
     """Yield (table, `ExtraRows`) of a frame; rows of later ticks belong to the previous episode.
 
-    Such rows are from the step in which the world restarted.
+    Such rows belong to the step in which the world restarted.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -30,7 +30,7 @@ def wrong_frames(frames: Sequence[RecordedFrame], rows: NDArray[np.void], num_zo
 
     Args:
         frames: the frames of one part.
-        rows: SEEN (n,) of all frames, one after another.
+        rows: SEEN (n,) of all frames, in order.
         num_zones: number of zones of the recording.
     """
     return (
@@ -41,7 +41,7 @@ def wrong_frames(frames: Sequence[RecordedFrame], rows: NDArray[np.void], num_zo
 
 
 def wrong_on_map(frame: WorldFrame, network: RoadNetwork) -> str:
-    """Return what is wrong with a frame that is drawn on a map; empty if nothing."""
+    """Return why a frame cannot be drawn on a map; empty if it can."""
     if len(frame.signals) not in (len(network.signals), len(network.signals) + len(network.links)):
         return f"a frame has {len(frame.signals)} signals, and the map has {len(network.signals)}"
     return wrong_phases(frame.signals, network)

@@ -13,8 +13,8 @@ _SPARE = 64  # additional rows, in case the next frame is larger
 class FrameMemory:
     """Hands out rows of SEEN and takes them back.
 
-    Fresh memory pages cost more than copying the rows. One thread takes memory, another one gives
-    it back.
+    Fresh memory pages cost more than copying the rows. One thread takes memory, and another thread
+    gives it back.
     """
 
     def __init__(self) -> None:

@@ -23,21 +23,21 @@ from cavmarl.engine.spaces import action_space, flat_observation_space
 from cavmarl.recordings.offline_data import RecordedTrip, recorded_trips, settings_of
 from cavmarl.recordings.recording import Recording
 
-MINARI_VERSION = "0.5.4"  # of the layout
+MINARI_VERSION = "0.5.4"  # version of Minari that defines the layout
 DATA_FOLDER = "data"
 _METADATA_FILE = "metadata.json"
 
 
 def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
-    """Write all trips of a recording to a new folder; return the numbers of trips and decisions.
+    """Write all trips of a recording to a new folder; return the number of trips and of decisions.
 
     The metadata of the data set contain the names of the environment, the observed numbers and the
     reward terms. The metadata of a trip contain its world, episode, agent and vehicle.
 
     Raises:
         ConfigError: the folder exists and is not empty, or cannot be written.
-        RecordingError: the recording cannot be read, has no observations, has no whole trip, or has
-            other observations and actions than its settings.
+        RecordingError: the recording cannot be read, has no observations or no whole trip, or its
+            observations and actions do not match its settings.
         MissingExtraError: pyarrow is not installed.
     """
     arrow = require("pyarrow", "record")
@@ -106,7 +106,7 @@ def _write_trips(arrow: Any, data: Path, trips: Iterable[RecordedTrip]) -> tuple
 
 
 def _table(arrow: Any, trip: RecordedTrip) -> Any:
-    """Return the rows of a trip; the last row has an observation only, other columns are 0."""
+    """Return the rows of a trip; the last row has only an observation, its other columns are 0."""
     ended = np.zeros((2, len(trip.ticks)), dtype=np.bool_)
     ended[:, -2] = trip.terminated, trip.truncated
     columns = {

@@ -1,7 +1,7 @@
-"""Recorded trips as data for offline learning: observations, actions, rewards and ends.
+"""Recorded trips as data for offline learning: observations, actions, rewards, and how trips end.
 
-The data are the table `observations` of a recording (`RecordOptions.include`). A trip is one
-vehicle of an agent, from its first recorded observation on.
+The data come from the table `observations` of a recording (`RecordOptions.include`). A trip is the
+drive of one vehicle of an agent, starting with its first recorded observation.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ class RecordedTrip(NamedTuple):
     episode: int
     agent: int
     vehicle: int
-    ticks: NDArray[np.int64]  # (N + 1,) of the observations
-    observations: NDArray[np.float32]  # (N + 1, D) flat
+    ticks: NDArray[np.int64]  # (N + 1,) ticks of the observations
+    observations: NDArray[np.float32]  # (N + 1, D) flat observations
     actions: NDArray[Any]  # (N, 2) float32 throttle and steering, or (N,) int64 choices
     rewards: NDArray[np.float32]  # (N,)
-    terms: NDArray[np.float32]  # (N, T) of the reward, named in `Recording.head.terms`
+    terms: NDArray[np.float32]  # (N, T) reward terms, named in `Recording.head.terms`
     terminated: bool  # the trip ended by an event of the vehicle
     truncated: bool  # the trip was cut: by a horizon, a reset, or the end of the recording
 
@@ -65,7 +65,7 @@ def recorded_trips(recording: Recording) -> Iterator[RecordedTrip]:
 def settings_of(recording: Recording) -> EnvConfig:
     """Return the configuration of the recorded environment.
 
-    Raises RecordingError: this version cannot read it.
+    Raises RecordingError: this version cannot read the configuration.
     """
     try:
         settings = recording.manifest["world"]["config"]
@@ -101,9 +101,9 @@ def _check_columns(recording: Recording) -> None:
 
 
 def _trip(world: int, episode: int, rows: NDArray[np.void]) -> RecordedTrip:
-    """Return the trip of rows (N + 1,); each row contains a decision and what it led to."""
+    """Return the trip of rows (N + 1,); each row has a decision and its results."""
     after = rows[1:]
-    # A vehicle that left at the horizon of its trip has both flags: its trip was cut.
+    # A vehicle that left at the horizon of its trip has both flags; its trip counts as truncated.
     terminated = bool(after["terminated"][-1] and not after["truncated"][-1])
     return RecordedTrip(
         world,

@@ -1,7 +1,7 @@
 """Sizes that a Parquet file states in its footer and in the heads of its pages.
 
-Arrow allocates what these numbers say, so they are compared with limits before Arrow reads the
-file. Both are in Thrift's compact encoding; only the fields that are needed have names here.
+Arrow allocates as much memory as these sizes say, so they are compared with limits before Arrow
+reads the file. Footer and heads use Thrift's compact encoding; only the needed fields have names.
 """
 
 from __future__ import annotations
@@ -19,16 +19,16 @@ _COLUMNS, _ROWS_OF_GROUP = 1, 3  # fields of a row group
 _OTHER_FILE, _COLUMN = 1, 3  # fields of a column of a row group
 _PATH, _NUM_VALUES, _COMPRESSED, _DATA, _DICTIONARY = 3, 5, 7, 9, 11  # fields of its metadata
 _KIND, _UNCOMPRESSED_PAGE, _COMPRESSED_PAGE = 1, 2, 3  # fields of the head of a page
-_PAGES = {0: (5, True), 2: (7, False), 3: (8, True)}  # by kind: field, and whether it has rows
+_PAGES = {0: (5, True), 2: (7, False), 3: (8, True)}  # page kind → field, and whether it has rows
 
 
 class ColumnSize(NamedTuple):
     """The size of one column of a file."""
 
-    path: str  # names of the column and of its parts, with points
+    path: str  # dotted names of the column and of its parts
     num_values: int
     num_words: int  # entries of its dictionary
-    num_bytes: int  # of its pages in memory, before they are decoded
+    num_bytes: int  # size of its pages in memory, before they are decoded
 
 
 class ParquetSize(NamedTuple):
@@ -69,7 +69,7 @@ def _column_size(content: memoryview, column: Any) -> ColumnSize:
     if not isinstance(metadata, dict) or _OTHER_FILE in column:
         raise ValueError("the data of a column are in another file")
     path = ".".join(bytes(word).decode() for word in _items(metadata, _PATH, bytes))
-    if metadata.get(_NUM_VALUES) == 0:  # it may have no pages
+    if metadata.get(_NUM_VALUES) == 0:  # an empty column may have no pages
         return ColumnSize(path, 0, 0, 0)
     start, length = _number(metadata, _DATA), _number(metadata, _COMPRESSED)
     if 0 < metadata.get(_DICTIONARY, 0) < start:
@@ -121,7 +121,7 @@ class _Compact:
         self._content = content
 
     def structure(self, at: int, depth: int = 0) -> tuple[dict[int, Any], int]:
-        """Return the fields of the structure at a place by number, and the place behind it."""
+        """Return the fields of the structure at a place by number, and the place after it."""
         if depth > MOST_DEPTH:
             raise ValueError("its structures are nested too deeply")
         found: dict[int, Any] = {}

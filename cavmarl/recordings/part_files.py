@@ -1,7 +1,7 @@
-"""Reads the files of a recording, whose sender may be a stranger.
+"""Reads the files of a recording, which may come from an untrusted source.
 
 The metadata of a file are compared with the expected columns and with limits before its rows are
-read, so that a small file cannot ask for much memory.
+read, so that a small file cannot demand much memory.
 """
 
 from __future__ import annotations
@@ -13,13 +13,14 @@ from typing import Any
 from cavmarl.core.errors import RecordingError, require
 from cavmarl.recordings.parquet_pages import ParquetSize, parquet_size
 
-MOST_ROWS = 1 << 22  # of one table in one part
-MOST_RECORDS = 1 << 20  # of one table with texts or lists, and of structures in lists, in one part
-MOST_VALUES = 1 << 26  # of one column with lists in one part
-MOST_BYTES = 1 << 31  # of the rows of one table in one part
-MOST_TEXT_BYTES = 1 << 28  # of one column in one part
+# Limits for one table or one column in one part.
+MOST_ROWS = 1 << 22  # rows of a table
+MOST_RECORDS = 1 << 20  # rows of a table with texts or lists; structures in lists
+MOST_VALUES = 1 << 26  # values of a column with lists
+MOST_BYTES = 1 << 31  # bytes of the rows of a table
+MOST_TEXT_BYTES = 1 << 28  # bytes of the texts of a column
 MOST_FILE_BYTES = 1 << 31
-MOST_RATIO = 256  # of numbers in memory to the bytes of their file; LZ4 does not compress more
+MOST_RATIO = 256  # limit of bytes in memory / bytes in the file; LZ4 cannot compress more
 
 
 def damaged(path: Path, why: str) -> RecordingError:
@@ -31,7 +32,7 @@ def damaged(path: Path, why: str) -> RecordingError:
 
 
 def read_file(path: Path) -> bytes:
-    """Read a regular file of limited size; raises OSError if there is none."""
+    """Read a regular file of limited size; raises OSError if there is no such file."""
     _check_file(path)
     return path.read_bytes()
 
@@ -65,7 +66,7 @@ def read_table(path: Path, schema: Any) -> Any:
                 if wrong := _wrong_values(chunk):
                     raise damaged(path, f"column {name} {wrong}")
         table = table.cast(schema)
-        table.validate(full=True)  # also that texts are UTF-8
+        table.validate(full=True)  # also checks that texts are UTF-8
         return table
     except FileNotFoundError:
         raise RecordingError(
@@ -74,17 +75,17 @@ def read_table(path: Path, schema: Any) -> Any:
         ) from None
     except MemoryError as error:
         raise damaged(path, "its rows need more memory than there is") from error
-    except KeyError as error:  # a column of texts is not there
+    except KeyError as error:  # a column of texts is missing
         raise damaged(path, f"it has no column {error.args[0]!r}") from error
     except (OSError, ValueError, TypeError, pa.ArrowException) as error:
         raise damaged(path, str(error)) from error
 
 
 def _check_file(path: Path) -> None:
-    """Raise OSError if a path is no regular file, such as a device, or is too large."""
+    """Raise OSError if a path is not a regular file (for example a device), or is too large."""
     found = path.stat()
     if not stat.S_ISREG(found.st_mode):
-        raise OSError("it is no file")
+        raise OSError("it is not a regular file")
     if found.st_size > MOST_FILE_BYTES:
         raise OSError(f"it has {found.st_size} bytes, and {MOST_FILE_BYTES} are allowed")
 
@@ -137,7 +138,7 @@ def _too_large(size: ParquetSize, file_bytes: int, schema: Any) -> str:
 
 
 def _plain_bytes(kind: Any) -> int:
-    """Return the bytes of a value of a column, without those of texts and lists of any length."""
+    """Return the size in bytes of a value of a column, without texts and lists of any length."""
     pa = require("pyarrow", "record")
     if pa.types.is_fixed_size_list(kind):
         return int(kind.list_size) * _plain_bytes(kind.value_type)
@@ -166,7 +167,7 @@ def _text_columns(schema: Any) -> list[str]:
 
 
 def _wrong_values(array: Any) -> str:
-    """Return whether an array has nulls or too many values or too long texts."""
+    """Return whether an array has nulls, too many values, or too much text; empty if not."""
     pa, compute = require("pyarrow", "record"), require("pyarrow.compute", "record")
     kind = array.type
     if array.null_count:

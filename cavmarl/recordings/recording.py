@@ -1,4 +1,4 @@
-"""`Recording`: reads what `RecordingWriter` has written."""
+"""`Recording`: reads the recordings of a `RecordingWriter`."""
 
 from __future__ import annotations
 
@@ -34,12 +34,12 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.network_check import wrong_network
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-MOST_DIGITS = 9  # of the number of a world
+MOST_DIGITS = 9  # limit of the digits of a world's number
 _INDEX = np.dtype([("episode", "<i4"), ("tick", "<i8"), ("part", "<i4"), ("row", "<i4")])
 
 
 def recordings_in(folder: Path) -> list[Path]:
-    """Return the recordings at most three levels below a folder that is no recording itself."""
+    """Return the recordings at most three levels below a folder that is not itself a recording."""
     if (folder / HEAD_FILE).is_file():
         return []
     found = [file for depth in (1, 2, 3) for file in folder.glob(f"{'*/' * depth}{HEAD_FILE}")]
@@ -49,8 +49,8 @@ def recordings_in(folder: Path) -> list[Path]:
 class Recording:
     """A recording, read part by part on demand.
 
-    If the recording is still being written, or its run was killed, it has the parts that were
-    committed when it was opened.
+    If the recording is still being written, or its run was killed, only the parts that were
+    committed when it was opened can be read.
 
     Args:
         path: the folder that was given to `record`.
@@ -76,17 +76,17 @@ class Recording:
         }
         self.worlds = sorted(self._parts)
         self._kept: tuple[Path | None, list[RecordedFrame]] = (None, [])
-        self._kept_extras: dict[str, tuple[Path, Any]] = {}  # last read part by table
+        self._kept_extras: dict[str, tuple[Path, Any]] = {}  # table → part that was read last
         self._indices: dict[int, NDArray[np.void]] = {}
 
     @classmethod
     def open(cls, path: str | Path) -> Recording:
-        """Open a recording, like the class itself."""
+        """Open a recording; the same as calling the class."""
         return cls(path)
 
     @property
     def is_whole(self) -> bool:
-        """Return whether the recording was closed; False while written, or if its run died."""
+        """Return whether the recording was closed; False during its run, or if the run died."""
         return self.head.status == "closed"
 
     @property
@@ -139,7 +139,7 @@ class Recording:
         """Check that a frame can be drawn on the map.
 
         Raises:
-            RecordingError: its signals are not those of the map, or the map is missing or damaged.
+            RecordingError: its signals do not match the map, or the map is missing or damaged.
         """
         if wrong := wrong_on_map(frame, self.network):
             raise RecordingError(f"{self.path}: does not fit its map ({wrong}); get it again")
@@ -164,7 +164,7 @@ class Recording:
                 yield found.frame
 
     def recorded(self, world: int = 0) -> Iterator[RecordedFrame]:
-        """Yield all frames of a world with their episodes; raises as `frames`."""
+        """Yield all frames of a world with their episodes; errors as in `frames`."""
         for path in self._paths(world):
             yield from self._read(path, world)
 
@@ -186,7 +186,7 @@ class Recording:
         return self._read(self._paths(world)[int(found["part"])], world)[int(found["row"])].frame
 
     def events(self, world: int = 0) -> Iterator[RecordedEvent]:
-        """Yield the events of a world, in order; raises as `frames`."""
+        """Yield the events of a world, in order; errors as in `frames`."""
         for frames in self._paths(world):
             path = frames.parent.parent / "events" / frames.name
             yield from events_of(read_table(path, event_schema()))
@@ -213,7 +213,7 @@ class Recording:
     ) -> Iterator[tuple[int, NDArray[np.void]]]:
         """Yield the rows of an optional table episode by episode: (index of episode, rows).
 
-        Only one episode is in memory at a time. Raises as `extra`.
+        Only one episode is in memory at a time. Errors as in `extra`.
         """
         present, parts = 0, [np.zeros(0, self._dtype(table))]
         for frames in self._paths(world):

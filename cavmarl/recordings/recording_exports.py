@@ -22,7 +22,7 @@ from cavmarl.recordings.recording import Recording
 from cavmarl.roads.network import VEHICLE_CLASSES
 
 Track = Callable[[Iterator[WorldFrame]], Iterable[WorldFrame]]
-"""Wraps the iterator of frames, to show the progress."""
+"""Wraps the iterator of frames to show the progress."""
 Export = Callable[[Recording, Path, int, int, Track], int]
 _EVENT = "cavmarl.Event"
 
@@ -30,9 +30,9 @@ _EVENT = "cavmarl.Event"
 def write_fcd(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write SUMO's FCD output; as in SUMO, x and y are those of the front bumper.
+    """Write SUMO's FCD output; as in SUMO, x and y are the position of the front bumper.
 
-    Angles are degrees clockwise from north; `pos` is the front's position along its lane.
+    Angles are degrees clockwise from north; `pos` is the front bumper's position along its lane.
 
     Args:
         recording: the recording.
@@ -109,11 +109,11 @@ def write_csv(
 def write_emissions(
     recording: Recording, path: Path, world: int, episode: int, track: Track = iter
 ) -> int:
-    """Write SUMO's emission output: in each frame, what was emitted since the frame before it.
+    """Write SUMO's emission output: in each frame, the emissions since the previous frame.
 
-    `electricity` (Wh) is that of an electric car, `CO2` and `fuel` (mg) are those of a combustion
-    engine, so each vehicle has all three. The speed and acceleration in a frame stand for the time
-    since the frame before it. Arguments, result and errors are those of `write_fcd`.
+    Each vehicle has three values: `electricity` (Wh) for an electric car, `CO2` and `fuel` (mg) for
+    a combustion engine. The speed and acceleration in a frame apply to the time since the previous
+    frame. Arguments, result and errors are the same as in `write_fcd`.
     """
     lane_ids, count = recording.network.lane_ids, 0
     per_co2, before_s = np.array(FUEL_PER_CO2), math.nan
@@ -144,7 +144,7 @@ def write_mcap(
 ) -> int:
     """Write MCAP with JSON messages: `/vehicles` as Foxglove's SceneUpdate, and `/events`.
 
-    Foxglove shows it in its 3D panel. See `write_fcd` for the arguments.
+    Foxglove shows the file in its 3D panel. See `write_fcd` for the arguments.
 
     Raises:
         MissingExtraError: mcap is not installed.

@@ -35,7 +35,7 @@ from cavmarl.zones.partition.zone_partition import ZonePartition
 FORMAT_VERSION = 2
 HEAD_FILE = "recording.json"
 NETWORK_FILE = "network.bin"
-TABLES = ("vehicles", "events", "frames")  # in every recording; the last one commits a part
+TABLES = ("vehicles", "events", "frames")  # in every recording; the last table commits a part
 
 ALIGNED = 64  # alignment of columns in memory, bytes
 # Numbers that rarely repeat: their bytes are split into streams, which compress better.
@@ -50,10 +50,10 @@ _OPTIONS: dict[str, Any] = {
 }
 
 
-MOST_LETTERS = 1000  # limit of a text in the head
+MOST_LETTERS = 1000  # limit of letters of a text in the head
 MOST_SHOWN = 100
-MOST_ROW_BYTES = 1 << 28  # of a table of samples
-SHORTEST_S, LONGEST_S = 1e-4, 1e3  # of a tick or step
+MOST_ROW_BYTES = 1 << 28  # limit of the size of a row in a table of samples
+SHORTEST_S, LONGEST_S = 1e-4, 1e3  # limits of the length of a tick or step
 _EXTRA = re.compile(r"observations|commands|v2x|handovers|samples-[^/\\\x00]{1,200}")
 _WHOSE = ("tick", "agent", "vehicle")
 _NEEDED = {
@@ -87,8 +87,8 @@ class RecordingHead:
     sim_dt_s: float  # seconds per tick
     step_s: float  # seconds between frames, unless the frame has another time
     network: Mapping[str, str]  # name, source_sha256, layout, sha256 of the file
-    bounds: Sequence[float]  # of all zones: min_x, min_y, max_x, max_y in m
-    rects: Sequence[Sequence[float]]  # of each zone: min_x, min_y, max_x, max_y in m
+    bounds: Sequence[float]  # min_x, min_y, max_x, max_y of all zones in m
+    rects: Sequence[Sequence[float]]  # min_x, min_y, max_x, max_y of each zone in m
     halo_m: float
     manifest: Mapping[str, Any]  # manifest of the run
     status: str = "open"  # "closed" after an orderly end
@@ -104,7 +104,7 @@ class RecordingHead:
         return ZonePartition((low_x, low_y, high_x, high_y), np.array(self.rects))
 
     def wrong(self) -> str:
-        """Return what is wrong with a head from a file; empty if nothing. May raise any error."""
+        """Return what is wrong with a head from a file; empty if nothing. Bad types may raise."""
         self.partition  # noqa: B018 - raises for invalid zones
         texts = [self.network[key] for key in ("name", "source_sha256", "layout", "sha256")]
         texts += [self.environment, self.status, *self.terms, *chain(*self.features)]
@@ -310,10 +310,10 @@ def frames_of(
     """Return the frames of a part, from its tables `frames` and `vehicles`.
 
     Args:
-        path: the file of its `frames`, for errors.
+        path: the file of the table `frames`, for error messages.
         world: index of the world.
-        table: its `frames`.
-        vehicles: its `vehicles`.
+        table: the table `frames` of the part.
+        vehicles: the table `vehicles` of the part.
         num_zones: number of zones of the recording.
 
     Raises:

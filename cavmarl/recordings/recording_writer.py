@@ -38,7 +38,7 @@ from cavmarl.roads.cache import network_layout, pack_network
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.zones.partition.zone_partition import ZonePartition
 
-COMMIT_S = 0.8  # wall time between parts, so that each is on disk within a second
+COMMIT_S = 0.8  # wall time between parts, so that each frame is on disk within a second
 MOST_WAITING_BYTES = 256 << 20  # size of unwritten frames above which `add` waits
 
 
@@ -50,13 +50,13 @@ class RecordingWriter:
 
     Args:
         path: a folder to create; it may exist if it is empty.
-        environment: name and version.
+        environment: name and version of the environment.
         network: the map, which is copied into the recording.
         partition: the zones.
         halo_m: sensing range of zones over their borders.
         sim_dt_s: seconds per tick.
         step_s: seconds per step.
-        manifest: manifest of the run, with the key `world`; numbers, text, lists and dicts.
+        manifest: manifest of the run, with the key `world`; has numbers, text, lists and dicts.
         extras: dtypes of the optional tables, by name; their first field is `tick`.
         features: sensor and name of each observed number, if observations are recorded.
         terms: names of the reward terms, if observations are recorded.
@@ -65,7 +65,7 @@ class RecordingWriter:
         memory: memory for frames; only this writer reads their rows.
 
     Raises:
-        RecordingError: `path` exists and is not empty, or it cannot be written.
+        RecordingError: `path` exists and is not empty, or cannot be written.
         MissingExtraError: pyarrow is not installed.
     """
 
@@ -115,10 +115,10 @@ class RecordingWriter:
             raise _unwritable(self.path, error) from error
         self.memory = FrameMemory()
         self._sink = _Sink(self.path, head, dict(extras or {}), self.memory)
-        self._finish = weakref.finalize(self, self._sink.close)  # also at the end of the process
+        self._finish = weakref.finalize(self, self._sink.close)  # also runs when the process ends
 
     def add(self, frames: Iterable[WorldFrame], extras: Iterable[Extras] = ()) -> None:
-        """Add one frame per world; a tick that is not after the last one begins an episode.
+        """Add one frame per world; a tick that does not follow the last tick begins an episode.
 
         Args:
             frames: frames of worlds.
@@ -170,7 +170,7 @@ class _Sink:
         self._memory = memory
         self._head = head
         self._extras = extras
-        self._pid = os.getpid()  # a forked process has no such thread
+        self._pid = os.getpid()  # a forked process does not have the writing thread
         self._waiting: list[_Moment] = []
         self._waiting_bytes = 0
         self._changed = threading.Condition()
@@ -190,7 +190,7 @@ class _Sink:
         with self._changed:
             self._waiting += moments
             self._waiting_bytes += size
-            if self._thread is None:  # started late: a process may fork until its worlds are made
+            if self._thread is None:  # started as late as possible, since worlds may fork first
                 self._thread = threading.Thread(target=self._run, name="recording", daemon=True)
                 self._thread.start()
             if self._waiting_bytes > MOST_WAITING_BYTES:
@@ -285,7 +285,7 @@ class _WorldParts:
         elif last is not None:
             found = events_between(last.frame, frame)
             self._events += (RecordedEvent(episode, event) for event in found)
-        if last is not None and not self._frames:  # the last frame is committed and compared
+        if last is not None and not self._frames:  # the last frame is committed already
             self._memory.give_back(last.frame.vehicles)
         self._last = RecordedFrame(episode, frame)
         self._frames.append(self._last)

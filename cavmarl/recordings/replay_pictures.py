@@ -28,7 +28,7 @@ class ReplayPictures:
     Raises:
         ConfigError: there is no zone with that index.
         MissingExtraError: pygame-ce is not installed.
-        RecordingError: the map is missing or damaged, or a frame does not fit it.
+        RecordingError: the map is missing or damaged, or a frame does not fit the map.
     """
 
     def __init__(self, recording: Recording, ghosts_of: int | None = None) -> None:

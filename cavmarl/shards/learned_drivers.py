@@ -1,4 +1,4 @@
-"""The networks of background vehicles, in the form that the kernel `drive_by_network` reads."""
+"""The neural networks of background vehicles, in the form that `drive_by_network` reads."""
 
 from __future__ import annotations
 
@@ -29,8 +29,8 @@ def learned_drivers(
     """Return the networks that `traffic.model` names, ordered as `TrafficConfig.models`.
 
     Raises:
-        PolicyError: see `background_drivers`; or the sensors of a driver give another number of
-            features than it observes, or left and right cannot be exchanged in them.
+        PolicyError: see `background_drivers`; or the number of features that a driver's sensors
+            give is wrong for its network, or left and right cannot be exchanged in these features.
     """
     drivers = background_drivers(config.traffic)
     return tuple(_learned(drivers, network, plans, capacity)) if drivers else ()
@@ -91,7 +91,7 @@ def _learned(
 def _exchanged_sides(
     driver: BackgroundDriver, network: RoadNetwork
 ) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
-    """Return how to exchange left and right in an observation; empty: the sides are the same."""
+    """Return how to exchange left and right in an observation; empty: the driver keeps its side."""
     if not is_other_side(untrained_kinds(network, driver.maps)):
         return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.float32)
     try:

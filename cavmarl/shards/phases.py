@@ -21,11 +21,11 @@ from cavmarl.shards.shard_group import ShardGroup
 class PhaseRule(NamedTuple):
     """The ways in which a phase may be run."""
 
-    method: Callable[..., None]  # of `ShardGroup`; it calls the kernel of the phase
+    method: Callable[..., None]  # method of `ShardGroup` that calls the kernel of the phase
     is_shared: bool = False  # whether workers share its zones; if not, one process runs all zones
-    is_late: bool = False  # whether the next phase needs this phase's results of its own zone only
-    is_early: bool = False  # whether it needs no results of the previous phase in other zones
-    is_beside: bool = False  # whether it runs outside of a tick, and is no part of a zone's cost
+    is_late: bool = False  # whether the next phase needs its results in the same zone only
+    is_early: bool = False  # whether it needs results of the previous phase in its own zone only
+    is_beside: bool = False  # whether the phase runs outside of a tick, and adds no cost to a zone
 
 
 class Phase(Enum):

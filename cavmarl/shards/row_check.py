@@ -27,7 +27,7 @@ from cavmarl.traffic.native import NativeTraffic
 Mask = NDArray[np.bool_]
 Numbers = NDArray[np.int64]
 
-LEAST_FACTOR = 1e-6  # of desired speeds; a vehicle of a smaller one never gets anywhere
+LEAST_FACTOR = 1e-6  # minimum factor of desired speeds, since slower vehicles never arrive
 _LARGEST = 1e12  # limit of all numbers in metres or seconds
 _ENDLESS = ("to_go", "step_to_go")  # fields that are infinite without a route
 _LEAST = dict.fromkeys(("s", "wait_s", "stopped_s", "distance_m", "free_s", "step_jerk"), 0.0)
@@ -44,8 +44,8 @@ class ColumnCheck:
     Args:
         ints: allowed ranges of integer columns.
         floats: columns of floating-point numbers, in metres, seconds or radians.
-        endless: those of `floats` that may be infinite.
-        least: the smallest allowed numbers of some of `floats`.
+        endless: columns of `floats` that may be infinite.
+        least: minimum of some columns of `floats`.
     """
 
     def __init__(
@@ -76,7 +76,7 @@ class ColumnCheck:
         if usual.all():
             return ""
         row, column = np.argwhere(~usual)[0].tolist()
-        return _of(rows[row], self._floats[column], f"is no allowed number up to ±{_LARGEST:g}")
+        return _of(rows[row], self._floats[column], f"is not an allowed number up to ±{_LARGEST:g}")
 
 
 class RowCheck:
@@ -89,7 +89,7 @@ class RowCheck:
 
     Attributes:
         indices: ranges of the fields by which kernels index tables, except `way`.
-        steps: limit of `way` plus the lane, which is the index of a row.
+        steps: limit of the sum of `way` and the lane, which is the index of a row.
     """
 
     def __init__(self, roads: RoadArrays, traffic: NativeTraffic, num_agents: int) -> None:
@@ -124,7 +124,7 @@ class RowCheck:
             "blinker": range(-1, 2),
             "leg": range(MOST + 1),
             "order": range(-1, MOST + 1),
-            "owner": range(MOST + 1),  # may name a zone of other partitions; a load overwrites it
+            "owner": range(MOST + 1),  # may be a zone of another partition; loading overwrites it
             "epoch": range(MOST + 1),
             "transfer": range(AUTHORITATIVE, AUTHORITATIVE + 1),
         }
@@ -145,7 +145,7 @@ class RowCheck:
         self,
         rows: NDArray[np.void],  # VEHICLE (n,)
         tail: NDArray[np.void] | None = None,  # PLAN (n,) the last steps; None: the present steps
-        num_orders: int = MOST,  # of the world's demand
+        num_orders: int = MOST,  # number of orders in the world's demand
     ) -> str:
         """Return what is wrong with one of these vehicles of one world; empty if nothing."""
         if not len(rows):
@@ -207,7 +207,7 @@ class RowCheck:
         return _of(rows[np.argmax(wrong)], "order", "is invalid, or its id or tick is invalid")
 
     def _wrong_ways(self, rows: NDArray[np.void], tail: NDArray[np.void] | None) -> str:
-        """Check that a route begins with a step of its lane. Follow it if its lanes may differ."""
+        """Check that a route begins with a step of its lane; follow routes if lanes may differ."""
         lane, way = self._own_lanes(rows["lane"]), rows["way"]
         at = way + lane
         if wrong := self._wrong_places(rows, lane, way):
@@ -227,7 +227,7 @@ class RowCheck:
         )
         drives = np.isin(rows["driver"], (DRIVER_BACKGROUND, DRIVER_AGENT, DRIVER_LEARNED))
         follow = drives & ~planned
-        if self._is_moved:  # after the load, SUMO sends the routes again
+        if self._is_moved:  # SUMO sends the routes again after loading
             follow &= at < travel.num_fixed
         rows, lane, way = rows[follow], lane[follow], way[follow]
         past_way, past_lane, num_steps = way, lane, 0
@@ -266,7 +266,7 @@ class RowCheck:
         return _of(rows[np.argmax(wrong)], "way", "leads out of all routes") if wrong.any() else ""
 
     def _own_lanes(self, lane: NDArray[np.int32]) -> Numbers:
-        """Return the lanes whose steps apply: inside a junction, the lane after it."""
+        """Return the lanes whose steps apply: for a lane inside a junction, the lane after it."""
         lanes = self._roads.lanes
         behind = self._roads.links["to_lane"][lanes["link"][lane]]
         return np.where(lanes["internal"][lane], behind, lane).astype(np.int64)

@@ -40,10 +40,10 @@ from cavmarl.shards.registered_outputs import RegisteredOutputs
 from cavmarl.v2x.kernels.v2x_records import REPORT, Mail
 from cavmarl.zones.kernels.zone_lookup import OUTER, Halo, ZoneArrays
 
-CELL_M = 25.0  # of the spatial index over vehicles
+CELL_M = 25.0  # side of a cell of the spatial index over vehicles
 COMMON = SharedState._fields
 TICKS_IN_ORDER = 32  # ticks between two sorts of the rows by lane
-SUGGESTED_HORIZON_S = 1.0  # time in which a suggested target speed is to be reached
+SUGGESTED_HORIZON_S = 1.0  # time in which a suggested target speed should be reached
 
 # The state of one actuated signal program in a world.
 CONTROLLER = np.dtype(
@@ -68,8 +68,8 @@ class Commands:
     # (W, I, 3) INSERT_* code, LANE and position in m of inserted vehicles; (0, 0, 3): insertions
     # are not configured
     inserted: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, 3)))
-    # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): there
-    # is no room for such vehicles
+    # (W, E, K) EXTERNAL, new commands to vehicles that the caller poses or drives; (0, 0, K): such
+    # vehicles are not configured
     external: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 0, EXTERNAL_FIELDS)))
     # (W, N, 2) LINK row and 1 + SIGNAL_* code of each link whose signal the caller overrides, 0: an
     # unused place; (0, 0, 2): overrides are not configured
@@ -100,7 +100,7 @@ class Shard:
         plans: NDArray[np.void],  # PLAN (V, G, L), the routes of agents, see `Worlds.lanes` for V
         travel: TripTables,
         zoned: ZoneState,  # the rows of all zones
-        outputs: Outputs,  # of the agents of all shards, by agent index
+        outputs: Outputs,  # outputs of the agents of all shards, by agent index
         zone: int,
         zones: ZoneArrays,
         halo: Halo,  # how far zones see beyond their borders
@@ -121,7 +121,7 @@ class Shard:
         num_worlds, capacity = zoned.rows.shape[2:]
         self.optional = optional_arrays(config.sensors, network, plans[0], most_told, capacity)
         self.registered = RegisteredOutputs(config, network)
-        # The networks of background vehicles; their scratch memory is shared, too.
+        # Neural networks that drive background vehicles; shards also share their scratch memory.
         self.learned: tuple[LearnedDriver, ...] = (
             learned_drivers(config, network, plans[0], capacity) if first is None else first.learned
         )
@@ -171,7 +171,7 @@ class Shard:
         self.discrete = config.action.kind == "discrete"
 
     def cut(self, zones: ZoneArrays, halo: Halo) -> None:
-        """Set the zones. Groups of this shard must be made anew afterwards."""
+        """Set the zones. The caller must then make new groups of this shard."""
         self.zones = zones
         self.halo = halo
         seen = self._extent_m
@@ -180,7 +180,7 @@ class Shard:
         self.grid = make_grid(seen, CELL_M, self.zoned.rows.shape[3], self._floating)
 
     def align(self) -> None:
-        """Use the first buffer for all rows, after a tick that was abandoned."""
+        """Use the first buffer for all rows after an abandoned tick."""
         self.set_sides(0, 0)
 
     def set_sides(self, side: int, next_side: int) -> None:
@@ -220,7 +220,7 @@ def make_worlds(
 
     Agents' commands take effect `latency_ticks` later; scripts wait for `num_cues` cues. If
     `zoned` is given, the rows are views of its zone `zone`. The state that all zones share (ticks,
-    keys, signals, detections, cues) is that of `common`, if given; else `zeros` allocates it.
+    keys, signals, detections, cues) comes from `common`, if given; else `zeros` allocates it.
     """
     if zoned is None:
         zoned = make_zone_state(1, num_worlds, capacity)
@@ -253,7 +253,7 @@ def make_worlds(
 
 
 def make_lane_tables(network: RoadNetwork, num_worlds: int, zeros: Zeros) -> NDArray[np.void]:
-    """Return LANE (1 + W, L): the lanes of the map, and again for each world."""
+    """Return LANE (1 + W, L): the lanes of the map, and a copy for each world."""
     lanes = network.arrays.lanes
     tables = zeros((1 + num_worlds, len(lanes)), dtype=lanes.dtype)
     tables[:] = lanes
@@ -268,7 +268,7 @@ def _read_only(array: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def override_columns(config: EnvConfig, network: RoadNetwork) -> int:
-    """Return the number of columns of `Worlds.signal_phase` behind those of the signals."""
+    """Return the number of columns of `Worlds.signal_phase` after the columns of the signals."""
     return len(network.links) if config.signals.overrides else 0
 
 

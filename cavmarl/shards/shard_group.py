@@ -25,7 +25,7 @@ class ShardGroup:
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # of one process, by rising zones; they share clock and scratch
+        shards: Sequence[Shard],  # shards of one process, by zones; they share clock and scratch
     ) -> None:
         self.shards = tuple(shards)
         self.first = shards[0]
@@ -105,7 +105,7 @@ class ShardGroup:
         self.departure_calls(departures).admit()
 
     def commit(self) -> None:
-        """Make the next rows the committed ones."""
+        """Make the next rows the committed rows."""
         self.set_sides(self.first.next_side, self.first.next_side)
 
     def detect(self) -> None:
@@ -150,9 +150,9 @@ class GroupCalls:
     """The kernel calls of a group, each with its arguments.
 
     Attributes:
-        controls: (W, A, 2), which `advance` reads.
-        meta_actions: (W, A), which `begin_step` reads.
-        chosen: (W,), which `sense` and `credit` read.
+        controls: (W, A, 2) input of `advance`.
+        meta_actions: (W, A) input of `begin_step`.
+        chosen: (W,) input of `sense` and `credit`.
     """
 
     def __init__(self, shards: Sequence[Shard]) -> None:

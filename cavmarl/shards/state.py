@@ -1,7 +1,7 @@
 """The table of arrays that are the state of worlds, because they outlive a tick.
 
 Code that saves, moves or digests worlds takes the arrays from this table. The state also includes
-the owned rows, the arrays of rerouting and those of components (`Component.arrays`).
+the owned rows, the arrays of rerouting, and the arrays of components (`Component.arrays`).
 """
 
 from __future__ import annotations
@@ -19,8 +19,8 @@ from cavmarl.core.records.arrays import DepartureQueue, Outputs, SharedState
 class Use(Enum):
     """The uses of an array of the state."""
 
-    SAVED = auto()  # in checkpoints, and with a world that changes its worker
-    DIGESTED = auto()  # in the hash of a world's state
+    SAVED = auto()  # stored in checkpoints, and sent with a world that moves to another worker
+    DIGESTED = auto()  # part of the hash of a world's state
 
 
 S, D = Use.SAVED, Use.DIGESTED

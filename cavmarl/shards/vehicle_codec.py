@@ -12,9 +12,9 @@ all processes of a world, so the record contains indices into them. The state ha
 sensors, which are taken again.
 
 Reader and writer must have the same layout of the record. The header has a digest of the layout,
-and a change of it needs a new major version (`RECORD_VERSION`). A minor version may append data
-that no tick reads, after the frames. A reader skips unknown data and tolerates missing data, so all
-minor versions can read each other.
+and a change of the layout needs a new major version (`RECORD_VERSION`). A minor version may append
+data that no tick reads, after the frames. A reader skips unknown data and tolerates missing data,
+so all minor versions can read each other.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ class TransferCodec:
         record: np.dtype[np.void],  # dtype of a vehicle's record
         # (W, A, …) float64, the delayed commands of agents: `Worlds.pending`
         commands: NDArray[np.float64],
-        # (W, A, F) float32, the part of an agent's observation that the next one repeats
+        # (W, A, F) float32, the part of an agent's observation that its next observation repeats
         frames: NDArray[np.float32],
         # returns what is wrong with VEHICLE (1,), empty if nothing; None: no check
         check: Callable[[NDArray[np.void]], str] | None = None,
@@ -124,8 +124,8 @@ class TransferCodec:
         rows: NDArray[np.void],  # VEHICLE (W, C)
         world: int,
         i: int,
-        # tick of the state, as `unpack` expects it. In vehicles that entered after the reset,
-        # `VEHICLE["tick"]` is lower by one
+        # tick of the state, as `unpack` expects it. `VEHICLE["tick"]` is lower by one if the
+        # vehicle entered after the reset
         tick: int,
     ) -> bytes:
         """Return the state of a vehicle."""

@@ -26,7 +26,7 @@ from cavmarl.core.processes import start_dying_with_process, start_python
 from cavmarl.evaluate.subprocess_calls import told_error
 from cavmarl.verify.differences import Arrays, Difference, find_difference
 
-HASH_SEEDS = ("0", "1", "4294967295")  # of the three processes
+HASH_SEEDS = ("0", "1", "4294967295")  # hash seeds of the three processes
 MAX_STEPS = 10_000_000
 
 
@@ -34,7 +34,7 @@ MAX_STEPS = 10_000_000
 class FirstDifference(Difference):
     """The first difference of two processes."""
 
-    processes: tuple[int, int]  # the numbers of the processes; the tick is that of the first one
+    processes: tuple[int, int]  # the numbers of the processes; `tick` is from the first process
 
 
 @dataclass(frozen=True)
@@ -42,9 +42,9 @@ class Determinism:
     """The result of `verify_determinism`."""
 
     steps: int  # number of compared steps
-    ticks: int  # of the world at the end
+    ticks: int  # ticks of the world at the end
     hash_seeds: tuple[str, ...]  # `PYTHONHASHSEED` of the processes
-    state_hash: str  # of the first process at the end
+    state_hash: str  # hash of the first process at the end
     difference: FirstDifference | None  # None if all processes were equal
 
 
@@ -63,7 +63,7 @@ def verify_determinism(
         policy: as in `load_policy`.
         steps: number of steps; episodes follow one another.
         progress: called after each step with its number and `steps`.
-        keys: of the world.
+        keys: settings of the world.
 
     Raises:
         ConfigError: a number or a key is invalid.
@@ -76,7 +76,7 @@ def verify_determinism(
     with ExitStack() as stack:
         room = Path(stack.enter_context(TemporaryDirectory()))
         programs = [stack.enter_context(_Program(job, HASH_SEEDS[0]))]
-        # If kernels must be compiled, one process does it for all.
+        # If kernels must be compiled, one process compiles them for all.
         programs[0].wait_for_line()
         stack.enter_context(_load_beside())
         programs += [stack.enter_context(_Program(job, key)) for key in HASH_SEEDS[1:]]

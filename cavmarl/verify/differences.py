@@ -31,7 +31,7 @@ class Difference:
     what: str
     vehicle: int | None  # least id of the vehicles that differ; None: no vehicle differs
     field: str  # first field of the vehicle that differs, or the place in the array
-    values: tuple[Any, Any]  # in the two runs; None where a vehicle is missing
+    values: tuple[Any, Any]  # its values in the two runs; None where a vehicle is missing
 
 
 def step_results(result: StepResult, actions: NDArray[Any]) -> Arrays:
@@ -53,7 +53,7 @@ def first_results(vec: CavVectorEnv, seed: int) -> Arrays:
 
 
 class DrivenRun:
-    """W worlds and their driver, with the same seed, from the reset on."""
+    """W worlds and their driver, with the same seed, since the reset."""
 
     def __init__(self, vec: CavVectorEnv, policy: str | Path, seed: int) -> None:
         self.vec = vec
@@ -69,7 +69,7 @@ class DrivenRun:
 
 
 def single_arrays(results: Mapping[str, Any]) -> Iterator[tuple[str, NDArray[Any]]]:
-    """Yield the arrays of results with their names; observations by sensor one by one."""
+    """Yield the arrays of results with their names; observations are split by sensor."""
     for name, found in results.items():
         if isinstance(found, Mapping):
             yield from ((f"{name} {sensor}", array) for sensor, array in found.items())
@@ -101,8 +101,8 @@ def same_bytes(one: Mapping[str, NDArray[Any]], other: Mapping[str, NDArray[Any]
 def find_difference(step: int, tick: int, one: Arrays, other: Arrays) -> Difference:
     """Return the first difference of two snapshots.
 
-    This is the first field that differs of the vehicle with the least id; without such a vehicle,
-    the first place that differs in another array.
+    If vehicles differ, this is the first differing field of the vehicle with the lowest id; if not,
+    the first differing place in another array.
     """
 
     def found(what: str, vehicle: int | None, field: str, values: tuple[Any, Any]) -> Difference:

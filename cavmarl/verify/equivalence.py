@@ -1,8 +1,8 @@
 """Check that divided worlds equal the undivided world, step by step.
 
-All worlds use the public interface, with the same seed and a driver of their own. After every step,
-the hashes of all worlds and all results of `step` are compared. A world in which another simulator
-runs a zone with a tolerance is run, but not compared.
+All worlds use the public interface, with the same seed and separate drivers. After every step, the
+hashes of all worlds and all results of `step` are compared. If another simulator with a tolerance
+runs a zone of a world, the world is run, but not compared.
 """
 
 from __future__ import annotations
@@ -37,9 +37,9 @@ class ZoneResult:
     zones: int  # number of zones
     steps: int  # number of compared steps
     crossings: int  # number of changes of zone from step to step, in all worlds
-    vehicles: float  # number in all worlds, averaged over the steps
+    vehicles: float  # number of vehicles in all worlds, averaged over the steps
     world: int | None  # the first world that differs; None if all were equal
-    difference: Difference | None  # in this world; None if all were equal
+    difference: Difference | None  # the difference in this world; None if all were equal
     # the largest tolerance of a simulator of a zone, see `register_zone_simulator`; if it is above
     # 0, the worlds are not compared
     tolerance_m: float = 0.0
@@ -52,8 +52,8 @@ class Equivalence:
     env: str  # name of the environment
     worlds: int  # number of worlds stepped together
     steps: int  # number of requested steps
-    ticks: int  # of the first world's episode at the end
-    state_hashes: tuple[str, ...]  # of the undivided worlds at the end
+    ticks: int  # ticks of the first world's episode at the end
+    state_hashes: tuple[str, ...]  # hashes of the undivided worlds at the end
     results: tuple[ZoneResult, ...]  # one for each number of zones
 
     @property
@@ -81,15 +81,15 @@ def verify_zones(
 
     Args:
         env: as in `make_vec`, like the other keywords that are not explained here.
-        zones: numbers of zones; default: that of the zone file, otherwise `ZONES`.
+        zones: numbers of zones; default: the number in the zone file, otherwise `ZONES`.
         steps: number of steps; episodes follow one another.
         layout: replaces zones.layout; the path of a zone file is relative to the working directory.
         policy: as in `load_policy`; it has the same seed as the worlds.
         worlds: number of worlds stepped together.
-        check: check the invariants of ownership in the divided worlds.
+        check: whether to check the invariants of ownership in the divided worlds.
         journals: folder for the journals of the divided worlds, one for each number of zones.
         progress: called after each step with its number and `steps`.
-        keys: of the worlds; overrides of `zones` apply to the divided worlds only.
+        keys: settings of the worlds; overrides of `zones` apply to the divided worlds only.
 
     Raises:
         ConfigError: a number or a key is invalid, the map cannot hold this many zones, or a zone

@@ -14,13 +14,13 @@ from cavmarl.core.errors import ConfigError
 class FaultLine:
     """The runs with one number of nodes and one kind of fault."""
 
-    nodes: int  # number of nodes at the beginning
+    nodes: int  # number of nodes at the start
     kind: str  # kind of the faults, or name of a mix of kinds
     runs: int = 0  # number of runs
     deaths: int = 0  # number of processes that faults have ended
     lost: int = 0  # number of lost nodes
     recoveries: int = 0  # number of rollbacks to a kept state
-    equal: int = 0  # runs that were equal to the undivided world to the end
+    equal: int = 0  # runs that equalled the undivided world until the end
     ended: int = 0  # runs that ended with `WorkerDeathError`: a part of the state was lost
     injected: Counter[str] = field(default_factory=Counter)  # number of faults, by kind
     wrong: list[str] = field(default_factory=list)  # descriptions of all other runs
@@ -38,8 +38,8 @@ class FaultCampaign(Generic[Line]):
     """The result of a campaign."""
 
     env: str  # name of the environment
-    zones: int  # of each world
-    steps: int  # least number of steps of each run
+    zones: int  # number of zones of each world
+    steps: int  # minimum number of steps of each run
     lines: tuple[Line, ...]  # one for each number of nodes and kind of fault
 
     @property
@@ -68,7 +68,7 @@ def run_lines(
     run: Callable[[Line, int], None],  # does one run of a line with a seed
     progress: Callable[[int, int], None] | None,  # called with completed runs and all runs
 ) -> None:
-    """Do a run of each line with each seed."""
+    """Do one run for each line and each seed."""
     for n, line in enumerate(lines):
         for k, seed in enumerate(seeds, start=1):
             line.runs += 1

@@ -17,7 +17,7 @@ from typing import TypeAlias
 LOCAL = "127.0.0.1"
 CHUNK = 1 << 16
 LONGEST_DELAY_S = 0.05
-END_S = 2.0  # limit for the end of a thread
+END_S = 2.0  # time for a thread to end
 
 Place: TypeAlias = tuple[str, int]
 
@@ -32,7 +32,7 @@ class NetworkFault(StrEnum):
 
 
 class _Connection:
-    """The two sockets of one connection, by direction: 0 from the caller, 1 to the caller."""
+    """The two sockets of one connection. Direction 0 is from the caller, 1 is to the caller."""
 
     def __init__(self, ends: tuple[socket.socket, socket.socket]) -> None:
         self.ends = ends
@@ -55,7 +55,7 @@ class FaultyNetwork:
     def __init__(
         self,
         seed: int,
-        latency_s: float = 0.0,  # of all bytes
+        latency_s: float = 0.0,  # latency of all bytes
     ) -> None:
         self.done: Counter[NetworkFault] = Counter()
         self._random, self._latency_s = random.Random(seed), latency_s

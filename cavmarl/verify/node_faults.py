@@ -33,9 +33,9 @@ FAULTS = (*map(str, NetworkFault), KILL, STOP)
 PER_RUN = {NetworkFault.DELAY: 10, KILL: 35, ANY: 5}  # number of faults in a run, by kind
 OTHERS = 2  # number of faults in a run, for all other kinds
 APART = 4  # steps between two faults that may cost a node, and after the last such fault
-WAIT_S = 0.05  # between two steps, while a lost node is replaced
-REPLACED_S = 60.0  # limit for the replacement of a lost node
-TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
+WAIT_S = 0.05  # pause between two steps, while a lost node is replaced
+REPLACED_S = 60.0  # time for the replacement of a lost node
+TIMEOUT_S = 1.0  # time without a frame, after which a node receives a ping
 
 
 def verify_node_faults(
@@ -63,14 +63,14 @@ def verify_node_faults(
         faults: kinds of faults; `ANY` draws each fault from all kinds.
         seeds: number of runs for each number of nodes and kind of fault.
         first_seed: seed of the faults of the first run; further runs have the next seeds.
-        zones: of each world; default: twice the largest number of nodes.
-        steps: least number of steps of each run; a run continues until all its faults have
+        zones: number of zones of each world; default: twice the largest number of nodes.
+        steps: minimum number of steps of each run; a run continues until all its faults have
             happened.
         per_run: number of faults in a run; default: see `PER_RUN`. A run with one node has at most
             one fault that may cost the node.
         policy: as in `load_policy`.
         progress: called with the number of completed runs and of all runs.
-        keys: of the worlds.
+        keys: settings of the worlds.
 
     Raises:
         ConfigError: a number is invalid.
@@ -92,9 +92,9 @@ def verify_node_faults(
 
 
 def _let_nodes_compile(spec: WorldSpec, nodes: int, zones: int, policy: str | Path) -> None:
-    """Let nodes, and the successor of a killed one, compile their kernels, without a campaign.
+    """Let nodes, and the successor of a killed node, compile their kernels before the campaign.
 
-    Compiling takes longer than `TIMEOUT_S`. In the campaign, all nodes would count as lost.
+    Compiling takes longer than `TIMEOUT_S`, so all nodes would count as lost in the campaign.
     """
     pair = ComparedWorlds(spec, nodes, zones, 1, policy)
     drawn = random.Random(0)
@@ -158,7 +158,7 @@ class _PlannedFaults:
         kinds = FAULTS if line.kind == ANY else (line.kind,)
         self._kinds = drawn.choices(kinds, k=num)
         self._next_step = FIRST_STEPS + drawn.randrange(APART)
-        self._waits_until_s = 0.0  # limit for the replacement of a lost node; 0: none is lost
+        self._waits_until_s = 0.0  # latest time for the replacement of a lost node; 0: none is lost
         self.signalled: Counter[str] = Counter()  # number of signals, by kind
 
     def are_left(self, step: int) -> bool:
@@ -176,7 +176,7 @@ class _PlannedFaults:
         return partial(self._network.inject, NetworkFault(kind))
 
     def _is_replaced_later(self, step: int) -> bool:
-        """Wait shortly if a lost node is not replaced yet. Return whether to wait longer.
+        """Wait briefly if a lost node is not replaced yet. Return whether to wait longer.
 
         After the replacement, `APART` steps follow, so that two nodes keep each state again. After
         `REPLACED_S` without a replacement, the faults continue.

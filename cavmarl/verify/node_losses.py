@@ -29,19 +29,19 @@ from cavmarl.verify.differences import DrivenRun, same_bytes
 from cavmarl.verify.fault_campaign import check_nodes
 
 FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
-LATEST = 1.5  # latest time of a kill, in durations of a step; some kills happen between two steps
+LATEST = 1.5  # latest time of a kill, in durations of a step, so some happen between two steps
 
 
 @dataclass(frozen=True)
 class NodeRun:
     """The result for one number of nodes."""
 
-    nodes: int  # number of nodes at the beginning
+    nodes: int  # number of nodes at the start
     killed: int  # number of lost nodes
     migrations: int  # number of changes of owner
     different: int | None  # the first step after which anything differed; None: none
-    step_ms: float  # median of the steps in which no node was lost
-    recovery_ms: tuple[float, ...]  # time above this median of the steps in which a node was lost
+    step_ms: float  # median duration of the steps in which no node was lost
+    recovery_ms: tuple[float, ...]  # additional durations of the steps in which a node was lost
 
 
 @dataclass(frozen=True)
@@ -49,7 +49,7 @@ class NodeReport:
     """The result of `verify_nodes`."""
 
     env: str  # name of the environment
-    zones: int  # of each world
+    zones: int  # number of zones of each world
     worlds: int  # number of worlds stepped together
     steps: int  # number of compared steps
     runs: tuple[NodeRun, ...]  # one for each number of nodes
@@ -79,13 +79,13 @@ def verify_nodes(
     Args:
         env: as in `make_vec`, like the other keywords; the kills have the same seed.
         nodes: numbers of nodes, one run each.
-        kills: number of nodes that get a SIGKILL at random times in each run; at most all but one.
-        zones: of each world; default: twice the largest number of nodes.
+        kills: number of nodes killed by SIGKILL at random times in each run; at most all but one.
+        zones: number of zones of each world; default: twice the largest number of nodes.
         worlds: number of worlds stepped together.
-        steps: of each run.
+        steps: number of steps of each run.
         policy: as in `load_policy`.
         progress: called with the number of completed steps and of all steps.
-        keys: of the worlds.
+        keys: settings of the worlds.
 
     Raises:
         ConfigError: a number is invalid.
@@ -119,7 +119,7 @@ def _due(planned: Mapping[int, Callable[[], object]], step: int) -> Callable[[],
 
 
 class ComparedWorlds:
-    """Worlds over nodes, and undivided worlds with the same driver to compare them with."""
+    """Worlds over nodes, and undivided worlds with the same driver, for comparison."""
 
     def __init__(
         self,
@@ -131,7 +131,7 @@ class ComparedWorlds:
         route: Route = straight,  # maps a place to the place that nodes call to reach it
     ) -> None:
         self._nodes = nodes
-        self._signalled: set[int] = set()  # processes that have got a signal
+        self._signalled: set[int] = set()  # processes that have received a signal
         whole = make_vec(spec.env, num_envs=worlds, **spec.keywords)
         config, base_dir = load_config(spec.env, zones=zones, **spec.keywords)
         world = make_world(config, base_dir)
@@ -148,7 +148,7 @@ class ComparedWorlds:
         steps: int,
         due: Callable[[int], Callable[[], object] | None],  # step → fault during it, or None
         note: Callable[[int], None],  # called with the number of completed steps
-        # whether to run more than `steps`
+        # returns whether to run more than `steps`
         must_continue: Callable[[int], bool] = lambda step: False,
     ) -> NodeRun:
         """Drive and compare the worlds, then close the nodes."""
@@ -177,7 +177,7 @@ class ComparedWorlds:
                 note(step + 1)
             for timer in timers:
                 timer.join()
-            one, other = self._hashes()  # detects the loss of a node that was killed last
+            one, other = self._hashes()  # also detects the loss of the node that was killed last
             different = step if different is None and one != other else different
             migrations = self.worlds.migrations
         finally:
@@ -189,7 +189,7 @@ class ComparedWorlds:
         )
 
     def signal_node(self, drawn: random.Random, number: signal.Signals) -> bool:
-        """Send a signal to a random node that has got none. Return whether there is such a node."""
+        """Send a signal to a random node that has received none. Return whether there is one."""
         living = [pid for pid in self.worlds.pool.pids if pid not in self._signalled]
         if living:
             pid = drawn.choice(living)

@@ -1,4 +1,4 @@
-"""Published numbers: lines with numbers of pages, the commands that repeat them, and tolerances.
+"""Published numbers: for each line, numbers of a page, the command that repeats them, a tolerance.
 
 `docs/figures/lines.yaml` has the lines. The published values are read from the pages themselves:
 from prose by patterns in which `{}` stands for a number, from tables by row and column.
@@ -18,10 +18,10 @@ from cavmarl.core.errors import ConfigError
 
 LINES_FILE = Path("docs/figures/lines.yaml")
 NUMBER = r"[-+]?(?:[0-9]{1,3}(?:,[0-9]{3})+|[0-9]+)(?:\.[0-9]+)?"
-FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # not the end of a name or of a version
+FREE_NUMBER = re.compile(rf"(?<![\w.,]){NUMBER}")  # excludes the end of a name or of a version
 _TOLERANCE = re.compile(
     r"exact|range(?: {0}{1} %)?|{0}{1} %|[0-9]+{1}".format("[0-9]{1,2}", r"(?:\.[0-9]+)?")
-)  # less than 100 %, as any published number that is too large would be within 100 %
+)  # less than 100 %, since a tolerance of 100 % would accept any published number that is too large
 _NEEDS = ("module", "program", "variable", "file")
 
 
@@ -31,30 +31,30 @@ class PublishedLine:
 
     Attributes:
         page: path of the page in the repository.
-        command: as a page shows it.
+        command: the command, as the page shows it.
         text: patterns of prose or of whole rows, in which `{}` stands for a number. Each occurs
             once in the page.
-        values: an expression of the command's JSON for each `{}`; empty: not compared, so the
-            number is a condition of the page or has a line with by_hand. With the tolerance
-            `range`, there is one for two numbers.
+        values: for each `{}`, an expression that finds the value in the command's JSON; empty: not
+            compared, so the number is a condition of the page or has a line with by_hand. With the
+            tolerance `range`, two numbers have one expression.
         table: beginning of the header row of a table.
         section: heading above the table; empty if the header row is unique in the page. Without
             text and table, the line has all numbers of this section that no other line has.
-        nth: number of the table among those with this header in this section, from 1.
+        nth: number of the table among the tables with this header in this section, from 1.
         row: path of the object to which the expressions of columns are relative.
-        word: word of the command and the expressions that stands for a row of the table, for
-            example `NAME`. `NAME_` stands for the same with `_` in place of `-`.
-        rows: label of a row → what replaces the word; empty: all rows, with their labels.
+        word: placeholder for a row of the table in the command and the expressions, for example
+            `NAME`. `NAME_` stands for the same text with `_` in place of `-`.
+        rows: label of a row → text that replaces the word; empty: all rows, with their labels.
         columns: head → expression.
-        tolerance: `exact` (equal in the digits of the page), `N %` of the published number, `N`, or
-            `range`: measured values lie between two published ones, `range N %`: wider on both
-            sides.
-        needs: what has to be there: `module:NAME`, `program:NAME`, `variable:NAME` of the
-            environment, `file:WORD`, which is a word of the command that `--file` replaces.
+        tolerance: `exact` (equal in the digits of the page); `N %` of the published number; `N`;
+            `range` (measured values lie between the two published numbers); `range N %` (the range
+            is wider by N % on both sides).
+        needs: requirements: `module:NAME`, `program:NAME`, `variable:NAME` of the environment, or
+            `file:WORD`, where WORD is a word of the command that `--file` replaces.
         minutes: how long the command takes.
-        quick: whether `--quick` repeats the line; equal bytes on every machine within seconds.
+        quick: whether `--quick` repeats the line: within seconds, equal bytes on every machine.
         quick_rows: labels of the rows that `--quick` repeats.
-        by_hand: why no command repeats these numbers here; the line is then shown and not run.
+        by_hand: why no command can repeat these numbers; the line is then shown and not run.
     """
 
     page: str
@@ -111,10 +111,10 @@ class PublishedLine:
 
 @dataclass(frozen=True)
 class PublishedLines:
-    """All lines, and the numbers of pages that are no results.
+    """All lines, and the numbers on pages that are not results.
 
     Attributes:
-        lines: by name.
+        lines: lines by name.
         conditions: page → patterns of numbers that are conditions, settings or versions.
     """
 
@@ -145,7 +145,7 @@ class PageTable:
     """A table of a page.
 
     Attributes:
-        section: the heading above it.
+        section: the heading above the table.
         heads: texts of the header row.
         rows: texts of the cells.
     """
@@ -159,7 +159,7 @@ def repository_root(start: Path | None = None) -> Path:
     """Return the folder of the checkout that contains the package, or `start`.
 
     Raises:
-        ConfigError: this is no checkout, as the pages with the numbers are missing.
+        ConfigError: this is not a checkout, since the pages with the numbers are missing.
     """
     root = start or Path(__file__).resolve().parents[2]
     if not (root / LINES_FILE).is_file():
@@ -186,10 +186,10 @@ def cells_of(
     """Return the published numbers of a line, as the page shows them.
 
     Args:
-        name: of the line.
+        name: name of the line.
         line: the line.
-        root: of the checkout.
-        quick: only the rows that `--quick` repeats.
+        root: root folder of the checkout.
+        quick: whether to return only the rows that `--quick` repeats.
 
     Raises:
         ConfigError: the page has no such text, table, row or column, or has a text twice.
@@ -208,7 +208,7 @@ def cells_of(
 
 
 def find_text(where: str, pattern: str, text: str) -> re.Match[str]:
-    """Return the one match of a pattern in a page; raises ConfigError if there is not one."""
+    """Return the only match of a pattern in a page; raises ConfigError: no match, or several."""
     found = list(compile_pattern(pattern).finditer(text))
     if len(found) != 1:
         count = "no text" if not found else f"{len(found)} texts"
@@ -219,13 +219,13 @@ def find_text(where: str, pattern: str, text: str) -> re.Match[str]:
 
 
 def compile_pattern(pattern: str) -> re.Pattern[str]:
-    """Return the expression of a pattern: `{}` is a number, and any space a break of the line."""
+    """Compile a pattern: `{}` matches a number, and a space also matches a line break."""
     parts = [r"\s+".join(map(re.escape, part.split(" "))) for part in pattern.split("{}")]
     return re.compile(f"({NUMBER})".join(parts))
 
 
 def section_of(where: str, section: str, text: str) -> str:
-    """Return the text below a heading, up to the next one; raises ConfigError if it is missing."""
+    """Return the text below a heading, up to the next heading; raises ConfigError: no heading."""
     found = re.search(rf"^#+ {re.escape(section)}\n(.*?)(?=^#|\Z)", text, re.DOTALL | re.MULTILINE)
     if found is None:
         raise ConfigError(f"{where} has no heading {section!r}; correct the section")
@@ -233,7 +233,7 @@ def section_of(where: str, section: str, text: str) -> str:
 
 
 def without_code(text: str) -> str:
-    """Return a page's text with blanks in place of code, comments and targets of links."""
+    """Return a page's text with code, comments and targets of links replaced by blanks."""
     code = r"^```.*?^```|`[^`]*`|<[^>]*>|(?<=\])\([^)]*\)"
     blank = partial(re.sub, r"[^\n]", " ")
     return re.sub(code, lambda found: blank(found[0]), text, flags=re.DOTALL | re.MULTILINE)
@@ -274,7 +274,7 @@ def find_table(where: str, line: PublishedLine, text: str) -> PageTable:
 
 
 def label_of(row: tuple[str, ...]) -> str:
-    """Return the text of the first cell with text, without links, pictures and marks."""
+    """Return the text of the first non-empty cell, without links, pictures and markup."""
     for cell in row:
         text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", re.sub(r"<[^>]*>", "", cell))
         if text := text.replace("`", "").replace("*", "").strip():
@@ -334,7 +334,7 @@ def _twice(texts: list[str]) -> str:
 
 
 def with_row(text: str, word: str, value: str) -> str:
-    """Return a command or an expression with the value of a row in place of its word."""
+    """Return a command or an expression in which the value of a row replaces the word."""
     text = re.sub(rf"(?<![A-Za-z]){word}_", f"{value.replace('-', '_')}_", text)
     return re.sub(rf"(?<![A-Za-z]){word}(?![A-Za-z])", value, text)
 

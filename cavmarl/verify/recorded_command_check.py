@@ -1,4 +1,4 @@
-"""Check of recorded commands. Kernels use their numbers as indices, so files are not believed."""
+"""Check of recorded commands. Kernels use their numbers as indices, so files are not trusted."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ from cavmarl.signals.kernels.green_choices import KEEP
 
 
 def seed_of(row: np.void) -> int | None:
-    """Return the seed of a row of a reset; None: it begins the next episode of an earlier seed.
+    """Return the seed in the row of a reset; None: the reset continues with an earlier seed.
 
     Raises:
-        ConfigError: it is no seed.
+        ConfigError: the value is not a valid seed.
     """
     if not row["seed"]:
         return None
@@ -44,8 +44,8 @@ def wrong_inputs(
     Args:
         rows: rows with the dtype of `inputs_dtype`.
         network: map of the world.
-        num_choices: (S,) number of choices of each signal or unit with speed limits that is
-            controlled; None: there are none.
+        num_choices: (S,) number of choices of each controlled signal or unit with speed limits;
+            None: nothing is controlled.
     """
     if not np.isin(rows["kind"].astype(str), (RESET, STEP)).all():
         return f"a row is neither a {RESET} nor a {STEP}"

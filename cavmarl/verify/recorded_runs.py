@@ -20,7 +20,7 @@ from cavmarl.env.recorded_inputs import INPUTS, RESET, command_names, commands_o
 from cavmarl.recordings.recording import Recording
 from cavmarl.verify.recorded_command_check import seed_of, wrong_inputs
 
-_MAY_DIFFER = ("zones", "workers", "nodes")  # keys that no result depends on
+_MAY_DIFFER = ("zones", "workers", "nodes")  # keys that do not affect results
 _MOST_SHOWN = 5
 
 
@@ -31,8 +31,8 @@ class RepeatedRun:
     environment: str
     episodes: int
     steps: int  # number of repeated steps
-    state_hash: str  # at the end
-    # step from 0 over all episodes whose state differs first, and its tick; None: all are equal
+    state_hash: str  # hash of the state at the end
+    # first step (from 0 over all episodes) whose state differs, and its tick; None: all are equal
     first_difference: tuple[int, int] | None
 
 
@@ -56,7 +56,7 @@ def repeat_recording(
         progress: called after each step with its number and the number of all steps.
 
     Raises:
-        ConfigError: the recording has no commands, or is that of another world.
+        ConfigError: the recording has no commands, or belongs to another world.
         RecordingError: the recording cannot be read, or does not begin with a reset.
     """
     recording = Recording.open(path)
@@ -112,7 +112,7 @@ def _check_inputs(path: str | Path, made: CavEnv, rows: Any) -> None:
     differing |= {name for name in wanted - differing if given[name] != expected[name]}
     if differing:
         raise RecordingError(
-            f"{path}: its commands have another column {min(differing)} than this world: it is "
+            f"{path}: the column {min(differing)} of its commands does not fit this world: it is "
             "damaged, or of another version of cavmarl; record the run again"
         )
     controlled, num_choices = made.config.controlled, None
@@ -133,10 +133,10 @@ def _check_world(recording: Recording, made: CavEnv) -> None:
         )
     recorded, present = _keys_of(world.get("config", {})), _keys_of(_plain(made.config))
     defaults = _keys_of(_plain(EnvConfig(name="", map=MapConfig(source="map"))))
-    for name in present.keys() - recorded.keys():  # keys that are newer than the recording
+    for name in present.keys() - recorded.keys():  # keys that did not exist for the recording
         if name in defaults:
             recorded[name] = defaults[name]
-    for keys in (recorded, present):  # like maps, logged scenes may have moved
+    for keys in (recorded, present):  # logged scenes, like maps, may be in other folders now
         if is_scene_file(str(keys.get("scenario.name"))):
             keys["scenario.name"] = Path(str(keys["scenario.name"])).name
     names = sorted(recorded.keys() | present.keys())
@@ -155,13 +155,13 @@ def _check_world(recording: Recording, made: CavEnv) -> None:
 
 
 def _plain(config: EnvConfig) -> dict[str, Any]:
-    """Return a configuration with lists in place of tuples, as JSON has it."""
+    """Return a configuration with lists in place of tuples, as in JSON."""
     found: dict[str, Any] = json.loads(json.dumps(asdict(config)))
     return found
 
 
 def _keys_of(sections: Any, start: str = "") -> dict[str, Any]:
-    """Return all values that results depend on, by dotted key."""
+    """Return all values that affect results, by dotted key."""
     found: dict[str, Any] = {}
     for name, value in sections.items():
         if not start and name in _MAY_DIFFER:

@@ -1,4 +1,4 @@
-"""Repeats the commands behind published numbers, and compares what they measure with the pages."""
+"""Repeats the commands behind published numbers, and compares the results with the pages."""
 
 from __future__ import annotations
 
@@ -25,20 +25,20 @@ from cavmarl.verify.result_paths import as_number, numbers_at, value_at
 
 Verdict = Literal["same", "differs", "failed", "skipped", "by hand"]
 Say = Callable[[str], None]
-LEAST_S = 300.0  # a command may take this long, or `SLOWER` times its minutes
+LEAST_S = 300.0  # a command may always take this long, even if `SLOWER` times its minutes is less
 SLOWER = 10.0
 _WITH_JSON = ("cavmarl ", "python -m benchmarks")
 
 
 @dataclass(frozen=True)
 class ComparedNumber:
-    """A published number beside the measured one.
+    """A published number and the measured number.
 
     Attributes:
         place: row and column of a table, or the pattern of a text.
-        published: as the page shows it; two numbers are the ends of a range.
-        measured: None: the command has found no value.
-        tolerance: as the line states it.
+        published: the number as the page shows it; two numbers are the ends of a range.
+        measured: the measured number; None: the command's result has no such value.
+        tolerance: the tolerance as the line states it.
         is_same: whether the measured number is within the tolerance.
     """
 
@@ -54,11 +54,11 @@ class LineResult:
     """The result of a line.
 
     Attributes:
-        name: of the line.
-        verdict: `same`: all numbers agree; `differs`; `failed`: the command has failed, or has no
-            such result; `skipped` and `by hand`: it did not run.
+        name: name of the line.
+        verdict: `same`: all numbers agree; `differs`; `failed`: the command has failed, or its
+            result lacks a number; `skipped` and `by hand`: the command did not run.
         comparisons: the compared numbers.
-        reason: why it was not run or has failed.
+        reason: why the command was not run or has failed.
     """
 
     name: str
@@ -72,11 +72,11 @@ class LineResult:
 
 
 class CommandRunner:
-    """Runs commands of pages, each once, and keeps their JSON.
+    """Runs commands of pages, each command once, and keeps their JSON.
 
     Args:
-        root: of the checkout.
-        files: word of a command → path that replaces it.
+        root: root folder of the checkout.
+        files: word of a command → path that replaces the word.
     """
 
     def __init__(self, root: Path, files: Mapping[str, Path]) -> None:
@@ -88,7 +88,7 @@ class CommandRunner:
         self._found: dict[str, Any] = {}
 
     def lacking(self, needs: Iterable[str]) -> str:
-        """Return what a line needs and this machine does not have; empty: nothing."""
+        """Return the first requirement of a line that this machine lacks; empty: it has all."""
         for need in needs:
             kind, _, name = need.partition(":")
             if kind == "module" and importlib.util.find_spec(name.partition(".")[0]) is None:
@@ -175,11 +175,11 @@ def reproduce(
     """Repeat lines and yield their results.
 
     Args:
-        lines: by name.
-        root: of the checkout.
+        lines: lines by name.
+        root: root folder of the checkout.
         runner: runs the commands.
-        quick: repeat only the quick rows of tables.
-        say: told of each line before it runs.
+        quick: whether to repeat only the quick rows of tables.
+        say: called with the name of each line before it runs.
 
     Raises:
         ConfigError: a page does not have the numbers of a line.
@@ -212,7 +212,7 @@ def _repeated(
 
 
 def _compared(cell: PublishedCell, line: PublishedLine, document: Any) -> Iterator[ComparedNumber]:
-    """Yield the comparisons of a cell; a number that the result does not have is wrong."""
+    """Yield the comparisons of a cell; a number that is missing in the result counts as wrong."""
     shown = _shown_numbers(cell, line.tolerance)
     if line.table:
         own = value_at(cell.row, document) if cell.row else document
@@ -228,13 +228,13 @@ def _compared(cell: PublishedCell, line: PublishedLine, document: Any) -> Iterat
 
 
 def _shown_numbers(cell: PublishedCell, tolerance: str) -> list[tuple[str, ...]]:
-    """Return the published numbers of a cell, each alone; those of a range in pairs."""
+    """Return the published numbers of a cell: single numbers, or pairs for ranges."""
     step = 2 if tolerance.startswith("range") else 1
     return [cell.numbers[k : k + step] for k in range(0, len(cell.numbers), step)]
 
 
 def _as_shown(measured: list[float], count: int) -> list[float]:
-    """Return mean and half width for a mean with the ends of its interval, if two are shown."""
+    """Convert (mean, low, high) to (mean, half width) if the page shows two numbers."""
     if count == 2 and len(measured) == 3:
         mean, _, high = measured
         return [mean, high - mean]
@@ -256,7 +256,7 @@ def _comparison(
 
 
 def _is_close(published: str, measured: float, tolerance: str) -> bool:
-    """Return whether a measured number is the published one in its digits, or close to it."""
+    """Return whether a measured number equals the published one in its digits, or is close."""
     expected = as_number(published)
     if tolerance == "exact":
         decimals = len(published.partition(".")[2])
@@ -267,7 +267,7 @@ def _is_close(published: str, measured: float, tolerance: str) -> bool:
 
 
 def _end_group(program: subprocess.Popen[Any]) -> None:
-    """End a program and all that it has started."""
+    """End a program and all processes that it has started."""
     try:
         os.killpg(program.pid, signal.SIGKILL)
     except ProcessLookupError:

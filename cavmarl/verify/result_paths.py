@@ -3,9 +3,9 @@ r"""Expressions that name numbers in the JSON of a command.
 An expression is a path, such as `rows[side=libsumo].median`. A step is a key, an index, `{any key}`
 or `*` for all elements; `[key=value,…]` chooses an element of a list, with braces around a value
 with commas. `100 max rows.*.share` applies operations from right to left: a factor,
-`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth`. A text has the numbers that it
-shows. `PATH / PATH` is a ratio, `PATH ; PATH` the first numbers of several paths. A metric of an
-evaluation is its mean with the ends of its interval, in the unit of the reports.
+`min`, `max`, `mean`, `median`, `sum`, `len`, or `first` to `fourth`. A text gives the numbers that
+it contains. `PATH / PATH` is a ratio; `PATH ; PATH` gives the first number of each path. A metric
+of an evaluation gives its mean and the ends of its interval, in the unit of the reports.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ def numbers_at(expression: str, document: Any) -> list[float]:
     """Return the numbers that an expression names.
 
     Raises:
-        EvaluationError: the result does not have them.
+        EvaluationError: the result does not have these numbers.
     """
     if ";" in expression:
         parts = [numbers_at(part.strip(), document) for part in expression.split(";")]
@@ -52,7 +52,7 @@ def _evaluate(expression: str, document: Any) -> list[float]:
         values = _evaluate(rest, document)
         try:
             return [float(_OPERATIONS[word](values))]
-        except (IndexError, ValueError) as error:  # also of statistics
+        except (IndexError, ValueError) as error:  # `statistics` raises subclasses of ValueError
             raise _too_few(expression, values) from error
     if rest and re.fullmatch(NUMBER, word):
         return [float(word) * value for value in _evaluate(rest, document)]
@@ -114,7 +114,7 @@ def _numbers(found: Any, path: str) -> list[float]:
             return [] if mean is None else [scale * value for value in values]
         case None:
             return []
-    raise EvaluationError(f"{path!r} is {found!r}, which is no number; correct the expression")
+    raise EvaluationError(f"{path!r} is {found!r}, which is not a number; correct the expression")
 
 
 def _scale_of(metric: str) -> float:

@@ -17,7 +17,7 @@ from cavmarl.verify.simulated_machine import (
     SimulatedSocket,
 )
 
-SKEW_S = 1e6  # bound of the offset of a clock
+SKEW_S = 1e6  # limit of the offset of a clock
 CLOCK_RATES = (0.8, 1.25)
 JUMP_S = 0.3  # longest jump of a clock
 
@@ -39,7 +39,7 @@ class Fault(StrEnum):
     LOST_HEARTBEAT = "lost_heartbeat"  # a living node answers a ping too late, and is replaced
     LOSE = "lose"  # a frame never arrives, but its successors do
     DUPLICATE = "duplicate"  # a frame arrives twice
-    REORDER = "reorder"  # a frame arrives after the next one of its connection
+    REORDER = "reorder"  # a frame arrives after the next frame of its connection
     DAMAGE = "damage"  # one bit of a frame flips
     SILENCE = "silence"  # no further bytes arrive in one direction of a connection
     PARTITION = "partition"  # no further bytes arrive between a node and all other processes
@@ -76,14 +76,14 @@ TOLERATED_RATES: Mapping[Fault, float] = {
 SEVERE_RATES: Mapping[Fault, float] = dict.fromkeys(SEVERE, 3e-4) | dict.fromkeys(
     NODE_DEATHS, 1.5e-3
 )
-# Severe faults that are drawn by rate are some seconds apart, so that worlds recover from most of
-# them. Tolerated faults are short, so that many of them together stay below the time limits.
+# Severe faults drawn by rate are some seconds apart, so that worlds recover from most of them.
+# Tolerated faults are short, so that even many of them stay below the time limits.
 SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01
 SHORT_LAG_S = 0.005
 SHORT_JUMP_S = 0.002
-# If a report is late by this time, callers with the fastest and with the slowest clock send a ping.
-# The answer follows the report and arrives in time.
+# If a report is late by this time, the caller sends a ping, whether its clock is fast or slow, and
+# the answer follows the report and arrives in time.
 STALE_S = (1.28, 1.45)
 
 
@@ -106,7 +106,7 @@ class SimulatedFaults:
         self,
         machine: SimulatedMachine,
         drawn: random.Random,
-        rates: Mapping[Fault, float],  # probabilities for each frame that is sent
+        rates: Mapping[Fault, float],  # probability of each fault, per sent frame
     ) -> None:
         self._machine, self._drawn = machine, drawn
         self.injected: Counter[Fault] = Counter()
@@ -123,7 +123,7 @@ class SimulatedFaults:
     def begin_severe(self) -> None:
         """Draw severe faults for sent frames from now on.
 
-        Before the worlds begin, the starter of the nodes would have to handle lost nodes.
+        Do not call this before the worlds begin: the starter of the nodes cannot handle lost nodes.
         """
         self._calm_until_s = self._machine.now_s
 
@@ -215,7 +215,7 @@ class SimulatedFaults:
         process: SimulatedProcess,
         kind: FrameKind,
         share: float,  # share of the frame that is still sent
-        left: int,  # number of frames of the kind that are sent before
+        left: int,  # number of frames of this kind that are sent before
     ) -> None:
         def sent(data: bytes) -> int | None:
             nonlocal left
@@ -371,8 +371,8 @@ def counts_by_name(counts: Iterable[tuple[Fault, int]]) -> dict[str, int]:
     return {str(fault): found[fault] for fault in Fault if found.get(fault)}
 
 
-# The place of a change is drawn as a share, so that the length of a frame does not affect further
-# random numbers.
+# The place of a change is drawn as a share of the frame, so that the length of a frame does not
+# affect further random numbers.
 
 
 def _damaged(drawn: random.Random, data: bytes) -> list[bytes]:

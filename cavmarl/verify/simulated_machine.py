@@ -33,8 +33,8 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 ADDRESS = "node"
 ALIVE_S = 25.0  # time without an answer, after which the system ends a connection
 LATEST_S = 0.002  # longest delay of bytes
-JOIN_S = 5.0  # limit for the end of a thread
-MAX_MOVES = 2_000_000  # limit of the turns of all processes in a run
+JOIN_S = 5.0  # time for a thread to end
+MAX_MOVES = 2_000_000  # limit of the total number of turns of all processes in a run
 
 
 class ProcessEndedError(BaseException):
@@ -47,7 +47,7 @@ class SimulatedProcess:
     Attributes:
         slowness_s: longest extra delay of each turn of the process.
         lag_s: extra delay of the next turn only.
-        clock: offset of its clock at time 0 of the machine, and rate of its clock.
+        clock: offset of the process's clock at time 0 of the machine, and rate of this clock.
         on_send: called with each frame before it is sent; returns the number of bytes that are
             sent before the process dies, or None if it does not die.
     """
@@ -65,7 +65,7 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
-        self.newest_received = -1  # number of the newest received frame, in the order of sending
+        self.newest_received = -1  # highest number of a received frame, in the order of sending
         self._machine = machine
 
     def clock_s(self) -> float:
@@ -77,7 +77,7 @@ class SimulatedProcess:
         self.clock = self.clock_s() + jump_s - rate * self._machine.now_s, rate
 
     def runs_at_s(self, now_s: float) -> float | None:
-        """Return the time when the process continues; None: only after an event."""
+        """Return the time when the process continues; None: it continues only after an event."""
         first_s = max(self.stopped_until_s, self.not_before_s, now_s)
         if self.is_ended or self.ready():
             return now_s if self.is_ended else first_s
@@ -100,11 +100,11 @@ class SimulatedMachine:
         self.world = world
         self.listeners: dict[Place, SimulatedListener] = {}
         self.processes: list[SimulatedProcess] = []
-        self.numbers = count(100)  # of sockets
+        self.numbers = count(100)  # numbers of sockets
         self.connections: list[tuple[SimulatedSocket, SimulatedSocket]] = []
         self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._moves = count()  # turns of all processes
-        self._event_numbers = count()  # keep the order of events at the same time
+        self._moves = count()  # counts the turns of all processes
+        self._event_numbers = count()  # these numbers keep the order of simultaneous events
         self._threads: list[threading.Thread] = []
         self.frames = count()
         self.before_send: Callable[[SimulatedSocket, bytes], None] = lambda end, data: None
@@ -120,7 +120,7 @@ class SimulatedMachine:
         return _System(self, process)
 
     def start(self, name: str, run: Callable[[NodeSystem], None]) -> SimulatedProcess:
-        """Start a process. It runs when other processes wait."""
+        """Start a process, which runs when other processes wait."""
         process = self._new(name)
 
         def run_and_finish() -> None:
@@ -154,7 +154,7 @@ class SimulatedMachine:
         self.at_time(self.now_s + delay_s, act)
 
     def at_time(self, time_s: float, act: Callable[[], None]) -> None:
-        """Call `act` at a simulated time; calls of the same time keep their order."""
+        """Call `act` at a simulated time; simultaneous calls keep their order."""
         heapq.heappush(self._events, (time_s, next(self._event_numbers), act))
 
     def end(self, process: SimulatedProcess) -> None:
@@ -184,7 +184,7 @@ class SimulatedMachine:
             raise ProcessEndedError
 
     def _next(self) -> SimulatedProcess:
-        """Advance the time and return the next process; the caller, if no process can run."""
+        """Advance the time and return the next process; if none can run, return the caller."""
         while True:
             if next(self._moves) > MAX_MOVES:
                 self.stuck = f"the processes have not ended after {MAX_MOVES} turns"
@@ -231,7 +231,7 @@ class SimulatedSocket:
     `Link` sends a complete frame with each call of `send`.
 
     Attributes:
-        due: the fault of the next frame; it returns the pieces that are delivered.
+        due: fault of the next frame: a function that returns the pieces to be delivered.
         on_arrival: called when the next frame arrives, with whether the receiver already has a
             frame that was sent later over another connection.
         held_until_s: no bytes in this direction arrive before this time.
@@ -267,7 +267,7 @@ class SimulatedSocket:
             raise BrokenPipeError
         machine.before_send(self, data)
         sent = self.owner.on_send(data)
-        if self.is_closed or self.has_ended:  # by a fault
+        if self.is_closed or self.has_ended:  # a fault has closed it
             raise BrokenPipeError
         change, self.due = self.due, None
         arrived, self.on_arrival = self.on_arrival, None
@@ -295,7 +295,7 @@ class SimulatedSocket:
     def _deliver(
         self,
         chunk: bytes | None,  # None: the end of the connection
-        number: int = -1,  # of the frame
+        number: int = -1,  # number of the frame
         arrived: Callable[[bool], None] | None = None,  # see `on_arrival`
     ) -> None:
         """Deliver bytes after a delay, and after all bytes sent before."""
@@ -314,7 +314,7 @@ class SimulatedSocket:
                     arrived(receiver.newest_received > number)
                 receiver.newest_received = max(receiver.newest_received, number)
 
-        # Now plus the delay could round to a time before the arrival of earlier bytes.
+        # `now_s` plus the delay could round to a time before the arrival of earlier bytes.
         machine.at_time(self._last_s, arrive)
 
     def receive(self, room: memoryview) -> int:

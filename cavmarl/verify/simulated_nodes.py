@@ -1,8 +1,8 @@
 """A campaign of faults on a simulated machine: many runs, each reproducible from its seed.
 
 The caller and the nodes run the code of real processes; only the sockets, the clocks and the
-processes are those of `SimulatedMachine`. The clocks of the processes have different offsets and
-rates.
+processes are simulated by `SimulatedMachine`. The clocks of the processes have different offsets
+and rates.
 """
 
 from __future__ import annotations
@@ -55,12 +55,12 @@ from cavmarl.verify.simulated_machine import (
     SimulatedProcess,
 )
 
-TIMEOUT_S = 1.0  # time without a frame, after which a node gets a ping
+TIMEOUT_S = 1.0  # time without a frame, after which a node receives a ping
 STARTED = (-2.0, 0.5)  # range of log10 of the time that a node's start takes, s
 THOUGHT_S = 0.15  # longest pause of the caller between two steps
-WITHIN_S = 0.03  # latest time of a planned fault after its step begins
+WITHIN_S = 0.03  # longest time from the start of a step to its planned fault
 MAX_SEEDS = 1_000_000
-PATIENCE_S = 100.0  # limit for nodes to notice the end of the caller
+PATIENCE_S = 100.0  # time for nodes to notice the end of the caller
 FIRST_STEPS = 2  # number of steps without planned faults
 HASHED = 4  # steps between two comparisons of the state's hash
 
@@ -154,19 +154,19 @@ def verify_simulated_nodes(
 ) -> FaultCampaign[SimulatedLine]:
     """Drive worlds over simulated nodes, and compare each run with an undivided world.
 
-    A run is a function of the world, the number of nodes, the mix and the seed of its faults.
+    The world, the number of nodes, the mix and the seed of the faults determine a run completely.
 
     Args:
         env: as in `make_vec`, like the other keywords.
         nodes: numbers of nodes.
-        mixes: mixes of faults, of MIXES.
+        mixes: mixes of faults; keys of MIXES.
         seeds: number of runs for each number of nodes and mix.
         first_seed: seed of the faults of the first run; further runs have the next seeds.
-        zones: of each world; default: twice the largest number of nodes.
-        steps: of each run.
+        zones: number of zones of each world; default: twice the largest number of nodes.
+        steps: number of steps of each run.
         policy: as in `load_policy`.
         progress: called with the number of completed runs and of all runs.
-        keys: of the worlds.
+        keys: settings of the worlds.
 
     Raises:
         ConfigError: a number is invalid.
@@ -209,7 +209,7 @@ class _Run:
         self._machine.caller.clock = random_clock(self._drawn)
         self._faults = SimulatedFaults(self._machine, self._drawn, RATES.get(line.kind, {}))
         self._losses = 0  # number of lost nodes
-        # number of lost and of living nodes at the last state that all nodes have kept
+        # numbers of lost and of living nodes at the time of the last state that all nodes have kept
         self._losses_before, self._living = 0, line.nodes
 
     def execute(self) -> None:
@@ -235,7 +235,7 @@ class _Run:
             setattr(line, result, getattr(line, result) + 1)
 
     def _result(self) -> str:
-        """Drive the worlds. Return the kind of end: "equal", "ended" or "caller_ended".
+        """Drive the worlds. Return how the run ended: "equal", "ended" or "caller_ended".
 
         Raises:
             AssertionError: the worlds differ from the reference, or ended too soon.
@@ -244,7 +244,7 @@ class _Run:
             self._drive()
         except WorkerDeathError as error:
             lost = self._losses - self._losses_before
-            if lost < min(2, self._living):  # the next node keeps the state of a lost node
+            if lost < min(2, self._living):  # one loss is survivable: the next node has a replica
                 raise AssertionError(f"ended after {lost} losses in a row: {error}") from error
             return "ended"
         except ProcessEndedError:

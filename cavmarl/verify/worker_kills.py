@@ -25,7 +25,7 @@ from cavmarl.verify.differences import Arrays, DrivenRun, same_bytes
 
 FIRST_STEPS = 10  # steps without kills, to measure the duration of a step
 PINGS = 500
-LATEST = 1.5  # latest time of a kill, in durations of a step; some workers are idle then
+LATEST = 1.5  # latest time of a kill, in durations of a step, so some workers are killed while idle
 STOPS = 0.25  # share of workers that are stopped instead of killed
 
 
@@ -35,13 +35,13 @@ class Kill:
 
     signal: str  # name of the signal
     worker: int  # index of the worker
-    step: int  # after which the death was noticed
-    idle: bool  # whether the worker was idle; if so, its next command noticed the death
-    cause: str  # of the death, according to the pool
-    # from the signal, or from the next command to an idle worker, until the pool noticed the death
+    step: int  # step after which the death was noticed
+    idle: bool  # whether the worker was idle, so that its next command noticed the death
+    cause: str  # cause of the death, according to the pool
+    # from the signal (idle worker: from its next command) until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from that time until the successor had its command
-    recovered_ms: float  # from the same time until the successor had completed the command
+    replaced_ms: float  # from that notice until the successor had received the command
+    recovered_ms: float  # from that notice until the successor had completed the command
 
 
 @dataclass(frozen=True)
@@ -54,10 +54,10 @@ class KillReport:
     steps: int  # number of compared steps
     different: int | None  # the first step after which anything differed; None: none
     kills: tuple[Kill, ...]
-    step_ms: float  # median of the steps without a death
-    ping_us: float  # median of an empty command to all workers, before the first death
-    state_hashes: tuple[str, ...]  # of the undisturbed worlds at the end
-    hardware: dict[str, Any]  # of this machine
+    step_ms: float  # median duration of the steps without a death
+    ping_us: float  # median duration of an empty command to all workers, before the first death
+    state_hashes: tuple[str, ...]  # hashes of the undisturbed worlds at the end
+    hardware: dict[str, Any]  # hardware of this machine
 
     @property
     def holds(self) -> bool:
@@ -88,11 +88,11 @@ def verify_kills(
         backend: where the worlds run, `processes:N`; default: `processes:2`.
         workers: short form: N for `processes:N`.
         worlds: number of worlds stepped together; default: two per worker.
-        steps: number of steps; default: three per kill, and the first steps without kills.
+        steps: number of steps; default: three per kill, after the first steps without kills.
         policy: as in `load_policy`.
         zones: replaces zones.count.
         progress: called with the number of completed steps and of all steps.
-        keys: of the worlds.
+        keys: settings of the worlds.
 
     Raises:
         ConfigError: a number is invalid.
@@ -207,7 +207,7 @@ class _Killer:
         os.kill(self.pool.pids[worker], how)
 
     def _match(self, step: int) -> None:
-        """Match each new death with its signal. Raises EvaluationError for a death without one."""
+        """Match each new death with its signal. Raises EvaluationError: a death had no signal."""
         deaths = self.pool.deaths
         for death in deaths[self._seen :]:
             if death.worker not in self._sent:
@@ -218,7 +218,7 @@ class _Killer:
             self.found.append(_kill(death, how, sent_s, step))
             for worker in self.pool.team_of(death.worker):
                 if worker in self._sent and self._sent[worker][1] < death.replaced_s:
-                    del self._sent[worker]  # it was replaced together with the dead worker
+                    del self._sent[worker]  # this worker was replaced together with the dead worker
         self._seen = len(deaths)
 
 

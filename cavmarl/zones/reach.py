@@ -18,7 +18,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import APPROACH_M
 from cavmarl.driving.kernels.motion.motion import CROSSINGS_PER_TICK, LATERAL_MPS, MAX_SPEED_MPS
 from cavmarl.roads.network import RoadNetwork
 
-ASIDE_M = 10.0  # between the centres of adjacent lanes, and of vehicles beside them
+ASIDE_M = 10.0  # limit of the distance of the centres of adjacent lanes, and of vehicles on them
 
 
 def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
@@ -42,9 +42,9 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
 def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float:
     """Return an upper bound, in m, of a vehicle's move in a tick of `dt` seconds.
 
-    It includes the motion along the lane at the greatest possible speed, the lateral motion of a
-    lane change, and jumps at kinks of the map's lines and at junctions. In a hairpin, the centre of
-    a body is on the chord between its bumpers, up to half its length off the lane.
+    The bound includes the motion along the lane at the greatest possible speed, the lateral motion
+    of a lane change, and jumps at kinks of the map's lines and at junctions. In a hairpin, the
+    centre of a body is on the chord between its bumpers, up to half its length off the lane.
     """
     _, jump_m = _jumps(network)
     shortest_m = float(network.lanes["length_m"].min())
@@ -57,9 +57,9 @@ def longest_move_m(network: RoadNetwork, travel: TripTables, dt: float) -> float
 def off_lane_m(network: RoadNetwork, travel: TripTables) -> float:
     """Return an upper bound, in m, of the distance of a body's centre from its lane's centre line.
 
-    It includes a lane's width during a lane change, half a body's length in a bend, and a jump
-    between the bumpers on a junction without internal lanes. Agents may be farther away, but at
-    most `LOST_M`.
+    The bound includes a lane's width during a lane change, half a body's length in a bend, and a
+    jump between the bumpers on a junction without internal lanes. Agents may be farther away, but
+    at most `LOST_M`.
     """
     _, jump_m = _jumps(network)
     half_m = 0.5 * float(travel.types["length"].max())

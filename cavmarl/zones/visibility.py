@@ -24,7 +24,7 @@ class Visibility:
     network: RoadNetwork
     travel: TripTables  # the types of vehicles, and how far drivers look
     halo_m: float  # zones see no vehicles farther away
-    sure_m: float  # zones see all nearer vehicles; if it is `halo_m`, roads have no influence
+    sure_m: float  # zones see all nearer vehicles; if equal to `halo_m`, roads have no influence
     outside_m: float  # how far a vehicle can be outside of its zone while its transfer is late
 
     def halo(self, partition: ZonePartition) -> Halo:
@@ -35,7 +35,7 @@ class Visibility:
         scratch = make_scratch(len(roads.lanes), len(roads.links))
         half_m = 0.5 * float(self.travel.types["length"].max())
         aside_m = off_lane_m(self.network, self.travel)
-        wide_m = self.outside_m + aside_m  # how far a zone's vehicle can be on a lane outside of it
+        wide_m = self.outside_m + aside_m  # how far outside of its zone a vehicle's lane can be
         rects = partition.reaching + np.array([-wide_m, -wide_m, wide_m, wide_m])
         looks = np.zeros((partition.count, len(roads.lanes)), dtype=LOOK)
         seen_m = self.sure_m

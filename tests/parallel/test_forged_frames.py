@@ -106,7 +106,7 @@ def test_rows_with_an_index_out_of_range_are_refused(
     checks.check(rows[:0])
     for name, value in change.items():
         rows[name][-1] = value
-    with pytest.raises(MessageError, match="an index that no table has"):
+    with pytest.raises(MessageError, match="an index that is out of bounds"):
         checks.check(rows)
 
 

@@ -67,7 +67,7 @@ def test_a_frame_has_the_recorded_bytes() -> None:
         (b"cavN\x09\x00" + bytes(34), "version 9"),
         (head(255, 0), "kind 255"),
         (frame(FrameKind.PING, b"abc")[:-1] + b"d", "are damaged"),
-        (2 * frame(FrameKind.SYNC, b"abc"), "not the next one"),
+        (2 * frame(FrameKind.SYNC, b"abc"), "out of order"),
         (frame(FrameKind.SYNC, b"abc")[:-1], "has ended"),
     ],
 )

@@ -136,7 +136,7 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (changed(FRAMES, "signals", [-7]), "signals|phase"),
     (changed(FRAMES, "ghosts", [[1], [2], [3]]), "ghosts of 3 zones"),
     (changed(FRAMES, "episode", None), "has empty fields"),
-    (changed(VEHICLES, "x", 1e300), r"x = 1e\+300, which is no allowed number up to"),
+    (changed(VEHICLES, "x", 1e300), r"x = 1e\+300, which is not an allowed number up to"),
     (changed(VEHICLES, "y", float("nan")), "y = nan"),
     (changed(VEHICLES, "length", 3e38), "length = 3.0"),
     (changed(VEHICLES, "width", -1.0), "width = -1"),
@@ -171,8 +171,8 @@ FORGERIES: Sequence[tuple[Forge, str]] = [
     (map_with("points", "x", float("nan")), "x of points"),
     (map_with("points", "cos", float("inf")), "cos of points is not a number from -1 to 1"),
     (pipe_at("network.bin"), "network.bin"),
-    (pipe_at(VEHICLES), "it is no file"),
-    (pipe_at("recording.json"), "it is no file"),
+    (pipe_at(VEHICLES), "it is not a regular file"),
+    (pipe_at("recording.json"), "it is not a regular file"),
 ]
 
 

@@ -233,7 +233,7 @@ def test_an_expression_selects_numbers_of_a_result(expression: str, numbers: lis
         ("rows[n=3].x", r"has no \[n=3\] at rows"),
         ("rows[m=3].x", r"has no \[m=3\] at rows"),
         ("policies.sumo", r"has no sumo at policies\..*\(idm\); correct the expression"),
-        ("policies", "which is no number"),
+        ("policies", "which is not a number"),
         ("fourth {odd, key}", "has too few numbers"),
         ("rows.0.n / none", "has too few numbers"),
     ],

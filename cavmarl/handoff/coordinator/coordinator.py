@@ -1,10 +1,10 @@
 """`Coordinator`: the base class of coordinators of one world.
 
 A coordinator decides which zone advances each vehicle to the next tick, and checks the result. The
-division moves the rows.
+division (`ZonedShards`) moves the rows.
 
-`LocalCoordinator` runs in one process with all its zones, `MessageCoordinator` too if other
-simulators run some of them, `NodeCoordinator` over nodes.
+`LocalCoordinator` needs all zones in its process. `MessageCoordinator` is used instead if other
+simulators run some of these zones, and `NodeCoordinator` if nodes host the zones.
 """
 
 from __future__ import annotations
@@ -68,11 +68,11 @@ class Coordinator(ABC):
         """True if a tick has begun and is not committed."""
 
     def watch(self, watcher: Watcher) -> None:
-        """Send all further records also to this watcher."""
+        """Also send all further records to this watcher."""
         self._watchers = (*self._watchers, watcher)
 
     def notes(self) -> tuple[tuple[Birth, ...], tuple[Removed, ...]]:
-        """Return vehicles that entered since the last BEGIN, and left since the last COMMIT."""
+        """Return vehicles that entered since the last BEGIN or left since the last COMMIT."""
         return tuple(self._births), tuple(self._gone)
 
     def resume(self, births: Iterable[Birth] = (), gone: Iterable[Removed] = ()) -> None:
@@ -93,7 +93,7 @@ class Coordinator(ABC):
 
     @abstractmethod
     def save(self) -> SavedOwnership | None:
-        """Return the state between two ticks, except zones and their rows; None: it is not kept."""
+        """Return the state between two ticks, except zones and rows; None: no state is kept."""
 
     @abstractmethod
     def go_on(
@@ -141,7 +141,7 @@ class Coordinator(ABC):
             self.journal.close()
 
     def _check(self, births: Iterable[Birth], counts: list[int]) -> None:
-        """Compare the numbers of vehicles in the up-to-date table with those of the zones' rows."""
+        """Compare the numbers of vehicles in the updated table with the rows of the zones."""
         owned = list(self._directory.table.counts.values())
         for birth in births:
             owned[birth.zone] += 1

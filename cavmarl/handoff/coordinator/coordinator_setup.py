@@ -30,7 +30,7 @@ from cavmarl.ownership.transfers import TransferLog
 class CoordinatorSetup(NamedTuple):
     """The coordinators of a divided environment."""
 
-    coordination: WorldCoordinators  # of all worlds
+    coordination: WorldCoordinators  # coordinators of all worlds
     transfers: tuple[TransferLog, ...]  # one log per world
 
 

@@ -39,14 +39,14 @@ class OwnershipRuntime:
         """Begin an episode in the chosen worlds (W,)."""
 
     def save(self, w: int) -> SavedOwnership | None:
-        """Return the state that the next changes of owner depend on; None: unknown here."""
+        """Return the state on which the next changes of owner depend; None: not known here."""
         return None
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
         """Resume after worlds were loaded; None: ownership begins anew."""
 
     def begin(self, commands: Commands) -> None:
-        """Change owners of vehicles before a tick, by the committed rows."""
+        """Change owners of vehicles before a tick, according to the committed rows."""
 
     def left(self, departures: DepartureQueue) -> None:
         """Record that the vehicles in `departures.passing` have left the world."""
@@ -58,7 +58,7 @@ class OwnershipRuntime:
         """End the tick, after all zones of this process have computed it."""
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
-        """Return the vehicles whose next zone has their state already."""
+        """Return the vehicles whose state has already arrived at their next zone."""
         return []
 
 
@@ -71,7 +71,7 @@ class WorldCoordinators(OwnershipRuntime):
         self,
         division: ZonedShards,
         coordinators: Sequence[Coordinator],  # one per world
-        digests: RowDigests | None = None,  # of zones' rows; None: not needed
+        digests: RowDigests | None = None,  # digests of zones' rows; None: not needed
         monitor: InvariantMonitor | None = None,  # checks every committed tick; None: no checks
     ) -> None:
         self.coordinators = tuple(coordinators)
@@ -94,7 +94,7 @@ class WorldCoordinators(OwnershipRuntime):
                     self._monitor.begin(w, coordinator.notes()[0])
 
     def save(self, w: int) -> SavedOwnership | None:
-        """Return the state that the next changes of owner depend on, except the zones."""
+        """Return the state on which the next changes of owner depend, except the zones."""
         saved = self.coordinators[w].save()
         if saved is None or not self._rows_changed[w]:
             return saved

@@ -47,7 +47,7 @@ class SavedBorders(NamedTuple):
 
 
 class HandoffLog:
-    """Hands vehicles over to the zones that contain them, and keeps unread changes."""
+    """Hands vehicles over to the zones that contain them, and keeps changes until they are read."""
 
     def __init__(self, division: ZonedShards, world: int) -> None:
         self._division = division
@@ -62,14 +62,14 @@ class HandoffLog:
         self,
         check_all: bool,  # check all rows, because rows have changed since ghosts were renewed
         vehicles: int,  # expected number of vehicles
-        newborn: Sequence[Birth],  # entered since the last tick began; they keep their owner
+        newborn: Sequence[Birth],  # vehicles that entered since the last BEGIN, which stay
     ) -> int:  # number of changes
-        """Change the owners of vehicles that have crossed a border, by the committed rows.
+        """Change the owners of vehicles that have crossed a border, according to committed rows.
 
         Raises:
             ConfigError: a zone has no ghost of a vehicle that enters it.
-            ProtocolError: a vehicle enters a zone that is not a neighbour of its own, although the
-                zones have not changed and vehicles are not teleported.
+            ProtocolError: a vehicle enters a zone that is not a neighbour of its old zone, although
+                the zones have not changed and vehicles are not teleported.
         """
         division, book, w = self._division, self._book, self._world
         changed = 0
@@ -94,7 +94,7 @@ class HandoffLog:
         return changed
 
     def _note_teleports(self, changed: int) -> None:
-        """Record which of the newest changes are between zones that are not neighbours."""
+        """Record the teleports among the newest changes: their zones are not neighbours."""
         division, last = self._division, len(self)
         new = self._book.changes[self._world, last - changed : last]
         near = division.neighbours[new["source"], new["target"]]
@@ -107,7 +107,7 @@ class HandoffLog:
         self._teleports.update(zip(far["tick"].tolist(), far["vehicle"].tolist(), strict=True))
 
     def teleports(self, switches: Iterable[Switch], tick: int) -> tuple[int, ...]:
-        """Return the vehicles whose new owner in a tick is not a neighbour of the old one."""
+        """Return the vehicles whose new owner in a tick is not a neighbour of the old owner."""
         if not self._teleports:
             return ()
         return tuple(s.vehicle for s in switches if (tick, s.vehicle) in self._teleports)
@@ -146,7 +146,7 @@ class HandoffLog:
         return [OwnerChange(*change) for change in found.tolist()]
 
     def take(self, but: int = 0) -> NDArray[np.void]:
-        """Return and remove all changes CHANGE (n,), except the newest `but`."""
+        """Return and remove all changes CHANGE (n,), except the `but` newest ones."""
         last = len(self)
         changes = self._book.changes[self._world]
         taken: NDArray[np.void] = changes[: last - but].copy()
@@ -155,7 +155,7 @@ class HandoffLog:
         return taken
 
     def take_counts(self) -> tuple[int, int]:
-        """Return and clear two sums over ticks: vehicles near borders, vehicles turned away."""
+        """Return and clear two sums over ticks: vehicles near borders, and vehicles turned away."""
         acknowledged, aborted = self._book.acknowledged, self._book.aborted
         counts = acknowledged.item(self._world), aborted.item(self._world)
         acknowledged[self._world] = aborted[self._world] = 0
@@ -169,7 +169,7 @@ class HandoffLog:
         return list(zip(entries["vehicle"].tolist(), entries["target"].tolist(), strict=True))
 
     def save(self) -> SavedBorders:
-        """Return the state of vehicles near borders that the next tick depends on."""
+        """Return the state of vehicles near borders, on which the next tick depends."""
         book, w = self._book, self._world
         now = book.turn.item(w)
         num_now, num_before = book.num_coming[w, now], book.num_coming[w, 1 - now]

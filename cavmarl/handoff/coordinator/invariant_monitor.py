@@ -1,8 +1,8 @@
 """`InvariantMonitor`: checks of the invariants of ownership after every tick of every world.
 
-One compiled pass over the rows (`kernels.invariant_checks`) sums up the vehicles and finds entered
-and left ones. The expected owners come from the coordinators' records, at a cost that grows with
-the changes. Only a violation is described in detail (`coordinator.violations`).
+One compiled pass over the rows (`kernels.invariant_checks`) sums up the vehicles, and finds
+vehicles that have entered or left. The expected owners come from the coordinators' records, at a
+cost that grows with the changes. `coordinator.violations` describes violations in detail.
 """
 
 from __future__ import annotations
@@ -59,8 +59,8 @@ def _nothing() -> None:
 class OwnersOnRecord:
     """The owners according to the records of a coordinator, with a check of the records.
 
-    This class receives the same records as a `Trace`. A coordinator that makes its records later
-    announces changes of owner with `foretold` until then.
+    This class receives the same records as a `Trace`. A coordinator that delays its records first
+    announces changes of owner with `foretold`.
 
     Attributes:
         entered: number of vehicles that have entered.
@@ -96,7 +96,7 @@ class OwnersOnRecord:
                 self._commit()
 
     def foretold(self, changes: Iterable[OwnerChange]) -> None:
-        """Receive changes of owner of the committed tick before their records."""
+        """Receive changes of owner of the committed tick, whose records follow later."""
         sums = self._current = self._current.copy()
         for change in changes:
             _add(sums, change.source, -int(owner_hash(change.vehicle, change.epoch - 1)))

@@ -1,7 +1,7 @@
 """The coordinator's write-ahead log on disk: decisions are stored before any zone receives them.
 
-A line is a record of `ownership.log_records`. Nothing is kept in memory, and an append is one
-write. So a process that dies leaves complete lines, and at most one incomplete line.
+A line is a record of `ownership.log_records`. Lines are not buffered, and an append is one write.
+So a process that dies leaves complete lines, and at most one incomplete line.
 """
 
 from __future__ import annotations
@@ -60,8 +60,8 @@ class JournalReader:
         self,
         path: Path,
         *,
-        # whether an incomplete last line, which was never acted upon, is dropped; if not, it is an
-        # error
+        # whether to drop an incomplete last line, which was never acted upon; if not, such a line
+        # is an error
         drop_torn: bool = False,
     ) -> None:
         self.path = path
@@ -74,7 +74,7 @@ class JournalReader:
         return self.chain.sequence
 
     def __iter__(self) -> Iterator[Record]:
-        """Yield the records, from the first line on."""
+        """Yield the records, starting with the first line."""
         self.chain, self.size, self.torn = LogChain(), 0, ""
         try:
             with self.path.open("rb") as file:
@@ -118,14 +118,14 @@ class Journal:
         self,
         path: Path,  # the file, which must not exist unless `resume` or `anew` is set
         *,
-        # append to the lines of the file. All of them are read, and an incomplete last line is
-        # dropped
+        # whether to append to an existing file; all its lines are read, and an incomplete last line
+        # is dropped
         resume: bool = False,
-        # overwrite an existing file. The process that writes, possibly a fork of this one,
-        # truncates it with its first line or with `go_to`
+        # whether to overwrite an existing file; the process that writes, possibly a fork of this
+        # one, truncates the file with its first line or with `go_to`
         anew: bool = False,
-        # "flush": when an append returns, the operating system has the lines, so that they outlive
-        # the process; "fsync": they are on disk, so that they outlive the machine
+        # where the lines are when an append returns; "flush": in the operating system, so that they
+        # survive a crash of the process; "fsync": on disk, so that they survive a power failure
         sync: Sync = "flush",
     ) -> None:
         if sync not in get_args(Sync):
@@ -149,7 +149,7 @@ class Journal:
         # reference.
         weakref.finalize(self, self._file.close)
         self._pid = os.getpid()
-        self._is_taken = not anew  # whether the process that writes has prepared the file
+        self._is_taken = not anew  # whether the writing process has prepared the file
         try:
             self._lock()
             if resume:
@@ -172,7 +172,7 @@ class Journal:
     def go_to(self, place: JournalPlace) -> None:
         """Truncate the journal to an earlier end, and let this process append there.
 
-        A process may take over the file of another process that has stopped writing.
+        A process may continue the file of another process that has stopped writing.
 
         Raises:
             JournalError: the journal has no such earlier end.
@@ -249,7 +249,7 @@ class Journal:
             raise self._unwritable(error) from error
 
     def _read(self) -> None:
-        """Find the end of the last complete line, and truncate the file there."""
+        """Truncate the file after the last complete line."""
         reader = JournalReader(self.path, drop_torn=True)
         for _ in reader:
             pass

@@ -25,8 +25,8 @@ class JournalSummary:
     births: int = 0  # vehicles that entered
     removals: int = 0  # vehicles that left
     switches: int = 0  # changes of owner
-    forced: int = 0  # changes of owner with the state attached: the target was not ready in time
-    deferrals: int = 0  # sum over vehicles of ticks with an owner whose zone they had left
+    forced: int = 0  # changes of owner with attached state, since the target was not ready in time
+    deferrals: int = 0  # ticks that vehicles spent with an owner whose zone they had left, summed
     hosts: int = 0  # assignments of a zone to a process
     fences: int = 0  # processes that were fenced
     unfinished: int = -1  # the tick that was begun but not committed; -1: none
@@ -52,7 +52,7 @@ def summarize(path: Path) -> tuple[JournalSummary, Table]:
     """Return a journal's summary, and its final table of owners and hosts.
 
     Raises:
-        JournalError: the journal cannot be read, is damaged, or is not one of a coordinator.
+        JournalError: the journal cannot be read, is damaged, or is not a coordinator's journal.
     """
     zones = _zones(path)
     summary, table = JournalSummary(), Table(zones)

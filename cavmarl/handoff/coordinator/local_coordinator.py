@@ -1,14 +1,14 @@
 """`LocalCoordinator`: the coordinator of a world whose zones are all in one process.
 
 In one process no message is lost, no zone is late, and no process dies alone. So no messages are
-needed: a vehicle across a border is offered, acknowledged and handed over in one call, the new
-owner copies the old owner's row, and the call that advances a shard replaces the lease. The
-decisions and the records are the same as with messages if none of them is lost.
+needed: a vehicle that has crossed a border is offered, acknowledged and handed over in one call,
+the new owner copies the old owner's row, and the call that advances a shard replaces the lease. The
+decisions and the records are the same as with messages if no message is lost.
 
-The table of owners is updated from time to time, and on request. Records are made only if they
-are read. A journal gets all records at once. Watchers get the records of ticks in which a vehicle
-has entered, left or changed its owner, when the table is updated. Callers that need changes in
-the same tick set `foretell`.
+The table of owners is updated from time to time, and on request. Records are made only if they are
+read. A journal receives all records immediately. Watchers receive the records of ticks in which a
+vehicle has entered, left or changed its owner, when the table is updated. Callers that need changes
+in the same tick set `foretell`.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class LocalCoordinator(Coordinator):
         self._tick = 0
         self._vehicles = 0
         self._changed = 0  # number of changes in the present tick
-        self._late = 0  # number of changes that are not in the table yet
+        self._late = 0  # number of changes that are missing in the table
         self._new: tuple[Birth, ...] = ()
-        self._news: dict[int, _News] = {}  # by tick, entries that are not in the table yet
+        self._news: dict[int, _News] = {}  # tick → entries that are missing in the table
 
     @property
     def directory(self) -> Directory:

@@ -1,9 +1,9 @@
 """`MessageCoordinator`: the coordinator of a world in which other simulators run some zones.
 
-All zones are in this process, but such a simulator can refuse a vehicle, be late or die. So each
-zone has an endpoint of the ownership protocol, and all messages are sent: a vehicle across a border
-is offered with its state (PREPARE), its new zone accepts or refuses it (ACK, NACK), the coordinator
-decides (BEGIN, STEP), and both zones confirm and release it (DONE, COMMIT).
+All zones are in this process, but another simulator can refuse a vehicle, be late or die. So each
+zone has an endpoint of the ownership protocol, and all messages are sent: a vehicle that has
+crossed a border is offered with its state (PREPARE), its new zone accepts or refuses it (ACK,
+NACK), the coordinator decides (BEGIN, STEP), and both zones confirm and release it (DONE, COMMIT).
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ if TYPE_CHECKING:
 
 
 class ZoneGate(Protocol):
-    """The simulators that run zones, as the coordinators see them.
+    """Interface of coordinators to the simulators that run zones.
 
     Attributes:
         zones: the zones that simulators run.
@@ -63,7 +63,7 @@ class ZoneGate(Protocol):
         vehicles: NDArray[np.void],  # VEHICLE (n,)
         is_last: bool = False,  # whether a refusal is a failure of the simulator
     ) -> Mapping[int, str]:
-        """Ask the simulator of a zone whether vehicles may enter; return the reasons against it.
+        """Ask the simulator of a zone which vehicles may enter; return the reasons for refusals.
 
         Raises ZoneSimulatorError if the simulator fails, unless cavmarl takes the zone back.
         """
@@ -111,7 +111,7 @@ class MessageCoordinator(Coordinator):
         return self._is_open
 
     def reset(self) -> None:
-        """Begin an episode without vehicles. Simulators get the zones back that they have lost."""
+        """Begin an episode without vehicles. Simulators run the zones again that they have lost."""
         directory = self._directory
         self.resume()
         self._is_open = False
@@ -129,7 +129,7 @@ class MessageCoordinator(Coordinator):
         return 1 + zone if zone in self._gate.zones and zone not in self._returned else 0
 
     def save(self) -> None:
-        """Return None: a saved state has no offers, so ownership begins anew with it."""
+        """Return None: a saved state has no offers, so ownership begins anew after loading."""
 
     def go_on(self, saved: SavedOwnership, rows: Mapping[int, tuple[int, int]]) -> list[Departed]:
         """Raise ProtocolError: `OwnershipRuntime.resumes` is false."""
@@ -173,7 +173,7 @@ class MessageCoordinator(Coordinator):
         return movers
 
     def _offer(self, movers: Sequence[Near]) -> None:
-        """Send PREPARE for each vehicle that has crossed a border, and ABORT for those turned."""
+        """Send PREPARE for vehicles beyond a border, and ABORT for vehicles that turned back."""
         approaches: dict[int, list[Approach]] = {zone: [] for zone in self._endpoints}
         for near in movers:
             state = self._states.states[near.vehicle]

@@ -34,10 +34,10 @@ class OwnershipNumbers(NamedTuple):
     episode: int
     tick: int  # the committed tick, counted over all episodes
     switched: int  # number of changes of owner
-    seen_below: int  # all smaller ids have been in the episode
+    seen_below: int  # all smaller vehicle ids have been used in the episode
     is_stirred: int  # 1: rows have changed since ghosts were renewed
-    repartition_steps_done: int  # steps begun, if zones may change
-    # The next six are described in `BorderRecords`.
+    repartition_steps_done: int  # number of steps begun, if zones may change
+    # The next six fields are described in `BorderRecords`.
     near_tick: int
     acknowledged: int
     aborted: int
@@ -64,7 +64,7 @@ class SavedOwnership(NamedTuple):
     zones: NDArray[np.float64]  # (1 + k, 4) bounds of the partition, and the rectangle of each zone
     counts: Words  # (k,) number of vehicles of each zone; vehicles are in the order of zones
     numbers: OwnershipNumbers
-    seen: Words  # (n,) further ids that have been in the episode
+    seen: Words  # (n,) further vehicle ids that have been used in the episode
     births: Words  # (n, 2) vehicle and zone of entered vehicles that are not recorded yet
     gone: Words  # (n, 4) vehicle, reason, zone and epoch of left vehicles that are not recorded yet
     near: NDArray[np.void]  # NEAR (n,)

@@ -39,7 +39,7 @@ class Violations:
     def explain(
         self, kind: int, vehicle: int, owners: Mapping[int, Owner], births: Sequence[Birth]
     ) -> None:
-        """Raise ProtocolError with the first violation that is found."""
+        """Raise ProtocolError with the first violation."""
         expected = {**owners, **{birth.vehicle: (birth.zone, 0) for birth in births}}
         for words in (
             self._duplicates(),

@@ -19,7 +19,7 @@ def row_digest(
     words: NDArray[np.uint64], i: int, masks: NDArray[np.uint64], factors: NDArray[np.uint64]
 ) -> np.uint64:
     """Return the digest of record `i`, given as whole words."""
-    row = words[i]  # a row of its own lets the compiler multiply several words at once
+    row = words[i]  # with a separate row, the compiler multiplies several words at once
     total = np.uint64(0)
     for n in range(row.shape[0]):
         total += (row[n] & masks[n]) * factors[n]

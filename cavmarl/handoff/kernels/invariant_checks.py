@@ -1,8 +1,8 @@
 """Checks of the invariants of ownership in one pass over all rows of a world after a tick.
 
 Sets are compared by sums of hashes, so the order of rows and zones does not matter. A vehicle is
-compared with its row in the last tick. Nearly all vehicles keep their row. Other vehicles are
-searched among the vehicles that are missing from their former rows.
+compared with its row in the last tick. Nearly all vehicles keep their row. The other vehicles are
+looked up among the vehicles that are missing from their former rows.
 """
 
 from __future__ import annotations
@@ -113,7 +113,7 @@ def make_strays(zones: int, capacity: int) -> Strays:
 KIND_NONE = 0
 KIND_TICK = 1  # a vehicle was not advanced exactly once
 KIND_FAR = 2  # a vehicle is too far from its last position
-KIND_SUMS = 3  # zones own or see wrong vehicles
+KIND_SUMS = 3  # zones own or see the wrong vehicles
 
 
 @kernel
@@ -124,7 +124,7 @@ def owner_hash(vehicle: int, epoch: int) -> np.uint64:
 
 @kernel
 def owned_sum(
-    rows: NDArray[np.void],  # of a zone
+    rows: NDArray[np.void],  # rows of a zone
     num: int,  # number of owned rows, which come first
 ) -> np.uint64:
     """Return the sum of `owner_hash` of the vehicles that a zone owns, from its rows."""
@@ -159,7 +159,7 @@ def _record_missing(strays: Strays, vehicle: int, zone: int, row: int, num: int)
 
 @inlined_kernel
 def _record_finding(found: np.void, kind: int, vehicle: int) -> None:
-    """Record a finding, if it is about a lower id than the present one."""
+    """Record a finding, unless the recorded finding is about a vehicle with a lower id."""
     if found["kind"] == KIND_NONE or vehicle < found["vehicle"]:
         found["kind"] = kind
         found["vehicle"] = vehicle
@@ -172,7 +172,7 @@ def _check_motion(found: np.void, last: np.void, now: np.void, limit_m: float) -
     dy = now["y"] - last["y"]
     if now["late"] != last["late"]:
         _record_finding(found, KIND_TICK, now["id"])
-    elif not dx * dx + dy * dy <= limit_m * limit_m:  # true for NaN, too
+    elif not dx * dx + dy * dy <= limit_m * limit_m:  # also true for NaN
         _record_finding(found, KIND_FAR, now["id"])
 
 
@@ -188,12 +188,12 @@ def watch(
     masks: NDArray[np.uint64],  # (n,) the bits that a ghost shares with its owner's row
     factors: NDArray[np.uint64],  # (n,) odd random numbers
     before: Kept,  # from the last check
-    now: Kept,  # is written, for the next check
-    strays: Strays,  # scratch; entered and left are written
+    now: Kept,  # output, for the next check
+    strays: Strays,  # scratch; its `entered` and `left` are outputs
     live: int,  # expected number of vehicles
     expected: NDArray[np.uint64],  # (k,) expected `TALLY["owned"]` of each zone
-    tallies: NDArray[np.void],  # TALLY (k,) is written
-    found: NDArray[np.void],  # FINDING (1,) is written: the finding about the lowest id, if any
+    tallies: NDArray[np.void],  # TALLY (k,), output
+    found: NDArray[np.void],  # FINDING (1,), output: the finding about the lowest id, if any
 ) -> int:
     """Check all rows of one world after a tick. Return the KIND_* of the finding."""
     finding = found[0]
@@ -258,7 +258,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Search vehicles that are new in their row among the missing ones."""
+    """Search vehicles that are new in their row among the vehicles missing from theirs."""
     table = strays.table
     entered = 0
     for n in range(moved):
@@ -304,7 +304,7 @@ def _add_due_ghosts(
     for n in range(halo.near_start[here], halo.near_start[here + 1]):
         other = halo.near[n]
         if other != zone and is_seen(halo, other, row, squared_distance(zones.rects, other, x, y)):
-            if sought:  # no other zone sees most outer rows, and these need no digest
+            if sought:  # most outer rows are seen by no other zone, and need no digest
                 digest = row_digest(words, i, masks, factors)
                 sought = False
             tallies[other]["due"] += digest

@@ -41,13 +41,13 @@ BLUEPRINTS = {
     "lidar": "sensor.lidar.ray_cast",
     "radar": "sensor.other.radar",
 }
-_NOT_GIVEN = ("bev_grid",)  # sensors of the surroundings without such frames
+_NOT_GIVEN = ("bev_grid",)  # sensors of the surroundings for which CARLA has no frames
 MOST_RADAR_DEG = 179.0  # field of view of CARLA's radars
-_RADAR_HEIGHT_DEG = 0.1  # CARLA's radars look into a cone, those of a rig into a plane
-_PER_RAY = 2  # columns of a CARLA lidar for each ray of the rig: every other one is on the ray
-# Echoes next to each other are those of one target if they differ by at most this.
+_RADAR_HEIGHT_DEG = 0.1  # CARLA's radars scan a cone, but a rig's radars scan a plane
+_PER_RAY = 2  # columns of a CARLA lidar per ray of the rig: every other column is on the ray
+# Adjacent echoes belong to one target if they differ by at most these values.
 _SAME_TARGET_M, _SAME_TARGET_MPS = 3.0, 1.0
-_ON_GROUND_M = 0.2  # echoes below this height are those of the ground
+_ON_GROUND_M = 0.2  # echoes below this height come from the ground
 _FARTHEST_M = 1000.0
 _DEPTH_STEPS = (1 << 24) - 1
 _CLASS_OF_TAG = {
@@ -75,7 +75,7 @@ def check_option(options: Mapping[str, str]) -> None:
 
 
 def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedConfig]) -> None:
-    """Check that CARLA's sensors can take the samples of a rig, if that is wanted.
+    """If the samples of a rig are to come from CARLA, check that its sensors can take them.
 
     Raises:
         ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a
@@ -105,7 +105,7 @@ def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedCo
 
 
 def mounts_of(rig: Mapping[str, MountedConfig], dt_s: float) -> dict[str, dict[str, Any]]:
-    """Return what the client needs to mount each sensor of a rig, in CARLA's frame.
+    """Return the blueprint, pose and attributes of each sensor of a rig, in CARLA's frame.
 
     `dt_s`: length of a tick; each sensor takes a whole frame in each tick.
     """
@@ -138,7 +138,7 @@ def mounts_of(rig: Mapping[str, MountedConfig], dt_s: float) -> dict[str, dict[s
 
 
 def _lidar_attributes(sensor: LidarRigConfig, dt_s: float) -> dict[str, float]:
-    """Return the attributes of a lidar that turns once in each tick, without losses."""
+    """Return the attributes of a lidar that turns once per tick and loses no points."""
     _, step_rad, rays = azimuths(sensor.fov_deg, sensor.rays)
     rising = np.degrees(elevations(sensor.lower_deg, sensor.upper_deg, sensor.layers))
     return {
@@ -182,7 +182,7 @@ def sample_of(config: MountedConfig, frame: str) -> NDArray[Any]:
 def _distances(config: LidarRigConfig, points: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the distances (layers, rays) from points (n, 3): ahead, to the right, upwards.
 
-    A ray takes the point in its direction; points between two rays belong to none.
+    Each ray uses the point in its direction; points between two rays are ignored.
     """
     ahead, right, up = points.astype(np.float64).T
     distance = np.sqrt(ahead * ahead + right * right + up * up)
@@ -208,8 +208,8 @@ def _distances(config: LidarRigConfig, points: NDArray[np.float32]) -> NDArray[n
 def _targets(config: RadarConfig, echoes: NDArray[np.float32]) -> NDArray[np.float32]:
     """Return the targets (targets, 3) from echoes (n, 4): speed, azimuth, altitude and distance.
 
-    Echoes next to each other that have nearly the same place and speed are those of one target,
-    whose nearest echo counts. The ground has no echo, as in cavmarl's model.
+    Adjacent echoes with nearly the same place and speed belong to one target, whose nearest echo
+    counts. Echoes of the ground are ignored, as in cavmarl's model.
     """
     speed, azimuth, altitude, distance = echoes.astype(np.float64).T
     azimuth = -azimuth  # CARLA's is clockwise

@@ -29,7 +29,7 @@ GHOSTS_M = 60.0
 TIMEOUT_S = 30.0
 MOST_TIMEOUT_S = 3600.0
 MOST_GHOSTS_M = 10_000.0
-GRACE_S = 5.0  # the client reports its own timeout before the process counts as hung
+GRACE_S = 5.0  # additional time, so that the client can report its own timeout first
 _END_S = 5.0  # time for the process to end by itself
 _LAST_WORDS = 500
 _CHECKED_LANES = 20
@@ -86,7 +86,7 @@ class CarlaZone:
             raise self._failure(f"{python} cannot be started ({error.strerror})") from error
         self.pid = self._process.pid
         self._rest = b""
-        self._unread = 0  # answers that are due; several after an interrupt
+        self._unread = 0  # number of answers still to come; more than one after an interrupt
         try:
             self._call(
                 "start",
@@ -201,7 +201,7 @@ class CarlaZone:
         return answer["result"]
 
     def _line(self, until_s: float) -> bytes:
-        """Return the last answer that is due."""
+        """Wait for all answers still to come; return the last answer."""
         line = b""
         while self._unread:
             line = self._next_line(until_s)

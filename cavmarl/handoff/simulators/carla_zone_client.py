@@ -1,8 +1,8 @@
 """The program of a process that runs a zone with CARLA's official client.
 
-It is run by its file name, possibly by another Python, and imports nothing of this package: CARLA's
-client supports only some versions of Python, and it can abort its process. Requests come as lines
-of JSON on standard input; each line is answered with one line.
+This file runs as a script, possibly with another Python, and imports nothing of this package:
+CARLA's client supports only some versions of Python, and it can abort its process. Requests come as
+lines of JSON on standard input; each line is answered with one line.
 
 CARLA's frame is left-handed: y and yaw have the opposite sign.
 """
@@ -22,15 +22,15 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
-SPAWN_HEIGHT_M = 0.3  # above the ground, so that the wheels do not touch it
+SPAWN_HEIGHT_M = 0.3  # height above the ground, so that the wheels do not touch the ground
 LARGE_M = 7.0  # longer vehicles are buses or trucks
-WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles
+WHEELBASE_SHARE = 0.6  # wheelbase / length of CARLA's vehicles
 MOST_SLIP = 0.6  # largest sine of the slip angle
 PLACED_TICKS = 2  # ticks for which a vehicle is placed, before it drives by its own physics
-FIRST_FRAMES = 20  # frames of a new sensor that may be missing
-FIRST_FRAME_S = 0.2  # time to wait for each of them
+FIRST_FRAMES = 20  # number of first frames of a new sensor that may be missing
+FIRST_FRAME_S = 0.2  # time to wait for each of these frames
 PREDECESSOR_S = 3.0  # longest wait for the end of the synchronous mode of another client
-SEEN_LANES = 0.5  # least share of the sent places that must be on a road of CARLA's map
+SEEN_LANES = 0.5  # minimum share of the sent places that must be on a road of CARLA's map
 STATES = {"r": "Red", "y": "Yellow", "u": "Yellow", "g": "Green", "G": "Green", "s": "Red"}
 
 Row = Sequence[float]
@@ -50,23 +50,23 @@ class CarState(NamedTuple):
         return cls(*row[1:6])
 
     def after(self, dt: float) -> CarState:
-        """Return the state after a tick straight on."""
+        """Return the state after driving straight on for `dt` s."""
         step_m = self.speed * dt
         x, y = self.x + step_m * math.cos(self.heading), self.y + step_m * math.sin(self.heading)
         return self._replace(x=x, y=y)
 
 
 class Car:
-    """An actor that stands for a vehicle."""
+    """An actor of CARLA that represents a vehicle."""
 
     def __init__(self, actor: Any, pose: CarState) -> None:
         self.actor = actor
-        self.pose = pose  # where it was placed last
+        self.pose = pose  # where the actor was placed last
         self.length_m = 2.0 * actor.bounding_box.extent.x
         self.is_owned = False
-        self.is_seen = False  # a snapshot has had it; before, it reads as place (0, 0, 0)
-        self.left = PLACED_TICKS  # ticks for which it is still placed
-        self.sensors: dict[str, MountedActor] = {}  # of an agent's vehicle, by their names
+        self.is_seen = False  # whether a snapshot has had the actor; before, it reads as (0, 0, 0)
+        self.left = PLACED_TICKS  # remaining ticks in which the actor is placed
+        self.sensors: dict[str, MountedActor] = {}  # name → sensor, if the vehicle is an agent's
 
     def unmount(self) -> None:
         """Remove the sensors."""
@@ -91,7 +91,7 @@ class MountedActor:
             self._come.notify()
 
     def data(self, frame: int, timeout_s: float) -> bytes | None:
-        """Wait for the data of a frame. Return None if no frame has come since the mounting."""
+        """Wait for the data of a frame. Return None if the new sensor has sent no frame yet."""
         self._asked += 1
         with self._come:
             is_new = self._newest[0] < 0 and self._asked <= FIRST_FRAMES
@@ -202,7 +202,7 @@ class Zone:
             car.sensors[name] = MountedActor(actor)
 
     def sense(self, sensor: str, vehicles: Sequence[int]) -> dict[int, str]:
-        """Return the data of the last tick's frames in base64, of vehicles that have one."""
+        """Return the last tick's frame in base64 for each vehicle that has one."""
         found = {}
         for vehicle in vehicles:
             data = self._cars[vehicle].sensors[sensor].data(self._frame, self._timeout_s)
@@ -232,7 +232,7 @@ class Zone:
         return (fitting or self._blueprints)[0]
 
     def drop(self, vehicles: Sequence[int]) -> None:
-        """Give vehicles up. Those that remain visible become ghosts in `show`."""
+        """Give up vehicles. Vehicles that remain visible become ghosts in `show`."""
         for vehicle in vehicles:
             car = self._cars[vehicle]
             car.is_owned = False
@@ -247,10 +247,10 @@ class Zone:
         moves = []
         for vehicle, row in near.items():
             if vehicle not in self._cars:
-                self._place(vehicle, row)  # if CARLA refuses it, it is not shown now
+                self._place(vehicle, row)  # a ghost that CARLA refuses is not shown in this tick
                 continue
             car = self._cars[vehicle]
-            car.pose = CarState.of(row).after(self._dt)  # where it is at the end of the tick
+            car.pose = CarState.of(row).after(self._dt)  # where the ghost is at the end of the tick
             moves.append(self._move(car))
         if moves:
             self._client.apply_batch_sync(moves, False)
@@ -303,7 +303,7 @@ class Zone:
     def _drive(self, car: Car, now: CarState, wanted: CarState, aim: Sequence[float] | None) -> Any:
         """Return the control by which a vehicle reaches its wanted speed, and steers.
 
-        It steers to its aim by pure pursuit (Coulter 1992). An agent turns as it is commanded.
+        The vehicle steers to its aim by pure pursuit (Coulter 1992); an agent steers as commanded.
         """
         accel = (wanted.speed - now.speed) / self._dt
         if aim is None:
@@ -373,7 +373,7 @@ def answer(zone: Zone, kind: str, content: dict[str, Any]) -> Any:
 def main() -> None:
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     answers = os.fdopen(os.dup(1), "w")
-    os.dup2(2, 1)  # what CARLA's client prints is no answer
+    os.dup2(2, 1)  # keep the output of CARLA's client apart from the answers
     zone: Zone | None = None
     for line in sys.stdin:
         content = json.loads(line)
@@ -388,7 +388,7 @@ def main() -> None:
             text = json.dumps({"error": f"{type(error).__name__}: {error}"})
         answers.write(text + "\n")
         answers.flush()
-    if zone is not None:  # the process that has started this one has ended
+    if zone is not None:  # the parent process has ended
         zone.close()
 
 

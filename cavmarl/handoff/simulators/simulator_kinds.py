@@ -22,7 +22,7 @@ class SimulatorKind(NamedTuple):
     Attributes:
         make: makes the simulator of one zone of one world.
         tolerance_m: largest distance between the place that the simulator reports and the place
-            where cavmarl would have moved the vehicle in the same tick; 0: they are equal.
+            where cavmarl would have moved the vehicle in the same tick; 0: both are equal.
     """
 
     make: MakeSimulator
@@ -40,13 +40,13 @@ class HostedZone(NamedTuple):
     tolerance_m: float
 
     def check_rig(self, rig: Mapping[str, MountedConfig]) -> None:
-        """Raise ConfigError if the simulator cannot take the samples that its options demand."""
+        """Raise ConfigError if the simulator cannot take the samples that its options require."""
         if self.is_single:
             carla_frames.check_rig(self.zone, self.options, rig)
 
     @property
     def is_single(self) -> bool:
-        """Whether the simulator can run a zone of one world only."""
+        """True if the simulator can run a zone of one world only."""
         return self.kind.make is carla_zone.make
 
 
@@ -54,12 +54,12 @@ def register_zone_simulator(name: str, make: MakeSimulator, *, tolerance_m: floa
     """Register a simulator that can run zones, for `zone_simulators` of `make_vec`.
 
     Args:
-        name: `zone_simulators={2: name}`, or `{2: "name://PLACE?OPTION=VALUE"}`, uses it.
+        name: name in `zone_simulators={2: name}` or `{2: "name://PLACE?OPTION=VALUE"}`.
         make: makes the simulator of one zone of one world.
-        tolerance_m: 0 if the simulator moves vehicles exactly as cavmarl does, so that a world with
-            it equals the undivided world bit for bit. Otherwise the largest distance between the
-            place that it reports and the place where cavmarl would have moved the vehicle in the
-            same tick.
+        tolerance_m: 0 if the simulator moves vehicles exactly as cavmarl does, so that a world that
+            uses it equals the undivided world bit for bit. Otherwise the largest distance between
+            the reported place and the place where cavmarl would have moved the vehicle in the same
+            tick.
 
     Raises:
         ConfigError: the name is not an identifier, or is taken; or the tolerance is not valid.
@@ -93,7 +93,7 @@ def hosted_zones(simulators: Mapping[int, str], num_zones: int) -> tuple[HostedZ
 
 
 def check_servers(hosted: Sequence[HostedZone], num_worlds: int) -> None:
-    """Raise ConfigError if a server that runs a zone of one world would run several."""
+    """Raise ConfigError if a server for a single world would have to run several worlds."""
     if num_worlds > 1 and any(one.is_single for one in hosted):
         raise ConfigError(
             f"num_envs = {num_worlds}: a CARLA server runs a zone of one world; set num_envs = 1"

@@ -1,8 +1,8 @@
 """`ZoneSimulator`: the interface of another simulator that moves the vehicles of one zone.
 
-The rows of such a zone are ordinary rows of a shard. cavmarl's drivers decide in them, and its
-signals, contacts, sensors and messages read them. In each tick, the simulator receives the state
-that each vehicle should reach, and reports the state that the vehicle has reached.
+The rows of such a zone are ordinary rows of a shard. cavmarl's drivers write their decisions to
+them, and its signals, contacts, sensors and messages read them. In each tick, the simulator
+receives the state that each vehicle should reach, and reports the state that it has reached.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class ZoneSetup(NamedTuple):
     rect: tuple[float, float, float, float]
     network: RoadNetwork
     dt_s: float  # length of a tick
-    wheelbases: NDArray[np.float64]  # m, by `VEHICLE["vtype"]`
+    wheelbases: NDArray[np.float64]  # wheelbase in m of each `VEHICLE["vtype"]`
     place: str  # the text after `NAME://` in `zones.simulators`, without options; may be empty
     options: Mapping[str, str]  # the options after `?`
     rig: Mapping[str, MountedConfig]  # the sensors that are mounted on agents' vehicles, by name
@@ -62,11 +62,11 @@ class ZoneSimulator(Protocol):
         ...
 
     def spawn(self, vehicles: NDArray[np.void]) -> None:
-        """Own vehicles VEHICLE (n,) from now on, after `prepare` has accepted them."""
+        """Take over vehicles VEHICLE (n,) that `prepare` has accepted."""
         ...
 
     def drop(self, vehicles: Sequence[int]) -> None:
-        """Give vehicles up, by id: they have left the world or the zone."""
+        """Remove vehicles, given by id, that have left the world or the zone."""
         ...
 
     def show(self, ghosts: NDArray[np.void], signals: Sequence[str]) -> None:
@@ -85,8 +85,8 @@ class ZoneSimulator(Protocol):
         Args:
             wanted: VEHICLE (n,), the owned vehicles as they would be after the tick if cavmarl
                 moved them, with the commanded `throttle` and `steering`.
-            aims: (n, 2), a point in m ahead on the way of each vehicle, for simulators that steer;
-                NaN for agents, whose `steering` is theirs.
+            aims: (n, 2), a point in m ahead on the route of each vehicle, for simulators that
+                steer; NaN for agents, which command their `steering` themselves.
         """
         ...
 
@@ -95,7 +95,7 @@ class ZoneSimulator(Protocol):
         ...
 
     def close(self) -> None:
-        """End the simulator's part: remove all its vehicles, and end its processes."""
+        """Remove all vehicles of the zone from the simulator, and end its processes."""
         ...
 
 
@@ -117,8 +117,8 @@ class FrameSource(Protocol):
             vehicles: owned vehicles of agents, by id.
 
         Returns:
-            Vehicle → sample, with the shape and the unit of the sensor's type. Vehicles of which
-            there is no sample yet are left out: cavmarl's own sample stands.
+            Vehicle → sample, with the shape and the unit of the sensor's type. Vehicles without a
+            sample are left out: cavmarl's own sample is used for them.
         """
         ...
 
@@ -127,7 +127,7 @@ MakeSimulator = Callable[[ZoneSetup], ZoneSimulator]
 
 
 def number_option(options: Mapping[str, str], name: str, default: float, most: float) -> float:
-    """Return the value of an option. Raises ConfigError unless it is above 0 and at most `most`."""
+    """Return a numeric option. Raises ConfigError unless it is above 0 and at most `most`."""
     try:
         value = float(options.get(name, default))
     except ValueError:

@@ -1,8 +1,8 @@
-"""The part of a tick that concerns units that set speed limits.
+"""The part of a tick that concerns roadside units that set speed limits.
 
 All sums over vehicles are whole numbers, so they do not depend on the order or the owners of
-vehicles. Sums are over the ticks since the last decision; so density, flow and mean speed of a
-section follow from them by Edie's definitions (1963).
+vehicles. They include the ticks since the last decision, and give the density, flow and mean speed
+of a section by Edie's definitions (1963).
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.signals.kernels.green_choices import GREEN, KEEP, PREVIOUS, REFUSED
 PRESENT = 0  # vehicles, summed over ticks
 SPEED_MM = 1  # speeds in mm/s
 LOST_PPM = 2  # 1 - speed / (limit of the map · the driver's factor), at least 0, in millionths
-STANDING = 3  # vehicles below 0.1 m/s
+STANDING = 3  # vehicles slower than 0.1 m/s
 SUMS = 4
 
 STANDING_MPS = 0.1
@@ -29,8 +29,8 @@ STANDING_MPS = 0.1
 DENSITY_SCALE = 100.0  # vehicles per km and lane
 FLOW_SCALE = 2500.0  # vehicles per h and lane
 SPEED_SCALE = 40.0  # m/s
-LOST_SCALE_S = 100.0  # of the term delay: vehicle seconds
-OF_SECTION = 4  # features: density, flow, speed, standing share
+LOST_SCALE_S = 100.0  # scale of the reward term delay, in vehicle seconds
+OF_SECTION = 4  # features of a section: density, flow, speed, share of stopped vehicles
 
 
 class LimitPlaces(NamedTuple):
@@ -38,29 +38,29 @@ class LimitPlaces(NamedTuple):
 
     section: NDArray[np.int32]  # (L,) section of each LANE; -1: not counted
     map_mps: NDArray[np.float64]  # (L,) limits of the map
-    length_m: NDArray[np.float64]  # (M,) summed over lanes
+    length_m: NDArray[np.float64]  # (M,) length of each section, summed over lanes
 
 
 class LimitRules(NamedTuple):
     """The rules for choices and rewards."""
 
     decide: int  # ticks between decisions
-    most_change: int  # 0: any
+    most_change: int  # largest change of a choice at a decision; 0: no limit
     num_choices: int  # C
     dt: float
     weights: NDArray[np.float64]  # (T,) of LIMIT_TERMS
 
 
 class LimitOutputs(NamedTuple):
-    """State and outputs of U units; the observations are those of the last decision."""
+    """State and outputs of U units; observations are made at decisions, and kept in between."""
 
     observations: NDArray[np.float32]  # (W, U, D)
     rewards: NDArray[np.float32]  # (W, U) 0 in steps that do not end an interval of decisions
     terms: NDArray[np.float32]  # (W, U, T)
     masks: NDArray[np.bool_]  # (W, U, C) choices that are allowed in the next step
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
-    # (W, U, HELD) as of signals (`signals.kernels.green_choices`): the choices before and now, the
-    # tick of the last change, and the refused choices
+    # (W, U, HELD) as for signals (`signals.kernels.green_choices`): the previous and the present
+    # choice, the tick of the last change, and the number of refused choices
     states: NDArray[np.int64]
 
 
@@ -91,7 +91,7 @@ def choose_limits(
 def count_sections(
     places: LimitPlaces,
     rows: NDArray[np.void],  # VEHICLE (2, k, W, C), see `ZoneState`
-    sides: NDArray[np.int64],  # (2,) the half with the committed rows; another number
+    sides: NDArray[np.int64],  # (2,) the first number is the half of `rows` with the committed rows
     num_owned: NDArray[np.int64],  # (k, W)
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
     sums: NDArray[np.int64],  # (W, M, SUMS) updated
@@ -128,10 +128,10 @@ def observe_limits(
     rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
     sums: NDArray[np.int64],  # (W, M, SUMS) set to 0 at decisions
 ) -> None:
-    """Write what is allowed in the next step; at decisions also observations and rewards.
+    """Write the allowed choices of the next step; at decisions also observations and rewards.
 
-    An observation has the present choice as one value of 1 among zeros, then for each section the
-    means since the last decision: density, flow, speed, and the share of standing vehicles.
+    An observation has the present choice in one-hot encoding, then for each section the means since
+    the last decision: density, flow, speed, and the share of stopped vehicles.
     """
     for w in range(chosen.size):
         if not chosen[w]:

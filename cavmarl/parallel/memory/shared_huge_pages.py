@@ -1,7 +1,7 @@
 """Memory that a process shares with its forks, in huge pages if the system has them.
 
 The vehicles of a city take thousands of small pages. In a virtual machine, translating their
-addresses takes a few hundredths of a tick. By default, most systems give no huge pages to shared
+addresses takes a few percent of a tick. By default, most systems give no huge pages to shared
 memory (`shmem_enabled`), but Linux from 6.1 on merges pages on request. If Linux cannot merge them,
 the program is only slower.
 """
@@ -21,7 +21,7 @@ from numpy.typing import DTypeLike, NDArray
 from cavmarl.parallel.memory.shared_memory import shared_zeros
 
 HUGE_BYTES = 1 << 21  # size of a huge page, on most processors
-MOST_BYTES = 1 << 28  # larger arrays get small pages
+MOST_BYTES = 1 << 28  # larger arrays have small pages
 
 _NO_ACCESS = 0  # PROT_NONE: reserves addresses only
 _AT_THIS_PLACE = 0x10  # MAP_FIXED
@@ -38,7 +38,7 @@ _libc.madvise.argtypes = (ctypes.c_void_p, ctypes.c_size_t, ctypes.c_int)
 
 
 def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float64) -> NDArray[Any]:
-    """Return `shared_zeros`; large arrays lie in huge pages, as far as the system has some.
+    """Return zeros like `shared_zeros`; large arrays use huge pages if the system has free ones.
 
     An array of more than `MOST_BYTES` has small pages, each allocated when it is first written.
 
@@ -59,10 +59,10 @@ def huge_shared_zeros(shape: int | tuple[int, ...], dtype: DTypeLike = np.float6
 
 
 def collapse_heap() -> None:
-    """Merge the heap of this process into huge pages, as far as the system has some.
+    """Merge the heap of this process into huge pages if the system has free ones.
 
-    Forked processes then share fewer pages. The system reports the death of a process when it has
-    released each page, so deaths are noticed sooner.
+    Forked processes then share fewer pages. The system reports the death of a process only after it
+    has released all pages of the process, so fewer pages mean that deaths are noticed sooner.
     """
     with open("/proc/self/maps", encoding="utf-8") as maps:
         heaps = [line.split()[0] for line in maps if line.rstrip().endswith("[heap]")]

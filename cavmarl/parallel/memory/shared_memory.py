@@ -1,7 +1,7 @@
 """Memory that processes share. The memory has no name, so nothing is left behind.
 
-A process knows a segment by its descriptor alone, which it gets when it starts. The system frees a
-segment when the last process that has it open or mapped ends, whatever the cause.
+A process knows a segment only by its descriptor, which it receives when it starts. The system frees
+a segment when the last process that has it open or mapped ends, whatever the cause.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class Segment:
 
     def __init__(
         self,
-        fd: int,  # descriptor, which the segment owns from here on
+        fd: int,  # file descriptor; the segment takes ownership and closes it
         size: int,  # bytes
     ) -> None:
         self.fd = fd  # to be passed to other processes
@@ -77,7 +77,7 @@ class Segment:
             raise WorkerError(f"shared memory cannot be mapped: {error}") from error
 
     def close(self) -> None:
-        """Close the descriptor; mapped memory stays while it is referenced."""
+        """Close the descriptor; existing mappings stay valid while they are referenced."""
         os.close(self.fd)
 
 

@@ -18,7 +18,7 @@ from typing import Any
 
 from cavmarl.core.errors import require
 
-MAX_CALL_BYTES = 1 << 16  # bytes that one call encrypts
+MAX_CALL_BYTES = 1 << 16  # limit of bytes that one call encrypts
 _VALID = datetime(2000, 1, 1, tzinfo=UTC), datetime(2100, 1, 1, tzinfo=UTC)
 _WAITS = (ssl.SSLWantReadError, ssl.SSLWantWriteError)
 
@@ -27,7 +27,7 @@ class EncryptedSocket(ssl.SSLSocket):
     """A TLS socket that raises `BlockingIOError` like a plain non-blocking socket."""
 
     def sendmsg(self, buffers: Iterable[Any], *_: Any) -> int:  # type: ignore[override]
-        """Send the first bytes and return how many; the next call must pass the rest unchanged."""
+        """Send bytes and return their number; the next call must pass the rest unchanged."""
         pieces, size = [], 0
         for piece in buffers:
             pieces.append(piece)
@@ -76,7 +76,7 @@ def _is_loopback(address: str) -> bool:
 def encrypted(connection: socket.socket, secret: bytes, calls: bool) -> EncryptedSocket:
     """Return an encrypted connection, which owns the socket.
 
-    The end that calls does the handshake here; the other end has to do it later.
+    The calling end does its handshake here; the listening end has to do its handshake later.
 
     Raises:
         ssl.SSLError: the other end does not know the secret.

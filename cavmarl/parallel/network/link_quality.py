@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 from cavmarl.parallel.network.transport import Connection
 
-# Fields of `struct tcp_info` of Linux, in `linux/tcp.h`; later fields only follow these.
+# Fields of `struct tcp_info` in `linux/tcp.h`; newer kernels only append fields.
 _RTT = struct.Struct("<68x I I")  # smoothed round trip and its mean deviation, in µs
 _LEAST_RTT = struct.Struct("<148x I")  # in µs
 _DELIVERY = struct.Struct("<160x Q")  # bytes per second
@@ -17,17 +17,17 @@ _SIZE = _DELIVERY.size
 
 
 class LinkQuality(NamedTuple):
-    """A connection in use, as its end here sees it; None: the system does not know."""
+    """Quality of a connection, measured at the end in this process; None: not measured."""
 
     is_encrypted: bool
     rtt_ms: float | None = None  # smoothed round trip
     rtt_deviation_ms: float | None = None  # mean deviation
     least_rtt_ms: float | None = None  # since the connection was made
-    delivered_mbit_s: float | None = None  # last rate of delivery, at most what was sent
+    delivered_mbit_s: float | None = None  # last delivery rate, limited by the sending rate
 
 
 def measure_link(connection: Connection) -> LinkQuality:
-    """Return what the system knows about a connection; only Linux knows about TCP."""
+    """Return what the system has measured about a connection; TCP is measured on Linux only."""
     is_encrypted = bool(connection.keeps_bytes)
     if not hasattr(socket, "TCP_INFO"):
         return LinkQuality(is_encrypted)

@@ -1,8 +1,8 @@
 """`Listener`: accepts connections of processes that know a secret.
 
 Both ends prove that they know the secret without sending it: each answers the random number of the
-other end with an HMAC. Before that, the listener reads only these few bytes. Connections that leave
-this machine are encrypted first.
+other end with an HMAC. Until then, the listener reads only these few bytes. Connections that leave
+this machine are encrypted before the handshake.
 
     caller → listener   HELLO: magic, version, number of the caller, random number
     listener → caller   random number, proof
@@ -64,12 +64,12 @@ class PendingConnection:
         return self._socket.fileno()
 
     def listen(self) -> socket.socket | None:
-        """Read what has come; return the connection once the caller has proved the secret.
+        """Read received bytes; return the connection once the caller has proved the secret.
 
         Raises:
             OSError: the caller has gone.
             EOFError: the caller has ended the connection.
-            MessageError: the caller is a stranger.
+            MessageError: the caller has another protocol or version, or does not know the secret.
         """
         if isinstance(self._socket, EncryptedSocket) and self._socket.version() is None:
             try:
@@ -106,9 +106,7 @@ class PendingConnection:
     def _answer(self, hello: bytes) -> None:
         magic, version, self.number, _ = HELLO.unpack(hello)
         if magic != MAGIC:
-            raise MessageError(
-                f"a caller sends {hello[:4]!r}, which starts no handshake of cavmarl"
-            )
+            raise MessageError(f"a caller sends {hello[:4]!r}, which is not cavmarl's handshake")
         if version != VERSION:
             self._socket.sendall(_VERSION.pack(MAGIC, VERSION))
             raise MessageError(
@@ -163,7 +161,7 @@ class Listener:
         """Serve all callers, without waiting.
 
         Returns:
-            number and connection of each caller that has proved that it knows the secret.
+            number and connection of each caller that has now proved that it knows the secret.
         """
         admitted: list[tuple[int, socket.socket]] = []
         for key, _ in self._selector.select(0.0):
@@ -178,7 +176,7 @@ class Listener:
         return admitted
 
     def _welcome(self) -> Iterator[PendingConnection]:
-        """Accept new callers; if there are too many callers, disconnect silent ones first."""
+        """Accept new callers; if there are too many callers, disconnect silent callers first."""
         for _ in range(MAX_CALLERS):
             try:
                 connection, _ = self._listener.accept()
@@ -201,7 +199,7 @@ class Listener:
     def _listen(self, caller: PendingConnection, admitted: list[tuple[int, socket.socket]]) -> None:
         try:
             connection = caller.listen()
-        except (EOFError, OSError, MessageError):  # a stranger: ignored
+        except (EOFError, OSError, MessageError):  # not a node of this run: ignored
             self._disconnect(caller)
             return
         if connection is not None:
@@ -226,7 +224,7 @@ class Listener:
             time.sleep(NO_DESCRIPTORS_S)
 
     def _disconnect_the_first(self) -> None:
-        """Disconnect the oldest caller without a HELLO, or else the oldest one."""
+        """Disconnect the oldest caller without a HELLO; if all have sent one, the oldest caller."""
         self._disconnect(min(self._callers, key=lambda each: (each.number >= 0, each.until_s)))
 
     def _disconnect(self, caller: PendingConnection) -> None:

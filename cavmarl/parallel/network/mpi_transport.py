@@ -50,12 +50,12 @@ _SHARED = re.compile(r"/dev/shm/mpich_shm_\w+(?= *$)", re.MULTILINE)
 
 
 class _Notice(IntEnum):
-    """Kinds of notices, and the two numbers that each kind carries."""
+    """Kinds of notices. The comments name the first and the second number of each kind."""
 
-    OPEN = 0  # number for the listener; end of the opener
-    ACCEPT = 1  # end of the sender; end of the opener
-    CLOSE = 2  # unused; end of the receiver
-    GONE = 3  # unused: the process of the sender ends
+    OPEN = 0  # number of the caller, for the listener; number of the caller's end
+    ACCEPT = 1  # number of the listener's end; number of the caller's end
+    CLOSE = 2  # unused; number of the receiver's end
+    GONE = 3  # both unused; the process of the sender ends
 
 
 class MpiConnection:
@@ -157,7 +157,7 @@ class MpiTransport:
     """A `Transport` between the ranks of this run.
 
     Attributes:
-        rank: of this process.
+        rank: rank of this process.
         ranks: number of ranks.
         wait_s: time for a rank to answer a call without a limit of its own; None: unlimited.
         is_broken: whether a rank is lost, so that this process aborts the run when it ends.
@@ -236,7 +236,7 @@ class MpiTransport:
             raise OSError(f"rank {rank} cannot be reached: {error}") from error
 
     def receive_all(self) -> None:
-        """Receive all messages that are there.
+        """Receive all messages that have arrived.
 
         Raises:
             WorkerError: MPI has lost a rank.

@@ -16,7 +16,7 @@ Main = Callable[[tuple[str, int], bytes, int], None]
 
 
 class NodeActor:
-    """The class of the actors. An actor gets a single call, which lasts for its life."""
+    """The class of the actors. An actor executes a single call, which lasts for its life."""
 
     def run(self, main: Main, place: tuple[str, int], secret: bytes, number: int) -> None:
         main(place, secret, number)
@@ -26,11 +26,11 @@ class RayActors:
     """Actors on the nodes of a Ray cluster.
 
     Ray restarts an actor that dies, on its node of the cluster or, if that is lost, on another one,
-    and repeats its call. Ray transports no step: it passes the function to run, the place of the
-    caller, and the secret.
+    and repeats its call. Ray carries no data of steps: it only passes the function to run, the
+    place of the caller, and the secret.
 
     Attributes:
-        address: of this node of the cluster.
+        address: address of this machine in the cluster.
         workers: number of actors, without spare ones.
 
     Raises:
@@ -89,7 +89,7 @@ class RayActors:
         self._ray.kill(self._actors[number], no_restart=False)
 
     def trouble(self) -> str | None:
-        """Return the error of an actor whose call has ended; None: there is none."""
+        """Return the error of an actor whose call has ended; None: no call has ended."""
         ended, _ = self._ray.wait(self._calls, num_returns=len(self._calls), timeout=0)
         for call in ended:
             try:

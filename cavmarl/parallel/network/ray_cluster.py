@@ -14,18 +14,18 @@ from cavmarl.core.errors import ConfigError, WorkerError, require
 
 ADDRESS = "RAY_ADDRESS"  # environment variable that Ray itself reads
 CALL_S = 5.0
-RELEASE_S = 2.0  # Ray notices the end of an actor with a delay
+RELEASE_S = 2.0  # time to wait for CPUs, since Ray notices the end of an actor with a delay
 _RESOURCES = ("CPU", "memory", "GPU")
 _joined = 0  # calls of `join` without their `leave`; 0 if the program itself has joined
 
 
 @dataclass(frozen=True)
 class Node:
-    """A node of the cluster. Its use is the share of each resource that is reserved."""
+    """A node of the cluster, as Ray describes it."""
 
     name: str
     cpus: int  # free CPUs
-    use: Utilisation  # reserved shares
+    use: Utilisation  # reserved share of each resource
     hosted: int = 0  # actors that were assigned to it
 
 
@@ -72,7 +72,7 @@ def _call(address: str) -> None:
 
 
 def leave() -> None:
-    """Leave the cluster if no other part of this program uses it; one started here ends."""
+    """Leave the cluster if no other part of this program uses it; end it if `join` started it."""
     global _joined
     _joined -= 1
     ray = require("ray", "ray")
@@ -113,7 +113,7 @@ def choose_nodes(known: Sequence[Node], workers: int) -> list[str]:  # names of 
     if workers > free:
         raise ConfigError(
             f"backend = 'ray:{workers}': the Ray cluster has {free} free CPUs on {len(known)} "
-            "nodes; use fewer, or add nodes (ray start --address=…); ray status shows their users"
+            "nodes; use fewer workers, or add nodes (ray start --address=…); see ray status"
         )
     left = list(known)
     chosen: list[str] = []

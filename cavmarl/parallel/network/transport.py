@@ -40,7 +40,7 @@ class Connection(Protocol):
         ...
 
     def send(self, pieces: Sequence[Bytes]) -> int:
-        """Send the pieces in order; return how many bytes were accepted, from the first on.
+        """Send the pieces in order; return the number of bytes that the system has accepted.
 
         Raises:
             OSError: the other end has gone.
@@ -48,7 +48,7 @@ class Connection(Protocol):
         ...
 
     def receive(self, room: memoryview) -> int:
-        """Read into `room`; return how many bytes, 0 if none are there or the end has closed.
+        """Read into `room`; return the number of bytes, 0 if none has arrived or the end closed.
 
         Raises:
             OSError: the other end has gone.

@@ -65,7 +65,7 @@ def _read(data: memoryview) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
 
 
 class AgentStream:
-    """Rows of tables of agents, from each node to the others."""
+    """Sends rows of tables of agents from each node to the other nodes."""
 
     def __init__(self, tables: Sequence[Array]) -> None:  # (W, A, …)
         self._tables = _tables(tables)
@@ -84,7 +84,7 @@ class AgentStream:
         self,
         present: Flags,  # (W, A) agents that have sensed in this node
         chosen: Flags,  # (W,) worlds whose agents are sent
-        number: int,  # of this node
+        number: int,  # number of this node
         own: Flags,  # (W, A) output: agents that sensed here last
         owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> Bytes:
@@ -97,11 +97,11 @@ class AgentStream:
         """Write the frame of node `number` to the tables, and note that it owns these agents.
 
         Returns:
-            these agents.
+            the agents of that node.
 
         Raises:
-            MessageError: the bytes are not such a frame, or name agents that are unknown or of
-                another node.
+            MessageError: the bytes are not a frame about agents, or name agents that are unknown
+                or belong to another node.
         """
         words, content = _read(data)
         unowned = np.count_nonzero(owner == UNOWNED)
@@ -154,7 +154,7 @@ class ResultStream:
         chosen: Flags,  # (W,) worlds that were reset or stepped
         of_step: bool,
         with_common: bool,  # the node is the reporter, and is read first
-        number: int,  # of the node
+        number: int,  # number of the node
         owner: NDArray[np.int32],  # (W · A,) output: node of each agent
     ) -> None:
         """Write the results of a node to the arrays.

@@ -1,4 +1,4 @@
-"""`IndexCheck`: refuses vehicles of other nodes whose indices point at no row of a table."""
+"""`IndexCheck`: refuses vehicles from other nodes if one of their indices is out of bounds."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class IndexCheck:
 
     Attributes:
         of_rows: bounds of the indices in a row.
-        of_ghosts: bounds of the indices in a ghost: in its row, in its PLAN, and of its `step_at`.
+        of_ghosts: bounds of the indices in a ghost: in its row, its PLAN, and its `step_at`.
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -42,15 +42,15 @@ class IndexCheck:
         """Refuse (n,) rows of VEHICLE with an index that is out of bounds. Raises MessageError."""
         words = np.ascontiguousarray(rows).view(np.int64).reshape(-1, ROW_WORDS)
         if not self._are_bounded(words, self.of_rows):
-            raise MessageError("a vehicle has an index that no table has")
+            raise MessageError("a vehicle has an index that is out of bounds")
 
     def check_state(self, record: bytes) -> None:
-        """Refuse a row, as bytes. Raises MessageError."""
+        """Refuse a row, given as bytes, with an index out of bounds. Raises MessageError."""
         self.check(np.frombuffer(bytearray(record), VEHICLE, 1))
 
 
 def _word(dtype: np.dtype[Any], name: str) -> int:
-    """Return the word of a record in which a field starts."""
+    """Return the offset of a field in a record, in words of 8 bytes."""
     assert dtype.fields is not None
     return int(dtype.fields[name][1]) // 8
 

@@ -46,7 +46,7 @@ class JoiningNodes:
 
     Attributes:
         place: where nodes call.
-        ready: nodes that have loaded the world, by their numbers here.
+        ready: nodes that have loaded the world, by the numbers of their connections.
         refused: why other nodes were rejected.
         failures: exceptions of nodes that loaded the world.
         dropped: accepted nodes that have sent a bad frame, and have to be started again.
@@ -56,9 +56,9 @@ class JoiningNodes:
         self,
         listener: TransportListener,
         job: Any,  # JSON value for the nodes
-        files: Sequence[WorldFile],  # of the world
+        files: Sequence[WorldFile],  # files of the world
         room: Callable[[], int],  # returns how many more nodes can be used
-        zones: int,  # of each world
+        zones: int,  # number of zones of each world
         system: NodeSystem = MACHINE,
     ) -> None:
         self._listener = listener
@@ -93,7 +93,7 @@ class JoiningNodes:
         self,
         num: int,
         timeout_s: float,
-        trouble: Callable[[], str | None],  # returns why nodes will not come
+        trouble: Callable[[], str | None],  # returns why a node will never join; None: no reason
     ) -> None:
         """Wait until this number of nodes is ready.
 

@@ -1,7 +1,7 @@
-"""Length of the leases of nodes: at most a step, because its commands are known in advance.
+"""Length of the leases of nodes: at most one step, because its commands are known in advance.
 
-A vehicle that crosses a border during a lease stays with its owner until the next lease. A vehicle
-without a record cannot be offered. For such a vehicle, a lease of no ticks comes first.
+A vehicle that crosses a border during a lease stays with its owner until the next lease. Only a
+vehicle with a record can be offered. A lease of 0 ticks first gives new vehicles their records.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ def leases_of(ticks: int, lease: int) -> int:
 
 
 def late_ticks(config: EnvConfig) -> int:
-    """Return how many ticks longer than one a vehicle may stay with the zone that it has left.
+    """Return for how many extra ticks, beyond one, a zone may keep a vehicle that has left it.
 
-    Other simulators may refuse it for some leases.
+    Simulators of zones may refuse the vehicle for `zones.max_deferred_ticks` leases.
     """
     deferred = config.zones.max_deferred_ticks if config.zones.simulators else 0
     return lease_ticks(config) * (1 + deferred) - 1

@@ -49,7 +49,7 @@ class FrameKind(IntEnum):
     JOIN = 2  # N → C: the code that the node runs
     COMMAND = 3  # C → N: a task and its arguments
     LEASE = 4  # C → N: STEP messages
-    REPORT = 5  # N → C: DONE messages, and what the next decision needs
+    REPORT = 5  # N → C: DONE messages, and the data that the next decision needs
     MESSAGES = 6  # N → N, N → C: other messages of the protocol
     RESULT = 7  # N → C: the result of a task
     FAILED = 8  # N → C: an error
@@ -121,17 +121,17 @@ class NeededNoMoreError(Exception):
 
 
 class Link:
-    """One connection, with bytes still to be sent, and the part of a frame that has come."""
+    """One connection, with its unsent bytes and the received part of the next frame."""
 
     def __init__(self, connection: Connection) -> None:
         self.connection = connection
         self.waiting: deque[memoryview] = deque()
         self.frames: deque[NodeFrame] = deque()
-        self._room = memoryview(bytearray(ROOM))  # received bytes that are not split yet
-        self._filled = 0  # bytes in the room
-        self._into = self._room  # target of the next bytes: the room, or an open frame
-        self._opened: tuple[NodeFrame, int] | None = None  # the open frame, and its checksum
-        self._num_sent = self._num_received = 0  # frames
+        self._room = memoryview(bytearray(ROOM))  # received bytes, not yet split into frames
+        self._filled = 0  # number of bytes in `_room`
+        self._into = self._room  # target of the next bytes: `_room`, or an incomplete frame
+        self._opened: tuple[NodeFrame, int] | None = None  # incomplete frame, and its checksum
+        self._num_sent = self._num_received = 0  # numbers of frames
 
     def send(self, kind: FrameKind, number: int, pieces: Sequence[Bytes]) -> int:
         """Send as much as the connection accepts at once; keep a copy of the rest.
@@ -163,7 +163,7 @@ class Link:
                 waiting[0] = waiting[0][sent:]
 
     def receive(self, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
-        """Receive what has come; append urgent frames, with the number of this link.
+        """Read received bytes; append urgent frames to `urgent`, with the number of this link.
 
         Raises:
             EOFError, OSError: the other end has gone.
@@ -188,7 +188,7 @@ class Link:
                 return
 
     def _split(self, filled: int, urgent: deque[tuple[int, NodeFrame]], number: int) -> None:
-        """Split the room into frames. The last frame may be incomplete."""
+        """Split the bytes in `_room` into frames. The last frame may be incomplete."""
         room, at = self._room, 0
         while filled - at >= HEAD_BYTES:
             begin, code, which, size, summed, own = _WHOLE_HEAD.unpack_from(room, at)
@@ -219,7 +219,7 @@ class Link:
         frame: NodeFrame,
         summed: int,  # checksum in the head
         urgent: deque[tuple[int, NodeFrame]],
-        number: int,  # of the link
+        number: int,  # number of the link
     ) -> None:
         """Check a complete frame, and queue it."""
         if xxh3_64_intdigest(frame.data) != summed:
@@ -238,7 +238,7 @@ class Link:
 
 
 def _joined(pieces: Sequence[Bytes]) -> Bytes:
-    """Return the pieces as one, without a copy of a single piece."""
+    """Join pieces; return a single piece without a copy."""
     if len(pieces) != 1:
         return b"".join(pieces)
     (data,) = pieces
@@ -258,14 +258,14 @@ def _stranger(begin: bytes, is_next: bool, code: int, size: int) -> MessageError
             "on all machines"
         )
     if not is_next:
-        return MessageError("the head of a frame is damaged, or not the next one")
+        return MessageError("the head of a frame is damaged or out of order")
     if code not in _KINDS:
         return MessageError(f"a frame has the unknown kind {code}")
     return MessageError(f"a frame has {size} bytes, more than {MAX_FRAME}")
 
 
 def read_list(frame: NodeFrame) -> list[Any]:
-    """Read a JSON list. Raises MessageError: the frame has something else."""
+    """Read a JSON list. Raises MessageError: the frame has no JSON list."""
     try:
         found: list[Any] = read_json(frame.data, list)
     except MessageError as error:

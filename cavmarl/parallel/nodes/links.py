@@ -25,11 +25,11 @@ handler returns."""
 
 
 class AwaitedOffer(NamedTuple):
-    """An offer of a vehicle that has no answer."""
+    """An unanswered offer of a vehicle."""
 
     world: int
     vehicle: int
-    zone: int  # that has to answer
+    zone: int  # zone that has to answer
     source: int  # node that has to offer the vehicle
     target: int  # node of the zone
 
@@ -51,7 +51,7 @@ class RecoveryOrderedError(Exception):
 
     Attributes:
         frame: the order, if it has been received.
-        witness: node that claims to have got the order.
+        witness: node that claims to have received the order.
     """
 
     def __init__(self, frame: NodeFrame | None, witness: int | None = None) -> None:
@@ -116,7 +116,7 @@ class Links:
 
     def receive(
         self,
-        wanted: Collection[int],  # senders
+        wanted: Collection[int],  # numbers of the senders
         timeout_s: float | None = None,  # None: no limit
     ) -> dict[int, NodeFrame]:
         """Receive the next frame of each sender.
@@ -184,11 +184,11 @@ class Links:
         return frames.popleft() if frames else None
 
     def await_urgent(self, number: int, has_come: Callable[[], bool]) -> None:
-        """Wait until a sender has sent an urgent frame, which comes before its next frame.
+        """Wait for an urgent frame that a sender has to send before its next other frame.
 
         Args:
-            number: of the sender, another node.
-            has_come: whether the frame has come; an urgent frame is handled as soon as it comes.
+            number: number of the sender, another node.
+            has_come: returns whether the urgent frame has come and was handled.
 
         Raises:
             LinkLostError: the sender has gone, or has not sent the frame.
@@ -217,15 +217,15 @@ class Links:
         return self._forget(number)
 
     def unread(self, number: int, frame: NodeFrame) -> None:
-        """Put a frame back, as the next one of its sender."""
+        """Put a frame back, as the next frame of its sender."""
         self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None, looks: int = 0) -> None:
-        """Send and receive on all connections that are ready; wait up to `timeout_ms` for one.
+        """Send and receive on all ready connections; wait up to `timeout_ms` until one is ready.
 
         Poll `looks` times before the process sleeps.
         """
-        if self._urgent_frames:  # the frame before them has raised an error
+        if self._urgent_frames:  # an earlier urgent frame raised an error, so these were left
             self._deliver()
             return
         began_s = self.now_s()
@@ -285,7 +285,7 @@ class Links:
         return link
 
     def end(self, timeout_s: float) -> None:
-        """Send END to all, and wait up to a limit for them to close."""
+        """Send END on all connections, and wait up to `timeout_s` for the other ends to close."""
         for number in self.numbers:
             with suppress(LinkLostError):
                 self.send(number, FrameKind.END, 0)

@@ -45,7 +45,7 @@ class Actions(NamedTuple):
         """Return the actions for a node: of its agents, and of agents without an owner.
 
         Args:
-            number: of the node.
+            number: number of the node.
             owner: (W · A,) node of each agent, as far as it is known.
         """
         words = np.empty(2 + 4 * len(owner), dtype=np.int64)
@@ -61,12 +61,12 @@ class Actions(NamedTuple):
 class NodeCommand(NamedTuple):
     """A command to all nodes."""
 
-    pieces: list[bytes]  # of its frame, the same for all nodes
+    pieces: list[bytes]  # parts of its frame that are the same for all nodes
     changes: bool  # whether it changes the worlds
-    ticks: int  # of the worlds
-    actions: Actions | None = None  # of a step
+    ticks: int  # simulated ticks; 0 unless the command is a step
+    actions: Actions | None = None  # actions of the agents, if the command is a step
     cut: ZoneRects | None = None  # new zones of the worlds
-    receptions: list[bytes] | None = None  # answers of a network simulator so far, in a step
+    receptions: list[bytes] | None = None  # answers of a network simulator so far in this step
 
     def of_node(self, number: int, owner: NDArray[np.int32], lease: bytes) -> list[Bytes]:
         """Return the pieces of the frame for a node. Arguments are as in `Actions.of_node`.
@@ -81,14 +81,14 @@ class NodeCommand(NamedTuple):
 class ReceivedActions:
     """The actions that a node receives for a step."""
 
-    def __init__(self, arrays: StepArrays, number: int) -> None:  # `number`: of the node
+    def __init__(self, arrays: StepArrays, number: int) -> None:  # `number` of the node
         num = arrays.mask.size
         self._number = number
         self._arrays = arrays.controls.reshape(num, 2), arrays.meta_actions.reshape(num)
         self._missing = np.zeros(num, dtype=np.bool_)
         self._wrong = np.empty(num, dtype=np.int64)
         self._unpack = specialized(take_actions, checks=False)
-        self.are_due = False  # actions of agents of this node are missing
+        self.are_due = False  # whether actions of agents of this node are missing
 
     def due(self) -> list[int]:
         """Return the agents of this node whose actions are missing in the present step."""

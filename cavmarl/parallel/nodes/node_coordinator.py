@@ -33,7 +33,7 @@ class CrossingDigests:
         return self.digests[vehicle]
 
     def state(self, vehicle: int) -> bytes:
-        """Raise ProtocolError: a node needs a state again that it has acknowledged."""
+        """Raise ProtocolError: a node asks for a state that it has already acknowledged."""
         raise ProtocolError(
             f"vehicle {vehicle}: its new zone does not have the state that it acknowledged"
         )
@@ -57,12 +57,12 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.has_stepped = False  # each zone has got a STEP in the present episode
-        self.has_begun = False  # before the first reset, rows belong to no episode
+        self.has_stepped = False  # whether each zone has received a STEP in the present episode
+        self.has_begun = False  # whether the first reset is done; before, rows have no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
     def check_owned(self, w: int, reports: Sequence[Report]) -> None:
-        """Compare the vehicles that zones own by their rows with the records.
+        """Compare the vehicles that each zone owns according to its rows with the records.
 
         Raises:
             ZonesError: the vehicles, or their epochs, differ.
@@ -88,7 +88,7 @@ class _World:
         return self.has_stepped and not (births or self.movers or is_watched)
 
     def write(self, output: Output) -> int:
-        """Write records; return how many vehicles change their owner by them."""
+        """Write records; return the number of vehicles whose owner they change."""
         if not output.records:
             return 0
         if self.journal is not None:
@@ -104,18 +104,18 @@ class NodeCoordinator:
 
     Attributes:
         worlds: ownership in each world.
-        switched: number of changes of owner.
-        is_late: a vehicle without a record has crossed a border, so a lease of no ticks is due.
+        switched: number of changes of owner so far.
+        is_late: whether a vehicle without a record has crossed a border: a lease of 0 ticks is due.
     """
 
     def __init__(
         self,
-        runs: Sequence[bytes],  # of each world
+        runs: Sequence[bytes],  # run of each world
         node_of: Sequence[int],  # zone → node
         limits: Limits,
         links: Links,  # to all nodes
-        journals: Sequence[Journal | None],  # of each world
-        is_checked: bool = False,  # check the vehicles that zones own
+        journals: Sequence[Journal | None],  # journal of each world
+        is_checked: bool = False,  # whether to compare rows of vehicles with the records
     ) -> None:
         self.worlds = [
             _World(run, len(node_of), limits, journal, is_checked)
@@ -124,8 +124,8 @@ class NodeCoordinator:
         self._node_of = node_of
         self._links = links
         self.switched, self.is_late = 0, False
-        self._has_recovered = False  # since the last commit
-        self._has_differed = False  # the rows of a zone have differed from the records
+        self._has_recovered = False  # whether there was a recovery since the last commit
+        self._has_differed = False  # whether the rows of a zone have differed from the records
 
     def host(self, neighbours: Neighbours) -> list[list[Hosting]]:
         """Start; return the hostings of all zones, by worlds."""
@@ -174,7 +174,7 @@ class NodeCoordinator:
         """Apply acknowledgements as soon as they come.
 
         Raises:
-            MessageError: the frame has something else, or is about a zone of another node.
+            MessageError: the frame has another message, or is about a zone of another node.
         """
         messages = unpacked(frame.data)
         self.check(number, messages)
@@ -194,14 +194,14 @@ class NodeCoordinator:
 
     def check(
         self,
-        number: int,  # of a node
+        number: int,  # number of a node
         messages: Sequence[tuple[int, Message]],
-        reports: Sequence[Report] = (),  # of all worlds, or none
+        reports: Sequence[Report] = (),  # one for each world, or none at all
     ) -> None:
         """Check messages of a node.
 
         Raises:
-            MessageError: they are about a zone of another node, or name something unknown.
+            MessageError: the messages are about a zone of another node, or have unknown numbers.
         """
         check_indices("world", (w for w, _ in messages), len(self.worlds))
         for report in reports:
@@ -223,7 +223,7 @@ class NodeCoordinator:
                 raise MessageError(f"{digest!r} is not a digest of vehicle {vehicle}")
 
     def _take_report(self, number: int, w: int, report: Report) -> None:
-        """Take the new vehicles of a node.
+        """Register the new vehicles of a node.
 
         Raises:
             ProtocolError: the node offers or reports vehicles that it cannot have.
@@ -282,11 +282,11 @@ class NodeCoordinator:
         self._has_recovered = False
 
     def _check_late(self, reports: Mapping[int, Sequence[Report]]) -> None:
-        """Note whether a lease of no ticks is due.
+        """Note whether a lease of 0 ticks is due.
 
         Raises:
-            LinkLostError: vehicles of a node are without a record, but the previous lease was for
-                their records.
+            LinkLostError: vehicles of a node have no record, although the previous lease should
+                have created the missing records.
         """
         late = [number for number, report in reports.items() if any(one.is_late for one in report)]
         if late and self.is_late:
@@ -294,7 +294,7 @@ class NodeCoordinator:
         self.is_late = bool(late)
 
     def _check_began(self, began: Mapping[int, bool]) -> None:
-        """Raise LinkLostError if a node is wrong about whether an episode has begun.
+        """Raise LinkLostError if a node wrongly reports that an episode has begun, or has not.
 
         An episode begins in all nodes or in none, and in all of them after a recovery.
         """
@@ -304,7 +304,7 @@ class NodeCoordinator:
                 raise LinkLostError(number, MessageError(f"an episode has begun: {has_begun}"))
 
     def _check_owned(self, w: int, world: _World, reports: Sequence[Report]) -> None:
-        """Compare the vehicles that zones own by their rows with the records.
+        """Compare the vehicles that each zone owns according to its rows with the records.
 
         Raises:
             LinkLostError: the vehicles differ for the first time, so the report may be wrong.
@@ -340,7 +340,7 @@ class NodeCoordinator:
             self.worlds[w].directory.answer_for_silent()
 
     def begin(self, timeout_s: float) -> dict[int, bytes]:
-        """Decide the ownership in the next ticks, once all offers are answered.
+        """Wait until all offers are answered, then decide the ownership in the next ticks.
 
         Returns:
             node → its lease: the STEP messages of its zones, for worlds with changes.
@@ -360,7 +360,7 @@ class NodeCoordinator:
         return lease | self._by_node(messages) if messages else lease
 
     def _check_answers(self, w: int, world: _World) -> None:
-        """Raise LinkLostError if a node has offered another state than it has reported."""
+        """Raise LinkLostError if a node has offered a state that differs from its report."""
         held = world.directory.readiness.held.get(world.directory.table.tick, {})
         for vehicle, zone in world.movers:
             answer = held.get((vehicle, zone))

@@ -1,8 +1,8 @@
 """Repartitioning of zones that nodes host: the messages between the caller and the nodes.
 
-The first node receives the rows of all vehicles for a moment, and proposes new zones. Then all
-nodes repartition: each vehicle goes to the node of its zone, and ownership starts anew, as when
-worlds are loaded. The zones are a part of the kept state: if nodes are lost, they are restored too.
+The first node temporarily receives the rows of all vehicles, and proposes new zones. Then all nodes
+repartition: each vehicle goes to the node of its zone, and ownership starts again, as when worlds
+are loaded. The zones are a part of the kept state: if nodes are lost, the zones are restored too.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ class PoolState(NamedTuple):
     """A state that nodes have kept, as the caller describes it."""
 
     number: int
-    zones: list[list[int]]  # of each node
+    zones: list[list[int]]  # zones of each node
     switched: int  # number of changes of owner when the state was kept
     cut: ZoneCut
 
@@ -59,7 +59,7 @@ def neighbours_as_json(simulation: Simulation) -> list[Any]:
 
 
 def read_neighbours(content: Sequence[Any], zones: int) -> Neighbours:
-    """Read the neighbours of zones. Raises MessageError: they are of other zones."""
+    """Read the neighbours of each zone. Raises MessageError: the number of zones differs."""
     near, may_teleport = content
     if len(near) != zones:
         raise MessageError(f"it has neighbours of {len(near)} zones: there are {zones}")
@@ -69,7 +69,7 @@ def read_neighbours(content: Sequence[Any], zones: int) -> Neighbours:
 
 
 def proposal_of(simulation: Simulation) -> list[Any] | None:
-    """Propose zones, with the figures of `Repartition`; this process has to have all vehicles."""
+    """Propose zones, with the figures of `Repartition`; needs all vehicles in this process."""
     began = time.perf_counter()
     tolerance = simulation.config.zones.repartition_tolerance
     found = propose_cut(simulation.network, simulation.division, simulation.partition, tolerance)

@@ -13,7 +13,7 @@ from cavmarl.shards.shard_group import ShardGroup
 
 
 class NodeExecutor(ShardGroup):
-    """Runs phases on the shards of this node, and keeps the other shards on the same side."""
+    """Runs phases on the shards of this node; the other shards use the same side of the rows."""
 
     def __init__(self, own: Sequence[Shard], foreign: Sequence[Shard]) -> None:
         super().__init__(own)
@@ -28,7 +28,7 @@ class NodeExecutor(ShardGroup):
         self.align_foreign()
 
     def align_foreign(self) -> None:
-        """Turn the shards of other nodes to the side of the shards of this node."""
+        """Set the side of the shards of other nodes to the side of the shards of this node."""
         side, next_side = self.sides
         for shard in self._foreign:
             if shard.side != side or shard.next_side != next_side:

@@ -1,4 +1,4 @@
-"""The files of a world, which nodes on other machines receive once, identified by content."""
+"""The files of a world, identified by content. Nodes on other machines receive each file once."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def pieces_of(task: Task, payload: Any, arrays: StepArrays) -> list[bytes]:
 
 
 def command_of(data: memoryview) -> tuple[Task, Any, int]:
-    """Read a command; return the task, the payload, and the place of the arrays."""
+    """Read a command; return the task, the payload, and the offset of the arrays in bytes."""
     task, size = _HEAD.unpack_from(data)
     at = _HEAD.size + size
     return Task(task), json.loads(bytes(data[_HEAD.size : at])) if size else None, at

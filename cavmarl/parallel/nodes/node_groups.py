@@ -43,7 +43,7 @@ class NodeGroups(CommandedWorlds):
     from it. With `workers.balance_steps`, worlds move to other nodes between steps.
 
     Attributes:
-        pool: the supply of nodes.
+        pool: supplies the nodes.
         groups: the worlds of each node.
 
     Raises:
@@ -121,7 +121,7 @@ class NodeGroups(CommandedWorlds):
         """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: the state is one of other worlds.
+            ConfigError: the state belongs to other worlds.
         """
         parts = [saved[first:last] for first, last in pairwise(self._bounds)]
         for group, part in zip(self.groups, parts, strict=True):

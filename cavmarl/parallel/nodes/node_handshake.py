@@ -58,7 +58,7 @@ def accept_nodes(
 def call_node(
     system: NodeSystem, place: Place, secret: bytes, number: int, generation: int, of: int
 ) -> Connection:
-    """Call node `of` from node `number`, and return the connection.
+    """Call node `of` as node `number`, and return the connection.
 
     Raises:
         LinkLostError: the node cannot be reached.

@@ -16,8 +16,8 @@ from cavmarl.balance.probe import Watch
 from cavmarl.engine.simulation import Simulation
 from cavmarl.parallel.nodes.links import Links
 
-TOTALS = 7  # numbers that a node reports about itself
-TO_SHOW, TO_BALANCE = "to show", "to balance"  # purposes of requests about machines
+TOTALS = 7  # count of the numbers that a node reports about itself
+TO_SHOW, TO_BALANCE = "to show", "to balance"  # purposes of requests about the load of machines
 LINKS = "links"  # purpose of a request about connections
 
 
@@ -25,7 +25,7 @@ class NodeLoad(NamedTuple):
     """The load of a node since the previous request."""
 
     node: int  # number of the node
-    ticks: int  # of the worlds
+    ticks: int  # simulated ticks
     cpu_s: float  # processor time
     waited_s: float  # time spent waiting for frames
     sent_bytes: int  # to other nodes and to the caller
@@ -38,7 +38,7 @@ class NodeLoad(NamedTuple):
 class MachineAsked(NamedTuple):
     """A request about the machines of nodes."""
 
-    purpose: str  # each purpose has its own time of the previous request
+    purpose: str  # the load counts since the previous request for the same purpose
     processes: dict[str, list[int]]  # machine → processes of this run on it
 
 
@@ -59,7 +59,7 @@ class MachineWatch:
 
 
 def _watch(pids: Sequence[int]) -> Watch:
-    """Watch processes; this process is the first one."""
+    """Watch processes, starting with this process."""
     return Watch(dict(enumerate(dict.fromkeys((os.getpid(), *pids)))))
 
 
@@ -72,7 +72,7 @@ def machine_watch(purpose: str) -> MachineWatch:
 def load_report(
     payload: Any, links: Links, simulation: Simulation, zones: Sequence[int]
 ) -> list[Any]:
-    """Return what a `MachineAsked` asks for, or the load of the node if it is None."""
+    """Return the load of the machine, as a `MachineAsked` requests; None: the load of the node."""
     if payload is not None:
         asked = MachineAsked(*payload)
         if asked.purpose == LINKS:
@@ -82,7 +82,7 @@ def load_report(
 
 
 def totals(links: Links, simulation: Simulation, zones: Sequence[int]) -> list[Any]:
-    """Return the fields of `NodeLoad` from `cpu_s` on; the first four are totals."""
+    """Return the fields of `NodeLoad`, starting with `cpu_s`; the first four are totals."""
     zoned = simulation.division.zoned
     vehicles = int(zoned.num_owned[list(zones)].sum())
     return [

@@ -1,4 +1,4 @@
-"""A network simulator of the caller, which decides what the stations of nodes receive.
+"""A network simulator of the caller, which decides which packets the stations of nodes receive.
 
 All nodes compute the same packets. In each tick, the reporter (the node that reports common
 results) sends a request to the caller, which asks the simulator and sends the answer to all nodes.
@@ -85,10 +85,10 @@ class RemoteNetwork:
 
 
 class ExchangeRequest(NamedTuple):
-    """A request to the simulator, and what is needed to check the answer."""
+    """A request to the simulator, and the data needed to check the answer."""
 
     exchange: Exchange
-    num_packets: NDArray[np.int64]  # in flight, see `check_receptions`
+    num_packets: NDArray[np.int64]  # number of packets in flight, see `check_receptions`
 
 
 def request_of(sent: Exchange, num_packets: NDArray[np.int64]) -> list[Bytes]:

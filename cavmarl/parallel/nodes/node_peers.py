@@ -35,17 +35,17 @@ from cavmarl.zones.kernels.row_frames import Passing, count_own
 
 Array = NDArray[Any]
 _SHARE = FrameKind.SHARE
-SHARE_BITS = 32  # the number of a share has the generation above them
+SHARE_BITS = 32  # low bits of the number of a share; the higher bits are the generation
 PIECES = ("terms", "terminated", "present", "acted", "events", "vehicle_ids", "places")
 
 
 class NodePeers(Peers):
-    """Exchanges shares: each share is one frame to every other node, and one frame from it.
+    """Exchanges shares: for each share, this node and every other node swap one frame.
 
     Attributes:
         own: (W, A) agents for which this node sensed last.
-        stepped: (W, A) the same at the end of the last step, before the autoreset.
-        checks: checks rows of other nodes.
+        stepped: (W, A) `own` at the end of the last step, before the autoreset.
+        checks: refuses bad rows of other nodes.
         owner: (W · A,) node that sensed last for each agent; `UNOWNED`: none.
     """
 
@@ -55,8 +55,8 @@ class NodePeers(Peers):
         self,
         simulation: Simulation,
         links: Links,  # to all other nodes
-        zones: Sequence[Sequence[int]],  # of each node
-        number: int,  # of this node
+        zones: Sequence[Sequence[int]],  # zones of each node
+        number: int,  # number of this node
         generation: int = 0,  # number of changes of nodes
     ) -> None:
         super().__init__(simulation.division)
@@ -97,7 +97,7 @@ class NodePeers(Peers):
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
 
     def begin_step(self) -> None:
-        """Note that the next outputs are those of a step."""
+        """Note that the next outputs belong to a step."""
         self._is_stepping = True
 
     def drop_foreign_rows(self, chosen: NDArray[np.bool_]) -> None:
@@ -322,7 +322,7 @@ class NodePeers(Peers):
         """Receive the present share of another node.
 
         Raises:
-            RecoveryOrderedError: the other node has already got an order to recover.
+            RecoveryOrderedError: the other node has already received an order to recover.
         """
         kind, which, data = self._links.receive_next(number)
         if kind is _SHARE and which == self._sent:
@@ -345,7 +345,7 @@ def _bytes(array: Array) -> Bytes:
 
 
 def _check_end(data: memoryview, at: int) -> None:
-    """Raise MessageError if bytes are left."""
+    """Raise MessageError if the data do not end at `at`."""
     if at != len(data):
         raise MessageError(f"a share has {len(data)} bytes, not {at}")
 

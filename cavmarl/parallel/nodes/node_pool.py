@@ -49,7 +49,7 @@ from cavmarl.zones.kernels.agent_frames import UNOWNED
 
 log = logging.getLogger("cavmarl.nodes")
 
-KEEP_S = 0.2  # time between kept states: a recovery repeats about this much work
+KEEP_S = 0.2  # time between kept states; a recovery repeats about this much work
 END_S = 1.0  # time for nodes to end
 
 Found = TypeVar("Found")
@@ -62,8 +62,8 @@ class NodePool:
     """The nodes of W worlds. A node hosts the same zones in each world.
 
     Attributes:
-        zones: of each node.
-        pids: process of each node, on its machine.
+        zones: zones of each node.
+        pids: process id of each node, on its machine.
         reporter: number of the node that reports the results that all nodes share.
         owner: (W · A,) node that owns each agent, as far as it is known.
         partition: rectangles of the zones, see `node_cuts.zones_as_json`.
@@ -72,7 +72,7 @@ class NodePool:
         generation: number of changes of nodes.
         losses: number of lost nodes.
         recoveries: number of returns to a kept state because of lost nodes.
-        replacements: number of nodes that have replaced lost ones.
+        replacements: number of nodes that have replaced lost nodes.
         redirected: number of actions that were refused by a node and forwarded to the owner.
 
     Raises:
@@ -82,7 +82,7 @@ class NodePool:
 
     owner: NDArray[np.int32]
     _performed: NodeCommand | None = None  # the present command
-    _exchanged = 0  # answers of a network simulator that nodes have got for it
+    _exchanged = 0  # number of answers of a network simulator that nodes have received for it
 
     def __init__(
         self,
@@ -116,7 +116,7 @@ class NodePool:
         self._refused: dict[int, int] = {}  # agent → node that has refused its action
         self._watch = NodeWatch(self._links, self._stopped, self._holder)
         self._nodes: dict[int, JoiningNode] = {}  # living nodes
-        self._present: set[int] = set()  # nodes that have answered in this generation
+        self._present: set[int] = set()  # nodes that have sent a frame in this generation
         self._new: dict[int, tuple[str, int]] = {}  # new nodes → where other nodes can call
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
         self._links.urgent = self._receive
@@ -139,7 +139,7 @@ class NodePool:
         self._next_state += 1
         self._kept: dict[int, Bytes] = {}  # replicas of the states of a single node, by numbers
         self._keep_again_s = -math.inf  # time of the next kept state, by the clock of `_links`
-        self._log: list[NodeCommand] = []  # commands since the state
+        self._log: list[NodeCommand] = []  # commands since the newest kept state
         self.owner = np.full(len(runs) * self._num_ids, UNOWNED, dtype=np.int32)
         self.coordinator = NodeCoordinator(
             [run.run for run in runs],
@@ -152,7 +152,7 @@ class NodePool:
         self._runs = [run.run.hex() for run in runs]
 
     def begin_anew(self, runs: Sequence[WorldRun]) -> None:
-        """Replace the worlds by others before their first reset, maybe another number of them.
+        """Replace the worlds by other worlds before their first reset; their number may change.
 
         Raises:
             WorkerError: too many nodes were lost.
@@ -163,7 +163,7 @@ class NodePool:
         self._begin()
 
     def _begin(self) -> None:
-        """Wait until all nodes have joined, and assign zones; repeat it if a node is lost."""
+        """Wait until all nodes have joined, and assign zones; start over if a node is lost."""
         hostings: list[list[Hosting]] = []
         while True:
             try:
@@ -222,7 +222,7 @@ class NodePool:
         return self._cut.partition
 
     def _seat(self, num: int, waits: bool = True) -> None:
-        """Give ready nodes the numbers of missing ones, and so their home zones."""
+        """Give ready nodes the numbers, and thus the home zones, of missing nodes."""
         empty = [n for n in range(len(self._homes)) if n not in self._nodes]
         for joining_node, connection in self._supply.take(num, self._pump, waits):
             number = joining_node.asked if joining_node.asked in empty else empty[0]
@@ -256,7 +256,7 @@ class NodePool:
         return self._watch.wait(self._living, self._timeout_s, wait)
 
     def _holder(self, agent: int) -> int:
-        """Return the node that has got the action of an agent, or has refused it."""
+        """Return the node that has received the action of an agent, or has refused it."""
         return self._refused.get(agent, self.owner.item(agent))
 
     # Commands, and their repetition when nodes are lost
@@ -269,10 +269,10 @@ class NodePool:
             read: reads the result of a node; an error in it is the fault of the node.
 
         Returns:
-            what `read` returns for each node, first of all for the reporter.
+            what `read` returns for each node, the reporter first.
 
         Raises:
-            WorkerDeathError: no node has a replica of a lost one, or too many were lost.
+            WorkerDeathError: no node has a replica of a lost node, or too many were lost.
         """
         refuse_fork(self._pid, "the nodes")
         self._successions = 0
@@ -310,7 +310,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Carry out a command, if any; recover and try again until no node is lost during it."""
+        """Carry out a command, if any; recover and try again until no node is lost meanwhile."""
         while self._failed:
             number = self._failed.pop()
             self._lose(LinkLostError(number, MessageError("it has ended with an error")))
@@ -334,10 +334,10 @@ class NodePool:
         return found
 
     def _replace_lost(self) -> bool:  # whether the worlds go back to the newest state
-        """Let nodes that have joined in the meantime replace lost ones.
+        """Let nodes that have joined in the meantime replace lost nodes.
 
-        The new nodes get the zones of the newest state from the nodes that host these zones now.
-        With SUMO this is impossible, since no state has all commands to SUMO so far.
+        The new nodes receive the zones of the newest state from the nodes that now host the zones.
+        With SUMO this is impossible, since no kept state has all commands to SUMO so far.
         """
         if not self._is_native:
             return False
@@ -396,7 +396,7 @@ class NodePool:
         """Apply an urgent frame.
 
         Returns:
-            an error of a node, for the caller.
+            an error that a node reports, to be raised in the caller.
         """
         match frame.kind:
             case FrameKind.PONG:
@@ -434,7 +434,7 @@ class NodePool:
         return None
 
     def _keep(self, frame: NodeFrame) -> None:
-        """Keep a replica of the state of the only node. Raises MessageError: there is no state."""
+        """Keep a replica of the only node's state. Raises MessageError: no state was ordered."""
         check_indices("state", [frame.number], self._next_state)
         if frame.number == (self._opened or self._state).number:
             self._kept[frame.number] = frame.data
@@ -450,7 +450,7 @@ class NodePool:
         """Send the receptions to all nodes; in a repeated step, send the same receptions again.
 
         Raises:
-            MessageError: there is no step.
+            MessageError: no step is in progress.
         """
         known = None if self._performed is None else self._performed.receptions
         if known is None:
@@ -466,7 +466,7 @@ class NodePool:
         """Forward actions that a node has refused to their owners.
 
         Raises:
-            MessageError: the agents or owners are unknown, or the node was not to get the actions.
+            MessageError: the agents or owners are unknown, or the node had no such actions.
         """
         found = read_refusal(frame.data, self.owner.size, {*self._living} - {number})
         if (self.owner[found[0]] != number).any():
@@ -481,7 +481,7 @@ class NodePool:
             self._links.send(owner, FrameKind.ACTIONS, self.generation, [actions.some(agents)])
 
     def _lose(self, lost: LinkLostError, has_begun: bool = True) -> None:
-        """Remove a lost node, and start another one in its place.
+        """Remove a lost node, and start another node in its place.
 
         Raises:
             WorkerError: the node had not begun, and too many nodes were lost before they had begun.
@@ -507,9 +507,9 @@ class NodePool:
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
-        """Go back to the newest state of all nodes; living nodes take over zones of lost ones.
+        """Go back to the newest state of all nodes; living nodes take over zones of lost nodes.
 
-        Zones whose home is another living node go there.
+        Zones whose home is another living node move to that node.
 
         Raises:
             LinkLostError: another node is lost.
@@ -532,7 +532,7 @@ class NodePool:
         self.recoveries += bool(moves.heirs or kept)
 
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
-        """Return the new zones of the nodes, and the state's replica if only this process has it.
+        """Return the new zones of the nodes, and the replica of a state that only the caller has.
 
         If the only node is lost, another one takes its place.
 
@@ -588,7 +588,7 @@ class NodePool:
             self._links.send(number, FrameKind.RECOVER, self.generation, [size, data, kept])
 
     def _choose_reporter(self) -> int:
-        """Return the reporter: a node that was there in the last step, if possible."""
+        """Return the reporter: a node that took part in the last step, if possible."""
         old = [number for number in self._living if number not in self._new]
         self.reporter = self.reporter if self.reporter in old else (old or self._living)[0]
         return self.reporter
@@ -597,7 +597,7 @@ class NodePool:
         """Wait for the reports of all nodes on a tick, and commit it.
 
         Returns:
-            the results that came with the reports, that of the reporter first.
+            the results that came with the reports; the result of the reporter comes first.
 
         Raises:
             LinkLostError: a node is lost, or has sent a bad report.

@@ -91,7 +91,7 @@ class NodeProgram:
     def __init__(self, system: NodeSystem, links: Links, address: str, secret: bytes) -> None:
         self.zones: tuple[int, ...] = ()
         self._system, self._links = system, links
-        self._address = address  # of this machine, as the caller reaches it
+        self._address = address  # address of this machine that the caller can reach
         self._secret = secret
         self._network: RemoteNetwork | None = None
         self._number = -1  # the caller sends it with the first RECOVER
@@ -99,7 +99,7 @@ class NodeProgram:
         self._synchronized: set[int] = set()  # nodes whose SYNC of this generation has come
         # world, vehicle and zone of each offer that was answered lately
         self._answered: list[tuple[int, int, int]] = []
-        # node → fault of a frame of it; an earlier report may have been void
+        # node → fault in one of its frames, kept since an earlier report may have been void
         self._faults: dict[int, str] = {}
         self._witness: int | None = None  # node that claims that a recovery is ordered
         self._actions: deque[NodeFrame] = deque()  # forwarded actions
@@ -182,7 +182,7 @@ class NodeProgram:
         settings, division = simulation.config.zones, simulation.division
         limits = limits_of(settings, division.codec.schema)
         gate = simulation.zones.gate
-        if gate is not None:  # the coordinator awaits an answer about each vehicle in each lease
+        if gate is not None:  # the coordinator awaits an answer for each vehicle in each lease
             limits = replace(limits, backoff=0)
         self._endpoints = ZoneEndpoints(
             division, mine, nodes_of(zones), own_hostings, limits,
@@ -192,7 +192,7 @@ class NodeProgram:
         self._run_own()
 
     def _run_own(self) -> None:
-        """Run the phases of the zones of this node from now on."""
+        """From now on, run only the phases of the zones of this node."""
         simulation = self._worlds.simulation
         own = [simulation.shards[zone] for zone in self.zones]
         foreign = [shard for shard in simulation.shards if shard.zone not in self.zones]
@@ -363,7 +363,7 @@ class NodeProgram:
                 return
 
     def _connect(self, places: Mapping[int, Place], others: Sequence[int]) -> None:
-        """Connect to new nodes; of two new nodes, the one with the higher number calls.
+        """Connect to new nodes; of two new nodes, the node with the higher number calls.
 
         Raises:
             LinkLostError: a node cannot be reached.
@@ -492,7 +492,7 @@ class NodeProgram:
         return self._results.packed(peers.own, chosen, peers.stepped, of_step, self._is_reporter)
 
     def _do_alone(self, task: Task, payload: Any) -> None:
-        """Let the first node do a task; it gets the whole worlds from the other nodes."""
+        """Let the first node do a task; the other nodes first send it their parts of the worlds."""
         worlds, answer = self._worlds, list[Bytes]()
         with self._peers.whole(worlds.simulation):
             if self._is_first:
@@ -532,7 +532,7 @@ def run_node(
     note: Callable[[str], None] = lambda text: None,  # receives notes on the progress
     system: NodeSystem = MACHINE,
 ) -> bool:
-    """Run a node until its end.
+    """Run a node until the caller dismisses it or has gone.
 
     Returns:
         True if the caller has dismissed the node, False if the caller has gone.

@@ -37,7 +37,7 @@ def straight(place: Place) -> Place:
 
 
 class NodeStarter:
-    """Starts nodes, and replaces lost ones; by default, nodes that are started by hand."""
+    """Starts nodes, and replaces lost nodes. The base class serves nodes started by hand."""
 
     def __init__(self, count: int) -> None:
         self.count = count  # number of nodes
@@ -46,7 +46,7 @@ class NodeStarter:
         """Return why a node will not come; restart nodes that were killed before they began.
 
         Args:
-            begun: processes of nodes that have begun, which are not checked.
+            begun: process ids of nodes that have begun and need no check.
         """
         return None
 
@@ -220,10 +220,10 @@ Start: TypeAlias = Callable[
 
 def start_nodes(
     backend: BackendName,
-    num_worlds: int,  # limit on the number of Ray actors if the backend has no number
+    num_worlds: int,  # limit on the number of Ray actors if the backend names no number
     settings: WorkersConfig,
     base_dir: Path,  # folder of a relative key file
-    route: Route,  # for nodes of this machine
+    route: Route,  # maps the place of the listener to the place that nodes of this machine call
 ) -> tuple[NodeStarter, TransportListener]:
     """Start nodes, which will call the listener.
 

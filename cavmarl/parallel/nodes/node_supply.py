@@ -21,7 +21,7 @@ from cavmarl.parallel.worlds.journaled_worlds import without_journals
 from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.parallel.worlds.world_message import make_world_message
 
-SPARES = 1  # additional nodes that may wait to replace a lost one
+SPARES = 1  # additional nodes that may wait to replace a lost node
 
 
 class NodeSupply:
@@ -55,8 +55,8 @@ class NodeSupply:
             LocalWorlds(without_journals(world), 1, warm=True)
         self._join_timeout_s = config.workers.join_timeout_s
         self._lock, self._pid = RLock(), os.getpid()
-        self._are_complete = False  # the pools have once had all their nodes
-        self._begun: list[int] = []  # processes of the nodes of pools
+        self._are_complete = False  # whether the pools have had all their nodes at some time
+        self._begun: list[int] = []  # process ids of the nodes of pools
         files = files_of(config, base_dir)
         self._starter, listener = start(backend, num_worlds, config.workers, base_dir, route)
         self.count = self._starter.count
@@ -124,13 +124,13 @@ class NodeSupply:
         return None
 
     def _usable(self) -> list[int]:
-        """Return the ready nodes; spare ones count only once the pools were complete."""
+        """Return the ready nodes; spare nodes count only once the pools have been complete."""
         joining_nodes, spares = self.joining_nodes, range(self.count, ANYONE)
         ready = joining_nodes.ready
         return [n for n in ready if self._are_complete or joining_nodes.asked(n) not in spares]
 
     def replace(self, node: JoiningNode, is_silent: bool) -> None:
-        """Start another node in the place of a lost one."""
+        """Start another node in place of a lost node."""
         with self._lock:
             self._begun.remove(node.pid)
             self._starter.replace(node.asked, is_silent)

@@ -20,7 +20,7 @@ LOOKS = 25  # polls of about a microsecond each
 class NodeSystem(Transport, Protocol):
     """The system of a node: a real machine, or the simulated machine of `cavmarl.verify`."""
 
-    looks: int  # polls of a node for a frame of another node before it sleeps
+    looks: int  # number of times a node polls for a frame of another node before it sleeps
 
     def now_s(self) -> float:
         """Return the time of a monotonic clock of this process."""
@@ -29,7 +29,7 @@ class NodeSystem(Transport, Protocol):
     def worlds_of(
         self,
         message: Mapping[str, Any],
-        trouble: str,  # text for the error if files differ
+        trouble: str,  # error text in case that files differ
         num_worlds: int,
         in_next_step: bool,  # when new episodes start
     ) -> LocalWorlds:

@@ -1,4 +1,4 @@
-"""`NodeWatch`: finds out which node is lost if a node is silent or others cannot reach it."""
+"""`NodeWatch`: finds the lost node if a node is silent or other nodes cannot reach it."""
 
 from __future__ import annotations
 
@@ -25,14 +25,14 @@ Found = TypeVar("Found")
 class Pong(NamedTuple):
     """The answer of a node to a PING."""
 
-    awaited: list[int]  # nodes whose frames it awaits, or COORDINATOR
-    witnesses: list[int]  # node that claims that a recovery is ordered, if it waits for the order
-    answered: Sequence[Sequence[int]]  # world, vehicle and zone of each offer that it has answered
-    agents: list[int]  # whose actions it awaits
+    awaited: list[int]  # nodes whose frames this node awaits, or COORDINATOR
+    witnesses: list[int]  # node that claims a recovery was ordered, if this node awaits the order
+    answered: Sequence[Sequence[int]]  # world, vehicle and zone of each offer this node answered
+    agents: list[int]  # agents whose actions this node awaits
 
 
 class SilentNodeError(LinkLostError):
-    """A node is silent, or another node waits for it in vain; its process may still run."""
+    """A node is silent, or keeps another node waiting; its process may still run."""
 
 
 class NodeWatch:
@@ -42,12 +42,12 @@ class NodeWatch:
         self,
         links: Links,
         stopped: Callable[[], set[int]],  # returns the nodes whose processes are stopped
-        # agent → node that has got its action, or has refused it; raises IndexError
+        # agent → node that has received its action, or has refused it; raises IndexError
         holder: Callable[[int], int],
     ) -> None:
         self._links, self._stopped, self._holder = links, stopped, holder
         self._missed: list[int] = []  # both ends of each connection that nodes have lost
-        # node → nodes that have got a bad frame from it, and the fault of the frame
+        # node → nodes that have received a bad frame from it, and the fault of the frame
         self._faults: dict[int, dict[int, str]] = {}
         self._answered: dict[int, Pong] = {}  # node → its answer to the last PING
         self._pings = 0
@@ -56,7 +56,7 @@ class NodeWatch:
         """Note that a node has lost its connection to another node. Raises LinkLostError.
 
         Args:
-            number: of the node.
+            number: number of the node.
             peer: number of the other node.
             fault: reason why a frame of the other node is bad; empty if the connection has ended.
         """
@@ -70,7 +70,7 @@ class NodeWatch:
         check_indices("PING", [frame.number], self._pings + 1)
         pong = Pong(*read_list(frame))
         if not all(isinstance(part, list) for part in pong):
-            raise MessageError("a PONG has something else than lists")
+            raise MessageError("a PONG has values other than lists")
         peers = [peer for peer in (*pong.awaited, *pong.witnesses) if peer != COORDINATOR]
         check_indices("node", peers, MOST_NODES)
         for agent in pong.agents:
@@ -87,8 +87,8 @@ class NodeWatch:
         """Call `wait` until it succeeds, as long as all nodes answer.
 
         Raises:
-            SilentNodeError: a node does not answer, or its process is stopped, or it owes a frame
-                to another node or to this process, or an offer or its answer after two timeouts.
+            SilentNodeError: a node does not answer, its process is stopped, a process awaits a
+                frame of it, or its offer or answer to an offer is missing after two timeouts.
             WorkerError: all nodes answer, but `wait` does not succeed.
         """
         silence: SilenceError | None = None
@@ -124,7 +124,7 @@ class NodeWatch:
             raise SilenceError(text, silence.offers) from silence
 
     def _without_answer(self, offer: AwaitedOffer) -> SilentNodeError:
-        """Return which node is at fault for an offer without an answer."""
+        """Return an error with the node that is at fault for an unanswered offer."""
         if [offer.world, offer.vehicle, offer.zone] in self._answered[offer.target].answered:
             return SilentNodeError(offer.target, MessageError("its answer to an offer is missing"))
         why = f"it has not offered vehicle {offer.vehicle}, which it reports as offered"
@@ -158,20 +158,20 @@ class NodeWatch:
         for number in sorted(living, key=lambda n: (self._waits(n, living), -awaited[n])):
             if awaited[number]:
                 raise SilentNodeError(number, MessageError("others wait for it"))
-        for number in links.awaited:  # it has sent all it will send, before its answer
+        for number in links.awaited:  # a frame would have come before the answer to the PING
             if number in living and COORDINATOR in self._answered[number].awaited:
                 raise SilentNodeError(number, MessageError("its frame is missing"))
 
     def _waits(self, number: int, living: Sequence[int]) -> bool:
-        """Return whether a node waits for another one."""
+        """Return whether a node waits for another node."""
         return not {*living}.isdisjoint(self._answered[number].awaited)
 
     def most_missed(self, lost: LinkLostError, generation: int) -> LinkLostError:
         """Return the node that is lost, after nodes have reported lost connections.
 
-        It is the node that has ended, or else the node from which most nodes have got a bad frame,
-        or else the node that most nodes cannot reach. If two nodes miss each other, either may be
-        at fault, so they are given up in turn.
+        The lost node is a node that has ended; if none has, the node that has sent bad frames to
+        most nodes; if none has, the node that most nodes cannot reach. If two nodes cannot reach
+        each other, either may be at fault, so they are given up in turn.
 
         Args:
             lost: the first report.

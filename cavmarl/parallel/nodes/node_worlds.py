@@ -66,9 +66,9 @@ HASH = re.compile("[0-9a-f]{32}")  # the hash of a state
 class WorldShare(NamedTuple):
     """The worlds that one node of `NodeGroups` hosts."""
 
-    arrays: StepArrays  # of these worlds
-    runs: Sequence[WorldRun]  # of these worlds
-    supply: NodeSupply  # of all nodes
+    arrays: StepArrays  # step arrays of these worlds
+    runs: Sequence[WorldRun]  # runs of these worlds
+    supply: NodeSupply  # supplies nodes to all pools
 
 
 class NodeWorlds(CommandedWorlds):
@@ -76,7 +76,7 @@ class NodeWorlds(CommandedWorlds):
 
     Attributes:
         pool: the nodes.
-        repartitions: changes of the zones.
+        repartitions: past changes of the zones.
 
     Raises:
         ConfigError: a setting that such worlds do not support, or more nodes than zones.
@@ -128,7 +128,7 @@ class NodeWorlds(CommandedWorlds):
         self._spent_s = np.zeros((1, count))
         self._ticks_per_step = config.clock.ticks_per_step
         self._ticks_done = self._ticks_reported = 0
-        self._steps_begun = 0  # since the worlds were made
+        self._steps_begun = 0  # number of steps since the worlds were made
         self.repartitions: list[Repartition] = []
         self._last_loads: dict[int, list[Any]] = {}  # last report of each node
         every = config.workers.balance_steps
@@ -225,7 +225,7 @@ class NodeWorlds(CommandedWorlds):
     def set_worlds(
         self, arrays: StepArrays, runs: Sequence[WorldRun], saved: Sequence[bytes]
     ) -> None:
-        """Replace the worlds by saved ones. Raises the errors of `NodePool.begin_anew`."""
+        """Replace the worlds by saved worlds. Raises the errors of `NodePool.begin_anew`."""
         self._set_arrays(arrays)
         self.pool.begin_anew(runs)
         self.perform(Task.LOAD, saved)
@@ -259,7 +259,7 @@ class NodeWorlds(CommandedWorlds):
         """Do nothing: the pool has noted the new zones."""
 
     def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
-        """Let all nodes do a task; return what `read` makes of each result."""
+        """Let all nodes do a task; return what `read` returns for each result."""
         try:
             return self.pool.run(self._make_command(task, payload), read)
         except NetworkFailedError as failed:
@@ -277,7 +277,7 @@ class NodeWorlds(CommandedWorlds):
         return self.ask(task, payload)
 
     def ask(self, task: Task, payload: Any = None) -> Any:
-        """Return the answer of the first node, which gets the whole worlds for the task."""
+        """Return the answer of the first node, which receives the whole worlds for the task."""
         read = self._read_proposal if task == Task.PROPOSE else _ANSWERS[task]
         first = self._of_first(lambda data: read(json.loads(bytes(data))))
         return self._run(task, payload, first)[0]
@@ -322,7 +322,7 @@ class NodeWorlds(CommandedWorlds):
     def node_loads(self) -> list[NodeLoad]:
         """Return the load of each node since the previous call, in rising order.
 
-        The load of a node that has replaced a lost one counts from its start.
+        The load of a node that has replaced a lost node counts from the start of the new node.
         """
         found = []
         ticks, self._ticks_reported = self._ticks_done - self._ticks_reported, self._ticks_done
@@ -368,13 +368,13 @@ class NodeWorlds(CommandedWorlds):
         """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: the state is one of other worlds.
+            ConfigError: the state belongs to other worlds.
         """
         self.check_worlds(saved)
         self._command(Task.LOAD, saved)
 
     def check_worlds(self, saved: Sequence[bytes]) -> None:
-        """Raise ConfigError if the worlds cannot resume from saved ones."""
+        """Raise ConfigError if the worlds cannot resume from the saved worlds."""
         if refusal := self.ask(Task.CHECK, worlds_payload(saved)):
             raise ConfigError(refusal)
 
@@ -409,7 +409,7 @@ def empty_arrays(world: World, num_worlds: int) -> StepArrays:
 
 
 def _read_hash(found: Any) -> str:
-    """Read the hash of a state. Raises MessageError: it is something else."""
+    """Check that a value is the hash of a state. Raises MessageError: it is not."""
     if not isinstance(found, str) or not HASH.fullmatch(found):
         raise MessageError(f"it has {found!r} in place of a hash")
     return found
@@ -441,7 +441,7 @@ def _read_watched(number: int, data: memoryview) -> tuple[Candidate, str]:
 
 
 def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]]]:
-    """Read what a node reports about its connections."""
+    """Read the report of a node about its connections."""
     rows = read_json(data, list)
     if rows.pop(0) != number:
         raise MessageError("it reports the connections of another node")

@@ -1,4 +1,4 @@
-"""A bad frame is the fault of its sender: that node counts as lost, and the run goes on."""
+"""Faults of peers: the sender of a bad frame counts as lost, and the run goes on."""
 
 from __future__ import annotations
 
@@ -56,10 +56,10 @@ class reading:
 
 
 def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) -> None:
-    """Check indices of a table with `count` rows before anything is looked up by them.
+    """Check indices into a table with `count` rows before they are used.
 
     Raises:
-        MessageError: an index is no whole number, or out of range.
+        MessageError: an index is not a whole number, or is out of range.
     """
     if isinstance(found, np.ndarray):
         if found.size and not 0 <= int(found.min()) <= int(found.max()) < count:
@@ -71,7 +71,7 @@ def check_indices(what: str, found: Iterable[int] | NDArray[Any], count: int) ->
 
 
 def read_json(data: memoryview | bytes, kind: type[Any]) -> Any:
-    """Read a JSON value of a type from a frame. Raises MessageError: it is something else."""
+    """Read a JSON value of a type from a frame. Raises MessageError: it has another type."""
     try:
         value = json.loads(bytes(data))
     except (ValueError, RecursionError) as error:

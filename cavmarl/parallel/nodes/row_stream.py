@@ -1,7 +1,7 @@
 """`RowStream`: the ghosts that two nodes send each other in each tick.
 
-Both ends keep the ghosts of the previous frame, and forecast those of the next one. A frame has
-only the words that differ from the forecast.
+Both ends keep the ghosts of the previous frame, and forecast the ghosts of the next frame. A frame
+has only the words that differ from the forecast.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ Array = NDArray[Any]
 
 
 class _Room:
-    """Ghosts of the previous frame, and room for those of the present frame."""
+    """Ghosts of the previous frame, and a buffer for the ghosts of the present frame."""
 
-    def __init__(self, words: int) -> None:  # of a ghost
+    def __init__(self, words: int) -> None:  # `words` of a ghost
         self._before, self.now = (_ghosts(np.empty((0, words), dtype=np.int64)) for _ in range(2))
         self.before = self._before
 
@@ -49,7 +49,7 @@ class _Room:
             self.now = _ghosts(huge_zeros((num + num // 2, size), dtype=np.int64))
 
     def turn(self, num: int) -> None:
-        """Let the `num` present ghosts be the previous ones from now on."""
+        """Make the `num` present ghosts the previous ghosts."""
         self._before, self.now = self.now, self._before
         self.before = _ghosts(self._before.words[:num])
 
@@ -60,7 +60,7 @@ def _ghosts(words: Array) -> Ghosts:
 
 def forecast_of(
     roads: RoadArrays,
-    dt: float,  # s of a tick
+    dt: float,  # duration of a tick in s
     ticks_per_step: int,
     of_rows: Bounds,  # see `IndexCheck`
     of_ghosts: Bounds,  # see `IndexCheck`
@@ -82,7 +82,7 @@ def forecast_of(
 
 
 def _word(dtype: np.dtype[Any], name: str) -> int:
-    """Return the word of a record that has a field."""
+    """Return the offset of a field in a record, in words of 8 bytes."""
     assert dtype.fields is not None
     return int(dtype.fields[name][1]) // 8
 
@@ -93,7 +93,7 @@ class RowStream:
     def __init__(
         self,
         zoned: ZoneState,
-        zones: NDArray[np.int64],  # of this node
+        zones: NDArray[np.int64],  # zones of this node
         others: NDArray[np.int64],  # zones of the other node
         running: NDArray[np.int64],  # (W,) see `ExchangeState`
         rerouted: NDArray[np.int64],  # (W,) see `ExchangeState`
@@ -119,8 +119,8 @@ class RowStream:
         """Return the next frame for the other node, valid until the next call.
 
         Args:
-            side: of the rows whose ghosts are sent.
-            passing: vehicles that leave.
+            side: side of the rows whose ghosts are sent.
+            passing: vehicles that leave by the departure queue.
         """
         sent = self._sent
         before = len(sent.before.words)

@@ -1,9 +1,9 @@
 """`StateReplicas`: kept states of the zones of a node, and of the previous node of the ring.
 
-Now and then, between two steps, each node keeps its state, and sends a replica to the next living
-node. When a node is lost, the next one takes over its zones, and all nodes go back to the newest
-state that all of them have. They repeat the commands since then, which gives the same bytes. When
-zones move to another node, for example a new node, all nodes also go back to a kept state.
+From time to time, between two steps, each node keeps its state, and sends a replica to the next
+living node. When a node is lost, the next node takes over its zones, and all nodes go back to the
+newest state that all of them have. They repeat the commands since then, which gives the same bytes.
+When zones move to another node, for example a new node, all nodes also go back to a kept state.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.parallel.worlds.local_worlds import LocalWorlds
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
 Array = NDArray[Any]
-KEPT = 2  # states, since the newest one may not have arrived everywhere
+KEPT = 2  # number of kept states, since the newest one may not have arrived at all nodes
 
 
 class StateReplicas:
@@ -41,14 +41,14 @@ class StateReplicas:
         self, worlds: LocalWorlds, logs: Sequence[ToldLog], links: Links, number: int
     ) -> None:
         self._worlds = worlds
-        self._logs = logs  # of commands to SUMO
+        self._logs = logs  # logs of commands to SUMO
         self._links = links
         self._number = number
         self.own: dict[int, Bytes] = {}
         self.others: dict[int, dict[int, Bytes]] = {}
         self._arrived: dict[int, NodeFrame] = {}  # newest replica of each sender, unread
         self._given: dict[int, NodeFrame] = {}  # state of each node that gives zones away
-        self._is_settled = True  # no state was kept since `settle`
+        self._is_settled = True  # whether no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
         """Switch to other worlds; replicas stay, since their senders may have switched before."""
@@ -57,7 +57,7 @@ class StateReplicas:
         self._given.clear()
 
     def settle(self) -> None:
-        """Drop older states, since the newest one has arrived everywhere."""
+        """Drop older states, since the newest one has arrived at all nodes."""
         if self._is_settled:
             return
         self._is_settled = True
@@ -67,7 +67,7 @@ class StateReplicas:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> list[Array]:
-        """Keep the present state here, and send a replica to the next living node; return it."""
+        """Keep and return the present state, and send a replica to the next living node."""
         saved = self._worlds.save()
         data = to_bytes(saved)
         _add(self.own, state, data)
@@ -81,10 +81,10 @@ class StateReplicas:
         return saved
 
     def resume_from(self, state: int, data: Bytes) -> None:
-        """Take over a state that the coordinator has kept for the only node, which is lost.
+        """Resume from a state that the coordinator has kept for the only node, which is lost.
 
         Raises:
-            ConfigError: the state is one of other worlds.
+            ConfigError: the state belongs to other worlds.
         """
         _drop_later(self.own, -1)
         like = [*(log.words for log in self._logs), *self._worlds.save()]
@@ -96,7 +96,7 @@ class StateReplicas:
         self.own[state] = to_bytes(saved)
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Take the replica of another node; `await_replica` reads it."""
+        """Store the replica of another node unread; `await_replica` reads it."""
         self._arrived[number] = frame
 
     def await_replica(
@@ -104,12 +104,12 @@ class StateReplicas:
     ) -> None:
         """Wait for the state of the previous living node, check it, and keep it.
 
-        A damaged state is found while its sender still lives.
+        So a damaged state is detected while its sender is still alive.
 
         Args:
-            state: its number.
-            zones: of each node.
-            like: the same state of this node.
+            state: number of the state.
+            zones: zones of each node.
+            like: state of this node with the same number.
 
         Raises:
             LinkLostError: the previous node has not sent the state, or its state is damaged.
@@ -131,7 +131,7 @@ class StateReplicas:
         self._is_settled = False
 
     def _check_zones(self, saved: Sequence[Array], zones: Sequence[int]) -> None:
-        """Raise MessageError if a state has vehicles of other zones than these."""
+        """Raise MessageError if a state has vehicles of zones other than `zones`."""
         count = self._worlds.world.partition.count
         first = len(saved) - self._worlds.simulation.num_worlds * count
         found = {n % count for n, rows in enumerate(saved[first:]) if len(rows)}
@@ -139,7 +139,7 @@ class StateReplicas:
             raise MessageError(f"its state has vehicles of zones {sorted(found - {*zones})}")
 
     def receive_given(self, number: int, frame: NodeFrame) -> None:
-        """Take the state of another node, some of whose zones this node will host."""
+        """Store the state of another node, from which this node takes over zones."""
         self._given[number] = frame
 
     def load(
@@ -147,8 +147,8 @@ class StateReplicas:
         state: int,
         lost: Sequence[int],  # nodes whose zones this node takes over
         donors: Sequence[int],  # nodes that give zones to this node
-        takers: Sequence[int],  # nodes that get zones of this node
-        zones: Sequence[int],  # of this node from now on
+        takers: Sequence[int],  # nodes that receive zones of this node
+        zones: Sequence[int],  # new zones of this node
         generation: int,  # number of changes of nodes
     ) -> None:
         """Resume from a kept state.

@@ -1,9 +1,9 @@
 """`ZoneEndpoints`: the zones of a node as endpoints of the ownership protocol.
 
-When a vehicle has crossed a border, its owner offers it by PREPARE to the node of the zone that it
-is in. That node acknowledges the offer to the coordinator and to the source. The coordinator
-decides, and the next STEP of both zones contains the decision. Until then the source keeps the
-vehicle.
+When a vehicle has crossed a border, its owner (the source) sends a PREPARE to the node of the zone
+in which the vehicle is. That node acknowledges the offer to the coordinator and to the source. The
+coordinator decides, and the next STEP of both zones contains the decision. Until then, the source
+keeps the vehicle.
 """
 
 from __future__ import annotations
@@ -62,13 +62,13 @@ _LENGTH = struct.Struct("<II")
 class Report(NamedTuple):
     """Data about a tick of a world for the coordinator, in addition to DONE."""
 
-    # vehicle, zone that it is in, digest of its state in hex
+    # vehicle, zone in which it is, digest of its state in hex
     movers: list[tuple[int, int, str]]
     births: list[tuple[int, int]]  # vehicle, first owner
-    began: bool  # an episode has started after the tick
-    # zone, number of vehicles that it owns by its rows, sum of their `owner_hash`; if checked
+    began: bool  # whether an episode has started after the tick
+    # if checked: zone, number of vehicles that it owns by its rows, sum of their `owner_hash`
     owned: list[tuple[int, int, int]]
-    # a vehicle without a record has crossed a border; it needs a lease of no ticks
+    # whether a vehicle without a record has crossed a border, so that a lease of 0 ticks is due
     is_late: bool = False
 
 
@@ -83,21 +83,21 @@ class ZoneEndpoints(OwnershipRuntime):
     def __init__(
         self,
         division: ZonedShards,
-        zones: Sequence[int],  # of this node
+        zones: Sequence[int],  # zones of this node
         node_of: Sequence[int],  # zone → node
-        hostings: Sequence[Sequence[Hosting]],  # of these zones, by worlds
+        hostings: Sequence[Sequence[Hosting]],  # hostings of these zones, by worlds
         limits: Limits,
         links: Links,  # to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
         checks: IndexCheck,  # checks offered vehicles
-        # output: world, vehicle and zone of each offer that was answered in the present lease or in
-        # the one before
+        # output: world, vehicle and zone of each offer that was answered in the present or the
+        # previous lease
         answered: list[tuple[int, int, int]],
         *,
         generation: int = 0,  # number of changes of nodes
-        is_checked: bool = False,  # the caller checks the vehicles that zones own
-        ticks: int = 1,  # of a lease
-        gate: ZoneGate | None = None,  # the simulators of zones of this node; None: none
+        is_checked: bool = False,  # whether the caller checks which vehicles each zone owns
+        ticks: int = 1,  # ticks of a lease
+        gate: ZoneGate | None = None,  # the simulators of zones of this node, if any
     ) -> None:
         self._gate, self._limits = gate, limits
         # world, vehicle → number of leases in a row in which a simulator has refused it
@@ -111,7 +111,7 @@ class ZoneEndpoints(OwnershipRuntime):
         # world, vehicle → node that has offered it last
         self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
-        self._answered, self._num_answered = answered, 0  # number before the present lease
+        self._answered, self._num_answered = answered, 0  # `_num_answered` before the present lease
         answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -129,7 +129,7 @@ class ZoneEndpoints(OwnershipRuntime):
         self._early: list[tuple[int, int, Message]] = []
         self._began = [False] * num_worlds
         self._stirred = [True] * num_worlds
-        self._is_quiet = [False] * num_worlds  # the lease has come without a STEP
+        self._is_quiet = [False] * num_worlds  # whether the lease has no STEP for the world
         self._is_open = False
 
     # Called by a tick
@@ -180,7 +180,7 @@ class ZoneEndpoints(OwnershipRuntime):
         return self._is_quiet[w] or len(self._leases[w]) == len(self._zones)
 
     def note(self, messages: Sequence[tuple[int, Message]]) -> None:
-        """Apply a lease of no ticks: it records births, so that they can be offered."""
+        """Apply a lease of 0 ticks: it records new vehicles, so that they can be offered."""
         self.lease(messages)
         self._enter_lease()
         self._stirred = [True] * len(self._stirred)
@@ -253,7 +253,7 @@ class ZoneEndpoints(OwnershipRuntime):
         self._is_open = False
 
     def _rests(self, w: int) -> bool:
-        """End a quiet lease if there is nothing to report; return whether that is so."""
+        """Return whether a quiet lease has nothing to report; if so, end the lease."""
         endpoints = self._endpoints[w].values()
         if self._began[w] or self._stirred[w] or self._gone[w] or self._births[w]:
             return False
@@ -289,10 +289,10 @@ class ZoneEndpoints(OwnershipRuntime):
                 yield endpoint.complete(0, left.get(zone, ()))
 
     def _offer(self, w: int, began: bool) -> tuple[list[tuple[int, int, str]], bool]:
-        """Offer vehicles that have crossed a border to the zones that they are in.
+        """Offer vehicles that have crossed a border to the zones in which they are.
 
         Returns:
-            movers of the report, and whether vehicles without a record have crossed, too.
+            movers of the report, and whether vehicles without a record have also crossed a border.
         """
         division, endpoints = self._division, self._endpoints[w]
         check_all, self._stirred[w] = self._stirred[w] or began, False
@@ -350,7 +350,7 @@ class ZoneEndpoints(OwnershipRuntime):
         endpoint = self._endpoints[w][zone]
         if isinstance(message, Prepare):
             if message.episode == endpoint.episode + 1:
-                self._early.append((number, w, message))  # the other node got its lease first
+                self._early.append((number, w, message))  # the other node received its lease first
                 return
             self._sources |= {(w, offer.vehicle): number for offer in message.entries}
         elif isinstance(message, Abort):
@@ -384,7 +384,7 @@ class ZoneEndpoints(OwnershipRuntime):
         return self._gate is not None and zone in self._gate.zones
 
     def _send(self, w: int, message: Message) -> None:
-        """Send a message to its zones, in this process or others, and to the coordinator."""
+        """Send a message to its destination zones, in any process, and to the coordinator."""
         if isinstance(message, Ack | Nack):
             self._answered += [(w, entry.vehicle, message.zone) for entry in message.entries]
         for destination in message.destinations():
@@ -528,7 +528,7 @@ def read_report(
     data: memoryview,
     num_worlds: int,
 ) -> tuple[list[tuple[int, Message]], list[Report], memoryview]:
-    """Return the messages, the reports of the worlds, empty if none has any, and the rest."""
+    """Return the messages, the reports of all worlds (empty: no reports), and the other bytes."""
     size, length = _LENGTH.unpack_from(data)
     if not size and not length:
         return [], [], data[_LENGTH.size :]

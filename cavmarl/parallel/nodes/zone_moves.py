@@ -8,15 +8,15 @@ from typing import Any, NamedTuple
 from cavmarl.core.errors import MessageError, WorkerDeathError
 from cavmarl.parallel.nodes.peer_faults import check_indices, read_json
 
-Zones = list[list[int]]  # of each node
+Zones = list[list[int]]  # zones of each node
 
 
 class ZoneMoves(NamedTuple):
-    """The changes with which nodes resume from a state that they have kept."""
+    """Changes of the hosts of zones, with which nodes resume from a kept state."""
 
-    zones: Zones  # from now on
+    zones: Zones  # new zones of each node
     heirs: dict[int, int]  # lost node → node that takes over its zones
-    donors: list[tuple[int, int]]  # node that gives zones away, and node that gets them
+    donors: list[tuple[int, int]]  # node that gives zones away, and node that receives them
 
 
 def living_of(zones: Sequence[Sequence[int]]) -> list[int]:
@@ -69,7 +69,7 @@ def moves_of(
     """Give the zones of a lost node to the next node of the ring; return zones to their homes.
 
     Raises:
-        WorkerDeathError: the next node is lost, too.
+        WorkerDeathError: the next node is lost as well.
     """
     ring = living_of(kept)
     zones = [list(some) for some in kept]

@@ -1,1 +1,1 @@
-"""Which worker or node runs what, how that changes, and the commands that go there."""
+"""Which worker or node runs which worlds and zones, how they move, and commands to the workers."""

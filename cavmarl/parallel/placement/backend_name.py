@@ -26,7 +26,7 @@ class BackendName:
 
     Attributes:
         kind: one of `OWN`, or the name of a registered backend.
-        count: number of processes or nodes; None: no number, or as many as are of use.
+        count: number of processes or nodes; None: no number given, or as many as are useful.
         address: host and port to listen on for nodes started by hand, or MPI, whose other ranks are
             the nodes.
     """
@@ -49,7 +49,7 @@ class BackendName:
 
     @property
     def logs_transfers(self) -> bool:
-        """True if the worlds have a log of the changes of owner between zones."""
+        """True if the worlds log changes of the zone that owns a vehicle."""
         return self.kind in (LOCAL, NODES, RAY)
 
     @property
@@ -58,7 +58,7 @@ class BackendName:
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
-        """Return whether there are more processes or nodes than worlds, which share zones."""
+        """Return whether processes or nodes share the zones of worlds, being more than worlds."""
         return self.count is not None and self.count > num_worlds
 
 
@@ -68,10 +68,10 @@ def read_backend(
     nodes: int | None = None,
     registered: Collection[str] = (),
 ) -> BackendName:
-    """Read where worlds run; the given arguments have to agree.
+    """Return the backend that the arguments name; they have to agree.
 
     Args:
-        backend: one of `FORMS`; None: by the short forms, else local.
+        backend: one of `FORMS`; None: as the short forms say, or else local.
         workers: short form: N for `processes:N`, 0 for `local`.
         nodes: short form: N for `nodes:N`.
         registered: names of registered backends.
@@ -127,7 +127,7 @@ def _read(backend: str, registered: Collection[str]) -> BackendName:
 
 
 def read_address(text: str) -> Address:
-    """Read HOST:PORT. Raises ConfigError: the text is something else."""
+    """Read HOST:PORT. Raises ConfigError: the text has another form."""
     host, colon, port = text.rpartition(":")
     if not (host and colon and port.isascii() and port.isdigit() and 0 < int(port) < 1 << 16):
         raise ConfigError(f"{text!r}: must be HOST:PORT, like 192.168.1.10:7600")

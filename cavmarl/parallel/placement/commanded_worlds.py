@@ -57,7 +57,7 @@ class CommandedWorlds(ABC):
     placement: StepPlacement
     mover: Mover | None = None
     pool: CommandedPool
-    _steps = 0  # since the last reset of all worlds
+    _steps = 0  # number of steps since the last reset of all worlds
 
     @property
     def simulation(self) -> Simulation:
@@ -73,7 +73,7 @@ class CommandedWorlds(ABC):
 
     @property
     def worker_pids(self) -> dict[int, int]:
-        """Worker → process, for workers on this machine."""
+        """Worker → process id, for workers on this machine."""
         return {worker: pid for worker, pid in self._pids().items() if pid}
 
     def close(self) -> None:
@@ -81,7 +81,7 @@ class CommandedWorlds(ABC):
 
     @abstractmethod
     def _pids(self) -> Mapping[int, int]:
-        """Return worker → process, as far as this machine can observe the processes."""
+        """Return worker → process id, for processes that this machine can observe."""
 
     def _seen(self) -> LoadSnapshot:
         return self.placement.snapshot(self._pids())
@@ -110,13 +110,13 @@ class CommandedWorlds(ABC):
     def step(self, commands: Commands) -> None:
         """Let the agents act, and reset worlds whose episode is over, now or a step later.
 
-        Before that, worlds or zones move to other workers if that is due.
+        If a round of balancing is due, worlds or zones move to other workers first.
         """
         parts = None if self.mover is None else self.mover.before_step(self._command, self._seen)
         if parts is not None:
             self._settle(parts)
         arrays = self.arrays
-        if commands.controls is not arrays.controls:  # `CavVectorEnv` decodes into them
+        if commands.controls is not arrays.controls:  # `CavVectorEnv` decodes into `arrays`
             arrays.controls[:] = commands.controls
             arrays.meta_actions[:] = commands.meta_actions
         arrays.declared[:] = commands.declared if commands.declared.size else 0

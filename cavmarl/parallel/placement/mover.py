@@ -22,15 +22,15 @@ Run = Callable[[Task, Any, bool], None]
 
 
 class Mover:
-    """Counts steps; from time to time, makes new plans and moves worlds or zones accordingly."""
+    """Counts steps; every `every` steps, makes new plans and moves worlds or zones accordingly."""
 
     def __init__(
         self,
         placement: StepPlacement,  # the plans
-        num_zones: int,  # of each world
-        every: int,  # steps from one round to the next
-        # (W, zones) total processor time of each shard, which the workers update; a whole world is
-        # one zone
+        num_zones: int,  # number of zones of each world
+        every: int,  # steps from one round of balancing to the next
+        # (W, zones) total processor time of each shard in s, which the workers update; if whole
+        # worlds are placed, each world has one column
         spent_s: NDArray[np.float64],
     ) -> None:
         self._placement = placement
@@ -95,7 +95,7 @@ class MovingMemory:
     def __init__(
         self,
         num_worlds: int,  # W
-        num_zones: int,  # of each world; 1 if whole worlds are placed
+        num_zones: int,  # number of zones of each world; 1 if whole worlds are placed
         outboxes: int,
     ) -> None:
         layout = {"spent_s": ("<f8", (num_worlds, num_zones))}

@@ -35,7 +35,7 @@ class StepPlacement:
         world: World,
         num_worlds: int,
         workers: int,
-        is_here: bool = True,  # workers are on this machine, not on machines of their own
+        is_here: bool = True,  # whether all workers are on this machine
     ) -> None:
         settings = world.config.workers
         self._rule = BalanceRule(
@@ -70,11 +70,11 @@ class StepPlacement:
 
     def round(
         self,
-        spent_s: Floats,  # (W, zones) total processor time of each shard; a whole world is one zone
-        steps: int,  # since the last round
+        spent_s: Floats,  # (W, zones) total processor time of each shard; (W, 1) for whole worlds
+        steps: int,  # number of steps since the last round
         seen: LoadSnapshot,  # how busy workers are
     ) -> bool:  # whether shards have to move
-        """Make new plans by the costs of shards since the last round."""
+        """Make new plans from the costs of shards since the last round."""
         cost_s = (spent_s - self._before_s) / (steps * self._ticks_per_step)
         self._before_s = spent_s.copy()
         for balancer in self._balancers:
@@ -105,7 +105,7 @@ class StepPlacement:
         self,
         pids: Mapping[int, int],  # worker → process
     ) -> LoadSnapshot:
-        """Return how busy workers are; idle if not measured, or if a worker was replaced."""
+        """Return how busy workers are; idle if unknown, as after the replacement of a worker."""
         watch, before = self._watch, self._pids
         self.watch(pids)
         if watch is None or before != pids:

@@ -24,8 +24,8 @@ class Part(NamedTuple):
     """The part of one team of workers; most teams are a single worker."""
 
     first: int  # first world
-    last: int  # world after the last one; a team of several workers has one world
-    zones: list[list[int]]  # of each worker
+    last: int  # number after the last world; a team of several workers has one world
+    zones: list[list[int]]  # zones of each worker
 
     @property
     def names(self) -> list[str]:

@@ -1,8 +1,8 @@
 """Placement of workers on cores: no two workers share a core while there are enough cores.
 
-Operating systems put processes that wake together on one core, where one waits for the other, and
-take many steps to move one to a free core. A worker found on a shared core is kept off the cores of
-the other workers. Apart from that the system is free to place it.
+Operating systems put processes that wake together on one core, where one process waits for the
+other, and take many steps to move one of them to a free core. A worker on a shared core is kept off
+the cores of the other workers. Otherwise the system is free to place it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ def homes(
     cores: Sequence[int],  # where each process was seen
     usable: set[int],
 ) -> list[int]:  # different cores; empty if there are too few
-    """Choose each process's core: where it was seen, unless an earlier process was seen there."""
+    """Choose each process's core: where it was seen, unless an earlier process has that core."""
     free = sorted(usable - set(cores))
     found: list[int] = []
     for core in cores:
@@ -34,8 +34,8 @@ def homes(
 
 
 def keep_apart(
-    pids: Sequence[int],  # of processes that work at the same time
-    cores: Sequence[int],  # where each was seen; -1: unknown
+    pids: Sequence[int],  # ids of processes that work at the same time
+    cores: Sequence[int],  # core where each process was seen; -1: unknown
 ) -> None:
     """Keep each process off the cores of the others, if two of them shared a core."""
     if len(set(cores)) == len(cores) or UNKNOWN in cores:

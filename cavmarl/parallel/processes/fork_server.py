@@ -1,4 +1,4 @@
-"""`ForkServer`: the process that forks the workers of a pool, as the pool sees it."""
+"""`ForkServer`: the pool's handle of the process that forks its workers."""
 
 from __future__ import annotations
 
@@ -51,10 +51,10 @@ class Process:
     pid: int  # not reused until the process is reaped
     pidfd: int  # readable when the process has ended
     wire: socket.socket  # connection to the process
-    mail: list[bytes] = field(default_factory=list)  # received messages that are not read yet
+    mail: list[bytes] = field(default_factory=list)  # received messages that are still unread
 
     def collect(self) -> None:
-        """Receive all messages that have come, and drop messages that only wake."""
+        """Receive all messages that have come, and drop messages that are only wake-ups."""
         with suppress(BlockingIOError, ConnectionResetError):
             while self.receive():
                 pass
@@ -64,7 +64,7 @@ class Process:
 
         Raises:
             BlockingIOError: no message has come.
-            ConnectionResetError: the other end was closed with unread messages.
+            ConnectionResetError: the other end was closed before it had read all messages.
         """
         message = self.wire.recv(MAX_MESSAGE, socket.MSG_DONTWAIT)
         if message and message != WAKE:
@@ -93,7 +93,7 @@ class ForkServer:
 
     def __init__(
         self,
-        program: str,  # module that the server runs, which calls `worker_loop.serve`
+        program: str,  # module that the server runs; it has to call `worker_loop.serve`
         start: Mapping[str, Any],  # JSON message for the server, with numbers of descriptors
         descriptors: tuple[int, ...],  # inherited by the server and its workers
     ) -> None:

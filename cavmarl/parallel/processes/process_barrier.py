@@ -1,14 +1,14 @@
 """A barrier of two processes: a waiting process polls for a moment, then it sleeps.
 
-Each of the two sides has a line of 64-bit words that only this side writes. Word `NUMBER` counts
-what the side has done; word `ASLEEP` says whether it has to be woken. A side that waits first polls
-the number of the other side in a compiled loop, which reacts within a fraction of a microsecond.
-Then it sleeps on a socket, which takes no processor time.
+Each of the two sides writes its own cache line of 64-bit words. Word `NUMBER` counts the steps of
+its work; word `ASLEEP` says whether the side has to be woken. A waiting side first polls the number
+of the other side in a compiled loop, which reacts within a fraction of a microsecond. Then the
+waiting side sleeps on a socket, which takes no processor time.
 
 No wake-up is lost, because all accesses are sequentially consistent. Before it sleeps, a side
 writes `ASLEEP`, then reads the number of the other side. The other side writes its number, then
-reads `ASLEEP`. At least one of the two reads returns the new value: the first side does not sleep,
-or the other side wakes it. A side that sees a number also sees all memory written before it.
+reads `ASLEEP`. At least one of the two reads returns the new value: either the first side does not
+sleep, or the other side wakes it. A side that sees a number also sees all memory written before.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from cavmarl.core.compiled.intrinsic import intrinsic
 Words = NDArray[np.int64]
 
 WORDS = 8  # words of a line, which is one cache line
-NUMBER, ASLEEP = 0, 1  # words of this module; callers define the others
+NUMBER, ASLEEP = 0, 1  # words that this module uses; callers define the other words
 
 SHORT_S = 20e-6  # a side polls for this time before it sleeps
 LONG_S = 200e-6  # a side polls for this time if its previous wait was not longer
 LONG_WORK_S = 500e-6  # after a longer wait or more work, a side does not poll for `LONG_S`
-PAUSES = 4  # polls before it yields the core
-ROUNDS = 16  # yields before it reads the clock
+PAUSES = 4  # polls before a side yields the core
+ROUNDS = 16  # yields before a side reads the clock
 ALONE_S = 300e-6  # a side with a core of its own polls without yielding for this time
 AWAKE_S = 10e-3  # within a command, a side polls and yields for this time
 NAP_S = 100e-6  # after `AWAKE_S`, a side sleeps for this time between polls
@@ -90,7 +90,7 @@ def _generate_pause(typing: Any) -> Any:
 
 
 def _generate_system_call(name: str) -> Any:
-    """Return a generator of calls to a function of the C library that gives an int32."""
+    """Return a code generator for calls to a C library function that returns an int32."""
 
     def generator(typing: Any) -> Any:
         from llvmlite import ir
@@ -221,11 +221,11 @@ def post(mine: Words, number: int) -> None:
 def wait_for(
     theirs: Words,  # (WORDS,) line of the other side
     number: int,  # the awaited number
-    # whether the other side was last seen on another core. Then this side does not yield at first,
-    # since another program could keep the core for milliseconds
+    # whether the other side was last seen on another core; if so, this side does not yield at
+    # first, since another program could keep the core for milliseconds
     is_apart: bool = False,
 ) -> None:
-    """Wait until the other side reaches a number; only a dead side takes long."""
+    """Wait until the other side reaches a number; the wait is short unless that side is dead."""
     if look(theirs, number, False):
         return
     now = time.perf_counter()
@@ -244,7 +244,7 @@ class WakeSignal:
         mine: Words,  # (WORDS,) line of this side
         theirs: Words,  # (WORDS,) line of the other side
         wire: socket.socket,  # connection to the other side, over which a sleeping side is woken
-        crowded: bool,  # there are more processes than cores, so a polling side yields
+        crowded: bool,  # whether there are more processes than cores, so that polling sides yield
     ) -> None:
         self.mine = mine
         self.theirs = theirs
@@ -259,7 +259,7 @@ class WakeSignal:
             _pass()  # the other side may poll or wake up on this core
 
     def announce(self, number: int) -> int:
-        """Set the number of this side; the result is not 0 if the other side has to be woken."""
+        """Set the number of this side; return 0 unless the other side has to be woken."""
         return _set(self.mine, NUMBER, number, self.theirs)
 
     def wake_peer(self) -> None:
@@ -274,7 +274,7 @@ class WakeSignal:
         number: int,  # the awaited number
         last_s: float,  # duration of the previous wait
         work_s: float = 0.0,  # duration of the work since then
-        is_soon: bool = False,  # the caller knows that it does not take long
+        is_soon: bool = False,  # whether the caller expects a short wait
     ) -> bool:
         """Poll for a moment whether the other side reaches a number.
 
@@ -297,7 +297,7 @@ class WakeSignal:
         self.mine[ASLEEP] = 1  # the other side sees this word before or with that number
 
     def sleep(self, number: int) -> bool:
-        """Mark this side as asleep; return False if the number is already there."""
+        """Mark this side as asleep; return False if the other side has reached the number."""
         _set(self.mine, ASLEEP, 1, self.theirs)
         if self.has(number):
             self.wake()

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 CHECK_S = 0.1  # time between checks
-STILL_CHECKS = 8  # checks in a row at which a process may sleep without processor time
-AT_WORK = ("R", "D")  # states: runnable, waits for a disk
-STOPPED_CHECKS = 2  # checks in a row at which it is stopped
+STILL_CHECKS = 8  # checks in a row at which a process may be asleep and use no processor time
+AT_WORK = ("R", "D")  # states of a working process: runnable, waiting for a disk
+STOPPED_CHECKS = 2  # checks in a row after which a process counts as stopped
 
 
 class Watchdog:
@@ -21,7 +21,7 @@ class Watchdog:
         self,
         pid: int,
         timeout_s: float,  # limit on the work; times without calls of `verdict` do not count
-        may_sleep: bool = False,  # whether it may wait for programs that are not its descendants
+        may_sleep: bool = False,  # whether the process may wait for programs other than descendants
     ) -> None:
         self._pid = pid
         self._may_sleep = may_sleep
@@ -32,7 +32,7 @@ class Watchdog:
         self._stopped = 0
 
     def verdict(self) -> str | None:
-        """Return what is wrong with the process, None: nothing. Call it every `CHECK_S`."""
+        """Return what is wrong with the process; None: nothing. Call this every `CHECK_S`."""
         try:
             state, spent = read_state(self._pid)
         except OSError:

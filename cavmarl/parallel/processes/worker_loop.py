@@ -34,7 +34,7 @@ from cavmarl.parallel.processes import process_barrier as barrier
 from cavmarl.parallel.processes.process_barrier import NUMBER, WAKE, WORDS, WakeSignal, present_core
 from cavmarl.parallel.state.state_image import Arrays, Image
 
-# Words of the line of the pool, after those of `process_barrier`.
+# Words of the pool's line, after the words of `process_barrier`.
 TASK, PAYLOAD, SLOT, COMMITTED, LOADS = 2, 3, 4, 5, 6
 # Words of the line of a worker: how its command ended, and the core on which it began.
 ANSWER, CORE = 2, 3
@@ -56,10 +56,10 @@ class Job:
 
     def perform(
         self,
-        task: int,  # its number, from 0 on; each kind of job has tasks of its own
+        task: int,  # number of the task, counted from 0 for each kind of job
         payload: Any,  # JSON value from the pool, often None
     ) -> Any:
-        """Do a task, and return its answer, a JSON value, or None if it has none."""
+        """Do a task, and return its answer as a JSON value; None: no answer."""
         raise NotImplementedError
 
     def save(self) -> Arrays:
@@ -88,7 +88,7 @@ MakeJobs = Callable[[Mapping[str, Any]], Sequence[Job]]
 
 def serve(make_jobs: MakeJobs) -> NoReturn:
     """Run the fork server until the pool is closed."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the pool, which ends all
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # the pool handles Ctrl-C, and ends all processes
     faulthandler.enable()
     start = json.loads(sys.argv[1])
     pool = socket.socket(fileno=start["pool"])
@@ -172,7 +172,7 @@ def _fork_on_demand(
 
 
 def _end(alive: set[int]) -> NoReturn:
-    """End with all workers, and reap them, after the pool was closed."""
+    """End all workers, reap them, and exit, after the pool was closed."""
     for pid in alive:
         os.kill(pid, signal.SIGKILL)
     for pid in alive:

@@ -1,10 +1,10 @@
 """`Pool`: worker processes that carry out commands together, and survive deaths of workers.
 
-Each worker has its state in its own memory, and writes an image of it after each command that
-changes it. A worker has two images: the committed image, and the image that it writes. When all
-workers have carried out a command, the pool commits it. If a worker dies before that, its successor
-resumes from the committed image and repeats the command. Commands are deterministic, so the result
-is the same.
+Each worker has its state in its own memory, and writes an image of the state after each command
+that changes it. A worker has two images: the committed image, and the image that it writes. When
+all workers have carried out a command, the pool commits the command. If a worker dies before that,
+its successor resumes from the committed image and repeats the command. Commands are deterministic,
+so the result is the same.
 """
 
 from __future__ import annotations
@@ -39,12 +39,12 @@ class Death:
     """The death of a worker process and its replacement; times are of `time.monotonic`."""
 
     worker: int  # number of the worker
-    order: int  # number of the command at that time
+    order: int  # number of the command in progress
     cause: str  # signal, exit status, or why the process was given up
     ordered_s: float  # when the command was sent
     noticed_s: float  # when the death was noticed
-    replaced_s: float  # when the successor had the command
-    done_s: float = nan  # when the successor had carried it out; nan: not yet
+    replaced_s: float  # when the successor had received the command
+    done_s: float = nan  # when the successor had carried out the command; nan: not yet
 
 
 class Pool:
@@ -52,7 +52,7 @@ class Pool:
 
     Raises:
         WorkerError: a process cannot be started, or there is not enough memory.
-        WorkerFailureError: an exception while the jobs were made.
+        WorkerFailureError: an exception was raised while the jobs were made.
     """
 
     def __init__(
@@ -63,14 +63,14 @@ class Pool:
         may_sleep: bool = False,  # whether workers may wait for other programs
     ) -> None:
         self._may_sleep = may_sleep
-        self.deaths: list[Death] = []  # since the start
+        self.deaths: list[Death] = []  # all deaths since the start
         self._program = program
         self._timeout_s = timeout_s
         self._repeats = repeats
         self._all = tuple(range(len(program.parts)))
         self._committed = -1  # the slot of the committed images
         self._open: tuple[int, ...] = ()  # workers with a command that is not committed
-        self._stale = [False] * len(program.parts)  # memory differs from what is committed
+        self._stale = [False] * len(program.parts)  # workers whose memory differs from their image
         self._ordered_s = 0.0
         self._lasted: dict[int, float] = {}  # last duration of each task in s
         self._pid = os.getpid()
@@ -99,7 +99,7 @@ class Pool:
             the answer of each worker.
 
         Raises:
-            WorkerDeathError: too many processes died of the task; the pool is closed.
+            WorkerDeathError: too many processes died during the task; the pool is closed.
             WorkerFailureError: a worker raised an exception; the state is that before the task.
         """
         return self._command(self._all, task, payload, commits)
@@ -177,7 +177,7 @@ class Pool:
             asked = pending
             pending = self._pending()
             if pending and len(pending) < len(asked):
-                # Work is shared so that all workers end at about the same time.
+                # Work is shared so that all workers finish at about the same time.
                 self._processes.drain_wakeups()
                 pending = [k for k in pending if not self._processes.watch(k, is_soon=True)]
             self._note_done(first, pending)
@@ -198,7 +198,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Note the time in `deaths[first:]` whose successors have just finished."""
+        """Set `done_s` in those of `deaths[first:]` whose successors have just finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()
@@ -239,7 +239,7 @@ class Pool:
 
 
 class _Guard:
-    """Checks from time to time the workers for which the pool waits."""
+    """Regularly checks the workers for which the pool waits."""
 
     def __init__(
         self, processes: WorkerProcesses, timeout_s: float, since_s: float, may_sleep: bool

@@ -37,15 +37,15 @@ _FIRST_IMAGE_BYTES = 1 << 12
 class Program(NamedTuple):
     """The program of the workers of a pool."""
 
-    module: str  # run as a program, which calls `worker_loop.serve`
+    module: str  # module that runs as the program; it has to call `worker_loop.serve`
     message: Mapping[str, Any]  # JSON value from which the program makes the jobs
     parts: tuple[str, ...]  # description of the part of each worker
-    # memory shared by the jobs and the pool, which closes it; the message names the descriptors
+    # memory shared by the jobs and the pool, which the pool closes; `message` names descriptors
     segments: tuple[Segment, ...]
     tasks: tuple[str, ...]  # name of each task, by its number
-    pins: bool = False  # pin each worker to a core of its own, as far as there are enough cores
+    pins: bool = False  # whether to pin each worker to a core of its own, if there are enough cores
     # groups of workers that share their state, so that none can go on without the others; a worker
-    # in no team is alone
+    # that is in no group has a state of its own
     teams: tuple[tuple[int, ...], ...] = ()
 
     def team_of(self, worker: int) -> tuple[int, ...]:
@@ -107,15 +107,15 @@ class WorkerProcesses:
         self,
         workers: Sequence[int],
         head: tuple[int, ...],  # words of the command, from TASK to COMMITTED
-        stale: Sequence[bool],  # of all workers: whether the memory differs from what is committed
+        stale: Sequence[bool],  # for each worker, whether its memory differs from its image
         mail: bytes | None,  # payload
-        # this side sleeps at once, since a worker may wait for its core
+        # whether this side sleeps at once, since a worker may wait for its core
         sleeps: bool = False,
     ) -> None:
         """Send the next command; `sleep` detects dead workers.
 
-        Polling workers get the command before any other is woken. A worker that may need the core
-        of this process is woken last.
+        Polling workers receive the command before sleeping workers are woken. A worker that may
+        need the core of this process is woken last.
         """
         if sleeps:
             for k in workers:
@@ -142,7 +142,7 @@ class WorkerProcesses:
         return self._signals[k].has(self.number(k))
 
     def watch(self, k: int, last_s: float = 0.0, is_soon: bool = False) -> bool:
-        """Poll for a moment whether a worker finishes its command; longer if it is due soon."""
+        """Poll briefly whether a worker finishes its command; longer if `is_soon`."""
         return self._signals[k].watch(self.number(k), last_s, is_soon=is_soon)
 
     def sleep(
@@ -169,7 +169,7 @@ class WorkerProcesses:
     def drain_wakeups(self) -> None:
         """Drain the sockets, so that old messages do not wake this side again.
 
-        Usually there is one message; the next call reads another one.
+        Each call reads one message per socket. Usually there is only one.
         """
         for k in self._woken_by:
             with suppress(BlockingIOError, ConnectionResetError):
@@ -179,7 +179,7 @@ class WorkerProcesses:
     def _none_has_finished(self, pending: Sequence[int]) -> bool:
         """Drain late wake-ups; return False if a worker has finished.
 
-        Call this after the workers got their command. If it drains a wake-up that belongs to
+        Call this after the workers received their command. If it drains a wake-up that belongs to
         this command, the number of that worker is already set.
         """
         for fd, _ in self._poll.poll(0):
@@ -193,7 +193,7 @@ class WorkerProcesses:
         """Wait up to a limit for a worker to finish or to die; return whether it did."""
         process = self.processes[k]
         if has_ended([process.pidfd], 0.0 if self.has(k) else limit_s):
-            self._statuses[k][NUMBER] = self.number(k)  # its writer, the worker, is dead
+            self._statuses[k][NUMBER] = self.number(k)  # the worker is dead
         process.collect()
         process.mail.clear()
         return self.has(k)
@@ -255,10 +255,10 @@ class WorkerProcesses:
         asked = [j for j in team if j in ordered]
         if not all(self.has(j) for j in asked):
             for j in asked:
-                self._statuses[j][NUMBER] = self.number(j) - 1  # its writer is dead
+                self._statuses[j][NUMBER] = self.number(j) - 1  # the worker is dead
 
     def _hand_over(self, k: int, old: Process, mail: bytes | None) -> None:
-        """Give a new process the mail from the old one, or else the payload again."""
+        """Give a new process the unread messages of the old process, or else the payload again."""
         if self.has(k):
             self.processes[k].mail = old.mail
         else:
@@ -277,7 +277,7 @@ class WorkerProcesses:
             if process is dead.get(k):
                 continue
             self._dismiss(process)
-            if k in dead:  # release also the successor of a dead process
+            if k in dead:  # also release the successor of a dead process
                 process.release()
         old = {**self.processes, **dead}
         for team in {self._program.team_of(k) for k in old}:
@@ -338,7 +338,7 @@ class WorkerProcesses:
         )
 
     def _clear(self) -> None:
-        """Free what a failed start has left."""
+        """Free the resources of a failed start."""
         for process in self.processes.values():
             if process.wire.fileno() in self._owners:
                 self._dismiss(process)

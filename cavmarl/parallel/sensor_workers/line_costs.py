@@ -22,7 +22,7 @@ class LineCosts:
         return float(self._parts[sensor] @ self._covered(sensor, begin, end))
 
     def line_at(self, sensor: int, part: float) -> int:
-        """Return the line before which about this share of the cost of the frame lies."""
+        """Return the line such that the lines before it cost about this share of the frame."""
         before = np.concatenate([[0.0], np.cumsum(self._parts[sensor])])
         place = np.interp(part, before, np.arange(PARTS + 1.0))
         return round(float(place) / PARTS * self._num_lines[sensor])
@@ -33,7 +33,7 @@ class LineCosts:
         lines: Sequence[tuple[int, int]],  # [begin, end) of ranges that cover each line once
         spent_s: Sequence[float],  # time of each range; if all are 0, nothing changes
     ) -> None:
-        """Correct the costs by the measured time of ranges of lines."""
+        """Update the costs with the measured times of ranges of lines."""
         total_s = sum(spent_s)
         if not total_s > 0.0:
             return

@@ -31,8 +31,8 @@ from cavmarl.sensors.kernels.sensor_share import gather_rows
 from cavmarl.sensors.mounted.mounted_sensor import SensedScene
 from cavmarl.sensors.mounted.sensor_rig import Turn, sense_here
 
-SHARED_ANEW = 32  # ticks between two distributions; initially 1, 2, 4, …
-NEW_COST = 0.5  # weight of new costs after that; the first measurements suffer from cold caches
+SHARED_ANEW = 32  # ticks between two distributions of the work; initially 1, 2, 4, …
+NEW_COST = 0.5  # weight of newly measured costs; the first measurements suffer from cold caches
 
 
 class SensorWorkerPlan(NamedTuple):
@@ -48,13 +48,13 @@ class SensorWorkerPlan(NamedTuple):
 
 @dataclass
 class SensorWorkerTimes:
-    """Sums over all ticks in which sensors were due."""
+    """Totals over all ticks in which sensors were due."""
 
     own_s: float = 0.0  # sensing in this process
-    wait_s: float = 0.0  # from the command until all frames were there
+    wait_s: float = 0.0  # from the command until all frames were written
     busy_s: float = 0.0  # part of `wait_s` in which the busiest worker sensed
     ticks: int = 0
-    sent_bytes: int = 0  # written for the workers
+    sent_bytes: int = 0  # size of the scene written for the workers
     got_bytes: int = 0  # size of the frames written by the workers
     messages: int = 0  # commands and answers
 
@@ -69,14 +69,14 @@ class _Sharing:
     """The shares of a set of sensors, and the measurements since they were made.
 
     Attributes:
-        spent_s: (n, S) processor time of each worker for each sensor since then.
+        spent_s: (n, S) processor time of each worker for each sensor since the shares were made.
     """
 
     def __init__(self, shares: Shares, sensors: int) -> None:
         self.shares = shares
-        self.uses = 0  # ticks in total
+        self.uses = 0  # total number of ticks with these sensors
         self.spent_s = np.zeros((shares.workers, sensors))
-        self.agents = 0  # agents, summed over the ticks since then
+        self.agents = 0  # agents, summed over the ticks since the shares were made
 
     def note(self, spent_s: NDArray[np.float64], agents: int) -> None:
         self.uses += 1
@@ -134,7 +134,7 @@ class SensorWorkers:
 
     @property
     def costs_s(self) -> NDArray[np.float64]:
-        """(S,) recent processor time of a frame of one agent, for each sensor."""
+        """(S,) recent processor time of each sensor for one frame of one agent."""
         return self._costs_s.copy()
 
     def __call__(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
@@ -180,7 +180,7 @@ class SensorWorkers:
         return Pool(program, plan.workers.timeout_s, plan.workers.max_retries)
 
     def _publish(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the scene: the rows of all zones, each row once."""
+        """Write the scene: the rows of all zones, without duplicates."""
         shared, worlds = self.shared, scenes[0].worlds
         shared.num_rows[:] = 0
         for scene in scenes:
@@ -266,7 +266,7 @@ class SensorWorkers:
         times, shared = self.times, self.shared
         times.own_s += sensed - published
         times.wait_s += ended - sensed
-        # the workers begin while this process still senses, so their time may exceed the wait
+        # workers start while this process still senses, so their time may exceed the waiting time
         times.busy_s += min(float(shared.busy_s.max()), ended - sensed)
         times.ticks += 1
         times.sent_bytes += int(shared.num_rows.sum()) * shared.rows.itemsize + sum(
@@ -274,6 +274,6 @@ class SensorWorkers:
         )
         for turn in turns:
             frames = turn.frames.data
-            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # frames of a world
+            one = frames.nbytes // (frames.shape[0] * frames.shape[2])  # a world's frames
             times.got_bytes += int(turn.due.num.sum()) * one
         times.messages += 2 * self._plan.shape.workers

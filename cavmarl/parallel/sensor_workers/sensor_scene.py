@@ -1,7 +1,7 @@
 """`SceneArrays`: the memory that a process with worlds shares with its sensor workers.
 
-Before a command, the process writes the scene and the share of each worker. The workers write
-frames, and here the tick to which the frames belong.
+Before a command, the process writes the scene and the share of each worker. The workers write their
+frames to `Frames`, and the tick of these frames to `delivered`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class SceneShape(NamedTuple):
     capacity: int  # C, rows of a world
     agents: int
     signals: int  # columns of `signal_phase`
-    sensors: int  # S, of the rig
+    sensors: int  # S, number of sensors of the rig
     workers: int  # n
 
     @property
@@ -53,10 +53,10 @@ class SceneArrays(NamedTuple):
     rows: NDArray[np.void]  # VEHICLE (W, C) of all zones, vehicles of agents first
     num_agents: NDArray[np.int64]  # (W,) number of rows of agents
     num_rows: NDArray[np.int64]  # (W,) number of rows
-    ticks: NDArray[np.int64]  # (W,) since the reset
+    ticks: NDArray[np.int64]  # (W,) ticks since the reset
     keys: NDArray[np.uint64]  # (W,) see `Worlds`
     signal_phase: NDArray[np.int32]  # (W, columns) see `Worlds`
-    before: NDArray[np.void]  # POSE (W, A) of the tick before
+    before: NDArray[np.void]  # POSE (W, A) in the previous tick
     due: NDArray[np.int64]  # (S, 3, W) each sensor's `Due`, without the carriers
     lines: NDArray[np.int32]  # (n, S, W, A, 2) lines [first, last) of each frame for each worker
     delivered: NDArray[np.int64]  # (n, S, W) tick of the last frames of each worker

@@ -1,8 +1,8 @@
 """Distribution of sensing over sensor workers: round robin, or by cost.
 
-A unit is one sensor of some agents. Agents of one sensor cost about the same, so a unit has many
-agents. By cost, frames are divided as well if whole frames overload a worker: then several workers
-write lines of the same frames.
+A unit is one sensor of some agents. For one sensor, all agents cost about the same, so a unit has
+many agents. Distribution by cost also divides frames if whole frames would overload a worker: then
+several workers write lines of the same frames.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ class Unit(NamedTuple):
 
     sensor: int  # number in the rig
     first: int  # first agent
-    last: int  # agent after the last one
-    begin: int = 0  # first line of their frames
-    end: int = 1  # line after the last one
+    last: int  # number after the last agent
+    begin: int = 0  # first line of the agents' frames
+    end: int = 1  # number after the last line
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class Shares:
     def divided(self) -> dict[int, list[tuple[int, tuple[int, int]]]]:
         """For each sensor divided in the same way for all agents: worker and lines of each part.
 
-        For other sensors, the time of a worker cannot be attributed to lines.
+        The time that a worker spends on other sensors cannot be attributed to lines.
         """
         parts: dict[int, list[tuple[int, tuple[int, int]]]] = {}
         agents: dict[int, set[tuple[int, int]]] = {}
@@ -92,7 +92,7 @@ def cut(sensors: Mapping[int, int], agents: int, workers: int) -> list[Unit]:
 
 
 def share_in_turn(units: Sequence[Unit], costs_s: Sequence[float], workers: int) -> Shares:
-    """Assign the units to the workers in turn, whatever they cost."""
+    """Assign the units to the workers in turn, regardless of their costs."""
     homes = tuple(number % workers for number in range(len(units)))
     return Shares(tuple(units), homes, tuple(costs_s), workers)
 
@@ -139,7 +139,7 @@ def divide(shares: Shares, costs: LineCosts) -> Shares:
         within = costs.part(unit.sensor, unit.begin, unit.end)
         line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)
         if not unit.begin < line < unit.end:
-            break  # the lines are too coarse for this division
+            break  # no whole number of lines fits this division
         given_s = cost_s * costs.part(unit.sensor, line, unit.end) / within
         units[number], costs_s[number] = unit._replace(end=line), cost_s - given_s
         units.append(unit._replace(begin=line))

@@ -1,8 +1,8 @@
 """`CheckpointLog`: an occasional image of worlds, and the commands of the steps after it.
 
-Writing an image takes a tenth of a step; for ten thousand vehicles, it takes half as long as a
-tick that several workers share. A step follows from the state and the commands, so a successor may
-resume from an older image and repeat the steps after it.
+Writing an image takes a tenth of a step; for ten thousand vehicles, it takes half as long as a tick
+that several workers share. The state and the commands determine a step, so a successor may resume
+from an older image and repeat the steps after it.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from cavmarl.parallel.state.sumo_log import FIRST_LOG_BYTES, KeptLog
 from cavmarl.shards.shard import COMMANDS, Commands
 from cavmarl.traffic.sumo.sumo_history import ToldLog
 
-STEPS = 16  # most steps from one image to the next, which a successor repeats
+STEPS = 16  # limit on the steps from one image to the next, which a successor has to repeat
 _FIRST_IMAGE_BYTES = 1 << 12
 
 
@@ -44,7 +44,7 @@ class CheckpointLog:
 
     Attributes:
         place: (2,) number of the image, and number of steps after it; part of the committed state.
-        entries: commands of all steps for which there is room, for the first and the second image.
+        entries: buffers for the commands of the steps after the first and after the second image.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class CheckpointLog:
     ) -> None:
         *images, steps = (Segment(fd, 0) for fd in descriptors[:3])
         self.place = np.zeros(2, dtype=np.int64)
-        self.is_prepared = False  # the other image has the state at the end of the log
+        self.is_prepared = False  # whether the other image has the state at the end of the log
         self._images = [Image(segment) for segment in images]
         kept = [KeptLog(Segment(fd, 0)) for fd in descriptors[3:]]
         self._logs = kept[::2], kept[1::2]  # for each image, by world
@@ -103,7 +103,7 @@ class CheckpointLog:
         return list(self._images[self.place.item(0)].read(dtypes))
 
     def read_logs(self, logs: Sequence[ToldLog]) -> None:
-        """Restore the SUMO logs of that state.
+        """Restore the SUMO logs that belong to the image.
 
         Raises:
             WorkerError: a log is damaged.

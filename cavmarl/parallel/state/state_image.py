@@ -25,7 +25,7 @@ class _Place(NamedTuple):
     """The place of an array in an image."""
 
     shape: tuple[int, ...]
-    end: int  # in words from the start of the image
+    end: int  # offset in words from the start of the image
     target: Array  # the place as an array of raw items
 
 
@@ -69,7 +69,7 @@ class Image:
     def _lay_out(self, arrays: Arrays, same: int) -> None:
         """Find the place of each array; the first `same` arrays keep their places.
 
-        Callers pass arrays of constant shapes before those whose shapes vary.
+        Callers pass arrays of constant shapes before arrays whose shapes vary.
         """
         head = [array.ndim for array in arrays]
         for array in arrays:
@@ -117,7 +117,7 @@ class Image:
             at = end
 
     def _make_room(self, size: int) -> bool:
-        """Grow to this number of bytes; return whether the image has moved for that."""
+        """Grow to this number of bytes; return whether the mapping of the image has changed."""
         if size <= _WORD * len(self._words):
             return False
         self._segment.grow(-(-size * 5 // 4 // mmap.PAGESIZE) * mmap.PAGESIZE)

@@ -1,4 +1,4 @@
-"""`KeptLog`: a copy of the commands to a SUMO, in memory that outlives its writer."""
+"""`KeptLog`: a copy of the commands to a SUMO process, in memory that outlives its writer."""
 
 from __future__ import annotations
 
@@ -18,13 +18,13 @@ _WORD = 8
 class KeptLog:
     """The log of one world as it was at the last `write`.
 
-    Within an episode a log only grows, so a write costs only what was added since the last one.
+    Within an episode a log only grows, so a write only copies the commands since the last write.
     """
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
         self._words = np.zeros(0, dtype=np.int64)
-        self._episode = 0  # of the log that this process wrote last; 0: none
+        self._episode = 0  # episode of the log that this process wrote last; 0: none
         self._size = 0
 
     def write(self, log: ToldLog) -> None:

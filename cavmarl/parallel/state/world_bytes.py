@@ -44,7 +44,7 @@ def from_bytes(content: bytes | bytearray | memoryview, like: Sequence[Array]) -
     """Return the arrays passed to `to_bytes`, with the types and numbers of axes of `like`.
 
     Raises:
-        ConfigError: the bytes have other arrays.
+        ConfigError: the bytes hold different arrays.
     """
     file, found = BytesIO(content), []
     try:

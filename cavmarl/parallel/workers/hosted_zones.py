@@ -21,8 +21,8 @@ class HostedZones:
 
     def __init__(
         self,
-        shards: Sequence[Shard],  # of all zones of the world
-        zones: Sequence[int],  # hosted here, maybe none
+        shards: Sequence[Shard],  # shards of all zones of the world
+        zones: Sequence[int],  # zones that this worker runs, maybe none
         # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:
@@ -32,12 +32,12 @@ class HostedZones:
         self.host(zones)
 
     def host(self, zones: Sequence[int]) -> None:
-        """Run these zones from now on, and no others."""
+        """Run only these zones from now on."""
         self._shards = [self._all[zone] for zone in sorted(zones)]
         self._together = [ShardGroup(self._shards)] if self._shards else []
         self._alone: list[ShardGroup] = []
-        self._untimed = -1  # tick in which the timed groups were made, whose time does not count
-        self._sides: tuple[int, int] | None = None  # of the shards, if known
+        self._untimed = -1  # tick in which the timed groups were made; its time does not count
+        self._sides: tuple[int, int] | None = None  # sides of the shards, if known
 
     def set_sides(self, side: int, next_side: int) -> None:
         """Set the sides of the present and the next rows, as another process announced them."""

@@ -1,4 +1,4 @@
-"""`LoggedWorlds`: worlds that survive their worker by a checkpoint log."""
+"""`LoggedWorlds`: worlds with a checkpoint log, by which they survive the death of their worker."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class LoggedWorlds(WorkerWorlds):
         self._log = checkpoint_log
         self._sumo_logs = worlds.keep_logs()
         self._limits_repeat = limits_repeat
-        self._is_behind = False  # the worlds are at the start of the log, not at its end
+        self._is_behind = False  # whether the worlds are at the start of the log, not at its end
         self._lost: SumoError | None = None  # why the worlds cannot reach the end of the log
         self._repeat_s = 0.0  # duration of the steps in the log
 
@@ -70,8 +70,8 @@ class LoggedWorlds(WorkerWorlds):
     def on_idle(self) -> None:
         """Write the next image while the pool does not wait for it, if it is due.
 
-        The log does not write two images in a row: what is committed may still start with the
-        previous image, which the new one would overwrite.
+        The log does not write two images in a row: the committed state may still start with the
+        previous image, which the new image would overwrite.
         """
         checkpoint_log = self._log
         is_current = not self._is_behind and self._lost is None

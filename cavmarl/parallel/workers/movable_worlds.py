@@ -3,8 +3,8 @@
 Worlds move between two commands. A worker that gives worlds away writes them to its outbox, which
 all workers can read (PACK). Then each worker restarts with the worlds that it has kept and with its
 new worlds, which it finds in the outboxes of other workers (UNPACK). Both tasks give the same
-result if they are repeated, so a worker that dies during a move is replaced as usual. The bounds
-that say where the worlds are belong to the committed state.
+result if they are repeated, so a worker that dies during a move is replaced as usual. The bounds,
+which say which worker has which worlds, belong to the committed state.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class MovableWorlds(WorkerWorlds):
 
     def __init__(
         self,
-        make: MakeWorlds,  # makes the worlds from a number up to, not including, another one
+        make: MakeWorlds,  # makes the worlds [first, last), given these two numbers
         bounds: Sequence[int],  # first world of each worker, and the number of worlds
-        number: int,  # of this worker
-        outboxes: Sequence[Image],  # of all workers
+        number: int,  # number of this worker
+        outboxes: Sequence[Image],  # outboxes of all workers
         spent_s: NDArray[np.float64],  # (W,) total processor time of each world, updated
     ) -> None:
         self._make = make
@@ -52,7 +52,7 @@ class MovableWorlds(WorkerWorlds):
         return first, last
 
     def step(self) -> None:
-        """Step, and measure the processor time, which worlds share by their vehicles."""
+        """Step; divide the processor time among the worlds in proportion to their vehicles."""
         began_ns = time.thread_time_ns()
         super().step()
         spent_s = 1e-9 * (time.thread_time_ns() - began_ns)
@@ -93,7 +93,7 @@ class MovableWorlds(WorkerWorlds):
         return found
 
     def save(self) -> list[Array]:
-        """Return the bounds of all workers, and what the next step of these worlds depends on."""
+        """Return the bounds of all workers, and the state on which the next step depends."""
         saved, parts = self.worlds.save(), self.worlds.num_parts
         sizes = np.array([len(rows) for rows in saved[-parts:]], dtype=np.int64)
         return [self._bounds, *saved[:-parts], sizes, _concatenated(saved[-parts:])]

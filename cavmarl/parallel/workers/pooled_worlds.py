@@ -36,7 +36,7 @@ class PooledWorlds(CommandedWorlds):
     """W worlds over m worker processes.
 
     Raises:
-        ConfigError: a setting that such worlds cannot have.
+        ConfigError: a setting that worlds in worker processes do not support.
         WorkerError: the processes cannot be started, or there is not enough memory.
     """
 

@@ -6,8 +6,8 @@ it on its own zones, and continues when the members have run it on theirs. Betwe
 handles departures, signals and ownership alone.
 
 All arrays that shards write are shared memory (`shared_huge_pages`), and each row has one writer at
-a time. Between phases a member keeps scratch memory only. Beside the arrays, a phase depends on the
-line of the leader alone.
+a time. Between phases a member keeps scratch memory only. A phase depends on the arrays and on the
+leader's line of words, and on nothing else.
 """
 
 from __future__ import annotations
@@ -38,8 +38,8 @@ from cavmarl.shards.phases import Phase
 from cavmarl.shards.shard import Commands, Shard
 from cavmarl.shards.shard_group import ShardGroup
 
-# Words of the leader's line, after those of `process_barrier`: the calls with even numbers, and
-# those with odd numbers.
+# Words of the leader's line, after the words of `process_barrier`: for calls with even numbers, and
+# for calls with odd numbers.
 CALLS = (2, 3)
 # A word of a member's line.
 FAILED = 2
@@ -57,7 +57,7 @@ class Team:
         self,
         shards: Sequence[Shard],  # one per zone, in the order of zones; their arrays are shared
         zones: Sequence[Sequence[int]],  # initial zones of each worker; the first worker leads
-        # every tuple of arguments that each shared phase may get; its arrays are shared
+        # all tuples of arguments that each shared phase may receive; their arrays are shared
         known: Mapping[Phase, Sequence[tuple[Any, ...]]],
         # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
@@ -85,7 +85,7 @@ class TeamLeader(PhaseExecutor):
         self._codes = {phase: code for code, phase in enumerate(SHARED)}
         self._leads = False
         self._last: Phase | None = None
-        self._is_ahead = False  # a phase is announced and not awaited yet
+        self._is_ahead = False  # whether a phase is announced and not awaited yet
 
     @contextmanager
     def command(self) -> Iterator[None]:
@@ -155,7 +155,7 @@ class TeamLeader(PhaseExecutor):
     def _which(self, phase: Phase, arguments: tuple[Any, ...]) -> int:
         """Return the index of the arguments in the list that members know.
 
-        -1: the members do not know the arguments, or wait for no phase.
+        -1: the members do not know the arguments, or do not wait for a phase.
         """
         if self._leads and phase in self._codes:
             for number, known in enumerate(self._known[phase]):
@@ -189,7 +189,7 @@ class TeamMember:
         self._cores = usable_cores()
 
     def run_phases(self) -> None:
-        """Run what the leader announces until it ends the command."""
+        """Run the phases that the leader announces, until the leader ends the command."""
         line, leader = self._line, self._leader
         line[FAILED] = 0
         failure: Exception | None = None

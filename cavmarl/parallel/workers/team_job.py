@@ -1,4 +1,4 @@
-"""The team of one world as its leader commands it, and the job of the other members."""
+"""The leader's view of the team of one world, and the job of the other members."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ALONE = (Task.STATE_HASH, Task.TRAFFIC_STATS, Task.DRIVEN, Task.SIGNAL_PHASES)
 
 
 class LedTeam:
-    """The workers of one world, as the worker that leads them sees them.
+    """The workers of one world, commanded by the worker that leads them.
 
     Attributes:
         hosts: (k,) number within the team of the worker that hosts each zone.
@@ -32,9 +32,9 @@ class LedTeam:
 
     def __init__(
         self,
-        kept: WorkerWorlds,  # of one world, whose shards write shared memory
-        zones: Sequence[Sequence[int]],  # initial zones of each worker, those of the leader first
-        repeated: Sequence[Commands],  # commands that the steps of a checkpoint log may have
+        kept: WorkerWorlds,  # the single world, whose shards write shared memory
+        zones: Sequence[Sequence[int]],  # initial zones of each worker; the leader comes first
+        repeated: Sequence[Commands],  # possible commands of steps that a checkpoint log repeats
         # (k,) total processor time of each zone, updated; None: not measured
         spent_s: NDArray[np.float64] | None = None,
     ) -> None:

@@ -12,13 +12,13 @@ from cavmarl.parallel.worlds.tasks import Task, commands_of
 
 
 class WorkerWorlds:
-    """Worlds with consecutive numbers, and what a successor of the worker resumes them from.
+    """Worlds with consecutive numbers, and the state from which a successor resumes them.
 
     Attributes:
         worlds: the worlds.
-        first: number of the first of them among all worlds.
-        commands: what their agents do in the next step, as views of the step arrays.
-        tasks: tasks beside those of `WORLD_TASKS` that these worlds support.
+        first: number of the first of these worlds among all worlds.
+        commands: commands of their agents in the next step, as views of the step arrays.
+        tasks: tasks that these worlds support in addition to `WORLD_TASKS`.
     """
 
     tasks: Mapping[Task, Callable[[Any], None]]
@@ -46,7 +46,7 @@ class WorkerWorlds:
         """See `Job.on_idle`."""
 
     def save(self) -> list[NDArray[Any]]:
-        """Return what a successor needs in order to resume the worlds."""
+        """Return the state from which a successor can resume the worlds."""
         return self.worlds.save()
 
     def load(self, saved: Sequence[NDArray[Any]]) -> None:

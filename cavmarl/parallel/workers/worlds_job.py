@@ -56,7 +56,7 @@ class WorldsJob(Job):
         return None
 
     def save(self) -> list[NDArray[Any]]:
-        """Return what the worlds need, and for a team which worker hosts which zone."""
+        """Return the state of the worlds, and for a team the host of each zone."""
         kept = self._kept.save()
         return kept if self._team is None else [*kept, self._team.hosts]
 

@@ -11,7 +11,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.engine.world_setup import World
 from cavmarl.handoff.coordinator.coordinator_setup import OpenRun, WorldRun, prepare_runs
 
-RunText = tuple[str, str]  # the run in hex, and the path of its journal, empty without one
+RunText = tuple[str, str]  # the run in hex, and the path of its journal; "": no journal
 
 
 def without_journals(world: World) -> World:

@@ -45,11 +45,11 @@ class LocalWorlds:
         self,
         world: World,
         num_worlds: int,  # W
-        arrays: StepArrays | None = None,  # to write to; None: new arrays
-        warm: bool = False,  # load all kernels now
+        arrays: StepArrays | None = None,  # arrays to write; None: make new arrays
+        warm: bool = False,  # whether to load all kernels now
         in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
-        like: LocalWorlds | None = None,  # worlds of the same environment, to share their tables
+        like: LocalWorlds | None = None,  # worlds of the same environment, whose tables are shared
         runs: Sequence[OpenRun] | None = None,  # see `Simulation`
         late_ticks: int = 0,  # see `Simulation`
     ) -> None:
@@ -60,7 +60,7 @@ class LocalWorlds:
         self._senses = form.mode == "sensors"
         self._is_flat = form.kind == "flat"
         self._shows_signals = world.config.controlled is not None
-        # whether an episode goes on without agents that drive
+        # whether an episode goes on when no agent drives
         self._goes_on = world.config.roadside is not None or world.config.drives_alone
         self.simulation: Simulation = Simulation(
             world.config,
@@ -84,7 +84,7 @@ class LocalWorlds:
         self._horizon = world.config.max_steps
         self._late_ticks = late_ticks
         self._steps = np.zeros(num_worlds, dtype=np.int64)
-        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # episode over, reset in the next step
+        self._waiting = np.zeros(num_worlds, dtype=np.bool_)  # worlds to reset in the next step
         self._results = Results(*(getattr(arrays, name) for name in Results._fields))
         self._report = specialized(report)
         self._report_continuation = specialized(report_continuation)
@@ -129,7 +129,7 @@ class LocalWorlds:
         if self.in_next_step and self._waiting.any():
             waiting = self._waiting.copy()
             self._begin(waiting)
-            self._steps[waiting] = -1  # their first step comes next
+            self._steps[waiting] = -1  # the first step of these worlds comes next
             arrays.signal_rewards[waiting] = arrays.signal_terms[waiting] = 0.0
         some_ended = self._write_results()
         if some_ended:
@@ -186,9 +186,9 @@ class LocalWorlds:
         self._waiting[chosen] = False
 
     def _show(self, chosen: NDArray[np.bool_], begins: bool = False) -> None:
-        """Write what the agents of the chosen worlds (W,) observe.
+        """Write the observations of the agents in the chosen worlds (W,).
 
-        At the begin of an episode, signals keep the rewards of the step that ended the last one.
+        At the start of an episode, signals keep the rewards of the last step of the old episode.
         """
         if self._senses and self._is_flat:
             write_sensed(self.arrays.frames, chosen, self.arrays.observations)
@@ -223,7 +223,7 @@ class LocalWorlds:
         return stats
 
     def driven(self, world: int, agents: Sequence[int]) -> list[Driven]:
-        """Return the vehicles of some agents of a world, in no order, if they have any."""
+        """Return the vehicles of some agents of a world, in any order; some may have none."""
         simulation = self.simulation
         rows = simulation.vehicles(world)
         rows = rows[np.isin(rows["agent"], agents)]
@@ -245,7 +245,7 @@ class LocalWorlds:
         if not self.world.config.v2x.enabled:
             return None
         reports = self.simulation.messages.mail.signals[world, agent]
-        # The code of an overridden signal is negative: its letters are not those of a phase.
+        # The code of an overridden signal is negative: it shows no phase of its program.
         reports = reports[(reports["sender"] >= 0) & (reports["code"] >= 0)]
         age = self.ticks()[world] - reports["tick"]
         heard = np.stack([reports["subject"], reports["code"], age], axis=1)
@@ -256,7 +256,7 @@ class LocalWorlds:
         return self.simulation.signal_phases(world)
 
     def save(self) -> list[NDArray[Any]]:
-        """Return all that the next step depends on, as views."""
+        """Return all state on which the next step depends, as views."""
         return [self._steps, self._waiting, *self.simulation.save()]
 
     def load(self, saved: Sequence[NDArray[Any]], with_sumo: bool = True) -> None:
@@ -289,8 +289,8 @@ class LocalWorlds:
         A copy has no journal, since the file belongs to the original.
 
         Raises:
-            ConfigError: the worlds have processes of their own, or use extensions that the reader
-                of a pickle could not register.
+            ConfigError: the worlds have processes of their own, or use extensions that the process
+                that reads a pickle could not register.
         """
         config = self.world.config
         if key := kept_elsewhere(config):
@@ -329,7 +329,7 @@ class LocalWorlds:
         return () if sumo is None else sumo.keep_logs()
 
     def share_of(self, world: int) -> list[NDArray[Any]]:
-        """Return what `save` would return if there were only this world, as views."""
+        """Return, as views, the result of `save` if there were only this world."""
         only = slice(world, world + 1)
         return [self._steps[only], self._waiting[only], *self.simulation.share_of(world)]
 
@@ -355,7 +355,7 @@ class LocalWorlds:
         """Resume from what `save_worlds` returned; `arrays` do not change.
 
         Raises:
-            ConfigError: the state is one of other worlds.
+            ConfigError: the state belongs to other worlds.
         """
         self.load(self.read_worlds(saved))
 
@@ -422,14 +422,14 @@ def _made_again(
 
 
 def kept_elsewhere(config: EnvConfig) -> str:
-    """Return a configuration key whose value prevents copies of worlds; empty: none does."""
+    """Return a configuration key whose value prevents copies of worlds; empty: no such key."""
     return "zones.simulators" if config.zones.simulators else missing_in_states(config)
 
 
 def missing_in_states(config: EnvConfig) -> str:
-    """Return a configuration key whose value puts state outside of the arrays; empty: none does.
+    """Return a key whose value puts state outside of the saved arrays; empty: no such key.
 
-    Simulators of zones are filled from a loaded state.
+    `zones.simulators` is not such a key: simulators of zones receive the loaded state.
     """
     kept = {
         "traffic.source = sumo-traffic": config.traffic.source == "sumo-traffic",

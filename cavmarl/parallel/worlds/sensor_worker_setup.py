@@ -1,4 +1,4 @@
-"""Worlds of this process with sensor workers, and the message from which these start."""
+"""Worlds of this process with sensor workers, and the message that starts these workers."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def local_worlds(
 
 
 def warn_if_crowded(sensor_workers: int, times: int) -> None:
-    """Warn if `times` processes with sensor workers each have more of them than cores."""
+    """Warn if the sensor workers of `times` processes are more than the cores."""
     cores = len(usable_cores())
     if sensor_workers * times > cores:
         warnings.warn(
@@ -59,7 +59,7 @@ def warn_if_crowded(sensor_workers: int, times: int) -> None:
 def sensor_workers_of(
     world: World, base_dir: Path, arrays: Segment, part: tuple[int, int], num_worlds: int
 ) -> SensorWorkers:
-    """Return the sensor workers of worlds `part`; the first call starts them."""
+    """Return the sensor workers of worlds `part`; their first call starts the processes."""
     config = world.config
     first, last = part
     shape = SceneShape(

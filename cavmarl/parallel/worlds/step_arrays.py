@@ -35,30 +35,30 @@ class StepArrays(NamedTuple):
     """
 
     observations: NDArray[np.float32]  # (W, A, D) for the next action
-    final_observations: NDArray[np.float32]  # (W, A, D) last ones of an agent or episode that ended
+    final_observations: NDArray[np.float32]  # (W, A, D) last of an agent or episode that ended
     rewards: NDArray[np.float32]  # (W, A)
     terminations: NDArray[np.bool_]  # (W, A) the vehicle has left
     # (W, A) the horizon of the episode or of the trip was reached; a trip ends with its vehicle
     truncations: NDArray[np.bool_]
     acted: NDArray[np.bool_]  # (W, A) agents that acted in the step
     vehicle_done: NDArray[np.bool_]  # (W, A)
-    vehicle_ids: NDArray[np.int64]  # (W, A) of the vehicle at the end of the step; -1: none
+    vehicle_ids: NDArray[np.int64]  # (W, A) agent's vehicle at the end of the step; -1: none
     mask: NDArray[np.bool_]  # (W, A) agents that act next
     terms: NDArray[np.float32]  # (W, A, T)
-    arrivals: NDArray[np.int64]  # (W,) since each world's reset
-    ticks: NDArray[np.int64]  # (W,) since each world's reset
+    arrivals: NDArray[np.int64]  # (W,) arrived vehicles since the reset of each world
+    ticks: NDArray[np.int64]  # (W,) ticks since the reset of each world
     episode_over: NDArray[np.bool_]  # (W,) worlds that were reset, or will be in the next step
     chosen: NDArray[np.bool_]  # (W,) worlds to reset
-    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, like the next seven
+    controls: NDArray[np.float64]  # (W, A, 2) see `Commands`, also for the next seven arrays
     meta_actions: NDArray[np.int64]  # (W, A)
     declared: NDArray[np.int32]  # (W, A)
     inserted: NDArray[np.float64]  # (W, I, 3)
     external: NDArray[np.float64]  # (W, E, K)
     overridden: NDArray[np.int32]  # (W, N, 2)
     lane_changes: NDArray[np.float64]  # (W, N, 3)
-    # of agents of signals, or of other agents beside the road (`RoadsideAgents`):
+    # Arrays of agents that control signals, or of other agents beside the road (`RoadsideAgents`):
     signal_choices: NDArray[np.int64]  # (W, S)
-    signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, like the next eight
+    signal_observations: NDArray[np.float32]  # (W, S, D) see `SignalOutputs`, also for the next 8
     signal_rewards: NDArray[np.float32]  # (W, S)
     signal_terms: NDArray[np.float32]  # (W, S, T)
     signal_masks: NDArray[np.bool_]  # (W, S, G)
@@ -67,15 +67,15 @@ class StepArrays(NamedTuple):
     signal_states: NDArray[np.int64]  # (W, S, HELD)
     signal_history: NDArray[np.int64]  # (W, N, HISTORY)
     signal_loops: NDArray[np.int64]  # (W, N, 2, READINGS)
-    final_signal_observations: NDArray[np.float32]  # (W, S, D) last ones of an episode that ended
+    final_signal_observations: NDArray[np.float32]  # (W, S, D) last of an episode that ended
     suggested: NDArray[np.float64]  # (W, A, 2) actions of the built-in driver
     states: NDArray[np.float32]  # (W, S) global states at the last request
-    frames: Frames  # of mounted sensors
-    final_frames: Frames  # last ones of an agent or episode that ended
+    frames: Frames  # frames of mounted sensors
+    final_frames: Frames  # last frames of an agent or episode that ended
 
     @classmethod
     def of(cls, arrays: Mapping[str, NDArray[Any]]) -> StepArrays:
-        """Make them from arrays with the names of `layout_of`."""
+        """Make step arrays from arrays with the names of `layout_of`."""
         fields: dict[str, Any] = {name: arrays[name] for name in cls._fields if name in arrays}
         return cls(**fields, frames=frames_in(arrays), final_frames=frames_in(arrays, FINAL_FRAMES))
 
@@ -89,7 +89,7 @@ class StepArrays(NamedTuple):
 
 
 def layout_of(config: EnvConfig, capacity: int, num_worlds: int, signals: SignalSizes) -> Layout:
-    """Return name → dtype and shape of the `StepArrays` of worlds with room for `capacity`."""
+    """Return name → dtype and shape of `StepArrays`; `capacity`: number of rows of a world."""
     of_signals = (num_worlds, signals.signals)
     observed = ("<f4", (*of_signals, signals.features))
     agents = (num_worlds, config.population.num_ids)
@@ -142,8 +142,8 @@ class Driven(NamedTuple):
     goal_edge: int  # EDGE row of the goal
     speed_mps: float
     wheelbase_m: float
-    # last SPAT received from each signal: SIGNAL row, PHASE row, ticks since it was sent; None:
-    # there are no messages
+    # last SPAT received from each signal: SIGNAL row, PHASE row, ticks since it was sent; None: the
+    # world has no messages
     heard: list[list[int]] | None = None
 
 
@@ -156,7 +156,7 @@ class SteppedWorlds(Protocol):
 
     @property
     def simulation(self) -> Simulation:
-        """The simulation, if the worlds run in this process."""
+        """The simulation; only available if the worlds run in this process."""
         ...
 
     @property
@@ -166,13 +166,13 @@ class SteppedWorlds(Protocol):
 
     @property
     def worker_pids(self) -> Mapping[int, int]:
-        """Worker or node → process, as far as they are on this machine."""
+        """Worker or node → process id, for processes on this machine."""
         ...
 
     def reset(
         self,
-        seed: int | None,  # root of all random numbers; None continues those of the last seed
-        first_world: int,  # number of the first world among all worlds of the seed
+        seed: int | None,  # root of all random numbers; None: continue with the last seed
+        first_world: int,  # number of the first world among all worlds with this seed
     ) -> None:
         """Start an episode in the worlds of `chosen`; write `observations` and `mask`."""
         ...

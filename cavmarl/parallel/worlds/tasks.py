@@ -1,4 +1,4 @@
-"""Tasks of worlds in other processes, in one table for workers and nodes."""
+"""Tasks of worlds in other processes: one table for workers and nodes."""
 
 from __future__ import annotations
 
@@ -40,10 +40,10 @@ TASK_NAMES = tuple(task.name.lower().replace("_", " ") for task in Task)
 
 
 class WorldTask(NamedTuple):
-    """The execution of a task by the process of the worlds.
+    """How the process of the worlds does a task.
 
     Attributes:
-        method: of the worlds.
+        method: method of the worlds.
         read: converts the payload into keywords of the method. A payload names worlds by their
             numbers among all worlds; the second argument is the first world of this process.
         write: converts the returned value into the answer.
@@ -54,7 +54,7 @@ class WorldTask(NamedTuple):
     write: Callable[[Any], Any] = lambda found: found
 
     def perform(self, worlds: LocalWorlds, payload: Any, first: int = 0) -> Any:
-        """Do the task with worlds, numbered from `first` on."""
+        """Do the task with worlds whose numbers start at `first`."""
         return self.write(self.method(worlds, **self.read(payload, first)))
 
 
@@ -72,7 +72,7 @@ def _nothing(payload: None, first: int) -> dict[str, Any]:
 
 
 def shifted_reset(payload: dict[str, Any], first: int) -> dict[str, Any]:
-    """Return the payload of RESET for a process whose worlds follow `first` others."""
+    """Return the payload of RESET for a process whose worlds have numbers from `first`."""
     return {**payload, "first_world": payload["first_world"] + first}
 
 
@@ -88,7 +88,7 @@ def _saved(payload: list[bytes], first: int) -> dict[str, Any]:
     return {"saved": payload}
 
 
-# A process that does not pass saved worlds as bytes replaces these rows.
+# A process that does not pass saved worlds as bytes replaces these entries.
 WORLD_TASKS: Mapping[Task, WorldTask] = {
     Task.STEP: WorldTask(_step, _nothing),
     Task.RESET: WorldTask(LocalWorlds.reset, shifted_reset),

@@ -1,4 +1,4 @@
-"""Errors of worlds in other processes: what they do not support, and what they raise there."""
+"""Errors of worlds in other processes: unsupported calls, and errors that workers have raised."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def refuse_external(v2x: V2xConfig) -> None:
 
 
 def original_error(failure: WorkerFailureError) -> CavmarlError:
-    """Return the error of cavmarl that a worker has raised; else the failure itself."""
+    """Return the error of cavmarl that a worker has raised, or else the failure itself."""
     kind = getattr(cavmarl.core.errors, failure.kind, None)
     if not isinstance(kind, type) or not issubclass(kind, CavmarlError):
         return failure

@@ -91,14 +91,14 @@ forget_each = for_each_zone(forget)
 
 @kernel
 def turn(members: Members, ticks_in_order: int) -> None:
-    """Put the next rows into the other half, in a tick that sorts rows by lane."""
+    """Put the next rows into the other half of `ZoneState.rows`, in a tick that sorts rows."""
     if members.common.ticks[0] % ticks_in_order == 0:
         members.sides[NEXT] = 1 - members.sides[COMMITTED]
 
 
 @kernel
 def commit(members: Members) -> None:
-    """Make the next rows the committed ones."""
+    """Make the next rows the committed rows."""
     members.sides[COMMITTED] = members.sides[NEXT]
 
 

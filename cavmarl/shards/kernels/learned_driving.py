@@ -1,7 +1,7 @@
-"""Background vehicles that networks drive: their observations, and the commands of a step.
+"""Background vehicles that neural networks drive: their observations, and the commands of a step.
 
-The observations are those of agents' vehicles, by the same kernels. What a network remembers of
-earlier steps is in the vehicle's record, so it moves with the vehicle from zone to zone.
+The same kernels make the observations as for agents' vehicles. A network's memory of earlier steps
+is in the vehicle's record, so the memory moves with the vehicle from zone to zone.
 """
 
 from __future__ import annotations
@@ -26,16 +26,16 @@ from cavmarl.sensors.kernels.sense import observe_frame
 
 
 class LearnedDriver(NamedTuple):
-    """A network that drives background vehicles, and the settings of their sensors."""
+    """A neural network that drives background vehicles, and the settings of their sensors."""
 
     number: int  # VTYPE["network"] of its vehicles
     sensors: Sensors
     optional: OptionalSensors
     layers: NDArray[np.int64]  # the network, see `networks.kernels.inference`
     weights: NDArray[np.float32]
-    accel_mps2: float  # throttle of the action 1
-    steering_rad: float  # angle of the front wheels of the action 1
-    # (D,) exchange of left and right as in `exchanged_sides`; (0,): the driver knows this side
+    accel_mps2: float  # acceleration at the action 1
+    steering_rad: float  # angle of the front wheels at the action 1
+    # (D,) exchange of left and right as in `exchanged_sides`; (0,): trained on this side of roads
     exchanged: NDArray[np.int64]
     signs: NDArray[np.float32]
     no_reports: NDArray[np.void]  # REPORT (0,), the empty inbox of each vehicle
@@ -51,7 +51,7 @@ class LearnedDriver(NamedTuple):
 
 @inlined_kernel
 def _recall(row: np.void, at: int, size: int, frame: NDArray[np.float32]) -> None:
-    """Write what the vehicle remembers to the part of `history`, the last step first."""
+    """Write the vehicle's memory to the part `history` of the frame, the last step first."""
     if size > HISTORY_FEATURES:
         frame[at] = row["throttle_1"]
         frame[at + 1] = row["steering_1"]
@@ -77,7 +77,7 @@ def _remember(row: np.void, at: int, size: int, frame: NDArray[np.float32]) -> N
 
 @inlined_kernel
 def _exchange_sides(learned: LearnedDriver, frame: NDArray[np.float32]) -> None:
-    """Exchange left and right in an observation, if the driver knows the other side."""
+    """Exchange left and right in an observation, if the driver was trained on the other side."""
     if learned.exchanged.size == 0:
         return
     for k in range(frame.size):
@@ -91,7 +91,7 @@ def _exchange_sides(learned: LearnedDriver, frame: NDArray[np.float32]) -> None:
 def _act(rows: NDArray[np.void], num: int, learned: LearnedDriver) -> None:
     """Evaluate the network for the observed rows, and set their commands.
 
-    Commands are 0 where the network gives NaN, and `failed` is written.
+    If the network gives NaN, the command is 0 and `failed` is set.
     """
     width = learned.observations.shape[0] // TILE_ROWS
     evaluate_network(
@@ -121,15 +121,15 @@ def drive_by_network(
     plans: NDArray[np.void],  # PLAN (V, G, L)
     travel: TripTables,
     lane_grid: LaneGrid,
-    worlds: Worlds,  # throttle, steering and memory of the owned committed rows are written
+    worlds: Worlds,  # outputs: throttle, steering and memory of the owned committed rows
     grid: Grid,
     learned: LearnedDriver,
     tick_s: float,
     ticks_per_step: int,
 ) -> None:
-    """Set the commands of a step of all vehicles that one network drives.
+    """Set the commands of a step for all vehicles that one network drives.
 
-    Observations read nothing that this kernel writes, except of the observed vehicle itself.
+    An observation reads data that this kernel writes for its own vehicle, but for no other vehicle.
     """
     width = learned.observations.shape[0] // TILE_ROWS
     history_at, history_size = learned.optional.history.at, learned.optional.history.size

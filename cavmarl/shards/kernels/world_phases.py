@@ -49,7 +49,7 @@ from cavmarl.zones.kernels.zone_lookup import is_inside, note_outer
 @kernel
 def begin_step(
     roads: RoadArrays,
-    worlds: Worlds,  # the rows of agents are written
+    worlds: Worlds,  # outputs: the rows of agents
     discrete: bool,  # whether actions are meta-actions
     meta_actions: NDArray[np.int64],  # (W, A), ACTION_*; not read for continuous actions
     target_speeds: NDArray[np.float64],  # m/s, rising
@@ -228,15 +228,15 @@ def advance(
     plans: NDArray[np.void],  # PLAN (V, G, L)
     travel: TripTables,
     lane_grid: LaneGrid,  # index of lanes by position
-    worlds: Worlds,  # next_rows is written
+    worlds: Worlds,  # output: next_rows
     inner: NDArray[np.float64],  # the part of the zone that no other zone sees; see `Halo`
     scratch: Scratch,
     # (W, A, 2) throttle in m/s² and steering in rad of continuous actions
     commands: NDArray[np.float64],
-    discrete: bool,  # whether agents are driven by the controllers instead
-    accel_limit: float,  # m/s², of the agents' throttle
-    steering_limit: float,  # rad, of the agents' front wheels
-    dt: float,  # seconds of the tick
+    discrete: bool,  # whether controllers drive the agents, towards the targets of discrete actions
+    accel_limit: float,  # limit of the agents' throttle, m/s²
+    steering_limit: float,  # limit of the angle of the agents' front wheels, rad
+    dt: float,  # length of the tick, s
     in_place: bool,  # whether `next_rows` is `rows`; if not, rows are sorted by lane
 ) -> int:  # number of background vehicles whose trip is over, in all worlds
     """Decide all controls from the committed rows, then move every owned row into `next_rows`."""
@@ -296,11 +296,11 @@ def advance(
 
 @kernel
 def resolve(
-    # events and hit of the owned next_rows are written; num_contacts rises by one for each vehicle
+    # outputs: events and hit of the owned next_rows; num_contacts rises by one for each vehicle
     # that begins to touch another vehicle
     worlds: Worlds,
     scratch: Scratch,
-    grid: Grid,  # spatial index over the vehicles of one world, filled here as far as needed
+    grid: Grid,  # spatial index over the vehicles of one world, filled here if needed
 ) -> None:
     """Mark contacts in `next_rows`."""
     for w in range(worlds.ticks.shape[0]):
@@ -323,14 +323,14 @@ def suggest(
     roads: RoadArrays,
     plans: NDArray[np.void],  # PLAN (V, G, L)
     travel: TripTables,
-    worlds: Worlds,  # not written
+    worlds: Worlds,  # input only
     scratch: Scratch,
     discrete: bool,  # whether to write meta-actions
     target_speeds: NDArray[np.float64],  # m/s, rising; discrete only
-    lookahead_s: float,  # time in which a target speed is to be reached; discrete only
-    dt: float,  # seconds of a step, for which an action applies
-    # (W, A, 2) is written: throttle in m/s² and steering in rad, or the meta-action in [..., 0];
-    # values of absent agents are unchanged
+    lookahead_s: float,  # time in which a target speed should be reached; discrete only
+    dt: float,  # length of a step, for which an action applies, s
+    # (W, A, 2) output: throttle in m/s² and steering in rad, or the meta-action in [..., 0];
+    # values of absent agents do not change
     out: NDArray[np.float64],
 ) -> None:
     """Write the actions that the built-in driver would take for the agents."""

@@ -2,7 +2,7 @@
 
 A call passes about sixty arrays from Python, which takes longer than the work in a small zone.
 `for_each_zone` therefore makes a kernel that calls the kernel of one zone for each zone in turn.
-The result of a zone depends on its own rows only, not on the other zones of the call.
+The result of a zone does not depend on the other zones of the call.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class Members(NamedTuple):
     numbers: NDArray[np.int64]  # (n,) the numbers of the zones, rising
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone
     sides: NDArray[np.int64]  # (2,) the halves of `ZoneState.rows` with committed and next rows
-    zones: ZoneArrays  # of the partition
+    zones: ZoneArrays  # the partition
     halo: Halo
     zoned: ZoneState
     common: SharedState
@@ -118,8 +118,8 @@ _OF_ZONE = {
 def for_each_zone(phase: Callable[..., object]) -> Callable[..., None]:
     """Return a kernel `NAME_each(members, ...)` that calls the kernel `phase` in each zone.
 
-    Parameters of `phase` that are named in `_OF_ZONE` are filled in for each zone. The others
-    follow `members` in the signature of the kernel that is returned, by the same names.
+    For each zone, the returned kernel fills in parameters of `phase` that are named in `_OF_ZONE`.
+    The other parameters follow `members` in its signature, with the same names.
     """
     names = list(inspect.signature(phase).parameters)
     given = [name for name in names if name not in _OF_ZONE]

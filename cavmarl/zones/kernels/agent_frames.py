@@ -25,7 +25,7 @@ Flags = NDArray[np.bool_]
 Owners = NDArray[np.int32]
 
 Table = NDArray[np.uint8]
-"""(A, b) b bytes of each agent."""
+"""(A, b): b bytes for each agent."""
 
 UNOWNED = -1  # the owner of an agent without a vehicle
 
@@ -59,7 +59,7 @@ def _aligned(at: int) -> int:
 def pack_agents(
     mine: Flags,  # (A,) agents in the frame
     tables: tuple[Table, ...],
-    words: Words,  # is written: the frame, with room for all agents
+    words: Words,  # output: the frame, with room for all agents
     data: Bytes,  # the same memory
 ) -> int:  # number of bytes
     """Write a frame of rows."""
@@ -78,16 +78,16 @@ def pack_agents(
 
 @kernel
 def take_agents(
-    tables: tuple[Table, ...],  # is written
+    tables: tuple[Table, ...],  # output
     words: Words,  # the first whole words of the frame
     data: Bytes,  # the frame and the following bytes
-    number: int,  # of the sending process
-    owner: Owners,  # (A,) is written: that number
+    number: int,  # number of the sending process
+    owner: Owners,  # (A,) output: `number` for each agent in the frame
 ) -> int:
     """Read a frame of rows.
 
     Returns:
-        The number of bytes; -1 if `pack_agents` has not made the frame, and nothing is written.
+        The number of bytes; -1 if `pack_agents` has not made the frame; then nothing is written.
     """
     size = 8
     for table in tables:
@@ -112,12 +112,12 @@ def take_agents(
 def note_own(
     present: Flags,  # (W, A) agents that have sensed in this process
     chosen: Flags,  # (W,) worlds to update
-    number: int,  # of this process
-    own: Flags,  # (W, A) is written: agents that have sensed here last
-    mine: Flags,  # (W · A,) is written: these agents in the chosen worlds
-    owner: Owners,  # (W · A,) is written: the number, or `UNOWNED`
+    number: int,  # number of this process
+    own: Flags,  # (W, A) output: agents that have sensed here last
+    mine: Flags,  # (W · A,) output: these agents in the chosen worlds
+    owner: Owners,  # (W · A,) output: `number`, or `UNOWNED`
 ) -> None:
-    """Record which agents belong to this process, as far as this process knows."""
+    """Record which agents this process owns, according to its own knowledge."""
     at = 0
     for w in range(own.shape[0]):
         for agent in range(own.shape[1]):
@@ -134,8 +134,8 @@ def pack_actions(
     meta_actions: NDArray[np.int64],  # (A,)
     mask: Flags,  # (A,) agents that act
     owner: Owners,  # (A,) the process of each agent, as far as known
-    number: int,  # of the receiving process
-    words: Words,  # (2 + 4 · A,) is written
+    number: int,  # number of the receiving process
+    words: Words,  # (2 + 4 · A,) output
     numbers: NDArray[np.float64],  # the same memory
 ) -> int:  # number of words
     """Write a frame of the actions of a process's agents and of agents without a vehicle."""
@@ -159,18 +159,18 @@ def pack_actions(
 def take_actions(
     words: Words,  # begin with the frame
     numbers: NDArray[np.float64],  # the same memory
-    controls: NDArray[np.float64],  # (A, 2) is written
-    meta_actions: NDArray[np.int64],  # (A,) is written
-    missing: Flags,  # (A,) is written: agents whose actions have not arrived
+    controls: NDArray[np.float64],  # (A, 2) output
+    meta_actions: NDArray[np.int64],  # (A,) output
+    missing: Flags,  # (A,) output: agents whose actions have not arrived
     owner: Owners,  # (A,) the process of each agent
-    number: int,  # of this process
-    wrong: Words,  # (A,) the first entries are written: agents of another process
+    number: int,  # number of this process
+    wrong: Words,  # (A,) output in the first entries: agents of another process
 ) -> tuple[int, int, int]:
     """Read a frame of actions.
 
     Returns:
-        The number of words, or -1 if `pack_actions` has not made the frame, and nothing is written;
-        the number of wrong agents; the number of agents that are still missing.
+        The number of words, or -1 if `pack_actions` has not made the frame (then nothing is
+        written); the number of wrong agents; the number of agents that are still missing.
     """
     num_agents = missing.size
     if words.size < 2 or min(words[0], words[1]) < 0 or max(words[0], words[1]) > num_agents:
@@ -228,7 +228,7 @@ def pack_results(
     of_step: bool,  # whether results are of a step; if not, of a reset
     with_common: bool,  # whether to include `outcome.common`
     mine: Flags,  # (W · A,) scratch
-    words: Words,  # is written
+    words: Words,  # output
     data: Bytes,  # the same memory
 ) -> int:  # number of bytes
     """Write a frame of results."""
@@ -254,12 +254,12 @@ def pack_results(
 
 @kernel
 def take_results(
-    outcome: Outcome,  # is written
+    outcome: Outcome,  # output
     chosen: Flags,  # (W,) the worlds that have been reset, or stepped
     of_step: bool,  # whether results are of a step; if not, of a reset
     with_common: bool,  # true for the process whose results are read first
-    number: int,  # of the sending process
-    owner: Owners,  # (W · A,) is written: the process of each agent
+    number: int,  # number of the sending process
+    owner: Owners,  # (W · A,) output: the process of each agent
     unread: Owners,  # (W · A,) scratch
     words: Words,  # the first whole words of the frame
     data: Bytes,

@@ -30,8 +30,8 @@ NEAR = np.dtype(
 class Borders(NamedTuple):
     """The rules for when a vehicle is near a border, and when it has crossed it."""
 
-    hysteresis_m: float  # up to this distance outside of its zone, a vehicle keeps its owner
-    ahead_s: float  # a vehicle is near a border if it crosses it within this time
+    hysteresis_m: float  # a vehicle keeps its owner up to this distance outside of the owner's zone
+    ahead_s: float  # a vehicle is near a border if it will cross the border within this time
     max_speed_mps: float  # upper bound of the speed of vehicles
 
 
@@ -42,7 +42,7 @@ def find_near(
     zoned: ZoneState,  # the rows of all zones
     side: int,  # the buffer of rows, 0 or 1
     w: int,
-    # whether to check all owned rows, or only rows that `exchange` has found near a border
+    # whether to check all owned rows; if not, only rows that `exchange` has found near a border
     check_all: bool,
     # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
@@ -123,20 +123,20 @@ def _note(
 def pass_on(
     vehicle: int,
     source: int,  # the present owner
-    row: int,  # its probable row there
+    row: int,  # the vehicle's probable row in the source zone
     target: int,  # the next owner
-    epoch: int,  # of the new ownership
+    epoch: int,  # epoch of the new ownership
     zoned: ZoneState,  # the rows of all zones and their numbers
     side: int,  # the buffer of rows, 0 or 1
     w: int,
 ) -> int:
-    """Change a vehicle's owner: its row becomes a ghost, and its ghost at the target a row.
+    """Change a vehicle's owner: the old row becomes a ghost, and the target's ghost becomes a row.
 
-    The new row is a copy of the old one; only its owner and its epoch differ.
+    The new row is a copy of the old row; only its owner and its epoch differ.
 
     Returns:
-        The vehicle's row at the target; -1 if the source does not own it; -2 if the target has no
-        ghost of it.
+        The vehicle's row at the target; -1 if the source does not own the vehicle; -2 if the target
+        has no ghost of the vehicle.
     """
     row = _owned_row(vehicle, source, row, zoned, side, w)
     if row < 0:

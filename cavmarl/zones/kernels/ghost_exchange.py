@@ -37,21 +37,21 @@ def exchange(
     halo: Halo,  # from `partition.zone_halo.zone_halo`, for the same partition
     touching_m: float,  # a ghost farther outside of a zone cannot touch a vehicle of the zone
     borders: Borders,
-    # the ghosts and their numbers, border and num_border are written. Only owned rows in `outer`
-    # are read; if this list is missing, it is made here
+    # ghosts, their numbers, border and num_border are outputs. Only owned rows in the list `outer`
+    # are read; if the list is missing, it is made here
     zoned: ZoneState,
     side: int,  # the buffer of rows, 0 or 1
     first: int,  # the first world
     last: int,  # one after the last world
-    book: BorderRecords,  # vehicles near a border are written
+    book: BorderRecords,  # output: vehicles near a border
 ) -> None:
     """Renew all ghosts of some worlds from the owned rows, and record vehicles near a border.
 
-    A zone needs a vehicle if and only if a driver there may consider it; see
+    A zone needs a vehicle if and only if a driver in the zone may consider it; see
     `visibility_tests.find_looks`. If a late transfer leaves a vehicle outside of its owner's zone,
-    the vehicle is published as usual, also to the zone that contains it.
+    the vehicle is published as usual, even to the zone that contains it.
     """
-    # Vehicles farther from a border cannot cross it within `ahead_s`.
+    # A vehicle at a greater distance cannot cross the border within `ahead_s`.
     border_m = borders.max_speed_mps * borders.ahead_s
     count = zones.rects.shape[0]
     for w in range(first, last):
@@ -71,14 +71,14 @@ def gather(
     halo: Halo,  # as for `exchange`
     touching_m: float,  # as for `exchange`
     border_m: float,  # an owned row within this distance of another zone is at a border, m
-    # the ghosts of this zone and their number, its border and num_border are written; outer and
-    # num_outer are not
+    # outputs: the ghosts of this zone and their number, its border and num_border, but not outer
+    # and num_outer
     zoned: ZoneState,
     side: int,  # the buffer of rows, 0 or 1
     zone: int,  # the zone that gathers
     w: int,
 ) -> None:
-    """Renew the ghosts of one zone from the owned rows of all others; record rows at a border.
+    """Renew the ghosts of one zone from the owned rows of all other zones; record rows at borders.
 
     Calls for different zones may run at the same time: a call writes only the state of its zone,
     and reads only state that no call writes.
@@ -126,9 +126,9 @@ def gather(
 def note_gathered(
     zones: ZoneArrays,
     borders: Borders,
-    zoned: ZoneState,  # num_outer is written: rows may change afterwards
+    zoned: ZoneState,  # num_outer is reset, since rows may change afterwards
     side: int,  # the buffer of rows, 0 or 1
-    book: BorderRecords,  # vehicles near a border are written
+    book: BorderRecords,  # output: vehicles near a border
 ) -> None:
     """Record vehicles near a border, as `exchange` does, after all zones have gathered ghosts."""
     for w in range(zoned.num_outer.shape[1]):
@@ -149,10 +149,10 @@ def _publish(
     w: int,
     due: NDArray[np.void],
 ) -> None:
-    """Append the owned rows of one zone to the rows of all zones that need them.
+    """Append the owned rows of one zone to the rows of all zones that need these rows.
 
-    The target zones are found first, in batches of the size of `due`. This search has unpredictable
-    branches, which do not delay the copies if the search has its own loop.
+    The target zones are searched first, in batches of the size of `due`. This search has
+    unpredictable branches, which do not delay the copies if the search has its own loop.
     """
     near_limit = touching_m * touching_m
     border_limit = border_m * border_m
@@ -205,7 +205,7 @@ def _publish(
 def _note_due(
     due: np.void, outer: np.void, zone: int, squared: float, near_limit: float, border_limit: float
 ) -> None:
-    """Write an entry for a row that a zone may need. The caller keeps or overwrites the entry."""
+    """Write an entry for a row that a zone may need; the caller may later overwrite the entry."""
     due["row"] = outer["row"]
     due["zone"] = zone
     due["near"] = squared <= near_limit
@@ -253,7 +253,7 @@ def _take_ghost(
     """Append row i of a zone to another zone's ghosts.
 
     Ghosts that can touch a vehicle of the zone come before all other ghosts. The step of the row's
-    route is copied, too, because the table of routes is far away in memory.
+    route is also copied, because the table of routes is far away in memory.
     """
     rows = zoned.rows[side, zone, w]
     step = zoned.step[zone, w]

@@ -1,11 +1,11 @@
-"""Forecast of a row one tick later: nodes send only the words of a ghost that differ from it.
+"""Forecast of a row one tick later: nodes only send words of a ghost that differ from the forecast.
 
-Sender and receiver compute the same forecast, with the same operations on the same numbers. So rows
-arrive bit for bit in any case; a good forecast only saves bytes.
+Sender and receiver compute the same forecast, with the same operations on the same numbers. So the
+received rows are always exact, bit for bit; a good forecast only saves bytes.
 
 A background driver chooses an acceleration (`throttle`). Speed, rates and sums follow from it, as
-in `motion.move_background` and `motion.account`. The position on the map depends on the roads, and
-is sent.
+in `motion.move_background` and `motion.account`. The position on the map is sent, since it depends
+on the roads.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from cavmarl.core.compiled import inlined_kernel
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS, STANDING_MPS
 from cavmarl.zones.kernels.row_bounds import Bounds
 
-# The word of a VEHICLE record with each field; the lane is in the low half of its word.
+# The offset in words of each field in a VEHICLE record; the lane is in the low half of its word.
 PLACES = {
     "s": 1, "speed": 3, "lane": 5, "speed_factor": 8, "wait_s": 9, "accel": 21, "jerk": 23,
     "throttle": 26, "tick": 29, "to_go": 30, "distance_m": 31, "free_s": 32, "step_to_go": 33,
@@ -36,13 +36,13 @@ Floats = NDArray[np.float64]
 class Forecast(NamedTuple):
     """The constants and the scratch memory of forecasts."""
 
-    dt: float  # s of a tick
+    dt: float  # length of a tick in s
     ticks_per_step: int
     way_to_go: int  # index of the step's `to_go` among the words of a row and its step
     limits: Floats  # (lanes,) m/s
-    beyond: Floats  # (lanes,) m from a lane's start to the end of the link that it is in
-    row_bounds: Bounds  # of the indices in a row
-    bounds: Bounds  # of the indices in a row followed by its step
+    beyond: Floats  # (lanes,) m from a lane's start to the end of its link
+    row_bounds: Bounds  # bounds of the indices in a row
+    bounds: Bounds  # bounds of the indices in a row followed by its step
     words: Words  # scratch: the forecast of a row and its step
     floats: Floats  # the same memory
 
@@ -60,11 +60,11 @@ def write_forecast(
     before_words: Words,  # the same memory
     row: Floats,  # the present row; a word of the forecast is read only after it is written
     row_words: Words,  # the same memory
-    known: np.uint64,  # a bit per word; known words are not written
-    found: Floats,  # is written: a copy of the row before, or `row` itself
+    known: np.uint64,  # one bit per word; words with the bit 1 are not written
+    found: Floats,  # output: a copy of the row one tick ago, or `row` itself
     found_words: Words,  # the same memory
 ) -> None:
-    """Write the words that change in every tick, each after the words that it depends on."""
+    """Write the words that change in every tick, each word after the words on which it depends."""
     dt = forecast.dt
     if not is_known(known, SPEED):
         speed = before[SPEED] + row[THROTTLE] * dt
@@ -90,7 +90,7 @@ def write_forecast(
         found[TO_GO] = row[forecast.way_to_go] + (
             -row[S] + forecast.beyond[_lane(forecast, row_words)]
         )
-    begins = before_words[TICK] % forecast.ticks_per_step == 0  # a step
+    begins = before_words[TICK] % forecast.ticks_per_step == 0  # whether a step begins
     if not is_known(known, STEP_TO_GO):
         found[STEP_TO_GO] = before[TO_GO] if begins else before[STEP_TO_GO]
     if not is_known(known, STEP_JERK):

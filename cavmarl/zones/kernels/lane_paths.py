@@ -12,7 +12,7 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 
 @inlined_kernel
 def _num_next(roads: RoadArrays, lane: int, forwards: bool) -> int:
-    """Return the number of lanes that follow a lane, or lead to it."""
+    """Return the number of lanes that follow a lane (forwards), or that lead to it (backwards)."""
     row = roads.lanes[lane]
     if not forwards:
         return int(row["num_into"])
@@ -43,11 +43,11 @@ def begin_paths(
 @kernel
 def extend_paths(
     roads: RoadArrays,
-    # whether paths lead in the direction of driving, to the starts of lanes; if not, backwards to
-    # the ends of lanes
+    # whether paths lead in the direction of driving, to the starts of lanes; if not, they lead
+    # backwards to the ends of lanes
     forwards: bool,
-    limit_m: float,  # of the length of a path
-    # (L,) m, is written; finite where paths begin, inf elsewhere; values above the limit are kept
+    limit_m: float,  # limit of the length of a path
+    # (L,) m, updated; finite where paths begin, inf elsewhere; values above the limit are kept
     ways: NDArray[np.float64],
     scratch: VisibilityScratch,  # `waits` and `following` are used
 ) -> None:

@@ -1,6 +1,6 @@
-"""Approaches to borders and changes of owner where one process has all zones.
+"""Approaches to borders, and changes of owner, if one process has all zones.
 
-`BorderRecords` has both. Vehicles near a border are recorded at the end of a tick, together with
+`BorderRecords` stores both. Vehicles near a border are recorded at the end of a tick, together with
 the exchange of ghosts. In most ticks no vehicle has crossed, so the next tick has nothing to do.
 """
 
@@ -24,9 +24,9 @@ NOT_SEEN = -2
 COMING = np.dtype(
     [
         ("vehicle", np.int64),
-        ("target", np.int64),  # zone that it approaches
-        ("epoch", np.int64),  # of its present ownership
-        ("tick", np.int64),  # in which it was near first
+        ("target", np.int64),  # zone that the vehicle approaches
+        ("epoch", np.int64),  # epoch of the present ownership
+        ("tick", np.int64),  # first tick in which the vehicle was near
         ("depth_m", np.float64),  # distance outside of its owner's zone in that tick, see NEAR
         ("ms", np.float64),  # clock time of that tick
     ],
@@ -39,13 +39,13 @@ CHANGE = np.dtype(
         ("vehicle", np.int64),
         ("source", np.int64),
         ("target", np.int64),
-        ("epoch", np.int64),  # of the new ownership
-        ("place", np.int64),  # its row at the target
-        ("approached", np.int64),  # tick in which it was near first
+        ("epoch", np.int64),  # epoch of the new ownership
+        ("place", np.int64),  # the vehicle's row at the target
+        ("approached", np.int64),  # first tick in which the vehicle was near
         ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick,
         ("switch_depth_m", np.float64),  # at the change of owner,
         ("release_depth_m", np.float64),  # and one tick later; NaN: the vehicle has left the world
-        # duration since it was near first; until the tick ends, clock time of the first approach
+        # duration since the first approach; until the tick ends, clock time of the first approach
         ("ms", np.float64),
     ],
     align=True,
@@ -56,8 +56,8 @@ DUE = np.dtype(
     [
         ("row", np.int32),  # index of the row at its owner
         ("zone", np.int32),  # zone that needs the row
-        ("near", np.bool_),  # whether it can touch a vehicle there
-        ("at_border", np.bool_),  # whether it is at a border of that zone
+        ("near", np.bool_),  # whether the vehicle can touch a vehicle of that zone
+        ("at_border", np.bool_),  # whether the vehicle is at a border of that zone
     ],
     align=True,
 )
@@ -67,27 +67,27 @@ BATCH_SIZE = 512
 """Size of a batch of rows to copy; larger than the greatest number of zones."""
 
 UNREAD_LIMIT = 256
-"""Unread changes are read from this number on. A tick may add one more change per vehicle."""
+"""As soon as this many changes are unread, they are read. A tick adds at most one per vehicle."""
 
 
 class BorderRecords(NamedTuple):
-    """Approaches and changes of owner at the borders of W worlds, with room for C rows a zone."""
+    """Approaches and changes of owner at the borders of W worlds, with room for C rows per zone."""
 
-    near: NDArray[np.void]  # NEAR (W, 2 C) in the newest rows
-    num_near: NDArray[np.int64]  # (W,)
-    num_crossed: NDArray[np.int64]  # (W,) entries of `near` that have crossed
+    near: NDArray[np.void]  # NEAR (W, 2 C) vehicles near borders, in the newest rows
+    num_near: NDArray[np.int64]  # (W,) number of entries of `near`
+    num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near, owner unchanged; two lists, swapped a tick
-    turn: NDArray[np.int64]  # (W,) index of the present list; the other list is of the tick before
-    num_coming: NDArray[np.int64]  # (W, 2)
-    known: NDArray[np.int64]  # (W,) entries of the present list that were in the list before
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two lists that take turns
+    turn: NDArray[np.int64]  # (W,) index of the present list; the other is the previous tick's
+    num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
+    known: NDArray[np.int64]  # (W,) entries of the present list that were in the previous list
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
     aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
-    ms: NDArray[np.float64]  # (W,) clock time at the begin of that tick
+    ms: NDArray[np.float64]  # (W,) clock time at the start of that tick
     newborn: NDArray[np.int64]  # (W, C) ids that have entered since the last tick began
     changes: NDArray[np.void]  # CHANGE (W, C + UNREAD_LIMIT) that are not read yet
-    num_changes: NDArray[np.int64]  # (W,)
+    num_changes: NDArray[np.int64]  # (W,) number of entries of `changes`
     due: NDArray[np.void]  # DUE (BATCH_SIZE,) scratch of `exchange`
 
 
@@ -124,7 +124,7 @@ def look(
     w: int,
     check_all: bool,  # whether to check all owned rows, see `find_near`
     num_newborn: int,  # vehicles in `book.newborn[w, :num_newborn]` are left out
-    book: BorderRecords,  # `near` and `coming` are written
+    book: BorderRecords,  # outputs: `near` and `coming`
 ) -> None:
     """Record vehicles that are near a border or have crossed it."""
     near = book.near[w]
@@ -167,13 +167,13 @@ def hand_over(
     w: int,
     check_all: bool,  # whether rows have changed since `look_on`
     num_newborn: int,  # see `look`
-    book: BorderRecords,  # is written
+    book: BorderRecords,  # output
 ) -> int:
     """Give every vehicle beyond its zone's hysteresis to the zone that contains it.
 
     Returns:
-        The number of changes, which are at the end of `book.changes` by rising ids; or NOT_OWNED or
-        NOT_SEEN, with the failed change after them.
+        The number of changes, which are at the end of `book.changes` by rising ids. If a change
+        fails: NOT_OWNED or NOT_SEEN, and the failed change follows the other changes.
     """
     if check_all:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
@@ -219,7 +219,7 @@ def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> 
 
 @inlined_kernel
 def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
-    """Write the present list in `coming`. Vehicles in the list before keep their first approach."""
+    """Write the present list in `coming`; vehicles of the previous list keep their approach."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
     now = book.coming[w, turn]
@@ -310,7 +310,7 @@ def release(
     w: int,
     changed: int,  # number of the newest changes
     now_ms: float,  # clock time
-    book: BorderRecords,  # `changes` is written
+    book: BorderRecords,  # output: `changes`
 ) -> None:
     """Complete the newest changes at the end of their tick: duration and distance to the source."""
     last = book.num_changes[w]

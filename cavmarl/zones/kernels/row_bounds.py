@@ -10,12 +10,12 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 Words = NDArray[np.int64]
 
 Bounds = NDArray[np.int64]
-"""(k, 4) for each index: its word in a row; its first bit in the word, `WHOLE` or `WITH_LANE`; its
-least value; and the first value that is too large."""
+"""(k, 4) for each index: its word in a row; its first bit in the word, or `WHOLE` or `WITH_LANE`;
+its minimum; and the first value that is too large."""
 
 WHOLE = -1  # the index takes the whole word, not 32 bits
 WITH_LANE = -2  # the index is the sum of the whole word and the row's lane
-_LANE = 5  # the word with the lane in its low half
+_LANE = 5  # offset of the word that has the lane in its low half
 _LOW = np.int64((1 << 32) - 1)
 _SIGN = np.int64(1 << 31)
 

@@ -1,7 +1,7 @@
 """Frames that two processes exchange about the rows of a tick: ghosts and vehicles that leave.
 
 If another process hosts a zone, the zone has no owned rows here, and `exchange` writes only its
-ghosts. For a ghost that was in the frame before, only words that differ from their forecast are
+ghosts. For a ghost that was in the previous frame, only words that differ from their forecast are
 sent.
 A ghost has V + S + 2 words: its row, its step, the place of the step, its world.
 
@@ -9,11 +9,11 @@ A frame for a process with k zones in W worlds has these words:
 
     1           number of words in the frame
     W           numbers of vehicles that this process owns
-    W           numbers of changes of route since the frame before
+    W           numbers of changes of route since the previous frame
     W           numbers of vehicles that leave
     k · W · 2   numbers of ghosts, and of ghosts that can touch a vehicle of the zone
-    n           for each ghost, its index in the frame before; -1: it is sent whole
-    n           for each ghost, a bit per word that is sent, because `ghost_forecast` differs
+    n           for each ghost, its index in the previous frame; -1: all its words are sent
+    n           for each ghost, one bit per word: 1 if the word is sent, because it differs
     …           rows of the vehicles that leave
     …           words of ghosts
 """
@@ -32,7 +32,7 @@ from cavmarl.zones.kernels.row_bounds import is_bounded
 
 ID = 0  # the word of a row with the vehicle's id
 AFTER = 2  # number of words in a ghost after its row and its step
-MOST = 64  # limit of the words of a ghost: one word has a bit for each of them
+MOST = 64  # limit of the words of a ghost, since one word has one bit for each of them
 GROUP = 8  # number of words that are compared at once
 NO_FRAME = -(1 << 62)
 
@@ -42,7 +42,7 @@ Words = NDArray[np.int64]
 class ExchangeState(NamedTuple):
     """The state that a process exchanges with another process."""
 
-    rows: Words  # (2, k, W, C, V) of all zones
+    rows: Words  # (2, k, W, C, V) rows of all zones
     steps: Words  # (k, W, C, S)
     step_at: NDArray[np.int64]  # (k, W, C)
     num_owned: NDArray[np.int64]  # (k, W)
@@ -50,8 +50,8 @@ class ExchangeState(NamedTuple):
     num_near: NDArray[np.int64]  # (k, W)
     mine: NDArray[np.int64]  # zones of this process
     theirs: NDArray[np.int64]  # zones of the other process
-    running: NDArray[np.int64]  # (W,) is written: vehicles of this process and of frames so far
-    rerouted: NDArray[np.int64]  # (W,) is written: changes of route up to the last frame
+    running: NDArray[np.int64]  # (W,) output: vehicles of this process and of frames so far
+    rerouted: NDArray[np.int64]  # (W,) output: changes of route up to the last frame
 
 
 class Ghosts(NamedTuple):
@@ -86,10 +86,10 @@ def pack_frame(
     side: int,
     passing: Passing,
     forecast: Forecast,
-    before: Ghosts,  # of the frame before
+    before: Ghosts,  # ghosts of the previous frame
     slots: NDArray[np.int32],  # scratch; its size is a power of two above the number of `before`
-    now: Ghosts,  # the first rows are written: the ghosts
-    frame: Words,  # is written
+    now: Ghosts,  # output in the first rows: the ghosts
+    frame: Words,  # output
 ) -> int:
     """Write a frame.
 
@@ -134,7 +134,7 @@ def _pack_ghosts(
     slots: NDArray[np.int32],
     now: Ghosts,
     frame: Words,
-    first: int,  # start of the ghosts' indices in the frame before
+    first: int,  # start in `frame` of the ghosts' indices in the previous frame
     total: int,
     at: int,  # start of the ghosts' words
 ) -> int:
@@ -179,7 +179,7 @@ def _every_bit(num: int) -> np.uint64:
 
 @inlined_kernel
 def _pack_differences(known: Words, ghost: Words, frame: Words, at: int) -> tuple[np.uint64, int]:
-    """Write the words that differ from known ones. Return their bits, and where they end."""
+    """Write the words that differ from known words. Return their bits, and where they end."""
     bits = np.uint64(0)
     for first in range(0, ghost.size, GROUP):
         if _differ(known, ghost, first):
@@ -240,10 +240,10 @@ def _count_ghosts(both: ExchangeState, frame: Words) -> int:
 def take_frame(
     both: ExchangeState,
     side: int,
-    passing: Passing,  # is written
+    passing: Passing,  # output
     forecast: Forecast,
-    before: Ghosts,  # of the frame before
-    now: Ghosts,  # the first rows are written: the ghosts
+    before: Ghosts,  # ghosts of the previous frame
+    now: Ghosts,  # output in the first rows: the ghosts
     frame: Words,
 ) -> int:
     """Append the rows in a frame to the rows of these zones and to the departure queue.
@@ -326,7 +326,7 @@ def _put(both: ExchangeState, side: int, zone: int, w: int, ghost: Words, is_nea
 
 @inlined_kernel
 def _copy(source: Words, first: int, target: Words, to: int, num: int) -> None:
-    # Unsigned indices, because Numba checks whether signed ones are negative.
+    # The indices are unsigned, because Numba checks whether signed indices are negative.
     for c in range(num):
         target[np.uint64(to + c)] = source[np.uint64(first + c)]
 
@@ -338,7 +338,7 @@ def _unpack(
     now: Ghosts,
     num: int,
     frame: Words,
-    before_at: int,  # start in `frame` of the ghosts' indices in the frame before
+    before_at: int,  # start in `frame` of the ghosts' indices in the previous frame
     at: int,  # start of the ghosts' words
 ) -> bool:
     """Write the ghosts of a frame to `now`. Return whether the frame is valid."""
@@ -373,7 +373,7 @@ def _unpack(
 
 @inlined_kernel
 def _slot(ghost: Words, slots: NDArray[np.int32]) -> int:
-    """Return the first slot for a ghost, a hash of its vehicle and its world."""
+    """Return the first slot for a ghost: a hash of its vehicle and its world."""
     word = np.uint64(ghost[ID]) * np.uint64(0x9E3779B97F4A7C15) + np.uint64(ghost[ghost.size - 1])
     return int(np.int64((word >> np.uint64(32)) & np.uint64(slots.size - 1)))
 
@@ -390,7 +390,7 @@ def _fill_slots(before: Words, slots: NDArray[np.int32]) -> None:
 
 @inlined_kernel
 def _find(before: Words, slots: NDArray[np.int32], ghost: Words) -> int:
-    """Return the index of the same vehicle's ghost in the frame before; -1: there is none."""
+    """Return the index of the same vehicle's ghost in the previous frame; -1: there is none."""
     at = _slot(ghost, slots)
     last = ghost.size - 1
     found = -1

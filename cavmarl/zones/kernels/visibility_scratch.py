@@ -15,11 +15,11 @@ class VisibilityScratch(NamedTuple):
     last: NDArray[np.float64]  # (L,) end of the zone's part of a lane, m
     ahead: NDArray[np.float64]  # (L,) distance from a driver of the zone to a lane's start, m
     behind: NDArray[np.float64]  # (L,) distance from a lane's end to a vehicle with followers, m
-    to_line: NDArray[np.float64]  # (L,) distance from a lane's end to the line of a foe, m
-    to_room: NDArray[np.float64]  # (L,) the same for the lines of foes in `swept`
+    to_line: NDArray[np.float64]  # (L,) distance from a lane's end to the stop line of a foe, m
+    to_room: NDArray[np.float64]  # (L,) distance from a lane's end to the line of a foe in `swept`
     beyond: NDArray[np.float64]  # (L,) distance from a junction in `asked` to a lane, m
     asked: NDArray[np.bool_]  # (K,) links that a driver of the zone may want to enter
-    foe: NDArray[np.bool_]  # (K,) foes of these links
+    foe: NDArray[np.bool_]  # (K,) foes of the links in `asked`
     swept: NDArray[np.bool_]  # (K,) foes for which vehicles leave room
     waits: NDArray[np.bool_]  # (L,) lanes in the queue of a search
     following: NDArray[np.int32]  # (L,) the next lane in the queue

@@ -1,10 +1,10 @@
 """The parts of lanes with vehicles that a zone's drivers may consider.
 
-A halo is as wide as the farthest look in any direction. But a driver looks only along its route, at
-vehicles beside it, and at vehicles that approach the stop lines before it. Most lanes within the
-halo have no such vehicles. This module follows the roads from the zone's own lanes, and finds the
-part of each lane in which vehicles can matter. A part that is too large causes needless copies; a
-part that is too small causes wrong results.
+A halo is as wide as the farthest look in any direction. But a driver only considers vehicles along
+its route, beside it, and on the approach to the stop lines before it. Most lanes within the halo
+have no such vehicles. This module follows the roads from the zone's own lanes, and finds the part
+of each lane in which vehicles can matter. A part that is too large causes needless copies; a part
+that is too small causes wrong results.
 
 The search runs once per partition, not in each tick.
 """
@@ -31,16 +31,16 @@ from cavmarl.zones.kernels.visibility_scratch import VisibilityScratch
 from cavmarl.zones.kernels.zone_lookup import squared_distance
 
 AT_LINE_M = 0.2  # a vehicle within this distance of a line may be about to cross it
-ASIDE_M = 10.0  # bound of the distance, and of the difference in s, of adjacent places on an edge
+ASIDE_M = 10.0  # limit of the distance, and of the difference in s, of adjacent places on an edge
 BACK_M = max(LOOK_BACK_M, ENTER_REACH_M)  # distance back to the end of lanes with followers
-ROUNDING_M = 0.1  # bound of the rounding of sums over lanes and of float32
+ROUNDING_M = 0.1  # limit of rounding errors of sums over lanes and of float32
 
 
 @kernel
 def _within(
     rect: NDArray[np.float64], x: float, y: float, to_x: float, to_y: float
 ) -> tuple[float, float]:
-    """Return the part of a segment in a rectangle, as shares from 0 to 1; else (inf, -inf)."""
+    """Return the part of a segment in a rectangle, as shares from 0 to 1; none: (inf, -inf)."""
     low = 0.0
     high = 1.0
     for axis in range(2):
@@ -105,7 +105,7 @@ def _widen(looks: NDArray[np.void], lane: int, first: float, last: float, length
 
 @inlined_kernel
 def _longest_beside_m(roads: RoadArrays, lane: int) -> float:
-    """Return how far adjacent lanes go on beside the junction at a lane's end; 0: not at all."""
+    """Return the length of adjacent lanes beside the junction at a lane's end; 0: no such lanes."""
     further = 0.0
     for side in (roads.lanes[lane]["left"], roads.lanes[lane]["right"]):
         if side >= 0 and not roads.lanes[lane]["internal"]:
@@ -119,7 +119,7 @@ def _look_beyond(
 ) -> None:
     """Make vehicles visible that are past a lane's end but may cover a longer adjacent lane.
 
-    `back` is the place in m on the lane from which on followers are visible; inf: all vehicles are.
+    Followers are visible beyond the place `back` in m on the lane; inf: all vehicles are visible.
     """
     further = _longest_beside_m(roads, lane)
     if further == 0.0:
@@ -146,7 +146,7 @@ def _see(
     lane: int,
     first: float,
     last: float,
-    half_m: float,  # of the longest vehicle
+    half_m: float,  # half the length of the longest vehicle
     looks: NDArray[np.void],
 ) -> None:
     """Extend the visible part of all lanes of an edge: adjacent vehicles may change lanes."""
@@ -302,7 +302,7 @@ def _look_at_junctions(
 
 @inlined_kernel
 def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void]) -> None:
-    """Make vehicles on the edge of a lane visible within `MERGES_M` of the line, `way` m ahead."""
+    """Make vehicles on a lane's edge visible within `MERGES_M` of the line `way` m ahead."""
     edge = roads.edges[roads.lanes[lane]["edge"]]
     for other in range(edge["first_lane"], edge["first_lane"] + edge["num_lanes"]):
         place = way + roads.lanes[other]["length_m"] - ROUNDING_M
@@ -311,10 +311,10 @@ def _merge_from(roads: RoadArrays, lane: int, way: float, looks: NDArray[np.void
 
 @kernel
 def _look_at_merges(roads: RoadArrays, scratch: VisibilityScratch, looks: NDArray[np.void]) -> None:
-    """Make vehicles visible from farther away before foes' lines where vehicles merge.
+    """Make vehicles visible at greater distances before the lines of foes where vehicles merge.
 
-    These vehicles are on the lanes before the lines, or on lanes with the right of way that lead
-    to these lanes.
+    These vehicles are on the lanes before the lines, or on lanes with the right of way that lead to
+    these lanes.
     """
     for lane in range(roads.lanes.shape[0]):
         if scratch.to_line[lane] == 0.0 and roads.lanes[lane]["merges"]:
@@ -348,7 +348,7 @@ def find_looks(
     see_m: float,  # distance of a driver's centre to a line at which it considers the junction
     half_m: float,  # half the length of the longest vehicle
     scratch: VisibilityScratch,  # see `make_scratch`
-    looks: NDArray[np.void],  # LOOK (L,) is written
+    looks: NDArray[np.void],  # LOOK (L,) output
 ) -> None:
     """Find the part of each lane in which vehicles matter to the drivers of one zone."""
     for lane in range(roads.lanes.shape[0]):
@@ -375,7 +375,7 @@ def _farther(
     zone: int,
     squared: float,
 ) -> float:
-    """Return the maximum of `squared` and the squared distances of part of a segment from a zone.
+    """Return the maximum of `squared` and the squared distance from a zone to part of a segment.
 
     The part is from `first` to `last` m of the lane. One of its ends is its farthest point.
     """
@@ -399,7 +399,7 @@ def farthest_m(
     zone: int,
     looks: NDArray[np.void],  # LOOK (L,) of the zone, from `find_looks`
 ) -> float:
-    """Return the distance from a zone of the farthest vehicle that its drivers may consider."""
+    """Return the distance from a zone to the farthest vehicle that its drivers may consider."""
     squared = 0.0
     for lane in range(roads.lanes.shape[0]):
         look = looks[lane]

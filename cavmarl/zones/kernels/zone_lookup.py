@@ -1,13 +1,13 @@
-"""Lookup of the zone of a position, and of the zones that must see a vehicle there.
+"""Lookup of the zone of a position, and of the zones that must see a vehicle at the position.
 
 A zone is a rectangle [min_x, max_x) by [min_y, max_y); zones at the rim extend to infinity. The
-cuts of all zones form a table of cells, each of one zone. Two searches among the cuts find the cell
-of a position. They only compare the coordinates with stored numbers, so all processes agree, also
-on a border.
+cuts of all zones form a table of cells, each of which belongs to one zone. Two searches among the
+cuts find the cell of a position. They only compare the coordinates with stored numbers, so all
+processes agree, even for positions on a border.
 
-Ghosts depend on a vehicle's position: a zone gets the vehicle as a ghost if it is within the zone's
-halo and a driver there may consider it, even if the zone does not touch the vehicle's own zone
-(decision 012).
+Ghosts depend on a vehicle's position: a zone receives a ghost of the vehicle if the vehicle is
+within the zone's halo and a driver of the zone may consider it, even if the zone does not touch the
+vehicle's own zone (decision 012).
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ class ZoneArrays(NamedTuple):
 
 LOOK = np.dtype([(name, np.float32) for name in ("head", "tail", "back", "line", "room", "merge")])
 """The vehicles on a lane that a zone's drivers may consider (`kernels.visibility_tests`), by their
-position in m along the lane: vehicles up to `head`, vehicles from `tail` on, and vehicles within
+position in m along the lane: vehicles up to `head`, vehicles beyond `tail`, and vehicles within
 their registration distance of one of three places. These are `back`, the position of a vehicle that
 they may follow; `line`, a stop line, except for vehicles that may be ignored before it; and `room`,
 a stop line before which no vehicle may be ignored. Moving vehicles are also considered within
@@ -74,9 +74,9 @@ class Halo(NamedTuple):
     # near[near_start[z] : near_start[z + 1]]: zones within the halo of zone z, including z
     near: NDArray[np.int32]
     sure_m: float  # all vehicles within this distance are seen
-    seen_m: float  # between `sure_m` and this, vehicles in `watchers` are seen; beyond it, none
+    seen_m: float  # from `sure_m` to this distance, only vehicles in `watchers` are seen
     line_m: float  # a vehicle whose centre is farther before a line has not reached the line
-    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) if sure_m is seen_m: there are no watchers
+    watcher_start: NDArray[np.int32]  # (L + 1,); (1,) without watchers: sure_m equals seen_m
     # WATCH: watchers[watcher_start[l] : watcher_start[l + 1]] are the zones that may see vehicles
     # on lane l, and the vehicles that they see
     watchers: NDArray[np.void]
@@ -100,7 +100,7 @@ def _slot(cuts: NDArray[np.float64], value: float) -> int:
 def zone_of(zones: ZoneArrays, x: float, y: float) -> int:
     """Return the zone of a position in metres, in O(log k).
 
-    A position on a border belongs to the zone that begins there.
+    A position on a border belongs to the zone that begins at the border.
     """
     return int(zones.cells[_slot(zones.cuts_y, y), _slot(zones.cuts_x, x)])
 
@@ -110,7 +110,7 @@ def zones_of(
     zones: ZoneArrays,
     rows: NDArray[np.void],  # records with `x` and `y` in metres, such as VEHICLE
     num: int,  # number of rows to look up, `rows[:num]`
-    out: NDArray[np.int32],  # (num,) or longer, is written
+    out: NDArray[np.int32],  # (num,) or longer, output
 ) -> None:
     """Write the zone of each row's position; see `zone_of`."""
     for i in range(num):
@@ -128,10 +128,10 @@ def is_inside(rect: NDArray[np.float64], x: float, y: float) -> bool:
 def squared_distance(rects: NDArray[np.float64], zone: int, x: float, y: float) -> float:
     """Return the squared distance in m² from a position to the nearest point of a zone; 0 inside.
 
-    Rounding is monotonic. So the squared distance from (x, y) to a vehicle inside the zone, if
-    computed with the same operations, is never smaller, not even by one bit.
+    Rounding is monotonic. So the squared distance from (x, y) to any vehicle inside the zone,
+    computed with the same operations, is at least as large, without any rounding error.
     """
-    # One difference is negative, or both are inside: this needs no branch.
+    # On each axis, at most one difference is positive, so no branch is needed.
     dx = max(rects[zone, 0] - x, x - rects[zone, 2], 0.0)
     dy = max(rects[zone, 1] - y, y - rects[zone, 3], 0.0)
     return float(dx * dx + dy * dy)
@@ -154,7 +154,7 @@ def note_outer(outer: np.void, row: np.void, i: int) -> None:
 @inlined_kernel
 def may_be_considered(halo: Halo, watch: np.void, row: np.void) -> bool:
     """Return whether a driver of a zone that watches a vehicle's lane may consider the vehicle."""
-    # No branches: they are unpredictable, and would cost more than the work that they save.
+    # Branches would be unpredictable, and would cost more than the work that they save.
     s = row["s"]
     reach_m = registration_distance_m(row["speed"])
     to_line = watch["line"] - s
@@ -163,7 +163,7 @@ def may_be_considered(halo: Halo, watch: np.void, row: np.void) -> bool:
     comes = (to_line < reach_m) & (not is_let)
     merges = (watch["merge"] - s < MERGES_M) & (not stands)
     follows = watch["back"] - s < reach_m
-    swept = watch["room"] - s < reach_m  # waiting drivers leave room even if they may ignore it
+    swept = watch["room"] - s < reach_m  # drivers leave room even for vehicles they may ignore
     considered: bool = (
         (s <= watch["head"]) | (s >= watch["tail"]) | follows | comes | merges | swept
     )
@@ -175,10 +175,10 @@ def is_seen(
     halo: Halo,
     zone: int,
     row: np.void,  # VEHICLE or OUTER
-    squared: float,  # m², its `squared_distance` from the zone
+    squared: float,  # m², the `squared_distance` of the row from the zone
 ) -> bool:
     """Return whether a zone must see a vehicle."""
-    if not squared <= halo.seen_m * halo.seen_m:  # false for NaN, too
+    if not squared <= halo.seen_m * halo.seen_m:  # also false for NaN
         return False
     if squared <= halo.sure_m * halo.sure_m:
         return True

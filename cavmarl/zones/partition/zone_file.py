@@ -5,8 +5,8 @@
      "zones": [{"id": 0, "rect_m": [0.0, 0.0, 120.0, 100.0]},
                {"id": 1, "rect_m": [120.0, 0.0, 200.0, 100.0]}]}
 
-The file is JSON, or the same as YAML. The rectangles (min_x, min_y, max_x, max_y) tile `bounds_m`;
-sides on `bounds_m` extend to infinity. Ids are 0 to k - 1, in any order.
+The file is JSON or YAML. The rectangles (min_x, min_y, max_x, max_y) tile `bounds_m`; sides on
+`bounds_m` extend to infinity. Ids are 0 to k - 1, in any order.
 """
 
 from __future__ import annotations
@@ -68,7 +68,7 @@ def read_zones(path: str | Path) -> ZonePartition:
 
 
 def zones_for(network: RoadNetwork, path: str | Path, count: int | None) -> ZonePartition:
-    """Return a zone file's partition, if it covers this map and has `count` zones, if given."""
+    """Return a zone file's partition. Raises ConfigError: map or number of zones do not match."""
     partition = read_zones(path)
     if count is not None and partition.count != count:
         raise ConfigError(

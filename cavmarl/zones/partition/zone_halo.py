@@ -1,7 +1,7 @@
 """Halos: the areas beyond their borders that zones see.
 
-A halo is a distance (decision 012): a zone gets every vehicle within this distance, from neighbours
-and from zones that do not touch it.
+A halo is a distance (decision 012): a zone receives a ghost of every vehicle within this distance,
+even from zones that do not touch the zone.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ def zone_halo(partition: ZonePartition, halo_m: float) -> Halo:
 
 
 def lane_watchers(
-    partition: ZonePartition,  # of k zones
+    partition: ZonePartition,  # k zones
     lanes: NDArray[np.void],  # LANE (L,)
     looks: NDArray[np.void],  # LOOK (k, L), the vehicles that each zone's drivers may consider
     within_m: float,  # a zone within this distance of a lane's bounding box always watches it
@@ -64,7 +64,7 @@ def lane_watchers(
 
 def inner_parts(partition: ZonePartition, seen_m: float) -> NDArray[np.float64]:
     """Return the part (k, 4) of each zone that is farther than `seen_m` from all other zones."""
-    # The margin keeps vehicles in this part invisible to other zones in spite of rounding.
+    # With the margin, no other zone sees vehicles in this part, in spite of rounding.
     margin = seen_m + _ROUNDING_M
     inner: NDArray[np.float64] = partition.reaching + np.array([margin, margin, -margin, -margin])
     return inner

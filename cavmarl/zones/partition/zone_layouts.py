@@ -23,13 +23,13 @@ Floats = NDArray[np.float64]
 Rect = tuple[float, float, float, float]
 
 _WEIGHTS = ("lane_length", "uniform")
-MIN_SIDE_M = 5.0  # of a zone: about the length of a car
-# Margin around the roads, so that a single straight road has an area, too.
+MIN_SIDE_M = 5.0  # minimum side of a zone: about the length of a car
+# Margin around the roads, so that even a single straight road has an area.
 _RIM_M = 5.0
-# How far a cut may move to avoid junctions: as a share of a zone's side or of the lesser weight.
+# How far a cut may move to avoid junctions, as a share of a zone's side or of the smaller weight.
 _SIDE_SHIFT = 0.25
 _WEIGHT_SHIFT = 0.1
-# Distance of a moved cut from the junction, if there is room.
+# Distance of a moved cut from the junction that it avoids, if there is room.
 _CLEAR_M = 1.0
 
 
@@ -47,8 +47,8 @@ def cut_map(
     layout: str,  # `grid`, `strips` or `bisection`
     count: int,  # k
     *,
-    # move cuts, by at most a quarter of a zone's side (bisection: a tenth of the weight), so that
-    # they do not cut junctions
+    # whether to move cuts, by at most a quarter of a zone's side (bisection: a tenth of the
+    # weight), so that they do not cut junctions
     avoid_junctions: bool = False,
     weight: str = "lane_length",  # for bisection: `lane_length`, or `uniform` for area
     # (n, 3) x and y in m and a weight, such as expected vehicles; it replaces `weight`
@@ -180,7 +180,7 @@ def _window(
 
 
 def _quantile(rect: Rect, samples: Floats | None, axis: int) -> Callable[[float], float]:
-    """Return a function from a share to the coordinate below which this share of weight is."""
+    """Return a function that maps a share of the weight to the coordinate of that quantile."""
     if samples is None or not len(samples):
         low, high = rect[axis], rect[axis + 2]
         return lambda share: low + share * (high - low)
@@ -201,7 +201,7 @@ def _quiet_cut(
     axis: int,  # 0: between left and right, 1: between below and above
     window: tuple[float, float, float],  # first allowed, wanted and last allowed cut
 ) -> float:
-    """Return the cut in a window that divides the fewest junctions; on a tie, the nearest one."""
+    """Return the cut in a window that divides the fewest junctions; on a tie, the nearest cut."""
     first, wanted, last = window
     across = 1 - axis
     boxes = area.junctions

@@ -1,4 +1,4 @@
-"""Search for zones without loops, in which a vehicle cannot drive on forever."""
+"""Search for zones without loops: no vehicle can stay in such a zone forever while it drives."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def zones_without_loop(network: RoadNetwork, partition: ZonePartition) -> tuple[
     of_lane = lanes["edge"]
     arcs = np.stack([of_lane[links["from_lane"]], of_lane[links["to_lane"]]], axis=1)[whole]
     component = strong_components(len(network.edges), arcs)
-    # An arc is part of a closed route if its two edges can reach each other.
+    # An arc between two edges is part of a closed route if the edges can reach each other.
     closed = component[arcs[:, 0]] == component[arcs[:, 1]]
     with_loop = set(first[whole][closed].tolist())
     return tuple(zone for zone in range(partition.count) if zone not in with_loop)

@@ -1,9 +1,9 @@
 """`ZonePartition`: a map divided into rectangles, so that each position is in exactly one zone.
 
 Zones are half-open: [min_x, max_x) by [min_y, max_y). So a position on a border or at a corner
-belongs to one zone. Zones at the rim extend to infinity, so positions outside of the map have a
-zone, too. `zone_layouts` makes partitions of maps, `zone_file` stores them, `zone_halo` computes
-how far zones see beyond their borders, and `zone_statistics` describes their contents.
+belongs to one zone. Zones at the rim extend to infinity, so even positions outside of the map have
+a zone. `zone_layouts` makes partitions of maps, `zone_file` stores them, `zone_halo` computes how
+far zones see beyond their borders, and `zone_statistics` describes their contents.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class ZonePartition:
     rects: NDArray[np.float64]
 
     def __post_init__(self) -> None:
-        rects = np.array(self.rects, dtype=np.float64).reshape(-1, 4) + 0.0  # no -0.0 in the hash
+        rects = np.array(self.rects, dtype=np.float64).reshape(-1, 4) + 0.0  # avoids -0.0 in hashes
         rects.setflags(write=False)
         object.__setattr__(self, "rects", rects)
         _check_rects(rects, self.bounds)
@@ -106,7 +106,7 @@ class ZonePartition:
 
     @cached_property
     def content_hash(self) -> str:
-        """Hex SHA-256 of the zones of all positions, for manifests."""
+        """SHA-256, in hex, of the zones of all positions, for manifests."""
         sides = [[float(side).hex() for side in rect] for rect in self.reaching]
         return hashlib.sha256(json.dumps({"cavmarl.zones": sides}).encode()).hexdigest()
 

@@ -18,10 +18,10 @@ Floats = NDArray[np.float64]
 
 
 def imbalance(values: Sequence[float]) -> float:
-    """Return maximum / mean: 1 if k values are equal, k if only one is not 0; 1 if all are 0.
+    """Return maximum / mean of k values: 1 if all are equal (even 0), k if only one is not 0.
 
     With one worker per zone, the slowest worker sets the pace: the imbalance is the ratio of its
-    time to that of a perfect division.
+    time to the time with a perfect division.
     """
     mean = sum(values) / len(values)
     return max(values) / mean if mean else 1.0
@@ -35,8 +35,8 @@ class ZoneStatistics:
     junctions: int  # number of junctions with crossing or merging lanes
     junctions_cut: int  # number of these junctions in more than one zone
     cut_junctions: tuple[int, ...]  # number of cut junctions that are partly in the zone
-    vehicles: tuple[int, ...]  # by position; zeros without positions
-    # upper bound: vehicles of other zones within the halo; zeros without positions
+    vehicles: tuple[int, ...]  # number of vehicles in the zone; zeros if no positions are given
+    # upper bound: vehicles of other zones within the halo; zeros if no positions are given
     ghosts: tuple[int, ...]
     # zones with a side shorter than the halo; their results are exact, but most of their vehicles
     # are ghosts

@@ -10,7 +10,7 @@ from cavmarl.roads.network import RoadNetwork
 
 Floats = NDArray[np.float64]
 
-_SAMPLE_M = 2.0  # greatest distance of two samples on a lane
+_SAMPLE_M = 2.0  # maximum distance of two adjacent samples on a lane
 
 
 def lane_segments(network: RoadNetwork) -> Floats:
