@@ -49,13 +49,13 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     - `("vehicles", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
     - `("next", "vehicles", "reward")`: (W, A, 1);
     - `("next", "vehicles", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
-      vehicle ended, or the horizon cut its trip. Use these for value estimators;
+      vehicle ended, or the horizon ended its trip. Use these for value estimators;
     - `("next", "vehicles", "info", term)`: (W, A, 1) each term by its name.
 
     The group `signals` has the same entries with these differences:
 
     - `("signals", "observation")`: (W, S, D) padded with 0 to the longest observation;
-    - `("signals", "mask")`: (W, S) whether it is time for a decision. In other steps, actions are
+    - `("signals", "mask")`: (W, S) whether a decision is due. In other steps, actions are
       not read, and rewards are 0;
     - `("signals", "action")`: (W, S) choices from 0 to G - 1, where G is the largest number of
       choices. A choice that a signal does not have keeps its green;
@@ -228,7 +228,7 @@ class _Group(NamedTuple):
     """A kind of agents."""
 
     ids: tuple[str, ...]
-    terms: tuple[str, ...]  # of the reward
+    terms: tuple[str, ...]  # terms of the reward
     observation: dict[str, TensorSpec]  # entries of the observation without `mask` and `info`
     action: TensorSpec
 

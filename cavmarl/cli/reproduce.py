@@ -77,7 +77,7 @@ def reproduce(
     if wrong:
         print_error(
             f"{', '.join(wrong)}: measured numbers differ from the page; correct the page, or "
-            f"the code if the change was not intended"
+            "the code if the change was not intended"
         )
         raise typer.Exit(1)
 

@@ -157,7 +157,7 @@ def _refuse_world_options(world: WorldSpec, rig: str | None, pace: float | None)
     wrong = [name for name, value in given.items() if value]
     if wrong:
         raise ConfigError(
-            f"{wrong[0]}: a bridge that joins does not create the world: use it with `cavmarl lead`"
+            f"{wrong[0]}: a bridge that joins makes no world; pass it to `cavmarl lead`"
         )
 
 

@@ -46,7 +46,7 @@ SIGNAL_FIGURES = {
     "arrived": "arrived",
     "never_departed": "never departed",
     "delay_s": "delay, s",
-    "delay_of_all_s": "delay of all vehicles, s",
+    "delay_of_all_s": "delay of all, s",
     "trip_s": "trip, s",
     "waiting_s": "waiting, s",
     "stops": "stops",
@@ -101,7 +101,7 @@ def suite(
         if (zones, backend, workers) != (None, None, None):
             raise ConfigError(
                 f"--zones, --backend and --workers: the suite {name} runs signal controllers in "
-                f"this process; leave these options out"
+                "this process; leave these options out"
             )
         with counting(console, f"worlds of {name}") as told:
             figures = run_signals(

@@ -98,8 +98,8 @@ class Client:
     """A synchronous client.
 
     Args:
-        url: of the service; after a comma, those of its standbys.
-        secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
+        url: URL of the service; after a comma, URLs of its standbys.
+        secret: secret of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
         allow_plain_http: send the secret and tokens to other machines without TLS, too.
@@ -134,8 +134,8 @@ class Client:
             keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
                 `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
                 name under which the service numbers the versions of the configuration; `drivers`:
-                folders of trained drivers of yours, by the names with which `traffic.model` and
-                `policies` name them; `licence`: that of your files, as text.
+                folders of your trained drivers, by the names that `traffic.model` and `policies`
+                use; `licence`: licence of your files, as text.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.

@@ -51,7 +51,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def draft_folder(parent: Path) -> Iterator[Path]:
-    """Yield a new folder in `parent` and remove it at the end, or in a later call if killed.
+    """Yield a new folder in `parent`; it is removed at the end, or by a later call after a kill.
 
     Raises:
         OSError: `parent` cannot be written.
@@ -95,7 +95,7 @@ def _made(parent: Path) -> tuple[Path, int | None]:
             return folder, None
         try:
             lock = _locked(folder)
-        except (BlockingIOError, FileNotFoundError):  # another process took it for abandoned
+        except (BlockingIOError, FileNotFoundError):  # another process has removed it
             continue
         except OSError:  # this file system has no locks
             return folder, None

@@ -30,7 +30,7 @@ class ComponentContext(NamedTuple):
     network: RoadNetwork
     num_worlds: int  # W
     shards: Sequence[Shard]  # one per zone; components read their rows
-    division: ZonedShards  # of all shards
+    division: ZonedShards  # all shards together
     travel: TripTables
     outputs: Outputs  # outputs of the agents
     zeros: Zeros  # allocates the arrays that outlive a tick

@@ -70,7 +70,7 @@ class RecordedExtras:
 
     Args:
         config: configuration of the worlds.
-        include: the wanted ones of `observations`, `samples`, `messages` and `commands`.
+        include: any of `observations`, `samples`, `messages` and `commands`.
         arrays: results of the worlds' steps.
         simulation: the worlds; their messages are logged from now on.
         state_hash: returns the hash of a world; None: `commands` are not available.
@@ -78,7 +78,7 @@ class RecordedExtras:
     Attributes:
         dtypes: dtypes of the tables, by table name.
         features: sensor and name of each number of the newest frame of an observation.
-        inputs: of the last reset or step.
+        inputs: inputs of the last reset or step.
     """
 
     def __init__(
@@ -201,7 +201,7 @@ class RecordedExtras:
     def _results(
         self, dtype: np.dtype[Any], world: int, tick: int | None, actions: NDArray[Any]
     ) -> Rows:
-        """Return a row of each agent that acted in the last step; `tick`: None: the world's next.
+        """Return a row of each agent that acted in the last step; `tick` None: the next tick.
 
         The observations of agents and episodes that have ended are their last ones.
         """

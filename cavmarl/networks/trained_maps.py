@@ -1,4 +1,4 @@
-"""The kinds of a map that a trained driver does not know, and what is said about them."""
+"""The kinds of a map that a driver was not trained on, and the warnings about them."""
 
 from __future__ import annotations
 

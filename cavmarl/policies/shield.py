@@ -1,4 +1,4 @@
-"""`ShieldedPolicy`: a driver that the built-in driver overrides where the latter brakes harder."""
+"""`ShieldedPolicy`: a driver that the built-in driver overrides where it would brake harder."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The environments of RESCO that sumo-rl names, from a folder of maps of the user.
+"""The environments of RESCO that sumo-rl names, from a user's folder of maps.
 
 Ault and Sharon: "Reinforcement learning benchmarks for traffic signal control", 2021. The maps have
 non-commercial licences or the GPL, so this package does not contain them.
@@ -60,7 +60,7 @@ def _folder(name: str, nets: str | Path | None) -> Path:
         if (folder / f"{name}.net.xml").is_file():
             return folder
     raise ConfigError(
-        f"{name}: {str(root)!r} has no {name}/{name}.net.xml, also not in its folder RESCO; pass "
+        f"{name}: {str(root)!r} has no {name}/{name}.net.xml, nor has its folder RESCO; pass "
         f"nets=FOLDER or set {NETS} to a folder with the maps of RESCO"
     )
 
