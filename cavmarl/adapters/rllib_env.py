@@ -170,7 +170,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
         return self._padded(observations), rewards, ended, cut, infos
 
     def _padded(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Return the observations; those of signals with their action masks, padded."""
+        """Return the observations; for signals, padded and with their action masks."""
         roadside = self._roadside
         if roadside is None:
             return observations

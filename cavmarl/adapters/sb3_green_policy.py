@@ -58,7 +58,7 @@ class GreenNetwork(nn.Module):
         return self.forward_actor(rows), self.forward_critic(rows)
 
     def forward_actor(self, rows: Tensor) -> Tensor:
-        """Return the logits (n, G); those of forbidden greens are very low."""
+        """Return the logits (n, G); forbidden greens have very low logits."""
         greens, _, inputs = self._split(rows)
         embedded = self.embed(inputs)
         pooled = _pooled(embedded, greens[..., EXISTS, None])

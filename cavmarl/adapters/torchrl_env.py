@@ -39,7 +39,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     """W worlds of the batch size (W,), with A agents of vehicles and S agents of signals each.
 
     The groups are `vehicles` and `signals`; a kind without agents has no group. Agents of speed
-    limits have the group `limits`, which is like that of signals. Entries of a
+    limits have the group `limits`, which is like the group of signals. Entries of a
     tensordict; the entries of a group have one axis more than the batch:
 
     - `("vehicles", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
@@ -65,7 +65,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     If vehicles choose meta-actions beside signals, `vehicles` has an `action_mask` (W, A, n), too:
     it allows every action. BenchMARL needs masks of all groups or of none.
 
-    `("next", "terminated")`, `"truncated"`, `"done"` (W, 1) are those of each world; TorchRL resets
+    `("next", "terminated")`, `"truncated"`, `"done"` (W, 1) refer to each world; TorchRL resets
     worlds that are done. Observations of that step are still the last ones of the old episode.
 
     Every population can be used; the mask changes when agents enter and leave. In `respawn` worlds,

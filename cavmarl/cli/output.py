@@ -370,7 +370,7 @@ def with_world(
     the options called `names`, by default all of them. A parameter of the function with the name
     of such an option replaces that option, and the function receives its value, too.
 
-    `is_here`: whether the world is made in this process; otherwise there is no --import.
+    `is_here`: whether the world is made in this process; otherwise, --import is not offered.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
     return partial(_with_world, ("env", *chosen, *(("imports",) if is_here else ())))

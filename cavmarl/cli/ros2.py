@@ -77,8 +77,8 @@ Bag = Annotated[
 Rig = Annotated[
     str | None,
     about(
-        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
-        "the environment, or reference].",
+        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: the "
+        "environment's, or reference].",
         metavar="RIG",
         panel=WORLD,
     ),

@@ -92,7 +92,7 @@ def _joined(shares: tuple[float, ...]) -> str:
 
 
 def _shares(option: str, text: str) -> tuple[float, float, float]:
-    """Return three shares; raise ConfigError if the text is no list of three numbers."""
+    """Return three shares; raise ConfigError if the text is not three numbers."""
     try:
         cpu, ram, gpu = (float(word) for word in text.split(","))
     except ValueError:

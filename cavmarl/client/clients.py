@@ -69,13 +69,13 @@ def _request(
     """Return a request.
 
     Raises:
-        ServiceError: its secret or token could be read on the way to another machine.
+        ServiceError: others could read its secret or token on the network.
     """
     url = httpx.URL(ask.url)
     if url.scheme != "https" and not is_loopback(url.host) and not allow_plain_http:
         raise ServiceError(
-            f"{url.scheme}://{url.netloc.decode()}: is another machine, and without TLS the secret "
-            "can be read on the way: use https://, or allow_plain_http=True (--plain-http) in a "
+            f"{url.scheme}://{url.netloc.decode()}: is another machine, and without TLS others "
+            "can read the secret: use https://, or allow_plain_http=True (--plain-http) in a "
             "network that you trust"
         )
     headers = {"Authorization": f"Bearer {ask.token}"} if ask.token else {}

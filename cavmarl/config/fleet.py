@@ -28,7 +28,7 @@ RESERVED_TYPES = (*KNOWN_TYPES, "pedestrian", "cyclist", "roadside_unit")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnType:
-    """A vehicle type of an environment; missing values are those of the type `like`.
+    """A vehicle type of an environment; missing values are taken from the type `like`.
 
     Attributes:
         like: the type that provides the missing values, the vehicle class and the permitted lanes.

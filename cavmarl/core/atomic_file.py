@@ -79,7 +79,7 @@ def remove_dead_drafts(parent: Path) -> None:
 def _remove_dead(folder: Path) -> None:
     try:
         lock = _locked(folder)
-    except OSError:  # its process lives, another process removes it, or there are no locks
+    except OSError:  # its process is alive, another process removes it, or locks do not exist here
         return
     try:
         shutil.rmtree(folder, ignore_errors=True)

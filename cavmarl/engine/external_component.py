@@ -119,7 +119,7 @@ class ExternalComponent(Component):
         held[self.leaving] = np.zeros((), dtype=EXTERNAL)
 
     def _commands_of(self, commands: Commands) -> NDArray[np.void]:
-        """Return EXTERNAL (W, E), the commands of the caller and those of the table."""
+        """Return EXTERNAL (W, E), the commands of the caller and of the table."""
         self._told[:] = 0.0
         if commands.external.size:
             self._told[:, : self._num_told] = commands.external

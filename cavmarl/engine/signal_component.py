@@ -35,7 +35,7 @@ _MOST = 1 << 40  # ticks and counts in a saved state
 
 
 class SignalComponent:
-    """A `Component` that carries out the choices of greens, and observes the lanes of signals.
+    """A `Component` that applies the choices of greens, and observes the lanes of signals.
 
     Attributes:
         table: the signals whose greens are chosen.

@@ -225,7 +225,7 @@ class SimulatorComponent(Component):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
 
     def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns: cavmarl's own, then those of simulators with frames."""
+        """Write the samples of all turns: cavmarl's own, then samples of simulators with frames."""
         sense_here(scenes, turns)
         if not self._has_moved:  # at a reset, simulators have no vehicles yet
             return

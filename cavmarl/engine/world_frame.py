@@ -22,7 +22,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.shards.shard import override_columns
 
-# One vehicle of a frame. Units and coordinate frames are those of `driving.vehicles.VEHICLE`.
+# One vehicle of a frame. Units and coordinate frames are as in `driving.vehicles.VEHICLE`.
 SEEN = np.dtype(
     [
         ("id", "<i8"),

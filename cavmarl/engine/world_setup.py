@@ -203,7 +203,7 @@ def _warn_once(name: str, source_hash: str, note: str) -> None:
 def _demand_files(config: EnvConfig, base_dir: Path) -> list[Path]:
     """Return the files of `traffic.demand`.
 
-    A configuration of SUMO that is the map, too, may name no demand; then there are no files.
+    A configuration of SUMO that is also the map need not name a demand; then there are no files.
     """
     files = resolve_demand(config, base_dir)
     if files and files == resolve_maps(config, base_dir):

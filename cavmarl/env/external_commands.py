@@ -44,7 +44,7 @@ KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
 class ExternalCommands:
     """The vehicles of the caller in W worlds, at most E = `population.external` in each.
 
-    Commands to them are held until the next step.
+    Commands to them are kept until the next step.
 
     Args:
         config: configuration of the worlds.
@@ -257,7 +257,7 @@ class ExternalCommands:
         return found
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the waiting ones, which are held until `clear`."""
+        """Return the commands with the waiting ones, which are kept until `clear`."""
         return replace(commands, external=self._commands.copy()) if self._most else commands
 
     def clear(self) -> None:

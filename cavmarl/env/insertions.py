@@ -1,4 +1,4 @@
-"""Vehicles that a user adds to running worlds, held until the next step."""
+"""Vehicles that a user adds to running worlds, kept until the next step."""
 
 from __future__ import annotations
 
@@ -105,7 +105,7 @@ class Insertions:
         self._used[world] += len(rows)
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the waiting insertions, which are held until `clear`."""
+        """Return the commands with the waiting insertions, which are kept until `clear`."""
         return replace(commands, inserted=self._rows.copy()) if self._most else commands
 
     def clear(self) -> None:

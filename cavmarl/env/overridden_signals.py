@@ -105,7 +105,7 @@ class SignalOverrides:
         """Show these states from the next step on, and release all other links.
 
         Args:
-            codes: (num_links,) SIGNAL_* code of each link; SIGNAL_NONE: that of its program.
+            codes: (num_links,) SIGNAL_* code of each link; SIGNAL_NONE: the code of its program.
             world: number of the world.
 
         Raises:

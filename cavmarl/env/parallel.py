@@ -355,7 +355,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """Return the samples of the last step of each sensor of an agent's `rig`, by sensor name.
 
-        The arrays are those of `SensorFrames`, without the axes of worlds and agents.
+        The arrays are as in `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
             ActionError: there is no such agent, or it is a signal, which has no sensors.

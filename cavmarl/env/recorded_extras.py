@@ -166,7 +166,7 @@ class RecordedExtras:
     def at_the_end(self, world: int, actions: NDArray[Any]) -> Mapping[str, Rows]:
         """Return the rows of the last step of an episode, whose last frame is not available.
 
-        The arguments are those of `of`.
+        For the arguments, see `of`.
         """
         dtype = self.dtypes.get("observations")
         return {} if dtype is None else {"observations": self._results(dtype, world, None, actions)}
@@ -176,7 +176,7 @@ class RecordedExtras:
     ) -> Rows:
         """Return a row of each agent that acted in the step, or that acts next, by agent.
 
-        If the step has also reset the world, its results are those of the episode before.
+        If the step has also reset the world, its results belong to the previous episode.
         """
         arrays, world, tick = self._arrays, frame.world, frame.tick
         is_new = actions is None or tick <= self._ticks[world]

@@ -20,8 +20,8 @@ VEHICLES = "vehicles"  # key of the arrays of vehicles, beside those of a `Roads
 class RoadsideAgents(ABC):
     """S agents of one kind in W worlds, and their results.
 
-    All of them decide at the same times. Their arrays are those of `StepArrays` whose names begin
-    with `signal_`, whatever their kind: a world has agents of signals or of limits.
+    All of them decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
+    whatever their kind: a world has agents of signals or of limits.
 
     Args:
         arrays: inputs and outputs of a step.

@@ -298,7 +298,7 @@ class CavVectorEnv(WorldsEnvironment):
             "mask": self._mask.copy(),
             "episode_over": over.copy(),
         }
-        terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
+        terminations &= ~arrays.truncations  # the trip's own horizon does not terminate it
         rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
         roadside = session.roadside
         if roadside is None:

@@ -165,5 +165,5 @@ def logger_names(text: str) -> tuple[str, ...]:
 def make_loggers(
     names: Iterable[str], folder: Path, settings: Mapping[str, Any], rows: Sequence[Row]
 ) -> list[Logger]:
-    """Return the loggers of a run; `rows` are those of the run so far."""
+    """Return the loggers of a run; `rows`: the rows of the run so far."""
     return [LOGGERS[name](folder, settings, rows) for name in names]

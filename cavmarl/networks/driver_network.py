@@ -145,7 +145,7 @@ class DriverNetwork:
     def best(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         """Return the most likely actions: (N, 2) float32 in [-1, 1], or (N,) int64 choices.
 
-        Arguments and errors are those of `outputs`.
+        For arguments and errors, see `outputs`.
         """
         found = self._run(self.best_layers, observations)
         if self.config.action.kind == "continuous":

@@ -19,7 +19,7 @@ _NOTES: dict[RoadKind, str] = {
 
 
 def untrained_kinds(network: RoadNetwork, trained_on: Sequence[RoadKind]) -> tuple[RoadKind, ...]:
-    """Return the kinds of a map that are not among those of a driver's training."""
+    """Return the kinds of a map on which a driver was not trained."""
     return tuple(kind for kind in road_kinds(network) if kind not in trained_on)
 
 

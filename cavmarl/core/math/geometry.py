@@ -202,7 +202,7 @@ def _overlap_s(apart: float, rate: float, reach: float) -> tuple[float, float]:
 
 @kernel
 def time_to_collision_s(
-    dx: float,  # from the centre of the first box to that of the second box, m
+    dx: float,  # from the first box's centre to the second box's centre, m
     dy: float,  # see `dx`
     vx: float,  # velocity of the second box relative to the first box, m/s
     vy: float,  # see `vx`

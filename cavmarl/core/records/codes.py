@@ -56,7 +56,7 @@ UNTIL_DEPARTURE = 2
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow
 HOLD_YIELD = 2  # gives way
-HOLD_EXIT_BLOCKED = 3  # no room beyond the junction, or a vehicle on the junction blocks the way
+HOLD_EXIT_BLOCKED = 3  # no room beyond the junction, or a vehicle on the junction blocks the path
 
 # VEHICLE["events"]: bits, events of this step
 EVENT_COLLIDED = 1

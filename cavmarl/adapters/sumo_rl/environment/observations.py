@@ -35,7 +35,7 @@ class ObservationFunction(ABC):
 class DefaultObservationFunction(ObservationFunction):
     """The green as one value of 1 among zeros, whether it may end, and densities by lane.
 
-    The densities of all vehicles on each incoming lane precede those of stopped vehicles.
+    First come the densities of all vehicles by incoming lane, then of stopped vehicles by lane.
     """
 
     def __call__(self) -> NDArray[np.float32]:

@@ -35,7 +35,7 @@ _SCENARIOS = {
 
 
 def _make(name: str, parallel: bool, nets: str | Path | None, arguments: dict[str, Any]) -> Any:
-    """Make an environment; arguments of the caller replace those of the scenario."""
+    """Make an environment; the caller's arguments replace the scenario's."""
     folder = _folder(name, nets)
     scenario = _SCENARIOS[name]
     given = {
@@ -66,7 +66,7 @@ def _folder(name: str, nets: str | Path | None) -> Path:
 
 
 def grid4x4(parallel: bool = True, nets: str | Path | None = None, **arguments: Any) -> Any:
-    """Return a grid of 16 signals; other arguments are those of `SumoEnvironment`."""
+    """Return a grid of 16 signals; for other arguments, see `SumoEnvironment`."""
     return _make("grid4x4", parallel, nets, arguments)
 
 

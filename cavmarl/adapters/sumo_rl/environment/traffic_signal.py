@@ -35,7 +35,7 @@ class SignalPhase(NamedTuple):
 class TrafficSignal:
     """A signal whose greens are chosen: its lanes, vehicles and rewards.
 
-    Counts are those of the last decision.
+    Counts refer to the last decision.
 
     Args:
         env: the environment.
