@@ -26,7 +26,7 @@ DECIDED = ("num_envs", "device", "action.kind")
 class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separate environment
     """An environment; BenchMARL chooses the number of worlds, the device and the kind of action.
 
-    The groups are `vehicles` and `signals`, each with a policy of its own. If signals have agents,
+    The groups are `vehicles` and `signals`, each with its own policy. If signals have agents,
     all agents choose: vehicles have meta-actions, because BenchMARL trains either continuous or
     discrete actions.
 

@@ -22,7 +22,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     """One vehicle of a world; the built-in drivers drive all other vehicles.
 
     The entry's other agents become background vehicles, so that the traffic has the same density.
-    Infos also have highway-env's `speed` in m/s and `crashed`, and `is_success` (the vehicle has
+    Infos also contain highway-env's `speed` in m/s and `crashed`, and `is_success` (the vehicle has
     arrived). After the vehicle has left, `speed` is its last speed.
 
     An episode is the trip of one vehicle. In `closed` worlds, the default, the other vehicles leave
@@ -31,7 +31,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     Args:
         env: see `parallel_env`.
         render_mode: `human`, `rgb_array` or None.
-        background: number of other vehicles; None: one vehicle less than the entry has.
+        background: number of other vehicles; None: one less than the entry has.
         overrides: see `parallel_env`.
         config: more overrides, nested as in an env.yaml: `{"sensors": {"lidar": {"rays": 8}}}`.
         action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
@@ -95,7 +95,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run one step with the vehicle's action."""
         observations, rewards, _, truncations, infos = self._env.step({EGO: action})
-        ended = bool(infos[EGO]["vehicle_done"])  # a seat itself does not end
+        ended = bool(infos[EGO]["vehicle_done"])  # in `respawn` worlds, agents do not end
         cut = truncations[EGO] and not ended
         return observations[EGO], rewards[EGO], ended, cut, self._info(infos[EGO])
 

@@ -27,7 +27,7 @@ DECIDED = ("agents", "population.budget")
 
 
 class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
-    """The agents of one or more worlds as rows, for programs for vectors of single-agent worlds.
+    """The agents of one or more worlds as rows of a vector of single-agent environments.
 
     A row is an agent of a world; row `w · A + a` is agent a of world w. In `respawn` worlds, the
     default, a row gets a new vehicle as soon as there is room. In `closed` worlds, it waits until
@@ -45,14 +45,14 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     rows are chosen; otherwise its chosen rows must have ended, and wait as usual, with observations
     of 0 until they have a vehicle. The horizon truncates all rows of a world.
 
-    The frame of a row is that of its world.
+    The frame of a row is the frame of its world.
 
     Args:
         env: see `make_vec`.
         num_envs: number of rows in all worlds.
         num_worlds: number of worlds.
-        autoreset_mode: when rows and worlds restart after their end.
-        max_episode_steps: Gymnasium's name of `max_cycles`.
+        autoreset_mode: when rows and worlds restart after they end.
+        max_episode_steps: Gymnasium's name for `max_cycles`.
         render_mode: `rgb_array` or None.
         action_kind: sets action.kind: `continuous`, `discrete` or `grid`.
         overrides: values of any other keys.

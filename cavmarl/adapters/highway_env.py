@@ -68,7 +68,7 @@ class HighwayEnv(CavEgoEnv):
         action_type: has `actions_indexes`, the number of each named action.
 
     Raises:
-        ConfigError: a key or a type is unknown; the message lists the known ones.
+        ConfigError: a key or a type is unknown; the message lists all known keys or types.
     """
 
     def __init__(

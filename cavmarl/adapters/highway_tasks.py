@@ -1,7 +1,7 @@
 """highway-env's tasks: the entry of each task, and the default values of its `config`.
 
 The values are taken from highway-env 1.10, except for observations that this package does not have:
-`two-way` and `u-turn` have times to collision in highway-env, and `Kinematics` here.
+`two-way` and `u-turn` observe times to collision in highway-env, and `Kinematics` here.
 """
 
 from __future__ import annotations

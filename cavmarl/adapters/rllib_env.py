@@ -49,15 +49,15 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
 
     Agents enter and leave in every population. All ids of an episode are declared in advance, and
     an id that has ended does not return. The end of the episode (`__all__`) is a truncation if the
-    horizon cut an agent. RLlib ends an episode as soon as all agents known to it have ended, even
-    if new agents enter in the same step. The next episode then continues the same world with the
-    new agents.
+    horizon ended an agent's trip. RLlib ends an episode as soon as all agents known to it have
+    ended, even if new agents enter in the same step. The next episode then continues the same world
+    with the new agents.
 
-    In `respawn` worlds an id is a seat: its vehicle ends with `infos[agent]["vehicle_done"]`, but
-    RLlib's value estimates continue across it. Learning is therefore more exact in `closed` and
-    `open` worlds.
+    In `respawn` worlds an id gets one vehicle after another. `infos[agent]["vehicle_done"]` marks
+    the end of a vehicle, but RLlib's value estimates continue across it. Learning is therefore more
+    exact in `closed` and `open` worlds.
 
-    Agents of signals act only when it is time for their decision: other steps have no observation,
+    Agents of signals act only when a decision is due: other steps have no observation,
     reward or info of signals. All signals have the same spaces, so that they can share a policy.
     The action space is `Discrete(G)`, where G is the largest number of choices of a signal. A
     choice that a signal does not have keeps its green. An observation has `action_mask` (G,) and
@@ -141,7 +141,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
         return step
 
     def _nobody_acts(self) -> bool:
-        """Whether the world has no vehicles of agents, and it is not time for a decision."""
+        """Whether the world has no vehicles of agents, and no decision is due."""
         roadside = self._roadside
         return (
             roadside is not None
@@ -170,7 +170,7 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
         return self._padded(observations), rewards, ended, cut, infos
 
     def _padded(self, observations: dict[str, Any]) -> dict[str, Any]:
-        """Return the observations; those of signals with their action masks, padded."""
+        """Return the observations; for signals, padded and with their action masks."""
         roadside = self._roadside
         if roadside is None:
             return observations
@@ -196,7 +196,7 @@ def _only(agents: Collection[str], part: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _joined(first: Step, second: Step) -> Step:
-    """Return the results of two steps; those of the second one replace equal ids."""
+    """Return the results of two steps; for an id in both, the second result counts."""
     observations, rewards, ended, cut, infos = first
     more = second
     return (

@@ -1,6 +1,6 @@
 """`GreenPolicy`: a policy of stable-baselines3 that scores the greens of signals of any shape.
 
-`SharedNetwork` is a controller that asks it.
+`SharedNetwork` is a controller that uses it.
 
 Importing this module loads stable-baselines3 and torch; `import cavmarl` does not import it.
 """
@@ -27,7 +27,7 @@ except ModuleNotFoundError as error:
 
 EXISTS, ALLOWED = GREEN_FEATURES.index("exists"), GREEN_FEATURES.index("allowed")
 FORBIDDEN = -1e8  # logit of a green that may not be chosen
-FIRST_GAIN = 0.01  # of the logits, so that all allowed greens are about equally likely at first
+FIRST_GAIN = 0.01  # gain of the logits, so that allowed greens are about equally likely at first
 
 
 class GreenNetwork(nn.Module):
@@ -38,8 +38,8 @@ class GreenNetwork(nn.Module):
 
     Args:
         num_greens: G.
-        num_shared: values of a row that do not belong to a green.
-        width: of the hidden layers.
+        num_shared: number of values of a row that do not belong to a green.
+        width: width of the hidden layers.
     """
 
     def __init__(self, num_greens: int, num_shared: int, width: int) -> None:
@@ -58,7 +58,7 @@ class GreenNetwork(nn.Module):
         return self.forward_actor(rows), self.forward_critic(rows)
 
     def forward_actor(self, rows: Tensor) -> Tensor:
-        """Return the logits (n, G); those of forbidden greens are very low."""
+        """Return the logits (n, G); forbidden greens have very low logits."""
         greens, _, inputs = self._split(rows)
         embedded = self.embed(inputs)
         pooled = _pooled(embedded, greens[..., EXISTS, None])
@@ -74,7 +74,7 @@ class GreenNetwork(nn.Module):
         return found
 
     def _split(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the features (n, G, F) of greens, the others (n, C), and both (n, G, F + C)."""
+        """Return the features (n, G, F) of greens, the other values (n, C), both (n, G, F + C)."""
         num_greens, size = self._shape
         greens = rows[:, : num_greens * size].reshape(-1, num_greens, size)
         shared = rows[:, num_greens * size :]
@@ -99,7 +99,7 @@ class SharedNetwork:
     """A controller of signals: the most likely green of one network for all of them.
 
     Args:
-        model: as trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
+        model: a model trained on the rows of `CavSb3SignalEnv` with `features="greens"`.
     """
 
     def __init__(self, model: PPO) -> None:
@@ -107,7 +107,7 @@ class SharedNetwork:
         self._features: GreenFeatures | None = None
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
+        """Return the choice (W, S) of each agent; KEEP where no decision is due."""
         shape = view.states.shape[:2]
         if not view.decides.any():
             return np.full(shape, KEEP)

@@ -75,7 +75,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         if kind not in (SIGNALS, LIMITS):
             raise ConfigError(f"kind = {kind!r}: must be {SIGNALS!r} or {LIMITS!r}")
         if kind == LIMITS and features == "greens":
-            raise ConfigError("features = 'greens': limits have none; leave it out")
+            raise ConfigError("features = 'greens': limits have no greens; leave it out")
         keys = {f"{kind}.agents": "all", **(overrides or {})}
         self._vec = make_vec(
             env,
@@ -129,9 +129,9 @@ class CavSb3SignalEnv(CavSb3VecEnv):
 
     @property
     def sizes(self) -> tuple[int, int]:
-        """The number of greens, and of values of a row that do not belong to a green."""
+        """The numbers of greens, and of values of a row that do not belong to a green."""
         if self._features is None:
-            raise ConfigError("sizes: rows of lanes have none; pass features='greens'")
+            raise ConfigError("sizes: rows of lanes have no sizes; pass features='greens'")
         return self._features.num_greens, self._features.num_shared
 
     def action_masks(self) -> NDArray[np.bool_]:

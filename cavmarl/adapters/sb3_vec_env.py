@@ -44,9 +44,9 @@ class CavSb3VecEnv(WithSpec, OwnWorlds, VecEnv):
     from the time when its agent enters.
 
     A row that ended is `done`. Its info has its last observation as `terminal_observation`, whether
-    the horizon cut it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a row
-    waits for a vehicle, its observation and reward are 0, its actions are not read, and its info
-    has `inactive`. With `render_mode="rgb_array"`, a picture has one tile per world.
+    the horizon ended it as `TimeLimit.truncated`, and whether it arrived as `is_success`. While a
+    row waits for a vehicle, its observation and reward are 0, its actions are not read, and its
+    info has `inactive`. With `render_mode="rgb_array"`, a picture has one tile per world.
 
     Args:
         env: see `make_vec`.

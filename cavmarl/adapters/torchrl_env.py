@@ -39,7 +39,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     """W worlds of the batch size (W,), with A agents of vehicles and S agents of signals each.
 
     The groups are `vehicles` and `signals`; a kind without agents has no group. Agents of speed
-    limits have the group `limits`, which is like that of signals. Entries of a
+    limits have the group `limits`, which is like the group of signals. Entries of a
     tensordict; the entries of a group have one axis more than the batch:
 
     - `("vehicles", "observation")`: (W, A, D), or one entry per sensor (`observation.kind: dict`);
@@ -49,13 +49,13 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     - `("vehicles", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
     - `("next", "vehicles", "reward")`: (W, A, 1);
     - `("next", "vehicles", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
-      vehicle ended, or the horizon cut its trip. Use these for value estimators;
+      vehicle ended, or the horizon ended its trip. Use these for value estimators;
     - `("next", "vehicles", "info", term)`: (W, A, 1) each term by its name.
 
     The group `signals` has the same entries with these differences:
 
     - `("signals", "observation")`: (W, S, D) padded with 0 to the longest observation;
-    - `("signals", "mask")`: (W, S) whether it is time for a decision. In other steps, actions are
+    - `("signals", "mask")`: (W, S) whether a decision is due. In other steps, actions are
       not read, and rewards are 0;
     - `("signals", "action")`: (W, S) choices from 0 to G - 1, where G is the largest number of
       choices. A choice that a signal does not have keeps its green;
@@ -65,7 +65,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     If vehicles choose meta-actions beside signals, `vehicles` has an `action_mask` (W, A, n), too:
     it allows every action. BenchMARL needs masks of all groups or of none.
 
-    `("next", "terminated")`, `"truncated"`, `"done"` (W, 1) are those of each world; TorchRL resets
+    `("next", "terminated")`, `"truncated"`, `"done"` (W, 1) refer to each world; TorchRL resets
     worlds that are done. Observations of that step are still the last ones of the old episode.
 
     Every population can be used; the mask changes when agents enter and leave. In `respawn` worlds,
@@ -228,7 +228,7 @@ class _Group(NamedTuple):
     """A kind of agents."""
 
     ids: tuple[str, ...]
-    terms: tuple[str, ...]  # of the reward
+    terms: tuple[str, ...]  # terms of the reward
     observation: dict[str, TensorSpec]  # entries of the observation without `mask` and `info`
     action: TensorSpec
 

@@ -85,7 +85,7 @@ class _Group(CliGroup):
         return names
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """Return a command and the words after it; the name of one command has two words."""
+        """Return a command and its arguments; the name `submit train` is two words."""
         if args[:2] == SUBMIT_TRAIN.split():
             args = [SUBMIT_TRAIN, *args[2:]]
         return super().resolve_command(ctx, args)

@@ -53,8 +53,8 @@ def baseline(
 ) -> None:
     """Compare drivers on a map, and write a page.
 
-    Random actions, `idm` and a trained driver drive the same trips in traffic. For the cost of
-    traffic, `idm` also drives alone on the road.
+    Random actions, `idm` and a trained driver drive the same trips in traffic. To measure the cost
+    of traffic, `idm` also drives alone.
     """
     require_all(PAGE_EXTRAS)
     from cavmarl.evaluate.baseline import baseline_drivers, figures, run_baseline, write_baseline

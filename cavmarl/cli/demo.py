@@ -190,7 +190,7 @@ def _story(task: DemoTask, trained: Path, found: EvaluationReport, films: dict[s
     return Story(
         title=f"A driver learns to {task.env}",
         paragraphs=[
-            f"The driver {task.start} has learnt to drive on many maps, by its own sensors, but "
+            f"The driver {task.start} has learnt to drive on many maps, with its own sensors, but "
             f"never on {task.env}: a busy highway and an on-ramp whose lane ends. It was trained "
             f"further on {task.env} for {task.decisions:,} decisions, by PPO with one network for "
             f"all agents. An agent also receives a share of the reward of its neighbours.",
@@ -208,8 +208,8 @@ def _story(task: DemoTask, trained: Path, found: EvaluationReport, films: dict[s
             (f"cavmarl train ppo --config {SETTINGS} --total-agent-steps {3 * task.decisions}",
              "Train three times as long"),
             (f"cavmarl evaluate {task.env} -p {trained} -p merge_ippo -p {RULES} -n 64 "
-             "--seed 2000", "Compare it in other episodes, with a driver that learnt only this"),
-            ("cavmarl train ppo --config grid4x4", "Learn to cross sixteen signalled crossings"),
+             "--seed 2000", "Compare it in other episodes with a driver trained only here"),
+            ("cavmarl train ppo --config grid4x4", "Learn to cross sixteen signalled junctions"),
             ("cavmarl list", "List all environments and drivers"),
         ],
     )  # fmt: skip
@@ -225,7 +225,7 @@ def compared(found: EvaluationReport) -> str:
         f"{rules_success:.1f} %."
     )
     if delay is None or rules_delay is None:
-        return f"{text} Not both of them arrived, so their delays cannot be compared."
+        return f"{text} At least one of them never arrives, so their delays cannot be compared."
     wins = [
         name
         for name, is_better in (
@@ -234,7 +234,7 @@ def compared(found: EvaluationReport) -> str:
         if is_better
     ]  # fmt: skip
     return (
-        f"{text} An arrival loses {delay:.1f} s against free driving, one of {RULES} "
+        f"{text} Its arrivals take {delay:.1f} s longer than free driving, those of {RULES} "
         f"{rules_delay:.1f} s. So the adapted driver is better in "
         f"{' and '.join(wins) if wins else 'neither'}; it collides in "
         f"{100.0 * (ours['collision'].mean or 0.0):.1f} % of its trips, {RULES} in "

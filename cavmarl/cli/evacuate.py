@@ -1,4 +1,4 @@
-"""`cavmarl evacuate`: lets vehicles leave areas of a map, and writes a page."""
+"""`cavmarl evacuate`: evacuates areas of a map, and writes a page."""
 
 from __future__ import annotations
 
@@ -59,12 +59,12 @@ def evacuate(
     ] = None,
     radius: Annotated[
         float | None,
-        about("Radius of the area in m [default: 40 % of that of the map].", metavar="M", min=1.0),
+        about("Radius of the area in m [default: 40 % of the map's radius].", metavar="M", min=1.0),
     ] = None,
     exits: Annotated[
         list[str] | None,
         about(
-            "Road over which vehicles leave; repeat it for more [default: far dead ends].",
+            "Road by which vehicles leave; repeat it for more [default: far dead ends].",
             "--exit",
             metavar="EDGE",
         ),
@@ -75,7 +75,7 @@ def evacuate(
     ] = None,
     close: Annotated[
         list[str] | None,
-        about("Road that is closed from the order on; repeat it for more.", metavar="EDGE"),
+        about("Road that the evacuation closes; repeat it for more.", metavar="EDGE"),
     ] = None,
     within_s: Annotated[
         float | None, about("Vehicles depart within this time.", metavar="S", min=0.0)
@@ -91,9 +91,9 @@ def evacuate(
     out: NewFolder = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Let vehicles leave areas of a map over exits, and write a page with clearance times.
+    """Evacuate areas of a map through exits, and write a page with clearance times.
 
-    The folder of each run in the results is an environment, which `make_vec` takes.
+    In the results, the folder of each run is an environment for `make_vec`.
     """
     require_all(PAGE_EXTRAS)
     from cavmarl.engine.world_setup import load_world
@@ -130,7 +130,7 @@ def evacuate(
         try:
             prepared = prepare(plan, base, place, number)
         except CavmarlError:
-            if number == seed:  # nothing has been written
+            if number == seed:  # no earlier run has written results
                 rmtree(place if was_there else folder)
             raise
         if number == seed:
@@ -148,7 +148,7 @@ def evacuate(
             )
         found.append(run)
         if run.contacts:
-            places = escape(", ".join(run.contact_places) or "roads where no sample shows any")
+            places = escape(", ".join(run.contact_places) or "roads that no sample shows")
             console.print(f"contacts: {run.contacts}, on {places}")
         for road in (road for road, count in run.contraflow.items() if not count):
             console.print(f"contraflow: no vehicle used the lanes on {escape(road)}")

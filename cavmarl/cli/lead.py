@@ -204,7 +204,7 @@ def lead(
 
 
 def run_episode(world: FollowedWorld, seed: int, steps: int | None, on_lost: str) -> dict[str, Any]:
-    """Run one episode and return its figures; the arguments are those of `lead`."""
+    """Run one episode and return its figures; for the arguments, see `lead`."""
     master, lost = world.master, []
 
     def go_on(act: Callable[[], object]) -> None:

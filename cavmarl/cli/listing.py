@@ -17,7 +17,7 @@ from cavmarl.core.errors import ConfigError
 def list_entries(json_path: JsonPath = None) -> None:
     """List the environments and drivers that have a name."""
     console = Console()
-    environments = Table("environment", "agents", "others", "action", "what it is")
+    environments = Table("environment", "agents", "others", "action", "description")
     names = {}
     for name, folder in entries().items():
         names[name] = str(folder)
@@ -34,7 +34,7 @@ def list_entries(json_path: JsonPath = None) -> None:
             config.action.kind,
             escape(sentence_about(folder)),
         )
-    drivers = Table("driver", "kind", "what it is")
+    drivers = Table("driver", "kind", "description")
     paths = {}
     for name, path in agent_entries().items():
         drivers.add_row(escape(name), _kind(path), escape(sentence_about(path)))

@@ -64,7 +64,7 @@ def build(
     traffic_side: Annotated[
         Literal["auto", "left", "right"],
         about(
-            "Side of the road to drive on; auto: that of the country (OSM), or the rule of the "
+            "Side of the road to drive on; auto: the country's side (OSM), or the rule of the "
             "roads (OpenDRIVE).",
         ),
     ] = "auto",

@@ -56,7 +56,7 @@ def check(
 ) -> None:
     """Print the statistics and defects of a map.
 
-    If the map cannot be driven, or CARLA's client reads something else, exit with 1.
+    If the map cannot be driven, or CARLA's client reads it differently, exit with 1.
     """
     if fix is not None and not fix.name.endswith(".net.xml"):
         raise ConfigError(f"--fix {fix}: must end in .net.xml")
@@ -64,7 +64,7 @@ def check(
         from cavmarl.cosim.carla.client_map_check import check_with_client
         from cavmarl.cosim.carla.client_process import client_python
 
-        client_python()  # raises an error before any work if there is none
+        client_python()  # raises an error early if CARLA's client is missing
     console = Console()
     done: list[str] = []
     left: list[Defect] = []

@@ -29,7 +29,7 @@ from cavmarl.roads.network import RoadNetwork
 
 _ALIGNMENTS = ("icp", "edges", "none")
 _STAGES = ("points", "surroundings", "distances", "roads")
-_MARGIN_M = 5.0  # points this far outside of the map are kept, and the map this far around a cloud
+_MARGIN_M = 5.0  # crop the cloud to the map, and the map to the cloud, with this margin
 
 Reference = Annotated[str, typer.Argument(metavar="MAP", help="Reference: a map or a point cloud.")]
 Measured = Annotated[
@@ -179,8 +179,8 @@ def _print(console: Console, rows: list[Comparison], fits: list[RoadFit]) -> Non
     names = {
         "ICP RMSE, eq. (1), m": "icp_rmse_m",
         "mean distance, eq. (2), m": "mean_distance_m",
-        "… the other way, m": "mean_distance_reverse_m",
-        "… both ways, m": "mean_distance_symmetric_m",
+        "… in the other direction, m": "mean_distance_reverse_m",
+        "… in both directions, m": "mean_distance_symmetric_m",
         "… before alignment, m": "mean_distance_before_m",
         "RMSE of the pairs kept, m": "trimmed_rmse_m",
         "median, m": "median_distance_m",

@@ -110,9 +110,9 @@ def _print(console: Console, document: dict[str, Any]) -> None:
     pose, surface, told = document["pose"], document["surface"], document["comparison"]
     rows = [
         ["frames / drives / points", " / ".join(str(document[k]) for k in _COUNTS)],
-        ["poses off, mean / 95 %, m", f"{pose['mean_off_m']:.3f} / {pose['p95_off_m']:.3f}"],
-        ["heights off, mean, m", f"{pose['mean_off_height_m']:.3f}"],
-        ["headings off, mean, °", f"{pose['mean_off_heading_deg']:.3f}"],
+        ["position error, mean / 95 %, m", f"{pose['mean_off_m']:.3f} / {pose['p95_off_m']:.3f}"],
+        ["height error, mean, m", f"{pose['mean_off_height_m']:.3f}"],
+        ["heading error, mean, °", f"{pose['mean_off_heading_deg']:.3f}"],
         ["lanes seen", f"{surface['seen_share']:.0%}"],
         ["road heights, RMSE, m", f"{surface['height_rmse_m']:.3f}"],
         ["walls, RMSE across, m", _shown(surface["wall_rmse_m"])],

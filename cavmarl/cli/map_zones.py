@@ -126,7 +126,7 @@ def _print_notes(
     if statistics.narrow:
         console.print(
             f"note: narrower than the halo of {halo_m:g} m: zones {_named(statistics.narrow)}; "
-            "results stay exact, but such a zone processes more ghosts than own vehicles",
+            "results stay exact, but such a zone processes more ghosts than vehicles",
             style="yellow",
             soft_wrap=True,
         )

@@ -22,7 +22,7 @@ from cavmarl.cli.output import (
 from cavmarl.cli.service import Authority, Certificate, Key, PlainHttp, UserSecretFile, user_secret
 from cavmarl.core.errors import ConfigError, WorkerError, require
 
-AGAIN_S = 0.5  # between two attempts while no caller listens
+AGAIN_S = 0.5  # pause between two attempts while no caller listens
 
 
 def node(

@@ -89,7 +89,7 @@ WINDOW_EXTRAS = {"pygame": "render"}
 VIDEO_EXTRAS = WINDOW_EXTRAS | {"imageio_ffmpeg": "render"}
 WEB_EXTRAS = dict.fromkeys(PACKAGES, "viewer")
 RECORD_EXTRAS = {"pyarrow": "record"}
-DRIVER_EXTRAS: dict[str, dict[str, str]] = {  # by the suffix of a model file
+DRIVER_EXTRAS: dict[str, dict[str, str]] = {  # suffix of a model file → its extras
     SB3_FILE: {"stable_baselines3": "train", "torch": "train"},
     **{suffix: {"torch": "train"} for suffix in TORCH_SCRIPT_FILES},
     ONNX_FILE: {"onnxruntime": "onnx"},
@@ -213,7 +213,7 @@ Policies = Annotated[
     ),
 ]
 Seed = Annotated[
-    int, about("Root of all random numbers.", metavar="N", callback=check_seed, panel=WORLD)
+    int, about("Seed of all random numbers.", metavar="N", callback=check_seed, panel=WORLD)
 ]
 Agents = Annotated[
     int | None,
@@ -370,7 +370,7 @@ def with_world(
     the options called `names`, by default all of them. A parameter of the function with the name
     of such an option replaces that option, and the function receives its value, too.
 
-    `is_here`: whether the world is made in this process; otherwise there is no --import.
+    `is_here`: whether the world is made in this process; otherwise, --import is not offered.
     """
     chosen = names or ("agents", "background", "seed", "settings", "sensors_of")
     return partial(_with_world, ("env", *chosen, *(("imports",) if is_here else ())))
@@ -511,7 +511,7 @@ def pairs_grid(rows: Iterable[tuple[str, str]]) -> Table:
 
 
 def say_difference(difference: Difference, sides: tuple[str, str]) -> str:
-    """Return one sentence: where two runs first differ, and the value of each side."""
+    """Return a sentence that says where two runs first differ, with both values."""
     thing = difference.what if difference.vehicle is None else f"vehicle {difference.vehicle}"
     one, other = difference.values
     return (
@@ -527,7 +527,7 @@ def print_error(message: str) -> None:
 
 
 def driving_progress(bar: Any) -> Callable[[str, int, int], None]:
-    """Return a function that shows in a bar how far the driving of a policy is."""
+    """Return a function that shows the progress of a policy's run in a bar."""
     task = bar.add_task("")
 
     def show(policy: str, steps: int, most: int) -> None:

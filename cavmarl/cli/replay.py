@@ -79,7 +79,7 @@ def replay(
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
     watch_token: WatchToken = "",
-    watch_only: Annotated[bool, flag("Browsers may not pause or search.", panel=PAGE)] = False,
+    watch_only: Annotated[bool, flag("Do not let browsers pause or seek.", panel=PAGE)] = False,
     imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
@@ -125,7 +125,7 @@ def replay(
         )
     console = Console()
     if not recording.is_whole:
-        console.print(f"{path}: was not closed; shown up to its last complete part", markup=False)
+        console.print(f"{path}: never closed; shown up to its last complete part", markup=False)
     exports = dict(EXPORTS)
     if rosbag2:
         from cavmarl.cosim.ros2.recording_bag import write_recording_bag

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from cavmarl.verify.published_lines import PublishedLine
     from cavmarl.verify.reproduction import LineResult
 
-ALL_SHOWN = 4  # of a line with more numbers, only wrong numbers are shown, and a count
+ALL_SHOWN = 4  # a longer line shows only its wrong numbers, and a count
 
 
 def reproduce(
@@ -30,7 +30,7 @@ def reproduce(
         typer.Argument(metavar="LINE", help="Names of lines.", show_default=False),
     ] = None,
     quick: Annotated[
-        bool, flag("Repeat only what is equal on every machine and takes seconds.", "--quick")
+        bool, flag("Repeat only lines that take seconds and are equal on every machine.", "--quick")
     ] = False,
     every: Annotated[bool, flag("Repeat all lines; takes hours.", "--all")] = False,
     listed: Annotated[bool, flag("List the lines and run nothing.", "--list")] = False,
@@ -70,13 +70,13 @@ def reproduce(
 
             for result in reproduce(chosen, root, runner, quick=quick, say=say):
                 results.append(result)
-    finally:  # also of an interrupted call, which may have taken hours
+    finally:  # show results of an interrupted run, too: it may have taken hours
         if results:
             _show(console, results, len(chosen), json_path)
     wrong = [result.name for result in results if result.is_wrong]
     if wrong:
         print_error(
-            f"{', '.join(wrong)}: measured numbers are not those of the page; correct the page, or "
+            f"{', '.join(wrong)}: measured numbers differ from the page; correct the page, or "
             "the code if the change was not intended"
         )
         raise typer.Exit(1)

@@ -49,8 +49,8 @@ Distro = Annotated[
 Waits = Annotated[
     Literal["stamp", "newest"],
     about(
-        "Each step waits for a command whose time is that of the step (stamp), or takes the "
-        "newest command and never waits (newest)."
+        "Each step waits for a command with the time stamp of the step (stamp), or takes the "
+        "newest command without waiting (newest)."
     ),
 ]
 Deadline = Annotated[
@@ -77,8 +77,8 @@ Bag = Annotated[
 Rig = Annotated[
     str | None,
     about(
-        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: those of "
-        "the environment, or reference].",
+        "Sensors: `reference`, `camera`, a name in configs/rigs, or a file [default: the "
+        "environment's, or reference].",
         metavar="RIG",
         panel=WORLD,
     ),
@@ -157,7 +157,7 @@ def _refuse_world_options(world: WorldSpec, rig: str | None, pace: float | None)
     wrong = [name for name, value in given.items() if value]
     if wrong:
         raise ConfigError(
-            f"{wrong[0]}: a bridge that joins makes no world; give it to `cavmarl lead`"
+            f"{wrong[0]}: a bridge that joins makes no world; pass it to `cavmarl lead`"
         )
 
 

@@ -55,7 +55,7 @@ def list_scenarios(json_path: JsonPath = None) -> None:
     document: dict[str, Any] = {}
     for name in scenario_names():
         scenario = load_scenario(name)
-        table = Table("parameter", "default", "range", "what it is", box=box.SIMPLE_HEAD)
+        table = Table("parameter", "default", "range", "description", box=box.SIMPLE_HEAD)
         rows = describe(scenario.Parameters)
         for row in rows:
             table.add_row(*map(escape, row))
@@ -230,7 +230,7 @@ def realism(
 ) -> None:
     """Measure how realistic rollouts of a logged scene are.
 
-    The meta-metric is that of the Waymo Open Sim Agents Challenge 2024, over the vehicles of agents
+    The meta-metric of the Waymo Open Sim Agents Challenge 2024 covers the vehicles of agents
     and, with --param reactive=true, of built-in drivers.
     """
     check_extras(world, [driver])
@@ -265,7 +265,7 @@ def realism(
     )
     console.print(table)
     console.print(
-        f"mean distance from the log {found.ade_m:.2f} m, of the best rollout "
+        f"mean distance from the log {found.ade_m:.2f} m, in the best rollout "
         f"{found.min_ade_m:.2f} m; {found.missing_percent:.1f} % of the logged steps are missing, "
         "because vehicles had left"
     )

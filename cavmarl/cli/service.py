@@ -92,7 +92,7 @@ def _joined(shares: tuple[float, ...]) -> str:
 
 
 def _shares(option: str, text: str) -> tuple[float, float, float]:
-    """Return three shares; raise ConfigError if the text is no list of three numbers."""
+    """Return three shares; raise ConfigError if the text is not three numbers."""
     try:
         cpu, ram, gpu = (float(word) for word in text.split(","))
     except ValueError:
@@ -281,7 +281,7 @@ def submit(
                     _collect(client, job, part, bar)
         except BaseException:
             for job in jobs:
-                with suppress(ServiceError):  # it has ended
+                with suppress(ServiceError):  # the job has ended
                     client.delete(f"/sessions/{job}")
             raise
     if spread:
@@ -304,7 +304,7 @@ def _uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict
     }
     names = [Path(one).resolve().name if Path(one) in drivers.values() else one for one in policies]
     if len(set(names)) < len(set(policies)):
-        raise ConfigError(f"--policy {' '.join(policies)}: drivers need folders of other names")
+        raise ConfigError(f"--policy {' '.join(policies)}: equal names; rename a folder")
     return environment, names, drivers
 
 

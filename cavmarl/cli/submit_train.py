@@ -41,7 +41,7 @@ def submit_train(
         about("Where the job runs: slurm, ray, or local for this machine.", metavar="PLACE"),
     ] = "slurm",
     processes: Annotated[
-        int, about("Processes that train one network together; ppo.", metavar="N", min=1)
+        int, about("Processes that train one network together; only for ppo.", metavar="N", min=1)
     ] = 1,
     cpus: Annotated[int, about("CPUs of each process.", metavar="N", min=1, panel=CLUSTER)] = 1,
     gpus: Annotated[int, about("GPUs of the job.", metavar="N", min=0, panel=CLUSTER)] = 0,

@@ -1,4 +1,4 @@
-"""`cavmarl suite`: evaluates drivers or controllers of signals on several maps."""
+"""`cavmarl suite`: evaluates drivers or signal controllers on several maps."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ if TYPE_CHECKING:
     from cavmarl.evaluate import EvaluationReport
     from cavmarl.evaluate.signals.signal_meter import SignalFigures
 
-# Figures of controllers of signals, and their names in tables.
+# Figures of signal controllers, and their names in tables.
 SIGNAL_FIGURES = {
     "arrived": "arrived",
     "never_departed": "never departed",
@@ -83,7 +83,7 @@ def suite(
     ] = Path("runs/suite"),
     json_path: JsonPath = None,
 ) -> None:
-    """Evaluate drivers, or controllers of signals, in every world of a suite.
+    """Evaluate drivers, or signal controllers, in every world of a suite.
 
     `cavmarl report` shows all results of drivers in one world.
     """
@@ -97,11 +97,11 @@ def suite(
         console.print(f"not in {maps}, left out: {', '.join(missing)}", highlight=False)
     if loaded.controllers is not None:
         if policy:
-            raise ConfigError(f"--policy: the suite {name} evaluates controllers of signals")
+            raise ConfigError(f"--policy: the suite {name} evaluates signal controllers")
         if (zones, backend, workers) != (None, None, None):
             raise ConfigError(
-                f"--zones, --backend and --workers: the suite {name} runs controllers of signals "
-                "in this process; leave these options out"
+                f"--zones, --backend and --workers: the suite {name} runs signal controllers in "
+                "this process; leave these options out"
             )
         with counting(console, f"worlds of {name}") as told:
             figures = run_signals(

@@ -54,7 +54,7 @@ def train(
         )
     require_all(extras_of(known[name]))
     command = [sys.executable, str(known[name]), *with_config(options or [])]
-    os.execv(sys.executable, command)  # signals and the exit code are then those of the program
+    os.execv(sys.executable, command)  # the program then gets all signals, and sets the exit code
 
 
 def extras_of(program: Path) -> dict[str, str]:

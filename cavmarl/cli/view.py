@@ -38,7 +38,7 @@ from cavmarl.core.errors import ConfigError
 from cavmarl.core.progress import progress_bar
 from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 
-MOST_WORLDS = 16  # that one page can show
+MOST_WORLDS = 16  # limit of one page
 
 if TYPE_CHECKING:
     from cavmarl.env.parallel import CavEnv

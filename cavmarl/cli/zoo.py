@@ -64,9 +64,9 @@ def list_drivers(json_path: JsonPath = None) -> None:
         rows.append((escape(entry.name), *cells, str(entry.trips), *shares))
     console = Console()
     about_each = [(escape(one.name), escape(sentence_about(one.folder))) for one in found]
-    console.print(grid(("driver", "what it is"), about_each, lefts=2))
+    console.print(grid(("driver", "description"), about_each, lefts=2))
     sources = [(escape(one.name), escape(_sources(one))) for one in found]
-    console.print(grid(("driver", "what it reads comes from"), sources, lefts=2))
+    console.print(grid(("driver", "source of its inputs"), sources, lefts=2))
     console.print(grid(heads, rows, caption="shares in % of the result's trips", wraps=True))
     fields = ("environment", "weights_bytes", "trips", "shares")
     told = {
@@ -87,7 +87,7 @@ def show(
     imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Show what a driver reads, and the kinds of maps of its training."""
+    """Show the inputs of a driver, and the kinds of maps it was trained on."""
     from cavmarl.evaluate.zoo import zoo_entry
 
     entry = zoo_entry(name)
@@ -125,8 +125,8 @@ def verify(
         print_error(
             f"{found.name}: {len(found.differing)} of {len(found.expected)} files differ; expected "
             f"from {found.expected_on}, found on {found.found_on}. The same version of cavmarl "
-            "gives the same bytes on every processor: check the versions in the manifest of the "
-            "result, and report the difference if they are the installed ones"
+            "gives the same bytes on every processor: compare the installed versions with the "
+            "manifest of the result; if they are equal, report the difference"
         )
         raise typer.Exit(1)
 
@@ -203,7 +203,7 @@ def _sources(entry: ZooEntry) -> str:
 
 
 def _label(entry: ZooEntry) -> dict[str, Any]:
-    """Return what an entry reads and the kinds of its maps, for JSON."""
+    """Return the inputs of an entry and the kinds of its maps, for JSON."""
     return {"reads": [asdict(reading) for reading in entry.readings], "maps": list(entry.maps)}
 
 

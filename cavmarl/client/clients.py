@@ -69,13 +69,13 @@ def _request(
     """Return a request.
 
     Raises:
-        ServiceError: its secret or token could be read on the way to another machine.
+        ServiceError: others could read its secret or token on the network.
     """
     url = httpx.URL(ask.url)
     if url.scheme != "https" and not is_loopback(url.host) and not allow_plain_http:
         raise ServiceError(
-            f"{url.scheme}://{url.netloc.decode()}: is another machine, and without TLS the secret "
-            "can be read on the way: use https://, or allow_plain_http=True (--plain-http) in a "
+            f"{url.scheme}://{url.netloc.decode()}: is another machine, and without TLS others "
+            "can read the secret: use https://, or allow_plain_http=True (--plain-http) in a "
             "network that you trust"
         )
     headers = {"Authorization": f"Bearer {ask.token}"} if ask.token else {}
@@ -98,8 +98,8 @@ class Client:
     """A synchronous client.
 
     Args:
-        url: of the service; after a comma, those of its standbys.
-        secret: of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
+        url: URL of the service; after a comma, URLs of its standbys.
+        secret: secret of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
         allow_plain_http: send the secret and tokens to other machines without TLS, too.
@@ -134,8 +134,8 @@ class Client:
             keys: `zones`, `nodes`, `agents`, `background`, `max_cycles`, `num_envs`, `seed` and
                 `overrides` as in `make_vec`; `nodes` is a number of nodes of the service; `name`:
                 name under which the service numbers the versions of the configuration; `drivers`:
-                folders of trained drivers of yours, by the names with which `traffic.model` and
-                `policies` name them; `licence`: that of your files, as text.
+                folders of your trained drivers, by the names that `traffic.model` and `policies`
+                use; `licence`: licence of your files, as text.
 
         Raises:
             ServiceError: the request was refused; `problem` names the reason.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from cavmarl.core.errors import RecordingError
 
-MOST_BYTES = 1 << 32  # of one unpacked part
+MOST_BYTES = 1 << 32  # limit of one unpacked part
 
 
 def unpack_recordings(parts: Mapping[str, bytes], folder: str | Path) -> list[Path]:
@@ -32,6 +32,6 @@ def unpack_recordings(parts: Mapping[str, bytes], folder: str | Path) -> list[Pa
                     raise RecordingError(f"{name}: has over {MOST_BYTES} bytes; it is not written")
                 packed.extractall(path)  # it writes nothing outside of the folder
         except zipfile.BadZipFile as error:
-            raise RecordingError(f"{name}: is no ZIP file ({error}); fetch it again") from error
+            raise RecordingError(f"{name}: is not a ZIP file ({error}); fetch it again") from error
         found.append(path)
     return found

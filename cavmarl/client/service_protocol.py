@@ -19,9 +19,9 @@ from cavmarl.client.uploads import Upload, driver_files, environment_files
 from cavmarl.core.errors import ServiceError
 
 T = TypeVar("T")
-RENEW_BEFORE_S = 60.0  # time before its expiry at which a token is renewed
+RENEW_BEFORE_S = 60.0  # a token is renewed this long before it expires
 AGAIN_S = 0.2  # time between two attempts
-POLL_S = 0.25  # time between two questions about a job
+POLL_S = 0.25  # time between two requests about a job
 PAGE = 1000  # maximum number of events in one answer
 TAKEOVER_S = 10.0  # how long the services are asked in turn until one answers
 RETRIED_S = 10.0  # how long a request is repeated after a lost answer
@@ -48,16 +48,16 @@ class Rest(NamedTuple):
 
 Flow = Generator[Ask | Rest, Any, T]
 Told = Callable[[dict[str, Any]], None]
-"""Told what the service says of a job."""
+"""Called with the service's description of a job."""
 
 
 class ServiceFlows:
     """Requests to a service, with a token that is renewed in time.
 
     Args:
-        url: of the service; after a comma, those of its standbys. If one does not answer, the next
-            one is asked.
-        secret: of an identity.
+        url: URL of the service; after a comma, URLs of its standbys. If one does not answer, the
+            next one is asked.
+        secret: secret of an identity.
     """
 
     def __init__(self, url: str, secret: str) -> None:
@@ -159,8 +159,8 @@ class ServiceFlows:
     def add_configuration(self, environment: str | Path, keys: Mapping[str, Any]) -> Flow[str]:
         """Store a configuration with its files, and return its hash.
 
-        `keys` may have `drivers`, a folder for each name of a trained driver, and `licence`, that
-        of the files.
+        `keys` may have `drivers`, a folder for each name of a trained driver, and `licence`, the
+        licence of the files.
         """
         given = dict(keys)
         drivers, licence = given.pop("drivers", None) or {}, given.pop("licence", "")

@@ -11,10 +11,10 @@ from cavmarl.config.driver_form import CONFIG_FILE, WEIGHTS_FILE
 from cavmarl.core.errors import ServiceError
 
 ENVIRONMENT_FILE = "env.yaml"
-DRIVER_FOLDER = "drivers"  # has a folder for each uploaded driver
+DRIVER_FOLDER = "drivers"  # contains a folder for each uploaded driver
 DRIVER_FILES = (CONFIG_FILE, WEIGHTS_FILE)
 UNSENT = (".md", ".txt", ".netccfg", ".netgcfg")  # files that no world reads
-MOST_BYTES = 64 * 1024 * 1024  # of one file
+MOST_BYTES = 64 * 1024 * 1024  # limit of one file
 
 
 class Upload(NamedTuple):
@@ -52,7 +52,7 @@ def driver_files(drivers: Mapping[str, str | Path]) -> dict[str, Upload]:
     """Return the files of trained drivers by place.
 
     Raises:
-        ServiceError: a folder is not that of a trained driver.
+        ServiceError: a folder does not contain a trained driver.
     """
     files = {}
     for name, folder in drivers.items():

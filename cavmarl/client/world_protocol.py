@@ -4,7 +4,7 @@ Commands are numbered: resets, steps, and changes between steps. A node answers 
 from memory, and from time to time stores the state of its worlds with the service. The client keeps
 the commands since the last stored state. If the node is lost, the service selects another node,
 which loads that state, and the client repeats the later commands. Equal commands give equal bytes.
-The address of a node is not used after its lease.
+The client does not use the address of a node after its lease.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class WorldFlows:
     Attributes:
         description: shapes and names reported by the node.
         assignment: the last answer of the service.
-        moves: number of times that another node has taken the session.
+        moves: number of moves of the session to another node.
     """
 
     def __init__(self, service: ServiceFlows, recovery_s: float = RECOVERY_S) -> None:
@@ -142,7 +142,7 @@ class WorldFlows:
         seed: int = 0,
         params: Mapping[str, bool | float] | None = None,
     ) -> Flow[None]:
-        """Make the worlds again with a scenario; an empty name: without one. Reset them next.
+        """Make the worlds again with a scenario; an empty name: without one. Then reset them.
 
         The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
         """
@@ -375,7 +375,7 @@ def _may_pass(error: Exception, names: Sequence[str], until_s: float) -> bool:
 
 
 def _plain(value: Any) -> Any:
-    """Return a value as JSON has it: numbers of NumPy as numbers, sequences as lists."""
+    """Return a value in JSON's types: numbers of NumPy as numbers, sequences as lists."""
     if isinstance(value, np.generic):
         return value.item()
     if isinstance(value, Mapping):

@@ -28,8 +28,8 @@ class ActionConfig(Section, key="action"):
         grid_steering: `grid`: increasing steerings in [-1, 1], including 0. With n steerings,
             choice k is throttle k // n and steering k % n.
         out_of_range: continuous values beyond ±1: `error`, or `clip` (see `traffic_stats`).
-        missing_action: no action for a live agent: `error`, or `hold` its last action (counted).
-        late_actions: an action for an agent that has left: `error`, or `ignore` (counted).
+        missing_action: if a live agent gets no action: `error`, or `hold` its last one (counted).
+        late_actions: if an agent that has left gets an action: `error`, or `ignore` (counted).
     """
 
     kind: Literal["continuous", "discrete", "grid"] = "continuous"
@@ -59,7 +59,7 @@ class ActionConfig(Section, key="action"):
             )
         size = len(self.grid_throttle) * len(self.grid_steering)
         self.need(
-            "grid_steering", size <= MAX_GRID, f"makes {size} pairs; at most {MAX_GRID} are allowed"
+            "grid_steering", size <= MAX_GRID, f"makes {size} pairs; the maximum is {MAX_GRID}"
         )
 
     @property
@@ -84,7 +84,7 @@ class ActionConfig(Section, key="action"):
 
 
 def _rises(values: tuple[float, ...], low: float, high: float) -> bool:
-    """Return whether there are values, all within the bounds and strictly increasing."""
+    """Return whether `values` is not empty, within the bounds and strictly increasing."""
     return (
         bool(values)
         and all(math.isfinite(v) and low <= v <= high for v in values)

@@ -1,7 +1,7 @@
 """Checks of configuration values.
 
 The type of a field contains its range: `Annotated[float, Within(0.0, 1.0)]`. `check_ranges`
-reads it from the type. A class checks conditions on several fields in its own `__post_init__`.
+reads the range. A class checks conditions on several fields in its own `__post_init__`.
 """
 
 from __future__ import annotations
@@ -85,7 +85,7 @@ def _ranges(kind: type[Any]) -> tuple[tuple[str, Within], ...]:
     return tuple(
         (name, mark)
         for name, hint in hints.items()
-        # the marks are in the hint, or in a member of a union such as `Annotated[int, …] | None`
+        # the range is in the hint, or in a member of a union such as `Annotated[int, …] | None`
         for mark in (*get_args(hint), *chain.from_iterable(map(get_args, get_args(hint))))
         if isinstance(mark, Within)
     )

@@ -14,7 +14,7 @@ SB3_FILE = ".zip"  # suffixes of the model files of other libraries
 TORCH_SCRIPT_FILES = (".pt", ".ts")
 ONNX_FILE = ".onnx"
 DRIVER_FILES = (".py", SB3_FILE, *TORCH_SCRIPT_FILES, ONNX_FILE)
-SHIELDED = "shielded:"  # before a driver; the built-in driver acts where it would brake harder
+SHIELDED = "shielded:"  # prefix; the built-in driver takes over when it would brake harder
 
 
 def find_driver(policy: str | Path) -> Path:

@@ -1,6 +1,6 @@
 """`EnvConfig`: frozen dataclasses whose fields are the keys of `env.yaml`.
 
-The name of each number that has a unit ends with it. Each class checks values and combinations
+The name of a number ends with its unit, if it has one. Each class checks values and combinations
 in `__post_init__`; its messages say what to change. `registry.load_config` checks types and
 unknown keys when it reads a file.
 """
@@ -41,15 +41,15 @@ class MapConfig(Section, key="map"):
             each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
-        program: the program of each signal named here, whichever was loaded last; or `off`.
+        program: the program of each signal named here, instead of the last one; may be `off`.
         buildings: `osm`: the buildings in the OpenStreetMap file `source`; or a file of buildings
             (OpenStreetMap or SUMO's polygons), named like `source`; empty: none.
         changed_lanes: number of lanes that may differ from the map in a world at the same time:
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
             each world has its own table of lanes and its own plans.
         contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
-            opposite direction on them, which are closed until then. A reversed road counts in
-            `map.changed_lanes` with the lanes of both directions.
+            opposite direction on them, which are closed until the road is reversed. A reversed road
+            counts in `map.changed_lanes` with the lanes of both directions.
         events: roads that close, open, slow down or are reversed during each episode; see
             `config.road_events.RoadEvent`.
     """
@@ -115,9 +115,9 @@ class ObservationConfig:
     """The content and the form of observations.
 
     Attributes:
-        mode: `ground_truth`: the features configured under `sensors`, without errors. `sensors`:
-            the latest samples of the `rig`. `messages`: of `sensors`, only the features of the own
-            vehicle and its route, and those received over the air.
+        mode: `ground_truth`: the features configured under `sensors`, without measurement errors.
+            `sensors`: the latest samples of the `rig`. `messages`: only features under `sensors`
+            that describe the ego vehicle and its route, or are received by radio.
         kind: `flat`: one float32 Box. `dict`: one Box per sensor.
     """
 
@@ -205,7 +205,7 @@ class EnvConfig(Section, key=""):
         self.need(
             "traffic.model",
             not (self.zones.simulators and self.traffic.networks),
-            "other simulators do not evaluate networks: leave out zones.simulators, or name a "
+            "other simulators cannot run a trained driver: leave out zones.simulators, or name a "
             "car-following model",
         )
         self._check_messages()
@@ -343,21 +343,21 @@ class EnvConfig(Section, key=""):
 
     @property
     def tells_sumo(self) -> bool:
-        """Whether SUMO receives anything during an episode, so that its state is not its demand's.
+        """Whether SUMO receives commands during an episode, so that it departs from its demand.
 
-        It receives vehicles if it moves its own ones, and changes of lanes.
+        SUMO receives cavmarl's vehicles if it moves vehicles, and changes of lanes.
         """
         source = self.traffic.source
         return source == "sumo-traffic" or (source != "native" and self.may_change_lanes)
 
     @property
     def drives_alone(self) -> bool:
-        """Whether no agent drives, and the vehicles of a demand do; only the horizon ends that."""
+        """Whether only the vehicles of a demand drive, so that only the horizon ends an episode."""
         return self.population.agents == 0 and bool(self.traffic.demand)
 
     @property
     def controlled(self) -> SignalsConfig | LimitsConfig | None:
-        """The signals or the limits that are controlled, by agents or otherwise."""
+        """The signals or the limits that are controlled, by agents or by a controller."""
         if self.signals.are_controlled:
             return self.signals
         return self.limits if self.limits.are_controlled else None

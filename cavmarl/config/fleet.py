@@ -1,4 +1,4 @@
-"""The keys `population.fleet` and `population.own_types`: who drives what, with which sensors.
+"""The keys `population.fleet` and `population.own_types`: the agents' types, drivers and sensors.
 
 population:
 agents: 6
@@ -28,10 +28,10 @@ RESERVED_TYPES = (*KNOWN_TYPES, "pedestrian", "cyclist", "roadside_unit")
 
 @dataclass(frozen=True, kw_only=True)
 class OwnType:
-    """A vehicle type of an environment; values that are left out are those of the type `like`.
+    """A vehicle type of an environment; missing values are taken from the type `like`.
 
     Attributes:
-        like: the type whose other values, classes and lanes it has.
+        like: the type that provides the missing values, the vehicle class and the permitted lanes.
         length_m: between the bumpers.
         width_m: without mirrors.
         height_m: above the ground.
@@ -40,7 +40,7 @@ class OwnType:
         accel_mps2: largest acceleration.
         decel_mps2: comfortable deceleration of the built-in driver.
         emergency_decel_mps2: largest deceleration.
-        min_gap_m: of the built-in driver at rest.
+        min_gap_m: gap that the built-in driver keeps at rest.
         max_speed_mps: technical limit.
     """
 
@@ -104,12 +104,12 @@ def check_fleet(own_types: Mapping[str, OwnType], fleet: Sequence[FleetPart]) ->
 def parts_in_turn(fleet: Sequence[FleetPart], count: int) -> NDArray[np.int64]:
     """Return (count,) the part of each agent, so that each part always has about its share.
 
-    Agent k belongs to the part that is farthest behind its share of k + 1 agents; of equal ones,
-    to the first.
+    Agent k belongs to the part that is farthest behind its share of k + 1 agents; ties go to the
+    first part.
     """
     exact = [Fraction(part.share) for part in fleet]
     unit = math.lcm(*(share.denominator for share in exact))
-    shares = [int(share * unit) for share in exact]  # whole numbers: ties do not depend on rounding
+    shares = [int(share * unit) for share in exact]  # whole numbers, for exact ties
     whole, behind = sum(shares), [0] * len(fleet)
     chosen = np.zeros(count, dtype=np.int64)
     for k in range(count):

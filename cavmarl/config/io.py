@@ -1,8 +1,8 @@
 """Reads YAML into checked, frozen dataclasses.
 
-YAML is read with the core schema of YAML 1.2 (`1e-3` is a number, `on` and `1:30` are text). A
-configuration needs no tags, aliases, duplicate keys, deep nesting or large files: they raise
-errors. Types are strict: a bool is not an int, a quoted number is not a number.
+YAML is read with the core schema of YAML 1.2 (`1e-3` is a number, `on` and `1:30` are text). Tags,
+aliases, duplicate keys, deep nesting and large files raise errors. Types are strict: a bool is not
+an int, a quoted number is not a number.
 """
 
 from __future__ import annotations
@@ -135,8 +135,8 @@ def validate(
         raise ConfigError(f"{where}: must be a mapping from keys to values, not {raw!r}")
     try:
         # Via JSON, whose strict mode does not distinguish lists from tuples, or mappings from
-        # dataclasses. NumPy's numbers count as Python's. Other types become text, which is
-        # accepted for no number.
+        # dataclasses. NumPy's numbers count as Python's. Other types become text, which no
+        # number field accepts.
         text = json.dumps(raw, default=_plain)
     except (TypeError, ValueError, RecursionError) as error:
         raise ConfigError(f"{where}: has a value that is not allowed ({error})") from error
@@ -151,7 +151,7 @@ def validate(
 
 
 def _plain(value: object) -> object:
-    """Return a replacement of `value` that JSON can represent."""
+    """Return `value` in a form that JSON can represent."""
     return value.item() if isinstance(value, np.generic) else str(value)
 
 
@@ -170,7 +170,7 @@ def dotted_keys(kind: type[Any], prefix: str = "") -> list[str]:
 def _adapter(kind: type[Any], extra: Literal["forbid", "ignore"]) -> TypeAdapter[Any]:
     """Return pydantic's strict adapter of `kind`.
 
-    It adapts a union, because a dataclass by itself ignores a configuration from outside.
+    It adapts a union, because pydantic ignores `config` for a plain dataclass.
     """
     union: Any = kind | None
     return TypeAdapter(union, config=ConfigDict(extra=extra, strict=True))

@@ -26,23 +26,22 @@ class LimitsConfig(Section, key="limits"):
     """Roadside units that set speed limits; docs/reference/limit_agents.md describes the API.
 
     Attributes:
-        units: name of each unit: the edges on which its limit holds, on all lanes.
+        units: name of each unit: the edges whose lanes get its limit.
         sections: name of each section: the edges whose vehicles are counted together. All units
             know all sections.
         agents: `none`; `all` units; or a list of names of units. Other units set no limit.
         controller: what chooses the limits: `agents` of the environment, or `feedback`; then all
             agents are vehicles.
-        speeds_mps: the limits to choose from, ascending. On a lane whose limit on the map is lower,
-            that limit holds.
+        speeds_mps: the limits to choose from, ascending. On a lane with a lower limit on the map,
+            the map's limit holds.
         decide_s: time between two decisions; a whole number of steps of `clock.ctrl_dt_s`.
-        most_change: a decision changes the choice by at most this number of places in `speeds_mps`;
-            0: by any number.
+        most_change: largest change per decision, in places of `speeds_mps`; 0: no limit.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `LIMIT_TERMS`.
         wanted_per_km: above this density, in vehicles per km and lane, `feedback` sets the lowest
             limit that is allowed; otherwise, the limit rises by one place.
-        watched: `feedback` reads the density of this section; empty: of the last one.
+        watched: section whose density `feedback` reads; empty: the last section.
     """
 
     units: dict[str, tuple[str, ...]] = field(default_factory=dict)
@@ -127,11 +126,11 @@ class LimitsConfig(Section, key="limits"):
         )
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` cannot have agents of limits; empty if no unit has an agent."""
+        """Return why `what` does not support agents for limits; empty if there are none."""
         if not self.have_agents:
             return ""
         return (
-            f"limits.agents = {self.agents!r}: {what} has agents of vehicles alone; set "
+            f"limits.agents = {self.agents!r}: {what} has only vehicles as agents; set "
             f"limits.controller to {', '.join(LIMIT_CONTROLLERS)}, or use make_vec, parallel_env "
             "or an adapter of TorchRL, BenchMARL or RLlib"
         )

@@ -23,9 +23,9 @@ class PopulationConfig(Section, key="population"):
         mode: `closed`: all agents enter at the reset. `open`: agents also enter during the episode,
             each id once, `budget` agents in all. `respawn`: a fixed set of `agents` ids; if an
             agent's vehicle ends its trip, the agent gets a new one.
-        agents: vehicles that policies drive at the same time.
-        background: vehicles that the built-in driver drives. In `closed` worlds they are placed at
-            the reset; otherwise each arrival causes a departure, so their number is constant.
+        agents: number of vehicles that policies drive at the same time.
+        background: number of vehicles that the built-in driver drives. In `closed` worlds they are
+            placed at the reset; otherwise each arrival is replaced by a departure.
         budget: number of agents that may enter in an episode of an `open` world (default: 4 ·
             agents); not used in the other modes.
         types: vehicle types of the agents, from `car`, `truck` and `bus`. Agent k has type

@@ -32,7 +32,7 @@ from cavmarl.core.extensions import load_plugins
 from cavmarl.core.scene_names import SCENE_SUFFIXES, is_scene_file
 from cavmarl.core.xml_root import SUMO_CONFIG_SUFFIX, is_sumo_config
 
-_NATIVE = (".net.xml", ".net.xml.gz")  # read as they are; SUMO's netconvert converts the others
+_NATIVE = (".net.xml", ".net.xml.gz")  # read directly; SUMO's netconvert converts other formats
 MAP_SUFFIXES = (*_NATIVE, ".osm", ".osm.gz", ".osm.xml", ".xodr")
 
 PACKAGE = Path(__file__).resolve().parents[1]
@@ -73,7 +73,7 @@ def programs() -> dict[str, Path]:
 
 
 def agent_here(name: str) -> Path | None:
-    """Return the path in the working directory that has a driver's name but is another driver."""
+    """Return a path in the working directory that shadows the name of a driver of the package."""
     for path in (Path.cwd() / "agents" / f"{name}.py", Path.cwd() / "agents" / name):
         is_driver = isfile(path) if path.suffix == ".py" else _agent_name(path) is not None
         if is_driver and agent_entries().get(name) != path:
@@ -146,7 +146,7 @@ def load_config(
     Raises:
         UnknownEnvironmentError: nothing has that name.
         ConfigError: a key, a type or a value is not allowed, or a plugin cannot be imported; the
-            message suggests the nearest one.
+            message suggests the nearest allowed value.
     """
     from cavmarl.config.io import read_yaml, validate
 
@@ -175,7 +175,7 @@ def load_config(
         raise ConfigError(f"overrides = {overrides!r}: must map dotted keys to values")
     values = dict(overrides or {})
     if strange := [key for key in values if not isinstance(key, str)]:
-        raise ConfigError(f"overrides: {strange[0]!r} is not a key; keys are text, dotted")
+        raise ConfigError(f"overrides: {strange[0]!r} is not a key; a key is a dotted name")
     if twice := given.keys() & values.keys():
         raise ConfigError(f"{min(twice)} is given in overrides and as a keyword; use one of them")
     values |= {key: value for key, value in given.items() if key != "horizon_s"}

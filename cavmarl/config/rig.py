@@ -88,9 +88,9 @@ class SampledConfig(MountedConfig):
         rate_hz: samples per second.
         phase_ticks: tick of the first sample; 0: at the reset.
         schedule: `exact`: one sample every n ticks, or n samples every tick; other rates are
-            errors. `accumulate`: a rate below the tick rate is met on average. A sample is taken at
-            the first tick at or after its time.
-        noise: standard deviation of each channel, or of all; in the channel's unit.
+            errors. `accumulate`: a rate below the tick rate is kept on average. A sample is taken
+            at the first tick at or after its time.
+        noise: standard deviation per channel, or one for all channels; in the channel's unit.
         bias: standard deviation of a constant error, drawn for each vehicle and episode.
     """
 
@@ -129,7 +129,7 @@ class SampledConfig(MountedConfig):
             rate <= 1 or self.in_batches,
             f"{key}.rate_hz",
             self.rate_hz,
-            f"must be at most once per tick, {1.0 / sim_dt_s:g} Hz with clock.sim_dt_s = "
+            f"must be at most one sample per tick, {1.0 / sim_dt_s:g} Hz with clock.sim_dt_s = "
             f"{sim_dt_s:g}",
         )
         last = max(0, math.ceil(1 / rate) - 1)
@@ -170,7 +170,7 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
 
 
 def _check_exact(key: str, config: SampledConfig) -> None:
-    """Raise an error for noise of classes, which are labels and not quantities."""
+    """Raise an error if a sensor of classes has noise or bias, which labels cannot have."""
     for name in ("noise", "bias"):
         values = getattr(config, name)
         check(not any(values), f"{key}.{name}", values, "must be 0: classes have no noise or bias")
@@ -381,7 +381,7 @@ class LaneBoundaryConfig(SampledConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class CollisionConfig(MountedConfig):
-    """Events of the vehicle per tick: EVENT_* bits, and the id of the vehicle hit (-1: none)."""
+    """Events per tick: EVENT_* bits, and the id of the vehicle that was hit (-1: none)."""
 
     type: Literal["collision"] = "collision"
     units: ClassVar[tuple[str, ...]] = ("bits", "id")

@@ -20,12 +20,12 @@ from cavmarl.config.checks import Within, check, check_ranges
 
 @dataclass(frozen=True, kw_only=True)
 class RoadEvent:
-    """An event of all worlds, in the first step that begins at or after its time.
+    """An event in all worlds. It takes effect in the first step that begins at or after its time.
 
     Attributes:
-        at_s: time since the begin of the episode.
-        action: `close`, `open` (as on the map again), `damage` (a lower speed limit), or `reverse`
-            (one of `map.contraflow`).
+        at_s: time since the beginning of the episode.
+        action: `close`, `open` (restore the map's state), `damage` (a lower speed limit), or
+            `reverse` (one of `map.contraflow`).
         edges: ids of the roads.
         lanes: indices of the lanes, from the kerb; default: all.
         speed_mps: the limit of damaged roads.
@@ -50,7 +50,7 @@ def check_events(events: Sequence[RoadEvent], contraflow: Sequence[str]) -> None
             (event.speed_mps is not None) == (event.action == "damage"),
             f"{key}.speed_mps",
             event.speed_mps,
-            "must be given for damage, and only there",
+            "must be given for damage, and for no other action",
         )
         others = [edge for edge in event.edges if edge not in contraflow]
         check(

@@ -20,8 +20,8 @@ class ScenarioConfig(Section, key="scenario"):
             with `seed`.
         seed: seed that draws the place.
         params: values of the scenario's parameters; the other parameters keep their defaults.
-        seats: of a logged scene, the tracks whose vehicles the agents drive, one per agent; empty:
-            the vehicle that logged the scene first, then other vehicles in the order of the file.
+        seats: the tracks of a logged scene that the agents drive, one per agent; empty: first the
+            vehicle that logged the scene, then other vehicles in the order of the file.
     """
 
     name: str = ""

@@ -45,7 +45,7 @@ class SensorSection(Section, key=""):
     """The keys of one sensor.
 
     A subclass names its `switches`: the sensor is off if all of these fields are 0, empty or false.
-    `sight` are the switches for the perception of other vehicles or signals.
+    The `sight` switches turn on the perception of other vehicles or signals.
     """
 
     switches: ClassVar[tuple[str, ...]] = ()
@@ -133,8 +133,8 @@ class SignalAheadConfig(
         range_m: distance ahead up to which it is seen.
         timing: adds the exact time until the signal changes, from the world's state. A vehicle on a
             road knows it only from messages (`sensors.messages.timing`).
-        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; or with an
-            additional number of its `own`.
+        stop_signs: how a stop sign is shown. `give_way`: like a yield line; `own`: with an
+            additional number for stop signs.
     """
 
     enabled: bool = True
@@ -145,7 +145,7 @@ class SignalAheadConfig(
 
 @dataclass(frozen=True)
 class LanesConfig(SensorSection, key="sensors.lanes", switches=("range_m",), sight=("range_m",)):
-    """Vehicles by position along the surrounding lanes, and the next one to cross the path.
+    """Vehicles by position along the surrounding lanes, and the next vehicle to cross the path.
 
     Attributes:
         range_m: distance along lanes up to which vehicles are seen; 0 switches the sensor off.
@@ -176,15 +176,16 @@ class KinematicsConfig(
     """highway-env's `Kinematics`: a table with a row per vehicle, starting with the ego vehicle.
 
     Attributes:
-        vehicles_count: rows, including the ego vehicle (highway-env: 5); 0 switches the sensor off.
+        vehicles_count: number of rows, including the ego vehicle (highway-env: 5); 0 switches the
+            sensor off.
         features: columns, from `presence`, `x`, `y`, `vx`, `vy`, `heading`, `cos_h`, `sin_h`,
             `cos_d`, `sin_d`, `long_off`, `lat_off`, `ang_off`.
         features_range: feature to [min, max], mapped to [-1, 1]; other features stay unmapped.
             Empty: x ±200 m, y ±4 m for each lane of the map's widest road, vx and vy ±80 m/s.
         absolute: whether x, y, vx and vy of other vehicles are in the world's frame; otherwise
             relative to the ego vehicle. The ego row is always in the world's frame.
-        order: `sorted`: nearest along the lane first. `shuffled`: those with the smallest ids, in
-            random order.
+        order: `sorted`: nearest along the lane first. `shuffled`: the vehicles with the smallest
+            ids, in random order.
         normalize: whether ranges are mapped to [-1, 1].
         clip: whether mapped values are clipped to [-1, 1].
         see_behind: whether vehicles more than two lengths behind are included.
@@ -296,10 +297,10 @@ class MessagesConfig(
     """Information received in messages; see `v2x`.
 
     Attributes:
-        objects: number of vehicles known from messages, the nearest ones; 0: none.
-        events: number of events known from messages, the nearest ones; 0: none.
+        objects: number of nearest vehicles known from messages; 0: none.
+        events: number of nearest events known from messages; 0: none.
         signal: adds the message of the roadside unit at the next signal on the route.
-        timing: adds to it the distance to the stop line and the times at which its signal changes.
+        timing: adds to that message the distance to the stop line and the times of signal changes.
         range_m: distance that is scaled to 1; greater distances are clipped to 1.
     """
 
@@ -322,12 +323,12 @@ class WayConfig(
 
     Attributes:
         distances_m: increasing distances at which the path is sampled; an empty list: none.
-        lines: number of next stop lines with a signal or a duty to yield; 0: none.
+        lines: number of next stop lines with a signal or a yield rule; 0: none.
         range_m: distance ahead up to which a line is seen.
         timing: adds the exact time until a line's signal changes, from the world's state. A vehicle
             on a road knows it only from messages (`sensors.messages.timing`).
-        stop_signs: how a stop sign is shown: like a line where vehicles `give_way`; with an
-            additional number of its `own`; or like a `red` light, as `tollgate_ippo` needs it.
+        stop_signs: how a stop sign is shown. `give_way`: like a yield line; `own`: with an
+            additional number for stop signs; `red`: like a red light, as `tollgate_ippo` needs it.
     """
 
     distances_m: tuple[float, ...] = ()
@@ -352,17 +353,16 @@ class WayConfig(
 class ConflictsConfig(
     SensorSection, key="sensors.conflicts", switches=("count",), sight=("count",)
 ):
-    """The vehicles that come closest to the ego path, the soonest and closest ones first.
+    """The vehicles that come closest to the ego path, sorted by time and distance.
 
-    Their plans are unknown except for `indicators`: a vehicle is assumed to keep its motion, along
-    its heading.
+    Their plans are unknown except for `indicators`: speed and heading are assumed to be constant.
 
     Attributes:
         count: maximum number of vehicles; 0 switches the sensor off.
         range_m: distance up to which vehicles are seen.
         through_walls: false hides vehicles whose centre is behind a wall of `map.buildings`.
-        heard: true adds vehicles that are not seen but known from messages (`v2x`), extrapolated
-            from the message; and two numbers per vehicle, see `seen` and `age`.
+        heard: true adds vehicles known only from messages (`v2x`), extrapolated; and two numbers
+            per vehicle, see `seen` and `age`.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
             indicate at their present or next junction; and adds one number per vehicle, see `turn`.
         indicators_m: distance to the junction from which vehicles indicate; before that, their turn
@@ -390,12 +390,12 @@ class HistoryConfig(SensorSection, key="sensors.history", switches=("steps",)):
 
 @dataclass(frozen=True)
 class SensorsConfig(Section, key="sensors"):
-    """The sensors of every agent; a count or range of 0 switches one off.
+    """The sensors of every agent; a count or range of 0 switches a sensor off.
 
     Attributes:
-        stack: number of observations in one, the latest ones, oldest first. After a reset, all are
-            the first observation.
-        registered: names of sensors from outside of the package that are on
+        stack: number of latest observations that are stacked, oldest first. After a reset, all are
+            copies of the first observation.
+        registered: names of the registered sensors from outside the package that are on
             (docs/guides/extending.md); their features come last.
     """
 

@@ -43,16 +43,15 @@ class SignalsConfig(Section, key="signals"):
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
         longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
-            been red this long before a stopped vehicle; 0: they do not.
+            been red this long while a vehicle waits; 0: they do not.
         saturation_per_h: `webster`: vehicles per hour of green that leave a lane.
         flow_interval_s: `webster` plans from the vehicles counted in the last interval of this
             length.
         max_gap_s: `actuated` ends a green if its detectors have been free for this long.
         sotl_vehicle_s: `sotl` ends a green if vehicles on the red lanes of another green have
             waited this long in total.
-        platoon: `sotl` keeps a green while 1 to this number of vehicles are near its lines; 0: it
-            does not.
-        platoon_m: distance from the line within which they are near.
+        platoon: `sotl` keeps a green while 1 to this number of vehicles are near its lines; 0: off.
+        platoon_m: distance from the line within which these vehicles are counted.
         greens: which phases of a program are greens. `distinct`: those with a green and no yellow
             letter for vehicles; phases with equal letters count once. `all`: as in sumo-rl, each
             phase without the letter `y` that has any letter but `r` and `s`.
@@ -61,18 +60,18 @@ class SignalsConfig(Section, key="signals"):
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         range_m: scores of controllers and rewards count the vehicles on lanes that lead to a signal
-            within this distance of its stop line; 0: on the last lane before the signal alone, as
-            in sumo-rl. A lane counts as a whole. Needs `sensing: truth`.
+            within this distance of its stop line; 0: only on the last lane before the signal, as in
+            sumo-rl. Each lane counts in full. Needs `sensing: truth`.
         terms: weights of the reward's terms; see `SIGNAL_TERMS`.
         sensing: what agents and controllers know of the vehicles: `truth`; the induction `loops` of
             the lanes; what the `camera` of a signal sees; or `v2x`, messages that its roadside unit
             has received. Rewards always use the truth.
         loop_upstream_m: distance from the stop line to the loop before it.
-        camera_range_m: how far from the signal a camera sees, along a lane.
+        camera_range_m: range of a camera, measured from the signal along a lane.
         camera_height_m: height of a camera above the road.
         camera_misses: probability that a camera misses a vehicle at a decision.
-        overrides: number of links at whose signals the caller may show states of its own in a world
-            at the same time (`SignalOverrides`).
+        overrides: number of links whose signal state the caller may override in a world at the same
+            time (`SignalOverrides`).
     """
 
     agents: str | tuple[str, ...] = NO_SIGNALS
@@ -147,16 +146,16 @@ class SignalsConfig(Section, key="signals"):
 
     @property
     def have_agents(self) -> bool:
-        """Whether agents of the environment choose them."""
+        """Whether agents of the environment choose the greens."""
         return self.are_controlled and self.controller == BY_AGENTS
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` cannot have agents of signals; empty if no signal has an agent."""
+        """Return why `what` does not support agents at signals; empty if there are none."""
         if not self.have_agents:
             return ""
         choices = ", ".join(SIGNAL_CONTROLLERS)
         return (
-            f"signals.agents = {self.agents!r}: {what} has agents of vehicles alone; set "
+            f"signals.agents = {self.agents!r}: {what} has only vehicles as agents; set "
             f"signals.controller to one of {choices}, or use make_vec, parallel_env or an adapter "
             "of TorchRL, BenchMARL or RLlib"
         )

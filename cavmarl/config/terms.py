@@ -33,7 +33,7 @@ class TermsConfig(Section, key="terms"):
 
     Attributes:
         weights: weight of each named term; other terms have weight 0.
-        team_share: share of the mean over all live agents in the reward: 0 individual, 1 team.
+        team_share: weight of the mean reward of all live agents: 0 individual, 1 team.
         team_range_m: only agents within this distance count in the mean, as in the local
             coordination of CoPO (Peng et al. 2021); 0: all agents count.
     """

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from cavmarl.config.checks import Section, Whole, Within
 
-ZOO = "zoo:"  # before the name of a trained driver that drives background vehicles
+ZOO = "zoo:"  # prefix of the name of a trained driver that drives background vehicles
 
 
 @dataclass(frozen=True)
@@ -18,19 +18,19 @@ class TrafficConfig(Section, key="traffic"):
     Attributes:
         source: `native`: cavmarl reads the demand files. `sumo-demand`: SUMO determines departures,
             routes and signals; cavmarl's drivers drive. `sumo-traffic`: SUMO also moves its
-            vehicles. The generator's vehicles drive in all cases.
+            vehicles. Generated vehicles are added in all three cases.
         demand: SUMO files with vehicles, flows, routes and types (`.rou.xml`, `.add.xml`,
-            `.sumocfg`), named like `map.source`. Their vehicles drive beside the generator's.
-        on_bad_route: what happens to vehicles of the demand that cannot drive their route, and to
-            stops off the route: `error`, or `skip` them (counted).
+            `.sumocfg`), named like `map.source`. Their vehicles are added to the generated ones.
+        on_bad_route: handling of vehicles of the demand that cannot drive their route, and of stops
+            off the route: `error`, or `skip` them (counted).
         goals: number of destination edges of the generator; lane-level plans are made for each.
         origins: ids of edges that agents start on; empty: all edges from which a goal is reachable.
         destinations: ids of edges that agents drive to; empty: the generator's goals.
         min_trip_m: shortest route of an agent between origin and destination.
         max_trip_m: longest route of an agent; 0: no limit.
-        endless: 150 m before their goal, agents get another goal that is farther than that, like
-            the background vehicles of a `closed` world.
-        speed_factor_spread: half width of the uniform distribution of desired speed over limit.
+        endless: 150 m before their goal, agents get another goal, farther than 150 m away, like the
+            background vehicles of a `closed` world.
+        speed_factor_spread: half width of the uniform distribution of desired speed / speed limit.
         model: driver of the generator's vehicles: a car-following model (`IDM`, `Krauss`, `ACC`, or
             a registered model, docs/guides/extending.md), or `zoo:` and the name of a trained
             driver (docs/guides/learned_traffic.md). Several drivers: a mapping from each driver to

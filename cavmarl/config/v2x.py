@@ -1,4 +1,4 @@
-"""The keys under `v2x` of `env.yaml`: which messages are sent, and how many of them arrive.
+"""The keys under `v2x` of `env.yaml`: messages and the radio channel.
 
 Messages are off by default, and the channel is ideal: each of its effects is off at 0.
 """
@@ -20,9 +20,9 @@ class CamConfig(Section, key="v2x.cam"):
     """Messages of a vehicle about itself, modelled on CAM (ETSI EN 302 637-2).
 
     Attributes:
-        rate_hz: rate of messages; vehicles take turns by id. 0: never.
+        rate_hz: message rate; the phase depends on the vehicle's id. 0: never.
         triggered: send a message only if the vehicle has moved 4 m, turned 4° or changed its
-            speed by 0.5 m/s since its last one, or if that was a second ago.
+            speed by 0.5 m/s since its last message, or if that message is a second old.
     """
 
     rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 10.0
@@ -36,7 +36,7 @@ class DenmConfig(Section, key="v2x.denm"):
     Attributes:
         rate_hz: repetition rate while an event lasts; 0: only events that agents declare are sent.
         hard_braking_mps2: deceleration from which braking is an event.
-        stationary_s: time for which a vehicle must be stopped to be an event.
+        stationary_s: waiting time after which a stopped vehicle is an event.
         validity_s: time for which a receiver keeps an event.
     """
 
@@ -53,7 +53,7 @@ class PerceptionConfig(Section, key="v2x.perception"):
     Attributes:
         rate_hz: rate of messages of a vehicle; 0: never.
         range_m: range of a vehicle's perception, unless a vehicle or building is in between.
-        objects: maximum number of objects in a message, the nearest ones.
+        objects: maximum number of objects in a message; the nearest are kept.
     """
 
     rate_hz: Annotated[float, Within(0.0, MAX_RATE_HZ)] = 0.0
@@ -139,9 +139,9 @@ class InboxConfig(Section, key="v2x.inbox"):
     """The memory of a receiver: its local dynamic map.
 
     Attributes:
-        objects: maximum number of vehicles, the nearest ones.
-        events: maximum number of events, the nearest ones.
-        signals: maximum number of signals, the nearest ones.
+        objects: maximum number of vehicles; the nearest are kept.
+        events: maximum number of events; the nearest are kept.
+        signals: maximum number of signals; the nearest are kept.
         memory_s: time for which information about vehicles and signals is kept.
     """
 
@@ -158,8 +158,8 @@ class V2xConfig(Section, key="v2x"):
     Attributes:
         enabled: true switches messages on.
         equipped: share of the background vehicles that send, by id; all agents send.
-        capacity: packets that can be sent in one tick of a world. Packets of larger ids are dropped
-            and counted. 0: room for all.
+        capacity: packets that can be sent in one tick of a world. Packets of senders with larger
+            ids are dropped and counted. 0: no limit.
     """
 
     enabled: bool = False
@@ -188,7 +188,7 @@ class V2xConfig(Section, key="v2x"):
                     abs(ticks - fit) < 1e-6 * fit,
                     f"v2x.{key}",
                     rate_hz,
-                    f"must be once in a whole number of ticks of clock.sim_dt_s = {sim_dt_s:g}; "
+                    f"must give a period of whole ticks of clock.sim_dt_s = {sim_dt_s:g}; "
                     f"try {1.0 / (fit * sim_dt_s):g}",
                 )
 

@@ -17,18 +17,18 @@ class WorkersConfig(Section, key="workers"):
     Attributes:
         timeout_s: time after which a worker that is still busy with one step or reset is replaced.
             A worker that is stopped or sleeps is noticed within a second.
-        max_retries: how often a step is retried after the death of a worker.
-        pin: bind each worker to a core of its own. Without it, the system may run two on one core.
-            With it, several environments on one machine all use the same cores.
+        max_retries: number of retries of a step after a worker dies.
+        pin: bind each worker to a core of its own. If false, the system may run two on one core. If
+            true, several environments on one machine share the same cores.
         balance_steps: steps between two rounds in which worlds, or zones of a divided world, may
             move to another worker, based on their measured cost; 0: they never move. Results do
             not depend on it.
-        imbalance_tolerance: nothing moves while the slowest worker takes at most this share longer
-            than a perfect division would.
+        imbalance_tolerance: nothing moves while the slowest worker exceeds the time of a perfect
+            division by at most this share.
         max_moves: maximum number of worlds or zones that move in one round.
         monitor_cpu: measure the load of other programs on the workers' cores, and give no more work
-            to workers above a threshold; without it, cores are assumed to be free. Zone nodes
-            measure their machines for `balance_steps`.
+            to workers above a threshold; if false, cores are assumed to be free. Zone nodes measure
+            their machines for `balance_steps`.
         sensors: processes that compute the sensors of `rig`, for each process that runs worlds;
             0: each process computes its own. Results do not depend on it. See
             docs/guides/sensor_workers.md.

@@ -38,7 +38,7 @@ class WorldSpec:
     agents: int | None = None  # sets population.agents
     background: int | None = None  # sets population.background
     max_cycles: int | None = None  # sets horizon_s, in steps
-    seed: int = 0  # root of all random numbers
+    seed: int = 0  # seed of all random numbers
     overrides: Mapping[str, Any] = field(default_factory=dict)  # values of any other keys
 
     def __post_init__(self) -> None:
@@ -56,14 +56,14 @@ class WorldSpec:
             return env
         driver = keys.pop("sensors_of", None)
         if driver is not None:
-            load_plugins_of(env, keys.get("overrides"))  # the driver may have their sensors
+            load_plugins_of(env, keys.get("overrides"))  # the driver may use sensors of the plugins
         overrides = with_sensors_of(keys.get("overrides"), driver)
         given: dict[str, Any] = {**keys, "overrides": dict(overrides or {})}
         return cls(env=str(env), **given)
 
     @property
     def keywords(self) -> dict[str, Any]:
-        """Arguments for `load_world`, `make_vec` and `parallel_env`; they take the seed apart."""
+        """Arguments for `load_world`, `make_vec` and `parallel_env`; without the seed."""
         return {
             "agents": self.agents,
             "background": self.background,
@@ -81,7 +81,7 @@ def with_sensors_of_drivers(spec: WorldSpec, policies: Iterable[str | Path]) -> 
         ConfigError: an override of the world contradicts the drivers.
         PolicyError: a driver cannot be found or read, or two drivers need different forms.
     """
-    load_plugins_of(spec.env, spec.overrides)  # the drivers may have their sensors
+    load_plugins_of(spec.env, spec.overrides)  # the drivers may use sensors of the plugins
     forms = forms_in(policies)
     if not forms:
         return spec

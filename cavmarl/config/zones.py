@@ -17,28 +17,28 @@ class ZonesConfig(Section, key="zones"):
     """The division of the map into zones; see docs/reference/zones.md.
 
     Attributes:
-        layout: method of division: `grid`, `strips`, `bisection`; or a zone file, named like
+        layout: division method `grid`, `strips` or `bisection`; or a zone file, named like
             `map.source`.
         count: number of zones; a zone file sets it itself.
-        avoid_junctions: move cuts aside if that keeps junctions whole.
+        avoid_junctions: move borders if that keeps junctions in one zone.
         weight: quantity that `bisection` distributes evenly: length of lanes, or area.
-        hysteresis_m: distance behind a border at which a vehicle changes its zone.
+        hysteresis_m: distance past a border at which a vehicle changes its zone.
         max_deferred_ticks: ticks for which a vehicle that has crossed a border may stay with its
             old zone, if the new one does not acknowledge it; then the change is forced.
         backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
-        halo_m: how far zones see over their borders; default: as far as exact results need. Less is
-            an error.
-        approach_ticks: a vehicle is offered to a zone this many ticks before it reaches the zone at
-            its present speed.
+        halo_m: how far zones see over their borders; default: the minimum for exact results. Less
+            is an error.
+        approach_ticks: how many ticks before its arrival, at its present speed, a vehicle is
+            announced to the next zone.
         journal: file for the coordinator's log; empty: none. It must not exist.
         check_invariants: check the invariants of ownership at run time.
-        repartition_steps: steps between two checks whether a bisection by the positions of vehicles
-            would distribute them better. Results do not depend on it. 0: zones never change.
-        repartition_tolerance: share of the mean by which the fullest zone must shrink.
+        repartition_steps: steps between two checks whether bisection by vehicle positions would
+            balance the zones better. Results do not depend on it. 0: zones stay.
+        repartition_tolerance: by what share of the mean the fullest zone must shrink.
         simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
             a registered simulator (docs/guides/zone_simulators.md).
-        simulator_failure: consequence of a simulator that fails or refuses a vehicle for too long:
-            `error`, or `return`: cavmarl runs the zone until the episode ends.
+        simulator_failure: if a simulator fails or refuses a vehicle for too long: `error`, or
+            `return`: cavmarl runs the zone until the episode ends.
     """
 
     layout: str = "bisection"

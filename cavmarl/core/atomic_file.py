@@ -51,7 +51,7 @@ def write_whole(path: Path, content: bytes) -> None:
 
 @contextmanager
 def draft_folder(parent: Path) -> Iterator[Path]:
-    """Yield a new folder in `parent` and remove it at the end, or in a later call if killed.
+    """Yield a new folder in `parent`; it is removed at the end, or by a later call after a kill.
 
     Raises:
         OSError: `parent` cannot be written.
@@ -79,7 +79,7 @@ def remove_dead_drafts(parent: Path) -> None:
 def _remove_dead(folder: Path) -> None:
     try:
         lock = _locked(folder)
-    except OSError:  # its process lives, another process removes it, or there are no locks
+    except OSError:  # its process is alive, another process removes it, or locks do not exist here
         return
     try:
         shutil.rmtree(folder, ignore_errors=True)
@@ -95,7 +95,7 @@ def _made(parent: Path) -> tuple[Path, int | None]:
             return folder, None
         try:
             lock = _locked(folder)
-        except (BlockingIOError, FileNotFoundError):  # another process took it for abandoned
+        except (BlockingIOError, FileNotFoundError):  # another process has removed it
             continue
         except OSError:  # this file system has no locks
             return folder, None

@@ -184,7 +184,7 @@ class WorkerDeathError(WorkerError):
     Attributes:
         worker: number of the worker.
         part: description of the worker's worlds or zones.
-        order: number of the order that the worker could not carry out.
+        order: number of the order that the worker could not execute.
         causes: cause of each death.
     """
 

@@ -102,7 +102,7 @@ def _memory_gb() -> float | None:
 
 
 def _gpus() -> list[str]:
-    """Return NVIDIA GPUs with their identifiers; evaluation itself runs on the processor."""
+    """Return NVIDIA GPUs with their identifiers; evaluation does not use them."""
     tool = shutil.which("nvidia-smi")
     return _output_of([tool, "-L"]).splitlines() if tool else []
 

@@ -1,4 +1,4 @@
-"""`BoundedHeads`: HTTP connections that send request heads in time and of limited length."""
+"""`BoundedHeads`: HTTP connections with limits on the length and the time of request heads."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ HEAD_S = 10.0  # time limit of a request head, and of what follows an answered r
 
 
 class BoundedHeads(HttpToolsProtocol):
-    """HTTP that closes connections with long or slow request heads; the parser accepts these.
+    """HTTP that closes connections with long or slow request heads, which the parser accepts.
 
-    The length includes everything that is no body, such as trailers. An application limits the
+    The length includes everything except bodies, such as trailers. An application limits the
     time of the body that it reads; the time of a body that it did not read is limited here.
     """
 

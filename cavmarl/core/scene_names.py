@@ -1,4 +1,4 @@
-"""Names of files with a logged scene, which stand for a map and the vehicles on it."""
+"""Names of files with a logged scene, which provide a map and the vehicles on it."""
 
 from __future__ import annotations
 

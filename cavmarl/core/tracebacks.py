@@ -24,7 +24,7 @@ def print_traceback(error: BaseException) -> None:
 
 
 def traceback_text(error: BaseException) -> str:
-    """Return an exception as Python prints it, from the first frame of a user's code on.
+    """Return an exception as Python prints it, starting at the first frame of a user's code.
 
     If there is no such frame, the error is in the program, and all frames are included.
     """

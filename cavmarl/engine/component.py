@@ -30,7 +30,7 @@ class ComponentContext(NamedTuple):
     network: RoadNetwork
     num_worlds: int  # W
     shards: Sequence[Shard]  # one per zone; components read their rows
-    division: ZonedShards  # of all shards
+    division: ZonedShards  # all shards together
     travel: TripTables
     outputs: Outputs  # outputs of the agents
     zeros: Zeros  # allocates the arrays that outlive a tick
@@ -65,11 +65,11 @@ class Component(Protocol):
         return
 
     def begin(self, commands: Commands) -> None:
-        """Begin a tick. The rows are those of tick t, and their owners are decided."""
+        """Begin a tick. The rows have the state of tick t, and their owners are decided."""
         return
 
     def end(self) -> None:
-        """End a tick. The rows and the signals are those of t + 1; agents sense afterwards."""
+        """End a tick. The rows and the signals have the state of t + 1; agents sense afterwards."""
         return
 
     def arrays(self) -> Iterator[NDArray[Any]]:

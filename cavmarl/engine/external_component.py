@@ -41,7 +41,7 @@ if TYPE_CHECKING:
 
 _POSE = ("x", "y", "z", "heading", "pitch", "speed")
 _CONTROLS = ("throttle", "steering")
-LARGEST = 1e12  # limit of all numbers of a command, as of those of a vehicle
+LARGEST = 1e12  # limit of all numbers of a command or a vehicle
 
 
 class ExternalComponent(Component):
@@ -119,7 +119,7 @@ class ExternalComponent(Component):
         held[self.leaving] = np.zeros((), dtype=EXTERNAL)
 
     def _commands_of(self, commands: Commands) -> NDArray[np.void]:
-        """Return EXTERNAL (W, E), the commands of the caller and those of the table."""
+        """Return EXTERNAL (W, E), the commands of the caller and of the table."""
         self._told[:] = 0.0
         if commands.external.size:
             self._told[:, : self._num_told] = commands.external
@@ -157,7 +157,7 @@ class ExternalComponent(Component):
         return iter((self._held, self.ids))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with saved arrays; empty if nothing."""
+        """Return the fault of saved arrays; empty if they are valid."""
         held, ids = records_of(saved[0]), saved[1]
         is_held = held["kind"] != EXTERNAL_NONE
         slots = np.arange(ids.shape[1])
@@ -197,7 +197,7 @@ class ExternalPhases(OutsideTraffic):
         self._limits = config.action.acceleration_mps2, config.action.steering_rad
 
     def follow(self, tick: Tick) -> None:
-        """Move the vehicles. A vehicle leaves if it is removed, or to enter again at a far pose."""
+        """Move the vehicles. Removed vehicles leave; vehicles with a far new pose re-enter."""
         part = self._part
         # A pose that is farther than any vehicle drives in a step is a jump.
         reach_m = MAX_SPEED_MPS * self._dt * self._ticks_per_step if part.has_news else math.inf

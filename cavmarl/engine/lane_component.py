@@ -60,7 +60,7 @@ class LaneComponent(Component):
             self._follow()
 
     def _follow(self) -> None:
-        """Write what follows from changes and units: limits, permissions, plans, distances."""
+        """Write the results of changes and units: limits, permissions, plans, distances."""
         self._apply(self._told, self._unit_mps, self._speed_mps, self._permissions)
         for w in self.renew_plans():
             for shard in self._shards:
@@ -104,7 +104,7 @@ class LaneComponent(Component):
         return iter((*held, self._speed_mps, self._permissions))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with saved arrays; empty if nothing."""
+        """Return the fault of saved arrays; empty if they are valid."""
         told, unit_mps, changed_at, speed_mps, permissions = saved
         if wrong := wrong_changes(told, self._map):
             return wrong
@@ -115,4 +115,4 @@ class LaneComponent(Component):
             return "a speed limit of a roadside unit is not above 0"
         self._apply(told, unit_mps, *expected)
         same = np.array_equal(speed_mps, expected[0]) and np.array_equal(permissions, expected[1])
-        return "" if same else "the lanes do not follow from their changes"
+        return "" if same else "the lanes do not match their changes"

@@ -130,11 +130,11 @@ class LimitComponent(Component):
         return iter((self.outputs.states, self._sums, self.outputs.observations))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with saved arrays; empty if nothing."""
+        """Return the fault of saved arrays; empty if they are valid."""
         states, sums, observations = saved
         choices = states[..., [PREVIOUS, GREEN]]
         if ((choices < 0) | (choices >= self._rules.num_choices)).any():
-            return "a speed limit is none of the choices"
+            return "a speed limit is not one of the choices"
         numbers = states[..., [SINCE, REFUSED]], sums
         if any(((each < 0) | (each > _MOST)).any() for each in numbers):
             return "a time or a sum of a unit with a speed limit is negative or too large"

@@ -1,6 +1,6 @@
-"""The phases of a tick in which vehicles move that cavmarl's drivers do not drive.
+"""The phases of a tick that move vehicles without cavmarl's drivers.
 
-SUMO moves them here, the caller of the environment in `ExternalPhases`.
+SUMO moves its vehicles here; the caller's vehicles move in `ExternalPhases`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Signals that show states of the caller, and their part of a tick."""
+"""Signals that show the caller's states, and their part of a tick."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from cavmarl.shards.shard import Commands
 
 
 class OverrideComponent(Component):
-    """Writes the states of the caller to `Worlds.signal_phase`.
+    """Writes the caller's states to `Worlds.signal_phase`.
 
     All processes of a world write the same states.
     """
@@ -41,7 +41,7 @@ class OverrideComponent(Component):
 
 
 def wrong_states(told: NDArray[np.int32], has_signal: NDArray[np.bool_]) -> str:
-    """Return what is wrong with states of the caller; empty if nothing.
+    """Return what is wrong with the caller's states; empty if they are valid.
 
     `told`: (W, N, 2) see `Commands.overridden`. `has_signal`: (num_links,).
     """

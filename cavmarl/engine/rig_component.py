@@ -18,7 +18,7 @@ from cavmarl.shards.shard import Commands
 
 
 class RigComponent(Component):
-    """Lets the rigs of all agents sense in each tick.
+    """Takes the samples of all agents' rigs in each tick.
 
     Attributes:
         platform: the vehicles that carry the sensors.

@@ -25,7 +25,7 @@ class ShardClock(PhaseExecutor):
     def __init__(
         self,
         shards: Sequence[Shard],  # one per zone, in the order of zones
-        # One tick in `every` ticks is run zone by zone, and its time stands for all of them. The
+        # One tick in `every` ticks is run zone by zone, and its time counts for all of them. The
         # first measured tick is not counted, because it also binds the calls.
         every: int = 1,
     ) -> None:

@@ -22,7 +22,7 @@ class SharedOutputs:
     """Signals and outputs of W worlds, and the phases that run once for all shards.
 
     Attributes:
-        outputs: of all agents; each shard writes at the indices of its own agents.
+        outputs: outputs of all agents; each shard writes at the indices of its own agents.
         chosen: (W,) the chosen worlds, which `clearing` and `settling` read.
     """
 

@@ -35,7 +35,7 @@ _MOST = 1 << 40  # ticks and counts in a saved state
 
 
 class SignalComponent:
-    """A `Component` that carries out the choices of greens, and observes the lanes of signals.
+    """A `Component` that applies the choices of greens, and observes the lanes of signals.
 
     Attributes:
         table: the signals whose greens are chosen.
@@ -137,7 +137,7 @@ class SignalComponent:
         self._begin_step()
 
     def end(self) -> None:
-        """Set the phases of the next tick, count standing vehicles, and observe after a step."""
+        """Set the phases of the next tick, count stopped vehicles, and observe after a step."""
         for call in self.tick_calls:
             call()
         if self._ticks.item(0) % self._ticks_per_step == 0:
@@ -158,7 +158,7 @@ class SignalComponent:
         return iter((*kept, *self._sensing.kept))
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with saved arrays; empty if nothing."""
+        """Return the fault of saved arrays; empty if they are valid."""
         states, stood, observations, counts, history, *loops = saved
         num_greens = self.table.arrays.num_greens
         for column in (PREVIOUS, GREEN):

@@ -84,7 +84,7 @@ class SimulatorComponent(Component):
         self._hosted = {one.zone: one for one in hosted}  # of this process
         self._all_hosted = tuple(hosted)
         self._runs: dict[_Place, _Run] = {}  # zones that have failed are absent
-        self._has_moved = False  # since the begin of the tick
+        self._has_moved = False  # since the beginning of the tick
         self._broken: dict[int, str] = {}  # world → why it cannot continue before a reset
         self._patience = max(1, round(ENTRY_S / config.clock.sim_dt_s))
         self._roads, self._travel = tick.shards[0].roads, tick.shards[0].travel
@@ -119,7 +119,7 @@ class SimulatorComponent(Component):
     def refill(self) -> None:
         """Resume from the loaded rows: give them to the simulators, and start those that ended.
 
-        The vehicles enter in the next tick, as vehicles do that enter the world.
+        The vehicles enter in the next tick, like vehicles that enter the world.
         """
         self._broken.clear()
         for w in range(self._tick.division.num_worlds):
@@ -183,7 +183,7 @@ class SimulatorComponent(Component):
         run.simulator.show(ghosts, self._signals(w))
 
     def _accepted(self, place: _Place, run: _Run, new: NDArray[np.void]) -> NDArray[np.void]:
-        """Return the new vehicles that the simulator accepts; the others are asked about again."""
+        """Return the new vehicles that the simulator accepts; the others are offered again."""
         asked = new[~np.isin(new["id"], list(run.accepted))]
         refused = run.simulator.prepare(asked) if len(asked) else {}
         run.refused = {vehicle: run.refused.get(vehicle, 0) + 1 for vehicle in refused}
@@ -225,7 +225,7 @@ class SimulatorComponent(Component):
             self._ask(place, "run a tick", partial(self._take, place, run, wanted[place]))
 
     def sense(self, scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
-        """Write the samples of all turns: cavmarl's own, then those of simulators with frames."""
+        """Write the samples of all turns: cavmarl's own, then samples of simulators with frames."""
         sense_here(scenes, turns)
         if not self._has_moved:  # at a reset, simulators have no vehicles yet
             return
@@ -302,7 +302,7 @@ class SimulatorComponent(Component):
         return ZoneSimulatorError(
             f"zone {zone}: its simulator has moved vehicle {told['id'][n]} to {reported}, and "
             f"cavmarl to {due}; the simulator declares a tolerance of "
-            f"{self._hosted[zone].tolerance_m:g} m, so increase tolerance_m, or correct it",
+            f"{self._hosted[zone].tolerance_m:g} m, so increase tolerance_m, or fix the simulator",
             zone,
         )
 

@@ -190,7 +190,7 @@ def write_sensed(
 
 
 def action_space(config: ActionConfig) -> spaces.Box | spaces.Discrete:
-    """Return the space of an action: (throttle, steering) in [-1, 1], or a choice's number."""
+    """Return the space of an action: (throttle, steering) in [-1, 1], or the index of a choice."""
     if config.kind == "continuous":
         return spaces.Box(-1.0, 1.0, (2,), np.float32)
     return spaces.Discrete(config.choices)

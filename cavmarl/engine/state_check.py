@@ -140,7 +140,7 @@ class StateForm(NamedTuple):
     def _wrong_external(
         self, arrays: Sequence[Array], vehicles: Sequence[Array], is_whole: bool
     ) -> str:
-        """Check that the external vehicles are those of the slots."""
+        """Check that the external vehicles match the slots."""
         zones, at = self.division.count, 0
         for part in self.attached:
             number = sum(1 for _ in part.arrays())

@@ -36,7 +36,7 @@ class Tick:
         departures: the queue through which vehicles enter and leave; a reset may replace it.
         coordination: decides which zone owns which vehicle.
         peers: the processes that run the other zones.
-        outside: the phases of vehicles that SUMO or the caller moves, or their replacement.
+        outside: the phases of vehicles that SUMO or the caller moves; by default, they do nothing.
         common: ticks, keys and signals of the worlds, which all zones share.
     """
 

@@ -36,7 +36,7 @@ def make_tick(
     partition: ZonePartition,
     demand: DemandFile | SumoDemand | None,  # vehicles in addition to the generator's
     shared: SharedOutputs,  # signals and outputs of all zones
-    frames: Frames,  # of the mounted sensors
+    frames: Frames,  # samples of the mounted sensors
     zeros: Zeros,  # allocates large arrays
     # traffic of another simulation with the same environment and number of worlds; None: made here
     traffic: NativeTraffic | None,

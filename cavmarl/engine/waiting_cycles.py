@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 from cavmarl.core.records.codes import HOLD_SIGNAL, HOLD_YIELD
 from cavmarl.roads.network import RoadNetwork
 
-PATIENCE_S = 10.0  # a vehicle that has stood this long may be part of a deadlock
-# largest gap between bumpers to the vehicle that it waits for, without the way over junctions
+PATIENCE_S = 10.0  # a vehicle that has been stopped this long may be part of a deadlock
+# largest bumper gap to the vehicle that it waits for, excluding the path over junctions
 NEAR_M = 12.0
 STANDING_MPS = 0.1
 
@@ -19,15 +19,15 @@ STANDING_MPS = 0.1
 def find_deadlocks(
     network: RoadNetwork, steps: NDArray[np.void], rows: NDArray[np.void]
 ) -> tuple[tuple[int, ...], ...]:
-    """Return the cycles of vehicles that wait for each other, each from its smallest id on.
+    """Return the cycles of vehicles that wait for each other, each starting at its smallest id.
 
     A vehicle waits for the vehicle ahead of it on its route and, if it yields at a stop line, for
-    the standing vehicles to which it yields. A vehicle that stands before a red signal waits for no
-    vehicle. A cycle is reported if all its vehicles have stood for `PATIENCE_S`.
+    the stopped vehicles to which it yields. A vehicle that is stopped at a red signal waits for no
+    vehicle. A cycle is reported if all its vehicles have been stopped for `PATIENCE_S`.
 
     Args:
         network: the roads.
-        steps: PLAN, the table of ways (`TripTables.steps`).
+        steps: PLAN, the table of plans (`TripTables.steps`).
         rows: VEHICLE (n,) of one world.
     """
     stands = (np.abs(rows["speed"]) < STANDING_MPS) & (rows["wait_s"] >= PATIENCE_S)
@@ -114,7 +114,7 @@ def _foes(
 def _next(
     network: RoadNetwork, steps: NDArray[np.void], lane: int, way: int
 ) -> tuple[int, int, int]:
-    """Return the lane after the end of a lane, the way there, and the link that is entered."""
+    """Return the lane after the end of a lane, its plan, and the link that is entered."""
     if network.lanes["internal"][lane]:
         return int(network.lanes["successor"][lane]), way, -1
     step = steps[way + lane]

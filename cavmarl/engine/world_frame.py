@@ -22,7 +22,7 @@ from cavmarl.handoff.zone_view import TransferInFlight
 from cavmarl.roads.network import SIGNAL_STATES
 from cavmarl.shards.shard import override_columns
 
-# One vehicle of a frame. Units and coordinate frames are those of `driving.vehicles.VEHICLE`.
+# One vehicle of a frame. Units and coordinate frames are as in `driving.vehicles.VEHICLE`.
 SEEN = np.dtype(
     [
         ("id", "<i8"),
@@ -44,7 +44,7 @@ SEEN = np.dtype(
         ("events", "<i4"),
         ("vclass", "<i2"),
         ("zone", "<i2"),  # the owner
-        ("target_zone", "<i2"),  # of the transfer in flight; -1: none
+        ("target_zone", "<i2"),  # target of the transfer in flight; -1: none
         ("driver", "i1"),
         ("blinker", "i1"),
         ("transfer", "i1"),
@@ -73,7 +73,7 @@ class WorldFrame(NamedTuple):
     vehicles: NDArray[np.void]  # SEEN (n,), by id
     signals: NDArray[np.int32]  # active PHASE rows and more, see `Worlds.signal_phase`
     transfers: tuple[TransferInFlight, ...] = ()
-    ghosts: tuple[NDArray[np.int64], ...] = ()  # of each zone, the ids of its ghosts
+    ghosts: tuple[NDArray[np.int64], ...] = ()  # ids of each zone's ghosts
     ended: NDArray[np.void] = NONE_ENDED  # ENDED (m,): agents that are not among `vehicles`
     # kind and detail of each change that the caller made in the step before
     asked: tuple[tuple[str, str], ...] = ()

@@ -203,7 +203,7 @@ def _warn_once(name: str, source_hash: str, note: str) -> None:
 def _demand_files(config: EnvConfig, base_dir: Path) -> list[Path]:
     """Return the files of `traffic.demand`.
 
-    A configuration of SUMO that is the map, too, may name no demand; then there are no files.
+    A configuration of SUMO that is also the map need not name a demand; then there are no files.
     """
     files = resolve_demand(config, base_dir)
     if files and files == resolve_maps(config, base_dir):
@@ -299,8 +299,8 @@ def load_zones(config: EnvConfig, base_dir: Path, network: RoadNetwork) -> ZoneP
     """Return the zones of a configuration, from its zone file or by cutting the map.
 
     Raises:
-        ConfigError: the zone file cannot be read, or is of another map or number of zones; or the
-            map cannot be cut into this many zones.
+        ConfigError: the zone file cannot be read, or belongs to another map or number of zones; or
+            the map cannot be cut into this many zones.
     """
     settings = config.zones
     path = resolve_zones(config, base_dir)
@@ -330,7 +330,7 @@ def find_map(env: str | Path) -> Path:
 def check_agents(config: EnvConfig, *, may_be_alone: bool = False) -> None:
     """Refuse a world without agents where a caller wants to drive one.
 
-    `may_be_alone`: whether a world of `traffic.demand` needs no agents.
+    `may_be_alone`: whether a world with `traffic.demand` may have no agents.
     """
     is_alone = may_be_alone and config.drives_alone
     if config.population.agents == 0 and config.roadside is None and not is_alone:

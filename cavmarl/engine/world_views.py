@@ -131,7 +131,7 @@ class WorldViews:
         raise ConfigError(missing)
 
     def signal_view(self) -> SignalView:
-        """Return what controllers of signals know; its arrays follow the worlds."""
+        """Return what signal controllers know, in arrays that the worlds update."""
         part, config = self.signals, self.config
         outputs = part.outputs
         return SignalView(
@@ -155,7 +155,7 @@ class WorldViews:
 
     @property
     def scene(self) -> Scene | None:
-        """The scenario that each world plays to its agent; None: there is none."""
+        """The scenario of each world; None: there is none."""
         return self._tick.traffic.scene
 
     @property

@@ -69,7 +69,7 @@ class ActionDecoder:
 
     @property
     def last(self) -> NDArray[Any]:
-        """The actions (W, A, …) of the last step, after clipping; idle ones after a reset."""
+        """The actions (W, A, …) of the last step, after clipping; idle actions after a reset."""
         return self._last
 
     @property
@@ -82,7 +82,7 @@ class ActionDecoder:
         self._last, self.clipped, self.held, self.ignored = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with a loaded `memory`; empty if it is valid."""
         last, *counts = memory
         if any((count < 0).any() for count in counts):
             return "a count of tolerated actions is negative"
@@ -120,7 +120,7 @@ class ActionDecoder:
     def from_dict(
         self, actions: Mapping[str, Any], live: Sequence[str], needed: Sequence[str]
     ) -> Commands:
-        """Decode the actions of one world. Only those of `needed` agents are read."""
+        """Decode the actions of one world. Only actions of `needed` agents are read."""
         if not isinstance(actions, Mapping):
             raise ActionError(
                 f"actions are a {type(actions).__name__}: pass a dict from agent id to action"

@@ -1,4 +1,4 @@
-"""Events that agents want to announce by message, held until the next step."""
+"""Events that agents want to announce by message, kept until the next step."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ class DeclaredEvents:
         self._has_any = True
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the declared events, which are held until `clear`."""
+        """Return the commands with the declared events, which are kept until `clear`."""
         return replace(commands, declared=self._causes.copy()) if self._has_any else commands
 
     def clear(self) -> None:

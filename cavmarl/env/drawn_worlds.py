@@ -91,7 +91,7 @@ class WorldCopy:
         self._copied: LocalWorlds | None = None
 
     def standing(self, worlds: SteppedWorlds) -> Simulation:
-        """Return the local worlds, or a copy of remote worlds as of some earlier time."""
+        """Return the local worlds, or a copy of remote worlds that may be outdated."""
         worlds = unguarded(worlds)
         if isinstance(worlds, LocalWorlds):
             return worlds.simulation

@@ -1,6 +1,6 @@
 """`ExternalAgents`: external vehicles that observe, as agents of a PettingZoo environment.
 
-Their sensors are those of `rig`. They are computed from the whole world after each step, with the
+They carry the sensors of `rig`. Samples are computed from the whole world after each step, with the
 kernels of the agents' sensors, so samples do not depend on zones, workers or nodes. For this, a
 copy of the rows is used in which the observing external vehicles are the only agents.
 """

@@ -37,14 +37,14 @@ from cavmarl.shards.row_check import diagonals_m
 from cavmarl.shards.shard import Commands
 from cavmarl.traffic.kernels.external_rows import enter_at
 
-MARGIN_M = 100.0  # around the lanes of the map, within which vehicles may be placed
+MARGIN_M = 100.0  # vehicles may be placed within this distance of the map's lanes
 KINDS = (EXTERNAL_POSED, EXTERNAL_DRIVEN, EXTERNAL_REMOVED)
 
 
 class ExternalCommands:
     """The vehicles of the caller in W worlds, at most E = `population.external` in each.
 
-    Commands to them are held until the next step.
+    Commands to them are kept until the next step.
 
     Args:
         config: configuration of the worlds.
@@ -79,7 +79,7 @@ class ExternalCommands:
         self._commands[:], self._is_used[:] = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with a loaded `memory`; empty if it is valid."""
         told, is_used = records_of(memory[0]), memory[1]
         is_waiting = told["kind"] != EXTERNAL_NONE
         if wrong := wrong_commands(told[is_waiting], KINDS):
@@ -104,17 +104,17 @@ class ExternalCommands:
     ) -> int:
         """Let a vehicle enter a world in the next step.
 
-        It stands at its place until `pose` or `drive` moves it. All other vehicles and sensors see
+        It stays at its place until `pose` or `drive` moves it. All other vehicles and sensors see
         it. It has no route, and leaves at the end of the episode.
 
         Args:
-            x: of its centre, in m.
-            y: of its centre, in m.
+            x: position of its centre, in m.
+            y: position of its centre, in m.
             heading: in rad, counter-clockwise from east.
-            z: height of the ground below its centre, in m; None: of the lane.
+            z: height of the ground below its centre, in m; None: height of the lane.
             vtype: `car`, `truck`, `bus`, `pedestrian`, `cyclist`, `roadside_unit`, or a type of
                 `population.fleet`.
-            size_m: length, width and height, at most those of a bus; None: of its type.
+            size_m: length, width and height, at most those of a bus; None: size of its type.
             speed: in m/s along its heading, negative backwards.
             observes: whether it carries the sensors of `rig`, and is an agent of a PettingZoo
                 environment (`population.external_agents`).
@@ -156,8 +156,8 @@ class ExternalCommands:
         free = ~self._is_used[world] & (self._told["kind"][world] == EXTERNAL_NONE)
         if not free.any():
             raise CapacityError(
-                f"world {world}: all {self._most} places of population.external are in use; set it "
-                "higher, or remove a vehicle before the last step"
+                f"world {world}: all {self._most} places of population.external are in use; set "
+                "it higher, or remove a vehicle before the last step"
             )
         slot = int(np.argmax(free))
         self._told[world, slot] = told
@@ -182,10 +182,10 @@ class ExternalCommands:
 
         Args:
             slot: result of `spawn`.
-            x: of its centre, in m.
-            y: of its centre, in m.
+            x: position of its centre, in m.
+            y: position of its centre, in m.
             heading: in rad, counter-clockwise from east.
-            z: height of the ground below its centre, in m; None: of the lane.
+            z: height of the ground below its centre, in m; None: height of the lane.
             pitch: in rad, positive uphill; None: the slope of the lane.
             speed: in m/s along its heading; None: the speed of the move.
             world: number of the world.
@@ -208,7 +208,7 @@ class ExternalCommands:
 
         Args:
             slot: result of `spawn`.
-            throttle_mps2: acceleration; negative brakes, to a standstill at most.
+            throttle_mps2: acceleration; negative brakes, but does not reverse.
             steering_rad: angle of the front wheels, positive to the left.
             world: number of the world.
 
@@ -257,11 +257,11 @@ class ExternalCommands:
         return found
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the waiting ones, which are held until `clear`."""
+        """Return the commands with the waiting ones, which are kept until `clear`."""
         return replace(commands, external=self._commands.copy()) if self._most else commands
 
     def clear(self) -> None:
-        """Drop the waiting commands after the step that carried them out."""
+        """Drop the waiting commands after the step that executed them."""
         if self._most:
             kind = self._told["kind"]
             self._is_used |= (kind == EXTERNAL_POSED) | (kind == EXTERNAL_DRIVEN)

@@ -1,4 +1,4 @@
-"""Vehicles that a user adds to running worlds, held until the next step."""
+"""Vehicles that a user adds to running worlds, kept until the next step."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Insertions:
         self._lanes = {name: k for k, name in enumerate(network.lane_ids)} if self._most else {}
         self._rows = np.zeros((num_worlds, self._most, 3))
         self._waiting = np.zeros(num_worlds, dtype=np.int64)
-        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, waiting ones included
+        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, with waiting ones
         self._last: list[Asked] = [()] * num_worlds  # insertions of the last step
 
     @property
@@ -49,7 +49,7 @@ class Insertions:
         self._rows[:], self._waiting[:], self._used[:] = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with a loaded `memory`; empty if it is valid."""
         rows, waiting, used = memory
         if ((waiting < 0) | (waiting > used) | (used > self._most)).any():
             return "the number of insertions is out of range"
@@ -105,11 +105,11 @@ class Insertions:
         self._used[world] += len(rows)
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the waiting insertions, which are held until `clear`."""
+        """Return the commands with the waiting insertions, which are kept until `clear`."""
         return replace(commands, inserted=self._rows.copy()) if self._most else commands
 
     def clear(self) -> None:
-        """Drop the waiting insertions after the step that carried them out."""
+        """Drop the waiting insertions after the step that executed them."""
         if self._most:
             self._last = [self._texts(w, count) for w, count in enumerate(self._waiting.tolist())]
             self._rows[:] = INSERT_NONE
@@ -135,9 +135,9 @@ class Insertions:
 
 
 def wrong_insertions(rows: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
-    """Return what is wrong with insertions; empty if nothing.
+    """Return what is wrong with insertions; empty if they are valid.
 
-    `rows`: (n, 3) of `Commands.inserted`, without unused ones. `lanes`: LANE (L,) of the map.
+    `rows`: (n, 3) used rows of `Commands.inserted`. `lanes`: LANE (L,) of the map.
     """
     kind, lane, position_m = rows.T
     if not (kind == INSERT_VEHICLE).all():

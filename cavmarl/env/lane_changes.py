@@ -39,7 +39,7 @@ class LaneChanges:
     """The lanes of W worlds that differ from the map, at most N = `map.changed_lanes` of each.
 
     The changes stay until they are undone, or until the world is reset. The events of `map.events`
-    happen in all worlds.
+    apply to all worlds.
 
     Args:
         config: configuration of the worlds.
@@ -80,7 +80,7 @@ class LaneChanges:
         self._told[:], self._reversed.states[:] = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with a loaded `memory`; empty if it is valid."""
         told, states = memory
         return wrong_changes(told, self._network.lanes) or self._reversed.wrong(states, told)
 
@@ -191,7 +191,7 @@ class LaneChanges:
         self._tell(world, limit_mps, classes, (CLOSED, contraflow_of(edge)))
 
     def advance(self, ticks: NDArray[np.int64]) -> None:
-        """Let the events of the next step happen, and open reversed roads that are empty.
+        """Apply the events of the next step, and open reversed roads that are empty.
 
         `ticks`: (W,) of the worlds, before the step.
         """
@@ -219,7 +219,7 @@ class LaneChanges:
                 self._tell(world, limit_mps, classes, (OPENED, _detail(edge, opened)))
 
     def _happen(self, world: int, event: RoadEvent) -> None:
-        """Let an event happen in one world; what has happened already is left out."""
+        """Apply an event in one world, except for changes that are already in force."""
         for edge in event.edges:
             before = self._told[world].copy()
             waiting = self._waiting[world]
@@ -244,7 +244,7 @@ class LaneChanges:
         return bool((is_slower | (classes[rows] != 0)).any())
 
     def _check_events(self) -> None:
-        """Let all events happen in turn. Raises ConfigError for the first that is impossible."""
+        """Apply all events in turn. Raises ConfigError for the first impossible event."""
         order = sorted(range(len(self._events)), key=lambda k: self._events[k].at_s)
         for k in order:
             event = self._events[k]
@@ -265,8 +265,8 @@ class LaneChanges:
         Args:
             world: number of the world.
             edge: id of the road.
-            speed_mps: limit in m/s, above 0 and at most that of the map. A limit equal to that of
-                the map ends an earlier one.
+            speed_mps: limit in m/s, above 0 and at most the map's limit. The map's own limit ends
+                an earlier change.
             lanes: see `close`.
 
         Raises:
@@ -366,7 +366,7 @@ class LaneChanges:
         closed: NDArray[np.uint32],
         event: tuple[str, str],
     ) -> None:
-        """Let the changes hold from the next step on."""
+        """Apply the changes from the next step on."""
         differs = np.flatnonzero((limit_mps != self._network.lanes["speed_mps"]) | (closed != 0))
         number = len(np.union1d(differs, self._reversed.reserved(world)))
         if number > self._most:

@@ -62,7 +62,7 @@ class LimitAgents(RoadsideAgents):
         )
 
     def suggest(self) -> NDArray[np.int64]:
-        """Return choices (W, U) that raise the limits until the highest ones hold."""
+        """Return choices (W, U) that raise the limits step by step to the highest."""
         change = self._config.most_change or len(self._config.speeds_mps)
         most = len(self._config.speeds_mps) - 1
         found = np.minimum(self._arrays.signal_states[..., GREEN] + change, most)

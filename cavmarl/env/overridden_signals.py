@@ -1,4 +1,4 @@
-"""`SignalOverrides`: signals that show states of the caller instead of their programs'."""
+"""`SignalOverrides`: signals that show the caller's states instead of their programs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SignalOverrides:
     """The links in W worlds whose signals show states of the caller.
 
     At most N = `signals.overrides` links of a world can do so at the same time. Drivers, sensors,
-    messages and drawings see these states as those of a program. The programs run on meanwhile.
+    messages and drawings see these states like those of a program. The programs continue to run.
 
     Args:
         config: configuration of the worlds.
@@ -54,7 +54,7 @@ class SignalOverrides:
         (self._told[:],) = memory
 
     def wrong(self, memory: Sequence[NDArray[Any]]) -> str:
-        """Return what is wrong with a `memory` from outside; empty if nothing."""
+        """Return what is wrong with a loaded `memory`; empty if it is valid."""
         return wrong_states(memory[0], self._network.links["signal"] >= 0)
 
     def show(self, signal: str, index: int, letter: str, world: int = 0) -> None:
@@ -105,7 +105,7 @@ class SignalOverrides:
         """Show these states from the next step on, and release all other links.
 
         Args:
-            codes: (num_links,) SIGNAL_* code of each link; SIGNAL_NONE: that of its program.
+            codes: (num_links,) SIGNAL_* code of each link; SIGNAL_NONE: the code of its program.
             world: number of the world.
 
         Raises:

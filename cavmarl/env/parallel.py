@@ -189,7 +189,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         """Begin an episode.
 
         Args:
-            seed: root of all random numbers; None begins the next episode of the last seed.
+            seed: seed of all random numbers; None begins the next episode of the last seed.
             options: not used; the API requires it.
 
         Raises:
@@ -244,7 +244,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         return self._report(visited)
 
     def _advance(self, commands: Commands, choices: NDArray[np.int64] | None = None) -> None:
-        """Advance the world by a step, at whose end the external vehicles sense."""
+        """Advance the world by a step, then update the sensors of external vehicles."""
         if self._visitors is not None:
             self._visitors.prepare()
         self._session.step(commands, choices)
@@ -355,7 +355,7 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
     def frames(self, agent: str) -> dict[str, SensorFrames]:
         """Return the samples of the last step of each sensor of an agent's `rig`, by sensor name.
 
-        The arrays are those of `SensorFrames`, without the axes of worlds and agents.
+        The arrays are as in `SensorFrames`, without the axes of worlds and agents.
 
         Raises:
             ActionError: there is no such agent, or it is a signal, which has no sensors.

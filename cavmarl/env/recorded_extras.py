@@ -70,7 +70,7 @@ class RecordedExtras:
 
     Args:
         config: configuration of the worlds.
-        include: the wanted ones of `observations`, `samples`, `messages` and `commands`.
+        include: any of `observations`, `samples`, `messages` and `commands`.
         arrays: results of the worlds' steps.
         simulation: the worlds; their messages are logged from now on.
         state_hash: returns the hash of a world; None: `commands` are not available.
@@ -78,7 +78,7 @@ class RecordedExtras:
     Attributes:
         dtypes: dtypes of the tables, by table name.
         features: sensor and name of each number of the newest frame of an observation.
-        inputs: of the last reset or step.
+        inputs: inputs of the last reset or step.
     """
 
     def __init__(
@@ -166,7 +166,7 @@ class RecordedExtras:
     def at_the_end(self, world: int, actions: NDArray[Any]) -> Mapping[str, Rows]:
         """Return the rows of the last step of an episode, whose last frame is not available.
 
-        The arguments are those of `of`.
+        For the arguments, see `of`.
         """
         dtype = self.dtypes.get("observations")
         return {} if dtype is None else {"observations": self._results(dtype, world, None, actions)}
@@ -176,7 +176,7 @@ class RecordedExtras:
     ) -> Rows:
         """Return a row of each agent that acted in the step, or that acts next, by agent.
 
-        If the step has also reset the world, its results are those of the episode before.
+        If the step has also reset the world, its results belong to the previous episode.
         """
         arrays, world, tick = self._arrays, frame.world, frame.tick
         is_new = actions is None or tick <= self._ticks[world]
@@ -201,7 +201,7 @@ class RecordedExtras:
     def _results(
         self, dtype: np.dtype[Any], world: int, tick: int | None, actions: NDArray[Any]
     ) -> Rows:
-        """Return a row of each agent that acted in the last step; `tick`: None: the world's next.
+        """Return a row of each agent that acted in the last step; `tick` None: the next tick.
 
         The observations of agents and episodes that have ended are their last ones.
         """

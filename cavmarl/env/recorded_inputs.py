@@ -1,7 +1,7 @@
 """The inputs of a world as a table of a recording: seeds, commands, and the resulting states.
 
-With this table, a run is repeated without its drivers, clients and traces. It has one row per reset
-and per step. A row ends with the hash of the state that follows.
+With this table, a run can be repeated without its drivers, clients and traces. It has one row per
+reset and per step. A row ends with the hash of the state that follows.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class StepInputs:
     """The inputs of a reset or of a step.
 
     Attributes:
-        seed: of a reset; None: it begins the next episode of an earlier seed.
-        commands: of a step; None: it is a reset.
+        seed: seed of a reset; None: the reset begins the next episode of an earlier seed.
+        commands: commands of a step; None for a reset.
     """
 
     seed: int | None = None

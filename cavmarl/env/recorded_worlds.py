@@ -133,7 +133,7 @@ class WorldRecorder:
         self._writer.add((frame._replace(world=first + frame.world) for frame in these), extras)
 
     def end(self, worlds: Iterable[int], actions: NDArray[Any], first: int = 0) -> None:
-        """Add what is left of episodes that have just ended, whose last frames are not available.
+        """Add the last rows of episodes that have just ended, whose last frames are not available.
 
         Raises:
             RecordingError: an earlier part could not be written.

@@ -58,7 +58,7 @@ class ReversedRoads:
             )
 
     def state(self, world: int, edge: str) -> int:
-        """Return the state of a road; that of the map if it cannot be reversed."""
+        """Return the state of a road; the map's state if it cannot be reversed."""
         if edge not in self._roads:
             return AS_ON_MAP
         return int(self.states[world, self._roads.index(edge), _STATE])
@@ -117,7 +117,7 @@ class ReversedRoads:
         ]
 
     def wrong(self, states: NDArray[np.int64], told: NDArray[np.float64]) -> str:
-        """Return what is wrong with `states` from outside; empty if nothing.
+        """Return what is wrong with loaded `states`; empty if they are valid.
 
         `told`: (W, N, 3) changed lanes that were saved beside them; see `changed_lanes`.
         """
@@ -144,8 +144,8 @@ class ReversedRoads:
     ) -> Iterator[tuple[int, str, bool, NDArray[np.bool_]]]:
         """Yield each road whose lanes are empty.
 
-        The tuple has its world, its id, whether it is reversed, and which of its lanes stay closed
-        otherwise. The states of the roads change. Lanes are examined once a second.
+        Each item has the world, the road's id, whether it is reversed, and the lanes that stay
+        closed. The states of the roads change. Lanes are examined once a second.
 
         `ticks`: (W,) of the worlds; -1: the world's episode is over.
         """
@@ -185,7 +185,7 @@ def _ground(network: RoadNetwork, edge: int) -> NDArray[np.intp]:
 
 
 def _roads_before(network: RoadNetwork, edges: Sequence[int]) -> NDArray[np.bool_]:
-    """Return (C, C) whether the second road leads to the first one, but not back to itself.
+    """Return (C, C), true where the second road leads to the first one, but not back to itself.
 
     On a cycle of roads, no road waits for another.
     """

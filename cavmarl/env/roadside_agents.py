@@ -1,4 +1,4 @@
-"""`RoadsideAgents`: agents beside the road that choose at times, with their spaces and checks."""
+"""`RoadsideAgents`: agents beside the road, with their spaces and checks."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ VEHICLES = "vehicles"  # key of the arrays of vehicles, beside those of a `Roads
 class RoadsideAgents(ABC):
     """S agents of one kind in W worlds, and their results.
 
-    All of them decide at the same times. Their arrays are those of `StepArrays` whose names begin
-    with `signal_`, whatever their kind: a world has agents of signals or of limits.
+    All of them decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
+    whatever their kind: a world has agents of signals or of limits.
 
     Args:
         arrays: inputs and outputs of a step.
-        names: of the places that the agents control.
+        names: names of the places that the agents control.
         num_choices: (S,) choices of each agent.
         features: (S,) length of each agent's observation.
         is_strict: whether a missing action is an error.
@@ -37,8 +37,8 @@ class RoadsideAgents(ABC):
     """
 
     kind: ClassVar[str]  # key of the arrays of an environment, and section of the configuration
-    prefix: ClassVar[str]  # of the ids of these agents, followed by the name
-    terms: ClassVar[tuple[str, ...]]  # of the reward
+    prefix: ClassVar[str]  # prefix of these agents' ids, followed by the name
+    terms: ClassVar[tuple[str, ...]]  # terms of the reward
     choice: ClassVar[str]  # name of the present choice in infos
 
     def __init__(
@@ -69,7 +69,7 @@ class RoadsideAgents(ABC):
 
     @abstractmethod
     def suggest(self) -> NDArray[np.int64]:
-        """Return the choices (W, S) without control; KEEP where it is not time for a decision."""
+        """Return the choices (W, S) without control; KEEP where no decision is due."""
 
     @abstractmethod
     def kept(self) -> NDArray[np.int64]:
@@ -107,7 +107,7 @@ class RoadsideAgents(ABC):
         return np.where(choices < self.num_choices, choices, self.kept())
 
     def check(self, agent: str, action: Any) -> None:
-        """Raise the ActionError of an action that is no choice of the agent."""
+        """Raise the ActionError of an action that is not a choice of the agent."""
         s = self._index[agent]
         if np.shape(action) != () or np.asarray(action).dtype.kind not in "iu":
             raise ActionError(f"{agent}: the action is {action!r}, must be one whole number")
@@ -179,8 +179,8 @@ class RoadsideAgents(ABC):
         """Return the info of each agent of the first world.
 
         `decides`: whether its next action counts. `action_mask`: allowed choices, int8. `refused`:
-        choices of the episode that were not allowed. Then the index of the present choice, and each
-        term of the reward.
+        number of choices in the episode that were not allowed. Then the index of the present
+        choice, and each term of the reward.
         """
         arrays = self._arrays
         decides = int(arrays.signal_decides[0])

@@ -45,7 +45,7 @@ def load_session(session: StepSession, mask: NDArray[np.bool_], saved: bytes) ->
     digest, content = saved[:_DIGEST_BYTES], saved[_DIGEST_BYTES:]
     if digest != hashlib.sha256(content).digest():
         raise ConfigError(
-            "the saved state is damaged: its checksum differs from that of its content; save again"
+            "the saved state is damaged: its checksum does not match its content; save again"
         )
     memory = _memory(session, mask)
     like = [*memory, np.zeros(0, dtype=np.int64), np.zeros(0, dtype=np.uint8)]

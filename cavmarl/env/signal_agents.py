@@ -16,7 +16,7 @@ from cavmarl.signals.controllers import ProgramController, SignalView
 from cavmarl.signals.kernels.green_choices import GREEN
 from cavmarl.signals.signal_table import SignalTable
 
-PREFIX = "signal_"  # of the ids of these agents, followed by the id of the signal
+PREFIX = "signal_"  # prefix of these agents' ids, followed by the signal's id
 
 SIGNALS = "signals"  # key of the arrays of an environment in which signals have agents
 

@@ -57,7 +57,7 @@ class StepSession:
         events: the events that agents have declared for the next step.
         insertions: vehicles for the next step.
         external: commands for the next step to vehicles that the caller poses or drives.
-        overrides: signals that show states of the caller.
+        overrides: signals that show the caller's states.
         lane_changes: lanes that the caller closes or slows down.
         controlled: the signals or limits that are controlled; None: there are none.
         roadside: the same if agents control them, else None.

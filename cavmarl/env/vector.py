@@ -204,7 +204,7 @@ class CavVectorEnv(WorldsEnvironment):
         """Begin an episode in all worlds, or in some of them.
 
         Args:
-            seed: root of all random numbers; episodes of world w depend on (seed, w) alone. None
+            seed: seed of all random numbers; episodes of world w depend on (seed, w) alone. None
                 begins the next episodes of the last seed.
             options: `first_world` (with a seed): number of the first world, to run many worlds in
                 several parts. `reset_mask` (without a seed): (W,) the worlds that begin an episode;
@@ -260,8 +260,8 @@ class CavVectorEnv(WorldsEnvironment):
             their rewards count; `terms` (W, A, T) in the order of `config.terms.TERMS`;
             `arrivals` (W,) vehicles that reached their goal since the reset, agents included;
             `episode_over` (W,) worlds whose episode is over;
-            `final_observations` (W, A, D) observations before a reset, with the last ones of agents
-            that left: the same array as the observations if no agent left in the step.
+            `final_observations` (W, A, D) observations before a reset, including the last ones of
+            agents that left: the same array as the observations if no agent left in the step.
 
             With agents of signals, observations, rewards, terminations and truncations are dicts:
             `vehicles`, and `signals` (W, S, …). Their infos are `signal_mask` (W, S, G) allowed
@@ -298,7 +298,7 @@ class CavVectorEnv(WorldsEnvironment):
             "mask": self._mask.copy(),
             "episode_over": over.copy(),
         }
-        terminations &= ~arrays.truncations  # reaching the trip's own horizon is no termination
+        terminations &= ~arrays.truncations  # the trip's own horizon does not terminate it
         rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
         roadside = session.roadside
         if roadside is None:
@@ -458,7 +458,7 @@ class CavVectorEnv(WorldsEnvironment):
         return save_session(self._session, self._mask)
 
     def load_state(self, saved: bytes) -> None:
-        """Restore a state that `save_state` returned. Zones and workers may differ from then.
+        """Restore a state that `save_state` returned. The number of zones and workers may differ.
 
         Raises:
             ConfigError: the state is damaged, or of other worlds, of another number of worlds or of

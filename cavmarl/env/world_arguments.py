@@ -33,8 +33,7 @@ class WorldArguments(TypedDict, total=False):
             (docs/guides/nodes.md). "nodes:N@HOST:PORT": in N nodes that are started by hand and
             connect to that address. "nodes:N@mpi": in N other ranks of an MPI run.
             "ray:N": in N actors of a Ray cluster (docs/guides/nodes.md); "ray": in as many
-            actors as are useful. The name of a registered backend: there; "name:N": there, with
-            N workers.
+            actors as are useful. The name of a registered backend, or "name:N" for N workers.
         workers: short form: N for "processes:N", 0 for "local".
         nodes: short form: N for "nodes:N".
         sensor_workers: sets workers.sensors, the number of processes that compute the sensors of
@@ -80,7 +79,7 @@ def start_worlds(
         num_worlds: number of worlds.
         in_next_step: whether worlds reset in the next step; see `SteppedWorlds`.
         render_modes: allowed render modes.
-        may_be_alone: whether a world of `traffic.demand` needs no agents.
+        may_be_alone: whether a world with `traffic.demand` may have no agents.
         given: see `WorldArguments`.
 
     Raises:
@@ -99,7 +98,7 @@ def start_worlds(
         )
     if (seed := given.get("seed")) is not None:
         check_seed(seed)
-    load_plugins_of(env, given.get("overrides"))  # the driver may have their sensors
+    load_plugins_of(env, given.get("overrides"))  # the driver may use sensors of the plugins
     config, base_dir = load_config(
         env,
         zones=given.get("zones"),

@@ -108,7 +108,7 @@ class WorldsEnvironment(OwnWorlds):
 
     @property
     def signal_overrides(self) -> SignalOverrides:
-        """The signals that show states of the caller; see `signals.overrides`.
+        """The signals that show the caller's states; see `signals.overrides`.
 
         Raises:
             EpisodeError: before the first reset.
@@ -142,7 +142,7 @@ class WorldsEnvironment(OwnWorlds):
 
     @property
     def roadside(self) -> RoadsideAgents | None:
-        """The agents beside the road: those of signals or of limits; None: there are none."""
+        """The agents beside the road, at signals or for limits; None: there are none."""
         return self._session.roadside
 
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
@@ -173,10 +173,10 @@ class WorldsEnvironment(OwnWorlds):
     ) -> None:
         """Close lanes of a road, until they are opened or the episode is over.
 
-        From the next step on, no vehicle enters the lanes, except those that cannot stop before
-        them any more. Vehicles on the lanes leave them. The vehicles of `population.reroute` take
-        another route within a second. Vehicles without another route wait before the closed lanes,
-        and departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
+        From the next step on, no vehicle enters the lanes, except vehicles that cannot stop in
+        time. Vehicles on the lanes leave them. The vehicles of `population.reroute` take another
+        route within a second. Vehicles without another route wait before the closed lanes, and
+        departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
 
         Args:
             edge: id of a road.
@@ -198,7 +198,7 @@ class WorldsEnvironment(OwnWorlds):
         self._session.lane_changes.close(world, edge, lanes, shuts_in=shuts_in)
 
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
-        """Give lanes of a closed, damaged or reversed road the state that they have on the map.
+        """Restore lanes of a closed, damaged or reversed road to their state on the map.
 
         Vehicles that wait before them drive on from the next step on. A reversed road opens with
         all its lanes, once its contraflow lanes are closed and empty.
@@ -219,13 +219,13 @@ class WorldsEnvironment(OwnWorlds):
     ) -> None:
         """Lower the speed limit of lanes of a road, until it is opened or the episode is over.
 
-        From the next step on, drivers, sensors and rewards have the new limit. Each lane counts in
+        From the next step on, drivers, sensors and rewards use the new limit. Each lane counts in
         `map.changed_lanes`.
 
         Args:
             edge: id of a road.
-            speed_mps: the limit in m/s, above 0 and at most that of the map; equal to that of the
-                map, it ends an earlier one.
+            speed_mps: the limit in m/s, above 0 and at most the map's limit; the map's own limit
+                ends an earlier change.
             lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
 
@@ -248,7 +248,7 @@ class WorldsEnvironment(OwnWorlds):
     def deadlocks(self, world: int = 0) -> tuple[tuple[int, ...], ...]:
         """Return the cycles of vehicle ids in which each vehicle waits for the next.
 
-        All vehicles of a cycle have stood for at least 10 s; see `engine.waiting_cycles`.
+        All vehicles of a cycle have been stopped for at least 10 s; see `engine.waiting_cycles`.
 
         Raises:
             ConfigError: there is no such world, or its state is not available in this process.
@@ -272,7 +272,7 @@ class WorldsEnvironment(OwnWorlds):
         return self._session.frames(chosen, ghosts)
 
     def way_ahead(self, vehicle: int, world: int = 0) -> NDArray[np.float64]:
-        """Return points (n, 2) in m along the path of a vehicle, as of the last `world_frames`.
+        """Return points (n, 2) in m along the path of a vehicle, as in the last `world_frames`.
 
         Raises:
             EpisodeError: before the first reset.

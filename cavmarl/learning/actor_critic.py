@@ -80,7 +80,7 @@ class ActorCritic(nn.Module):
         return [list(self.actor.parameters()), list(self.critic.parameters())]
 
     def normal(self, observations: Tensor) -> Tensor:
-        """Return observations (…, D) less their mean, divided by their deviation, and clipped."""
+        """Return observations (…, D) minus their mean, divided by their deviation, and clipped."""
         normal: Tensor = (observations - self.mean) / self.deviation
         return normal.clamp_(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 

@@ -39,7 +39,7 @@ class RunState:
     logs: dict[str, int] = field(default_factory=dict)  # size of each log file in bytes
     random: Parts = field(default_factory=dict)  # see `random_states`
     parts: Parts = field(default_factory=dict)  # state of the program
-    shares: list[Parts] = field(default_factory=list)  # `random`, `parts` of ranks 1, 2, …
+    shares: list[Parts] = field(default_factory=list)  # `random` and `parts` of ranks 1, 2, …
 
 
 def write_checkpoint(folder: Path, state: RunState) -> None:

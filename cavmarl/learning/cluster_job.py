@@ -1,4 +1,4 @@
-"""`TrainingJob`: a training program as a job of a cluster, which continues where it was stopped.
+"""`TrainingJob`: a training program as a job of a cluster, which can be stopped and continued.
 
 A job that is preempted, or whose machine fails, is started again by its cluster. It then resumes
 from the last checkpoint of the run, whose folder all machines must be able to read and write.
@@ -97,7 +97,7 @@ class TrainingJob:
         return self.folder
 
     def checkpoint(self) -> Any:
-        """Let the program write its last checkpoint; return the job to queue again.
+        """Let the program write its last checkpoint; return the job, to be queued again.
 
         submitit calls this at SIGUSR2, before the job is preempted or reaches its time limit.
         """

@@ -1,8 +1,8 @@
 """`Ranks`: the processes of one training, which learn one network from their own worlds.
 
-`torchrun` starts the processes. Each collects in its share of the worlds; before each step of the
-optimiser, all processes average their gradients (data-parallel training, Li et al. 2020). So all
-have the same weights.
+`torchrun` starts the processes. Each process collects data in its share of the worlds; before each
+step of the optimiser, all processes average their gradients (data-parallel training, Li et al.
+2020). So all processes have the same weights.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Ranks:
         return count // self.size
 
     def gather(self, mine: T) -> list[T]:
-        """Return what each process gives, by rank."""
+        """Return the argument of each process, by rank."""
         found: list[T] = [mine] * self.size
         if self.size > 1:
             with _connected():
@@ -79,7 +79,7 @@ class Ranks:
         return found
 
     def gather_in_first(self, mine: T) -> list[T]:
-        """Return what each process gives in process 0, and an empty list in the others."""
+        """Return the argument of each process in process 0, and an empty list in the others."""
         if self.size == 1:
             return [mine]
         found: list[Any] = [None] * self.size
@@ -88,18 +88,18 @@ class Ranks:
         return found if self.rank == 0 else []
 
     def of_first(self, mine: T) -> T:
-        """Return what process 0 gives."""
+        """Return the argument of process 0."""
         return self.gather(mine)[0]
 
     def copy_weights(self, network: nn.Module) -> None:
-        """Give all processes the weights of process 0; processors may begin with others."""
+        """Copy the weights of process 0 to all processes; initial weights may differ."""
         if self.size > 1:
             self._reduce([*network.parameters()], lambda flat: dist.broadcast(flat, 0))
 
     def average_gradients(self, network: nn.Module, count: int) -> bool:
-        """Average the gradients over all decisions; `count`: those of this process, or 0.
+        """Average the gradients over all decisions; `count`: number in this process, or 0.
 
-        Return whether there is any decision.
+        Return whether there are any decisions.
         """
         if self.size == 1:
             return count > 0
@@ -115,7 +115,7 @@ class Ranks:
         return bool(total > 0.0)
 
     def _reduce(self, tensors: list[Tensor], act: Callable[[Tensor], object]) -> None:
-        """Let `act` change all values of the tensors at once."""
+        """Apply `act` to all values of the tensors at once."""
         with torch.no_grad(), _connected():
             flat = torch.cat([each.detach().flatten().cpu() for each in tensors])
             act(flat)

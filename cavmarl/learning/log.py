@@ -59,7 +59,7 @@ class Trips:
     def add(
         self, rewards: NDArray[Any], done: NDArray[Any], cut: NDArray[Any], terms: NDArray[Any]
     ) -> None:
-        """Add one step; `done` (W, A) ends trips, `cut` (W, A) discards them."""
+        """Add one step; `done` (W, A) marks trips that end, `cut` (W, A) trips to discard."""
         self._sums[..., 0] += rewards
         self._sums[..., 1] += terms[..., COLUMNS[3]]
         if (gone := done | cut).any():
@@ -102,9 +102,9 @@ class Log:
     """Writes the metrics of every update to a CSV table and to other loggers.
 
     Args:
-        folder: of the run.
+        folder: folder of the run.
         loggers: names of `LOGGERS`.
-        settings: of the run, for loggers that show them.
+        settings: settings of the run, for loggers that show them.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """Loggers of training runs: TensorBoard, Weights & Biases (offline) and MLflow (local files).
 
 A logger writes into the folder of the run and contacts no host. TensorBoard's files are cut at the
-checkpoint when a run is resumed. The files of the others cannot be cut: they are written again,
-from the rows of the table.
+checkpoint when a run is resumed. The files of the other loggers are written again from the rows of
+the table.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ class Logger(Protocol):
         ...
 
     def flush(self) -> None:
-        """Write all that is waiting to the files."""
+        """Write all buffered rows to the files."""
         ...
 
     def close(self) -> None:
@@ -87,7 +87,7 @@ class WandbLogger:
         self._run.log(dict(row), step=int(row["agent_steps"]))
 
     def flush(self) -> None:
-        pass  # another process writes the file as the rows come
+        pass  # another process writes the rows as they arrive
 
     def close(self) -> None:
         self._run.finish()
@@ -165,5 +165,5 @@ def logger_names(text: str) -> tuple[str, ...]:
 def make_loggers(
     names: Iterable[str], folder: Path, settings: Mapping[str, Any], rows: Sequence[Row]
 ) -> list[Logger]:
-    """Return the loggers of a run; `rows` are those of the run so far."""
+    """Return the loggers of a run; `rows`: the rows of the run so far."""
     return [LOGGERS[name](folder, settings, rows) for name in names]

@@ -29,7 +29,7 @@ class Opponents:
         self._drivers = [load_policy(name, vec) for name in names.split(",") if name]
         self._to_reset = [*self._drivers]
         drawn = np.random.default_rng(seed).random((vec.num_envs, vec.num_agents))
-        self._seats = np.floor(drawn / max(share, 1e-9))  # driver of each agent
+        self._seats = np.floor(drawn / max(share, 1e-9))  # index of each agent's driver
         self.absent: Mask = self._seats >= len(self._drivers)
 
     def begin(self) -> None:

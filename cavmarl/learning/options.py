@@ -96,7 +96,7 @@ def check_shares(settings: object, names: Iterable[str]) -> None:
 
 def check_device(name: str) -> None:
     """Check that torch can use the device; CPUs and NVIDIA GPUs are supported."""
-    import torch  # an extra; settings without a device do not need it
+    import torch  # an optional package; settings without a device do not need it
 
     cure = "give cpu, or cuda on a machine with an NVIDIA GPU and a torch build that supports it"
     if name.partition(":")[0] not in ("cpu", "cuda"):
@@ -162,7 +162,7 @@ def run_to_end(act: Callable[[], None], goes_on: str) -> int:
 
 @contextmanager
 def noting_sigterm() -> Iterator[Callable[[], bool]]:
-    """Let SIGTERM end no program inside; yield a function that returns whether it has come.
+    """Keep SIGTERM from ending the code inside; yield a function that tells whether it has arrived.
 
     A second SIGTERM ends the program at once.
     """

@@ -22,7 +22,7 @@ class PhaseTimes:
 
     @contextmanager
     def rest(self, phase: str) -> Iterator[None]:
-        """Add the time of a block to this phase, less the time of phases within it."""
+        """Add the time of a block to this phase, minus the time of phases within it."""
         began, before_s = time.perf_counter(), sum(self.spent_s.values())
         yield
         others_s = sum(self.spent_s.values()) - before_s

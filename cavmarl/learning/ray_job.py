@@ -16,7 +16,7 @@ from typing import Any
 from cavmarl.core.errors import TrainingError, require
 from cavmarl.learning.cluster_job import TrainingJob
 
-MAX_LOSSES = 20  # of machines or processes, before Ray gives the task up
+MAX_LOSSES = 20  # losses of machines or processes before Ray abandons the task
 
 
 def submit(job: TrainingJob, cpus: int, gpus: int) -> str:
@@ -26,7 +26,7 @@ def submit(job: TrainingJob, cpus: int, gpus: int) -> str:
         MissingExtraError: Ray, or its part for jobs, is not installed.
         TrainingError: there is no cluster, or it refuses the job.
     """
-    require("aiohttp_cors", "cluster")  # of Ray's part for jobs
+    require("aiohttp_cors", "cluster")  # needed by Ray's part for jobs
     jobs = require("ray.job_submission", "cluster")
     words = [sys.executable, "-m", __name__, json.dumps(asdict(job)), str(cpus), str(gpus)]
     try:

@@ -60,7 +60,7 @@ if TYPE_CHECKING:
         def folder(self) -> Path: ...
 
 
-LOCK_FILE = ".lock"  # contains the id of the process that writes here or was the last to do so
+LOCK_FILE = ".lock"  # contains the id of the process that writes here or did so last
 DRIVER_FILES = (WEIGHTS_FILE, CONFIG_FILE, CSV_FILE)
 
 # Settings that may change when a run is resumed.
@@ -98,7 +98,7 @@ class RunFolder:
         ranks: the processes of the run; the first one writes the files.
 
     Raises:
-        ConfigError: the run that is resumed had another number of processes.
+        ConfigError: the resumed run had another number of processes.
         TrainingError: another process uses the folder, it contains a run and `resume` is empty,
             the run cannot be resumed, or the folder cannot be written.
     """
@@ -204,7 +204,7 @@ class RunFolder:
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
         """Replace the checkpoint by a new one; all processes call this.
 
-        `parts` of other processes than the first one take precedence in these processes alone.
+        In each process other than the first, its own `parts` take precedence.
 
         Raises:
             TrainingError: it cannot be written; the previous one is intact.
@@ -231,7 +231,7 @@ class RunFolder:
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
         """Write the present driver for evaluation, with the kinds of the maps of its training.
 
-        Runs are not resumed from it.
+        A run cannot be resumed from this file.
         """
         if self._ranks.rank:
             return
@@ -296,7 +296,7 @@ def _locked(folder: Path) -> int:
 
 
 def _digest(world: World | Simulation) -> str:
-    """Return a digest of the environment without zones and workers, which change no result."""
+    """Return a digest of the environment without zones and workers, which do not affect results."""
     config = asdict(world.config)
     for name in ("zones", "workers"):
         del config[name]

@@ -26,11 +26,11 @@ OF_OBSERVATIONS = (
 
 
 def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int:
-    """Copy the weights of a driver into a network; return how many decisions they come from.
+    """Copy the weights of a driver into a network; return their number of training decisions.
 
     Observations that the driver does not have get the weight 0, so that the network first decides
-    as the driver does. Observations that the run does not have are left out and logged: the network
-    first decides as the driver does where they equal their mean.
+    like the driver. Observations that the run does not have are left out and logged: the network
+    first decides like the driver where they equal their mean.
 
     Args:
         network: the initialised network.
@@ -59,7 +59,7 @@ def _names(sensors: SensorsConfig) -> list[tuple[int, str, str]]:
 
 
 def _columns(driver: NetworkConfig, run: NetworkConfig, folder: Path) -> tuple[Tensor, Tensor]:
-    """Return two indices of each number that both observe: in the driver's and the run's array."""
+    """Return the indices, in the driver's and the run's array, of the numbers that both observe."""
     known = {name: k for k, name in enumerate(_names(run.sensors))}
     names = _names(driver.sensors)
     kept = [k for k, name in enumerate(names) if name in known]

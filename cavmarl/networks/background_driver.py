@@ -1,8 +1,8 @@
-"""Trained drivers for background vehicles: which of them fit, and their networks.
+"""Trained drivers for background vehicles: the suitable drivers, and their networks.
 
-A background vehicle carries its own state in its record, which zones hand over. So the memory of
-its driver is limited to `MEMORY_FIELDS` of `driving.vehicles`: the controls and speeds of the last
-steps. Drivers that need more are refused.
+A background vehicle carries its own state in its record, which zones hand over. Therefore, the
+memory of its driver is limited to `MEMORY_FIELDS` of `driving.vehicles`: the controls and speeds of
+the last steps. Drivers that need more are refused.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from cavmarl.roads.road_kinds import RoadKind
 if TYPE_CHECKING:
     from cavmarl.networks.network_files import NetworkConfig
 
-MOST_STEPS = 3  # of the sensor `history`: the present step, and those of `MEMORY_FIELDS`
+MOST_STEPS = 3  # limit of the sensor `history`: the present step, and those of `MEMORY_FIELDS`
 
 
 @dataclass(frozen=True)
@@ -50,8 +50,8 @@ def background_drivers(traffic: TrafficConfig) -> tuple[BackgroundDriver, ...]:
     """Return the trained drivers that `traffic.model` names, ordered as `TrafficConfig.models`.
 
     Raises:
-        PolicyError: a driver does not exist, its files are invalid, or it needs what background
-            vehicles do not have.
+        PolicyError: a driver does not exist, its files are invalid, or it needs data that
+            background vehicles do not have.
     """
     return tuple(map(_background_driver, traffic.networks))
 

@@ -1,4 +1,4 @@
-"""`DriverNetwork`: the network of a trained driver, evaluated by a kernel and not by torch."""
+"""`DriverNetwork`: the network of a trained driver, evaluated by a kernel, without torch."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ LINE_FLOATS = 16  # float32 numbers in a cache line
 class LayerTable:
     """The layers and the weights of a network, in the form that `evaluate_network` reads.
 
-    The weights of each layer begin with a cache line.
+    The weights of each layer start at the beginning of a cache line.
 
     Attributes:
         width: number of outputs of the last layer.
@@ -87,7 +87,7 @@ class LayerTable:
 
 
 def _aligned(size: int) -> NDArray[np.float32]:
-    """Return an array whose data begin with a cache line, so that no SIMD load crosses two lines.
+    """Return an array aligned to a cache line, so that no SIMD load crosses two lines.
 
     The alignment makes the evaluation about a seventh faster, and changes no result.
     """
@@ -119,7 +119,7 @@ class DriverNetwork:
         table.add(CLAMP, MAX_DEVIATIONS)
         add = _add_body if config.shared else _add_perceptron
         add(table, weights, config)
-        self._layers = table.layers()  # without the conversion of outputs to actions
+        self._layers = table.layers()  # excludes the conversion of outputs to actions
         if config.residual:
             table.add(RESIDUAL, RESIDUAL_PARTS)
         if config.action.kind == "continuous":
@@ -145,7 +145,7 @@ class DriverNetwork:
     def best(self, observations: NDArray[np.float32]) -> NDArray[Any]:
         """Return the most likely actions: (N, 2) float32 in [-1, 1], or (N,) int64 choices.
 
-        Arguments and errors are those of `outputs`.
+        For arguments and errors, see `outputs`.
         """
         found = self._run(self.best_layers, observations)
         if self.config.action.kind == "continuous":

@@ -49,8 +49,8 @@ class NetworkConfig:
         hidden: widths of the hidden layers of actor and critic.
         seed: seed of the training.
         agent_steps: number of decisions used for learning.
-        state_size: numbers of the world's state that the critic gets beside the observation; the
-            actor never gets them.
+        state_size: length of the world's state, which the critic gets in addition to the
+            observation, and the actor does not.
         shared: one body with LayerNorm and ReLU for actor and critic; else each is a tanh network.
         residual: the output, scaled by `RESIDUAL_PARTS`, is added to the built-in driver's action,
             which is observed last (residual learning: Silver et al. 2018, Johannink et al. 2019).

@@ -1,4 +1,4 @@
-"""The kinds of a map that a trained driver does not know, and what is said about them."""
+"""The kinds of a map that a driver was not trained on, and the warnings about them."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ _NOTES: dict[RoadKind, str] = {
 
 
 def untrained_kinds(network: RoadNetwork, trained_on: Sequence[RoadKind]) -> tuple[RoadKind, ...]:
-    """Return the kinds of a map that are not among those of a driver's training."""
+    """Return the kinds of a map on which a driver was not trained."""
     return tuple(kind for kind in road_kinds(network) if kind not in trained_on)
 
 

@@ -21,7 +21,7 @@ def check_fit(config: NetworkConfig, here: EnvConfig, name: str, driver: str) ->
         config: configuration of the network.
         here: configuration of the environment.
         name: name of the network in messages.
-        driver: what `--sensors-of` needs, to give an environment the sensors of the network.
+        driver: argument of `--sensors-of` that gives an environment the sensors of the network.
 
     Raises:
         PolicyError: the network does not fit; the message lists keys, values and the remedy.

@@ -1,6 +1,6 @@
 """Loading of policies: a name or a path becomes a policy that drives in an environment.
 
-`agents/` holds the policies that come with cavmarl: `NAME.py` defines `make_policy(env)`; a folder
+`agents/` contains the policies of cavmarl: `NAME.py` defines `make_policy(env)`; a folder
 holds the weights of a trained network. Both are files that are read, not modules that are imported.
 """
 

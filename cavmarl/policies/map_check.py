@@ -1,4 +1,4 @@
-"""Checks whether a trained driver knows maps of the kind that it is to drive on."""
+"""Checks whether a trained driver was trained on maps of the present kind."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def meet_map(env: Environment, name: str, trained_on: Sequence[RoadKind]) -> Oth
 
     Args:
         env: the environment.
-        name: of the driver.
+        name: name of the driver.
         trained_on: kinds of the maps of its training.
 
     Raises:
@@ -37,6 +37,6 @@ def meet_map(env: Environment, name: str, trained_on: Sequence[RoadKind]) -> Oth
         except PolicyError as error:
             raise PolicyError(f"The policy {name} cannot drive on this map: {error}") from error
     for kind in untrained:
-        # The warning is that of the caller of `load_policy`.
+        # The warning names the caller of `load_policy`.
         warnings.warn(note_of(name, kind), UntrainedMapWarning, stacklevel=5)
     return other_side

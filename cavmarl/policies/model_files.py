@@ -1,6 +1,6 @@
 """Drivers in model files of other libraries: stable-baselines3, TorchScript and ONNX.
 
-`make_policy` is the way in for all of them. A format is a suffix in `config/driver_names.py` and a
+`make_policy` reads all of them. A format is a suffix in `config/driver_names.py` and a
 reader in `_READERS`, which returns a `Model`, and the driver's configuration if the file states it.
 """
 
@@ -45,7 +45,7 @@ class ModelPolicy(Policy):
 
     Args:
         env: environment of the policy.
-        model: see `Model`. Actions are clipped to [-1, 1]; of logits, the largest is chosen.
+        model: see `Model`. Actions are clipped to [-1, 1]; for logits, the largest is chosen.
         name: name of the model in messages.
         is_residual: whether the model observes the built-in driver's action, too, as its last
             numbers, and returns a corrected action.

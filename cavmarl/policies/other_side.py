@@ -20,7 +20,7 @@ from cavmarl.sensors.observed.exchanged_sides import exchange_sides
 
 
 class OtherSide:
-    """Exchanges left and right in observations and actions; twice is no change.
+    """Exchanges left and right in observations and actions; applied twice, it changes nothing.
 
     Args:
         config: the environment.
@@ -60,7 +60,7 @@ class OtherSide:
 
 
 def _exchanged_choices(action: ActionConfig) -> NDArray[np.int64] | None:
-    """Return the choice that stands for each choice on the other side; None: no choices."""
+    """Return the mirror image of each choice; None: actions are not choices."""
     if action.kind == "continuous":
         return None
     choices = np.arange(action.choices, dtype=np.int64)
@@ -70,8 +70,8 @@ def _exchanged_choices(action: ActionConfig) -> NDArray[np.int64] | None:
     steering = action.grid_steering
     if tuple(-angle for angle in reversed(steering)) != steering:
         raise PolicyError(
-            f"action.grid_steering = {list(steering)}: has no equal steerings to both sides, so "
-            "that actions cannot be mirrored; use a driver that was trained on this side of the "
+            f"action.grid_steering = {list(steering)}: is not symmetric, so that actions cannot "
+            "be mirrored; use a driver that was trained on this side of the "
             "road"
         )
     return choices.reshape(-1, len(steering))[:, ::-1].ravel()

@@ -29,7 +29,7 @@ Environment = CavEnv | CavVectorEnv
 
 
 class Policy(ABC):
-    """Drives the agents of one environment that are vehicles.
+    """Drives the vehicles of the agents of one environment.
 
     Args:
         env: environment of the policy; `act` is for a `CavEnv`, `act_batch` for a `CavVectorEnv`.

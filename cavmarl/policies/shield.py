@@ -1,4 +1,4 @@
-"""`ShieldedPolicy`: a driver that the built-in driver overrides where the latter brakes harder."""
+"""`ShieldedPolicy`: a driver that the built-in driver overrides where it would brake harder."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class ShieldedPolicy(Policy):
         self.driver.reset(seed)
 
     def act_batch(self, observations: NDArray[np.float32], mask: NDArray[np.bool_]) -> NDArray[Any]:
-        """Return the actions (W, A, 2): those of the built-in driver where they brake harder.
+        """Return the actions (W, A, 2); the built-in driver's actions where they brake harder.
 
         Raises PolicyError: actions are discrete.
         """

@@ -608,7 +608,7 @@ def test_each_argument_without_an_effect_warns_once(routes: str, name: str, valu
         ({"reward_fn": "speed"}, ConfigError, "reward_fn = 'speed': must be a function"),
         ({"reward_fn": {"A0": "queue"}}, ConfigError, "reward_fn: 'A1' has no reward"),
         ({"sumo_seed": "seven"}, ConfigError, "sumo_seed = 'seven': must be a whole number"),
-        ({"additional_sumo_cmd": "--wings 2"}, ConfigError, "'--wings' is no option of SUMO"),
+        ({"additional_sumo_cmd": "--wings 2"}, ConfigError, "'--wings' is not an option of SUMO"),
         ({"additional_sumo_cmd": "-n other"}, ConfigError, "no such file|is set by another"),
         ({"additional_sumo_cmd": "-b 7"}, ConfigError, "begin is set by another argument"),
         ({"render_mode": "ansi"}, ConfigError, "render_mode = 'ansi'"),

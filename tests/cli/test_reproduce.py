@@ -93,7 +93,7 @@ def test_a_wrong_published_number_is_shown(
     assert code == 1
     assert "rows: 3, x 31 30 exact differs" in out
     assert "2, x" not in out
-    assert "error: rows: measured numbers are not those of the page; correct the page, or" in err
+    assert "error: rows: measured numbers differ from the page; correct the page, or" in err
 
 
 def test_results_before_an_error_are_shown(

@@ -329,7 +329,7 @@ def test_events_are_recorded(tmp_path: Path) -> None:
         ({"at_s": -1, "action": "close", "edges": ["B1B2"]}, "at_s = -1"),
         ({"at_s": 1, "action": "burn", "edges": ["B1B2"]}, "must be 'close'"),
         ({"at_s": 1, "action": "damage", "edges": ["B1B2"]}, "must be given for damage"),
-        ({"at_s": 1, "action": "close", "edges": ["B1B2"], "speed_mps": 3}, "only there"),
+        ({"at_s": 1, "action": "close", "edges": ["B1B2"], "speed_mps": 3}, "for no other action"),
         ({"at_s": 1, "action": "damage", "edges": ["B1B2"], "speed_mps": 90}, "at most that"),
         ({"at_s": 1, "action": "reverse", "edges": ["B1B2"]}, r"only roads in map\.contraflow"),
         ({"at_s": 1, "action": "reverse", "edges": ["C1B1"], "lanes": [0]}, "leave the key out"),

@@ -235,7 +235,7 @@ def test_a_controller_chooses_for_units_in_worlds_of_vehicles() -> None:
         assert (vec.limits.view.states[..., 1] < 3).all()
     with closing(vec_of(1, agents=2)) as vec, pytest.raises(PolicyError, match=r"limits\.agents"):
         load_policy("idm", vec)
-    with pytest.raises(ConfigError, match=r"this adapter has agents of vehicles alone; set limits"):
+    with pytest.raises(ConfigError, match=r"this adapter has only vehicles as agents; set limits"):
         CavEgoEnv("lane_drop", overrides=KEYS)
 
 

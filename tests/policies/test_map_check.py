@@ -210,5 +210,5 @@ def test_mirrored_discrete_actions_exchange_left_and_right() -> None:
     for choice, other in enumerate(grid.actions(np.arange(6))):
         throttle, steering = action.pairs[choice]
         assert action.pairs[other] == (throttle, 0.0 - steering)
-    with pytest.raises(PolicyError, match="no equal steerings to both sides"):
+    with pytest.raises(PolicyError, match="is not symmetric, so that"):
         OtherSide(config_of(kind="grid", grid_steering=(-0.5, 0.0, 0.2)))

@@ -82,7 +82,7 @@ def test_a_minute_has_sixty_times_as_many_samples_as_the_rate(
         ),
         ({"type": "imu", "rate_hz": 30}, "try 20 or 40"),
         ({"type": "gnss", "rate_hz": 30}, "try 20"),
-        ({"type": "gnss", "rate_hz": 40}, "at most once per tick, 20 Hz"),
+        ({"type": "gnss", "rate_hz": 40}, "at most one sample per tick, 20 Hz"),
         ({"type": "gnss", "rate_hz": 30, "schedule": "accumulate"}, "try 20"),
         ({"type": "imu", "rate_hz": 30, "schedule": "accumulate"}, "try 20 or 40"),
         ({"type": "gnss", "rate_hz": 0}, "must be a number from 0.001"),

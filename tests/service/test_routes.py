@@ -172,7 +172,7 @@ def test_the_page_has_the_routes_and_the_problems() -> None:
         (
             "/configurations",
             {"environment": "grid4x4", "overrides": {"signals.agents": "all"}},
-            422, "refused", "a session of the service has agents of vehicles alone",
+            422, "refused", "a session of the service has only vehicles as agents",
         ),
         (
             "/configurations",

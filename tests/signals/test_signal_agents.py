@@ -623,7 +623,7 @@ def test_policies_for_vehicles_can_be_loaded_beside_signal_agents() -> None:
 
 @pytest.mark.parametrize("adapter", [CavEgoEnv, CavAgentRows])
 def test_adapters_for_vehicles_refuse_signal_agents(adapter: Any) -> None:
-    with pytest.raises(ConfigError, match="this adapter has agents of vehicles alone; set sig"):
+    with pytest.raises(ConfigError, match="this adapter has only vehicles as agents; set sig"):
         adapter("grid4x4", overrides=ALL)
 
 
@@ -633,7 +633,7 @@ def test_a_followed_world_refuses_signal_agents(tmp_path: Path) -> None:
 
 
 def test_a_world_for_clients_of_carla_refuses_signal_agents() -> None:
-    message = "a world for CARLA's clients has agents of vehicles"
+    message = "a world for CARLA's clients has only vehicles as agents"
     with closing(world()) as env, pytest.raises(ConfigError, match=message):
         serve(env)
     source = LoadedWorlds(WorldSpec.of("grid4x4", agents=1, overrides={"signals.agents": "all"}))

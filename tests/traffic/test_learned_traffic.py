@@ -272,7 +272,7 @@ def test_networks_need_native_traffic_and_native_zones() -> None:
     for model in ("zoo:cities_ippo", {"IDM": 1.0, "ACC": 1.0}):
         with pytest.raises(ConfigError, match=r"traffic.source = sumo-traffic needs one"):
             load(model, **{"traffic.source": "sumo-traffic", "traffic.demand": ["a.rou.xml"]})
-    with pytest.raises(ConfigError, match="other simulators do not evaluate networks"):
+    with pytest.raises(ConfigError, match="other simulators cannot run a trained driver"):
         load("zoo:cities_ippo", **{"zones.simulators": {0: "carla://localhost:2000"}})
 
 

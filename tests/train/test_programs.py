@@ -162,7 +162,7 @@ def test_programs_that_train_drivers_refuse_signal_agents(
     }  # fmt: skip
     (tmp_path / "env.yaml").write_text(json.dumps(settings), encoding="utf-8")
     said = refusal(capsys, program, "--env", tmp_path, "--runs", tmp_path / "runs")
-    assert "this program has agents of vehicles alone" in said
+    assert "this program has only vehicles as agents" in said
 
 
 def test_five_seeds_trains_missing_seeds_and_writes_the_table(tmp_path: Path) -> None:

@@ -1,7 +1,7 @@
 """The API of sumo-rl 1.4.5: scripts for sumo-rl only have to change their import.
 
 `from cavmarl.adapters import sumo_rl` replaces `import sumo_rl`; its modules have the same names.
-Traffic is that of this package; SUMO does not run. Alegre: "SUMO-RL", 2019.
+This package simulates the traffic; SUMO does not run. Alegre: "SUMO-RL", 2019.
 docs/guides/signal_control.md lists what is supported.
 """
 

@@ -22,7 +22,7 @@ class QLAgent:
         exploration_strategy: chooses actions; default: `EpsilonGreedy()`.
 
     Attributes:
-        q_table: values of the actions of each state that the agent has met.
+        q_table: action values of each state that the agent has visited.
         state: present state.
         action: last action; None before the first one.
         acc_reward: sum of all rewards.
@@ -54,7 +54,7 @@ class QLAgent:
         return self.action
 
     def learn(self, next_state: Hashable, reward: float, done: bool = False) -> None:
-        """Update the value of the last action, and go to the next state.
+        """Update the value of the last action, and move to the next state.
 
         As in sumo-rl, `done` is not read: episodes end by truncation only.
         """

@@ -9,12 +9,12 @@ import numpy as np
 
 
 class EpsilonGreedy:
-    """Choose a random action with probability epsilon, else the one of the highest value.
+    """Choose a random action with probability epsilon, else the action of the highest value.
 
     Args:
         initial_epsilon: first probability.
         min_epsilon: lowest probability.
-        decay: factor of the probability after each choice.
+        decay: factor by which each choice reduces the probability.
 
     Attributes:
         epsilon: present probability.

@@ -22,8 +22,8 @@ def signals(
         about("Number of worlds. Repeat it for more. [default: 1, 16]", metavar="N"),
     ] = None,
     after: Annotated[int, about("Simulated seconds before the first turn.", metavar="S")] = 300,
-    turn: Annotated[int, about("Decisions of a turn, each of 5 s.", metavar="N")] = 60,
-    repeats: Annotated[int, about("Number of turns of each side.", metavar="N")] = 5,
+    turn: Annotated[int, about("Decisions per turn, one every 5 s.", metavar="N")] = 60,
+    repeats: Annotated[int, about("Number of turns of each program.", metavar="N")] = 5,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:

@@ -107,7 +107,7 @@ def verify_nodes(
 ) -> None:
     """Compare a world over node processes with the undivided one, step by step.
 
-    If a result or a state differs, print where and exit with 1.
+    On the first different result or state, print it and exit with 1.
     """  # fmt: skip
     counts = numbers_of("--nodes", nodes)
     runs: dict[str, Any] = {"zones": zones, "policy": policy}

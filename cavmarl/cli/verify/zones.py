@@ -114,7 +114,7 @@ def _verdict(result: ZoneResult) -> str:
     if result.difference is not None:
         return "[red]different[/]"
     if result.tolerance_m > 0.0:
-        return f"[yellow]not compared: a simulator declares {result.tolerance_m:g} m[/]"
+        return f"[yellow]not compared: a simulator has a tolerance of {result.tolerance_m:g} m[/]"
     return "[green]equal[/]"
 
 

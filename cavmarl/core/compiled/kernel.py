@@ -109,7 +109,7 @@ class TypedKernel:
         count = sum(kind.count for kind in self.types)
         results, self.read_result = result_reader(code.result, count)
         self.num_words = count + results
-        self.words: list[Words] = []  # not used by a call now; each thread takes its own
+        self.words: list[Words] = []  # free memory, of which each call takes one item
 
     def __call__(self, arguments: tuple[Any, ...]) -> Any:
         """Call with arguments of these types; no reference to them is kept."""

@@ -126,7 +126,7 @@ def project(
     x: float,  # m
     y: float,  # m
 ) -> tuple[float, float, float, float]:  # s and d in metres, cos and sin of the direction there
-    """Return the lane coordinates of a point: those of the nearest point of the polyline.
+    """Return the lane coordinates of a point, relative to the nearest point of the polyline.
 
     Of several nearest points, the point with the smallest `s` counts. If it is an end of the
     polyline, `s` and `d` are relative to the end segment's line, so `s` may be outside of [0,
@@ -202,11 +202,11 @@ def _overlap_s(apart: float, rate: float, reach: float) -> tuple[float, float]:
 
 @kernel
 def time_to_collision_s(
-    dx: float,  # from the centre of the first box to that of the second box, m
+    dx: float,  # from the first box's centre to the second box's centre, m
     dy: float,  # see `dx`
     vx: float,  # velocity of the second box relative to the first box, m/s
     vy: float,  # see `vx`
-    cos1: float,  # of the first box's heading
+    cos1: float,  # cos of the first box's heading
     sin1: float,  # see `cos1`
     half_length1: float,  # along its heading, m
     half_width1: float,  # across its heading, m

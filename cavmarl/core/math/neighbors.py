@@ -33,7 +33,7 @@ BODY = np.dtype(
         ("x", np.float64),  # centre, m
         ("y", np.float64),
         ("z", np.float64),
-        ("cos", np.float64),  # of the heading
+        ("cos", np.float64),  # cosine of the heading
         ("sin", np.float64),
         ("speed", np.float64),  # m/s
         ("half_length", np.float64),  # m

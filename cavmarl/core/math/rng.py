@@ -29,7 +29,7 @@ DRAWS_PER_STREAM = 1 << 16
 STREAM_WORLD = 0 * DRAWS_PER_STREAM  # keys of worlds and episodes
 STREAM_ROUTE = 1 * DRAWS_PER_STREAM  # destinations
 STREAM_ORIGIN = 2 * DRAWS_PER_STREAM  # where vehicles enter
-STREAM_SPEED_FACTOR = 3 * DRAWS_PER_STREAM  # desired speed over the limit
+STREAM_SPEED_FACTOR = 3 * DRAWS_PER_STREAM  # desired speed / speed limit
 STREAM_PLACE = 4 * DRAWS_PER_STREAM  # positions at reset
 STREAM_DEPARTURE = 5 * DRAWS_PER_STREAM  # times between departures
 STREAM_DRIVER = 9 * DRAWS_PER_STREAM  # decisions of background drivers
@@ -113,7 +113,7 @@ def _block(
 
 @kernel
 def world_key(
-    seed: int | np.uint64,  # of the run, in [0, 2**64)
+    seed: int | np.uint64,  # seed of the run, in [0, 2**64)
     world: int,  # number of the world, in [0, 2**48)
     episode: int,  # number of the episode in that world, in [0, 2**48)
 ) -> np.uint64:
@@ -124,9 +124,9 @@ def world_key(
 
 @kernel
 def uniform(
-    key: int | np.uint64,  # of the world, see `world_key`
-    vehicle: int,  # id, in [0, 2**48)
-    tick: int,  # of the world, in [0, 2**48)
+    key: int | np.uint64,  # key of the world, see `world_key`
+    vehicle: int,  # id of the vehicle, in [0, 2**48)
+    tick: int,  # tick of the world, in [0, 2**48)
     stream: int,  # one of `STREAM_*`, plus the index of the draw
 ) -> float:
     """Return a number with 53 random bits, uniform in [0, 1)."""
@@ -149,9 +149,9 @@ def fill_uniform(
 
 @kernel
 def below(
-    key: int | np.uint64,  # of the world, see `world_key`
-    vehicle: int,  # id, in [0, 2**48)
-    tick: int,  # of the world, in [0, 2**48)
+    key: int | np.uint64,  # key of the world, see `world_key`
+    vehicle: int,  # id of the vehicle, in [0, 2**48)
+    tick: int,  # tick of the world, in [0, 2**48)
     stream: int,  # one of `STREAM_*`, plus the index of the draw
     n: int,  # number of values, in [1, 2**32)
 ) -> int:

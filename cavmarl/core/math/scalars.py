@@ -17,7 +17,7 @@ def clamp(value: float, low: float, high: float) -> float:
 def not_zero(value: float) -> float:
     """Return `value`, moved at least `NEAR_ZERO` away from zero, for use as a divisor.
 
-    Highway-env's `utils.not_zero`: a standing car is assumed to creep at 1 cm/s.
+    Highway-env's `utils.not_zero`: a stopped car is assumed to creep at 1 cm/s.
     """
     if abs(value) > NEAR_ZERO:
         return value

@@ -6,7 +6,7 @@ be unbounded or partly behind a camera (Olano, Greer: "Triangle scan conversion 
 coordinates", Graphics Hardware 1997). Column i of row j has its centre at (u, v) =
 (i + 0.5, j + 0.5), in pixels from the upper left corner.
 
-Areas that share an edge leave no gap: they compute the same position of it, bit for bit.
+Areas that share an edge leave no gap: they compute the same position of the edge, bit for bit.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from cavmarl.core.compiled import kernel
 
 @kernel
 def row_span(
-    edges: NDArray[np.float64],  # (E, 4) constant, by column, by row, and one over by column
+    edges: NDArray[np.float64],  # (E, 4) constant, by column, by row, and 1 / by column
     num: int,  # number of valid edges
     row: int,  # row of the image
     width: int,  # columns of the image

@@ -53,7 +53,7 @@ class LaneGrid(NamedTuple):
 class Scripts(NamedTuple):
     """Positions of scripted vehicles and pedestrians by tick; see `scenarios.movement_scripts`."""
 
-    frames: NDArray[np.void]  # FRAME (num_frames,), by VEHICLE["goal"] of a scripted row
+    frames: NDArray[np.void]  # FRAME (num_frames,), indexed by VEHICLE["goal"] of a scripted row
     covers: NDArray[np.void]  # COVER (num_covers,) stretches of lanes that bodies cover
     claims: NDArray[np.void]  # CLAIM (num_claims,) links claimed by vehicles that arrive soon
     cues: NDArray[np.void]  # CUE (T,) conditions that scripts wait for
@@ -102,11 +102,11 @@ class Worlds(NamedTuple):
     next_rows: NDArray[np.void]  # VEHICLE (W, C)
     num_owned: NDArray[np.int64]  # (W,) rows [0, num_owned) belong to this shard
     num_rows: NDArray[np.int64]  # (W,) rows [num_owned, num_rows) are ghosts
-    ticks: NDArray[np.int64]  # (W,) since reset
+    ticks: NDArray[np.int64]  # (W,) ticks since reset
     keys: NDArray[np.uint64]  # (W,) the root of all random numbers of the episode
     # (W, num_signals) active PHASE rows; then one column per link, see `signal_overrides`, or none
     signal_phase: NDArray[np.int32]
-    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of the actuated programs
+    controllers: NDArray[np.void]  # CONTROLLER (W, num_controllers) of actuated programs
     detected_s: NDArray[np.float64]  # (W, D) time when a body was last over each detector
     num_through: NDArray[np.int64]  # (W,) background vehicles that have arrived in this tick
     pending: NDArray[
@@ -179,8 +179,8 @@ class Demand(NamedTuple):
     """The generator's distributions of departures; the same for all worlds of an environment."""
 
     agent_trips: TripTable
-    start_trips: TripTable  # of background vehicles at the reset, in proportion to lane length
-    enter_trips: TripTable  # of background vehicles that enter later
+    start_trips: TripTable  # trips of background vehicles at reset, by lane length
+    enter_trips: TripTable  # trips of background vehicles that enter later
     # (M,) whether background vehicles enter at the start of their lane (a road into the map)
     enter_at_start: NDArray[np.bool_]
     num_agents: int  # agents in the world at the same time
@@ -210,8 +210,8 @@ class Scratch(NamedTuple):
     link_start: NDArray[np.int32]  # approach of link k: [link_start[k], link_end[k])
     link_end: NDArray[np.int32]
     approach: NDArray[np.void]  # APPROACH (4 C,) vehicles on or before links, by link
-    largest: NDArray[np.int8]  # (J,) the largest size class of these, by the links' junctions
-    pairs: NDArray[np.void]  # APPROACH (4 C,) the same before sorting
+    largest: NDArray[np.int8]  # (J,) the largest size class in `approach`, by junction
+    pairs: NDArray[np.void]  # APPROACH (4 C,) `approach` before sorting
     order: NDArray[np.int32]  # (C,) the owned rows in order along the lanes
     accel: NDArray[np.float64]  # (C,) decided accelerations
     link_ahead: NDArray[np.int32]  # (C,) the link at the next stop line of each row

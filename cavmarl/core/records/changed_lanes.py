@@ -1,4 +1,4 @@
-"""Lanes that differ from the map: the form of the caller's changes, and the table that follows.
+"""Lanes that differ from the map: the caller's changes, and the resulting table of lanes.
 
 A change is a row of three numbers, see `LANE_CHANGE`; rows whose first number is 0 are unused.
 Lanes without permissions on the map are contraflow lanes (`maps.contraflow`).
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 # Columns of LANE_CHANGE (N, 3), float64.
 CHANGED = 0  # 1 + LANE row; 0: the row is unused
-LIMIT_MPS = 1  # speed limit in m/s, at most that of the map
-# Bits of the vehicle classes that may not use the lane, see LANE["permissions"]. Of a contraflow
-# lane: of the classes that may use it.
+LIMIT_MPS = 1  # speed limit in m/s, at most the map's limit
+# Bits of the vehicle classes that may not use the lane, see LANE["permissions"]. For contraflow
+# lanes: classes that may use them.
 CLASSES = 2
 
 
@@ -32,7 +32,7 @@ def wrong_changes(told: NDArray[np.float64], lanes: NDArray[np.void]) -> str:
         return "a changed lane does not exist"
     lane = row.astype(np.int64)
     if (used[:, LIMIT_MPS] <= 0.0).any() or (used[:, LIMIT_MPS] > lanes["speed_mps"][lane]).any():
-        return "a speed limit is 0 or above that of the map"
+        return "a speed limit is 0 or above the map's limit"
     classes = used[:, CLASSES]
     if (classes != np.floor(classes)).any() or (classes >= 1 << 32).any():
         return "a lane is closed to an unknown class"

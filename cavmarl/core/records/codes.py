@@ -52,11 +52,11 @@ UNTIL_ABSOLUTE = 0
 UNTIL_FLOW = 1
 UNTIL_DEPARTURE = 2
 
-# VEHICLE["hold"]: the reason why a driver stands or will stop
+# VEHICLE["hold"]: the reason why a driver is stopped or will stop
 HOLD_NONE = 0
 HOLD_SIGNAL = 1  # red or yellow
 HOLD_YIELD = 2  # gives way
-HOLD_EXIT_BLOCKED = 3  # no room beyond the junction, or a vehicle on the junction blocks the way
+HOLD_EXIT_BLOCKED = 3  # no room beyond the junction, or a vehicle on the junction blocks the path
 
 # VEHICLE["events"]: bits, events of this step
 EVENT_COLLIDED = 1
@@ -65,7 +65,7 @@ EVENT_WRONG_WAY = 4
 EVENT_RED_LIGHT = 8
 EVENT_ARRIVED = 16
 EVENT_OUT_OF_TIME = 32  # its trip has exceeded its time limit
-EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # these precede OUT_OF_TIME
+EVENTS_OF_FATE = EVENT_COLLIDED | EVENT_OFF_ROAD | EVENT_ARRIVED  # have priority over OUT_OF_TIME
 EVENTS_THAT_END = EVENTS_OF_FATE | EVENT_OUT_OF_TIME
 
 # VEHICLE["transfer"]

@@ -10,8 +10,8 @@ EXTERNAL_POSED = 1.0  # at the given pose at the end of the step
 EXTERNAL_DRIVEN = 2.0  # kinematic bicycle, driven by throttle and steering
 EXTERNAL_REMOVED = 3.0
 
-# Ids of external vehicles begin here, so that they change no id of another vehicle. The lowest 31
-# bits, which are the ids of ROS markers, differ from those of the other vehicles, too.
+# Ids of external vehicles begin here, so that the ids of other vehicles do not depend on them. The
+# lowest 31 bits, which are the ids of ROS markers, are also unique.
 FIRST_EXTERNAL_ID = (1 << 40) + (1 << 30)
 
 
@@ -27,12 +27,12 @@ EXTERNAL = np.dtype(
         (name, np.float64)
         for name in (
             "kind",  # EXTERNAL_*
-            "x",  # m, of the centre
+            "x",  # position of the centre, m
             "y",
             "z",  # m; NaN: the height of the lane
             "heading",  # rad
             "pitch",  # rad; NaN: the slope of the lane
-            "speed",  # m/s along the heading; NaN: of the move to the pose
+            "speed",  # m/s along the heading; NaN: speed of the move to the pose
             "throttle",  # m/s², of a driven vehicle
             "steering",  # rad, of a driven vehicle
             "vtype",  # VTYPE row

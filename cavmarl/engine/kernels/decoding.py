@@ -14,8 +14,8 @@ from cavmarl.core.compiled import kernel
 def decode_pairs(
     actions: NDArray[Any],  # (W, A, 2) floats
     mask: NDArray[np.bool_],  # (W, A) agents whose actions are read; others count as 0
-    acceleration_mps2: float,  # of a throttle of 1
-    steering_rad: float,  # of a steering of 1
+    acceleration_mps2: float,  # acceleration at throttle 1
+    steering_rad: float,  # steering angle at steering 1
     last: NDArray[np.float64],  # (W, A, 2) is written, the actions
     controls: NDArray[np.float64],  # (W, A, 2) is written, m/s² and rad
 ) -> bool:  # whether all actions are within [-1, 1]; NaN is not

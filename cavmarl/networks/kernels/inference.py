@@ -1,8 +1,8 @@
 """Evaluation of a whole driver network in one call.
 
 A network is a table of layers, int64 (L, 4), and one flat array of all weights. A row of the table
-holds the kind of the layer, the widths of its input and its output, and the place of its first
-weight. By kind, the weights from that place on are:
+holds the kind of the layer, the widths of its input and its output, and the index of its first
+weight. The weights of each kind of layer are:
 
 | kind | weights | effect on a row |
 |---|---|---|
@@ -34,7 +34,7 @@ GRU = 6
 RESIDUAL = 7
 
 TILE_ROWS = 8  # rows that are evaluated together, so that each weight is read once for all of them
-NUM_BUFFERS = 3  # the input and the output of a layer, and a part of a sum
+NUM_BUFFERS = 3  # for the input and the output of a layer, and for partial sums
 
 
 @kernel
@@ -112,7 +112,7 @@ def _evaluate_tile(
 
 @kernel
 def _copy(source: Float32s, target: Float32s) -> None:
-    """Copy `source` (n,) to the first places of `target`."""
+    """Copy `source` (n,) to the first n items of `target`."""
     for i in range(source.shape[0]):
         target[i] = source[i]
 

@@ -37,18 +37,18 @@ CIRCLE_MARGIN_M = 0.01  # margin around two circles that do not touch; larger th
 def _progress(row: np.void, step_s: float) -> float:
     """Return the progress towards the goal in m.
 
-    After a wrong turn the new way may be much longer, so progress and loss are limited to twice the
-    distance at the present speed (at least 1 m/s).
+    After a wrong turn the new route may be much longer, so progress and loss are limited to twice
+    the distance at the present speed (at least 1 m/s).
     """
     if row["step_to_go"] == math.inf:
-        return 0.0  # before the step, no way led to the goal
+        return 0.0  # before the step, no route led to the goal
     most = max(row["speed"], 1.0) * step_s * 2.0
     return clamp(row["step_to_go"] - row["to_go"], -most, most)
 
 
 @kernel
 def _speeding(roads: RoadArrays, row: np.void) -> float:
-    """Return the speed above the lane's limit as a share of it; `delay` covers lower speeds."""
+    """Return the speed above the lane's limit / the limit; `delay` covers lower speeds."""
     return float(max(row["speed"] / roads.lanes[row["lane"]]["speed_mps"] - 1.0, 0.0))
 
 

@@ -33,8 +33,8 @@ RANDOM = "random"
 _IGNORED: Mapping[str, tuple[tuple[Any, ...], str]] = {
     "use_gui": ((False,), "SUMO does not run; set render_mode, or record and replay a world"),
     "virtual_display": (((3200, 1800), None), "frames need no display"),
-    "max_depart_delay": ((-1,), "vehicles wait to depart for as long as they must"),
-    "waiting_time_memory": ((1000,), "waiting times on a lane are remembered without a limit"),
+    "max_depart_delay": ((-1,), "vehicles wait to depart without a time limit"),
+    "waiting_time_memory": ((1000,), "all waiting times on a lane are remembered"),
     "time_to_teleport": ((-1, 0), "no vehicle is teleported"),
     "sumo_warnings": ((True,), "SUMO does not run; set the level of the logger cavmarl"),
 }
@@ -73,7 +73,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         sumo_seed: seed of every episode, or `random`.
         fixed_ts: whether signals follow the programs of the map; actions are not read.
         sumo_warnings: ignored.
-        additional_sumo_cmd: further options of SUMO; docs/guides/demand.md lists supported ones.
+        additional_sumo_cmd: further options of SUMO; docs/guides/demand.md lists supported options.
         render_mode: `human`, `rgb_array` or None.
         overrides: keys of env.yaml.
 
@@ -297,7 +297,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         return observations, rewards, dict.fromkeys(self.ts_ids, False) | {"__all__": is_over}, info
 
     def advance(self, actions: Mapping[str, Any]) -> None:
-        """Carry out actions by id, and advance the world by `delta_time`; see `step`."""
+        """Apply actions by id, and advance the world by `delta_time`; see `step`."""
         world = self.world
         if not self.episode:
             raise EpisodeError("step() before reset(): call reset() first")

@@ -1,4 +1,4 @@
-"""Observations of a `TrafficSignal`: the base class for one's own, and sumo-rl's default."""
+"""Observations of a `TrafficSignal`: the base class for your own, and sumo-rl's default."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ class ObservationFunction(ABC):
 class DefaultObservationFunction(ObservationFunction):
     """The green as one value of 1 among zeros, whether it may end, and densities by lane.
 
-    The densities of all vehicles on each incoming lane are followed by those of standing vehicles.
+    First come the densities of all vehicles by incoming lane, then of stopped vehicles by lane.
     """
 
     def __call__(self) -> NDArray[np.float32]:

@@ -1,4 +1,4 @@
-"""The environments of RESCO that sumo-rl names, from a folder of maps of the user.
+"""The environments of RESCO that sumo-rl names, from a user's folder of maps.
 
 Ault and Sharon: "Reinforcement learning benchmarks for traffic signal control", 2021. The maps have
 non-commercial licences or the GPL, so this package does not contain them.
@@ -35,7 +35,7 @@ _SCENARIOS = {
 
 
 def _make(name: str, parallel: bool, nets: str | Path | None, arguments: dict[str, Any]) -> Any:
-    """Make an environment; arguments of the caller replace those of the scenario."""
+    """Make an environment; the caller's arguments replace the scenario's."""
     folder = _folder(name, nets)
     scenario = _SCENARIOS[name]
     given = {
@@ -60,13 +60,13 @@ def _folder(name: str, nets: str | Path | None) -> Path:
         if (folder / f"{name}.net.xml").is_file():
             return folder
     raise ConfigError(
-        f"{name}: {str(root)!r} has no {name}/{name}.net.xml, also not in its folder RESCO; pass "
+        f"{name}: {str(root)!r} has no {name}/{name}.net.xml, nor has its folder RESCO; pass "
         f"nets=FOLDER or set {NETS} to a folder with the maps of RESCO"
     )
 
 
 def grid4x4(parallel: bool = True, nets: str | Path | None = None, **arguments: Any) -> Any:
-    """Return a grid of 16 signals; other arguments are those of `SumoEnvironment`."""
+    """Return a grid of 16 signals; for other arguments, see `SumoEnvironment`."""
     return _make("grid4x4", parallel, nets, arguments)
 
 

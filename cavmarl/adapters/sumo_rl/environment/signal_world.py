@@ -42,7 +42,7 @@ from cavmarl.signals.kernels.lane_counts import (
 from cavmarl.signals.signal_table import SignalTable
 
 TICK_S = 0.2
-_MOST_STEP_S = 1.0  # of worlds whose signals follow their programs; SUMO's step
+_MOST_STEP_S = 1.0  # step of worlds whose signals follow their programs; SUMO's step
 
 
 @dataclass(frozen=True)
@@ -50,14 +50,14 @@ class WorldSettings:
     """The arguments of a `SumoEnvironment` that its world depends on; times are in s."""
 
     net_file: str
-    route_file: str  # one or several, separated by commas
+    route_file: str  # one or several files, separated by commas
     begin_s: float
     horizon_s: float
     decide_s: float
     yellow_s: float
     min_green_s: float
-    follows_programs: bool  # instead of choices
-    sumo_options: str  # of SUMO's command line
+    follows_programs: bool  # signals follow their programs instead of choices
+    sumo_options: str  # options of SUMO's command line
     render_mode: str | None
     overrides: Mapping[str, Any]  # keys of env.yaml
 
@@ -167,7 +167,7 @@ class SignalWorld:
             controlled = with_agent_programs(self.network, settings.signals)
         self.table = SignalTable(controlled)
         self.counts: NDArray[np.int64] = np.zeros((len(self.table.lanes), COUNTS), dtype=np.int64)
-        self._stood: dict[int, tuple[int, int]] = {}  # vehicle → lane, and steps stood on it
+        self._stood: dict[int, tuple[int, int]] = {}  # vehicle → lane, and steps stopped on it
         self._steps = 0
         self._is_seeded = False
         self._view: WorldView | None = None
@@ -179,7 +179,7 @@ class SignalWorld:
 
     @property
     def is_over(self) -> bool:
-        """Whether the episode has as many steps as it can have."""
+        """Whether the episode has reached its number of steps."""
         return self._steps >= self._settings.steps
 
     def reset(self, seed: int | None) -> None:
@@ -234,7 +234,7 @@ class SignalWorld:
         return int(self.network.programs[self.network.signals["program"][row]]["num_phases"])
 
     def stood_s(self, lanes: Sequence[int]) -> list[float]:
-        """Return for each lane how long its vehicles have stood on it, in total."""
+        """Return for each lane the total time for which its vehicles have been stopped."""
         unit_s = self._clock.sim_dt_s
         if self._settings.follows_programs:
             unit_s = self._clock.ctrl_dt_s
@@ -306,7 +306,7 @@ def _options(text: str) -> Iterator[tuple[str, str]]:
         option = known_options().get(name)
         if option is None or not word.startswith("-"):
             raise ConfigError(
-                f"additional_sumo_cmd = {text!r}: {word!r} is no option of SUMO; write options as "
+                f"additional_sumo_cmd = {text!r}: {word!r} is not an option of SUMO; write them as "
                 "for the program sumo"
             )
         if not has_value:

@@ -1,4 +1,4 @@
-"""`TrafficSignal`: a signal as reward functions and observations of sumo-rl's users read it."""
+"""`TrafficSignal`: the interface of a signal for sumo-rl's reward functions and observations."""
 
 from __future__ import annotations
 
@@ -21,8 +21,8 @@ RewardFunction: TypeAlias = Callable[["TrafficSignal"], Any]
 OneReward: TypeAlias = str | RewardFunction
 Rewards: TypeAlias = OneReward | Sequence[OneReward]
 
-GREEN_S = 60.0  # duration of a green in `all_phases`; without a meaning, as greens are chosen
-WAIT_SCALE_S = 100.0  # of the reward diff-waiting-time
+GREEN_S = 60.0  # duration of a green in `all_phases`; not used, as greens are chosen
+WAIT_SCALE_S = 100.0  # scale of the reward diff-waiting-time
 
 
 class SignalPhase(NamedTuple):
@@ -35,7 +35,7 @@ class SignalPhase(NamedTuple):
 class TrafficSignal:
     """A signal whose greens are chosen: its lanes, vehicles and rewards.
 
-    Counts are those of the last decision.
+    Counts refer to the last decision.
 
     Args:
         env: the environment.
@@ -61,10 +61,10 @@ class TrafficSignal:
         last_reward: reward of the last decision; None before the first one.
 
     Raises:
-        ConfigError: there is no reward of a name.
+        ConfigError: there is no reward of that name.
     """
 
-    MIN_GAP = 2.5  # m between standing vehicles, for the number of vehicles that a lane holds
+    MIN_GAP = 2.5  # m between stopped vehicles, for the number of vehicles that a lane holds
 
     def __init__(
         self, env: SumoEnvironment, ts_id: str, world: SignalWorld, reward_fn: Rewards
@@ -192,7 +192,7 @@ class TrafficSignal:
         """Return the green that an action begins, if the present green may end.
 
         Raises:
-            ActionError: the action is no index of a green.
+            ActionError: the action is not the index of a green.
         """
         shape = np.shape(action)
         if shape not in ((), (1,)) or np.asarray(action).dtype.kind not in "iu":
@@ -240,17 +240,17 @@ class TrafficSignal:
         return reward
 
     def get_accumulated_waiting_time_per_lane(self) -> list[float]:
-        """Return for each incoming lane how long its vehicles have stood on it, in s."""
+        """Return for each incoming lane how long its vehicles have been stopped on it, in s."""
         return self._world.stood_s(self._in)
 
     def get_average_speed(self) -> float:
-        """Return the mean speed on incoming lanes, as a share of the allowed one; 1 if empty."""
+        """Return the mean speed on incoming lanes, as a share of the speed limit; 1 if empty."""
         counts = self._world.counts[self._in].sum(axis=0)
         vehicles = int(counts[VEHICLES])
         return float(counts[SPEED_PPM]) * 1e-6 / vehicles if vehicles else 1.0
 
     def get_pressure(self) -> int:
-        """Return the number of vehicles on outgoing lanes less that on incoming lanes."""
+        """Return the number of vehicles on outgoing lanes minus the number on incoming lanes."""
         vehicles = self._world.counts[:, VEHICLES]
         return int(vehicles[self._out].sum()) - int(vehicles[self._in].sum())
 
@@ -259,7 +259,7 @@ class TrafficSignal:
         return self._shares(self._in, VEHICLES)
 
     def get_lanes_queue(self) -> list[float]:
-        """Return the standing vehicles on each incoming lane as a share of its room."""
+        """Return the stopped vehicles on each incoming lane as a share of its room."""
         return self._shares(self._in, STANDING)
 
     def get_out_lanes_density(self) -> list[float]:
@@ -267,7 +267,7 @@ class TrafficSignal:
         return self._shares(self._out, VEHICLES)
 
     def get_total_queued(self) -> int:
-        """Return the number of standing vehicles on incoming lanes."""
+        """Return the number of stopped vehicles on incoming lanes."""
         return int(self._world.counts[self._in, STANDING].sum())
 
     def _shares(self, lanes: list[int], column: int) -> list[float]:
@@ -282,7 +282,7 @@ class TrafficSignal:
 
     @classmethod
     def register_reward_fn(cls, fn: RewardFunction) -> None:
-        """Let `reward_fn` name a function by its name.
+        """Register a function, so that `reward_fn` can name it.
 
         Raises:
             ConfigError: the name exists already.
@@ -312,7 +312,7 @@ def signals_of(
         reward_fn = dict.fromkeys(env.ts_ids, reward_fn)
     if wrong := set(env.ts_ids) ^ set(reward_fn):
         name = min(wrong)
-        problem = "has no reward" if name in env.ts_ids else "is no signal of this map"
+        problem = "has no reward" if name in env.ts_ids else "is not a signal of this map"
         raise ConfigError(
             f"reward_fn: {name!r} {problem}; give one to each of {', '.join(env.ts_ids[:8])}"
         )
