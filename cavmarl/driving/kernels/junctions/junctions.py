@@ -59,7 +59,7 @@ LAST_CHANCE_M = 3.0  # a driver whose front is this close to the line still goes
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
 EXIT_LOOK_M = 75.0  # largest distance of that search: room for ten cars
-SWAP_TICKS = 64  # two vehicles that wait for room on each other's lane alternate after this time
+SWAP_TICKS = 64  # length of a turn for two vehicles that wait for room on each other's lane
 # A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
 CREPT_M = 2.4
 CREPT_MPS = 2.0

@@ -273,8 +273,8 @@ def _search_incoming(
         distance += row["length_m"]
         if row["num_into"] == 0:
             break
-        # Before a junction only the first incoming lane is searched: the right of way decides about
-        # the other lanes.
+        # Further back, only the first incoming lane is searched: the right of way decides about the
+        # other lanes.
         before = roads.into[row["first_into"]]
     return -1, math.inf
 
@@ -286,7 +286,7 @@ def behind_by(
     lane: int,
     s: float,
     own_id: int,
-    n: int,  # number of the incoming lane to search
+    n: int,  # number of the incoming lane to search; 0 if there is none
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
