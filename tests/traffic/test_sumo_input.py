@@ -164,7 +164,7 @@ def test_options_that_change_traffic_are_passed_to_sumo(tmp_path: Path, trip: st
     (tmp_path / "run.sumocfg").write_text(
         "<c><processing><what-is-this value='1'/></processing></c>"
     )
-    with pytest.raises(ConfigError, match="<what-is-this> is no option of SUMO"):
+    with pytest.raises(ConfigError, match="<what-is-this> is not an option of SUMO"):
         read_input([tmp_path / "run.sumocfg"])
 
 
