@@ -181,7 +181,7 @@ def test_files_that_cannot_be_checked_are_refused(tmp_path: Path, trip: str, enc
 
 def test_a_file_that_includes_another_is_refused(tmp_path: Path, trip: str) -> None:
     (tmp_path / "r.rou.xml").write_text(f'<routes><include href="x"/>{trip}</routes>')
-    with pytest.raises(ConfigError, match="<include> is not followed"):
+    with pytest.raises(ConfigError, match="<include> is not supported"):
         run(tmp_path, "r.rou.xml")
 
 
