@@ -50,7 +50,7 @@ class TripWays:
             way = self._way(start, goal, mask)
             if way is None:
                 names = self._network.edge_ids
-                raise RouteError(f"no way from edge '{names[start]}' to edge '{names[goal]}'")
+                raise RouteError(f"no route from edge '{names[start]}' to edge '{names[goal]}'")
             if not self._turns.isdisjoint(pairwise([start, *way.tolist()])):
                 self.turned.add((goal, mask))
             found.append(way)

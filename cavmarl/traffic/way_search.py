@@ -99,8 +99,8 @@ def way_slots(
     steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * longest))
     if num_worlds * number * steps > MAX_STEPS:
         raise CapacityError(
-            f"{num_worlds} worlds, {number} vehicles each that may search for a way, {steps} steps "
-            f"per way: more than {MAX_STEPS} steps; use fewer worlds, fewer vehicles with a "
+            f"{num_worlds} worlds, {number} vehicles each that may search for a route, {steps} "
+            f"steps per route: over {MAX_STEPS} steps; use fewer worlds, fewer vehicles with a "
             "rerouting device, or give trips their routes (duarouter)"
         )
     return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)

@@ -54,7 +54,7 @@ assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
 
 
 class Movements(NamedTuple):
-    """Links of a network with their conflicts and ways, by LINK row."""
+    """Links of a network with their conflicts and ways (see the module), by LINK row."""
 
     links: NDArray[np.void]  # LINK (K,), with conflicts
     conflicts: NDArray[np.void]  # CONFLICT

@@ -53,7 +53,7 @@ TO_GO_SCALE = 1000.0  # m
 LENGTH_SCALE = 20.0  # m
 WHEELBASE_SCALE = 10.0  # m
 HALF_S = 5.0  # a time of this length has a soonness of 0.5
-SLOWEST_MPS = 1.0  # the vehicle is assumed to approach at least this fast, even if it stands
+SLOWEST_MPS = 1.0  # the vehicle is assumed to approach at least this fast, even if stopped
 
 
 @kernel

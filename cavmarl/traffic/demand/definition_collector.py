@@ -273,7 +273,7 @@ class DefinitionCollector:
         self._departures += self._scale * timing.expected(self._begin_ms, end)
         if self._departures > self._max_departures:
             raise element.error(
-                f"makes more than {self._max_departures} departures together with earlier ones",
+                f"makes more than {self._max_departures} departures, including earlier elements",
                 "cut the demand, or raise max_departures if there is memory for it",
                 CapacityError,
             )

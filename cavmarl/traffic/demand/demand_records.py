@@ -80,7 +80,7 @@ CODES = {
 }
 
 UNTIL_ABSOLUTE = 0  # time of the simulation
-UNTIL_FLOW = 1  # the same for a flow's first vehicle; for later ones, shifted by the departure
+UNTIL_FLOW = 1  # the same for a flow's first vehicle; shifted by the departure for later vehicles
 UNTIL_DEPARTURE = 2  # time since the vehicle's departure (stops of standalone routes)
 
 FLOW_REGULAR = 0  # also single vehicles, as flows of one

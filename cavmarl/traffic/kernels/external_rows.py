@@ -246,7 +246,7 @@ def write_external(
     told: np.void,  # EXTERNAL
     vehicle: int,  # id of the vehicle
     slot: int,
-    nowhere: int,  # the way of a vehicle without a route
+    nowhere: int,  # VEHICLE["way"] of a vehicle without a route
     key: np.uint64,  # random key of the world
     tick: int,
     row: np.void,  # VEHICLE, blank; written
@@ -273,7 +273,7 @@ def add_external(
     coming: NDArray[np.bool_],  # (W, E) slots whose vehicles enter in this tick
     ids: NDArray[np.int64],  # (W, E), written
     blank: NDArray[np.void],  # VEHICLE (1,), template of every vehicle's record
-    nowhere: int,  # the way of a vehicle without a route
+    nowhere: int,  # VEHICLE["way"] of a vehicle without a route
     departures: DepartureQueue,  # passing is written
     ticks: NDArray[np.int64],  # (W,)
     keys: NDArray[np.uint64],  # (W,)

@@ -38,7 +38,7 @@ class Paths(NamedTuple):
     first: NDArray[np.int64]  # (P + 1,) path p has the rows [first[p], first[p + 1]) of:
     edges: NDArray[np.int32]  # EDGE rows; -1: not on this map
     ways: NDArray[np.int64]  # VEHICLE["way"] on that edge
-    nowhere: int  # the way of a vehicle on no edge of its route
+    nowhere: int  # VEHICLE["way"] of a vehicle on no edge of its route
 
 
 @kernel
