@@ -363,7 +363,7 @@ def decide(
     rows: NDArray[np.void],  # VEHICLE (C,), the committed state; read-only
     num: int,  # decide for the first `num` rows; the lane and link indices contain all rows
     driver: int,  # only for rows with this DRIVER_*
-    tick: int,  # of the committed state
+    tick: int,  # tick of the committed state
     dt: float,  # s for which a decision is valid: a tick, or an agent's step
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     step: NDArray[np.void],  # (C,) the PLAN of each row's lane

@@ -133,7 +133,7 @@ def _needed_cut(
 
 
 def redraw(shapes: list[Shape], way: Way) -> None:
-    """Replace the internal lanes of a movement by a curve, divided by their lengths."""
+    """Replace the internal lanes of a movement by a curve, divided in proportion to the lanes."""
     curve = smooth_curve(shapes[way.before], shapes[way.after])
     lengths = [max(shape_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
     whole = shape_length(curve)

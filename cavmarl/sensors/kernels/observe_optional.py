@@ -41,7 +41,7 @@ class OptionalSensors(NamedTuple):
 
 @kernel
 def observe_optional_frame(
-    roads: RoadArrays,  # of the world
+    roads: RoadArrays,  # roads of the world
     travel: TripTables,
     lane_grid: LaneGrid,
     rows: NDArray[np.void],

@@ -67,7 +67,7 @@ SEMANTIC_OF_CLASS = {
 
 
 PRISM = record(
-    ("id", np.int64),  # of the vehicle or pedestrian
+    ("id", np.int64),  # id of the vehicle or pedestrian
     ("semantic", np.int64),  # one of the classes above
     ("x", np.float64),  # centre, m
     ("y", np.float64),

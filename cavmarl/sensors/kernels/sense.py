@@ -268,7 +268,7 @@ def observe_lidar(
 
 @kernel
 def observe_frame(
-    roads: RoadArrays,  # of the world
+    roads: RoadArrays,  # roads of the world
     plans: NDArray[np.void],  # PLAN (G, L) that the vehicle follows
     travel: TripTables,
     rows: NDArray[np.void],

@@ -89,7 +89,7 @@ def measure_inertia(
 ) -> None:
     """Write the samples that are due for the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) force and rate.
+    `before`: POSE (W, A) at the previous tick. `scratch`: (6,). `data`: (W, A, S, 6) force, rate.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]

@@ -51,7 +51,7 @@ def lidar_directions(
 
 
 def has_echo(distances_m: Floats, range_m: float) -> NDArray[np.bool_]:
-    """Return which rays with these distances have hit something; the others have the range."""
+    """Return which rays with these distances have hit something; other rays end at the range."""
     return distances_m < range_m - ECHO_MARGIN_M
 
 

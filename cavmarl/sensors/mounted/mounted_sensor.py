@@ -36,7 +36,7 @@ class SensedScene(NamedTuple):
     travel: TripTables  # vehicle types
     worlds: Worlds  # the committed rows: the zone's own rows, then ghosts
     grid: Grid  # scratch: spatial index of one world, filled by the sensor that uses it
-    before: NDArray[np.void]  # POSE (W, A) of all agents at the tick before
+    before: NDArray[np.void]  # POSE (W, A) of all agents at the previous tick
 
 
 class Platform(NamedTuple):

@@ -82,7 +82,7 @@ class Rig:
 
     @property
     def before(self) -> NDArray[np.void]:
-        """POSE (W, A) at the tick before."""
+        """POSE (W, A) at the previous tick."""
         return self._before
 
     def begin(self, scenes: Sequence[SensedScene]) -> None:

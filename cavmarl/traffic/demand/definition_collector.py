@@ -171,7 +171,7 @@ class DefinitionCollector:
         self._departs = departs
         self._scale = scale
         self._departures = 0.0
-        self._latest_ms: dict[str, int] = {}  # by file
+        self._latest_ms: dict[str, int] = {}  # latest departure by file
 
     def take(self, element: Element) -> None:
         """Store one definition.

@@ -409,7 +409,7 @@ class SumoSimulation:
 
 
 def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
-    """Return a getter by name that skips the Python wrapper which SWIG generates for libsumo.
+    """Return a getter by name, without the Python wrapper that SWIG generates for libsumo.
 
     The wrapper only forwards its arguments, but takes a fifth of the time. If the interface has no
     such inner function, like TraCI, return the usual getter.

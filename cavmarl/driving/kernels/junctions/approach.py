@@ -38,8 +38,8 @@ APPROACH = np.dtype(
         ("link", np.int32),
         ("row", np.int32),  # VEHICLE row
         ("dist", np.float64),  # from the centre to the stop line, m; negative beyond the line
-        ("speed", np.float64),  # m/s
-        ("half", np.float64),  # half its length, m
+        ("speed", np.float64),  # speed of the vehicle, m/s
+        ("half", np.float64),  # half the length of the vehicle, m
         ("id", np.int64),
     ],
     align=True,

@@ -103,7 +103,7 @@ def behind_over_line(
     distance: float,
     scratch: Scratch,
 ) -> float:
-    """Return the constraint of a vehicle ahead on a short lane, with its rear before the line.
+    """Return the constraint of a vehicle on short lanes ahead whose rear is before the line.
 
     `lane` is the first lane behind the line, which is `distance` m ahead.
     """

@@ -29,8 +29,8 @@ VIEW_M = 250.0  # upper limit of a world's viewing distance along the road
 ENTRY = np.dtype(
     [
         ("s", np.float64),  # position of the centre on this lane, m
-        ("speed", np.float64),  # m/s
-        ("half", np.float64),  # half its length, m
+        ("speed", np.float64),  # speed of the vehicle, m/s
+        ("half", np.float64),  # half the length of the vehicle, m
         ("decel", np.float64),  # comfortable deceleration, m/s², positive
         ("id", np.int64),
         ("row", np.int32),  # VEHICLE row

@@ -96,4 +96,4 @@ def _acceleration(
     return ask_model(code, speed, allowed, gap, front_speed, min_gap, tau, accel, decel)
 
 
-REGISTERED = acceleration_model(_acceleration)  # of all registered models
+REGISTERED = acceleration_model(_acceleration)  # functions of all registered models
