@@ -124,7 +124,7 @@ def test_a_file_name_that_sumo_expands_to_another_file_is_refused(
         '<additional><edgeData id="d" file="victim"/></additional>'
     )
     (tmp_path / "r.rou.xml").write_text(f"<routes>{trip}</routes>")
-    with pytest.raises(ConfigError, match=r"reads a name with .* another file; rename"):
+    with pytest.raises(ConfigError, match=r"reads a name with .* another file.s name; rename"):
         run(tmp_path, name, "r.rou.xml")
 
 
