@@ -1,4 +1,4 @@
-"""The view of agents' surroundings that registered functions receive.
+"""The view of an agent's surroundings that registered functions receive.
 
 The view does not depend on the division of the world: it contains the vehicles within the reach
 that the function declares, ordered by id, with the fields that zones share about their vehicles.
@@ -17,7 +17,7 @@ from cavmarl.core.errors import RegisteredFunctionError
 from cavmarl.driving.vehicles import GHOST_FIELDS, STATE_FIELDS
 from cavmarl.roads.network import RoadNetwork
 
-ORDER_CHECKS = 32  # number of checks per function, of views with at least two other vehicles
+ORDER_CHECKS = 32  # per function, the number of views with two or more others that are checked
 _OWN = list(STATE_FIELDS)
 _OTHERS = list(GHOST_FIELDS)
 
@@ -28,7 +28,7 @@ class AgentView:
 
     Attributes:
         own: the fields of `VEHICLE` (docs/guides/extending.md) of the agent's vehicle.
-        others: (n,) the same for vehicles whose centres are within the reach, by increasing id.
+        others: (n,) the same fields of vehicles whose centres are in reach, by increasing id.
         network: the roads; `own["lane"]` is a row of `network.lanes`.
         step_s: length of a step in s.
     """
@@ -48,9 +48,9 @@ class BatchView:
 
     Attributes:
         own: (n,) the fields of `VEHICLE` (docs/guides/extending.md) of the agents' vehicles.
-        others: (m,) the same for the vehicles near each agent, agent by agent, by increasing id. A
-            vehicle near two agents occurs twice.
-        agent: (m,) for each of `others`, the row of `own` that the vehicle is near.
+        others: (m,) the same fields of vehicles near each agent, agent by agent, by increasing id.
+            A vehicle near two agents occurs twice.
+        agent: (m,) for each vehicle of `others`, the row of the agent in `own`.
         network: the roads; `own["lane"]` are rows of `network.lanes`.
         step_s: length of a step in s.
     """
@@ -62,7 +62,7 @@ class BatchView:
     step_s: float
 
     def chosen(self, agents: NDArray[np.int64]) -> BatchView:
-        """Return the view of these agents, in this order."""
+        """Return a view that contains only these rows of `own`, in this order."""
         pairs = [np.flatnonzero(self.agent == agent) for agent in agents.tolist()]
         return replace(
             self,
@@ -72,7 +72,7 @@ class BatchView:
         )
 
     def single(self) -> Iterator[AgentView]:
-        """Return the view of each agent."""
+        """Yield one `AgentView` per agent."""
         bounds = np.searchsorted(self.agent, np.arange(len(self.own) + 1))
         for k in range(len(self.own)):
             others = self.others[bounds[k] : bounds[k + 1]]
@@ -82,7 +82,7 @@ class BatchView:
 def batch_view(
     rows: NDArray[np.void],  # VEHICLE (n,), owned rows and ghosts
     agents: NDArray[np.int64],  # rows of the agents' vehicles
-    reach_m: float,  # largest distance of the centres of other vehicles
+    reach_m: float,  # largest distance between the centres of the agent and of other vehicles
     network: RoadNetwork,
     step_s: float,  # length of a step, s
 ) -> BatchView:
@@ -104,7 +104,7 @@ def batch_view(
 
 
 class RegisteredFunction:
-    """A registered function: called for a batch of agents, and its results are checked.
+    """A registered function, with checks of the values that it returns.
 
     Args:
         name: the name of the function.
@@ -171,7 +171,7 @@ class RegisteredFunction:
         self._refuse(f"{answer!r:.200}")
 
     def _check_order(self, view: BatchView, numbers: NDArray[np.float32]) -> None:
-        """Compare the values with those for vehicles and agents in another order, and alone."""
+        """Check that values do not depend on the order of vehicles or on other agents."""
         for order in (np.arange(view.agent.size)[::-1], np.roll(np.arange(view.agent.size), 1)):
             moved = order[np.argsort(view.agent[order], kind="stable")]
             again = self._ask(replace(view, others=view.others[moved]))
@@ -189,7 +189,7 @@ class RegisteredFunction:
         if wrong.any():
             before, after = numbers[wrong][0].tolist(), again[wrong][0].tolist()
             raise RegisteredFunctionError(
-                f"registered function '{self._name}' depends on {changed}: it returned {before}, "
-                f"and after a change {after}; use values that are independent of it, such as the "
+                f"registered function '{self._name}' depends on {changed}: it returned {before} "
+                f"before and {after} after a change; use values that do not, such as the "
                 "nearest, the minimum or the sum over each agent's others"
             )

@@ -1,4 +1,4 @@
-"""The car-following models by name: those of the package, of SUMO, and registered ones."""
+"""Names of car-following models: models of the package, of SUMO, and registered models."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from cavmarl.driving.kernels.models.registered_models import (
 _BY_CASE = {model.name.casefold(): model.code for model in MODELS}
 _CODES = {model.name: model.code for model in MODELS}
 
-# SUMO's other models, with the model of the package whose equations are most similar.
+# For SUMO's other models, the model of the package whose equations are most similar.
 NEAREST_MODEL = {
     "KraussOrig1": "Krauss",
     "KraussPS": "Krauss",
@@ -37,17 +37,17 @@ NEAREST_MODEL = {
 
 
 def model_names() -> tuple[str, ...]:
-    """Return the names of all models that exist here, for `traffic.model` and `carFollowModel`."""
+    """Return the model names that `traffic.model` and `carFollowModel` accept."""
     return (*_CODES, *REGISTERED_MODELS.names)
 
 
 def has_model(name: str) -> bool:
-    """Return whether a name is in `model_names`."""
+    """Return whether `model_names` contains a name."""
     return name in _CODES or name in REGISTERED_MODELS
 
 
 def model_code(name: str, key: str = "traffic.model") -> int:
-    """Return MODEL_* of a model by name; models of the package in upper or lower case.
+    """Return the MODEL_* code of a name; for models of the package, case does not matter.
 
     Raises:
         ConfigError: there is no such model; the message names `key` as the place.
@@ -60,7 +60,7 @@ def model_code(name: str, key: str = "traffic.model") -> int:
         return _BY_CASE[name.casefold()]
     known = ", ".join(model_names())
     raise ConfigError(
-        f"{key} = {name!r} is not a driver model; choose one of {known}, or zoo: and the name of "
+        f"{key} = {name!r} is not a driver model; use one of {known}, or 'zoo:' and the name of "
         "a trained driver. If a module registers the model with cavmarl.register_driver_model, "
         f"{HOW}"
     )

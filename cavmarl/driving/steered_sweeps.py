@@ -1,9 +1,9 @@
 """Swept areas of steered cars, for the maps of worlds with agents.
 
 Background vehicles have both bumpers on their paths. A steered car, whose axles are at its bumpers,
-drives with its front outside and its rear inside of a bend, and turns in late. So a car is driven
-over each link once, and SWEEP rows describe where it meets vehicles on other links. Only the
-built-in drivers of agents' vehicles read these rows.
+turns late and drives with its front outside and its rear inside of a bend. So a car is driven over
+each link once, and SWEEP rows describe where it meets vehicles on other links. Only the built-in
+drivers of agents' vehicles read these rows.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LENGTH_M, WIDTH_M = 5.0, 2.0
 HALF_M = 0.5 * SIZE_BODIES_M[0]
 BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
 TICKS_S = (0.05, 0.1)  # the longer a tick, the further out a car drives
-SETTLE_M = 20.0  # additional start distance, so that the car arrives at the speed of the bend
+SETTLE_M = 20.0  # additional start distance, so that the car reaches the speed of the bend
 MOST_POSES = 2000
 FORMAT = "steered-4"  # change it when the rows of the same map change
 
@@ -63,7 +63,7 @@ def with_steered_sweeps(network: RoadNetwork) -> RoadNetwork:
     own = np.split(network.sweeps, links["first_sweep"][1:]) if len(links) else []
     parts: list[bytes] = []
     for link, (old, rows) in enumerate(zip(own, found, strict=True)):
-        # Behind a vehicle that makes a U-turn, a steered car waits as other cars do.
+        # Behind a vehicle that makes a U-turn, a steered car waits like any other car.
         behind = links["from_lane"][old["foe"]] == links["from_lane"][link]
         rows += [(int(k["foe"]), STEERED, *k.item()[2:]) for k in old[behind & (old["own"] == 0)]]
         new = np.zeros(len(rows), SWEEP)
@@ -112,7 +112,7 @@ def _rows(network: RoadNetwork, movements: Movements) -> list[list[tuple[float, 
 
 
 def _way(network: RoadNetwork, link: int) -> LinkPath | None:
-    """Return a link's path with parts of the lanes at its ends, or None without internal lanes."""
+    """Return a link's path with parts of the lanes at both ends; None without internal lanes."""
     row = network.links[link]
     if row["first_internal"] < 0:
         return None

@@ -1,7 +1,7 @@
-"""`VTYPE`: what sets one type of vehicle apart, and SUMO's values by vehicle class.
+"""`VTYPE`: the properties of a vehicle type, and SUMO's default values by vehicle class.
 
-The numbers are those of SUMO 1.28 (Vehicle_Type_Parameter_Defaults in its documentation), read back
-from a running SUMO in the tests.
+The numbers are from SUMO 1.28 (Vehicle_Type_Parameter_Defaults in its documentation). The tests
+compare them with a running SUMO.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ VTYPE = np.dtype(
         # 1 + position of the network in `TrafficConfig.networks` that drives background vehicles of
         # this type; 0: the driver model drives them
         ("network", np.int32),
-        ("as_sumo", np.bool_),  # looks ahead, yields, queues and resolves deadlocks as in SUMO
+        ("as_sumo", np.bool_),  # look ahead, yield, queue and resolve deadlocks as SUMO does
         ("length", np.float64),  # m
         ("width", np.float64),  # m
         ("height", np.float64),  # m
@@ -55,9 +55,9 @@ VTYPE = np.dtype(
         ("speed_dev", np.float64),
         ("min_speed_factor", np.float64),
         ("max_speed_factor", np.float64),
-        ("reroute", np.float64),  # probability that a vehicle finds its own route; -1: not stated
+        ("reroute", np.float64),  # probability that a vehicle searches for a route; -1: not stated
         ("reroute_period_ms", np.int64),  # time between two searches; 0: one search, -1: not stated
-        # only for types of agents' vehicles, else 0
+        # the next fields: only for types of agents' vehicles, else 0
         ("wheelbase", np.float64),  # m, twice the distance from the centre to each axle
         ("most_steering", np.float64),  # rad, largest angle of the front wheels
         ("most_accel", np.float64),  # m/s², largest acceleration of a policy
@@ -71,7 +71,7 @@ STATED_FIELDS = [name for name in VTYPE.names or () if name not in ("as_sumo", "
 
 
 class ClassDefaults(NamedTuple):
-    """Default values of a type with a given class; names and units as in `VTYPE`."""
+    """Default values of a vehicle class; names and units as in `VTYPE`."""
 
     length: float
     width: float
@@ -118,7 +118,7 @@ CLASS_DEFAULTS = {
     "scooter": ClassDefaults(1.2, 0.5, 1.7, 0.5, 1.2, 3.0, 7.0, 25.0 * _KMH, 0.5, 0.1),
 }
 
-# The class of a road network whose permissions apply to each class of SUMO.
+# For each class of SUMO, the class of the road network whose permissions apply.
 NEAREST_CLASS = {name: name for name in VEHICLE_CLASSES} | {
     "private": "passenger",
     "hov": "passenger",
@@ -141,7 +141,7 @@ NO_ROAD_CLASSES = frozenset(
     "aircraft drone".split()
 )
 
-# Types that SUMO defines itself, with their classes.
+# Types that SUMO predefines, with their classes.
 DEFAULT_TYPES = {
     "DEFAULT_VEHTYPE": "passenger",
     "DEFAULT_TAXITYPE": "taxi",
@@ -153,7 +153,7 @@ DEFAULT_TYPES = {
 
 
 class AgentType(NamedTuple):
-    """Values in which a type of agents' vehicles differs from the car; as in `VTYPE`."""
+    """Values of a type of agents' vehicles that differ from the car; units as in `VTYPE`."""
 
     vclass: str
     length: float
@@ -168,19 +168,19 @@ class AgentType(NamedTuple):
     most_steering: float
 
 
-# A truck of two axles with a limiter at 90 km/h, and a city bus with one at 100 km/h.
+# A truck of two axles limited to 90 km/h, and a city bus limited to 100 km/h.
 AGENT_TYPES = {
     "truck": AgentType("truck", 8.0, 2.5, 3.6, 1.5, 4.0, 6.0, 3.0, 25.0, 4.8, 0.7),
     "bus": AgentType("bus", 12.0, 2.55, 3.2, 1.2, 3.5, 5.5, 3.0, 27.8, 6.0, 0.75),
 }
-# Types of the vehicles that the caller poses or drives, besides the car.
+# Types of vehicles, besides the car, that the caller poses or drives.
 EXTERNAL_TYPES = AGENT_TYPES | {
     "pedestrian": AgentType("pedestrian", 0.5, 0.5, 1.75, 1.5, 2.0, 4.0, 0.5, 5.0, 0.5, 0.7),
     "cyclist": AgentType("bicycle", 1.6, 0.65, 1.7, 1.2, 3.0, 7.0, 0.5, 13.9, 1.1, 0.7),
     # A pole with antennas and sensors; in camera pictures, it has the class of a car.
     "roadside_unit": AgentType("passenger", 0.4, 0.4, 3.0, 1.0, 1.0, 1.0, 0.5, 1.0, 0.4, 0.7),
 }
-# Fields of VTYPE that each key of a type of an environment sets.
+# For each key of an environment's vehicle type, the fields of VTYPE that it sets.
 _OWN_FIELDS = {
     "length_m": ["length"],
     "width_m": ["width"],
@@ -195,7 +195,7 @@ _OWN_FIELDS = {
 }
 NO_OWN_TYPES: Mapping[str, OwnType] = MappingProxyType({})
 CAR_WHEELBASE_M = 5.0  # the axles of highway-env's car are at its bumpers
-NO_LIMIT = 1e9  # the type does not limit a policy; `action` does
+NO_LIMIT = 1e9  # the type does not limit a policy; the setting `action` does
 
 
 def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
@@ -207,7 +207,7 @@ def set_model(types: NDArray[np.void] | np.void, model: int) -> None:
 def agent_types(
     names: Iterable[str], model: int = MODEL_IDM, own: Mapping[str, OwnType] = NO_OWN_TYPES
 ) -> NDArray[np.void]:
-    """Return VTYPE (n,) of types by name.
+    """Return the VTYPE records (n,) of types by name.
 
     Args:
         names: `car`, or keys of `EXTERNAL_TYPES` or `own`.
@@ -256,15 +256,15 @@ def _write_own(record: np.void, own: OwnType, model: int) -> None:
         if value is not None:
             for name in names:
                 record[name] = value
-    # What is left out may contradict what is given.
+    # Defaults of keys that are not given may contradict the given keys.
     record["wheelbase"] = min(record["wheelbase"], record["length"])
     record["decel"] = min(record["decel"], record["emergency_decel"])
 
 
 def generated_types(model: int = MODEL_IDM) -> NDArray[np.void]:
-    """Return VTYPE (1,): the passenger car of the generator and of agents.
+    """Return VTYPE (1,): the passenger car of generated traffic and of agents.
 
-    The car has highway-env's parameters of IDM, and the size of highway-env's car (5 m × 2 m).
+    The car has the IDM parameters and the size (5 m × 2 m) of highway-env's car.
     """
     types = np.zeros(1, dtype=VTYPE)
     car = types[0]

@@ -1,14 +1,14 @@
 """`VEHICLE`: the complete state of one vehicle, as one record.
 
 A shard has one array of these records: owned rows first, then ghosts. A migration is a row
-assignment, a snapshot is a copy, a halo is a slice, and the wire format is the bytes. So the record
-contains more than the next tick needs: ownership, the random stream, the sensor phase and the
-return move with the row. The delayed commands of agents are stored separately, in `Worlds.pending`:
-most vehicles have none, and every tick copies the rows.
+assignment, a snapshot is a copy, a halo is a slice, and the wire format is the bytes of the
+records. So the record contains more than the next tick needs: ownership, random stream, sensor
+phase and return move with the row. The delayed commands of agents are stored separately, in
+`Worlds.pending`: most vehicles have none, and every tick copies the rows.
 
-Frames are those of `roads.network`: x, y, z is the centre of the body; the heading is
+Frames are as in `roads.network`: x, y, z is the centre of the body; the heading is
 counter-clockwise from east; `s` and `d` are the centre's position on the lane, d positive to the
-left. Indices that refer to nothing are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are those of
+left. Indices that refer to nothing are -1. The codes (DRIVER_*, HOLD_*, EVENT_*) are defined in
 `records.codes`. Units are metres, seconds and radians unless the name states another unit.
 """
 
@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 RECORD_VERSION = 4
 
-# The fields are ordered by use: fields that drivers read of others come first and share two
+# The fields are ordered by use: fields that drivers read of other vehicles come first and share two
 # cache lines; fields that are rarely read come last.
 VEHICLE = np.dtype(
     [
@@ -33,19 +33,19 @@ VEHICLE = np.dtype(
         ("side_lane", np.int32),  # neighbour lane that the body also covers
         ("vtype", np.int32),  # VTYPE row
         ("driver", np.int32),  # DRIVER_*
-        ("way", np.int64),  # offset of its plan in the table of steps, see `route_following`
+        ("way", np.int64),  # offset of the plan in the table of steps, see `route_following`
         # state of the driver
         ("speed_factor", np.float64),  # desired speed divided by the speed limit
-        ("wait_s", np.float64),  # time since it stopped
+        ("wait_s", np.float64),  # time since the vehicle stopped
         ("rng_key", np.uint64),  # random numbers are a function of (rng_key, id, tick, stream)
-        ("link", np.int32),  # link that it is on, or that it entered last
+        ("link", np.int32),  # link that the vehicle is on, or that it entered last
         ("hold", np.int32),  # HOLD_*
-        ("stopped_at", np.int32),  # link at which it last stopped; for agents, at a stop sign
+        ("stopped_at", np.int32),  # link of the last stop; for agents, only at a stop sign
         ("blinker", np.int32),  # desired lane change: 1 left, -1 right
-        ("stop", np.int32),  # STOP row of its next stop; -1 or stops_end: none
+        ("stop", np.int32),  # STOP row of the next stop; -1 or stops_end: none
         ("stops_end", np.int32),
-        ("stopped_s", np.float64),  # time since it stopped there
-        ("last_change", np.int64),  # tick of its last lane change
+        ("stopped_s", np.float64),  # time spent at that stop
+        ("last_change", np.int64),  # tick of the last lane change
         # kinematics
         ("x", np.float64),
         ("y", np.float64),
@@ -60,43 +60,42 @@ VEHICLE = np.dtype(
         # control
         ("throttle", np.float64),  # commanded acceleration, m/s²; negative brakes
         ("steering", np.float64),  # front wheel angle, rad
-        ("target_speed", np.float64),  # of the speed controller, m/s
+        ("target_speed", np.float64),  # target of the speed controller, m/s
         # clock and totals
-        ("tick", np.int64),  # the world's tick of this state
+        ("tick", np.int64),  # world tick to which this state belongs
         ("to_go", np.float64),  # remaining distance to the goal, along the plan, m
         ("distance_m", np.float64),  # driven since departure
-        # s that the driven distance takes at `free_speed`: at the speed limit, for background
-        # vehicles times the speed factor, but at most at the type's maximum speed
+        # time in s that the driven distance takes at `free_speed`: the speed limit, for background
+        # vehicles times the speed factor, and at most the type's maximum speed
         ("free_s", np.float64),
         ("step_to_go", np.float64),  # to_go at the start of the current step
         ("step_jerk", np.float64),  # integral of |jerk| over the current step, m/s²
-        ("hit", np.int64),  # id of the vehicle that it collided with
+        ("hit", np.int64),  # id of the other vehicle of a collision
         ("events", np.int32),  # EVENT_* bits of the current step
-        ("target_lane", np.int32),  # of the lane controller or of the current lane change
+        ("target_lane", np.int32),  # target of the lane controller or of the current lane change
         # trip
         ("agent", np.int32),  # index of the PettingZoo agent that drives it
-        # row of the table of plans; for vehicles of a demand file, of their detours; for scripted
-        # vehicles, the current FRAME
+        # row of the table of plans; for vehicles of a demand file, row of their detours; for
+        # scripted vehicles, the current FRAME
         ("goal", np.int32),
         ("leg", np.int32),  # number of previous routes
-        # DEPARTURE row of the demand file, or slot of a vehicle of the caller; -1: made by the
-        # generator
+        # DEPARTURE row of the demand file, or slot of a caller's vehicle; -1: made by the generator
         ("order", np.int32),
         ("departed", np.int64),  # tick of insertion
         ("due", np.int64),  # tick at which an agent's trip is cut off; -1: none
         # ownership and transfer
         ("owner", np.int32),  # zone that may change this row
-        ("source_zone", np.int32),  # of the transfer in progress
+        ("source_zone", np.int32),  # source of the transfer in progress
         ("target_zone", np.int32),
         ("epoch", np.int32),  # number of changes of owner
-        ("transfer", np.int32),  # AUTHORITATIVE, or a state of the protocol
+        ("transfer", np.int32),  # AUTHORITATIVE, or a state of the transfer protocol
         # agents' vehicles only
         ("sensor_phase", np.int32),  # ticks until slow sensors fire; reserved: all fire each step
         ("episode_return", np.float64),  # sum of rewards since the agent got this vehicle
-        # how long it has stood on its lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)
+        # time stopped on the current lane: LANE · 2³² + ticks; -1: not counted (`lane_counts`)
         ("lane_stood", np.int64),
         # memory of a network that drives a background vehicle: throttle, steering and speed at the
-        # ends of the last step but one and the last step but two, scaled as `history` scales them
+        # ends of the second-last and third-last step, scaled as in the sensor `history`
         ("throttle_1", np.float32),
         ("steering_1", np.float32),
         ("speed_1", np.float32),
@@ -114,10 +113,10 @@ PLACEMENT_FIELDS = ("owner", "source_zone", "target_zone", "epoch", "transfer")
 STATE_FIELDS = tuple(name for name in VEHICLE.names or () if name not in PLACEMENT_FIELDS)
 
 
-# Fields that only vehicles with a network use, see `networks.background_driver`; 0 in all others.
+# Fields used only by vehicles with a network (`networks.background_driver`); 0 in all others.
 MEMORY_FIELDS = tuple(name for name in STATE_FIELDS if name.endswith(("_1", "_2")))
 
-# Fields that are equal in a ghost and in its owner's row of the same tick. Contacts and rewards are
+# Fields that are equal in a ghost and in the owner's row of the same tick. Contacts and rewards are
 # written after ghosts are sent, and are never read from a ghost.
 GHOST_FIELDS = tuple(
     name

@@ -1,4 +1,4 @@
 """Road networks: immutable arrays, a reader for SUMO networks, and routing.
 
-Builds on `core`; all folders above use it.
+This package depends on `core`; all higher packages use it.
 """

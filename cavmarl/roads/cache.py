@@ -33,10 +33,10 @@ from cavmarl.roads.network import (
 )
 from cavmarl.roads.sumo_net.reader import map_name, read_network, source_hash
 
-# Increase this if the reader returns other rows for a file. Record types are hashed, too.
+# Increase this if the reader returns different rows for a file. Record types are also hashed.
 FORMAT = 52
 
-_DIGEST_BYTES = 32  # each entry begins with the SHA-256 of the rest; damaged entries are not read
+_DIGEST_BYTES = 32  # an entry begins with the SHA-256 of its rest; damaged entries are not read
 _ALIGNED = 64  # arrays begin at multiples of this number of bytes
 
 _DTYPES = {
@@ -65,7 +65,7 @@ _TEXTS = (
 
 
 def load_network(path: str | Path) -> RoadNetwork:
-    """Read a network through a cache beside the compiled kernels; rebuild damaged entries.
+    """Read a network through the cache beside the compiled kernels; rebuild damaged entries.
 
     Raises MapError: see `read_network`.
     """
@@ -75,7 +75,7 @@ def load_network(path: str | Path) -> RoadNetwork:
 def derived_network(
     path: str | Path, what: str, derive: Callable[[RoadNetwork], RoadNetwork]
 ) -> RoadNetwork:
-    """Return a network derived from that of a map file, cached under the name `what`.
+    """Return a network derived from a map file's network, cached under the name `what`.
 
     Raises MapError: see `read_network`.
     """
@@ -96,13 +96,13 @@ def _cached(path: Path, what: str, make: Callable[[Path], RoadNetwork]) -> RoadN
 
 
 def network_layout() -> str:
-    """Return a short hash of the layout of packed networks, for names of cache entries."""
+    """Return a short hash of the layout of packed networks, for the names of cache entries."""
     columns = [dtype.descr for dtype in _DTYPES.values()]
     return hashlib.sha256(repr((FORMAT, columns)).encode()).hexdigest()[:12]
 
 
 def pack_network(network: RoadNetwork) -> bytes:
-    """Return a network as bytes for `unpack_network`, without its name and the source's hash."""
+    """Return a network as bytes for `unpack_network`, without the name and the source's hash."""
     pieces: list[bytes] = []
     sizes: dict[str, int] = {}
     for name in _DTYPES:
@@ -122,12 +122,12 @@ def pack_network(network: RoadNetwork) -> bytes:
 def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadNetwork | None:
     """Return a network that `pack_network` packed in the same layout, or None if it is damaged.
 
-    Its arrays are views of the packed bytes.
+    The network's arrays are views of the packed bytes.
 
     Args:
         content: the packed bytes.
         name: name of the network.
-        digest: SHA-256 of its source, hex.
+        digest: SHA-256 of the network's source, hex.
     """
     view = memoryview(content)
     if hashlib.sha256(view[_DIGEST_BYTES:]).digest() != view[:_DIGEST_BYTES]:
@@ -139,7 +139,7 @@ def unpack_network(content: bytes | memoryview, name: str, digest: str) -> RoadN
     for key, kind in _DTYPES.items():
         at += -at % _ALIGNED
         size = head["sizes"][key]
-        # Do not copy arrays: padding of records would be undefined, and hashes include it.
+        # Do not copy arrays: copies would have undefined padding, which hashes include.
         values[key] = np.frombuffer(view[at : at + size], dtype=kind)
         at += size
     facts = head["told"]

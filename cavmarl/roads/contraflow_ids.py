@@ -1,8 +1,8 @@
-"""Ids of contraflow roads, which lead back over the ground of another road."""
+"""Ids of contraflow roads, which run along another road in the opposite direction."""
 
 from __future__ import annotations
 
-CONTRAFLOW = "contraflow:"  # before the id of the road that is reversed
+CONTRAFLOW = "contraflow:"  # prefix of the id of the reversed road
 
 
 def contraflow_of(road: str) -> str:

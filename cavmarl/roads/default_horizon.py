@@ -6,14 +6,14 @@ import numpy as np
 
 from cavmarl.roads.network import CARS, RoadNetwork
 
-CROSSINGS = 3.0  # times the free-flow time of a trip across the map, because traffic is slower
+CROSSINGS = 3.0  # factor on the free-flow time of a trip across the map; traffic is slower
 LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
 
 
 def horizon_of(network: RoadNetwork) -> float:
-    """Return the duration in s of three trips over the map: along its width and its height.
+    """Return the duration in s of three trips along the width and the height of the map.
 
-    The speed is the average of a car that drives every lane once at its limit. The result is
+    The speed is the average of a car that drives every lane once at the speed limit. The result is
     rounded to tens and limited to [60, 900]. For several maps, it is the longest duration.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))

@@ -1,6 +1,6 @@
 """Finds signals that hold one phase so long that an episode ends before the next one.
 
-Maps of games have such signals: a player switches them.
+Maps of games have such signals, which a player switches.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ _SHOWN = 5
 
 
 def held_signals(network: RoadNetwork) -> tuple[str, ...]:
-    """Return the ids of signals that show red to some movement for `HELD_S` or more."""
+    """Return the ids of signals that show red to some movement for at least `HELD_S`."""
     found = []
     for row, signal in enumerate(network.signals):
         program = network.programs[signal["program"]]
@@ -30,7 +30,7 @@ def held_signals(network: RoadNetwork) -> tuple[str, ...]:
 
 
 def held_signals_note(network: RoadNetwork) -> str:
-    """Return a note on the signals of `held_signals`, or an empty text."""
+    """Return a note about the signals of `held_signals`, or an empty text."""
     ids = held_signals(network)
     if not ids:
         return ""

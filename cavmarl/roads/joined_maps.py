@@ -1,7 +1,7 @@
 """Several maps as one network: an episode uses one map, and no road connects two maps.
 
-Maps are placed side by side, so far apart that no search for roads reaches two of them. Each id
-gets the prefix `NAME/` of its map.
+Maps are placed side by side, so far apart that no search for roads reaches two maps. Each id gets
+the prefix `NAME/`, with the name of its map.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from cavmarl.roads.network import MAP, RoadNetwork
 APART_M = 1000.0  # distance between the lanes of two maps
 WHOLE_M = 1000.0  # maps are moved by multiples of this length
 
-# For each index field, the array to which it refers. -1 ("none") does not change.
+# For each index field, the array to which the index refers. -1 ("none") does not change.
 POINTERS: dict[str, dict[str, str]] = {
     "lanes": {
         "left": "lanes", "right": "lanes", "successor": "lanes", "link": "links",
@@ -55,7 +55,7 @@ _IDS = ("lane_ids", "edge_ids", "junction_ids", "signal_ids")
 
 
 def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
-    """Return several networks as one; a single network is returned as it is.
+    """Join several networks to one; a single network is returned unchanged.
 
     Raises MapError: some maps have left-hand traffic and others right-hand traffic.
     """
@@ -67,7 +67,7 @@ def join(networks: Sequence[RoadNetwork]) -> RoadNetwork:
         sides = ("right", "left")
         raise MapError(
             f"maps with {sides[not first.left_hand]}-hand traffic: {', '.join(others)}; "
-            f"'{first.name}' has {sides[first.left_hand]}-hand traffic: an entry needs one kind"
+            f"'{first.name}' has {sides[first.left_hand]}-hand traffic: use maps of one kind"
         )
     names = _names(networks)
     starts = {
@@ -129,7 +129,7 @@ def _names(networks: Sequence[RoadNetwork]) -> tuple[str, ...]:
 
 
 def _places(networks: Sequence[RoadNetwork]) -> list[tuple[float, float]]:
-    """Return the offset of each map in a square grid; the largest map fits into a cell."""
+    """Return the offset of each map in a square grid whose cells fit the largest map."""
     extents = np.array([one.extent_m for one in networks])
     side = float((extents[:, 2:] - extents[:, :2]).max()) + APART_M
     pitch = WHOLE_M * math.ceil(side / WHOLE_M + 1.0)
@@ -168,7 +168,7 @@ def _pointed(
 
 
 def _controllers(networks: Sequence[RoadNetwork]) -> NDArray[np.int32]:
-    """Return controller numbers of all actuated programs, map after map."""
+    """Return the controller numbers of all actuated programs, map by map."""
     own = np.concatenate([one.programs["controller"] for one in networks])
     found: NDArray[np.int32] = np.where(own >= 0, np.cumsum(own >= 0) - 1, -1).astype(np.int32)
     return found

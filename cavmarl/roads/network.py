@@ -2,11 +2,11 @@
 
 Frames and units: metres, radians, metres per second; x east, y north, z up, right-handed; headings
 are counter-clockwise from east. A lane is a polyline along its centre in driving direction; `s` is
-the arc length along it and `d` the lateral offset, positive to the left.
+the arc length along the polyline and `d` the lateral offset, positive to the left.
 
 Every lane has one row, including junction-internal lanes. A *link* is one permitted movement over a
 junction: from the end of a lane, along a chain of internal lanes, to the start of an outgoing lane.
-Records are used instead of plain arrays so that a kernel has one parameter instead of ten.
+Arrays contain records, so that a kernel has one parameter instead of ten.
 
 An index of -1 means "none".
 """
@@ -55,8 +55,8 @@ POINT = record(
     ("cos", np.float64),
     ("sin", np.float64),
     ("slope", np.float64),  # dz/ds of that segment
-    ("heading", np.float64),  # of that segment, rad
-    ("left_s", np.float64),  # position of the point on the left neighbour of its lane, m
+    ("heading", np.float64),  # heading of that segment, rad
+    ("left_s", np.float64),  # position beside this point on the left neighbour lane, m
     ("right_s", np.float64),
 )
 
@@ -67,9 +67,9 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # at the lane's end, vehicles turn into its road and yield to vehicles within `MERGES_M` of it
+    # whether vehicles that turn into the road at the lane's end yield to those within `MERGES_M`
     ("merges", np.bool_),
-    ("left", np.int32),  # LANE row of the neighbour to the left in the same direction
+    ("left", np.int32),  # LANE row of the left neighbour in the same direction
     ("right", np.int32),
     ("successor", np.int32),  # internal lanes: the LANE that follows (internal or normal)
     ("link", np.int32),  # internal lanes: the LINK that this lane is part of
@@ -81,7 +81,7 @@ LANE = record(
     ("edge", np.int32),  # EDGE row; also for internal lanes
     # internal lanes: path length of the link before this lane
     ("link_offset_m", np.float64),
-    ("stop_back_m", np.float64),  # from the stop line to the end, which other paths sweep over
+    ("stop_back_m", np.float64),  # from the stop line to the lane's end, where other paths sweep
     # into[first_into : first_into + num_into]: LANE rows that lead here (internal lanes if the map
     # has them)
     ("first_into", np.int32),
@@ -116,28 +116,28 @@ LINK = record(
     # lane after the end of from_lane: first_internal, or to_lane
     ("next_lane", np.int32),
     ("length_m", np.float64),  # length of the chain of internal lanes
-    ("fork_m", np.float64),  # length of the part of its path that is near paths from the same lane
+    ("fork_m", np.float64),  # length of the part of the path that is near paths from the same lane
     ("wait_m", np.float64),  # from the stop line to the waiting position inside; inf: none
     ("junction", np.int32),
     ("index", np.int32),  # the link's bit in its junction's request, response and foes
     ("signal", np.int32),  # SIGNAL row
     ("signal_index", np.int32),  # index of the letter in the signal's state
     ("direction", np.uint8),  # ord of SUMO's dir: s t l r L R
-    ("state", np.uint8),  # ord of SUMO's link state without a signal: M m = s w Z o …
+    ("state", np.uint8),  # ord of SUMO's link state when no signal controls it: M m = s w Z o …
     ("may_block", np.bool_),  # vehicles enter without room beyond the junction (keepClear="0")
     ("first_conflict", np.int32),  # CONFLICT rows, sorted by the foe's LINK row
     ("num_conflicts", np.int32),
     ("first_sweep", np.int32),  # SWEEP rows, sorted by the foe's LINK row and sizes
     ("num_sweeps", np.int32),
     ("swept_by", np.int32),  # the smallest size class of vehicles that sweep over cars on this link
-    ("swept_m", np.float64),  # other drivers watch rears up to here, in m from the stop line
+    ("swept_m", np.float64),  # up to here, rears may sweep over other lanes; m from the stop line
 )
 
 CONFLICT = record(
     ("foe", np.int32),  # LINK whose path crosses or merges with this link's path (a `foes` bit)
-    ("merging", np.bool_),  # both links lead into one lane
-    ("must_yield", np.bool_),  # this link must yield to the foe (a `response` bit)
-    ("near", np.bool_),  # False: a foe only by the map's rules; the paths stay apart
+    ("merging", np.bool_),  # whether both links lead into one lane
+    ("must_yield", np.bool_),  # whether this link must yield to the foe (a `response` bit)
+    ("near", np.bool_),  # False: the links are foes in the map, but their paths stay apart
     ("enter_m", np.float64),  # start and end of the shared area on this link's path,
     ("leave_m", np.float64),  # from the stop line; leave = the whole length if both merge
     ("foe_enter_m", np.float64),  # the same area on the foe's path
@@ -148,11 +148,11 @@ SWEEP = record(
     ("foe", np.int32),  # LINK of the same junction, but from another lane
     ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link
     ("other", np.int32),  # size class of the vehicle on the foe
-    # from the stop line to where a front begins to obstruct the foe, and where a rear stops doing
-    # so; may be outside the junction; if the body is longer than the shared area, leave < enter
+    # distances from the stop line at which a front begins to obstruct the foe and a rear stops to;
+    # may be outside the junction; if the body is longer than the shared area, leave < enter
     ("enter_m", np.float64),
     ("leave_m", np.float64),
-    ("foe_enter_m", np.float64),  # the same on the foe's path
+    ("foe_enter_m", np.float64),  # the same distances on the foe's path
     ("foe_leave_m", np.float64),
 )
 
@@ -162,12 +162,12 @@ JUNCTION = record(
     ("z", np.float64),
     ("kind", np.int32),  # index into RoadNetwork.junction_kinds
     ("signal", np.int32),  # SIGNAL row of the traffic light here
-    ("unruled", np.bool_),  # the map has no rule for movements that end in one lane here
+    ("unruled", np.bool_),  # the map has no rule for some movements that end in the same lane
 )
 
 SIGNAL = record(
-    ("program", np.int32),  # PROGRAM that runs at the beginning
-    ("num_links", np.int32),  # letters in a state
+    ("program", np.int32),  # PROGRAM at the beginning of the episode
+    ("num_links", np.int32),  # number of letters in a state
     ("first_switch", np.int32),  # SWITCH rows, in order of time
     ("num_switches", np.int32),
 )
@@ -178,19 +178,19 @@ PROGRAM = record(
     ("num_phases", np.int32),
     ("offset_s", np.float64),  # delay of all phases
     ("cycle_s", np.float64),  # sum of the phases' durations
-    # actuated, or chosen by an agent: its index in a world's controllers
+    # if actuated, or chosen by an agent: index in a world's controllers
     ("controller", np.int32),
-    # actuated: time from a detector to the stop line, at the limit; or CHOSEN_BY_AGENT
+    # if actuated: time from a detector to the stop line at the speed limit; or CHOSEN_BY_AGENT
     ("detector_gap_s", np.float64),
-    ("simplified", np.bool_),  # the program has rules in SUMO that are not implemented
+    ("simplified", np.bool_),  # whether rules of the program in SUMO are not implemented
 )
 
 PHASE = record(
     ("duration_s", np.float64),
-    ("min_ms", np.int64),  # actuated: bounds of the duration, in SUMO's unit of time
+    ("min_ms", np.int64),  # if actuated: bounds of the duration, in SUMO's unit of time
     ("max_ms", np.int64),
-    ("following", np.int32),  # actuated: the next PHASE
-    ("green", np.bool_),  # some letter is green and none is yellow: the phase may be prolonged
+    ("following", np.int32),  # if actuated: the next PHASE
+    ("green", np.bool_),  # some letter is green and none is yellow, so the phase may be prolonged
     ("first_state", np.int32),  # phase_states[first_state : first_state + num_links]
     ("first_detector", np.int32),  # phase_detectors that prolong the phase
     ("num_detectors", np.int32),
@@ -198,8 +198,8 @@ PHASE = record(
 
 SWITCH = record(
     ("signal", np.int32),
-    ("at_s", np.float64),  # since the beginning of the episode
-    ("program", np.int32),  # PROGRAM that runs from then on
+    ("at_s", np.float64),  # time since the beginning of the episode
+    ("program", np.int32),  # PROGRAM that then starts
 )
 
 DETECTOR = record(
@@ -211,11 +211,11 @@ DETECTOR = record(
 PLACE = record(
     ("next", np.int32),  # the next PLACE of the same lane
     ("detector", np.int32),
-    # s of the detector on this lane; outside of the lane for lanes before or after the detector's
+    # s of the detector along this lane; outside of the lane if the detector is on another lane
     ("s_m", np.float64),
 )
 
-# Rows of one map are contiguous; in a network of several maps, a world uses one.
+# Rows of one map are contiguous; in a network of several maps, a world uses one map.
 MAP = record(
     ("first_lane", np.int32),  # LANE rows [first_lane, first_lane + num_lanes)
     ("num_lanes", np.int32),
@@ -226,7 +226,7 @@ MAP = record(
 )
 
 # Maps with smaller files are copied to memory with huge pages. A tick reads many places of a map.
-# With the small pages of a mapped file, it takes a tenth longer, but processes share the memory.
+# With the small pages of a mapped file, ticks take a tenth longer, but processes share the memory.
 COPIED = 1 << 27
 
 # Fields of a network for kernels, in the order of `RoadArrays`.
@@ -247,7 +247,7 @@ class GeoReference:
 
 @dataclass(frozen=True, eq=False)
 class RoadNetwork:
-    """An immutable road map; see the module for frames, and the record types for fields.
+    """An immutable road map; the module describes frames, and the record types describe fields.
 
     Arrays are read-only; ids are the names in the source, by row.
     """
@@ -277,13 +277,13 @@ class RoadNetwork:
     junction_kinds: tuple[str, ...]  # SUMO's junction types, by `JUNCTION["kind"]`
     geo: GeoReference | None = None  # position on the earth; None: not given by the map
     left_hand: bool = False  # whether the map has left-hand traffic
-    # Where the lanes differ from those of the source, and what is not simulated, with counts
+    # differences from the lanes of the source, and elements that are not simulated, with counts
     notes: tuple[str, ...] = ()
-    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # if several
-    map_names: tuple[str, ...] = ()  # if there are several maps
-    # WALL (num_walls,) of the buildings, if they were requested; see `maps.buildings`
+    joined: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, MAP))  # of several maps
+    map_names: tuple[str, ...] = ()  # empty for a single map
+    # WALL (num_walls,) of the buildings, if requested; see `maps.buildings`
     walls: NDArray[np.void] = field(default_factory=lambda: np.zeros(0, WALL))
-    # (num_roofs, 4, 2) corners in m of the convex parts of their footprints
+    # (num_roofs, 4, 2) corners in m of the convex parts of the buildings' footprints
     roofs: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4, 2)))
     # (num_roofs,) m above the ground
     roof_height: NDArray[np.float64] = field(default_factory=lambda: np.zeros(0))
@@ -296,7 +296,7 @@ class RoadNetwork:
 
     @cached_property
     def arrays(self) -> RoadArrays:
-        """The tables for kernels, in huge pages; those of a large map stay in the mapped file.
+        """The tables for kernels, in huge pages; tables of a large map stay in the mapped file.
 
         The first access replaces the fields of the network by the same arrays.
         """
@@ -328,7 +328,7 @@ class RoadNetwork:
         return rows
 
     def name_of(self, number: int) -> str:
-        """Return the name of a map, given by its MAP row."""
+        """Return the name of the map in a MAP row."""
         return self.map_names[number] if self.map_names else self.name
 
     def extent_of(self, number: int) -> tuple[float, float, float, float]:
@@ -338,7 +338,7 @@ class RoadNetwork:
 
     @cached_property
     def room_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) of an area into which each of the maps fits, if moved."""
+        """(min_x, min_y, max_x, max_y) of an area in which each of the maps fits, if moved."""
         if len(self.maps) == 1:
             return self.extent_m
         extents = np.array([self.extent_of(number) for number in range(len(self.maps))])
@@ -354,8 +354,8 @@ class RoadNetwork:
     def _places(self) -> tuple[NDArray[np.int32], NDArray[np.void]]:
         """The first PLACE of every lane, (num_lanes,), and the PLACE rows.
 
-        A vehicle belongs to the lane of its centre, but its body may extend onto the lane before or
-        after it. So a detector is also listed for the internal lanes before and after its lane.
+        A vehicle belongs to the lane of its centre, but its body may extend onto the previous or
+        next lane. So a detector is also listed for the internal lanes before and after its lane.
         """
         found: list[tuple[int, int, float]] = []
         for number, detector in enumerate(self.detectors):
@@ -396,12 +396,12 @@ class RoadNetwork:
         return self.points[row["first_point"] : row["first_point"] + row["num_points"]]
 
     def pose_on(self, lane: int, s: float) -> tuple[float, float, float, float, float, float]:
-        """Return x, y, z of a position on a lane, and cosine, sine and slope of its direction."""
+        """Return x, y, z of a position on a lane, and the lane's cosine, sine and slope there."""
         row = self.lanes[lane]
         return lane_pose(self.points, row["first_point"], row["num_points"], s)
 
     def beside(self, lane: int, x: float, y: float) -> tuple[float, float, float, float]:
-        """Return s and d of a point beside a lane, and cosine and sine of the lane's direction."""
+        """Return s and d of a point beside a lane, and the lane's cosine and sine there."""
         row = self.lanes[lane]
         return project(self.points, row["first_point"], row["num_points"], x, y)
 

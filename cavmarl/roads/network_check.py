@@ -1,6 +1,6 @@
-"""Checks a road network that comes from outside before its tables are used as indices.
+"""Checks of a road network from an untrusted source, before its tables are used as indices.
 
-The reader of map files makes tables whose indices fit. A packed network in a recording may have
+The reader of map files makes tables with valid indices. A packed network in a recording may have
 been written by anybody.
 """
 
@@ -16,11 +16,11 @@ from cavmarl.roads.network import RoadNetwork
 FARTHEST_M = 1e9  # limit of coordinates
 LONGEST_LANE_M = 1e6
 WIDEST_LANE_M = 1000.0
-ROUNDING = 1e-6  # by which the length of a direction may differ from 1
-LENGTH_OF_SMALL_MAPS_M = 1e7  # all lanes together; in larger maps, `MOST_M_PER_POINT` applies
+ROUNDING = 1e-6  # largest difference between the length of a direction vector and 1
+LENGTH_OF_SMALL_MAPS_M = 1e7  # total length of lanes above which `MOST_M_PER_POINT` applies
 MOST_M_PER_POINT = 1000.0
 
-# Index columns: table, column, and the table of the rows; those of `_OPTIONAL` may be -1.
+# Index columns: table, column, and the table of the rows; columns in `_OPTIONAL` may be -1.
 _INDICES = (
     ("lanes", "left", "lanes"),
     ("lanes", "right", "lanes"),
@@ -70,7 +70,7 @@ _PLACES = (("points", "xyzs"), ("junctions", "xyz"))
 
 
 def wrong_network(network: RoadNetwork) -> str:
-    """Return what is wrong with a network; empty if nothing."""
+    """Return a description of the first error of a network; empty if there is no error."""
     return next(filter(None, _faults(network)), "")
 
 

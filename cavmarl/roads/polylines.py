@@ -1,4 +1,4 @@
-"""Lane shapes as POINT rows, without repeated points and segments of zero length."""
+"""Lane shapes as POINT rows, without repeated points or segments of zero length."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ Shape = NDArray[np.float64]
 SAME_POINT_M = 1e-3
 # Length of an internal lane whose ends coincide (SUMO joins lanes that meet).
 STUB_M = 0.01
-CURVE_M = 1.0  # between the points of a smooth curve
+CURVE_M = 1.0  # distance between the points of a smooth curve
 MOST_POINTS = 24
-UNLIKE_M = 3.0  # a neighbour's end this far from the ends of a lane adds a point to the lane
+UNLIKE_M = 3.0  # if a neighbour ends this far from the ends of a lane, the lane gets a point there
 
 
 def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
@@ -36,7 +36,7 @@ def clean_shape(points: Sequence[tuple[float, float, float]]) -> Shape:
 
 
 def refuse_points(shapes: Sequence[Shape], names: Sequence[str]) -> None:
-    """Check that lanes outside junctions have a length; `names` are their ids, for the message.
+    """Check that lanes outside junctions have a length; `names`: ids of the lanes, for the message.
 
     Raises MapError: a lane has no length.
     """
@@ -53,7 +53,7 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
 
     Args:
         shapes: one (n, 3) array per lane row; changed in place.
-        before: the row that leads into each internal row; rows of a chain in driving order.
+        before: for each internal row, the row that leads into it; rows of a chain in driving order.
     """
     for row, source in before.items():
         if len(shapes[row]) < 2:
@@ -64,7 +64,7 @@ def extend_stubs(shapes: list[Shape], before: Mapping[int, int]) -> None:
 
 
 def split_beside_ends(shapes: list[Shape], outer: Iterable[int]) -> None:
-    """Add a point where an adjacent lane begins or ends, if that is far from the lane's own ends.
+    """Add a point where an adjacent lane begins or ends far from the lane's own ends.
 
     Then positions between two points correspond linearly to positions on the neighbour.
 
@@ -92,7 +92,7 @@ def smooth_curve(before: Shape, after: Shape) -> Shape:
     leaves, arrives = _direction(before[-2:]), _direction(after[:2])
     chord = float(hypot_all(*(end - start)[:2]))
     cos_turn = float(leaves[0] * arrives[0] + leaves[1] * arrives[1])
-    # With these handles, the curve is a circular arc if both ends lie on one.
+    # With these control points, the curve is a circular arc if both ends lie on one arc.
     handle = chord * 2.0 / (3.0 * (1.0 + np.sqrt(max(0.5 * (1.0 + cos_turn), 0.0))))
     number = int(np.clip(np.ceil(chord / CURVE_M), 8, MOST_POINTS))
     t = np.linspace(0.0, 1.0, number + 1)[:, None]
@@ -133,7 +133,7 @@ def without_repeats(shape: Shape) -> Shape:
 
 
 def point_rows(shapes: Sequence[Shape]) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """Return all lanes' points as POINT rows, and each lane's first row, with the end appended."""
+    """Return the points of all lanes as POINT rows, and each lane's first row plus the end."""
     counts = np.array([len(shape) for shape in shapes])
     first = np.concatenate([[0], np.cumsum(counts)])
     xyz = np.concatenate(shapes)

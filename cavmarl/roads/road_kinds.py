@@ -1,4 +1,4 @@
-"""The kinds of a map that matter to a trained driver: the side of traffic, and stop signs."""
+"""Properties of a map that matter to a trained driver: the side of traffic, and stop signs."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ _STOP_SIGNS = (ord("s"), ord("w"))  # LINK["state"]: stop, and stop of all ways
 
 
 def road_kinds(network: RoadNetwork) -> tuple[RoadKind, ...]:
-    """Return the kinds of a map: one for its side of traffic, and whether it has stop signs.
+    """Return the kinds of a map: its side of traffic, and whether it has stop signs.
 
-    A stop sign is a link without a signal where each vehicle must stop once.
+    A link counts as a stop sign if it has no signal and every vehicle must stop once.
     """
     side: RoadKind = "left_hand" if network.left_hand else "right_hand"
     links = network.links

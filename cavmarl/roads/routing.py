@@ -1,7 +1,7 @@
-"""Plans: for each goal, the lane-level way from every lane.
+"""Plans: for each goal, the lane-level route from every lane.
 
 A plan is a table over all lanes, not a list of edges. A vehicle that misses a turn or changes lanes
-has a new way at once. A record that moves to another zone describes its way by one number.
+has a new route at once. A record that moves to another zone describes its route by one number.
 """
 
 from __future__ import annotations
@@ -21,15 +21,15 @@ from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 
 PLAN = record(
-    ("next", np.int32),  # LANE after this lane's end; -1: lane of the goal, or no way
+    ("next", np.int32),  # LANE after this lane's end; -1: lane of the goal, or no route
     ("link", np.int32),  # LINK that leads to `next`; -1 inside junctions
-    ("shift", np.int32),  # value to add to a vehicle's way on `next`, see `lanes.route_following`
+    ("shift", np.int32),  # change of VEHICLE["way"] on `next`, see `lanes.route_following`
     ("change", np.int16),  # side of the better lane: 1 left, -1 right, 0: this lane is best
-    ("changes", np.int16),  # lane changes to the best lane of this edge
-    ("turnarounds", np.int16),  # U-turns on the way: plans turn round only where a road ends
+    ("changes", np.int16),  # number of lane changes to the best lane of this edge
+    ("turnarounds", np.int16),  # number of U-turns on the route; only where a road ends
     # distance from the lane's start after which a lane change is needed, m
     ("room", np.float64),
-    ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no way
+    ("to_go", np.float64),  # m from the lane's start to the end of the goal edge; inf: no route
 )
 
 
@@ -42,7 +42,7 @@ def make_plans(
     """Return the plans of several goals.
 
     `goal_edges`: EDGE rows of the goals. `vehicle_class`: one of `VEHICLE_CLASSES`; lanes that
-    forbid it are not used. `roads`: arrays to use instead of the arrays of the network.
+    forbid this class are not used. `roads`: arrays to use instead of the network's arrays.
 
     Returns PLAN (len(goal_edges), num_lanes), read-only.
     """
@@ -63,7 +63,7 @@ def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
     """
     if not np.isfinite(plan[lane]["to_go"]):
         raise RouteError(
-            f"{network.name}: no way from lane '{network.lane_ids[lane]}' to the goal; "
+            f"{network.name}: no route from lane '{network.lane_ids[lane]}' to the goal; "
             "`cavmarl map check` shows which part of the map is strongly connected"
         )
     lanes = [lane]
@@ -80,7 +80,7 @@ def way(network: RoadNetwork, plan: NDArray[np.void], lane: int) -> list[int]:
 
 @lru_cache(maxsize=1)  # the shards of a world are created in sequence from the same network
 def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
-    """Return a grid over the map with the lanes whose surface may reach each cell of `cell_m`."""
+    """Return a grid with cells of `cell_m` m and the lanes whose surface may reach each cell."""
     min_x, min_y, max_x, max_y = (float(bound) for bound in network.extent_m)
     margin = float(network.lanes["width_m"].max()) + 2.0
     min_x, min_y = min_x - margin, min_y - margin
@@ -107,7 +107,7 @@ def lane_grid(network: RoadNetwork, cell_m: float = 25.0) -> LaneGrid:
 def _pieces(
     network: RoadNetwork, most_m: float
 ) -> tuple[NDArray[np.int64], NDArray[np.float64], NDArray[np.float64]]:
-    """Return straight pieces of centre lines up to `most_m`: LANE row, x and y of both ends.
+    """Return straight pieces of centre lines, at most `most_m` long: LANE row, x, y of both ends.
 
     Long diagonal segments are divided, because their bounding boxes would cover the map.
     """
@@ -137,7 +137,7 @@ def _cells_along(
 def _counted(
     first: NDArray[Any], last: NDArray[Any]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """List the numbers in each range, including both ends: the row of the range, and the number."""
+    """List all numbers in ranges (both ends included): row of the range, and the number."""
     counts = np.maximum(last - first + 1, 0).astype(np.int64)
     owner = np.repeat(np.arange(len(counts)), counts)
     before = np.cumsum(counts) - counts

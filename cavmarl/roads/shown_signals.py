@@ -10,7 +10,7 @@ from cavmarl.roads.network import RoadNetwork
 
 
 def signal_codes(network: RoadNetwork, signal_phases: NDArray[np.int32]) -> NDArray[np.uint8]:
-    """Return the code shown at each link (num_links,): an index in SIGNAL_STATES, or SIGNAL_NONE.
+    """Return the code at each link (num_links,): an index in SIGNAL_STATES, or SIGNAL_NONE.
 
     `signal_phases`: present phases of a world, see `Worlds.signal_phase`.
     """

@@ -1,4 +1,4 @@
-"""Roads from which no way leads out, because other roads are closed."""
+"""Roads from which no route leads out of the map, because other roads are closed."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from cavmarl.roads.network import CARS, RoadNetwork
 
 
 def shut_in_roads(network: RoadNetwork, closed: NDArray[np.uint32]) -> NDArray[np.bool_]:
-    """Return which roads (num_edges,) are open to cars, but let them reach no way out.
+    """Return which roads (num_edges,) are open to cars but have no way out.
 
-    A way out is a road that leads out of the map. If the map has none, each road with a way that
-    never ends counts as a way out.
+    A way out is a road that leads out of the map. If the map has no such road, each road with an
+    endless route counts as a way out.
 
     Args:
         network: the map.
-        closed: (L,) bits of the classes that each lane is closed to.
+        closed: (L,) bits of the classes to which each lane is closed.
     """
     lanes, links, num = network.lanes, network.links, len(network.edges)
     on_map = (lanes["permissions"] & CARS) != 0
@@ -53,7 +53,7 @@ def _spread(
 def _lasting(
     has_open: NDArray[np.bool_], before: NDArray[np.int32], after: NDArray[np.int32]
 ) -> NDArray[np.bool_]:
-    """Return from which roads some way never ends."""
+    """Return from which roads some route never ends."""
     found = has_open.copy()
     while True:
         goes_on = np.zeros_like(found)

@@ -1,7 +1,7 @@
 """The registry of sensors: observed by agents, mounted on vehicles, or added by other packages.
 
-A new mounted sensor needs a class in `config/rig.py` that the union `RigSensor` contains, a class
-in `sensors/mounted/`, a kernel, and an entry in `_CARRIED`.
+A new mounted sensor needs a settings class in `config/rig.py` that is part of the union
+`RigSensor`, a class in `sensors/mounted/`, a kernel, and an entry in `_CARRIED`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ _CARRIED: tuple[MountedType, ...] = (
     own_motion.LaneBoundary,
     own_motion.Collision,
 )
-# Key: the class of settings, which is the type argument of the sensor's base class.
+# The key is the class of settings, which is the type argument of the sensor's base class.
 TYPES: dict[type[MountedConfig], MountedType] = {
     get_args(kind.__orig_bases__[0])[0]: kind  # type: ignore[attr-defined]
     for kind in _CARRIED
@@ -50,7 +50,7 @@ _OBSERVED = {sensor.name: sensor for sensor in SENSORS}
 
 
 def sensor_names() -> tuple[str, ...]:
-    """Return the names of all sensors; mounted ones are named `rig.TYPE`."""
+    """Return the names of all sensors; mounted sensors are named `rig.TYPE`."""
     return (*_OBSERVED, *REGISTERED_SENSORS.names, *_MOUNTED)
 
 
@@ -71,11 +71,11 @@ def register_sensor(
             `batched`, an array (n, number of features) for a `BatchView` of n agents. The numbers
             must not depend on the order of `AgentView.others`; this is checked at the first use.
         features: meaning of each number; names are unique.
-        reach_m: largest distance of the centres of `AgentView.others`; 0: there are no others.
-        batched: whether `sense` is called once per world, with all its agents, instead of once per
+        reach_m: largest distance to the centres of `AgentView.others`; if 0, `others` is empty.
+        batched: whether `sense` is called once per world, with all agents, instead of once per
             agent.
-        sides: what happens to the features if left and right are exchanged. Without it, trained
-            drivers that observe the sensor do not drive on the other side of the road.
+        sides: change of the features if left and right are exchanged. Without `sides`, trained
+            drivers that observe the sensor cannot drive on the other side of the road.
 
     Raises:
         ConfigError: the name is taken, `reach_m` is negative or infinite, `features` is empty, or
@@ -111,7 +111,7 @@ def type_of(name: str, config: MountedConfig) -> MountedType:
     try:
         return TYPES[type(config)]
     except KeyError:
-        raise ConfigError(f"rig.{name}: no sensor takes {type(config).__name__}") from None
+        raise ConfigError(f"rig.{name}: no sensor has settings {type(config).__name__}") from None
 
 
 def mount(rig: Mapping[str, MountedConfig], platform: Platform) -> list[MountedSensor[Any]]:
@@ -150,7 +150,7 @@ def frame_layout(
 
 
 def frames_in(arrays: Mapping[str, NDArray[Any]], prefix: str = "rig.") -> dict[str, SensorFrames]:
-    """Collect arrays named as in `frame_layout` into frames, by sensor."""
+    """Collect the arrays of `frame_layout` into frames, by sensor."""
     found: dict[str, dict[str, NDArray[Any]]] = {}
     for key, array in arrays.items():
         if key.startswith(prefix):

@@ -35,7 +35,7 @@ from cavmarl.sensors.observed import layout
 MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
-GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # `units` is that of the noise
+GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # setting `units`: of the noise
 
 Shape = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -75,7 +75,7 @@ def observed_shapes(config: EnvConfig, observation: NDArray[np.float32]) -> list
 def _rays(
     name: str, shares: Floats, angles: Floats, range_m: float, axes: str = "vehicle"
 ) -> Shape:
-    """Make rays from the vehicle's centre; `shares` are their lengths as shares of the range."""
+    """Make rays from the vehicle's centre; `shares`: lengths of the rays divided by the range."""
     reach = np.clip(shares, 0.0, 1.0) * range_m
     ends = np.stack([np.cos(angles) * reach, np.sin(angles) * reach], axis=1)
     return _ray_shape(name, np.zeros(2), ends, has_echo(reach, range_m), axes)
@@ -166,7 +166,7 @@ def sampled_shapes(name: str, settings: MountedConfig, data: NDArray[Any]) -> li
 
 
 def _lidar(name: str, settings: LidarRigConfig, distances: Floats) -> Shape:
-    """Draw a lidar of one layer as rays, and one of several layers as the points that they hit."""
+    """Draw a lidar with one layer as rays, and a lidar with several layers as points."""
     directions = lidar_directions(
         settings.fov_deg, settings.rays, settings.lower_deg, settings.upper_deg, settings.layers
     )
@@ -185,7 +185,7 @@ def _in_vehicle(settings: MountedConfig, places: Floats) -> Floats:
 
 
 def _colored(settings: MountedConfig, data: NDArray[Any]) -> NDArray[np.uint8]:
-    """Return a (height, width, 4) picture: colours as given, classes by palette, depths as grey."""
+    """Return a picture (height, width, 4): colours as given, classes by palette, depths in grey."""
     every = max(1, math.ceil(math.sqrt(data.shape[0] * data.shape[1] / MOST_PIXELS)))
     data = data[::every, ::every]
     rgba = np.full((*data.shape[:2], 4), 255, np.uint8)

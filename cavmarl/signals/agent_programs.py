@@ -1,7 +1,7 @@
 """Programs of signals whose phases agents choose, made from the programs of the map.
 
-A program has the greens of the map's program, followed by a yellow phase and an all-red phase for
-each ordered pair of greens.
+A program has the greens of the map's program, and then a yellow phase and an all-red phase for each
+ordered pair of greens.
 """
 
 from __future__ import annotations
@@ -25,12 +25,12 @@ log = logging.getLogger(__name__)
 
 
 class AgentProgram(NamedTuple):
-    """The phases between which an agent chooses.
+    """The phases from which an agent chooses.
 
     Attributes:
-        greens: letters of each green, and its duration in s in the map's program.
-        yellow: whether yellow comes between two greens.
-        all_red: whether red for all links comes before a green.
+        greens: letters of each green, and the green's duration in s in the map's program.
+        yellow: whether there is a yellow phase between two greens.
+        all_red: whether an all-red phase comes before a green.
     """
 
     greens: tuple[tuple[str, float], ...]
@@ -62,7 +62,7 @@ class AgentProgram(NamedTuple):
         return found
 
     def cycle_s(self, config: SignalsConfig) -> float:
-        """Return the duration of a cycle with the durations of the map's program."""
+        """Return the duration in s of a cycle with the durations of the map's program."""
         change_s = config.yellow_s + config.all_red_s
         return sum(duration_s + change_s for _, duration_s in self.greens)
 
@@ -70,19 +70,19 @@ class AgentProgram(NamedTuple):
 def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetwork:
     """Return a network in which agents choose the phases of signals.
 
-    The greens of a signal are the phases of its program with a green and no yellow letter, in the
-    order of the program; see `signals.greens`. Other programs and timetables of these signals
-    do not run.
+    The greens of a signal are the phases of its program with a green letter and no yellow letter,
+    in the order of the program; see `signals.greens`. Other programs and timetables of these
+    signals are not used.
 
     Args:
         network: the map.
-        config: which signals agents control, and durations.
+        config: the signals that agents control, and durations.
 
     Returns:
-        A network with a new `source_hash`; the same network if no agents control signals.
+        A network with a new `source_hash`, or the same network if no agents control signals.
 
     Raises:
-        ConfigError: a signal is unknown or has fewer than two greens; there are several maps; or no
+        ConfigError: a signal is unknown or has fewer than two greens, there are several maps, or no
             signal of the map has two greens.
     """
     if not config.are_controlled:
@@ -104,7 +104,7 @@ def greens_of(
 ) -> tuple[tuple[str, float], ...]:
     """Return the greens of a signal's present program: letters, and duration in s.
 
-    `every`: whether the greens are those of `signals.greens = all`.
+    `every`: whether to apply the rule of `signals.greens = all`.
     """
     links = network.links[network.links["signal"] == signal]
     used = sorted({int(index) for index in links["signal_index"]})

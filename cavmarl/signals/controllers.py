@@ -1,7 +1,7 @@
-"""Controllers of signals: they choose greens from what agents know about the lanes.
+"""Controllers of signals, which choose greens from what agents know about the lanes.
 
-Each controller is for W worlds, and keeps no state of its own: what is remembered of lanes is part
-of the worlds' state. Choices that the mask excludes are replaced by the present green.
+Each controller is for W worlds and is stateless: the history of lanes is part of the worlds' state.
+Choices that the mask excludes are replaced by the present green.
 """
 
 from __future__ import annotations
@@ -23,22 +23,22 @@ from cavmarl.signals.signal_table import SignalTable, ticks_of
 
 
 class SignalView(NamedTuple):
-    """What controllers know, in W worlds.
+    """The input of controllers, for W worlds.
 
     Attributes:
         config: durations and kind of action.
         dt: length of a tick in s.
         table: greens, lanes and movements of S signals.
-        observations: (W, S, D) as agents get them.
+        observations: (W, S, D), the agents' observations.
         ticks: (W,) since the reset.
-        counts: (W, N, COUNTS) of the watched lanes, as far as `signals.sensing` knows them; see
+        counts: (W, N, COUNTS) counts of the watched lanes, by the sensors of `signals.sensing`; see
             `signals.kernels.lane_counts`.
-        states: (W, S, HELD) of the signals; see `signals.kernels.green_choices`.
+        states: (W, S, HELD) states of the signals; see `signals.kernels.green_choices`.
         masks: (W, S, G) allowed choices.
         decides: (W,) whether it is time for a decision.
-        history: (W, N, HISTORY) of the watched lanes; see `signals.kernels.lane_history`.
-        loops: (W, N, 2, READINGS) of induction loops, see `signals.kernels.loop_counts`; without
-            loops, (W, 0, 2, READINGS).
+        history: (W, N, HISTORY) history of the watched lanes; see `signals.kernels.lane_history`.
+        loops: (W, N, 2, READINGS) readings of induction loops, see `signals.kernels.loop_counts`;
+            without loops, (W, 0, 2, READINGS).
     """
 
     config: SignalsConfig
@@ -58,22 +58,22 @@ class SignalController(Protocol):
     """A controller of all signals."""
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Return the choice (W, S) of each agent; KEEP where it is not time for a decision."""
+        """Return the choice (W, S) of each agent; KEEP where no decision is due."""
         ...
 
 
 class ProgramController:
-    """Follows the order and the durations of the greens in the map's programs."""
+    """Uses the order and the durations of the greens in the map's programs."""
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Begin the next green when the present green has lasted as long as in the program."""
+        """Start the next green when the present green has lasted as long as in the program."""
         return _by_durations(
             view, np.repeat(view.table.green_s[None], len(view.ticks), axis=0), 0.5 * view.dt
         )
 
 
 class Webster:
-    """Follows the order of the greens, with durations from measured flows.
+    """Uses the order of the greens in the map's programs, with durations from measured flows.
 
     Until the first `signals.flow_interval_s` has ended, the durations are those of the programs.
 
@@ -81,7 +81,7 @@ class Webster:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Begin the next green at the decision nearest to the end of the planned duration."""
+        """Start the next green at the decision nearest to the end of the planned duration."""
         config, table = view.config, view.table
         green_s = np.repeat(view.table.green_s[None], len(view.ticks), axis=0)
         saturation = config.saturation_per_h * config.flow_interval_s / 3600.0
@@ -99,13 +99,13 @@ class Webster:
 
 
 class Actuated:
-    """Follows the order of the greens, and ends a green at a gap between vehicles.
+    """Uses the order of the greens in the map's programs, and ends a green at a gap in traffic.
 
-    Its detectors, and the greens that each prolongs, are those of SUMO's actuated programs.
+    The detectors, and the greens that each detector prolongs, are as in SUMO's actuated programs.
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Begin the next green if no detector of the present one was occupied for the gap."""
+        """Start the next green if no detector of the present green was occupied during the gap."""
         follows = np.empty(view.states.shape[:2], dtype=np.bool_)
         gap_ms = round(1e3 * view.config.max_gap_s)
         find_followers(
@@ -116,14 +116,14 @@ class Actuated:
 
 
 class Sotl:
-    """Lets vehicles at red lights demand a green, unless this separates a platoon (SOTL-platoon).
+    """Chooses the green that vehicles at red lights demand, without splitting platoons (SOTL).
 
     Sources: Gershenson, "Self-organizing traffic lights" (2005); Cools, Gershenson and D'Hooghe,
         "Self-organizing traffic lights: A realistic simulation" (2013).
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the most demanded green, or keep the present one."""
+        """Choose the most demanded green, or keep the present green."""
         wanted = np.empty(view.states.shape[:2], dtype=np.int64)
         find_demanded(
             view.table.served,
@@ -139,26 +139,26 @@ class Sotl:
 
 
 class LongestQueue:
-    """Chooses the green that opens lanes with most vehicles, as RESCO's controller "greedy"."""
+    """Chooses the green whose lanes have the most vehicles, like RESCO's controller "greedy"."""
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the green with most vehicles on lanes that it opens; the present one on a tie."""
+        """Choose the green with the most vehicles on its lanes; on a tie, the present green."""
         return _best(view, view.table.served)
 
 
 class MaxPressure:
-    """Chooses the green with the greatest pressure of the movements that it opens.
+    """Chooses the green with the largest pressure of the movements that it opens.
 
     Source: Varaiya, "Max pressure control of a network of signalized intersections" (2013), with
-        equal capacities, and the vehicles on a lane as its queue.
+        equal capacities, and with the number of vehicles on a lane as the queue.
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the green whose movements have most vehicles before and fewest behind them."""
+        """Choose the green whose movements have the most vehicles before and the fewest behind."""
         return _best(view, view.table.pressure)
 
 
-CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # the names of SIGNAL_CONTROLLERS
+CONTROLLERS: dict[str, Callable[[], SignalController]] = {  # same names as SIGNAL_CONTROLLERS
     "program": ProgramController,
     "webster": Webster,
     "actuated": Actuated,
@@ -182,7 +182,7 @@ def make_controller(name: str) -> SignalController:
 
 
 def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
-    """Choose the allowed green whose lanes have most vehicles, weighted."""
+    """Choose the allowed green with the largest weighted number of vehicles on its lanes."""
     choices = np.empty(view.states.shape[:2], dtype=np.int64)
     choose_best(
         weights,
@@ -204,9 +204,9 @@ def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
 def _by_durations(
     view: SignalView, green_s: NDArray[np.float64], early_s: float
 ) -> NDArray[np.int64]:
-    """Begin the next green if the present one has lasted its duration of (W or 1, S, G).
+    """Start the next green if the present green has lasted for its duration (W or 1, S, G).
 
-    `early_s`: time before the end of the duration from which the next green may begin.
+    `early_s`: how long before the end of the duration the next green may start.
     """
     green = view.states[..., GREEN]
     change_s = view.config.yellow_s + view.config.all_red_s
@@ -225,7 +225,7 @@ def _keeps(view: SignalView) -> NDArray[np.bool_]:
 
 
 def _choices(view: SignalView, wanted: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Return the choices for wanted greens (W, S), as far as they are allowed."""
+    """Return the choices for wanted greens (W, S) that are allowed."""
     green = view.states[..., GREEN]
     if view.config.action == "next_phase":
         choices, keep = wanted, green

@@ -1,7 +1,7 @@
 """`GreenFeatures`: the state of each green of each signal, for networks that score greens.
 
-The features of a green do not depend on the shape of its signal. So one network can serve signals
-with any number of greens and lanes.
+The features of a green do not depend on the layout of its junction. So one network can control
+signals with any number of greens and lanes.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.signals.kernels.green_choices import GREEN, SINCE
 from cavmarl.signals.kernels.lane_counts import SPEED_PPM, STANDING, STOOD_TICKS, VEHICLES
 from cavmarl.signals.signal_table import SignalTable
 
-# Features of each green; sums and maxima are over the lanes that the green opens.
+# Features of each green, with scales; sums and maxima are over the lanes that the green opens.
 GREEN_FEATURES = (
     "exists",  # 1; 0 beyond the signal's greens
     "allowed",  # whether it may be chosen now
@@ -27,13 +27,13 @@ GREEN_FEATURES = (
     "slowed",  # sum of 1 - speed / desired speed, / 10
     "most_vehicles",  # on a lane, / 10
     "most_standing",  # on a lane, / 10
-    "waited",  # sum of the times that vehicles have stood, / 200 s
+    "waited",  # sum of the times that vehicles have been stopped, / 200 s
     "most_waited",  # on a lane, / 200 s
     "pressure",  # see `SignalTable`, / 10
     "behind",  # vehicles on the lanes behind the signal, / 20
     "standing_behind",  # / 10
     "most_filled",  # vehicles as a share of the vehicles that a lane holds
-    "movements",  # that it opens, / 5
+    "movements",  # number of movements that the green opens, / 5
 )
 SIGNAL_FEATURES = (
     "vehicles",  # on the lanes before the signal, / 20
@@ -42,15 +42,15 @@ SIGNAL_FEATURES = (
     "lasted",  # time since the last change, at most 120 s, / 60 s
     "begun",  # the same, at most 20 s, / 20 s
 )
-MOST = 5.0  # larger features are cut
-_VEHICLE_M = 7.5  # length of a standing vehicle with its gap
+MOST = 5.0  # upper limit of all features
+_VEHICLE_M = 7.5  # length of a stopped vehicle with its gap
 
 
 class GreenFeatures:
     """Computes the features of S signals with at most G greens.
 
     A row has `GREEN_FEATURES` for each green, then `SIGNAL_FEATURES`, then the number of the signal
-    as one value of 1 among zeros (none if there is one signal).
+    in one-hot encoding (omitted if there is only one signal).
 
     Args:
         table: the signals.
@@ -82,7 +82,7 @@ class GreenFeatures:
             for g, is_open in enumerate(opened):
                 self._behind[s * self.num_greens + g, moves[is_open, 1]] = 1.0
         self._held = np.maximum(arrays.length_m, _VEHICLE_M) / _VEHICLE_M
-        # Lanes of each green, padded with the place of an empty lane.
+        # Lanes of each green, padded with the index of an empty lane.
         most = max(int(self._served.sum(axis=1).max(initial=0.0)), 1)
         self._lanes = np.full((len(self._served), most), lanes)
         for row, served in zip(self._lanes, self._served, strict=True):
@@ -131,7 +131,7 @@ class GreenFeatures:
         return np.concatenate(row, axis=-1).astype(np.float32).clip(-MOST, MOST)
 
     def _allowed(self, view: SignalView) -> NDArray[np.bool_]:
-        """Return which greens (W, S, G) may be chosen; the present one if none may."""
+        """Return which greens (W, S, G) may be chosen; if none may, the present green."""
         shown = np.arange(self.num_greens) == view.states[..., GREEN, None]
         some = view.masks.any(axis=2, keepdims=True)
         found: NDArray[np.bool_] = np.where(some, view.masks, shown)

@@ -1,4 +1,4 @@
-"""What observes the lanes of signals, made from the settings."""
+"""The sensors that observe the lanes of signals, made from the settings."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from cavmarl.signals.kernels.signal_observations import MIN_GAP_M
 from cavmarl.signals.signal_table import SignalSizes, SignalTable
 
 LOOP_M = 2.0  # length of a loop
-BEFORE_LINE_M = 1.0  # from the end of a loop to the stop line, before which vehicles stand
-STANDING_S = 2.0  # a vehicle that covers a loop for this time stands
-CLEAR_S = 2.0  # beyond the time from loop to loop at the speed limit
+BEFORE_LINE_M = 1.0  # distance from the end of a loop to the stop line
+STANDING_S = 2.0  # a vehicle that covers a loop for this time counts as stopped
+CLEAR_S = 2.0  # added to the driving time from loop to loop at the speed limit
 
 
 def make_cameras(
     config: SignalsConfig, network: RoadNetwork, table: SignalTable, most_vehicles: int
 ) -> Cameras:
-    """Return the cameras of all signals, for worlds of at most `most_vehicles`."""
+    """Return the cameras of all signals, for worlds of at most `most_vehicles` vehicles."""
     places = np.array([place_of_signal(network, row) for row in table.arrays.row.tolist()])
     places[:, 2] += config.camera_height_m
     return Cameras(
@@ -41,7 +41,7 @@ def make_cameras(
 def loops_shape(
     config: SignalsConfig, num_worlds: int, sizes: SignalSizes
 ) -> tuple[int, int, int, int]:
-    """Return the shape of the readings of loops; without loops, they are of no lanes."""
+    """Return the shape of the readings of loops; without loops, the number of lanes is 0."""
     return num_worlds, sizes.lanes if config.sensing == "loops" else 0, 2, READINGS
 
 
@@ -51,8 +51,8 @@ def make_loops(
     """Return the loops of all watched lanes.
 
     A lane that leads to a signal has a loop before the stop line, and a loop
-    `signals.loop_upstream_m` before the line, or at its start if it is shorter. A lane that only
-    leads away has a loop at its start, and a loop at that distance from it, or at its end.
+    `signals.loop_upstream_m` before the line (on shorter lanes, at the start). A lane that only
+    leads away has a loop at its start, and a loop at that distance from the start, or at its end.
 
     Args:
         config: the positions.

@@ -20,13 +20,13 @@ from cavmarl.signals.kernels.controlled_signals import (
 
 
 class SignalSizes(NamedTuple):
-    """Sizes of the arrays about the agents of signals, or of other agents beside the road."""
+    """Sizes of the arrays for agents of signals, or for other agents beside the road."""
 
     signals: int = 0  # S
-    greens: int = 0  # G, of the signal with most greens
+    greens: int = 0  # G, largest number of greens of a signal
     lanes: int = 0  # N, lanes that lead to or from these signals
-    features: int = 0  # D, of the longest observation
-    terms: int = len(SIGNAL_TERMS)  # T, of the reward
+    features: int = 0  # D, length of the longest observation
+    terms: int = len(SIGNAL_TERMS)  # T, number of reward terms
 
 
 class SignalTable:
@@ -36,8 +36,8 @@ class SignalTable:
         ids: ids of the signals (S,).
         greens: letters of the greens of each signal, as codes (num_greens, num_links).
         lanes: ids of the lanes before and behind the signals (N,).
-        movements: for each signal, (M, 2) lanes from which and to which vehicles may drive, as
-            indices of `lanes`, in the order of the signal's links; each once.
+        movements: for each signal, (M, 2) pairs of the lanes before and after a movement, as
+            indices of `lanes`, in the order of the signal's links, without repetitions.
         opened: for each signal, (num_greens, M) whether a green opens a movement.
         served: weight 1 for each lane that a green opens.
         pressure: for each movement that a green opens, weight 1 for the lane before the signal, and
@@ -45,7 +45,7 @@ class SignalTable:
         prolonging: weight 1 for each lane whose detector prolongs a green, by the rule of actuated
             programs (`roads.sumo_net.detectors`).
         green_s: (S, G) duration of each green in the map's program; 0 beyond a signal's greens.
-        arrays: the same for kernels.
+        arrays: the table for kernels.
         posts: where each of `lanes` is observed.
         sizes: sizes of the arrays.
     """
@@ -132,7 +132,7 @@ class SignalTable:
 def lanes_before(network: RoadNetwork, lane: int, range_m: float) -> list[int]:
     """Return the LANE rows that lead to a lane without a signal in between, nearest first.
 
-    Each begins less than `range_m` before the end of the lane, along the way, and counts once.
+    Each starts less than `range_m` before the given lane's end, along the path, and is listed once.
     """
     found: dict[int, None] = {}
     ends = [(lane, 0.0)]
@@ -167,7 +167,7 @@ def ticks_of(config: SignalsConfig, sim_dt_s: float) -> SignalTicks:
 
 
 def sizes_of(network: RoadNetwork, range_m: float) -> SignalSizes:
-    """Return the sizes of the arrays about the signals that agents control."""
+    """Return the sizes of the arrays for the signals that agents control."""
     return SignalTable(network, range_m).sizes
 
 
@@ -194,8 +194,8 @@ def _detectors(
 ) -> NDArray[np.int32]:
     """Return the DETECTOR row of each watched lane.
 
-    The programs of these signals are the last of the network, so their detectors are too: for each
-    signal, one for each incoming lane that a green opens (`place_detectors`).
+    The programs of these signals are the last programs of the network, so their detectors are the
+    last detectors: for each signal, one per incoming lane that a green opens (`place_detectors`).
     """
     detected = [
         lane
@@ -232,7 +232,7 @@ def _weights(
 ) -> LaneWeights:
     """Return the weights of lanes for each green, from the movements that the green opens.
 
-    Lanes `upstream` of a lane with a positive weight have its weight, the largest if several.
+    Lanes `upstream` of lanes with a positive weight get the largest of these weights.
     """
 
     def extended(found: dict[int, int]) -> dict[int, int]:
@@ -269,7 +269,7 @@ def _prolonging(
 
 
 def _as_table(lists: Sequence[dict[int, int]]) -> LaneWeights:
-    """Return the weights by lane of each green of each signal as one table."""
+    """Return the weights by lane, for each green of each signal, as one table."""
     return LaneWeights(
         first=np.cumsum([0, *map(len, lists)], dtype=np.int64),
         lanes=np.array([lane for each in lists for lane in each], dtype=np.int32),
@@ -280,7 +280,7 @@ def _as_table(lists: Sequence[dict[int, int]]) -> LaneWeights:
 def _posts(
     incoming: list[list[int]], outgoing: list[list[int]], lanes: NDArray[np.void]
 ) -> LanePosts:
-    """Return where lanes, LANE (N,), are observed; both lists have the lanes of each signal."""
+    """Return where lanes, LANE (N,), are observed, given the lanes in and out of each signal."""
     signal = np.full(len(lanes), -1, dtype=np.int32)
     leads_in = np.zeros(len(lanes), dtype=np.bool_)
     for lists, is_in in ((incoming, True), (outgoing, False)):

@@ -1,1 +1,1 @@
-"""Departures, routes and the seeded generator."""
+"""Traffic: departures, routes, and the seeded generator of traffic."""

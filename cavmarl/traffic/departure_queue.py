@@ -12,12 +12,12 @@ from cavmarl.core.records.codes import NUM_COUNTS, NUM_SUMS
 
 DEPARTURE = record(
     ("id", np.int64),  # vehicle id; the queue is sorted by it
-    ("due", np.int64),  # tick
+    ("due", np.int64),  # tick of departure
     ("way", np.int64),  # as VEHICLE["way"]; the vehicle starts on the first edge
     ("agent", np.int32),  # index of the agent that will drive the vehicle, or -1
     ("order", np.int32),  # row in `DepartureQueue.orders`; -1: ordered by the generator
     ("vtype", np.int32),  # VTYPE row
-    ("goal", np.int32),  # row of the table of plans, or -1: the end of the vehicle's route
+    ("goal", np.int32),  # row of the table of plans; -1: the end of the vehicle's route
     ("lane", np.int32),  # LANE row where the vehicle enters, or any lane of that edge
     ("stop", np.int32),  # STOP rows [stop, stops_end)
     ("stops_end", np.int32),

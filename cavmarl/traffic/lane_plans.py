@@ -1,7 +1,7 @@
 """`LanePlans`: the plans of each world whose lanes differ from the map.
 
-The plans of a world follow from its lanes alone. They are renewed when lanes change, and after a
-state is loaded, so that they are not part of the state.
+The plans of a world depend only on its lanes. They are renewed when lanes change, and after a state
+is loaded, so they are not part of the state.
 """
 
 from __future__ import annotations
@@ -14,24 +14,24 @@ from cavmarl.roads.kernels.plans import plan_goal
 from cavmarl.roads.network import CARS
 from cavmarl.traffic.kernels.way_requests import CLOSED_S
 
-# s to drive along a closed contraflow lane; any way over closed lanes of roads is faster
+# s to drive along a closed contraflow lane; any route over closed lanes of roads is faster
 SHUT_S = 1000.0 * CLOSED_S
 
 
 class LanePlans:
     """The plans of W worlds to G goals.
 
-    A plan avoids closed lanes wherever there is another way. Otherwise it leads over them: vehicles
-    wait before the first closed lane, and leave a closed lane on which they are.
+    A plan avoids closed lanes wherever there is another route. Otherwise it leads over them:
+    vehicles wait before the first closed lane, and leave a closed lane if they are on it.
 
     Args:
         roads: roads for plans, with the lanes of the map.
         goal_edges: (G,) EDGE rows.
         base: PLAN (G, L) on the lanes of the map.
-        own: PLAN (1 + W, G, L) of the world table of ways: a copy of `base`, then the plans of each
-            world, which are written here.
+        own: PLAN (1 + W, G, L) in the world's table of steps: a copy of `base`, then the plans of
+            each world, which are written here.
         shifts: (W,) `TripTables.shifts`, written here.
-        first: row of `own[0]` in the table of ways.
+        first: row of `own[0]` in the table of steps.
         follows_limits: whether plans also depend on the present speed limits.
 
     Attributes:
@@ -60,7 +60,7 @@ class LanePlans:
         self.tables.setflags(write=False)
 
     def renew(self, world: int, lanes: NDArray[np.void]) -> bool:
-        """Renew the plans of a world if they depend on what has changed; return whether they do.
+        """Renew the plans of a world if a change affects them; return whether it does.
 
         `lanes`: LANE (L,) of the world.
         """
@@ -84,11 +84,11 @@ class LanePlans:
             return True
         now = on_map.copy()
         now["speed_mps"] = speed_mps
-        # Vehicles that are on contraflow lanes when these close have to find a way out.
+        # Vehicles on contraflow lanes that close need a route out of these lanes.
         now["permissions"][contraflow] = CARS
         shut = contraflow & ~opened
         now["speed_mps"][shut] = on_map["length_m"][shut] / SHUT_S
-        # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
+        # Lanes are immutable like the roads, because kernels are compiled for immutable lanes.
         now.setflags(write=False)
         roads = self._roads._replace(lanes=now)
         for goal, edge in enumerate(self._goal_edges.tolist()):

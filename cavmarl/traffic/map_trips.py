@@ -18,8 +18,8 @@ from cavmarl.roads.network import CARS, RoadNetwork
 
 MIN_ORIGIN_M = 15.0  # m; trips do not start on shorter lanes
 MIN_GOAL_M = 10.0  # m; trips do not end on edges whose lanes are all shorter
-DENSITY_M = 25.0  # m; at reset, a lane counts once per such length in the draw
-MAX_TRIPS = 200_000  # per table; longer tables are thinned evenly
+DENSITY_M = 25.0  # m; in the draw at reset, a lane counts once for each such length
+MAX_TRIPS = 200_000  # maximum number per table; longer tables are thinned evenly
 
 ANY_LENGTH_M = (0.0, math.inf)
 
@@ -30,7 +30,7 @@ def for_each_map(network: RoadNetwork, make: Callable[[int], T]) -> list[T]:
     """Return `make(row)` for each MAP row.
 
     Raises:
-        CavmarlError: `make` failed; has the class of the first error and all messages.
+        CavmarlError: `make` failed; the error has the class of the first error and all messages.
     """
     found: list[T] = []
     refused: list[CavmarlError] = []
@@ -51,11 +51,11 @@ def together(parts: Sequence[NDArray[np.int32]]) -> TripTable:
 
 
 class DrawnTrips(NamedTuple):
-    """Trips of one map, (P, 2): LANE row of the origin, and goal."""
+    """Trips of one map, each (P, 2): LANE row of the origin, and goal."""
 
     agent_arrays: NDArray[np.int32]
-    at_start: NDArray[np.int32]  # of background vehicles at reset
-    entering: NDArray[np.int32]  # of vehicles that enter later
+    at_start: NDArray[np.int32]  # trips of background vehicles at reset
+    entering: NDArray[np.int32]  # trips of vehicles that enter later
     has_ways_in: bool  # whether `entering` starts on roads that lead into the map
 
 
@@ -73,7 +73,7 @@ class MapTrips:
         return float(self.network.lanes["length_m"][self._usable].sum())
 
     def goals(self, acted: Sequence[int]) -> list[int]:
-        """Return the EDGE rows that trips lead to: named destinations, then a spread over the map.
+        """Return the EDGE rows of goals: named destinations, then edges spread over the map.
 
         `acted`: further goals, used by a scenario.
         """
@@ -81,7 +81,7 @@ class MapTrips:
         edges = self._drivable_edges(MIN_GOAL_M)
         leaves = [e for e in edges if self._is_way_out(e)]
         rest = [e for e in edges if e not in set(leaves)]
-        # Ways out of the map come first. Other edges are picked evenly by row, not at random.
+        # Roads out of the map come first. Other edges are picked evenly by row, not at random.
         candidates = leaves + rest
         named += acted
         wanted = max(self.traffic.goals, len(named))
@@ -91,11 +91,11 @@ class MapTrips:
         return list(dict.fromkeys(named + candidates))[:wanted]
 
     def drawn(self, plans: NDArray[np.void], num_goals: int) -> DrawnTrips:
-        """Return the trips that departures are drawn from.
+        """Return the trips from which departures are drawn.
 
         `plans`: PLAN (G, L). `num_goals`: G.
 
-        Raises ConfigError: no trip of the wanted length exists on this map.
+        Raises ConfigError: no trip on this map has a length within the configured limits.
         """
         lanes = self.network.lanes
         edges = set(self._drivable_edges(MIN_ORIGIN_M))
@@ -169,7 +169,7 @@ class MapTrips:
     ) -> NDArray[np.int32]:
         """Return `_fitting`, thinned to at most `MAX_TRIPS` trips.
 
-        Raises ConfigError: there are none.
+        Raises ConfigError: no trip fits.
         """
         trips = self._fitting(plans, origins, goals, limits_m)
         if not len(trips):
@@ -179,7 +179,7 @@ class MapTrips:
         return np.ascontiguousarray(trips)
 
     def _no_trip(self, to_go: NDArray[np.float64], limits_m: tuple[float, float]) -> ConfigError:
-        """Return the error that says why ways of the lengths `to_go` (m, or inf) allow no trip."""
+        """Return the error that explains why routes of lengths `to_go` (m or inf) allow no trip."""
         name = self.network.name_of(self.number)
         if _is_within(to_go, limits_m).any():
             return ConfigError(
@@ -204,7 +204,7 @@ class MapTrips:
         goals: NDArray[np.int64],
         limits_m: tuple[float, float],
     ) -> NDArray[np.int32]:
-        """Return (P, 2) pairs of origin lane and goal whose way has a length within `limits_m`.
+        """Return (P, 2) pairs of origin lane and goal with a route of a length within `limits_m`.
 
         No trip begins with a lane change, and no trip has a turn that is too tight for the turning
         circle of a car.

@@ -1,4 +1,4 @@
-"""The seeded traffic generator: the possible trips, and the tables for drawing departures."""
+"""The seeded traffic generator: possible trips, and tables from which departures are drawn."""
 
 from __future__ import annotations
 
@@ -50,7 +50,7 @@ from cavmarl.traffic.sumo.sumo_demand import SumoDemand
 from cavmarl.traffic.turning_circle import TurningBody, with_tight_turns
 from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
-FAST_FACTOR = 1.5  # speed divided by the limit; few drivers of demand files want more
+FAST_FACTOR = 1.5  # speed divided by the limit; few drivers of demand files want to drive faster
 JAM_GAP_M = 2.5  # m between the bumpers of queued vehicles
 PLACED_SHARE = 0.75  # share of their lanes that placed agents may occupy so that others find room
 
@@ -107,7 +107,7 @@ class TrafficCalls:
 
 @dataclass(frozen=True)
 class NativeTraffic:
-    """Departures on one map for one population; a TrafficSource."""
+    """The departures on one map for one population, as a TrafficSource."""
 
     network: RoadNetwork
     traffic: TrafficConfig  # settings of the generator
@@ -115,12 +115,12 @@ class NativeTraffic:
     blank: NDArray[np.void]  # VEHICLE (1,), template of every vehicle's record
     dt: float
     horizon_s: float  # length of an episode in s
-    file: DemandFile | None = None  # demand whose vehicles drive beside the generated ones
+    file: DemandFile | None = None  # demand whose vehicles drive besides generated vehicles
     num_worlds: int = 1
-    # allocates the table of ways if vehicles find ways while the world runs
+    # allocates the table of steps if vehicles search for routes while the world runs
     zeros: Zeros = np.zeros
     scene: Scene | None = None  # the scenario that is played in each world
-    sumo: SumoDemand | None = None  # vehicles that SUMO runs beside these worlds; excludes `file`
+    sumo: SumoDemand | None = None  # vehicles that SUMO runs; excludes `file`
     lane_changes: bool = False  # whether lanes of a world may differ from the map
 
     def __post_init__(self) -> None:
@@ -129,7 +129,7 @@ class NativeTraffic:
         self._check_room()
 
     def for_worlds(self, num_worlds: int) -> NativeTraffic:
-        """Return a copy for another number of worlds; tables that all worlds share are kept."""
+        """Return a copy for another number of worlds, with the same shared tables."""
         other = copy(self)
         object.__setattr__(other, "num_worlds", num_worlds)
         for name in (
@@ -155,7 +155,7 @@ class NativeTraffic:
 
     @cached_property
     def plans(self) -> NDArray[np.void]:
-        """PLAN (G, L): for each goal, the way from each lane of the same map."""
+        """PLAN (G, L): for each goal, the route from each lane of the same map."""
         roads = self._plan_roads
         maps = self.network.maps
         if len(maps) == 1:
@@ -169,7 +169,7 @@ class NativeTraffic:
 
     @cached_property
     def _plan_roads(self) -> RoadArrays:
-        """The roads without the turns that are too tight for a type of the agents."""
+        """The roads without turns that are too tight for one of the agents' types."""
         names = dict.fromkeys(self.population.agent_types)
         bodies = tuple(
             TurningBody(*(float(kind[name]) for name in TurningBody._fields))
@@ -206,9 +206,9 @@ class NativeTraffic:
 
     @cached_property
     def own_types(self) -> NDArray[np.void]:
-        """VTYPE rows of the generator's cars: one for each driver model, then for each network.
+        """VTYPE rows of generated cars: one for each driver model, then one for each network.
 
-        The first is also the type of agents' cars: the car-following model with the largest share.
+        The first row, with the car-following model of the largest share, is also the agents' car.
         """
         codes = self._model_codes
         networks = len(self.traffic.networks)
@@ -221,7 +221,7 @@ class NativeTraffic:
 
     @cached_property
     def _drawn_types(self) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
-        """The rows of `own_types` that vehicles are drawn from, and the ends of their shares."""
+        """The rows of `own_types` from which vehicles are drawn, and their cumulative shares."""
         codes, networks = self._model_codes, self.traffic.networks
         rows = [
             len(codes) + networks.index(name.removeprefix(ZOO))
@@ -234,7 +234,7 @@ class NativeTraffic:
 
     @cached_property
     def travel(self) -> TripTables:
-        """Types and ways of all vehicles: generated, from the demand file, actors and agents.
+        """Types and routes of all vehicles: generated, from the demand file, actors and agents.
 
         Most agents drive a car, which is a generated type.
         """
@@ -245,17 +245,17 @@ class NativeTraffic:
 
     @property
     def num_replayed(self) -> int:
-        """Number of road users of a logged scene that are replayed."""
+        """Number of replayed road users of a logged scene."""
         return 0 if self.scene is None or self.scene.log is None else len(self.scene.log.replayed)
 
     @property
     def num_external(self) -> int:
-        """Slots of vehicles that are posed: of the caller, replayed ones, then SUMO's persons."""
+        """Number of slots of posed vehicles: the caller's, then replayed, then SUMO's persons."""
         return self.population.external + self.num_replayed + self.num_persons
 
     @property
     def num_persons(self) -> int:
-        """Number of SUMO's persons that are mirrored."""
+        """Number of mirrored persons of SUMO."""
         return 0 if self.sumo is None else self.sumo.num_persons
 
     @property
@@ -314,12 +314,12 @@ class NativeTraffic:
 
     @property
     def nowhere(self) -> int:
-        """The way of vehicles that are posed, or driven by the caller; its steps lead nowhere."""
+        """VEHICLE["way"] of vehicles that are posed or driven by the caller: it leads nowhere."""
         return self.plans.size + (0 if self.schedule is None else len(self.schedule.steps))
 
     @property
     def _nowhere_steps(self) -> NDArray[np.void]:
-        """PLAN (L,) that end every way; empty without vehicles that are posed."""
+        """PLAN (L,) in which each step ends the route; empty without posed vehicles."""
         steps = np.zeros(len(self.network.lanes) if self.num_external else 0, dtype=PLAN)
         steps["next"] = steps["link"] = -1
         steps["to_go"] = np.inf
@@ -331,22 +331,22 @@ class NativeTraffic:
 
     @property
     def _first_own(self) -> int:
-        """The first of the steps that the world writes while it runs."""
+        """Row of the first step that the world writes while it runs."""
         return self.nowhere + len(self._nowhere_steps)
 
     @property
     def _own_steps(self) -> int:
-        """Steps of the plans of all worlds; 0 if no world has plans of its own."""
+        """Number of steps of the plans of all worlds; 0 if no world has its own plans."""
         changes = self.lane_changes and self.population.reroute != "never"
         return (1 + self.num_worlds) * self.plans.size if changes else 0
 
     @property
     def own_plan_steps(self) -> range:
-        """The steps of the plans of single worlds; SUMO's routes follow."""
+        """Number of steps of the worlds' own plans, which SUMO's routes follow."""
         return range(self._first_own, self._first_own + self._own_steps)
 
     def _with_room(self, fixed: NDArray[np.void]) -> NDArray[np.void]:
-        """Return the table of ways, with room for the ways that are found at run time."""
+        """Return the table of steps, with room for routes found at run time."""
         more = self._own_steps + (0 if self.slots is None else self.slots.room)
         if not more:
             return fixed
@@ -356,7 +356,7 @@ class NativeTraffic:
 
     @cached_property
     def lane_plans(self) -> LanePlans | None:
-        """The plans of worlds whose lanes may differ from the map; None: there are none."""
+        """The plans of worlds whose lanes may differ from the map; None: no such worlds."""
         if not self._own_steps:
             return None
         first, shape = self._first_own, (1 + self.num_worlds, *self.plans.shape)
@@ -368,18 +368,18 @@ class NativeTraffic:
 
     @cached_property
     def changed_at(self) -> NDArray[np.int64]:
-        """(W,) the tick in which the lanes of each world last changed; -1: never."""
+        """(W,) tick in which the lanes of each world last changed; -1: never."""
         ticks: NDArray[np.int64] = self.zeros(self.num_worlds, dtype=np.int64)
         ticks[:] = -1
         return ticks
 
     @property
     def owns_ways(self) -> bool:
-        """Whether each world writes ways of its own while it runs."""
+        """Whether each world writes its own routes while it runs."""
         return self.rerouting is not None or self._own_steps > 0
 
     def moved_ways(self, ways: NDArray[np.int64], worlds: int) -> NDArray[np.int64]:
-        """Return VEHICLE["way"] (n,) as they are in the world with a number higher by `worlds`."""
+        """Convert VEHICLE["way"] (n,) to the values in the world that is `worlds` numbers later."""
         first = self._first_own
         is_plan = (ways >= first) & (ways < first + self._own_steps)
         moved: NDArray[np.int64] = ways + is_plan * (worlds * self.plans.size)
@@ -389,7 +389,7 @@ class NativeTraffic:
 
     @property
     def plans_now(self) -> NDArray[np.void]:
-        """PLAN (V, G, L): the plans on the map and, if lanes may change, those of each world."""
+        """PLAN (V, G, L): the plans on the map and, if lanes may change, each world's plans."""
         return self.plans[np.newaxis] if self.lane_plans is None else self.lane_plans.tables
 
     def _travel_of_sumo(
@@ -399,7 +399,7 @@ class NativeTraffic:
         fixed: NDArray[np.void],
         scripts: Scripts,
     ) -> TripTables:
-        """Return the tables, with room for the plans of each world and SUMO's routes and stops."""
+        """Return the tables with room for the plans of each world, and SUMO's routes and stops."""
         room = self._own_steps + RouteBook.room(self.network, self.num_worlds)
         steps = self.zeros(len(fixed) + room, dtype=fixed.dtype)
         steps[: len(fixed)] = fixed
@@ -433,11 +433,11 @@ class NativeTraffic:
             else min(look_m(kind, min(fast_mps, float(kind["max_speed"]))), VIEW_M)
             for kind in self.file.types
         ]
-        return max(looks_m, default=VIEW_M)  # a file may have no vehicles
+        return max(looks_m, default=VIEW_M)  # a demand file may have no vehicles
 
     @cached_property
     def slots(self) -> WaySlots | None:
-        """Room for ways found at run time; None if no vehicle reroutes."""
+        """Room for routes found at run time; None if no vehicle reroutes."""
         schedule = self.schedule
         if schedule is None or not self._reroutes:
             return None
@@ -452,7 +452,7 @@ class NativeTraffic:
 
     @property
     def _reroutes(self) -> bool:
-        """Return whether the demand has vehicles that search for ways, or rerouters."""
+        """Return whether the demand has rerouters, or vehicles that search for routes."""
         file = self.file
         searches = file is not None and (file.may_look or len(file.rerouters.rules) > 0)
         return searches or self._own_steps > 0
@@ -490,9 +490,9 @@ class NativeTraffic:
 
     @cached_property
     def demand(self) -> Demand:
-        """The tables that departures are drawn from.
+        """The tables from which departures are drawn.
 
-        Raises ConfigError: no trip of the wanted length exists on a map.
+        Raises ConfigError: no trip on a map has a length within the configured limits.
         """
         num_goals = self.goal_edges.shape[1]
         parts = for_each_map(
@@ -521,7 +521,7 @@ class NativeTraffic:
     ) -> DepartureQueue:
         """Draw the orders of the demand file for new episodes of the `chosen` worlds (W,).
 
-        Return the departure queue, or a larger one if it had too little room for the orders.
+        Return the departure queue, enlarged if it had too little room for the orders.
         """
         if self.schedule is None:
             return departures
@@ -559,13 +559,13 @@ class NativeTraffic:
 
     @cached_property
     def at_reset(self) -> NDArray[np.void]:
-        """EXTERNAL (L,) of the replayed road users at the reset; those not there are removed."""
+        """EXTERNAL (L,) of the replayed road users at the reset; absent users are removed."""
         log = None if self.scene is None else self.scene.log
         commands: NDArray[np.void] = logged_commands(log, self.type_rows, self.dt)[0]
         return commands
 
     def settle(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Count vehicles that have left, and order their successors."""
+        """Count vehicles that have left, and order replacements."""
         self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes).settle()
 
     def assign_lanes(self, departures: DepartureQueue, worlds: Worlds) -> None:
@@ -580,7 +580,7 @@ class NativeTraffic:
     def insert(
         self, departures: DepartureQueue, worlds: Worlds, inserted: NDArray[np.float64]
     ) -> None:
-        """Queue the vehicles that are to be inserted in this step; `inserted` as in `Commands`."""
+        """Queue the vehicles to insert in this step; `inserted`: see `Commands`."""
         calls = self.calls(departures, worlds.ticks, worlds.keys, worlds.lanes)
         np.copyto(calls.inserted, inserted)
         calls.insert()
@@ -604,12 +604,12 @@ class NativeTraffic:
 
     @property
     def placed_agents(self) -> int:
-        """Number of agents that find places at a reset on each map, whatever is drawn."""
+        """Number of agents that can be placed at a reset on each map, whatever is drawn."""
         return min(for_each_map(self.network, self._placed_agents))
 
     def _placed_agents(self, number: int) -> int:
         length_m = float(self.blank["length"][0])
-        if self.population.mode != "closed":  # further agents wait
+        if self.population.mode != "closed":  # further agents wait in the queue
             return int(self.trips_of(number).metres / (length_m + JAM_GAP_M))
         trips = self.demand.agent_trips
         origins = trips.pairs[trips.first[number] : trips.first[number + 1], 0]
@@ -620,7 +620,7 @@ class NativeTraffic:
         return max(1, int(PLACED_SHARE * blocked.sum()))
 
     def _check_room(self) -> None:
-        """Check that the population has room on each map, standing bumper to bumper.
+        """Check that the population has room on each map, bumper to bumper.
 
         Raises CapacityError: there are more vehicles than fit.
         """
@@ -670,7 +670,7 @@ def _capacity_of_sumo(population: PopulationConfig, sumo: SumoDemand) -> int:
 
 
 def _own_vehicles(population: PopulationConfig) -> int:
-    """Return how many vehicles a population has at most besides those of a demand."""
+    """Return the maximum number of vehicles of a population, without the demand's vehicles."""
     placed = population.agents + population.background
     return placed + population.insertions + population.external
 
@@ -682,7 +682,7 @@ def _capacity(
     dt: float,
     horizon_s: float,
 ) -> int:
-    """Return the smaller of the number of ordered vehicles and the number that fit on the map."""
+    """Return the number of ordered vehicles, at most the number that fit on the map."""
     own = _own_vehicles(population)
     if schedule is None or not len(schedule.demand.types):
         return own

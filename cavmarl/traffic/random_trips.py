@@ -19,10 +19,10 @@ _TURNAROUND = ord("t")
 
 
 class RandomTrips:
-    """Draws routes for cars between random places, each by the shortest way.
+    """Draws routes for cars between random places, each along the shortest path.
 
-    Places are edges, drawn in proportion to the length of their lanes. All are in the largest part
-    of the map in which every edge can be reached from every other without a U-turn.
+    Places are edges, drawn in proportion to the length of their lanes. All places are in the
+    largest part of the map in which every edge can be reached from every other without a U-turn.
 
     `seed`: seed of the draws; equal arguments give equal routes.
 
@@ -57,7 +57,7 @@ class RandomTrips:
         return int(self._random.choice(self._edges, p=self._weights))
 
     def _toward(self, goal: int) -> dict[int, int]:
-        """Map each edge to the next one on its shortest way to `goal` (Dijkstra from the goal)."""
+        """Map each edge to the next edge of its shortest path to `goal` (Dijkstra from there)."""
         if goal not in self._next_edges:
             lengths = self._network.edges["length_m"]
             onward: dict[int, int] = {}
@@ -81,7 +81,7 @@ def write_random_demand(
 ) -> None:
     """Write a `.rou.xml` of cars whose departures are evenly spaced in time.
 
-    `within_s`: the period that departures are spread over. `route_m`: minimum length of a route.
+    `within_s`: the period over which departures are spread. `route_m`: minimum length of a route.
     `seed`: equal arguments give equal bytes.
 
     Raises ConfigError: a number is out of range, or the file cannot be written; RouteError: the map

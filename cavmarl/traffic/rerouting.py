@@ -1,9 +1,9 @@
-"""`Rerouting`: vehicles of the demand that search for another way while the world runs.
+"""`Rerouting`: vehicles of the demand that search for another route while the world runs.
 
 Three mechanisms reroute vehicles. Vehicles react once to each change of lanes by the caller. SUMO's
-rerouting device searches for the fastest way by the speeds of the last minutes. <rerouter>s act on
-vehicles that drive on their edges. All run once a second on the departure queue, in one place for
-any division. Decision 011 gives the reasons.
+rerouting device searches for the fastest route by the speeds of the last minutes. <rerouter>s act
+on vehicles that drive on their edges. All mechanisms run once a second beside the departure queue,
+in one place for any division. Decision 011 gives the reasons.
 """
 
 from __future__ import annotations
@@ -37,19 +37,19 @@ LOOK = record(
     ("next", np.int64),  # tick of the next search
     ("period", np.int64),  # ticks between searches; 0: no repetition
     ("goal", np.int32),  # EDGE row of the destination
-    ("seen", np.int32),  # EDGE row on which the vehicle last asked the rerouters
-    ("may_leave", np.bool_),  # whether the route prescribes no edge between its first and last
+    ("seen", np.int32),  # EDGE row at which the vehicle last asked the rerouters
+    ("may_leave", np.bool_),  # whether no edge between the first and the last is prescribed
     ("reacted", np.int64),  # tick of the last change of lanes to which it has reacted; -1: none
-    ("equipped", np.bool_),  # whether it has a rerouting device, and so knows the speeds
+    ("equipped", np.bool_),  # whether the vehicle has a rerouting device, and so knows the speeds
 )
 
 
 class Rerouting:
-    """Rerouting of the vehicles of W worlds: measured speeds, searches and the ways found.
+    """Rerouting of the vehicles of W worlds: measured speeds, searches, and found routes.
 
-    `travel`: types and ways, with room for more ways at the end. `slots`: that room. `first_type`:
-    VTYPE row of the file's first type. `changed_at`: (W,) the tick in which lanes last changed.
-    `avoids`: the vehicles that react to that, see `population.reroute`.
+    `travel`: types and routes, with room for more routes at the end. `slots`: that room.
+    `first_type`: VTYPE row of the file's first type. `changed_at`: (W,) the tick in which lanes
+    last changed. `avoids`: the vehicles that react to such changes, see `population.reroute`.
     """
 
     def __init__(
@@ -113,7 +113,7 @@ class Rerouting:
             limit_speeds(self._roads, self._past[world], self._speed_sums[world])
 
     def act(self, departures: DepartureQueue, worlds: Worlds) -> None:
-        """Once a second, sample the speeds and let vehicles search for ways; writes `next_rows`."""
+        """Once a second, sample speeds and let vehicles search for routes; write `next_rows`."""
         for w, tick in enumerate(worlds.ticks):
             if tick % self._ticks_per_s == 0:
                 self._sample(worlds, w, int(tick))
@@ -122,7 +122,7 @@ class Rerouting:
     def state(self, world: int, rows: NDArray[np.void]) -> Iterator[NDArray[np.generic]]:
         """Yield the part of a world's state that is kept here, as arrays without padding.
 
-        `rows`: VEHICLE (n,) of the world; only the ways that these vehicles drive on are included.
+        `rows`: VEHICLE (n,) of the world; only the routes of these vehicles are included.
         """
         yield self._speed_sums[world]
         yield self._past[world]
@@ -192,7 +192,7 @@ class Rerouting:
         return int(rows["leg"][:num].sum() - legs)
 
     def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
-        """Let vehicles ask again if a rule on their edge has begun within the last second."""
+        """Let vehicles ask again if a rule on their edge has started within the last second."""
         rules = self._schedule.demand.rerouters.rules
         before_s = clock_s - self._ticks_per_s * self._dt
         begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])
@@ -200,7 +200,7 @@ class Rerouting:
             looks["seen"][np.isin(looks["seen"], rules["edge"][begun])] = -1
 
     def _closed(self, clock_s: float) -> NDArray[np.int64]:
-        """Return for each edge (num_edges,) the bits of the vehicle classes it is closed to."""
+        """Return the bits of the vehicle classes to which each edge (num_edges,) is closed."""
         closed = np.zeros(len(self._roads.edges), dtype=np.int64)
         closings = self._schedule.demand.rerouters.closings
         now = closings[(closings["begin_s"] <= clock_s) & (clock_s < closings["end_s"])]
@@ -210,9 +210,9 @@ class Rerouting:
     def _react(
         self, search: WaySearch, i: int, row: np.void, look: np.void, changed_at: int
     ) -> None:
-        """Let a vehicle search for another way after a change of lanes.
+        """Let a vehicle search for another route after a change of lanes.
 
-        Without another way, it keeps its present one, and waits before the closed lane.
+        Without another route, it keeps its present route and waits before the closed lane.
         """
         is_blocked = search.meets_closing(i)
         if is_blocked or self._avoids == "always":
@@ -226,7 +226,7 @@ class Rerouting:
     def _ask_rerouters(
         self, search: WaySearch, i: int, row: np.void, look: np.void, clock_s: float
     ) -> None:
-        """Follow the first rerouter on the vehicle's edge that has another way for it."""
+        """Follow the first rerouter on the vehicle's edge that has another route for it."""
         edge = self._roads.lanes[row["lane"]]["edge"]
         if look["seen"] == edge:
             return
@@ -248,7 +248,7 @@ class Rerouting:
         return self._drawn(rule, row, 0) < float(rule["chance"])
 
     def _drawn(self, rule: np.void, row: np.void, number: int) -> float:
-        """Return a number in [0, 1) that stays the same until the vehicle takes another way."""
+        """Return a random number in [0, 1) that is constant until the vehicle's route changes."""
         stream = STREAM_REROUTER + 2 * int(rule["interval"]) + number
         return uniform(row["rng_key"], row["id"], row["leg"], stream)
 
@@ -295,7 +295,7 @@ class Rerouting:
 def _plain(
     records: NDArray[np.void], unused: Collection[str] = ()
 ) -> Iterator[NDArray[np.generic]]:
-    """Yield the fields of records one by one, without padding and without the unused ones."""
+    """Yield the fields of records one by one, without padding and unused fields."""
     for name in records.dtype.names or ():
         if name not in unused:
             yield np.ascontiguousarray(records[name])

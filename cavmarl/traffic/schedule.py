@@ -1,4 +1,4 @@
-"""`Schedule`: a demand file prepared for the kernels: types, steps of all routes, departures."""
+"""`Schedule`: a demand file prepared for kernels: types, steps of all routes, departures."""
 
 from __future__ import annotations
 
@@ -21,24 +21,25 @@ MAX_STEPS = 50_000_000
 MAX_DETOUR_STEPS = 8_000_000
 DETOUR_CHANGE_WEIGHT = 100.0
 
-MAX_COUNTS = 4096  # episodes whose number of departures is cached
+MAX_COUNTS = 4096  # number of episodes whose number of departures is cached
 
 
 class Schedule:
     """The departures of a demand file as records, and the steps of their routes.
 
-    The ways of trips are found once, when the world is made: the fastest at the speed limits, over
-    the edges that the trip names.
+    The routes of trips are searched once, when the world is made: the fastest routes at the speed
+    limits, over the edges that the trip names.
 
     `demand`: the demand of the files. `first_type`: VTYPE row of the file's first type in the
     world's table. `first_step`: PLAN row of the first route's first step in the world's table.
 
-    Raises RouteError: no way exists for a trip; CapacityError: the routes have too many steps.
+    Raises RouteError: no route exists for a trip; CapacityError: the routes have too many steps.
     """
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
         self.demand = demand
-        # departures per (key, horizon); checking and then loading a state asks for it twice
+        # number of departures by (key, horizon); checking and then loading a state asks for it
+        # twice
         self._counts: dict[tuple[int, float], int] = {}
         self._network: RoadNetwork = demand.network
         self._first_type = first_type
@@ -66,7 +67,7 @@ class Schedule:
             begin += len(steps)
             if begin > MAX_STEPS:
                 raise CapacityError(
-                    f"the routes of the demand have over {MAX_STEPS} steps; "
+                    f"the routes of the demand have more than {MAX_STEPS} steps; "
                     "use fewer or shorter routes"
                 )
         self._report_loops(loops)
@@ -76,12 +77,12 @@ class Schedule:
         self.steps = np.concatenate(parts)
 
     def _passes_twice(self, edges: NDArray[np.int32]) -> bool:
-        """Return whether a route passes a junction more than once."""
+        """Return whether a route leads over a junction more than once."""
         passed = self._network.edges["to_junction"][edges[:-1]]
         return len(np.unique(passed)) < len(passed)
 
     def _report_loops(self, routes: list[int]) -> None:
-        """Add these routes to the report of the demand, once for all worlds that use it."""
+        """Add these routes to the report of the demand, once for all worlds with this demand."""
         what, report = "route passes a junction twice", self.demand.report
         if routes and what not in report.tolerated:
             report.tolerate(what, self._place(routes[0]), len(routes))
@@ -90,7 +91,7 @@ class Schedule:
         """Return steps from every lane to the last edges of the routes, with few lane changes.
 
         A vehicle that misses a lane change of its route continues on these steps. If they would
-        need more than `MAX_DETOUR_STEPS`, there are none, and such vehicles wait.
+        need more than `MAX_DETOUR_STEPS` steps, there are no detours, and such vehicles wait.
         """
         routes = self.demand.routes
         last = self.demand.route_edges[routes["first_edge"] + routes["num_edges"] - 1]
@@ -141,7 +142,7 @@ class Schedule:
         return last
 
     def way_on(self, route: int, vtype: int, edge: int) -> int:
-        """Return the way of a vehicle with this <route> from one of the route's edges, or -1.
+        """Return VEHICLE["way"] on this <route> from one of the route's edges, or -1.
 
         `route`: ROUTE row with all edges. `vtype`: VTYPE row of the file.
         """
@@ -161,7 +162,7 @@ class Schedule:
         return int(self._goal[route, self._class_of_type[vtype]])
 
     def _edges(self, route: int, mask: int, ways: TripWays) -> NDArray[np.int32]:
-        """Return the EDGE rows of a route; gaps between named edges are filled with a way."""
+        """Return the EDGE rows of a route; gaps between named edges are filled."""
         row = self.demand.routes[route]
         named = self.demand.route_edges[row["first_edge"] : row["first_edge"] + row["num_edges"]]
         if row["exact"]:
@@ -200,7 +201,7 @@ class Schedule:
         return len(self.orders(key, horizon_s)) if known is None else known
 
     def draw(self, key: int, horizon_s: float, dt: float) -> NDArray[np.void]:
-        """Draw the departures of one episode: DEPARTURE (n,), sorted by `due`.
+        """Draw the departures of an episode: DEPARTURE (n,), sorted by `due`.
 
         `horizon_s`: length of an episode in s; later departures are left out.
         """

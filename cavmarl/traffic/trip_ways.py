@@ -1,4 +1,4 @@
-"""`TripWays`: finds complete ways for trips, which name only some of their edges."""
+"""`TripWays`: finds complete routes for trips, which name only some of their edges."""
 
 from __future__ import annotations
 
@@ -13,18 +13,18 @@ from cavmarl.roads.kernels.route_steps import trace_edges
 from cavmarl.roads.network import RoadNetwork
 from cavmarl.roads.routing import PLAN
 
-MAX_EDGES = 100_000  # per way
-# A lane change costs next to nothing, so it decides only between ways of equal time. On lanes that
-# are too short for it, `change_cost` keeps its full cost.
+MAX_EDGES = 100_000  # maximum number per route
+# A lane change costs almost nothing, so it decides only between routes of equal time. On lanes that
+# are too short for a change, `change_cost` returns the full cost.
 CHANGE_WEIGHT = 1e-6
 
 
 class TripWays:
-    """The fastest ways at the speed limits; each pair of goal and class is planned once.
+    """The fastest routes at the speed limits; each pair of goal and class is planned once.
 
-    As SUMO's vehicles do, trips make U-turns wherever the map permits.
+    Like SUMO's vehicles, trips make U-turns wherever the map permits them.
 
-    `turned`: pairs (EDGE row of a goal, class) with ways that make U-turns.
+    `turned`: pairs (EDGE row of a goal, class) with routes that make U-turns.
     """
 
     def __init__(self, network: RoadNetwork) -> None:
@@ -40,17 +40,17 @@ class TripWays:
         self._plans: dict[tuple[int, int], NDArray[np.void]] = {}
 
     def edges(self, named: NDArray[np.int32], mask: int) -> NDArray[np.int32]:
-        """Return the EDGE rows of a way over the `named` edges for the classes in `mask`.
+        """Return the EDGE rows of a route over the `named` edges for the classes in `mask`.
 
         Raises:
-            RouteError: no way joins two consecutive edges; the message names them.
+            RouteError: no route joins two consecutive edges; the message names them.
         """
         found = [np.array([named[0]], dtype=np.int32)]
         for start, goal in pairwise(named.tolist()):
             way = self._way(start, goal, mask)
             if way is None:
                 names = self._network.edge_ids
-                raise RouteError(f"no way from edge '{names[start]}' to edge '{names[goal]}'")
+                raise RouteError(f"no route from edge '{names[start]}' to edge '{names[goal]}'")
             if not self._turns.isdisjoint(pairwise([start, *way.tolist()])):
                 self.turned.add((goal, mask))
             found.append(way)
@@ -64,7 +64,7 @@ class TripWays:
         plan_goal(roads, goal, mask, change_weight, out)
 
     def _way(self, start: int, goal: int, mask: int) -> NDArray[np.int32] | None:
-        """Return the EDGE rows after the first one; None: there is no way."""
+        """Return the EDGE rows after the first edge; None if there is no route."""
         key = (goal, mask)
         if key not in self._plans:
             self._plans[key] = np.zeros(len(self._network.lanes), dtype=PLAN)

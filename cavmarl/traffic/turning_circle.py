@@ -1,7 +1,7 @@
 """Finds turns of a map that are too tight for a car's turning circle; trips avoid these turns.
 
-Cars have no reverse gear here. Where a path turns back on itself within a few metres, as at dead
-ends and hairpins, a car would have to leave the road.
+Cars cannot reverse. Where a path turns back on itself within a few metres, as at dead ends and
+hairpins, a car would have to leave the road.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ NEAR_M = 12.0
 
 
 class TurningBody(NamedTuple):
-    """The dimensions of a vehicle that limit its turns, named and measured as in `VTYPE`."""
+    """The dimensions of a vehicle that limit its turns; names and units as in `VTYPE`."""
 
     length: float
     width: float
@@ -45,7 +45,7 @@ CAR_BODY = TurningBody(5.0, 2.0, 5.0, np.inf)
 def with_tight_turns(
     network: RoadNetwork, steering_rad: float, bodies: tuple[TurningBody, ...] = (CAR_BODY,)
 ) -> RoadArrays:
-    """Mark turns that one of the `bodies` cannot take as U-turns, which plans avoid.
+    """Mark turns that one of the `bodies` cannot take as U-turns, so that plans avoid them.
 
     `steering_rad`: maximum angle of the front wheels. If a lane itself turns too tightly, all links
     to and from it are marked.
@@ -103,8 +103,8 @@ class _Trial:
         ends = lanes[0], begin_m, lanes[-1], end_m
         stays = self._drives(*ends)
         if stays:
-            # The first drive aims as for link 0. A car that aims at this turn may cut the corner:
-            # the turn is too tight only if its centre leaves the road at each of the speeds.
+            # The first drive aims as for link 0. A car that aims at this turn may cut the corner,
+            # so the turn is too tight only if the centre leaves the road at each of the speeds.
             self._plan["link"][0, lanes[0]] = link
             stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
             self._plan["link"][0, lanes[0]] = 0

@@ -1,6 +1,6 @@
-"""`WaySearch`: searches for ways in one world at one second, using the traffic known then.
+"""`WaySearch`: searches for routes in a world at one second, using the traffic known then.
 
-Found ways are stored in slots behind the table of all ways.
+Found routes are stored in slots behind the table of the steps of all other routes.
 """
 
 from __future__ import annotations
@@ -30,31 +30,32 @@ from cavmarl.traffic.kernels.way_requests import (
 from cavmarl.traffic.lane_plans import SHUT_S
 from cavmarl.traffic.schedule import MAX_STEPS, Schedule
 
-LEAST_STEPS = 128  # minimum size of a slot, if the map has as many lanes
-PREFERENCE = 1.2  # factor of speed by which contraflow lanes seem faster to some vehicles
-DETOUR_RATIO = 3  # a found way may have this many times the steps of the longest known way
+LEAST_STEPS = 128  # minimum size of a slot, if the map has at least as many lanes
+PREFERENCE = 1.2  # factor by which contraflow lanes seem faster to some vehicles
+DETOUR_RATIO = 3  # a found route may have this many times the steps of the longest known route
 
 
 @dataclass(frozen=True)
 class WaySlots:
-    """Layout of the slots; their number is fixed for all episodes."""
+    """Layout of the slots; the number of slots is fixed for all episodes."""
 
     first: int  # PLAN row of the first world's first slot
     number: int  # slots per world
-    steps: int  # per slot
-    num_worlds: int  # worlds that have slots
-    # lanes of the map. As many unused steps precede the first slot, so that the ways in slots
-    # are greater than all others: a way is the row of a step minus the row of a lane.
+    steps: int  # number of steps per slot
+    num_worlds: int  # number of worlds with slots
+    # number of lanes of the map. As many unused steps precede the first slot, so that
+    # VEHICLE["way"] is greater in slots than elsewhere: it is the row of a step minus the row of a
+    # lane.
     num_lanes: int
 
     @property
     def room(self) -> int:
-        """PLAN rows to append to the table."""
+        """Number of PLAN rows to append to the table."""
         return self.num_lanes + self.num_worlds * self.of_world
 
     @property
     def of_world(self) -> int:
-        """Steps in all slots of one world."""
+        """Number of steps in all slots of one world."""
         return self.number * self.steps
 
     def first_of(self, world: int) -> int:
@@ -62,18 +63,18 @@ class WaySlots:
         return self.first + world * self.of_world
 
     def ways_of_first_world(self, ways: NDArray[np.int64], world: int) -> NDArray[np.int64]:
-        """Convert VEHICLE["way"] (n,) of a world to the values they would have in world 0.
+        """Convert VEHICLE["way"] (n,) of a world to the values in world 0.
 
-        `world`: the world of `ways`. Ways outside the slots stay as they are.
+        `world`: the world of `ways`. Values outside the slots do not change.
         """
         own = ways >= self.first - self.num_lanes
         return ways - own * (world * self.of_world)
 
 
 def seekers(schedule: Schedule, capacity: int, horizon_s: float) -> int:
-    """Return the maximum number of vehicles of one world that search for ways at the same time.
+    """Return the maximum number of rerouting vehicles in a world at the same time.
 
-    `capacity`: vehicles of one world. `horizon_s`: length of an episode in s.
+    `capacity`: number of vehicles of one world. `horizon_s`: length of an episode in s.
     """
     if len(schedule.demand.rerouters.rules):
         return capacity
@@ -83,13 +84,13 @@ def seekers(schedule: Schedule, capacity: int, horizon_s: float) -> int:
 
 
 def way_slots(
-    lanes: NDArray[np.void],  # LANE, of the map
-    longest: int,  # steps of the longest known way
+    lanes: NDArray[np.void],  # LANE of the map
+    longest: int,  # number of steps of the longest known route
     first_step: int,  # number of PLAN rows before the slots
     num_worlds: int,
     number: int,  # slots per world
 ) -> WaySlots:
-    """Return slots for the ways of `number` vehicles per world.
+    """Return slots for the routes of `number` vehicles per world.
 
     Raises CapacityError: the slots would take more than `MAX_STEPS`.
     """
@@ -98,19 +99,19 @@ def way_slots(
     steps = min(outside, max(LEAST_STEPS, DETOUR_RATIO * longest))
     if num_worlds * number * steps > MAX_STEPS:
         raise CapacityError(
-            f"{num_worlds} worlds, {number} vehicles each that may search for a way, {steps} steps "
-            f"per way: more than {MAX_STEPS} steps; use fewer worlds, fewer vehicles with a "
+            f"{num_worlds} worlds, {number} vehicles each that may search for a route, {steps} "
+            f"steps per route: over {MAX_STEPS} steps; use fewer worlds, fewer vehicles with a "
             "rerouting device, or give trips their routes (duarouter)"
         )
     return WaySlots(first_step + num_lanes, number, steps, num_worlds, num_lanes)
 
 
 class WaySearchResult(Enum):
-    """The result of a search for a way."""
+    """The result of a search for a route."""
 
-    KEPT = 0  # the present way is as fast
+    KEPT = 0  # the present route is as fast
     TAKEN = 1
-    LATER = 2  # the vehicle can no longer turn off here; it asks again in a second
+    LATER = 2  # the vehicle can no longer turn off here; it searches again in a second
     NO_WAY = 3
 
 
@@ -124,10 +125,10 @@ class Traffic(NamedTuple):
 
 
 class WaySearch:
-    """Searches for ways of one world's vehicles. Each plan is made at its first use.
+    """Searches for routes of a world's vehicles. Each plan is made at its first use.
 
-    `travel`: types and ways; found ways are written into the slots. `slots`: their layout. `rows`:
-    VEHICLE of the world.
+    `travel`: types and routes; found routes are written to the slots. `slots`: layout of the slots.
+    `rows`: VEHICLE of the world.
     """
 
     def __init__(
@@ -156,7 +157,7 @@ class WaySearch:
         self._cost = np.zeros(slots.steps)
 
     def meets_closing(self, i: int) -> bool:
-        """Return whether the way of row i leads over a lane that is closed to the vehicle."""
+        """Return whether the route of row i leads over a lane that is closed to the vehicle."""
         row = self._rows[i]
         permission = self._permission(i)
         roads = self._roads_now(permission, False, False)
@@ -164,9 +165,9 @@ class WaySearch:
         return CLOSED_S <= time - self._own_s(roads, row, permission) < np.inf
 
     def _own_s(self, roads: RoadArrays, row: np.void, permission: int) -> float:
-        """Return the time on the vehicle's own lane if the caller has closed it, else 0.
+        """Return the time in s on the vehicle's present lane if the caller has closed it, else 0.
 
-        A vehicle that is on a closed lane leaves it.
+        A vehicle on a closed lane leaves it.
         """
         lane = int(row["lane"])
         if int(self._traffic.lanes["permissions"][lane]) & permission:
@@ -176,12 +177,12 @@ class WaySearch:
     def send(
         self, i: int, goal: int, knows: bool, anyhow: bool, stands: bool = False
     ) -> WaySearchResult:
-        """Put row i on the fastest way to a goal if it is faster than the present way.
+        """Put row i on the fastest route to a goal if it is faster than the present route.
 
         `i`: row of a vehicle outside junctions. `knows`: whether it knows the measured speeds;
-        otherwise the limits are used. Closings are known to all. `anyhow`: whether to leave the
-        present way even for a slower one. `stands`: whether it stands, so that it needs no room to
-        brake before a lane change.
+        otherwise the limits are used. All vehicles know closures. `anyhow`: whether to leave the
+        present route even for a slower route. `stands`: whether the vehicle is stopped, so that it
+        needs no room to brake before a lane change.
         """
         row = self._rows[i]
         permission = self._permission(i)
@@ -221,15 +222,15 @@ class WaySearch:
         return int(self._travel.types[self._rows[i]["vtype"]]["permissions"])
 
     def _prefers_contraflow(self, row: np.void) -> bool:
-        """Return whether a vehicle takes contraflow lanes if both ways are about as fast.
+        """Return whether a vehicle takes contraflow lanes if both routes are about equally fast.
 
-        Every second vehicle does. Otherwise all vehicles would stay on the road beside them until
-        it is slow.
+        Every second vehicle does. Otherwise all vehicles would stay on the road beside the
+        contraflow lanes until it is slow.
         """
         return bool(self._contraflow.any()) and int(row["id"]) % 2 == 0
 
     def _roads_now(self, permission: int, knows: bool, prefers: bool) -> RoadArrays:
-        """Return the roads with the speeds that a class can expect as their speed limits."""
+        """Return the roads with the speeds that a class can expect as speed limits."""
         key = permission, knows, prefers
         if key not in self._speeds:
             lanes = self._roads.lanes.copy()
@@ -244,7 +245,7 @@ class WaySearch:
             lanes["speed_mps"][shut] = lanes["length_m"][shut] / SHUT_S
             if prefers:
                 lanes["speed_mps"][contraflow & ~shut] *= PREFERENCE
-            # Immutable like the roads themselves, because kernels are compiled for immutable lanes.
+            # Lanes are immutable like the roads, because kernels are compiled for immutable lanes.
             lanes.setflags(write=False)
             self._speeds[key] = self._roads._replace(lanes=lanes)
         return self._speeds[key]

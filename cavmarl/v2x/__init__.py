@@ -1,1 +1,1 @@
-"""Messages between vehicles and roadside units: their schema, the channel, and inboxes."""
+"""Messages between vehicles and roadside units: message schema, channel, and inboxes."""

@@ -1,7 +1,7 @@
-"""`Bus`: the messages of W worlds, one bus for all zones of each world.
+"""`Bus`: the messages of W worlds, for all zones of each world.
 
-The bus reads the rows of all shards in order of ids, and its state is per world. The range of
-messages is independent of a zone's sensing range, so results do not depend on the division of a
+The bus reads the rows of all shards in the order of ids, and has one state per world. The range of
+messages is independent of a zone's sensing range. So results do not depend on the division of a
 world.
 """
 
@@ -64,7 +64,7 @@ Zeros = Callable[..., NDArray[Any]]
 Watch = Callable[[int, int, NDArray[np.void], NDArray[np.void]], None]
 """A function of a world, a tick, and views of the PACKET (n,) and REPORT (m,) sent in the tick."""
 
-CELL_M = 100.0  # cell size of the grid of packets of a tick
+CELL_M = 100.0  # cell size of the grid of a tick's packets
 CLOSURE_RANGE_M = 500.0  # a roadside unit reports closed roads that begin within this distance
 BODY_CELL_M = 25.0  # cell size of the grid of perceived vehicles
 
@@ -107,7 +107,7 @@ class Bus:
         self._scratch = _make_scratch(network, self.mail, zoned, num_receivers)
         self._network: NetworkSimulator | None = None
         self._watchers: tuple[Watch, ...] = ()
-        # closed lanes of a world, and what each unit says about them
+        # closed lanes of a world, and the closed roads that each unit reports
         self._closures: dict[int, tuple[NDArray[np.bool_], tuple[NDArray[np.float64], ...]]] = {}
         self._exchange = specialized(exchange_messages)
         self._hand_out = specialized(hand_out)
@@ -115,7 +115,7 @@ class Bus:
         self._empty(np.ones(num_worlds, dtype=np.bool_))
 
     def connect(self, network: NetworkSimulator) -> None:
-        """Let a network simulator decide receptions from now on.
+        """Let a network simulator decide receptions.
 
         Raises ConfigError: `v2x.channel.external` is not set.
         """
@@ -124,7 +124,7 @@ class Bus:
 
     @contextmanager
     def muted(self) -> Iterator[None]:
-        """Suspend the network simulator; in this context, no station receives anything."""
+        """Suspend the network simulator in a context, in which no station receives anything."""
         before, self._network = self._network, _Silence()
         try:
             yield
@@ -132,7 +132,7 @@ class Bus:
             self._network = before
 
     def watch(self, watch: Watch) -> None:
-        """Call `watch` with the messages of every later tick, and again if a tick is repeated."""
+        """Call `watch` with the messages of each further tick, and again if a tick is repeated."""
         self._watchers = (*self._watchers, watch)
 
     def reset(self, chosen: NDArray[np.bool_]) -> None:
@@ -148,14 +148,14 @@ class Bus:
                 box[name][chosen] = -1
 
     def exchange(self, side: int) -> None:
-        """Send what is due in the present tick, and receive what arrives in it.
+        """Send the messages due in the present tick, and receive arriving messages.
 
         Args:
-            side: side of the zones' rows that holds the committed ones.
+            side: side of the zones' rows that holds the committed rows.
 
         Raises:
-            ConfigError: the channel is external, and no network simulator is connected or its
-                answer is invalid.
+            ConfigError: the channel is external, and either no network simulator is connected or
+                its answer is invalid.
         """
         num_worlds = len(self._common.ticks)
         if not self._config.channel.external:
@@ -208,7 +208,7 @@ class Bus:
             yield from (mail.last_cams, mail.num_last)
 
     def wrong(self, saved: Sequence[NDArray[Any]]) -> str:
-        """Return the error in saved arrays of the shapes of `arrays`, or an empty string."""
+        """Return the first error in saved arrays, shaped as in `arrays`, or an empty string."""
         found = {id(own): array for own, array in zip(self.arrays(), saved, strict=True)}
         mail, packets = self.mail, found.get(id(self.mail.packets))
         for numbers, most in (
@@ -228,7 +228,7 @@ class Bus:
         return "a message refers to missing reports" if outside.any() else ""
 
     def declare(self, causes: NDArray[np.int32]) -> None:
-        """Let agents report events in the next tick.
+        """Set the events that agents report in the next tick.
 
         Args:
             causes: (W, A) ETSI cause codes; 0: no event.
@@ -242,20 +242,21 @@ class Bus:
         Raises ConfigError: there is no such unit.
         """
         if not 0 <= unit < len(self.units):
-            raise ConfigError(f"roadside unit {unit}: there are only {len(self.units)}")
+            raise ConfigError(f"roadside unit {unit}: there are only {len(self.units)} units")
         return self._num_agents + unit
 
     def declare_of_unit(self, world: int, unit: int, cause: str) -> None:
         """Let a roadside unit report an event in the next tick.
 
-        Raises ConfigError: there is no such unit, or no such cause.
+        Raises ConfigError: the unit or the cause does not exist.
         """
         self.mail.declared[world, self.receiver_of_unit(unit)] = cause_code(cause)
 
     def tell_closures(self, world: int, closed: NDArray[np.bool_]) -> None:
-        """Let the roadside units that are due report a closed road near them in this tick.
+        """Let the roadside units that are due in this tick report a closed road near them.
 
-        The roads near a unit take turns. A unit that declares an event of its own reports that.
+        The closed roads near a unit take turns. A unit that declares its own event reports that
+        event instead.
 
         `closed`: (L,) lanes that are closed.
         """
@@ -275,7 +276,7 @@ class Bus:
     def _closures_near(
         self, world: int, closed: NDArray[np.bool_]
     ) -> tuple[NDArray[np.float64], ...]:
-        """Return, for each unit, x, y, z, heading and EDGE row + 1 of closed roads near it."""
+        """Return x, y, z, heading and EDGE row + 1 of the closed roads near each unit."""
         known = self._closures.get(world)
         if known is None or not np.array_equal(known[0], closed):
             lanes, points = self._roads.lanes, self._roads.points
@@ -337,7 +338,7 @@ def _make_mail(
 ) -> Mail:
     stations = capacity + num_units
     most = v2x.capacity or 3 * stations
-    # A CAM, DENM or SPAT has one report; a CPM has one per perceived vehicle.
+    # A CAM, DENM or SPAT has one report; a CPM has one report per perceived vehicle.
     sees = v2x.perception.rate_hz > 0.0 or v2x.roadside.perception_hz > 0.0
     most_reports = most + (min(most, stations) * (v2x.perception.objects - 1) if sees else 0)
     slots = v2x.channel.latency_ticks + 1
@@ -413,12 +414,12 @@ class V2xStatistics:
 
     sent: tuple[int, ...]  # number of packets by kind: CAM, DENM, CPM, SPAT
     overflow: int  # packets beyond `v2x.capacity`
-    no_access: int  # packets that never got access to the channel
-    reachable: int  # pairs of a packet and a receiver within its reach
+    no_access: int  # packets that never got channel access
+    reachable: int  # pairs of a packet and a receiver within reach
     received: int  # pairs in which the packet was received
     delays: NDArray[np.int64]  # (65,) number of receptions by delay in ticks
-    mean_latency_s: float  # mean of the receptions
-    # (40, 2) pairs reachable and received, by distance in bands of `BAND_M`; lossy channels only
+    mean_latency_s: float  # mean latency of the receptions
+    # (40, 2) reachable and received pairs, by distance in bands of `BAND_M`; lossy channels only
     bands: NDArray[np.int64]
     busy_mean: float  # channel busy ratio, mean over receivers and ticks
     busy_max: float  # largest channel busy ratio
@@ -429,7 +430,7 @@ class V2xStatistics:
         return self.received / self.reachable if self.reachable else 1.0
 
     def to_dict(self) -> dict[str, float]:
-        """Return the numbers for a report, named as in `traffic_stats`."""
+        """Return the numbers for a report, with the names of `traffic_stats`."""
         return {
             "v2x_sent": float(sum(self.sent)),
             "v2x_received": float(self.received),

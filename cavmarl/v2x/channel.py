@@ -16,7 +16,7 @@ from cavmarl.v2x.kernels.v2x_channel import Channel
 CARRIER_HZ = 5.9e9
 LIGHT_MPS = 299_792_458.0
 PREAMBLE_S = 40e-6  # IEEE 802.11p, 10 MHz channel
-# The reach is the distance at which the probability of reception falls below this.
+# The reach is the distance at which the probability of reception falls below this value.
 LEAST_CHANCE = 1e-3
 MAX_REACH_M = 20_000
 _ROOT_2 = 1.4142135623730951
@@ -37,8 +37,8 @@ def chance_of_reception(config: ChannelConfig, distance_m: float, extra_db: floa
     The power in dB is normally distributed around P = tx - loss(1 m) - 10 n log10(d), so the
     probability is Φ((P - sensitivity) / σ).
 
-    `config`: its `path_loss_exponent` is not 0. `distance_m`: between the antennas; less
-    than 1 m counts as 1 m. `extra_db`: additional loss, such as that of a building.
+    `config`: settings with a `path_loss_exponent` other than 0. `distance_m`: distance between the
+    antennas, at least 1 m is used. `extra_db`: additional loss, such as that of a building.
     """
     lost_db = 10.0 * config.path_loss_exponent * log10(max(distance_m, 1.0))
     power_dbm = config.tx_power_dbm - reference_loss_db() - lost_db - extra_db
@@ -62,10 +62,10 @@ def airtime_s(config: ChannelConfig) -> float:
 
 
 def hidden_share(distance_m: float, sensing_m: float) -> float:
-    """Return the share of the stations heard by a receiver that the sender does not hear.
+    """Return the share of the stations in a receiver's range that the sender does not hear.
 
-    Both hear stations within `sensing_m`. The density of stations is assumed to be uniform, so the
-    share is the part of the receiver's circle that lies outside the sender's circle.
+    Sender and receiver hear stations within `sensing_m`. The density of stations is assumed to be
+    uniform, so the share is the part of the receiver's circle that is outside the sender's circle.
     """
     half = 0.5 * distance_m / sensing_m
     if half >= 1.0:
@@ -76,13 +76,13 @@ def hidden_share(distance_m: float, sensing_m: float) -> float:
 def chances_among_others(busy: float, hidden: NDArray[np.float64]) -> NDArray[np.float64]:
     """Return the probabilities (n,) that no hidden station disturbs a packet.
 
-    The sender does not wait for hidden stations. They send at random, and a packet is lost if one
-    of them begins within two packet times: exp(-2 G), where G is their channel load (Abramson: "The
-    ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels: part II, the hidden
-    terminal problem", 1975).
+    The sender does not wait for hidden stations. They send at random, and a packet is lost if a
+    hidden station starts within two packet times: exp(-2 G), where G is their channel load
+    (Abramson: "The ALOHA system", 1970; Tobagi, Kleinrock: "Packet switching in radio channels:
+    part II, the hidden terminal problem", 1975).
 
     Args:
-        busy: share of time in which the receiver hears a station.
+        busy: share of time for which the receiver hears a station.
         hidden: (n,) shares of stations that the sender does not hear.
     """
     return exp_all(-2.0 * busy * hidden)

@@ -1,7 +1,7 @@
 """The message schema: fixed little-endian records with a version.
 
-The records resemble those of the standards but are simpler: metres and radians in the world's frame
-instead of degrees, ticks instead of milliseconds, no encoding rules, no certificates.
+The records resemble the standards but are simpler: metres and radians in the world's frame instead
+of degrees, ticks instead of milliseconds, no encoding rules, no certificates.
 
 | message | modelled after | contents |
 |---|---|---|
@@ -12,14 +12,14 @@ instead of degrees, ticks instead of milliseconds, no encoding rules, no certifi
 | `MAP` | SAE J2735, map data | one approach to a signal |
 
 All positions are centres of bodies, x east, y north, z up; headings are counter-clockwise from
-east. Ticks are those of the world. A station is a vehicle, given by its id, or roadside unit k,
+east. Ticks are ticks of the world. A station is a vehicle, given by its id, or roadside unit k,
 given by `FIRST_ROADSIDE_ID` + k.
 
-Roadside units stand at signals, and send maps of them.
+Roadside units are at signals, and send maps of these signals.
 
 An external network simulator (ns-3, OMNeT++ or any other) implements `NetworkSimulator.exchange`.
-This method is called once per tick and world with the packets sent in that tick, and returns when
-it has simulated up to that tick. The call is a barrier: neither side runs ahead.
+The bus calls this method once per tick and world with the packets sent in that tick. The method
+returns when it has simulated up to that tick, so neither side runs ahead.
 """
 
 from __future__ import annotations
@@ -103,8 +103,8 @@ DENM = np.dtype(
         ("x", "<f8"),  # m, position of the event
         ("y", "<f8"),
         ("z", "<f8"),
-        ("heading", "<f8"),  # rad, of the affected traffic
-        ("speed", "<f8"),  # m/s, of the vehicle
+        ("heading", "<f8"),  # rad, heading of the affected traffic
+        ("speed", "<f8"),  # m/s, speed of the vehicle
     ]
 )
 
@@ -124,7 +124,7 @@ MAP = np.dtype(
         ("signal", "<i4"),  # SIGNAL row
         ("link", "<i4"),  # LINK row: one movement
         ("letter", "<i4"),  # index of the link's letter in the signal's phases
-        ("x", "<f8"),  # m, position of its stop line
+        ("x", "<f8"),  # m, position of the link's stop line
         ("y", "<f8"),
         ("heading", "<f8"),  # rad, direction of travel
         ("speed_limit", "<f8"),  # m/s
@@ -147,7 +147,7 @@ CAUSES = {
     "hard_braking": CAUSE_HARD_BRAKING,
 }
 
-# Fields with another name in the bus's own REPORT.
+# Fields that have another name in the bus's REPORT.
 _OWN_NAMES = {
     "vclass": "code",
     "cause": "code",
@@ -170,7 +170,7 @@ def cause_code(cause: str) -> int:
 def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
     """Convert reports of the bus to records of the schema.
 
-    `reports`: REPORT (n,) of that kind; empty places (sender -1) are left out.
+    `reports`: REPORT (n,) of that kind; empty rows (sender -1) are left out.
 
     Returns CAM, DENM, CPM_OBJECT or SPAT (n,).
     """
@@ -182,9 +182,9 @@ def messages_of(kind: int, reports: NDArray[np.void]) -> NDArray[np.void]:
 
 
 def encode(packet: np.void, reports: NDArray[np.void]) -> bytes:
-    """Serialize a packet: the header, then its records.
+    """Serialize a packet: the header, then the records.
 
-    `reports`: REPORT (Q,) of its tick.
+    `reports`: REPORT (Q,) of the packet's tick.
     """
     kind, first, count = int(packet["kind"]), int(packet["first"]), int(packet["count"])
     header = np.zeros((), HEADER)
@@ -215,7 +215,7 @@ def decode(data: bytes) -> tuple[np.void, NDArray[np.void]]:
     return header, np.frombuffer(data, KINDS[kind], count, HEADER.itemsize)
 
 
-# The reception of one packet by one receiver, in the tick of the call.
+# The reception of a packet by a receiver, in the tick of the call.
 RECEPTION = record(
     ("tick", np.int64),  # tick of sending
     ("packet", np.int64),  # index among the packets of that tick
@@ -224,7 +224,7 @@ RECEPTION = record(
 
 
 class Exchange(NamedTuple):
-    """One tick of one world for a network simulator; the arrays are only valid in the call."""
+    """A tick of a world for a network simulator; the arrays are valid only during the call."""
 
     world: int
     tick: int  # tick of the world, from 1 after a reset
@@ -239,8 +239,8 @@ class NetworkSimulator(Protocol):
     def exchange(self, sent: Exchange) -> NDArray[np.void]:
         """Simulate up to this tick.
 
-        If a host dies, a tick is repeated: the same packets are passed again and must get the same
-        answer.
+        If a host dies, a tick is repeated: the method gets the same packets again and must return
+        the same answer.
 
         Returns RECEPTION (n,): packets of this or earlier ticks that are received in this tick.
         """
@@ -248,7 +248,7 @@ class NetworkSimulator(Protocol):
 
 
 def check_external(v2x: V2xConfig) -> None:
-    """Refuse to connect a network simulator if the channel is not external."""
+    """Check that the channel is external, so that a network simulator can be connected."""
     if not (v2x.enabled and v2x.channel.external):
         raise ConfigError("v2x.channel.external is off: set it to connect a network simulator")
 
@@ -256,17 +256,16 @@ def check_external(v2x: V2xConfig) -> None:
 def check_receptions(
     receptions: NDArray[np.void], sent: Exchange, latency_ticks: int, num_packets: NDArray[np.int64]
 ) -> NDArray[np.void]:
-    """Refuse impossible receptions.
+    """Check the receptions that a network simulator returns.
 
     `receptions`: the answer to `sent`. `latency_ticks`: the longest delay. `num_packets`:
     (latency_ticks + 1,) number of packets in flight, by tick modulo latency_ticks + 1.
 
     Returns:
-        the receptions sorted by receiver, tick and packet, so that the order of the answer is
-        irrelevant.
+        The receptions sorted by receiver, tick and packet, so that their order does not matter.
 
     Raises:
-        MessageError: a wrong dtype, an unknown packet or receiver, or a delay that is too long or
+        MessageError: the dtype is wrong, a packet or receiver is unknown, or a delay is too long or
             negative.
     """
     if not isinstance(receptions, np.ndarray) or receptions.dtype != RECEPTION:
@@ -289,7 +288,7 @@ def check_receptions(
 
 
 def make_units(config: RoadsideConfig, network: RoadNetwork) -> NDArray[np.void]:
-    """Return UNIT (n,): a unit at each equipped signal, at the centre of its stop lines.
+    """Return UNIT (n,): a unit at the centre of the stop lines of each equipped signal.
 
     `config`: the equipped signals.
 

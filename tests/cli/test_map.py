@@ -122,7 +122,7 @@ def test_the_error_for_a_file_that_is_no_map_names_the_suffixes_of_maps(
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("<net></net>", "no version attribute: not a SUMO network"),
+        ("<net></net>", "no version attribute, so it is not a SUMO"),
         ('<net version="new"></net>', "version='new'"),
     ],
 )

@@ -139,7 +139,7 @@ def test_files_are_sorted_by_their_content(tmp_path: Path) -> None:
     ("text", "says"),
     [
         ("<routes", "line 1: broken XML"),
-        ("<net/>", "<net> is no demand"),
+        ("<net/>", "<net> is not demand"),
         ("<!DOCTYPE a><routes/>", "document type"),
     ],
 )

@@ -79,5 +79,5 @@ def test_a_goal_that_cannot_be_reached_is_a_route_error() -> None:
     plan = make_plans(roads, [ramp])[0]
     assert plan[out]["to_go"] == np.inf
     assert plan[out]["next"] == -1
-    with pytest.raises(RouteError, match=r"no way from lane 'main_out_0'.*map check"):
+    with pytest.raises(RouteError, match=r"no route from lane 'main_out_0'.*map check"):
         way(roads, plan, out)

@@ -64,7 +64,7 @@ def test_an_option_may_have_any_of_its_names_in_any_section(tmp_path: Path) -> N
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        ('<net-f value="a"/>', "<net-f> is no option of SUMO: did you mean net-file"),
+        ('<net-f value="a"/>', "<net-f> is not an option of SUMO: did you mean net-"),
         ('<r value="a"/>\n<routes value="b"/>', "line 2: <routes> sets route-files again"),
     ],
 )

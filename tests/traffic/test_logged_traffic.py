@@ -374,7 +374,7 @@ def test_an_agent_in_a_vehicle_that_overlaps_another_one_is_refused(tmp_path: Pa
     scene = scenario()
     scene["tracks"]["twin"] = track(-58.0, -ASIDE_M, 10.0, 0.0)
     path = write_pickle(tmp_path, scene)
-    with pytest.raises(ConfigError, match=r"'7' overlaps another road user at 0 s; name another"):
+    with pytest.raises(ConfigError, match=r"'7' overlaps another road user at 0 s; use another"):
         parallel_env(path, overrides={"scenario.seats": ["7"]})
     with closing(made(path)) as env:  # without a name, the agent gets another vehicle
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([80.0], abs=1e-4)

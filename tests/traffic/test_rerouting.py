@@ -218,5 +218,5 @@ def test_too_many_routes_for_the_memory_are_refused(
     net: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(way_slots, "MAX_STEPS", 100)
-    with pytest.raises(CapacityError, match=r"may search for a way.*fewer worlds"):
+    with pytest.raises(CapacityError, match=r"may search for a route.*fewer worlds"):
         two_ways(net, tmp_path, cars(DEVICE) + FLOW)

@@ -5,7 +5,7 @@ file finds the inputs of these models:
 
 - the leader, also on the next lanes and behind a junction;
 - the next lower speed limit, and the end of the lane;
-- the line at which the vehicle must stop for a signal or for vehicles with the right of way;
+- the line at which the vehicle must stop, for a signal or for vehicles with the right of way;
 - a vehicle that wants to merge;
 - the lane that the route needs.
 """
@@ -84,7 +84,7 @@ from cavmarl.driving.kernels.models.following import before_line, no_constraint,
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
-SEE_LINE_M = 12.0  # for a standing vehicle: swept areas begin up to 10.5 m before a line
+SEE_LINE_M = 12.0  # for a stopped vehicle: swept areas begin up to 10.5 m before a line
 CLOSER_M = 0.9  # a driver that resolves deadlocks stops this much closer than `LINE_MARGIN_M`
 # Around a corner, if the gap to the leader is below `NEAR_M` and the headings differ by more than
 # `ASKEW_RAD`, half the leader's width is subtracted from the gap.
@@ -94,13 +94,13 @@ NEXT_LINE_M = 5.0  # plus the braking distance: a vehicle with a leader looks th
 # At this distance before the place where a lane change must be made, a driver adapts to the leader
 # on the other lane.
 FALL_IN_M = 100.0
-# `MERGE_ROOM_M` of a steered vehicle during a lane change: it stops with its front 0.2 m before the
-# end of the lane, closer than before a line.
+# `MERGE_ROOM_M` of a steered vehicle during a lane change: the front stops 0.2 m before the end of
+# the lane, closer than before a line.
 CHANGING_ROOM_M = -0.8
 MISSED_ROOM_M = 1.5  # additional room if the lane leads to a turn that the vehicle cannot take
 ACROSS_SHARE = 0.25  # lateral offset in lane widths from which the front covers the other lane
 CREEPS_MPS = 0.8 * CREEP_MPS  # speed of a lane change near the end of the lane
-KEPT_MPS = 0.1  # a vehicle is blocked by its leader if the leader allows a lower speed
+KEPT_MPS = 0.1  # a leader that allows only a lower speed blocks the vehicle
 ROW_LINES = 3  # cache lines of a VEHICLE row that drivers read
 FAST_MPS = 5.0  # below this speed, a background driver ignores vehicles that merge ahead of it
 RETURN_MPS = 5.0  # speed of a lost vehicle that searches for its lane
@@ -120,8 +120,8 @@ def look_ahead_m(kind: np.void, speed: float) -> float:
 def see_line_m(kind: np.void, speed: float) -> float:
     """Return the distance in m, from the front, at which a driver reacts to a line.
 
-    A driver as in SUMO reacts when it may soon have to brake, other drivers as soon as they see the
-    line.
+    Drivers with a model of SUMO react when they may soon have to brake. Other drivers react as soon
+    as they see the line.
     """
     if kind["as_sumo"]:
         braking = 0.6 * speed * speed / kind["decel"]
@@ -213,13 +213,13 @@ def _road_ahead(
 ) -> tuple[float, float, int, int]:
     """Follow the route of the vehicle of entry k and collect its constraints.
 
-    `step` is the PLAN of the vehicle's lane. A vehicle that stands close behind its leader does not
+    `step` is the PLAN of the vehicle's lane. A vehicle stopped close behind its leader does not
     look further ahead if the stop line is far: no other constraint could be stronger. Before the
     end of a lane that the route does not follow, the vehicle stops `merge_room_m` m early.
 
     Returns:
-        The binding constraint; the allowed speed in m/s; the reason to stop (HOLD_*); the LINK
-        whose line is near, or -1.
+        The binding constraint; the allowed speed in m/s; the reason to stop (HOLD_*); the LINK with
+        a near stop line, or -1.
     """
     own = scratch.entries[k]
     i = own["row"]
@@ -243,7 +243,7 @@ def _road_ahead(
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)
     hold = HOLD_NONE
-    kept = no_constraint(kind)  # constraint of the leader
+    kept = no_constraint(kind)  # will be the constraint of the leader
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]
@@ -260,7 +260,7 @@ def _road_ahead(
         constraint = before_foe_sweep_beyond_junction(roads, rows, i, kind, dt, scratch)
     look = min(look_ahead_m(kind, speed), travel.view_m)
     see = min(see_line_m(kind, speed) + half, travel.see_m)
-    # A driver with a leader on its own lane considers the next line only if it could otherwise not
+    # A driver with a leader on the same lane may ignore the next line as long as it could still
     # stop there after the leader has passed the line.
     if k + 1 < scratch.lane_end[lane] and (scratch.entries[k + 1]["s"] - row["s"] <= travel.view_m):
         leader = scratch.entries[k + 1]
@@ -323,7 +323,7 @@ def _road_ahead(
         distance += ahead["length_m"]
     if hold == HOLD_YIELD and speed < KEPT_MPS and -kept < KEPT_MPS:
         if kind["as_sumo"] and not here["internal"]:
-            hold = HOLD_EXIT_BLOCKED  # the leader blocks it, so others need not yield to it
+            hold = HOLD_EXIT_BLOCKED  # the leader blocks row i, so others need not yield to it
     return constraint, allowed, hold, link_ahead
 
 
@@ -344,7 +344,7 @@ def _prefetch_first(
 
 @inlined_kernel
 def _prefetch_further(roads: RoadArrays, step: np.void, scratch: Scratch) -> None:
-    """Prefetch the data that the decision reads next: foes on the junction, the lane behind it."""
+    """Prefetch the data that the decision reads next: foes on the junction, and the next lane."""
     link = step["link"]
     if link < 0 or link >= roads.links.shape[0]:  # a scripted vehicle has no step
         return
@@ -361,9 +361,9 @@ def decide(
     roads: RoadArrays,
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,), the committed state; read-only
-    num: int,  # number of rows to decide for, the first of `rows`; the indices contain all rows
+    num: int,  # decide for the first `num` rows; the lane and link indices contain all rows
     driver: int,  # only for rows with this DRIVER_*
-    tick: int,  # of the committed state
+    tick: int,  # tick of the committed state
     dt: float,  # s for which a decision is valid: a tick, or an agent's step
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     step: NDArray[np.void],  # (C,) the PLAN of each row's lane
@@ -415,7 +415,7 @@ def decide(
             change = choose_lane(roads, travel, rows, i, tick, needed, own_wish, scratch)
         if change != 0 and driver == DRIVER_AGENT:
             # During a lane change, a steered vehicle reacts to the leaders on both lanes. It may
-            # drive to the very end of its own lane, because it cannot steer while it stands.
+            # drive to the very end of its own lane, because a stopped vehicle cannot steer.
             lane = roads.lanes[row["lane"]]
             room_m = CHANGING_ROOM_M + further_m
             if change * row["d"] > ACROSS_SHARE * lane["width_m"]:
@@ -427,7 +427,8 @@ def decide(
             aside = behind_adjacent_leader(roads, travel, kind, row, target, scratch)
             constraint = max(constraint, askew, aside)
             if lane["length_m"] - row["s"] < 0.5 * row["length"] + SIDEWAYS_S * CREEP_MPS:
-                # At a higher speed the lane would end before the change is complete.
+                # At a higher speed, the vehicle would reach the end of the lane before it has
+                # changed.
                 allowed = min(allowed, CREEPS_MPS)
         share = 0.0
         if kind["sigma"] > 0.0:

@@ -1,8 +1,8 @@
 """Energy and CO₂ of a vehicle by speed and acceleration, as SUMO computes them.
 
-Energy is that of a battery-electric car; CO₂ is that of a car, van, truck, bus or motorcycle with a
-combustion engine, by the vehicle's class. So both are known for every vehicle. Trams, bicycles and
-pedestrians have neither, as in SUMO.
+Every motor vehicle has both values: the energy of a battery-electric car, and the CO₂ of a car,
+van, truck, bus or motorcycle with a combustion engine, by vehicle class. As in SUMO, both are 0 for
+trams, bicycles and pedestrians.
 
 Source: SUMO 1.28. Energy: its class Energy/unknown with the default parameters, those of a Kia Soul
     EV (Kurczveil, López and Schnieder 2014), without the friction of curves. CO₂: its default
@@ -21,7 +21,7 @@ from cavmarl.core.math.elementary import sine
 GRAVITY_MPS2 = 9.80665
 _MASS_KG = 1830.0
 _ROTATING_KG = 40.0  # added to the mass when the car accelerates
-_DRAG = 0.5 * 1.2041 * 2.6 * 0.35  # half the air's density · front surface · drag coefficient, kg/m
+_DRAG = 0.5 * 1.2041 * 2.6 * 0.35  # 0.5 · air density · frontal area · drag coefficient, kg/m
 _ROLLING = 0.01
 _DRIVE_EFFICIENCY = 0.98
 _RECUPERATION_EFFICIENCY = 0.96
@@ -49,14 +49,14 @@ FUEL_PER_CO2 = (0.32418, 0.32137, 0.32137, 0.32425, 0.32137, 0.32137, 0.32418, 0
 
 @kernel
 def battery_wh(vclass: int, speed: float, accel: float, pitch: float, dt_s: float) -> float:
-    """Return the energy in Wh that an electric car draws in dt_s; negative: it recuperates.
+    """Return the energy in Wh that an electric car draws in dt_s; negative if it recuperates.
 
     Args:
         vclass: index in `roads.network.VEHICLE_CLASSES`; pedestrians have the next index.
-        speed: in m/s at the end of the time; negative backwards.
-        accel: in m/s² along the heading, during the time.
+        speed: in m/s at the end of that time; negative backwards.
+        accel: in m/s² along the heading, during that time.
         pitch: in rad, positive uphill.
-        dt_s: length of the time in s.
+        dt_s: duration in s.
     """
     if vclass < 0 or vclass >= _NUM_CLASSES or _CO2[vclass][0] == 0.0:
         return 0.0
@@ -75,7 +75,7 @@ def battery_wh(vclass: int, speed: float, accel: float, pitch: float, dt_s: floa
 def co2_mg_per_s(vclass: int, speed: float, accel: float, pitch: float) -> float:
     """Return the CO₂ in mg/s; arguments as for `battery_wh`.
 
-    An engine that coasts, or brakes harder than it coasts, emits nothing.
+    The result is 0 if the vehicle coasts, or brakes harder than by coasting.
     """
     if vclass < 0 or vclass >= _NUM_CLASSES:
         return 0.0

@@ -1,1 +1,1 @@
-"""Compiled loops: plans to goals, steps of routes, phases of signals, static objects."""
+"""Compiled loops: plans to goals, steps of routes, signal phases, and static objects."""

@@ -1,6 +1,6 @@
-"""The static objects of a map (pieces of lanes, buildings), and those near a vehicle.
+"""The static objects of a map (pieces of lanes, buildings), and searches for nearby objects.
 
-Objects are in the order of the index's cells, so a search always returns them in the same order.
+Objects are sorted by the cells of the index, so a search always returns them in the same order.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ WALL = record(
 class Backdrop(NamedTuple):
     """The static objects of a map in its frame, and the semantic classes of vehicle types.
 
-    Objects are sorted by the cells of their centres. Their indices have only `start`, and `largest`
-    as half of the largest extent. Corners of a strip: right start, left start, left end, right end.
+    Objects are sorted by the cells of their centres. Indices use only `start` and `largest`, half
+    of the largest extent. Corners of a strip: right start, left start, left end, right end.
     """
 
     semantics: NDArray[np.uint8]  # (num_types,) semantic class of each VTYPE row
@@ -49,7 +49,7 @@ def gather_walls(
 ) -> int:
     """Collect the walls around a vehicle, always in the same order.
 
-    `walls`: WALL (num_walls,) in the frame of the map. `reach_m`: walls farther away are left out.
+    `walls`: WALL (num_walls,) in the map frame. `reach_m`: walls farther away are left out.
     `out`: WALL (num_walls,), overwritten up to the returned number.
 
     Returns the number of walls.
@@ -111,9 +111,9 @@ def gather_quads(
         corners: (num_quads, 4, 2) in the frame of the map.
         values: (num_quads,) an attribute of each quad.
         index: index of the quads by their centres; `largest` is the largest half diagonal.
-        reach_m: all quads with a part within this distance are found.
+        reach_m: the result contains all quads with a part within this distance.
         out_corners: (num_quads, 4, 2) in the vehicle's frame, overwritten.
-        out_values: (num_quads,) attributes of the found quads, overwritten.
+        out_values: (num_quads,) attributes of the collected quads, overwritten.
 
     Returns:
         The number of quads.

@@ -1,8 +1,8 @@
 """Lane-level plans: the next step to one goal, for every lane of the map.
 
-Dijkstra's algorithm backwards from the goal's lanes over the lane graph. Driving along a lane costs
-the time at the speed limit. A lane change costs more on shorter lanes, so that plans change lanes
-early and where there is room.
+Dijkstra's algorithm runs backwards from the goal's lanes over the lane graph. Driving along a lane
+costs the time at the speed limit. A lane change costs more on shorter lanes, so that plans change
+lanes early and where there is room.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from cavmarl.core.records.arrays import RoadArrays
 from cavmarl.core.records.codes import NO_CHANGE_LEFT, NO_CHANGE_RIGHT
 
 LANE_CHANGE_COST_S = 5.0  # cost of a lane change on a very long lane, as travel time in s
-LANE_CHANGE_M = 250.0  # the cost doubles on a lane of this length: drivers can barely change there
-LEAST_CHANGE_M = 9.0  # on shorter lanes, vehicles hardly change: a change always has its full cost
+LANE_CHANGE_M = 250.0  # on a lane of this length the cost doubles: drivers can barely change lanes
+LEAST_CHANGE_M = 9.0  # on shorter lanes, a change always has its full cost
 TURNAROUND = ord("t")
 
 
 @kernel
 def _is_allowed(roads: RoadArrays, link: int) -> bool:
-    """Return whether plans use a link; turnarounds are used only at the ends of roads."""
+    """Return whether plans use a link; they use turnarounds only at the ends of roads."""
     if roads.links[link]["direction"] != TURNAROUND:
         return True
     edge = roads.edges[roads.lanes[roads.links[link]["from_lane"]]["edge"]]
@@ -53,7 +53,7 @@ def _leads_to(roads: RoadArrays, before: int, lane: int) -> bool:
 def is_barred(roads: RoadArrays, lane: int, side: int, permission: int) -> bool:
     """Return whether a solid line bars vehicles from a lane change; side: 1 left, -1 right.
 
-    `permission`: bits of LANE["permissions"]; one that is not barred is enough.
+    `permission`: bits of LANE["permissions"]; one bit that is not barred is enough.
     """
     barred = roads.lanes[lane]["permissions"] >> (NO_CHANGE_LEFT if side > 0 else NO_CHANGE_RIGHT)
     every: bool = (barred & permission) == permission
@@ -62,7 +62,7 @@ def is_barred(roads: RoadArrays, lane: int, side: int, permission: int) -> bool:
 
 @kernel
 def change_cost(roads: RoadArrays, lane: int, weight: float) -> float:
-    """Return the cost in s of a lane change; shorter lanes cost more.
+    """Return the cost in s of a lane change; it is higher on shorter lanes.
 
     Inside junctions, vehicles do not change lanes.
     """
@@ -106,7 +106,7 @@ def _settle(
     cost: NDArray[np.float64],
     plan: NDArray[np.void],
 ) -> None:
-    """Write the plan of a lane. Its cost, and that of all cheaper lanes, must be final."""
+    """Write the plan of a lane. The costs of the lane and of all cheaper lanes must be final."""
     row = roads.lanes[lane]
     step = plan[lane]
     length = row["length_m"]
@@ -151,10 +151,10 @@ def _settle(
 
 
 class _Search(NamedTuple):
-    """State of a search: cost of each lane, and a binary heap of lanes by cost, then by lane."""
+    """State of a search: cost of each lane, and a binary heap of lanes by cost, then by row."""
 
-    cost: NDArray[np.float64]  # (L,) cost of the cheapest known way, s
-    heap: NDArray[np.int32]  # (L,) lanes that are reached and not settled
+    cost: NDArray[np.float64]  # (L,) cost of the cheapest known path, s
+    heap: NDArray[np.int32]  # (L,) lanes that are reached but not settled
     place: NDArray[np.int32]  # (L,) index of a lane in the heap, `_UNSEEN`, or `_SETTLED`
 
 
@@ -184,7 +184,7 @@ def _put_up(search: _Search, lane: int, at: int) -> None:
 
 @kernel
 def _put_down(search: _Search, lane: int, size: int) -> None:
-    """Insert a lane at the empty root of a heap, and move it down; `size` includes the lane."""
+    """Insert a lane at the empty root of a heap and move it down; `size` includes the lane."""
     at = 0
     while True:
         below = 2 * at + 1

@@ -1,4 +1,4 @@
-"""Explicit routes: the next step from every lane of each edge in a sequence of edges."""
+"""Explicit routes: the next step from every lane of the edges of a route."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def plan_route(
         first_step: index in `steps` at which the route begins.
         steps: PLAN, overwritten from `first_step` on. Lanes from which the route cannot be
             followed get to_go = inf.
-        cost: working memory, as long as `steps`.
+        cost: scratch memory, as long as `steps`.
 
     Returns:
         The number of steps.
@@ -61,7 +61,7 @@ def plan_route(
                 cost[way + lane] = roads.lanes[lane]["length_m"] / roads.lanes[lane]["speed_mps"]
             else:
                 _go_through(roads, lane, way, edges[n + 1], way_after, steps, cost)
-        # Propagate lane changes over the lanes of an edge, from the kerb inwards and back again.
+        # Propagate lane changes over the lanes of an edge, from the kerb inwards and back.
         for lane in range(first + 1, first + edge["num_lanes"]):
             _go_sideways(roads, lane, lane - 1, permission, way, steps, cost)
         for lane in range(first + edge["num_lanes"] - 2, first - 1, -1):
@@ -121,7 +121,7 @@ def _go_sideways(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> None:
-    """Write the step to the adjacent lane if that is cheaper than the present step."""
+    """Write the step to the adjacent lane if it is cheaper than the present step."""
     row = roads.lanes[lane]
     side = int(row["left"] == beside) - int(row["right"] == beside)
     if side == 0 or not row["permissions"] & permission:
@@ -146,7 +146,7 @@ def _go_sideways(
 def trace_edges(
     roads: RoadArrays, plan: NDArray[np.void], first_edge: int, out: NDArray[np.int32]
 ) -> int:
-    """Find the edges along a plan, starting from the lane of an edge with the fastest way.
+    """Find the edges along a plan, starting from the fastest lane of an edge.
 
     `plan`: PLAN (L,) of one goal. `out`: memory for EDGE rows, including the first edge.
 
@@ -167,10 +167,10 @@ def trace_edges(
 def follow_plan(
     roads: RoadArrays, plan: NDArray[np.void], lane: int, out: NDArray[np.int32]
 ) -> int:
-    """Find the edges along a plan from a lane.
+    """Find the edges along a plan, starting from a lane.
 
-    `plan`: PLAN (L,) of one goal, with a way from that lane. `lane`: LANE row outside junctions.
-    `out`: memory for EDGE rows, including that of the lane.
+    `plan`: PLAN (L,) of one goal that can be reached from that lane. `lane`: LANE row outside
+    junctions. `out`: memory for EDGE rows, including the row of the lane's edge.
 
     Returns the number of edges; -1 if `out` is too short.
     """

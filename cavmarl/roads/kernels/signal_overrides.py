@@ -1,8 +1,7 @@
-"""Letters that the caller shows at signals, instead of those of the signals' programs.
+"""Signal states that the caller shows instead of the states of the signals' programs.
 
-If worlds have such letters, the phases of a world (num_signals + num_links,) have one more column
-per link: 0, or 1 + the SIGNAL_* code that the link's signal shows. Otherwise they have no such
-columns.
+If worlds allow such states, the phases of a world (num_signals + num_links,) have one more column
+per link: 0, or 1 + the SIGNAL_* code that the caller shows. Otherwise the columns do not exist.
 """
 
 from __future__ import annotations

@@ -4,8 +4,8 @@ Agents choose the phases of other programs; see `signals.kernels.green_choices`.
 
 The phase of a fixed-time program is a function of the tick. An actuated program is SUMO's gap-based
 control: a green phase is prolonged while vehicles follow one another over its detectors, up to its
-maximum duration. Its times are whole milliseconds, as in SUMO. Its state is part of the world: the
-phase, its beginning, the time of the next check, and when each detector was last occupied.
+maximum duration. Times are whole milliseconds, as in SUMO. The world stores the program's state:
+the phase, its beginning, the time of the next check, and when each detector was last occupied.
 
 Sources: SUMO's documentation, Simulation/Traffic Lights ("actuated"), and the behaviour of libsumo
     1.28.
@@ -24,10 +24,10 @@ from cavmarl.core.records.codes import CHOSEN_BY_AGENT
 from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.roads.kernels.map_choice import map_of
 
-# Maximum distance from a detector to the centre of a vehicle that is on it or left it in this tick.
+# Maximum distance from a detector to the centre of a vehicle that occupied it in this tick.
 DETECTOR_REACH_M = 30.0
 
-SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; the least time from a switch to a check
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; also the least time to the first check
 
 
 @kernel
@@ -40,9 +40,9 @@ def detect(
     dt: float,
     detected_s: NDArray[np.float64],
 ) -> None:
-    """Record when vehicles were on the detectors: now, or when their rear left in this tick.
+    """Record when vehicles were on the detectors: now, or when a rear left in this tick.
 
-    The latest time is kept, so the result depends neither on the order of rows nor on their owners.
+    The latest time is kept, so the result does not depend on the order of rows or on their owners.
 
     `lane_place`: (L,) see `RoadArrays`. `places`: PLACE (num_places,). `rows`: VEHICLE (W, C), the
     committed rows of the tick. `num_owned`: (W,) number of rows to check. `detected_s`: (W, D),
@@ -75,11 +75,11 @@ def switch_signals(
     controllers: NDArray[np.void],
     signal_phase: NDArray[np.int32],
 ) -> None:
-    """Set every signal to its phase at the worlds' present ticks; repeated calls change nothing.
+    """Set every signal to its phase at the worlds' present ticks. A repeated call changes nothing.
 
     Signals of maps that a world does not use show their first phase.
 
-    `detected_s`: (W, D) times of detection in all shards up to these ticks. `controllers`:
+    `detected_s`: (W, D) latest times of detection, of all shards up to these ticks. `controllers`:
     CONTROLLER (W, num_controllers), updated. `signal_phase`: (W, num_signals), overwritten.
     """
     for w in range(ticks.size):
@@ -122,7 +122,7 @@ def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int
     left = (time - row["offset_s"]) % row["cycle_s"]
     phase = row["first_phase"]
     last = phase + row["num_phases"] - 1
-    # Half a tick of slack: sums of ticks are not exact.
+    # Allow half a tick of slack, because sums of ticks are not exact.
     while phase < last and left + 0.5 * dt >= roads.phases[phase]["duration_s"]:
         left -= roads.phases[phase]["duration_s"]
         phase += 1
@@ -131,7 +131,7 @@ def _fixed_phase(roads: RoadArrays, program: int, time: float, dt: float) -> int
 
 @kernel
 def _start(roads: RoadArrays, controllers: NDArray[np.void], dt: float) -> None:
-    """Reset every actuated program to the phase that its offset gives."""
+    """Reset every actuated program to the phase at its offset."""
     for program in range(roads.programs.shape[0]):
         controller = roads.programs[program]["controller"]
         if controller >= 0:
@@ -153,7 +153,7 @@ def _note(
     """Record when a vehicle was on a detector that is `ahead` m behind its centre."""
     rear = ahead - 0.5 * row["length"]
     if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
-        # The tick was driven at the speed at its end (semi-implicit Euler).
+        # The vehicle drove the whole tick at the speed at its end (semi-implicit Euler).
         since = rear / row["speed"] if rear > 0.0 else 0.0
         detected_s[detector] = max(detected_s[detector], time - since)
 
@@ -195,7 +195,7 @@ def _check(
     if phase["green"] and lasted < phase["max_ms"]:
         gap = _gap(roads, phase, detected_s, now_ms)
     if gap < math.inf:
-        # Prolong the phase until the last vehicle has driven from its detector to the stop line.
+        # Prolong the phase until the last vehicle has driven from the detector to the stop line.
         more = max(phase["min_ms"] - lasted, _milliseconds(detector_gap_s - gap), 1)
         if more % SECOND_MS != 0:
             more = ((more + lasted) // SECOND_MS + 1) * SECOND_MS - lasted

@@ -21,18 +21,18 @@ def swept_range(
     level_m: float,
     foes: bool,
 ) -> tuple[float, float, float, float]:
-    """Return the first and last position of each centre at which two bodies touch; inf first: none.
+    """Return each centre's first and last position with contact; without contact, first is inf.
 
     Args:
         mine: (n, 6) positions on a path: distance of the centre from the stop line, x, y, z, and
             cosine and sine of the body's heading.
-        theirs: (m, 6) the same for the other path.
-        own: half length and half width of the body, length of its path, and start and end on the
-            path of the area that a conflict protects, all in m; the last two are read if `foes`.
+        theirs: (m, 6) positions on the other path.
+        own: half length and half width of the body, length of its path, and start and end of the
+            conflict's area on that path, all in m; the area is used only if `foes`.
         other: the same for the other body.
         level_m: bodies with a larger difference in height do not touch.
-        foes: whether a conflict keeps the bodies apart in its area. Then a pair counts only if one
-            body has not reached the area (for example, waits at its line) or has left it.
+        foes: whether a conflict keeps the bodies apart in its area. Then a pair of positions counts
+            only if one body has not reached the area (for example, waits) or has left it.
     """
     first, last = math.inf, -math.inf
     foe_first, foe_last = math.inf, -math.inf

@@ -1,9 +1,9 @@
 """Redraws paths over junctions that run backwards, so that a car can follow them.
 
 netconvert joins the end of one lane to the start of another with a line. If roads overlap, the
-start may lie behind the end, or beside it. The line then runs against both roads, or folds back.
-This module shortens both lanes until a smooth curve joins them. The removed part of a lane is added
-to the other paths that begin or end there, so only the repaired paths change.
+start may lie behind the end, or beside it. The line then runs against the direction of both roads,
+or folds back. This module shortens both lanes until a smooth curve joins them. The removed part of
+a lane is added to the other paths that begin or end there, so only the repaired paths change.
 """
 
 from __future__ import annotations
@@ -26,17 +26,17 @@ from cavmarl.roads.polylines import (
     without_repeats,
 )
 
-# A car cannot follow a path with a corner above KINK_RAD that turns ASTRAY_RAD more than its roads
-# do, or with a corner above BACK_RAD between roads that do not make a U-turn of U_TURN_RAD.
+# A car cannot follow a path that has a corner above KINK_RAD and turns ASTRAY_RAD more than its
+# roads do, or a path with a corner above BACK_RAD between roads that make no U-turn of U_TURN_RAD.
 KINK_RAD = np.radians(60.0)
 ASTRAY_RAD = np.radians(90.0)
 BACK_RAD = np.radians(100.0)
 U_TURN_RAD = np.radians(150.0)
 SMOOTH_RAD = np.radians(60.0)  # accepted excess turning of a new path
-WORTH_RAD = np.radians(3.0)  # while no path is accepted, a longer cut must save this much turning
+WORTH_RAD = np.radians(3.0)  # a longer cut without an accepted path must save this much turning
 STEP_M = 0.5  # minimum cut of a lane, and step between two cuts
 MOST_M = 12.0  # maximum cut of a lane
-MOST_SHARE = 0.4  # maximum cut as a share of the lane, because its other end may be cut, too
+MOST_SHARE = 0.4  # maximum cut as a share of the lane, because its other end may be cut as well
 
 
 class Way(NamedTuple):
@@ -48,7 +48,7 @@ class Way(NamedTuple):
 
 
 def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
-    """Redraw paths that no car can follow; `shapes`: (n, 3) of each lane in m, changed in place.
+    """Redraw paths that no car can follow; `shapes`: (n, 3) in m per lane, changed in place.
 
     An end of a lane is not cut if a movement without internal lanes begins or ends there.
     """
@@ -82,7 +82,7 @@ def mend_backward_paths(shapes: list[Shape], ways: Sequence[Way]) -> None:
             last = way.inside[-1]
             shapes[last] = _join(shapes[last], heads[way.after][0])
         if (way.before in tails or way.after in heads) and _is_broken(shapes, way):
-            mended.add(way)  # the part removed from its lanes runs backwards
+            mended.add(way)  # the part removed from the lanes runs backwards
     for way in ways:
         if way in mended:
             redraw(shapes, way)
@@ -98,7 +98,7 @@ def _is_broken(shapes: Sequence[Shape], way: Way) -> bool:
 
 
 def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
-    """Return changes of direction in rad along a path, including both adjacent lanes."""
+    """Return the changes of direction in rad along a path, including both adjacent lanes."""
     steps = np.concatenate([before[-2:], path[1:], after[1:2] - after[0] + path[-1]])
     heading = atan2_all(*np.diff(steps[:, 1::-1], axis=0).T)
     corners: NDArray[np.float64] = (np.diff(heading) + np.pi) % (2.0 * np.pi) - np.pi
@@ -106,7 +106,7 @@ def _corners(before: Shape, path: Shape, after: Shape) -> NDArray[np.float64]:
 
 
 def _astray(corners: NDArray[np.float64]) -> float:
-    """Return the total turning in excess of the difference between the roads, in rad."""
+    """Return how much more a path turns in total than its roads, in rad."""
     net = (corners.sum() + np.pi) % (2.0 * np.pi) - np.pi
     return float(np.abs(corners).sum() - abs(net))
 
@@ -133,7 +133,7 @@ def _needed_cut(
 
 
 def redraw(shapes: list[Shape], way: Way) -> None:
-    """Replace the internal lanes of a way by a curve, divided in proportion to their lengths."""
+    """Replace the internal lanes of a movement by a curve, divided in proportion to the lanes."""
     curve = smooth_curve(shapes[way.before], shapes[way.after])
     lengths = [max(shape_length(shapes[lane]), SAME_POINT_M) for lane in way.inside]
     whole = shape_length(curve)

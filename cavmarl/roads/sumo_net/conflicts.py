@@ -5,7 +5,7 @@ The map says *that* two links are foes (a bit of the junction's request); this m
 
 The results are CONFLICT rows, the common parts of movements from one lane, and the positions where
 cars must stop so that no vehicle on the junction touches them. Maps put the stop line at the end of
-a lane, which some paths sweep over.
+a lane, but some paths sweep over that end.
 """
 
 from __future__ import annotations
@@ -26,9 +26,9 @@ from cavmarl.roads.network import CONFLICT
 from cavmarl.roads.sumo_net.selection import Movement
 
 SAMPLE_M = 0.5
-# Half the width of a car (2 m) on each path, and a margin for corners cut in a turn.
+# Half the width of a car (2 m) on each path, plus a margin for corners that are cut in a turn.
 NEAR_M = 1.0 + 1.0 + 0.6
-# Half the size of a car, with a margin.
+# Half the size of a car, plus a margin.
 HALF_LENGTH_M = 2.6
 HALF_WIDTH_M = 1.1
 # Paths with a larger difference in height are a bridge and the road below it.
@@ -39,9 +39,9 @@ WAITS_BACK_M = 3.0  # maximum distance that drivers wait before netconvert's wai
 
 
 class LinkPath(NamedTuple):
-    """The path of a link over its junction, sampled at most every `SAMPLE_M`, with both ends."""
+    """The path of a link over its junction: samples at most `SAMPLE_M` apart, and both ends."""
 
-    s: NDArray[np.float64]  # (n,) m from the stop line
+    s: NDArray[np.float64]  # (n,) distance from the stop line, m
     xyz: NDArray[np.float64]  # (n, 3) m
 
 
@@ -59,7 +59,7 @@ class Overlap(NamedTuple):
     leave_m: float
     foe_enter_m: float
     foe_leave_m: float
-    near: bool = True  # False: the paths stay apart; the area is where they are closest
+    near: bool = True  # False: the paths stay apart, and the area is where they are closest
 
 
 def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
@@ -72,11 +72,11 @@ def sample_path(s: NDArray[np.float64], xyz: NDArray[np.float64]) -> LinkPath:
 def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
     """Return where the paths of two foes meet, or None if one path is a bridge over the other.
 
-    `path`: the path of one link. `foe`: the path of the other link. `merging`: both lead into the
-    same lane, so the shared area extends to the end of both.
+    `path`: the path of one link. `foe`: the path of the other link. `merging`: both paths lead into
+    the same lane, so the shared area extends to their ends.
 
-    The area is the hull of all parts with less than `NEAR_M` between the centre lines. If there are
-    none, it extends `TOUCH_M` around the closest points.
+    The area is the hull of all parts with less than `NEAR_M` between the centre lines. Without such
+    parts, it extends `TOUCH_M` around the closest points.
     """
     plane = path.xyz[:, None, :2] - foe.xyz[None, :, :2]
     square = plane[..., 0] * plane[..., 0] + plane[..., 1] * plane[..., 1]
@@ -108,11 +108,11 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 def grazing(
     path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath, *, forked: bool = False
 ) -> Overlap | None:
-    """Return where cars on two paths would touch because cars are oblique in bends, or None.
+    """Return where cars on two paths would touch because they are oblique in bends, or None.
 
-    The ways are the paths with some metres of the lanes at their ends. If the paths are `forked`,
-    they leave the same lane: only the area where they meet again counts. The result has the
-    positions of an arriving front bumper and of a leaving rear bumper, like that of `overlap`.
+    The ways are the paths plus some metres of the lanes at their ends. If the paths are `forked`,
+    they leave the same lane, and only the area where they meet again counts. As for `overlap`, the
+    result has the positions of an arriving front bumper and of a leaving rear bumper.
     """
     mine, theirs = poses(path, way), poses(foe, foe_way)
     apart = mine.xyz[:, None, :] - theirs.xyz[None, :, :]
@@ -136,7 +136,7 @@ def _first_absent(numbers: NDArray[np.intp]) -> int:
 
 
 def poses(path: LinkPath, way: LinkPath) -> Poses:
-    """Return car poses along a path, which is a part of the way; both bumpers are on the way."""
+    """Return car poses along a path, which is a part of a way; both bumpers are on the way."""
     front, rear = places_on(way, path.s + HALF_LENGTH_M), places_on(way, path.s - HALF_LENGTH_M)
     chord = front - rear
     return Poses(0.5 * (front + rear), atan2_all(chord[:, 1], chord[:, 0]))
@@ -157,7 +157,7 @@ def touching(
 ) -> NDArray[np.bool_]:
     """Return which pairs of car boxes have no separating axis.
 
-    `apart`: (n, 2) between the centres, m. `mine`, `theirs`: (n,) headings, rad.
+    `apart`: (n, 2) vector between the centres, m. `mine`, `theirs`: (n,) headings, rad.
     """
     across = np.abs(sin_all(mine - theirs))
     along = np.abs(cos_all(mine - theirs))
@@ -183,7 +183,7 @@ def _stretch(path: LinkPath, start: float, end: float) -> tuple[float, float]:
 
 
 def fork_lengths(from_lane: Sequence[int], paths: Sequence[LinkPath | None]) -> NDArray[np.float64]:
-    """Return the length in m of each link's path that is near another path from the same lane.
+    """Return how much of each link's path is near another path from the same lane, in m.
 
     Args:
         from_lane: (K,) LANE row that each link leaves.
@@ -224,7 +224,7 @@ def stop_back(
     approaches: Sequence[LinkPath | None],
     ways: Sequence[LinkPath | None],
 ) -> NDArray[np.float64]:
-    """Return how far before its end each lane has its stop line, in m.
+    """Return the distance in m between the stop line and the end of each lane.
 
     Args:
         ends: (L, 4) x, y, z of each lane's end in m, and the lane's direction there in rad.
@@ -232,13 +232,13 @@ def stop_back(
         from_lane: (K,) LANE row that each link leaves.
         junction: (K,) JUNCTION row of each link.
         paths: (K,) the path of each link, None if the map has none.
-        approaches: (K,) the same, extended by the last metres before the junction, where vehicles
-            from another road must also be kept clear of.
-        ways: (K,) the same with some metres of the lanes at both ends.
+        approaches: (K,) the paths plus the last metres before the junction, where waiting vehicles
+            must also keep clear of vehicles from another road.
+        ways: (K,) the paths plus some metres of the lanes at both ends.
 
     Returns:
-        (L,), 0 if no path from another lane comes near. If `MOST_M` is not enough, the lane keeps
-        the stop line of the map.
+        (L,), 0 if no path from another lane comes near. If `MOST_M` is not enough, the map's stop
+        line is kept.
     """
     back = np.zeros(len(ends))
     at: dict[int, list[int]] = defaultdict(list)
@@ -296,19 +296,19 @@ def conflict_rows(
     ways: Sequence[LinkPath | None],
     left_hand: bool,
 ) -> tuple[NDArray[np.void], NDArray[np.int32], list[int]]:
-    """Return all conflicts of links, each link's first row with the end appended, unruled links.
+    """Return all CONFLICT rows, each link's first row plus the end, and the unruled links.
 
-    Two links are foes if the map sets the bit of either, as some maps set one of the two bits. A
-    link over a bridge and a link below it are never foes. Links from different lanes that are no
-    foes in the map, but so close that cars would touch, are foes, too; the turn across the road
+    Two links are foes if the map sets the bit of either link, because some maps set only one of the
+    two bits. A link over a bridge and a link below it are never foes. Links from different lanes
+    that are not foes in the map are also foes if cars would touch; then the turn across the road
     yields. Links from one lane are foes where their paths meet again beyond the fork; neither has
-    the right of way. An unruled link ends in the same lane as another link, and the map has no rule
-    for both.
+    the right of way. A link is unruled if it ends in the same lane as another link, and the map has
+    no rule for the pair.
 
     Args:
         movements: one per LINK row.
         paths: the path of each link; None if the map has no internal lanes.
-        ways: the same with some metres of the lanes at both ends.
+        ways: the paths plus some metres of the lanes at both ends.
         left_hand: whether the map has left-hand traffic; then turns to the right cross the road.
 
     Raises:
@@ -360,7 +360,7 @@ def fill_conflicts(
 ) -> None:
     """Write the conflicts of each LINK, and its waiting position in the junction, into `links`.
 
-    Also set `merges` of lanes at whose end vehicles turn into the road without a duty to stop.
+    Also set `merges` of lanes at whose end vehicles may turn into the road without having to stop.
     """
     links["first_conflict"] = first_conflict[:-1]
     links["num_conflicts"] = np.diff(first_conflict)
@@ -375,10 +375,10 @@ def fill_conflicts(
 def _wait_places(
     wait_m: NDArray[np.float64], owner: NDArray[np.intp], conflicts: NDArray[np.void]
 ) -> NDArray[np.float64]:
-    """Return waiting positions inside junctions, in m from the stop line, clear of other vehicles.
+    """Return waiting positions in junctions, in m from the stop line, clear of other vehicles.
 
-    netconvert's positions suit SUMO's margins. If a position is up to `WAITS_BACK_M` within the
-    area of a conflict with priority over the waiting vehicle, drivers wait before that area.
+    netconvert's positions suit SUMO's margins. If a position is at most `WAITS_BACK_M` inside the
+    area of a conflict in which the foe has priority, drivers wait before that area.
 
     Args:
         wait_m: (K,) netconvert's positions; inf: none.
@@ -387,7 +387,7 @@ def _wait_places(
     """
     place = conflicts["enter_m"] + LINE_MARGIN_M
     back = wait_m[owner] - place
-    # Rows are sorted by link, then foe. Sorting by foe, then link gives the opposite rows.
+    # Rows are sorted by link, then foe. Sorting by foe, then link, gives the opposite rows.
     mirror = np.argsort(np.lexsort((owner, conflicts["foe"])))
     drives_on = conflicts["must_yield"] & ~conflicts["must_yield"][mirror]
     moved = drives_on & (back > 0.0) & (back <= WAITS_BACK_M)
@@ -397,7 +397,7 @@ def _wait_places(
 
 
 def _bit(mine: Movement, foe: Movement, requests: dict[int, str]) -> bool:
-    """Return the foe's bit in a movement's row of requests; SUMO writes bit 0 at the right."""
+    """Return the foe's bit in a movement's row of requests; in SUMO, bit 0 is at the right."""
     if not requests:
         return False
     row = requests.get(mine.index, "")
@@ -433,7 +433,7 @@ def _grazing(
 
 
 def _shared(path: LinkPath | None, foe: LinkPath | None, *, merging: bool) -> Overlap | None:
-    """Return the shared area; without internal lanes, the junction is a point."""
+    """Return the shared area; without internal lanes, the junction counts as a point."""
     if path is None or foe is None:
         return Overlap(0.0, path.s[-1] if path else 0.0, 0.0, foe.s[-1] if foe else 0.0)
     return overlap(path, foe, merging=merging)

@@ -17,7 +17,7 @@ from cavmarl.roads.network import DETECTOR, VEHICLE_CLASSES
 from cavmarl.roads.sumo_net.programs import SignalProgram
 from cavmarl.roads.sumo_net.signal_rows import DETECTOR_GAP_S, SignalRows, parameter
 
-# SUMO's defaults of actuated programs, s.
+# SUMO's defaults for actuated programs, s.
 MAX_GAP_S = 3.0
 PASSING_TIME_S = 1.9
 # Length that a stopped vehicle occupies in a queue, m.
@@ -99,7 +99,7 @@ class _Approaches:
         }
 
     def _alone(self, lane: int) -> bool:
-        """Return whether the lane's edge has one lane for motor vehicles."""
+        """Return whether the lane's edge has only one lane for motor vehicles."""
         edge = self.roads.edges[self.roads.lanes["edge"][lane]]
         first = edge["first_lane"]
         beside = self.roads.lanes["permissions"][first : first + edge["num_lanes"]]
@@ -118,9 +118,9 @@ class _Approaches:
     def place(self, lane: int, shortest_s: float) -> tuple[int, float]:
         """Return the position of a lane's detector: (LANE, s in m).
 
-        It is `detector-gap` seconds before the stop line, but no farther than the queue that the
-        shortest green clears. If the lane is shorter, the detector is on the lane before it,
-        provided that only one lane leads there.
+        The detector is `detector-gap` seconds before the stop line, but no farther than the queue
+        that the shortest green clears. If the lane is too short, the detector is on the previous
+        lane, provided that there is only one.
         """
         custom = self.program.params.get(self.roads.lane_ids[lane])
         if custom is not None:
@@ -130,7 +130,7 @@ class _Approaches:
             )
         passing = parameter(self.program, "passing-time", PASSING_TIME_S)
         if passing <= 0.0:
-            raise MapError(f"{self.program.place} has passing-time='0': must be positive")
+            raise MapError(f"{self.program.place} has passing-time='0': set a positive number")
         gap = parameter(self.program, "detector-gap", DETECTOR_GAP_S)
         lanes = self.roads.lanes
         distance = min(
@@ -151,7 +151,7 @@ class _Approaches:
         return parameter(self.program, f"max-gap:{self.roads.lane_ids[lane]}", default)
 
     def usable(self, phase: int, detected: dict[int, int]) -> list[int]:
-        """Return the lanes in `detected` whose detectors prolong a phase."""
+        """Return the lanes of `detected` whose detectors prolong a phase."""
         stated = self.program.phases[phase]
         if stated.min_s == stated.max_s:
             return []
@@ -172,7 +172,7 @@ class _Approaches:
         ]
 
     def _counts(self, index: int, state: str, major: set[int]) -> bool:
-        """Return whether a green with a duty to yield (`g`) counts as one without (`G`)."""
+        """Return whether a green with a duty to yield (`g`) counts as a green without it (`G`)."""
         unimportant = index in self.never_major or index in self.turnaround
         if index in self.one_lane or (unimportant and major & self.lanes_at[index]):
             return True

@@ -15,7 +15,7 @@ from xml.sax.handler import ContentHandler
 from cavmarl.core.errors import MapError
 from cavmarl.roads.sumo_net.xml_source import read_xml
 
-# Every signal has this program: the signal is off, and the rules of right of way apply.
+# Every signal has this program, in which the signal is off and the rules of right of way apply.
 OFF = "off"
 UNNAMED = "<unknown>"  # SUMO's name of a program without programID
 
@@ -30,19 +30,19 @@ _REQUIRED = {
 
 @dataclass(frozen=True)
 class ProgramPhase:
-    """One <phase>."""
+    """A <phase> of a program."""
 
-    duration_s: float  # as stated; SUMO's defaults replace missing values
+    duration_s: float  # as in the file; SUMO's defaults replace missing values
     min_s: float
     max_s: float
     state: str  # one letter for every link of the signal
-    # indices of phases that may follow; empty: the next one
+    # indices of phases that may follow; empty: the next phase
     following: tuple[int, ...] = ()
 
 
 @dataclass(frozen=True)
 class SignalProgram:
-    """One <tlLogic>."""
+    """A signal program, <tlLogic>."""
 
     signal_id: str  # with `program_id`, the program's name
     program_id: str
@@ -50,20 +50,20 @@ class SignalProgram:
     kind: str
     offset_s: float  # delay of all phases
     place: str  # file and line, for error messages
-    # in order; none: the element only changes the offset of a known program
+    # phases in order; empty: the element only changes the offset of a known program
     phases: list[ProgramPhase] = field(default_factory=list)
     params: dict[str, str] = field(default_factory=dict)  # <param> by key
 
 
 @dataclass(frozen=True)
 class Timetable:
-    """One <WAUT>: the times at which signals switch between programs."""
+    """A timetable, <WAUT>: the times at which signals switch between programs."""
 
     start: str  # program at the beginning
     place: str  # file and line, for error messages
     # (seconds since the beginning, program), in the file's order
     switches: list[tuple[float, str]] = field(default_factory=list)
-    signal_ids: list[str] = field(default_factory=list)  # the signals that follow it
+    signal_ids: list[str] = field(default_factory=list)  # the signals that follow this timetable
 
 
 class ProgramReader:
@@ -147,13 +147,13 @@ class _AdditionalHandler(ContentHandler):
 
 def _phase(attrs: Mapping[str, str], place: str) -> ProgramPhase:
     duration = _seconds(attrs, "duration", place)
-    # As in SUMO, there is no maximum duration if only the minimum is given.
+    # As in SUMO, the maximum duration is unlimited if only the minimum is given.
     longest = math.inf if "minDur" in attrs else duration
     try:
         following = tuple(int(number) for number in attrs.get("next", "").split())
     except ValueError as error:
         raise MapError(
-            f"{place} has next='{attrs['next']}': must be phase numbers, separated by spaces"
+            f"{place} has next='{attrs['next']}': write phase numbers, separated by spaces"
         ) from error
     return ProgramPhase(
         duration,

@@ -1,4 +1,4 @@
-"""Reads SUMO networks as `RoadNetwork`: sumolib parses the file, this module fills the arrays."""
+"""Reads SUMO networks: sumolib parses the file, this module fills a `RoadNetwork`."""
 
 from __future__ import annotations
 
@@ -61,11 +61,11 @@ from cavmarl.roads.sumo_net.xml_source import limit
 if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
-APPROACH_M = 12.0  # before a junction, bodies are oblique to waiting vehicles up to this distance
-FORK_WATCHED_M = 5.0  # after a junction, drivers that turn off watch rears up to this distance
-MAX_CROSSING_M = 2000  # paths are compared point by point: memory grows with the squared length
-MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that changes this limit
-_NAMED = 5  # maximum number of changed lanes that are named
+APPROACH_M = 12.0  # up to this far before a junction, bodies may be oblique to waiting vehicles
+FORK_WATCHED_M = 5.0  # up to this far after a junction, drivers that turn off watch rears
+MAX_CROSSING_M = 2000  # paths are compared point by point, so memory grows with length squared
+MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that overrides this limit
+_NAMED = 5  # maximum number of changed lanes named in a note
 _ENDINGS = (".gz", ".xml", ".net", ".osm", ".xodr", ".sumocfg", *SCENE_SUFFIXES)
 
 
@@ -91,11 +91,11 @@ def source_hash(path: Path) -> str:
 def read_network(path: str | Path) -> RoadNetwork:
     """Read a SUMO network file (`.net.xml`, `.net.xml.gz`).
 
-    Lane lengths are those of the polylines; EDGE["length_m"] is the length that the map gives.
+    Lane lengths are lengths of the polylines; EDGE["length_m"] is the length stated in the map.
 
     Raises MapError: the file is broken, malicious or inconsistent, or has no drivable lane.
     """
-    # Import sumolib only here: it is not needed for networks in the cache.
+    # Import sumolib only here, because networks in the cache do not need it.
     from cavmarl.roads.sumo_net.sumo_xml import parse_net
 
     path = Path(path)
@@ -113,8 +113,8 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
     chosen = select(net)
     if not chosen.edges:
         raise MapError(
-            "no lane that road vehicles may use: check the lanes' permissions, or what "
-            "netconvert kept (--keep-edges.by-vclass)"
+            "no lane that road vehicles may use: check the lanes' permissions, and which "
+            "edges netconvert kept (--keep-edges.by-vclass)"
         )
     movements = chosen.movements
     lane_row = {id(lane): row for row, lane in enumerate(chosen.lanes)}
@@ -186,7 +186,7 @@ def _assemble(parsed: ParsedNet, name: str, digest: str) -> RoadNetwork:
 def _bar_changes(lanes: NDArray[np.void], lane_ids: Sequence[str], parsed: ParsedNet) -> None:
     """Set the bits of classes that must not change lanes.
 
-    SUMO's "left" is towards the middle of the road, which is the right in left-hand traffic.
+    SUMO's "left" is towards the middle of the road, which is to the right in left-hand traffic.
     """
     inwards, outwards = NO_CHANGE_LEFT, NO_CHANGE_RIGHT
     if parsed.left_hand:
@@ -201,7 +201,7 @@ def _bar_changes(lanes: NDArray[np.void], lane_ids: Sequence[str], parsed: Parse
 def _add_stop_offsets(
     lanes: NDArray[np.void], lane_ids: Sequence[str], offsets_m: dict[str, float]
 ) -> None:
-    """Move stop lines back; those of a lane win over those of its edge."""
+    """Move stop lines back; the offset of a lane overrides the offset of its edge."""
     for row, name in zip(lanes, lane_ids, strict=True):
         offset_m = offsets_m.get(name, offsets_m.get(name.rpartition("_")[0], 0.0))
         if offset_m > 0.0 and not row["internal"]:
@@ -214,7 +214,7 @@ def _shapes(
 ) -> tuple[list[Shape], tuple[str, ...]]:
     """Return the drivable centre line of each lane, (n, 3) in m, and notes on changed lanes.
 
-    Lanes of roads come first.
+    Lanes of roads come first, then internal lanes.
     """
     shapes = [clean_shape(lane.getShape3D()) for lane in chosen.lanes]
     refuse_points(shapes[: len(normal_ids)], normal_ids)
@@ -359,10 +359,10 @@ def _lane_rows(
 
 
 def _outer_rows(chosen: NetworkSelection, edges: NDArray[np.void]) -> NDArray[np.intp]:
-    """Return rows of lanes whose neighbour towards the middle of the road is the next row."""
+    """Return the rows of lanes whose neighbour towards the middle of the road is the next row."""
     edge = np.repeat(np.arange(len(edges)), edges["num_lanes"])
     position = np.array([lane.getIndex() for lane in chosen.lanes])
-    # Lanes cut by an internal junction have parts of different lengths, which are not adjacent.
+    # An internal junction cuts lanes into parts of different lengths, which are not adjacent.
     uncut = {id(move.chain[0]) for move in chosen.movements if len(move.chain) == 1}
     beside = np.array(
         [not lane.getID().startswith(":") or id(lane) in uncut for lane in chosen.lanes]
@@ -390,8 +390,8 @@ def _link_rows(
         link["length_m"] = lanes["length_m"][chain].sum()
         if not link["length_m"] <= most_m:
             raise MapError(
-                f"from lane '{connection.getFromLane().getID()}' to lane "
-                f"'{connection.getToLane().getID()}' are {link['length_m']:.6g} m over the "
+                f"the path from lane '{connection.getFromLane().getID()}' to lane "
+                f"'{connection.getToLane().getID()}' is {link['length_m']:.6g} m long over the "
                 f"junction, more than {most_m} ({MOST_CROSSING}): repair the shapes of both lanes"
             )
         # netconvert splits the path of a link where drivers wait inside the junction.
@@ -407,7 +407,7 @@ def _link_rows(
 
 
 def _fill_sweeps(movements: Movements) -> NDArray[np.void]:
-    """Return the SWEEP rows, and fill the fields of links that refer to them."""
+    """Return the SWEEP rows, and fill the LINK fields that refer to them."""
     sweeps, first = sweep_rows(movements)
     links = movements.links
     links["first_sweep"], links["num_sweeps"] = first[:-1], np.diff(first)

@@ -1,10 +1,10 @@
 """Rounds the corners inside a road, so that a car can follow its lane.
 
 A road may be drawn with a corner that is tighter than a car's turning circle. A car would leave its
-lane there and meet oncoming cars. Here, a wider curve replaces the corner. It is tangent to the
-segments before and after the corner, so it is on the inner side of the corner. The curves of all
-lanes of an edge have the same centre, so the distances between lanes do not decrease. Drivers slow
-down for the curve as for any other bend (`driving.kernels.motion.speed_limits_ahead`).
+lane there and meet oncoming cars. This module replaces such a corner by a wider curve, which is
+tangent to the segments before and after the corner, on its inner side. The curves of all lanes of
+an edge have the same centre, so the distances between lanes do not decrease. Drivers slow down for
+the curve as for any other bend (`driving.kernels.motion.speed_limits_ahead`).
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from numpy.typing import NDArray
 from cavmarl.core.math.elementary_arrays import atan2_all, hypot_all
 from cavmarl.roads.polylines import Shape, shape_length, smooth_curve, without_repeats
 
-# A corner is a turn by more than `CORNER_RAD` with a radius below `TIGHT_M`: the turning circle of
-# a car of 5 m. Corners sharper than `MOST_RAD` stay: the curve would be far from the road.
+# A corner is a turn by more than `CORNER_RAD` with a radius below `TIGHT_M`, the turning circle of
+# a car of 5 m. Corners sharper than `MOST_RAD` stay, because the curve would be far from the road.
 CORNER_RAD = np.radians(35.0)
 TIGHT_M = 5.6
 MOST_RAD = np.radians(165.0)
 MOST_CORNER_POINTS = 32
 CAR_M = (5.0, 2.0)  # length and width of a car that keeps within its lane in the new curve
-LEAST_RADIUS_M = 8.0  # bounds of the radius of the new curve of the innermost lane
+LEAST_RADIUS_M = 8.0  # bounds of the radius of the innermost lane's new curve
 MOST_RADIUS_M = 20.0
 END_M = 1.0  # a lane keeps this much of its first and last segment
 
@@ -80,7 +80,7 @@ def find_corners(shape: Shape) -> list[Corner]:
 
 
 def _curve_m(length_m: float, segments: int) -> float:
-    """Return the length of a curve of which the points of a polyline stand for equal parts."""
+    """Return the length of a curve that the points of a polyline divide into equal parts."""
     return length_m * (segments + 1) / max(segments, 1)
 
 
@@ -120,7 +120,7 @@ def _radius(width_m: float) -> float:
 
 
 def _fillets(shape: Shape, corners: Sequence[Corner], radius: float) -> list[_Fillet]:
-    """Return the curves for corners, each extended over gentle bends for which it needs room."""
+    """Return the curves for corners, each extended over the gentle bends in its place."""
     found: list[_Fillet] = []
     for number, corner in enumerate(corners):
         low = corners[number - 1].last if number else 0
@@ -145,7 +145,7 @@ def _fillets(shape: Shape, corners: Sequence[Corner], radius: float) -> list[_Fi
 
 
 def _fillet(shape: Shape, corner: Corner) -> _Fillet | None:
-    """Return the curve for a corner, or None if the lines around it do not meet in front of it."""
+    """Return the curve for a corner, or None if the lines around it do not meet ahead."""
     start, end = shape[corner.first - 1 : corner.first + 1, :2]
     begin, stop = shape[corner.last : corner.last + 2, :2]
     before = (end - start) / hypot_all(*(end - start))
@@ -201,7 +201,7 @@ def _radii(
 
 
 def _fitting(shape: Shape, fillets: Sequence[_Fillet], radii: Sequence[float]) -> list[float]:
-    """Return the radii, reduced so that the curves neither overlap nor reach the lane's ends."""
+    """Reduce the radii until the curves neither overlap nor reach the lane's ends."""
     needs = [fillet.tangent * radius for fillet, radius in zip(fillets, radii, strict=True)]
     rooms = list(needs)
     for number, fillet in enumerate(fillets):
@@ -227,7 +227,7 @@ def _round(
         first, last = fillet.corner.first, fillet.corner.last
         drawn_m = _curve_m(shape_length(whole[first : last + 1]), last - first)
         if radius <= drawn_m / abs(fillet.corner.turn):
-            continue  # no room for a wider curve than the drawn one
+            continue  # there is no room for a wider curve than the map's
         length = radius * fillet.tangent
         start = _point(fillet.apex - length * fillet.before, whole[first - 1], whole[first])
         end = _point(fillet.apex + length * fillet.after, whole[last + 1], whole[last])
@@ -242,6 +242,6 @@ def _round(
 
 
 def _point(place: Vector, outer: Vector, inner: Vector) -> Vector:
-    """Return (3,) a place with the height of a segment there."""
+    """Return (3,) the position of a place in the plane, with the segment's height there."""
     share = min(_apart(place, outer) / _apart(inner, outer), 1.0)
     return np.append(place, outer[2] + share * (inner[2] - outer[2]))

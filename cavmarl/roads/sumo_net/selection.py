@@ -17,7 +17,7 @@ _ROAD = sum(1 << bit for bit, name in enumerate(VEHICLE_CLASSES) if name not in 
 class Movement:
     """A permitted movement over a junction, before it becomes a LINK."""
 
-    connection: Any  # sumolib's connection out of a normal lane
+    connection: Any  # sumolib's connection that leaves a normal lane
     # sumolib's internal lanes along the movement, in order; empty if the map has none
     chain: tuple[Any, ...]
     node: Any  # sumolib's junction
@@ -28,7 +28,7 @@ class Movement:
 class NetworkSelection:
     """The parts of a network that become rows, in row order."""
 
-    edges: list[Any] = field(default_factory=list)  # normal edges first, then internal ones
+    edges: list[Any] = field(default_factory=list)  # normal edges first, then internal edges
     lanes: list[Any] = field(default_factory=list)  # grouped by edge, from the kerb to the middle
     movements: list[Movement] = field(default_factory=list)  # sorted by from-lane, then index
 
@@ -48,8 +48,8 @@ def _is_road(classes: Iterable[str]) -> bool:
 def select(net: Any) -> NetworkSelection:
     """Select the lanes for road vehicles, and the movements between them.
 
-    Pavements, crossings, walking areas, rails, bicycle lanes, and internal lanes that no movement
-    uses are left out.
+    The selection omits pavements, crossings, walking areas, rails, bicycle lanes, and internal
+    lanes that no movement uses.
 
     Raises MapError: an internal lane belongs to two movements or leads nowhere.
     """
@@ -91,7 +91,7 @@ def select(net: Any) -> NetworkSelection:
 
 
 def _movements(net: Any, node: Any) -> Iterable[Movement]:
-    """Yield all movements over a junction in SUMO's order, which gives the bits of requests."""
+    """Yield all movements over a junction in SUMO's order, which is the order of request bits."""
     index = 0
     for lane_id in node._incLanes or ():
         if not lane_id:
@@ -99,7 +99,7 @@ def _movements(net: Any, node: Any) -> Iterable[Movement]:
         lane = _lane(net, lane_id)
         if lane.getEdge().getToNode() is not node:
             raise MapError(
-                f"junction '{node.getID()}' names lane '{lane_id}', which ends elsewhere: build "
+                f"junction '{node.getID()}' lists lane '{lane_id}', which ends elsewhere: build "
                 "the network again with netconvert"
             )
         for connection in lane.getOutgoing():

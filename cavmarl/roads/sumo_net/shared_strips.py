@@ -1,10 +1,10 @@
 """Moves the two directions of a street apart if their lanes are drawn on the same strip.
 
 Vehicles of opposite directions have no right of way over each other, so they would collide on such
-lanes. Examples are tracks of trams that are open to cars, and streets that are drawn around their
-centre line. Here, all lanes of both edges move by the same distance to the side on which they are
-driven, until the lanes of both directions are side by side. Lanes, connections and permissions
-stay, so each route remains possible.
+lanes. Examples are tram tracks that are open to cars, and streets that are drawn around their
+centre line. This module moves all lanes of both edges by the same distance to the side of traffic,
+until the lanes of both directions are side by side. Lanes, connections and permissions stay, so
+each route remains possible.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ from cavmarl.core.math.elementary_arrays import hypot_all
 from cavmarl.roads.polylines import Shape, without_repeats
 from cavmarl.roads.sumo_net.backward_paths import Way, redraw
 
-NEAR_M = 2.0  # the width of a car: vehicles on lanes with nearer centre lines collide
-STEP_M = 5.0  # between the compared places of a lane
-LEAST_PLACES = 3  # of a strip
+NEAR_M = 2.0  # the width of a car; vehicles on lanes with closer centre lines would collide
+STEP_M = 5.0  # distance between the compared places of a lane
+LEAST_PLACES = 3  # smallest number of compared places in a strip
 OPPOSITE = -0.9  # largest cosine between opposite directions
 LEVEL_M = 3.0  # lanes with a larger difference in height do not meet
 SHORT_M = 3.0  # a shorter path over a junction has no room for a curve
-MOST_MITER = 3.0  # in a corner, a point moves by at most this many times the distance
+MOST_MITER = 3.0  # in a corner, a point moves at most this many times as far as the lane
 
 Vector = NDArray[np.float64]
 
@@ -44,7 +44,7 @@ class Strip(NamedTuple):
 
     one: Road
     other: Road
-    lanes: tuple[tuple[int, int], ...]  # rows of these lanes
+    lanes: tuple[tuple[int, int], ...]  # pairs of rows of these lanes
     apart_m: float  # distance by which the lanes of each edge have to move
 
 
@@ -73,7 +73,7 @@ def find_strips(
 def move_apart(
     shapes: list[Shape], strips: Sequence[Strip], ways: Sequence[Way], left_hand: bool
 ) -> None:
-    """Move the edges of strips apart, and redraw the paths over junctions that begin or end there.
+    """Move the edges of strips apart, and redraw the paths over junctions at their ends.
 
     `shapes` (n, 3) of all lanes in m are changed in place.
     """
@@ -114,7 +114,7 @@ def _strip(
 
 
 def _left_of(shape: Shape, other: Shape) -> Vector:
-    """Return how far to the left the other lane is, in m, where it runs in opposite direction."""
+    """Return how far to the left another lane is, in m, where its direction is opposite."""
     steps = np.diff(shape, axis=0)
     sizes = hypot_all(steps[:, 0], steps[:, 1])
     s = np.concatenate([[0.0], np.cumsum(sizes)])
@@ -142,13 +142,13 @@ def _left_of(shape: Shape, other: Shape) -> Vector:
 
 
 def _beside(shape: Shape, left_m: float) -> Shape:
-    """Return a parallel of a polyline, `left_m` to its left."""
+    """Return a polyline parallel to another one, `left_m` to its left."""
     steps = np.diff(shape[:, :2], axis=0)
     steps /= hypot_all(steps[:, 0], steps[:, 1])[:, None]
     normals = np.stack([-steps[:, 1], steps[:, 0]], axis=1)
     before, after = normals[[0, *range(len(normals))]], normals[[*range(len(normals)), -1]]
     middle = before + after
-    # Twice the square of the cosine of half of the turn: the parallels of both segments meet there.
+    # Twice the squared cosine of half the turn: the parallels of both segments meet there.
     square = np.maximum((middle * before).sum(axis=1), 2.0 / MOST_MITER**2)
     moved = shape.copy()
     moved[:, :2] += left_m * middle / square[:, None]

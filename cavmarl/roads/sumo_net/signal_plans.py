@@ -29,11 +29,11 @@ def with_programs(
     """Return a network whose signals also have the programs of additional files.
 
     As in SUMO, the program that is loaded last runs, and every signal has a program `off`. A <WAUT>
-    gives the times at which its signals switch programs. They switch at once, in any phase, and the
+    gives the times at which signals switch programs. Signals switch at once, in any phase, and the
     time of every program starts with the episode. `chosen` overrides files and timetables.
 
     `files`: additional files in loading order; elements that do not concern signals are ignored.
-    `chosen`: program by signal.
+    `chosen`: programs by signal.
 
     Returns a network whose `source_hash` covers all sources. Raises MapError: a file is broken, a
     signal or program is unknown, or a program does not fit its signal.
@@ -61,7 +61,7 @@ def with_programs(
 
 
 def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetwork:
-    """Return a network with signals that fail during the episode, and stay off.
+    """Return a network with signals that fail during the episode and stay off.
 
     Failed signals switch to their program `off`; links with a duty to yield blink.
 
@@ -85,7 +85,7 @@ def with_outages(network: RoadNetwork, outages: Mapping[str, float]) -> RoadNetw
 
 
 def remade(network: RoadNetwork, rows: SignalRows, sources: Sequence[str]) -> RoadNetwork:
-    """Return a network with other signals, and with the detectors of programs that need them.
+    """Return a network with other signals, and with the detectors that their programs need.
 
     `sources`: texts that the new `source_hash` covers.
     """
@@ -137,7 +137,7 @@ def _program(
 
 
 def _off(network: RoadNetwork, rows: SignalRows, signal_id: str) -> SignalProgram:
-    """Return the program of a failed signal: links with a duty to yield blink, others are off."""
+    """Return the program of a failed signal: links that yield show blinking, others are off."""
     row = rows.row[signal_id]
     letters = ["O"] * rows.signals[row][1]
     for link in network.links[network.links["signal"] == row]:
@@ -152,5 +152,5 @@ def _check_signal(rows: SignalRows, signal_id: str, place: str) -> None:
         known = ", ".join(sorted(rows.ids)[:8]) or "none"
         raise MapError(
             f"{place}: this map has no signal '{signal_id}', only {known}: "
-            "is the file for another map?"
+            "check that the file is for this map"
         )

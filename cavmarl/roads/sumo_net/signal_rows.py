@@ -1,6 +1,6 @@
 """Signals and their programs as SIGNAL, PROGRAM, PHASE and SWITCH rows.
 
-Rows are only appended, so programs of additional files can be added to those of a map.
+Rows are only appended, so programs of additional files can be added to the programs of a map.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from cavmarl.core.records.codes import CHOSEN_BY_AGENT
 from cavmarl.roads.network import PHASE, PROGRAM, SIGNAL, SIGNAL_STATES, SWITCH, RoadNetwork
 from cavmarl.roads.sumo_net.programs import ProgramPhase, SignalProgram
 
-# Trains switch these signals. There are no trains, so their links count as links without a signal.
+# Trains switch these signals. There are no trains, so the links count as links without a signal.
 RAIL_KINDS = ("rail_signal", "rail_crossing")
 
 MAX_MS = 10**12  # SUMO's largest time: 30 years
@@ -41,10 +41,10 @@ class SignalArrays(NamedTuple):
 
 
 class ControlledPhase(NamedTuple):
-    """A phase that an agent chooses, or that comes between two such phases."""
+    """A phase that an agent chooses, or a phase between two such phases."""
 
     letters: str
-    duration_s: float  # in the map's program
+    duration_s: float  # duration in the map's program
     min_ms: int
     max_ms: int
     following: int  # number of the next phase in the program
@@ -52,7 +52,7 @@ class ControlledPhase(NamedTuple):
 
 
 class SignalRows:
-    """The signals of a map: rows, letters, and the row of every id."""
+    """The signals of a map: rows, states, and the row of every id."""
 
     def __init__(self) -> None:
         self.ids: list[str] = []
@@ -64,16 +64,14 @@ class SignalRows:
         self.switches: list[tuple[int, float, int]] = []
         self.row: dict[str, int] = {}
         self.program_row: dict[tuple[str, str], int] = {}
-        self.used_links: dict[int, int] = {}  # by row; the links of a signal that exist
+        self.used_links: dict[int, int] = {}  # by row: number of links that exist
         self.num_controllers = 0
         self.phase_detectors: list[int] = []
-        self.specs: dict[
-            int, SignalProgram
-        ] = {}  # by row; of actuated programs that need detectors
+        self.specs: dict[int, SignalProgram] = {}  # by row: actuated programs that need detectors
 
     @classmethod
     def of(cls, network: RoadNetwork) -> SignalRows:
-        """Return the rows of a network, so that more can be appended."""
+        """Return the rows of a network, so that further rows can be appended."""
         rows = cls()
         rows.ids = list(network.signal_ids)
         rows.row = {name: row for row, name in enumerate(rows.ids)}
@@ -99,7 +97,7 @@ class SignalRows:
     def add(self, program: SignalProgram) -> None:
         """Append a program; the last program of a signal runs, as in SUMO.
 
-        A program without phases changes the offset of the known program with its name.
+        A program without phases changes the offset of the known program with the same name.
 
         Raises MapError: the program has no type, states of different lengths, an unknown letter, a
         cycle of zero length, or the name of another program.
@@ -152,9 +150,9 @@ class SignalRows:
         phases: Sequence[ControlledPhase],
         cycle_s: float,
     ) -> None:
-        """Append a program whose phases an agent chooses, and let it run.
+        """Append a program whose phases an agent chooses, and select it.
 
-        Its lanes get detectors like those of an actuated program. `cycle_s`: duration of a cycle,
+        The signal's lanes get detectors as for an actuated program. `cycle_s`: duration of a cycle,
         for estimates of travel times.
         """
         signal, first = self.row[signal_id], len(self.phases)
@@ -224,7 +222,7 @@ class SignalRows:
         self.letters.extend(map(SIGNAL_STATES.index, state))
 
     def set_detectors(self, program: int, phase: int, detectors: list[int]) -> None:
-        """Set the DETECTOR rows that prolong a phase, given by its number, of a program."""
+        """Set the DETECTOR rows that prolong a phase of a program; the phase is given by number."""
         row = int(self.programs[program][1]) + phase
         self.phases[row] = (*self.phases[row][:-2], len(self.phase_detectors), len(detectors))
         self.phase_detectors += detectors
@@ -299,9 +297,7 @@ def parameter(program: SignalProgram, key: str, default: float) -> float:
     except ValueError:
         value = math.nan
     if not (math.isfinite(value) and value >= 0.0):
-        raise MapError(
-            f"{program.place} has {key}='{text}': must be a number of seconds, at least 0"
-        )
+        raise MapError(f"{program.place} has {key}='{text}': write a number of seconds, at least 0")
     return value
 
 

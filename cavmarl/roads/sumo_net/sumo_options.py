@@ -1,18 +1,18 @@
-"""Reads SUMO's configurations: options by SUMO's names for them, and the files that they name.
+"""Reads SUMO's configurations: options by SUMO's names, and the files that they name.
 
-As SUMO 1.28 does, options are found in any section, by any of their synonyms, but not by
-abbreviations; `${NAME}` in a value stands for a variable of the environment; files are separated by
-commas, relative to the configuration, and `%20` in their names stands for a space.
+As in SUMO 1.28, an option may be in any section and have any of its synonyms, but no abbreviation.
+`${NAME}` in a value stands for an environment variable. Files are separated by commas and relative
+to the configuration; `%20` in a file name stands for a space.
 
 The text file beside this module lists all options of SUMO by kind:
 
 - `files`: net-file, route-files and additional-files.
 - `time`, `seed`: begin, end and step length; random numbers.
-- `read`: options that change traffic and that `traffic.demand` obeys.
+- `read`: options that change traffic and that `traffic.demand` implements.
 - `traffic`: further options that change the traffic of road vehicles.
 - `beyond`: options about pedestrians, trains, the mesoscopic model and SUMO's own computation.
-- `unread`: files and options that are never passed to SUMO.
-- `report`: outputs, messages, the GUI and remote control; they change no traffic.
+- `unread`: files and options that cavmarl never passes to SUMO.
+- `report`: outputs, messages, the GUI and remote control, which change no traffic.
 """
 
 from __future__ import annotations
@@ -36,23 +36,23 @@ _OTHER_ROOTS = ("routes", "additional", "add", "net", "osm", "OpenDRIVE")
 
 
 class KnownOption(NamedTuple):
-    """An option that SUMO has."""
+    """An option of SUMO."""
 
     name: str  # SUMO's main name
-    kind: str  # see above
+    kind: str  # one of the kinds above
     default: str
 
 
 class GivenOption(NamedTuple):
     """An option of a configuration."""
 
-    value: str  # not empty, variables replaced
+    value: str  # not empty; variables are replaced
     line: int
 
 
 @cache
 def known_options() -> Mapping[str, KnownOption]:
-    """Return SUMO's options by each of their names."""
+    """Return SUMO's options by name; an option is listed under each of its synonyms."""
     known: dict[str, KnownOption] = {}
     text = Path(__file__).with_name("sumo_options.txt").read_text(encoding="utf-8")
     for line in text.splitlines()[1:]:
@@ -63,7 +63,7 @@ def known_options() -> Mapping[str, KnownOption]:
 
 
 def differs_from_default(option: KnownOption, value: str) -> bool:
-    """Return whether a value of an option is not SUMO's default."""
+    """Return whether an option's value differs from SUMO's default."""
     try:
         return float(value) != float(option.default)
     except ValueError:
@@ -109,7 +109,7 @@ class _Handler(ContentHandler):
         if option is None:
             close = get_close_matches(name, known_options(), n=3)
             meant = f"did you mean {' or '.join(close)}?" if close else "remove it"
-            raise self._error(name, "is no option of SUMO", meant)
+            raise self._error(name, "is not an option of SUMO", meant)
         if option.name in self.given:
             first = self.given[option.name].line
             raise self._error(
@@ -127,8 +127,8 @@ def read_options(path: Path, failure: type[CavmarlError]) -> dict[str, GivenOpti
 
     `failure`: type of the error to raise.
 
-    Raises CavmarlError: an error of the type `failure`: the file cannot be read or is no
-    configuration, or SUMO has no option of a name, or an option is set twice.
+    Raises CavmarlError (of the type `failure`): the file cannot be read or is not a configuration,
+    SUMO does not have an option, or an option is set twice.
     """
     handler = _Handler(path, failure)
     read_xml(path, handler, failure)
@@ -145,7 +145,7 @@ def files_of(
 
     `failure`: type of the error to raise.
 
-    Raises CavmarlError: an error of the type `failure`: a file does not exist.
+    Raises CavmarlError (of the type `failure`): a file does not exist.
     """
     found: list[Path] = []
     for name in names:
@@ -165,7 +165,7 @@ def files_of(
 def map_of_config(path: Path) -> Path:
     """Return the road network of a configuration.
 
-    Raises MapError: the configuration cannot be read, or it names no network that exists.
+    Raises MapError: the configuration cannot be read, or does not name one existing network.
     """
     options = read_options(path, MapError)
     found = files_of(path, options, ["net-file"], MapError)
@@ -178,7 +178,7 @@ def map_of_config(path: Path) -> Path:
 
 
 def additional_files_of(path: Path) -> list[Path]:
-    """Return the additional files of a configuration; they may have signal programs.
+    """Return the additional files of a configuration, which may contain signal programs.
 
     Raises MapError: the configuration cannot be read.
     """

@@ -1,7 +1,7 @@
 """Reads SUMO's network files with sumolib, and adds checks that sumolib lacks.
 
 sumolib merges edges of the same name, accepts NaN as a speed, and raises a bare KeyError for
-missing attributes. This module checks every element first. Messages have a place and a remedy.
+missing attributes. This module checks every element first. Messages state the place and a remedy.
 """
 
 from __future__ import annotations
@@ -114,7 +114,7 @@ class _CheckedReader(ContentHandler):
                     raise self._error(name, attrs, f"has {key}='{attrs[key]}', must be bits")
 
     def _read_rules(self, name: str, attrs: Mapping[str, str]) -> None:
-        """Read the rules of lanes that sumolib does not read, and count the other ones."""
+        """Read the lane rules that sumolib does not read; count rules that are not simulated."""
         if name == "lane":
             self._lane = attrs["id"]
             changes = tuple(attrs.get(key) or "all" for key in ("changeLeft", "changeRight"))
@@ -137,7 +137,7 @@ class _CheckedReader(ContentHandler):
 
     def _check_version(self, attrs: Mapping[str, str]) -> None:
         if "version" not in attrs:
-            raise self._error("net", attrs, "has no version attribute: not a SUMO network")
+            raise self._error("net", attrs, "has no version attribute, so it is not a SUMO network")
         if not _VERSION.fullmatch(attrs["version"]):
             raise self._error(
                 "net", attrs, f"has version='{attrs['version']}', not a version of SUMO's"
@@ -192,9 +192,9 @@ class ParsedNet(NamedTuple):
     net: Any  # a `sumolib.net.Net`
     programs: list[SignalProgram]
     left_hand: bool  # whether the map has left-hand traffic
-    # SUMO's classes that may change to the left and to the right, of lanes where not all may
+    # SUMO's classes that may change left and right, for lanes where not all classes may
     changes: dict[str, tuple[list[str], list[str]]]
-    stop_offsets_m: dict[str, float]  # from the stop line to the end, by id of an edge or a lane
+    stop_offsets_m: dict[str, float]  # distance from stop line to lane end, by edge or lane id
     notes: tuple[str, ...]  # elements that are not simulated, with counts
 
 
@@ -204,7 +204,7 @@ def parse_net(path: Path) -> ParsedNet:
     Raises:
         MapError: the XML is malicious or broken, its root is not <net>, an attribute is missing,
             infinite or NaN, a speed, length or width is not positive, an id occurs twice, lanes are
-            not in order, or a reference is invalid. The message has a place and a remedy.
+            not in order, or a reference is invalid. The message states the place and a remedy.
     """
     handler = _CheckedReader(path)
     read_xml(path, handler)

@@ -1,9 +1,9 @@
 """Sweeps: where vehicles on two movements would touch although no conflict separates them.
 
-Conflicts describe cars on the junction. The body of a bus sweeps over adjacent lanes in bends, over
-vehicles that wait at the next line, and over vehicles that have just left the junction. So for each
-pair of sizes, bodies are moved along both ways, including some metres before and after the
-junction.
+Conflicts describe cars on the junction. But the body of a bus sweeps over adjacent lanes in bends,
+over vehicles that wait at the next line, and over vehicles that have just left the junction. So for
+each pair of sizes, two bodies are moved along their ways: the paths over the junction plus some
+metres before and after it.
 """
 
 from __future__ import annotations
@@ -37,24 +37,24 @@ class SweptBody(NamedTuple):
     half_width_m: float
 
 
-# Bodies of the size classes: car, van or truck, bus. Lengths in between count as the longer class.
+# Bodies of the size classes: car; van or truck; bus. Lengths in between belong to the longer class.
 BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
-# Bodies are examined from this distance of the front before its line to this distance of the rear
-# after the junction; a U-turn reaches farther over the adjacent lane.
+# Bodies are examined from `BEFORE_M` (front before its line) to this distance of the rear after the
+# junction; a U-turn reaches farther over the adjacent lane.
 BEFORE_M = 10.0
 BEYOND_M = 4.0
 TURN_BEYOND_M = 8.0
 MARGIN_M = STEP_M
 BEHIND_M = 1.0  # distance of a following vehicle behind the rear of its leader
-LEAST_ASIDE_M = 0.5  # minimum offset of a body from its way at which its rear swings back
+LEAST_ASIDE_M = 0.5  # smallest lateral offset of a body from its way at which its rear swings
 TURNAROUND = ord("t")
 AHEAD_M = BEFORE_M + 2.0 * BODIES[-1][0]  # length of lane that `poses_on_rails` needs at each end
 assert len(BODIES) == len(SIZE_LENGTHS_M) + 1
 
 
 class Movements(NamedTuple):
-    """Links of a network with their conflicts and ways, by LINK row."""
+    """Links of a network with their conflicts and ways (see the module), by LINK row."""
 
     links: NDArray[np.void]  # LINK (K,), with conflicts
     conflicts: NDArray[np.void]  # CONFLICT
@@ -69,7 +69,7 @@ def unfed_beside(
 ) -> dict[int, list[LinkPath]]:
     """Return, for each U-turn (LINK row), lanes beside its target lane into which no link leads.
 
-    Positions are measured along the U-turn: the lanes begin at the link's length.
+    Positions are measured along the U-turn, so the lanes begin at the link's length.
     """
     fed = np.zeros(len(lanes), dtype=np.bool_)
     fed[links["to_lane"]] = True
@@ -85,7 +85,7 @@ def unfed_beside(
 
 
 def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32]]:
-    """Return SWEEP rows of all links, and each link's first row with the end appended."""
+    """Return the SWEEP rows of all links, and each link's first row plus the end."""
     by_junction: dict[int, list[int]] = defaultdict(list)
     for link, way in enumerate(movements.ways):
         if way is not None:
@@ -116,7 +116,7 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
 
 
 def _by_own_size(row: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a sort key that keeps rows of one size together: a driver reads only these."""
+    """Return a sort key that keeps rows of one size together, because a driver reads one size."""
     return (row[1], *row)
 
 
@@ -153,7 +153,7 @@ def find_pair(
     movements: Movements,
     pair: tuple[int, int],  # LINK rows
     one: tuple[NDArray[np.float64], SweptBody],  # poses on the first link, and the body
-    other: tuple[NDArray[np.float64], SweptBody],  # the same on the second link
+    other: tuple[NDArray[np.float64], SweptBody],  # the same for the second link
 ) -> tuple[Area, Area] | None:
     """Return where two bodies on two links touch, on each link, if no conflict separates them."""
     a, b = (movements.links[link] for link in pair)
@@ -173,7 +173,7 @@ def find_pair(
         mine, beyond = _before_and_beyond(mine, float(a["length_m"]))
         theirs, foe_beyond = _before_and_beyond(theirs, float(b["length_m"]))
         found = swept_range(mine, theirs, *extents, CLEARANCE_M, foes)
-        # A vehicle that turns round comes near oncoming vehicles that have just left the junction.
+        # A vehicle in a U-turn comes near oncoming vehicles that have just left the junction.
         if a["direction"] == TURNAROUND and body.half_m > BODIES[0].half_m:
             turns = mine[mine[:, 0] + body.half_m <= a["length_m"]]
             found = _hull(found, swept_range(turns, foe_beyond, *extents, CLEARANCE_M, foes))
@@ -186,7 +186,7 @@ def find_pair(
 def _before_and_beyond(
     poses: NDArray[np.float64], length_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the poses whose centres are before the end of a junction, and the other poses."""
+    """Split poses into those with centres before the end of a junction, and the rest."""
     before = poses[:, 0] <= length_m
     return poses[before], poses[~before]
 
@@ -220,7 +220,7 @@ def _find_behind(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """Find contacts of a vehicle that makes a U-turn, and of its rear, with vehicles behind it."""
+    """Find contacts of a vehicle in a U-turn, and of its rear, with vehicles behind it."""
     way = movements.ways[turn]
     assert way is not None
     length = float(movements.links["length_m"][turn])
@@ -252,13 +252,13 @@ def _find_behind(
 def _find_beside(
     movements: Movements,
     turn: int,
-    path: LinkPath,  # of an adjacent lane into which no link leads
+    path: LinkPath,  # path of an adjacent lane into which no link leads
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
     """Find where a U-turn sweeps over the start of a lane on which vehicles have departed.
 
-    The rows have the U-turn's link as link and foe, as if these vehicles had come from there.
+    The rows have the U-turn's link as link and as foe, as if these vehicles came from that link.
     """
     length = float(movements.links["length_m"][turn])
     for foe, (foe_half, foe_wide) in enumerate(BODIES):
@@ -286,7 +286,7 @@ def is_near(mine: NDArray[np.float64], theirs: NDArray[np.float64]) -> bool:
 def poses_on_rails(
     way: LinkPath, half_m: float, length_m: float, beyond_m: float = BEYOND_M
 ) -> NDArray[np.float64]:
-    """Return (n, 6) centre position, x, y, z, cos and sin of bodies with both bumpers on a way."""
+    """Return (n, 6) position, x, y, z, cos, sin of the centres of bodies with bumpers on a way."""
     at = np.arange(-(BEFORE_M + half_m), length_m + beyond_m + half_m + STEP_M, STEP_M)
     front, rear = places_on(way, at + half_m), places_on(way, at - half_m)
     chord = front - rear

@@ -1,4 +1,4 @@
-"""Reads untrusted XML: rejects entities, document types and bombs; errors name the line.
+"""Reads untrusted XML: rejects entities, document types and XML bombs; errors name the line.
 
 Three limits can be changed by environment variables: the size of the text in bytes, its ratio to
 the size of the gzipped file, and the nesting depth of elements.
@@ -24,14 +24,14 @@ from defusedxml.expatreader import DefusedExpatParser
 
 from cavmarl.core.errors import CavmarlError, ConfigError, MapError
 
-# The OSM data of a country is larger than this, but no world that one machine can simulate is.
+# OSM data of a country is larger than this, but not the data of a world that one machine can run.
 MAX_XML_BYTES = 1 << 30
-LIMIT = "CAVMARL_MAX_XML_BYTES"  # environment variable that changes this limit
+LIMIT = "CAVMARL_MAX_XML_BYTES"  # environment variable that overrides this limit
 # Maps and demand are compressed by a factor of 5 to 40, bombs by up to 1,032.
 MAX_XML_RATIO = 100
 RATIO_LIMIT = "CAVMARL_MAX_XML_RATIO"
 _ANY_RATIO_BYTES = 1 << 24  # a text of this size may be compressed by any factor
-MAX_XML_DEPTH = 100  # files of maps and demand have at most twelve
+MAX_XML_DEPTH = 100  # map and demand files have a depth of at most twelve
 DEPTH_LIMIT = "CAVMARL_MAX_XML_DEPTH"
 
 # Encodings of maps and demand; UTF-16 is recognized by its first bytes.
@@ -54,7 +54,7 @@ class _Depth:
         self._open += 1
         if self._open > self._most:
             raise OSError(
-                f"its elements are nested over {self._most} deep: repair it, or set {DEPTH_LIMIT}"
+                f"its elements are nested over {self._most} deep: repair it or set {DEPTH_LIMIT}"
             )
 
     def closes(self) -> None:
@@ -90,7 +90,7 @@ class _Builder(TreeBuilder):
 
 
 class _Limited(io.RawIOBase):
-    """A stream that raises an error beyond a maximum size, to stop decompression bombs."""
+    """A stream that raises an error above a maximum size, against decompression bombs."""
 
     def __init__(self, raw: io.BufferedReader) -> None:
         packed = raw.read(2) == _GZIP_MAGIC
@@ -120,8 +120,8 @@ class _Limited(io.RawIOBase):
 def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = MapError) -> None:
     """Pass the elements of a plain or gzipped XML file to a SAX `handler`.
 
-    Exceptions of the handler are not caught. `failure`: type of the errors to raise, which depends
-    on the kind of file.
+    Exceptions of the handler are not caught. `failure`: type of the errors to raise, by kind of
+    file.
 
     Raises:
         CavmarlError: (of the type `failure`) the file is missing, is not well-formed XML, is too
@@ -152,7 +152,7 @@ def read_xml(path: Path, handler: ContentHandler, failure: type[CavmarlError] = 
 
 
 def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[CavmarlError]) -> None:
-    """Refuse encodings outside of `_ENCODINGS`: the parser would raise errors of other types."""
+    """Refuse encodings outside of `_ENCODINGS`, for which the parser raises other error types."""
     declared = declared_encoding(stream.read(_DECLARATION_BYTES))
     stream.seek(0)
     if declared and declared.lower() not in _ENCODINGS:
@@ -160,7 +160,7 @@ def _check_encoding(path: Path, stream: io.BufferedIOBase, failure: type[Cavmarl
 
 
 def declared_encoding(content: bytes) -> str:
-    """Return the encoding that the first line of an XML file declares; empty: none."""
+    """Return the encoding that the first line of an XML file declares, or an empty text."""
     declared = _DECLARED.match(content)
     return declared[1].decode("latin-1") if declared else ""
 
@@ -179,7 +179,7 @@ def read_tree(path: Path) -> Element:
     """Return the root of a plain or gzipped XML file.
 
     Raises:
-        OSError: the file cannot be read, or its text is too large or too deep.
+        OSError: the file cannot be read, or its text is too large or nested too deeply.
         ParseError, DefusedXmlException, ValueError, LookupError: see `defusedxml.ElementTree`.
     """
     parser = defusedxml.ElementTree.DefusedXMLParser(target=_Builder(), forbid_dtd=True)
@@ -198,7 +198,7 @@ def most_bytes() -> int:
 
 
 def limit(variable: str, usual: int) -> int:
-    """Return a limit from an environment variable, or the usual limit.
+    """Return a limit from an environment variable, or the default limit.
 
     Raises:
         ConfigError: the variable is not a number above 0.

@@ -1,7 +1,7 @@
 """Camera pictures: sky, ground, roads, and the faces of bodies and walls.
 
-A picture is rendered some rows at a time. The functions that write depths, classes or colours read
-the rows that were rendered last; `first` is the row of the whole picture at which these begin.
+A picture is rendered in bands of rows. The functions that write depths, classes or colours read the
+last rendered band; `first` is the row of the whole picture at which the band begins.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from cavmarl.sensors.kernels.polygon_fill import (
     set_corner,
 )
 
-# Faces of every picture; the faces of bodies and buildings follow.
+# These faces are in every picture; the faces of bodies and buildings follow.
 SKY_FACE = 0
 GROUND_FACE = 1
 ROAD_FACE = 2
@@ -118,7 +118,7 @@ def _corner_of(prism: np.void, along: float, across: float) -> tuple[float, floa
 
 @kernel
 def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void, first: int) -> int:
-    """Add the faces of a body that face the camera: at most two sides and the top or bottom."""
+    """Add the sides of a body that the camera sees: at most two, and the top or the bottom."""
     cos = prism["cos"]
     sin = prism["sin"]
     dx = camera.mount[0, 3] - prism["x"]
@@ -160,7 +160,7 @@ def _add_prism(camera: CameraPose, picture: PixelRows, num: int, prism: np.void,
 
 @kernel
 def _light(x: float, y: float) -> float:
-    """Return the brightness of an upright face with normal (x, y); light comes from ahead left."""
+    """Return the brightness of an upright face with normal (x, y), lit from ahead left."""
     return 0.7 + 0.15 * (x + y)
 
 
@@ -187,7 +187,7 @@ def _add_wall(camera: CameraPose, picture: PixelRows, num: int, wall: np.void, n
 def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: PixelRows) -> int:
     """Find the faces that a picture shows, and return their number.
 
-    `panorama`: the scene around the vehicle, prisms ordered by id. `picture`: its faces are
+    `panorama`: the scene around the vehicle, with prisms ordered by id. `picture`: the faces are
     overwritten.
     """
     num = 0
@@ -210,23 +210,23 @@ def find_faces(camera: CameraPose, panorama: Panorama, counts: Counts, picture: 
 def look(camera: CameraPose, picture: PixelRows, num: int, first: int, last: int) -> None:
     """Render the rows [first, last) of a picture.
 
-    `picture`: has its faces; its rows are overwritten from the first one on. `num`: number of
-    faces. `last`: at most `first` plus the number of rows of `picture`.
+    `picture`: contains the faces; its rows are overwritten, starting with the first. `num`: number
+    of faces. `last`: at most `first` plus the number of rows of `picture`.
     """
     _clear(camera, picture, first, last)
     draw_faces(picture, num, first, last)
 
 
-# Smallest depth, for cameras inside a body.
+# Lower bound of depths, for cameras inside a body.
 LEAST_DEPTH_M = 0.01
 
-# Conversion from float32 to float16: number of dropped bits, and difference of the exponents'
+# Conversion from float32 to float16: the number of dropped bits, and the difference of the exponent
 # biases minus half of the dropped range.
 _DROPPED = np.uint32(13)
 _ONE = np.uint32(1)
 _REBIAS = np.uint32((112 << 23) - 0xFFF)
 
-# Share of a colour that is lost in haze at the end of the range.
+# Share of a colour that haze removes at the end of the range.
 HAZE = 0.6
 
 _COLOURS = {
@@ -245,7 +245,7 @@ _COLOURS = {
 
 
 def colours() -> NDArray[np.float64]:
-    """Return red, green and blue (classes, 3) of each class in full light."""
+    """Return the colour of each class in full light, (classes, 3) red, green, blue."""
     found = np.zeros((NUM_SEMANTICS, 3))
     for semantic, colour in _COLOURS.items():
         found[semantic] = colour
@@ -254,7 +254,7 @@ def colours() -> NDArray[np.float64]:
 
 @kernel
 def _complete_closeness(camera: CameraPose, picture: PixelRows, first: int, rows: int) -> None:
-    """Set the closeness also of pixels that show only ground or sky."""
+    """Set the closeness of the remaining pixels, which show ground or sky."""
     width = picture.face.shape[1]
     constant, by_column, by_row = ground_at(camera, width, picture.height)
     nothing = 1.0 / camera.range_m
@@ -271,7 +271,7 @@ def _complete_closeness(camera: CameraPose, picture: PixelRows, first: int, rows
 def measure_depths(
     camera: CameraPose, picture: PixelRows, first: int, out: NDArray[np.float32]
 ) -> None:
-    """Write depths (rows, W) in metres along the optical axis; the range where nothing is seen.
+    """Write depths (rows, W) in m along the optical axis; pixels that show nothing get the range.
 
     `camera`: the camera of the picture. `picture`: rendered rows; their closeness is completed.
     `out`: (rows, W).
@@ -314,10 +314,10 @@ def write_colours(
     palette: NDArray[np.float64],
     out: NDArray[np.uint8],
 ) -> None:
-    """Write red, green and blue: the class's colour, shaded by its face, paler with distance.
+    """Write colours: the colour of the class, shaded by the face, and paler with distance.
 
     `camera`: the camera of the picture. `picture`: rendered rows; their closeness is completed.
-    `palette`: (classes, 3). `out`: (rows, W, 3).
+    `palette`: (classes, 3). `out`: (rows, W, 3) red, green, blue.
     """
     rows, width, _ = out.shape
     _complete_closeness(camera, picture, first, rows)

@@ -1,7 +1,7 @@
 """Frame stacks: an observation holds the last few frames, oldest first.
 
-Past frames are stored only in an agent's observation, in the output arrays. So moving an agent's
-outputs also moves its past frames.
+Past frames are stored only in an agent's observation, in the output arrays. So they move with the
+outputs when an agent moves to another zone.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
 
 @kernel
 def shift_frames(observation: NDArray[np.float32], stack: int, kept_at: int, kept: int) -> None:
-    """Move all frames back by one and clear the newest, except `kept` numbers from `kept_at` on."""
+    """Move all frames back by one and clear the newest, except `kept` numbers from `kept_at`."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):
@@ -55,7 +55,7 @@ def fill_stacks(
 ) -> None:
     """Repeat the first frame of every vehicle that entered during the last step.
 
-    `observations`: (W, A, D) with the newest frames complete.
+    `observations`: (W, A, D), in which the newest frames are complete.
     """
     for w in range(chosen.size):
         if not chosen[w]:

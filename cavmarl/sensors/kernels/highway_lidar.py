@@ -1,11 +1,11 @@
 """highway-env's `LidarObservation`: distance and radial speed in equal sectors around a vehicle.
 
 The sectors do not turn with the vehicle: the centre of cell k lies k steps clockwise from east (the
-frame of `vehicle_features`). The sensor does what highway-env does, and so differs from `lidar`,
-whose rays intersect bodies exactly and turn with the vehicle. A vehicle is seen if its centre is in
-range. It is also drawn into the cell of its centre, at its distance less half its width. Inside a
-body, distances are negative. Speeds, like distances, are divided by the range in metres. Empty
-cells have the range as distance and as speed.
+frame of `vehicle_features`). The sensor copies highway-env, so it differs from `lidar`, whose rays
+intersect bodies exactly and turn with the vehicle. A vehicle is seen if its centre is in range. It
+is also drawn into the cell of its centre, at the distance of the centre minus half the vehicle's
+width. Inside a body, distances are negative. Speeds, like distances, are divided by the range in
+metres. In empty cells, distance and speed are equal to the range.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def _cell_of(x: float, y: float, cells: int) -> tuple[int, float]:
 
 @kernel
 def _axis_interval(start: float, size: float, slope: float) -> tuple[float, float]:
-    """Return where a ray enters and leaves the strip between two parallels, in ray lengths."""
+    """Return where a ray enters and leaves the strip between two parallel lines, in ray lengths."""
     if slope == 0.0:
         return (-math.inf, math.inf) if start < 0.0 < start + size else (math.inf, math.inf)
     near = start / slope
@@ -111,7 +111,7 @@ def _cells_over(
 
 @kernel
 def _record(echo: np.void, distance: float, speed: float, vehicle_id: int) -> None:
-    """Keep the nearest echo; on a tie keep the larger id, which highway-env draws last."""
+    """Keep the nearest echo; on a tie, keep the larger id, which highway-env draws last."""
     if distance < echo["distance"] or (distance == echo["distance"] and vehicle_id >= echo["id"]):
         echo["distance"] = distance
         echo["speed"] = speed
@@ -145,9 +145,9 @@ def _trace(ego: np.void, ego_cos: float, ego_sin: float, body: np.void, sensor: 
 def observe_lidar_cells(
     rows: NDArray[np.void], i: int, grid: Grid, sensor: LidarCells, out: NDArray[np.float32]
 ) -> None:
-    """Write distance and speed of each cell.
+    """Write the distance and speed of each cell.
 
-    `out`: an observation; 2 · cells numbers are written, from `sensor.at` on.
+    `out`: an observation, of which 2 · cells numbers are written, starting at `sensor.at`.
     """
     ego = rows[i]
     ego_cos = cosine(ego["heading"])

@@ -2,12 +2,12 @@
 
 The table shows vehicles within `PERCEPTION_M` and at most two ego lengths behind, ordered by
 distance along the ego lane, which is extended straight beyond its ends. The first row is the ego
-vehicle, always in the world's frame.
+vehicle, in the world's frame in any case.
 
 `vehicle_features` returns the numbers of highway-env's `Vehicle.to_dict`. Their frame is that of
 highway-env's pictures: x points right (east), y points down (south), and headings turn clockwise.
-On a road to the east, y therefore grows to the right of the driving direction. Compared with this
-package, y, headings and lateral offsets are negated.
+So on a road to the east, y grows to the right of the driving direction. Compared with this package,
+y, headings and lateral offsets have the opposite sign.
 """
 
 from __future__ import annotations
@@ -26,8 +26,8 @@ from cavmarl.core.math.rng import STREAM_SENSOR, below
 from cavmarl.core.math.scalars import clamp
 from cavmarl.core.records.arrays import RoadArrays
 
-# In the order of `config.sensors.VEHICLE_FEATURES`; then `on_road`, a feature of a place and not
-# of a vehicle.
+# In the order of `config.sensors.VEHICLE_FEATURES`; then `on_road`, which is a feature of a place
+# and not of a vehicle.
 FEATURE_PRESENCE = 0
 FEATURE_X = 1
 FEATURE_Y = 2
@@ -74,8 +74,8 @@ def vehicle_features(
     """Write all features of a vehicle in the world's frame.
 
     `destinations`: (M, G, 2) x and y of each map's goals in m, in this package's frame.
-    `intentions`: whether to write the direction to the vehicle's goal; otherwise it is 0. `out`:
-    (len(VEHICLE_FEATURES),), overwritten.
+    `intentions`: whether to write the direction to the vehicle's goal; otherwise 0 is written.
+    `out`: (len(VEHICLE_FEATURES),), overwritten.
     """
     cos, sin = cos_sin(row["heading"])
     out[FEATURE_PRESENCE] = 1.0
@@ -107,7 +107,7 @@ def vehicle_features(
 
 @kernel
 def make_relative(values: NDArray[np.float64], ego: np.void) -> None:
-    """Subtract position and velocity of `ego` from `values`, in the world's axes."""
+    """Subtract the position and velocity of `ego` from `values`, in the world's axes."""
     values[FEATURE_X] -= ego["x"]
     values[FEATURE_Y] -= -ego["y"]
     values[FEATURE_VX] -= ego["speed"] * cosine(ego["heading"])
@@ -116,7 +116,7 @@ def make_relative(values: NDArray[np.float64], ego: np.void) -> None:
 
 @kernel
 def in_range(value: float, ranges: NDArray[np.float64], feature: int) -> float:
-    """Map a value from the feature's range to [-1, 1]; return it unchanged if there is no range."""
+    """Map a value from the feature's range to [-1, 1]; without a range, return it unchanged."""
     low = ranges[feature, 0]
     if math.isnan(low):
         return value
@@ -159,8 +159,8 @@ def _find_near(
             along = s - own_s
             if not (sensor.see_behind or along > -2.0 * ego["length"]):
                 continue
-            # Without sorting, highway-env takes vehicles in order of creation, which is that of
-            # ids.
+            # Without sorting, highway-env takes vehicles in order of creation, which is the order
+            # of ids.
             key = 0.0 if sensor.shuffled else abs(along)
             place = found
             while place > 0 and (
@@ -219,10 +219,10 @@ def observe_kinematics(
 ) -> None:
     """Write the table of one vehicle, row by row; rows without a vehicle are left unchanged.
 
-    Of two vehicles at equal distance along the lane, the one with the smaller id comes first.
+    At equal distance along the lane, the vehicle with the smaller id comes first.
 
-    `sensor`: settings and scratch; ranges in the frame of `vehicle_features`. `out`: an
-    observation, zeros from `sensor.at` on.
+    `sensor`: settings and scratch, with ranges in the frame of `vehicle_features`. `out`: an
+    observation, which must be 0 from `sensor.at` on.
     """
     ego = rows[i]
     vehicle_features(roads.lanes, roads.points, ego, sensor.destinations, True, sensor.values)

@@ -2,9 +2,9 @@
 
 Unlike in highway-env's `LidarObservation`, rays and boxes are intersected exactly.
 
-A vehicle covers few rays. For each vehicle in range, the kernel bounds the rays that can hit it by
-an angle that is never too small, and tests only those. The bound may be loose, since the test is
-exact.
+A vehicle covers few rays. For each vehicle in range, the kernel computes an upper bound of the
+angle that the vehicle covers, and tests only the rays within it. The bound may be loose, because
+the test is exact.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ from cavmarl.core.records import record
 # The first hit of a ray.
 ECHO = record(
     ("distance", np.float64),  # m; 0 inside a body, the range if nothing is hit
-    # speed of the vehicle relative to ego along the ray, in m/s, positive away (highway-env's
-    # sign); 0 if nothing is hit
+    # speed of the vehicle relative to the ego vehicle along the ray, in m/s, positive away (as in
+    # highway-env); 0 if nothing is hit
     ("speed", np.float64),
     ("id", np.int64),  # id of the vehicle; -1 if nothing is hit
 )
@@ -33,7 +33,7 @@ ECHO = record(
 PI = math.pi
 TWO_PI = 2.0 * math.pi
 
-# A ray that approaches a strip by less than this per metre does not reach it within any range.
+# A ray that approaches a strip by less than this per metre does not reach the strip in any range.
 _PARALLEL = 1e-200
 
 
@@ -60,7 +60,7 @@ def _ray_to_box(
         half_length: half the box's size along x.
         half_width: half the box's size along y.
     """
-    # These are negative if the ray starts inside the strip, and huge if it points away from it.
+    # These are negative if the ray starts in the strip, and huge if it points away from the strip.
     enter_x = (x - half_length) / max(closing_x, _PARALLEL)
     enter_y = (y - half_width) / max(closing_y, _PARALLEL)
     distance = max(max(enter_x, enter_y), 0.0)
@@ -85,13 +85,13 @@ def _rays_over(
 ) -> tuple[int, int]:
     """Return the first ray that can hit a box with centre (x, y), and the number of such rays.
 
-    Seen from the origin, the box stays within `across` of the line to its centre and begins no
-    nearer than `ahead`: the angle to each side is at most atan(across / ahead) < across / ahead.
+    Seen from the origin, the box is within `across` of the line to its centre, and nowhere nearer
+    than `ahead`: the angle to each side is at most atan(across / ahead) < across / ahead.
 
     `along`, `beside`: position of the origin from the centre along and across the box, in m, at
     least 0.
     """
-    # Both lengths are multiplied by the distance to the centre, which cancels in their ratio.
+    # Both lengths are multiplied by the distance to the centre, which cancels in the ratio.
     ahead = x * x + y * y - (half_length * along + half_width * beside)
     across = half_length * beside + half_width * along
     if across >= (PI - ANGLE_ERROR_RAD) * ahead:
@@ -168,7 +168,7 @@ def lidar(
 ) -> None:
     """Scan around one vehicle, from its centre, for other vehicles on its level.
 
-    Of two vehicles at equal distance along a ray, the one with the smaller id is reported.
+    At equal distance along a ray, the vehicle with the smaller id is reported.
 
     `rays`: (num_rays, 2) directions in the vehicle's frame, from `ray_directions`. `range_m`: range
     in the plane. `out`: ECHO (num_rays,), overwritten.

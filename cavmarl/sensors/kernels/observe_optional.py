@@ -1,4 +1,4 @@
-"""Sensors that most environments leave off: highway-env's sensors, and the map-independent ones."""
+"""Sensors that most environments leave off: highway-env's and the map-independent sensors."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from cavmarl.sensors.kernels.occupancy import OccupancyGrid, observe_occupancy
 class OptionalSensors(NamedTuple):
     """The settings of each optional sensor, by its name in `sensors.observed.SENSORS`.
 
-    They are separate from `arrays.Sensors`, so that `sense` does not unpack sensors that are off.
+    They are not part of `arrays.Sensors`, so that `sense` does not unpack sensors that are off.
     """
 
     kinematics: KinematicsSensor
@@ -41,7 +41,7 @@ class OptionalSensors(NamedTuple):
 
 @kernel
 def observe_optional_frame(
-    roads: RoadArrays,  # of the world
+    roads: RoadArrays,  # roads of the world
     travel: TripTables,
     lane_grid: LaneGrid,
     rows: NDArray[np.void],

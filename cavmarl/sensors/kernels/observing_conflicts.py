@@ -1,17 +1,17 @@
 """The kernel of the `conflicts` sensor: the vehicles that come closest to the ego path.
 
 All vehicles are assumed to keep their speed: the ego vehicle along its path, the others straight
-along their headings, as their plans are unknown. At a few moments ahead, the kernel computes the
-gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest and
-soonest comes first. Right of way follows from the lane that the other vehicle is on, whichever link
+along their headings, because their plans are unknown. At a few future moments, the kernel computes
+the gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest
+and soonest comes first. The right of way depends on the lane of the other vehicle, whichever link
 it takes from there.
 
 With `indicators`, other vehicles are assumed to follow their lanes and, over the current or next
-junction, the link that they indicate. After that they go straight. A vehicle that is farther from
-its junction than `indicators_m` does not indicate yet, and goes straight from there.
+junction, the link that they indicate. After that they go straight. A vehicle farther from its
+junction than `indicators_m` does not indicate yet, and is assumed to go straight over it.
 
-With `heard`, vehicles that are not seen but known from a message are included, extrapolated from
-the position and speed in the message. Their lanes are unknown.
+With `heard`, vehicles that are known only from a message are included; their positions are
+extrapolated from the position and speed in the message. Their lanes are unknown.
 """
 
 from __future__ import annotations
@@ -45,8 +45,8 @@ INDICATED_RAD = 0.4  # a link that turns by less is not indicated
 AGE_SCALE_S = 1.0
 NUM_LOOKS = 10  # number of predicted moments
 LOOK_S = 0.5  # time between predicted moments
-SLOWEST_MPS = 3.0  # the ego vehicle is assumed to drive at least this fast, even if it stands
-WAIT_MPS = 2.0  # in ranking approaches, 1 s later counts like this many metres farther
+SLOWEST_MPS = 3.0  # the ego vehicle is assumed to drive at least this fast, even if stopped
+WAIT_MPS = 2.0  # in the ranking, an approach 1 s later counts as this many metres farther
 GAP_HALF_M = 2.0  # a gap of this length has a closeness of 0.5
 WHEN_HALF_S = 2.0  # a time of this length has a soonness of 0.5
 PLACE_HALF_M = 10.0  # a distance of this length is scaled to 0.5
@@ -58,7 +58,7 @@ RANKED = record(
     ("near", np.float64),  # m, the gap of the nearest approach
     ("when", np.float64),  # s until the nearest approach
     ("id", np.int64),
-    ("body", np.int64),  # index in `Grid.bodies`; -1 - k: `ConflictsSensor.told[k]`
+    ("body", np.int64),  # index in `Grid.bodies`, or -1 - k for `ConflictsSensor.told[k]`
 )
 
 
@@ -70,15 +70,15 @@ class ConflictsSensor(NamedTuple):
     range_m: float
     walls: Walls  # walls that hide vehicles
     heard: bool  # whether vehicles known only from messages are included
-    told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of vehicles in messages
+    told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of the vehicles in messages
     indicators: bool  # whether others indicate their link over the next junction
-    indicators_m: float  # distance to the junction from which they do; 0: any distance
+    indicators_m: float  # distance to the junction at which they start to; 0: any distance
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
     heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
     others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
     indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
-    foreseen: NDArray[np.int64]  # (capacity,) grid filling of each body's `others`, `indicated`
-    filling: NDArray[np.int64]  # (1,) number of the present grid filling
+    foreseen: NDArray[np.int64]  # (capacity,) the `filling` for which each body was predicted
+    filling: NDArray[np.int64]  # (1,) how often the grid has been filled
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
@@ -191,7 +191,7 @@ def _indicates(
 
 @kernel
 def forget_others(sensor: ConflictsSensor) -> None:
-    """Mark the predictions as outdated, after the grid has been filled again."""
+    """Mark all predictions as outdated; call this after the grid has been filled again."""
     sensor.filling[0] += 1
 
 
@@ -223,7 +223,7 @@ def _nearest_approach(
 ) -> tuple[float, float]:
     """Return the gap in m and the time in s of the most critical approach between two boxes.
 
-    The gap is the sum of the gaps along and across the ego vehicle; a later gap counts as larger.
+    The gap is the sum of the gaps along and across the ego vehicle; later gaps count as larger.
     `looks`, `others` (NUM_LOOKS, 4): predicted poses of the ego vehicle and of the body.
     """
     half_length = 0.5 * row["length"]
@@ -286,7 +286,7 @@ def _right_of_way(
 def _take_reports(
     reports: NDArray[np.void], tick: int, tick_s: float, told: NDArray[np.void]
 ) -> int:
-    """Write the vehicles in `reports` (N,) to BODY `told` (N,) and return their number."""
+    """Convert the vehicles in `reports` (N,) to BODY `told` (N,) and return their number."""
     for k in range(reports.size):
         report = reports[k]
         if report["sender"] < 0:
@@ -400,10 +400,10 @@ def observe_conflicts(
     sensor: ConflictsSensor,
     observation: NDArray[np.float32],
 ) -> None:
-    """Write nine to twelve numbers per vehicle, in order of rank; missing vehicles are zeros.
+    """Write nine to twelve numbers per vehicle, by rank; numbers of missing vehicles are 0.
 
     `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `reports`: REPORT
-    (N,) of vehicles in the agent's inbox; not read without `heard`. `tick`: the world's tick.
+    (N,) of vehicles in the agent's inbox; read only with `heard`. `tick`: the world's tick.
     """
     row = rows[i]
     speed = max(row["speed"], SLOWEST_MPS)

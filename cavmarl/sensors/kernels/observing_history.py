@@ -1,6 +1,6 @@
 """The kernel of the `history` sensor: the controls and speeds of the last steps.
 
-The numbers of earlier steps are those of the previous frame, which `shift_frames` keeps in place.
+The numbers of earlier steps come from the previous frame, where `shift_frames` keeps them.
 """
 
 from __future__ import annotations
@@ -13,23 +13,23 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.sensors.kernels.sense import ACCEL_SCALE, SPEED_SCALE, STEERING_SCALE, unit
 
-HISTORY_FEATURES = 3  # per step
+HISTORY_FEATURES = 3  # number of features per step
 
 
 class HistorySensor(NamedTuple):
     """Settings of the `history` sensor."""
 
     at: int
-    size: int  # numbers; 0: off
+    size: int  # number of values; 0: off
 
 
 @kernel
 def observe_history(
     row: np.void, entered: bool, at: int, size: int, observation: NDArray[np.float32]
 ) -> None:
-    """Move the steps back by one and write the newest; if `entered`, write it to all steps.
+    """Move the steps back by one and write the newest step; if `entered`, write it to all steps.
 
-    `size` numbers from `at` on are written, the last step first.
+    Writes `size` numbers, starting at `at`, with the last step first.
     """
     for k in range(at + size - 1, at + HISTORY_FEATURES - 1, -1):
         observation[k] = observation[k - HISTORY_FEATURES]

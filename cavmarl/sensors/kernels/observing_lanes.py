@@ -1,8 +1,8 @@
 """The kernel of the `lanes` sensor: gaps on the lanes around, and the next crossing vehicle.
 
-The nearest vehicles in the plane (`neighbors`) do not show which of them are in the agent's way;
-here positions are given along lanes, as in car-following models. If two vehicles are equally near,
-the slower one is shown, so that the order of rows does not matter.
+The sensor `neighbors` does not show which vehicles are in the agent's way. Here, positions are
+given along lanes, as in car-following models. If two vehicles are equally near, the slower vehicle
+is shown, so that the order of rows does not matter.
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ from cavmarl.driving.kernels.junctions.gaps import is_red
 from cavmarl.driving.kernels.lanes.lane_index import beside_s
 from cavmarl.driving.kernels.lanes.route_following import next_step
 
-OWN = 0  # slots of two features each: gap and speed
-LEFT = 1  # ahead; the next slot is behind
+OWN = 0  # slots of two features, gap and speed: ahead on the ego lane
+LEFT = 1  # ahead on this side; the next slot is behind
 RIGHT = 3
 CROSSING = 10  # index of the first feature of the crossing vehicle
 LANES_FEATURES = 14
 SPEED_SCALE = 40.0  # m/s
 HALF_M = 10.0  # a distance of this length has a closeness of 0.5
-LANES_AHEAD = 8  # largest number of lanes that a path is followed over
+LANES_AHEAD = 8  # a path is followed over at most this many lanes
 SLOWEST_MPS = 1.0  # a crossing vehicle is assumed to drive at least this fast
 
 
@@ -53,7 +53,7 @@ def _way_between(
     target: int,
     target_s: float,
 ) -> float:
-    """Return the distance in m along a path from `s` on `lane` to `target_s`; inf: not on it."""
+    """Return the distance in m along a path from `s` on `lane` to a target; inf if not on it."""
     start = -s
     for _ in range(LANES_AHEAD):
         if lane == target:
@@ -87,7 +87,7 @@ def _observe_gap(
     range_m: float,
     out: NDArray[np.float32],
 ) -> None:
-    """Write `other` to `slot` if ahead on the path from `lane`, to the next slot if behind."""
+    """Write `other` to `slot` if it is ahead on the path from `lane`, to `slot` + 1 if behind."""
     s = row["s"] * roads.lanes[lane]["length_m"] / roads.lanes[row["lane"]]["length_m"]
     half = 0.5 * (row["length"] + other["length"])
     faster = other["speed"] - row["speed"]
@@ -112,7 +112,7 @@ def _observe_gap(
 def _next_link(
     roads: RoadArrays, travel: TripTables, row: np.void, range_m: float
 ) -> tuple[int, float]:
-    """Return the link that a vehicle is on or reaches next, or -1, and its stop line's distance."""
+    """Return a vehicle's present or next link, or -1, and the distance to its stop line in m."""
     lane = row["lane"]
     here = roads.lanes[lane]
     if here["internal"]:
@@ -142,9 +142,9 @@ def _observe_crossing(
     soonest: float,
     out: NDArray[np.float32],
 ) -> float:
-    """Write `other` if it reaches a place that both links share earlier than any other so far.
+    """Write `other` if it reaches an area shared by both links earlier than any vehicle so far.
 
-    Only vehicles inside the junction count, and vehicles with the right of way and no red signal.
+    Only vehicles inside the junction, or with the right of way and without a red signal, count.
     Returns the earliest arrival in s, at most `soonest`.
     """
     first = roads.links[link]["first_conflict"]
@@ -186,11 +186,11 @@ def observe_lanes(
     sensors: Sensors,
     observation: NDArray[np.float32],
 ) -> None:
-    """Write gaps and relative speeds on the lanes around, and the first vehicle to cross the path.
+    """Write gaps and relative speeds on the lanes around, and the first vehicle across the path.
 
     `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `sensors`: range
-    and position of the sensor; a range of 0 switches it off. `observation`: (D,); this
-    writes `LANES_FEATURES` numbers of it, which must be 0 before.
+    and position of the sensor; a range of 0 switches it off. `observation`: (D,), of which
+    `LANES_FEATURES` numbers are written; they must be 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:

@@ -130,7 +130,7 @@ def _observe_signal(
     distance_m: float,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the last message of the roadside unit at a link, if one was received."""
+    """Write the last message received from the roadside unit at a link, if any."""
     for k in range(signals.size):
         report = signals[k]
         if report["sender"] < 0:
@@ -163,9 +163,9 @@ def _observe_timing(
 ) -> None:
     """Write the times of the next two changes between green and another state of a link.
 
-    `row`: PHASE row that ends in `left_s`. The receiver knows the program; of actuated phases, it
-    knows the minimum duration. Of greens that agents or controllers choose, it knows the earliest
-    time of the next change alone.
+    `row`: PHASE row that ends in `left_s` s. The receiver knows the program and, for actuated
+    phases, the minimum duration. For greens that agents or controllers choose, it knows only the
+    earliest time of the next change.
     """
     plan = roads.programs[program]
     first, count = plan["first_phase"], plan["num_phases"]
@@ -224,9 +224,9 @@ def observe_messages(
     """Write the inboxes of the owned agents of the chosen worlds.
 
     `mail`: the inboxes. `at`: index of the sensor's part in a frame. `objects`, `events`: number of
-    vehicles and events. `signal`: whether to write the next signal. `timing`: whether to write its
-    times. `scale_m`: distance that is scaled to 1. `observations`: (W, A, D), whose part of the
-    newest frame is 0 before.
+    vehicles and events. `signal`: whether to write the next signal. `timing`: whether to write the
+    signal's times. `scale_m`: distance that is scaled to 1. `observations`: (W, A, D); the sensor's
+    part of the newest frame must be 0 before.
     """
     for w in range(chosen.size):
         if not chosen[w]:

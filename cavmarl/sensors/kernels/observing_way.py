@@ -1,7 +1,7 @@
 """The kernel of the `way` sensor: the shape of the path ahead, and its stop lines.
 
-If the plan needs another lane, the path continues from that lane, so that the next turn is visible
-from every lane of a road.
+If the plan needs a lane change, the path continues from the target lane, so that the next turn is
+visible from every lane of a road.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ from cavmarl.driving.kernels.junctions.signal_timing import time_to_change
 from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 
-PLACE_FEATURES = 4  # per point of the path
-LINE_FEATURES = 5  # per stop line; one more with timing, then one more with `OWN`
+PLACE_FEATURES = 4  # number of features per point of the path
+LINE_FEATURES = 5  # the same per stop line; one more with timing, and one more with `OWN`
 CURVATURE_SCALE = 0.2  # 1/m
 STOP_SIGNS = ("give_way", "own", "red")  # values of `sensors.way.stop_signs`
 GIVE_WAY, OWN, AS_RED = range(3)
 WIDTH_SCALE = 8.0  # m
 LINE_HALF_M = 20.0  # a line at this distance has a closeness of 0.5
-MOST_LANES = 48  # largest number of lanes that a path is followed over
+MOST_LANES = 48  # a path is followed over at most this many lanes
 
 
 class WaySensor(NamedTuple):
@@ -48,7 +48,7 @@ class WaySensor(NamedTuple):
     lines: int  # number of stop lines
     range_m: float  # range of the stop lines
     timing: bool
-    stop_signs: int  # how they are shown: a place in `STOP_SIGNS`
+    stop_signs: int  # how stop signs are shown: an index in `STOP_SIGNS`
 
 
 @kernel
@@ -107,7 +107,7 @@ def observe_way(
     """Write points of the path at the given distances, then the next stop lines.
 
     Beyond the end of the path, its last point is repeated, without curvature. `time`: time of the
-    tick, in s since the world's reset. `observation`: (D,), 0 before.
+    tick, in s since the world's reset. `observation`: (D,), must be 0 before.
     """
     cos_heading, sin_heading = cos_sin(row["heading"])
     distances = sensor.distances_m
@@ -115,7 +115,7 @@ def observe_way(
     size = line_size(sensor)
     lane, way = row["lane"], row["way"]
     here = roads.lanes[lane]
-    start = -row["s"]  # distance to the beginning of the lane
+    start = -row["s"]  # distance from the vehicle to the beginning of the lane
     _, _, _, cos, sin, _ = lane_pose(
         roads.points, here["first_point"], here["num_points"], row["s"]
     )

@@ -1,8 +1,8 @@
 """highway-env's `OccupancyGridObservation`: layers of cells around a vehicle.
 
-A cell shows the vehicle whose centre lies in it; of several vehicles, the one with the smallest id.
-Positions and velocities are relative to the ego vehicle, which is also in the grid. `on_road` marks
-the cells that contain a waypoint of a lane's centre line.
+A cell shows the vehicle whose centre lies in it; of several vehicles, the vehicle with the smallest
+id. Positions and velocities are relative to the ego vehicle, which is also in the grid. `on_road`
+marks the cells that contain a waypoint of a lane's centre line.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from cavmarl.sensors.kernels.kinematics_observation import (
     vehicle_features,
 )
 
-# Distance along a lane, from the point beside the vehicle, in which highway-env sets waypoints.
+# highway-env sets waypoints up to this distance along a lane, from the point beside the vehicle.
 LANE_REACH_M = 100.0
 
 
@@ -48,7 +48,7 @@ class OccupancyGrid(NamedTuple):
     as_image: bool
     destinations: NDArray[np.float64]  # (M, G, 2) position of each goal of each map, m
     cell_body: NDArray[np.int64]  # (num_x * num_y,) scratch
-    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: last drawing of each lane; count of drawings
+    lane_seen: NDArray[np.int64]  # (L + 1,) scratch: last drawing of each lane; number of drawings
     values: NDArray[np.float64]  # (len(VEHICLE_FEATURES),) scratch
 
 
@@ -70,7 +70,7 @@ def _cell(sensor: OccupancyGrid, ego: np.void, x: float, y: float) -> int:
 
 @kernel
 def _level(sensor: OccupancyGrid, value: float) -> float:
-    """Return the clipped, and for images scaled, value of a cell."""
+    """Return the value of a cell, clipped and, for images, scaled."""
     if sensor.clip or sensor.as_image:
         value = clamp(value, -1.0, 1.0)
     if sensor.as_image:
@@ -179,10 +179,10 @@ def observe_occupancy(
     sensor: OccupancyGrid,
     out: NDArray[np.float32],
 ) -> None:
-    """Write the layers of one vehicle, each by columns along x; empty cells are left unchanged.
+    """Write the layers of one vehicle, column by column along x; empty cells stay unchanged.
 
-    `sensor`: settings and scratch; cells and ranges in the frame of `vehicle_features`. `out`: an
-    observation, zeros from `sensor.at` on.
+    `sensor`: settings and scratch, with cells and ranges in the frame of `vehicle_features`. `out`:
+    an observation, which must be 0 from `sensor.at` on.
     """
     ego = rows[i]
     num_cells = sensor.num_x * sensor.num_y

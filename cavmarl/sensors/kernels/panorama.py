@@ -1,11 +1,10 @@
 """The surroundings of one vehicle in its own frame, for imaging sensors.
 
 The frame has its origin at the vehicle's position on the road; x points ahead, y left, and z up,
-perpendicular to the road under the vehicle. The frame turns with heading and pitch. In it, the
-ground is the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are
-walls on the ground. So a slope is rendered correctly while its gradient stays the same, and the
-ground never hides a body. As for every sensor, bodies more than `LEVEL_HEIGHT_M` above or below are
-not seen.
+perpendicular to the road under the vehicle. The frame turns with heading and pitch. In this frame,
+the ground is the plane z = 0, bodies are upright prisms over oriented rectangles, and buildings are
+walls on the ground. So a slope of constant gradient is rendered correctly, and the ground never
+hides a body. As for every sensor, bodies more than `LEVEL_HEIGHT_M` above or below are not seen.
 
 The result does not depend on a body's row or on the zone that owns it.
 """
@@ -52,7 +51,7 @@ SEMANTIC_NAMES = (
 )
 NUM_SEMANTICS = len(SEMANTIC_NAMES)
 
-# By SUMO's abstract vehicle class; vehicles of similar shape share a class.
+# Semantic class of SUMO's abstract vehicle classes; vehicles of similar shape share a class.
 SEMANTIC_OF_CLASS = {
     "passenger": CAR,
     "taxi": CAR,
@@ -68,23 +67,23 @@ SEMANTIC_OF_CLASS = {
 
 
 PRISM = record(
-    ("id", np.int64),  # of the vehicle or pedestrian
+    ("id", np.int64),  # id of the vehicle or pedestrian
     ("semantic", np.int64),  # one of the classes above
     ("x", np.float64),  # centre, m
     ("y", np.float64),
     ("bottom", np.float64),  # z, m
     ("top", np.float64),
-    ("cos", np.float64),  # cosine of its heading in the frame
+    ("cos", np.float64),  # cosine of the heading in the frame
     ("sin", np.float64),
     ("half_length", np.float64),  # m
     ("half_width", np.float64),
     ("radius", np.float64),  # half the diagonal, m
-    ("speed", np.float64),  # m/s over the ground, along its heading
+    ("speed", np.float64),  # m/s over the ground, along the heading
 )
 
 
 class Panorama(NamedTuple):
-    """Memory for the surroundings of one vehicle; `gather` returns how much of it is filled."""
+    """Memory for the surroundings of one vehicle; `gather` returns the number of filled rows."""
 
     prisms: NDArray[np.void]  # PRISM (C,)
     order: NDArray[np.int32]  # (C,) prisms by id
@@ -187,7 +186,7 @@ def _gather_prisms(
 
 @kernel
 def _sort_by_id(prisms: NDArray[np.void], num: int, order: NDArray[np.int32]) -> None:
-    """Write the first `num` prisms' indices, sorted by id, to `order` (C,)."""
+    """Write the indices of the first `num` prisms, sorted by id, to `order` (C,)."""
     for k in range(num):
         place = k
         while place > 0 and prisms[k]["id"] < prisms[order[place - 1]]["id"]:

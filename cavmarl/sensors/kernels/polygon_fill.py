@@ -1,15 +1,15 @@
 """Rasterization of flat convex faces in the picture of a pinhole camera.
 
-The reciprocal of a face's depth is linear in picture coordinates, and so are the half-planes of its
-edges. A face is drawn row by row, from its first to its last column, with one addition per pixel;
-the nearest face is kept. The method is exact for every orientation of the camera, including roll,
-and casts no rays.
+The reciprocal of a face's depth is linear in picture coordinates, and so are the half-planes of the
+face's edges. A face is drawn row by row, from its first to its last column, with one addition per
+pixel; the nearest face is kept. The method is exact for every orientation of the camera, including
+roll, and casts no rays.
 
-A picture is drawn in bands of rows that fit in the core's own cache with all data per pixel. Rows
-do not depend on each other, and only results are written to memory that cores share.
+A picture is drawn in bands of rows. A band with all its data per pixel fits in the core's own
+cache. Rows do not depend on each other, and only results are written to memory that cores share.
 
-Depth is along the optical axis. The camera's axes are those of its mount: ahead, left, up. Pixel
-rows go down, columns go right, and pixels are square.
+Depth is measured along the optical axis. The camera's axes are the axes of its mount: ahead, left,
+up. Pixel rows go down, columns go right, and pixels are square.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from cavmarl.core.compiled import kernel
 from cavmarl.core.math.scanlines import row_span
 
-# If a face has a corner nearer than this, or behind the camera, all rows are tested.
+# If a corner of a face is nearer than this, or behind the camera, all rows are tested.
 NEAR_M = 0.01
 
 
@@ -40,15 +40,15 @@ class CameraPose(NamedTuple):
 class Faces(NamedTuple):
     """The visible faces of one picture, in drawing order."""
 
-    edges: NDArray[np.float64]  # (F, 5, 4) edges of each face; the fifth is the range
-    plane: NDArray[np.float64]  # (F, 3) closeness: constant, per column, per row
+    edges: NDArray[np.float64]  # (F, 5, 4) edges of each face; the fifth limits the range
+    plane: NDArray[np.float64]  # (F, 3) closeness: constant, change per column, change per row
     rows: NDArray[np.int32]  # (F, 2) rows [first, last) that the face can cover
     number: NDArray[np.int32]  # (F,) index of the face
-    flat: NDArray[np.bool_]  # (F,) whether the face lies on the ground and covers earlier ones
+    flat: NDArray[np.bool_]  # (F,) whether the face lies on the ground and covers earlier faces
 
 
 class PixelRows(NamedTuple):
-    """Rendered rows of a picture, R at a time from top to bottom, and its faces."""
+    """R rendered rows of a picture, which is rendered from top to bottom, and its faces."""
 
     height: int  # height of the whole picture, pixels
     closeness: NDArray[np.float64]  # (R, W) 1 / depth in 1/m; 0: no body and no building
@@ -85,7 +85,7 @@ def _set_edge(
 
 @kernel
 def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
-    """Return whether all corners are behind the camera, or beyond one edge of the picture."""
+    """Return whether all corners are behind the camera, or all beyond one edge of the picture."""
     face = camera.face
     slope_x = 0.5 * width / camera.focal
     slope_z = 0.5 * height / camera.focal
@@ -101,10 +101,10 @@ def _is_aside(camera: CameraPose, width: int, height: int) -> bool:
 
 @kernel
 def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, float, float, float]:
-    """Set the edges of the face with the current corners; the fifth is the range.
+    """Set the edges of the face with the current corners; the fifth edge limits the range.
 
-    Returns the rows [first, last) that it can cover, and the closeness of its plane: constant, per
-    column, per row. A face that cannot be seen has no rows.
+    Returns the rows [first, last) that the face can cover, and the closeness of its plane:
+    constant, change per column, change per row. A face that cannot be seen has no rows.
     """
     if _is_aside(camera, width, height):
         return 0, 0, 0.0, 0.0, 0.0
@@ -143,7 +143,7 @@ def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, fl
     edges[4, 0] -= 1.0 / camera.range_m
     if not in_front:
         return 0, height, constant, by_column, by_row
-    # One row more than needed; the edges exclude it.
+    # This is one row more than needed; the edges exclude it.
     first = max(math.floor(max(low * camera.focal + 0.5 * height, 0.0) - 1.0), 0)
     last = min(math.ceil(min(high * camera.focal + 0.5 * height, float(height)) + 1.0), height)
     return first, last, constant, by_column, by_row
@@ -151,7 +151,7 @@ def _set_face(camera: CameraPose, width: int, height: int) -> tuple[int, int, fl
 
 @kernel
 def add_face(camera: CameraPose, picture: PixelRows, num: int, number: int, flat: bool) -> int:
-    """Append the face with the current corners to the `num` faces that are drawn before it.
+    """Append the face with the current corners to the `num` faces drawn before it.
 
     Returns the new number of faces, which is `num` if the face cannot be seen.
     """
@@ -219,7 +219,7 @@ def _draw_flat(picture: PixelRows, k: int, first: int, begin_row: int, end_row: 
 
 @kernel
 def ground_at(camera: CameraPose, width: int, height: int) -> tuple[float, float, float]:
-    """Return the ground's closeness (constant, per column, per row); overwrites edge 4.
+    """Return the ground's closeness (constant, change per column, per row); overwrite edge 4.
 
     A camera at ground level does not see the ground.
     """

@@ -1,7 +1,7 @@
 """Ray casting from one point of a vehicle to bodies, walls and the ground, for lidar and radar.
 
-A fan has columns of equal azimuth in the sensor's frame; each column has one ray per channel. A
-body covers few columns: these are bounded by an angle that is never too small, and only their rays
+A fan consists of columns; a column has one ray per channel, all with the same azimuth in the
+sensor's frame. A body covers few columns: only columns within an upper bound of the body's angle
 are tested, exactly. Rays and prisms are intersected by slabs (Kay, Kajiya: "Ray tracing complex
 scenes", SIGGRAPH 1986).
 
@@ -34,9 +34,9 @@ NO_HIT = -1
 GROUND_HIT = -2
 WALL_HIT = -3  # WALL row k of the scene is WALL_HIT - k
 
-# A ray that approaches a slab by less than this per metre does not reach it within any range.
+# A ray that approaches a slab by less than this per metre does not reach the slab in any range.
 _PARALLEL = 1e-200
-# A ray that falls by less than this per metre does not meet the ground within any range.
+# A ray that falls by less than this per metre does not meet the ground in any range.
 _LEVEL = 1e-9
 
 
@@ -47,7 +47,7 @@ class Fan(NamedTuple):
     ground_m: NDArray[np.float64]  # (A, E) distance to the ground; inf: never met
     mount: NDArray[np.float64]  # (3, 4)
     first_rad: float  # azimuth of the first column, in [-pi, pi]
-    step_rad: float  # between columns, positive: counter-clockwise
+    step_rad: float  # angle between columns, positive counter-clockwise
     per_rad: float  # columns per rad
     range_m: float
     tilted: bool  # whether the sensor's z axis differs from the vehicle's
@@ -127,7 +127,7 @@ def _columns(fan: Fan, middle_rad: float, spread_rad: float) -> tuple[int, int, 
 
 @kernel
 def _columns_of_ball(fan: Fan, x: float, y: float, z: float, radius: float) -> tuple[int, int, int]:
-    """Return the columns that can meet a ball, given in the vehicle's frame."""
+    """Return the columns that can meet a sphere; its centre is in the vehicle's frame."""
     mount = fan.mount
     dx = x - mount[0, 3]
     dy = y - mount[1, 3]
@@ -153,7 +153,7 @@ def _ray_to_prism(
     `place`: start of the ray, mirrored into the first octant. `closing`: decrease of each
     coordinate per metre along the ray. `half`: half the sizes of the box.
     """
-    # These are negative if the ray starts inside the slab, and huge if it points away from it.
+    # These are negative if the ray starts in the slab, and huge if it points away from the slab.
     enter_x = (place[0] - half[0]) / max(closing[0], _PARALLEL)
     enter_y = (place[1] - half[1]) / max(closing[1], _PARALLEL)
     enter_z = (place[2] - half[2]) / max(closing[2], _PARALLEL)
@@ -269,7 +269,7 @@ def _cast_at_wall(
 def _columns_of_wall(
     fan: Fan, wall: np.void, ax: float, ay: float, bx: float, by: float
 ) -> tuple[int, int, int]:
-    """Return the columns that can meet a wall with ends a and b, given from the sensor."""
+    """Return the columns that can meet a wall with ends a and b, relative to the sensor."""
     if fan.tilted:
         half_height = 0.5 * wall["height"]
         half_length = 0.5 * hypot(bx - ax, by - ay)
@@ -287,11 +287,11 @@ def _columns_of_wall(
     if across == 0.0 and along == 0.0:
         return 0, fan.rays.shape[0], 0  # the sensor is at an end of the wall
     from_a = rough_atan2(ay * yaw_cos - ax * yaw_sin, ax * yaw_cos + ay * yaw_sin)
-    # The turn from a to b, the short way round.
+    # The angle from a to b, the short way round.
     turn = rough_atan2(across, along)
     if abs(turn) > PI - 2.0 * ANGLE_ERROR_RAD:
         return 0, fan.rays.shape[0], 0  # rounding may have chosen the long way round
-    # Both angles are approximate, so the error bound is added once more.
+    # Both angles are approximate, so the error bound is added a second time.
     return _columns(fan, from_a + 0.5 * turn, 0.5 * abs(turn) + ANGLE_ERROR_RAD)
 
 

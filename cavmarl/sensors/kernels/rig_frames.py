@@ -1,8 +1,8 @@
 """Common parts of mounted sensors: poses, errors, sampling times, counts, and lost samples.
 
 The sampling schedule is a pure function of a world's tick: sample k is due k · ticks / samples
-ticks after the phase, and is delivered by the first tick at or after that time. So the schedule has
-no state that a migration, reset or repeated tick could change.
+ticks after the phase, and the first tick at or after that time delivers it. So the schedule has no
+state that a migration, reset or repeated tick could change.
 
 Frames are right-handed: x forward, y left, z up. An orientation is given by yaw (counter-clockwise
 seen from above), then pitch (positive upwards), then roll (positive with the left side up), each
@@ -11,7 +11,7 @@ below the centre of the body.
 
 Errors depend only on vehicle, tick, sensor and draw. The key of a sensor's random numbers is mixed
 from the key of the vehicle and the stream of the sensor. So no two sensors share random numbers,
-and adding a sensor does not change those of another.
+and adding a sensor does not change the random numbers of another.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from cavmarl.core.records import record
 from cavmarl.core.records.arrays import Worlds
 from cavmarl.core.records.codes import DRIVER_AGENT
 
-# Draws of biases and dropouts, apart from the draws of samples.
+# Numbers of the draws for biases and dropouts, which differ from the draws for samples.
 _BIAS = 1 << 28
 _DROPOUT = 1 << 29
 
@@ -51,7 +51,7 @@ def sensor_key(row: np.void, stream: np.uint64) -> np.uint64:
 
 @kernel
 def gauss(key: np.uint64, vehicle: int, tick: int, draw: int) -> float:
-    """Draw a standard normal number.
+    """Draw a number from the standard normal distribution.
 
     Source: Box and Muller, "A note on the generation of random normal deviates", 1958.
 
@@ -85,7 +85,7 @@ def add_errors(
     """Add an error to each channel of a sample (channels,).
 
     `row`: VEHICLE that carries the sensor. `sample`: index of the sample in the tick. `out`: the
-    sample, one number per channel.
+    sample, updated.
     """
     key = sensor_key(row, noise.stream)
     for channel in range(out.size):
@@ -178,24 +178,24 @@ NUM_COUNTS = 3  # fields of `Due` that change from tick to tick
 
 
 class Due(NamedTuple):
-    """The samples that one sensor must deliver in the present tick of each world."""
+    """The samples that a sensor must deliver in the present tick of each world."""
 
     num: NDArray[np.int64]  # (W,) number of samples
     first: NDArray[np.int64]  # (W,) index of the first sample since the reset
-    slot: NDArray[np.int64]  # (W,) slot of the first; the last sample of a step has the last slot
+    slot: NDArray[np.int64]  # (W,) slot of the first sample; a step's last sample has the last slot
     carriers: NDArray[np.bool_]  # (A,) agents whose vehicles carry the sensor
 
 
 @kernel
 def carries(due: Due, row: np.void) -> bool:
-    """Return whether a vehicle is an agent's and carries the sensor."""
+    """Return whether a vehicle belongs to an agent and carries the sensor."""
     carried: bool = row["driver"] == DRIVER_AGENT and due.carriers[row["agent"]]
     return carried
 
 
 @kernel
 def taken(schedule: SensorSchedule, tick: int) -> int:
-    """Return the number of samples taken at or before a tick."""
+    """Return the number of samples since the reset that are taken at or before a tick."""
     since = tick - schedule.phase
     if since < 0:
         return 0
@@ -207,7 +207,7 @@ def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) ->
     """Return the time of a sample that is delivered by `tick`, in s since the reset.
 
     With several samples per tick, this time may lie between two ticks. Otherwise it is the time of
-    the tick, whose state the sensor measures.
+    the tick whose state the sensor measures.
     """
     if schedule.samples <= schedule.ticks:
         return tick * tick_s
@@ -218,7 +218,7 @@ def stamp_of(schedule: SensorSchedule, number: int, tick: int, tick_s: float) ->
 def call_due(
     schedule: SensorSchedule, ticks: NDArray[np.int64], chosen: NDArray[np.bool_], due: Due
 ) -> bool:
-    """Write the samples that are due in the chosen worlds, and none in the others.
+    """Determine the samples that are due in the chosen worlds; no samples are due in the others.
 
     `ticks`: (W,) since each world's reset.
 
@@ -303,11 +303,11 @@ def deliver(
     fresh: NDArray[np.int64],
     data: NDArray[np.uint8],
 ) -> None:
-    """Stamp and count the samples that owned agents got in this tick, and drop some of them.
+    """Stamp and count the samples of owned agents in this tick, and drop some samples.
 
     `stream`: stream of the sensor's random numbers. `dropout`: probability that a sample is lost.
     `stamp_s`: (W, A, S) in s since the reset. `lost`: (W, A, S) whether each sample is lost.
-    `fresh`: (W, A) number of samples of this step so far. `data`: (W, A, S, bytes); lost samples
+    `fresh`: (W, A) number of samples in this step so far. `data`: (W, A, S, bytes); lost samples
     are zeros.
     """
     for w in range(worlds.ticks.size):

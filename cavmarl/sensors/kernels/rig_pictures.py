@@ -1,6 +1,6 @@
 """Cameras and bird's-eye grids on agents' vehicles.
 
-In a bird's-eye grid, objects are drawn in this order, later ones over earlier ones: ground, roads,
+In a bird's-eye grid, later objects are drawn over earlier objects, in this order: ground, roads,
 lane lines, buildings, bodies by id. The grid is aligned with the sensor's x axis; row 0 is farthest
 ahead, column 0 farthest left.
 """
@@ -58,7 +58,7 @@ class BirdsEye(NamedTuple):
 def make_birds_eye(
     mount: NDArray[np.float64], ahead_m: float, left_m: float, cell_m: float
 ) -> BirdsEye:
-    """Create a grid.
+    """Create the pose and the scratch memory of a bird's-eye grid.
 
     Args:
         mount: (3, 4) axes and position in the vehicle's frame, not tilted.
@@ -141,17 +141,17 @@ def _fill_line(
 
 @kernel
 def look_down(grid: BirdsEye, panorama: Panorama, counts: Counts, out: NDArray[np.uint8]) -> None:
-    """Fill the grid.
+    """Draw the surroundings of a vehicle into a bird's-eye grid.
 
-    `grid`: its pose. `panorama`: the surroundings of the vehicle, prisms ordered by id. `out`:
-    (rows, columns), overwritten.
+    `grid`: pose of the grid. `panorama`: the surroundings, with prisms ordered by id. `out`: (rows,
+    columns), overwritten.
     """
     out[:] = GROUND
     for k in range(counts.strips):
         for c in range(4):
             _set_corner(grid, c, panorama.strips[k, c, 0], panorama.strips[k, c, 1])
         _fill(grid, ROAD, out)
-    # Half a cell to each side, so that a line shows in every row that it crosses.
+    # Lines extend half a cell to each side, so that they show in every row that they cross.
     half_m = 0.5 * grid.cell_m
     for k in range(counts.strips):
         if panorama.lined[k] > 0.0:
@@ -209,14 +209,14 @@ def take_pictures(
     classes: bool | None,
     data: NDArray[np.unsignedinteger],
 ) -> None:
-    """Write the pictures that are due for the owned agents: depths, colours, or classes.
+    """Write the due pictures of the owned agents: depths, colours, or classes.
 
-    `lines`: (W, agents, 2) rows [first, last) of each agent's picture to write. `noise`: of depths
-    less than the range, or of colours. `scratch`: (rows of `picture`, W), and `scratch_bits`, the
-    same memory; for depths only. `palette`: for colours only. `classes`: True for classes only.
-    `data`: (W, agents, S, H, W) float16 as bits, m; or uint8, (…, 3) for colours.
+    `lines`: (W, agents, 2) rows [first, last) of each agent's picture to write. `noise`: errors of
+    depths below the range, or of colours. `scratch`: (rows of `picture`, W), and `scratch_bits`,
+    the same memory; for depths only. `palette`: for colours only. `classes`: True for classes only.
+    `data`: (W, agents, S, H, W) float16 as bits, in m; or uint8, (…, 3) for colours.
 
-    Numba leaves out the branches of arguments that are None.
+    Numba does not compile the branches of arguments that are None.
     """
     band, width = picture.face.shape
     reach_m = camera_reach_m(camera, width, picture.height)
@@ -258,7 +258,7 @@ def _add_noise(
 ) -> None:
     """Add errors to depths (rows, W) below the range; the results lie between 1 cm and the range.
 
-    `first` is their first row in the picture.
+    `first` is the row of the picture at which `depths` begins.
     """
     key = sensor_key(row, noise.stream)
     rows, width = depths.shape
@@ -295,7 +295,7 @@ def fill_grids(
     panorama: Panorama,
     data: NDArray[np.uint8],
 ) -> None:
-    """Write the bird's-eye grids (W, agents, S, rows, columns) that are due; see `take_pictures`.
+    """Write the due bird's-eye grids (W, agents, S, rows, columns); see `take_pictures`.
 
     `reach_m`: distance from the vehicle's position to the farthest corner of the grid.
     """

@@ -1,8 +1,8 @@
 """Lidars and radars on agents' vehicles.
 
-A radar target is a body or a building that a ray of the fan hits first; its echo is the nearest of
-these hits. The radial speed is the speed of the target's centre relative to the sensor, along the
-ray, positive if the distance grows. The ground and clutter give no echo.
+A radar target is a body or a building that is the first hit of a ray of the fan; the target's echo
+is the nearest of these hits. The radial speed is the speed of the target's centre relative to the
+sensor, along the ray, positive if the distance grows. The ground and clutter give no echo.
 """
 
 from __future__ import annotations
@@ -75,8 +75,8 @@ def detect(
 ) -> int:
     """List the targets that the rays have hit, nearest first, and return their number.
 
-    `fan`: of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten up
-    to the returned number, unordered. `order`: (A,), overwritten up to the same number with the
+    `fan`: rays of one channel. `hits`: HIT (A, 1), from `cast`. `targets`: TARGET (A,), overwritten
+    up to the returned number, unordered. `order`: (A,), overwritten up to the same number with the
     indices of targets, nearest first.
     """
     found = 0
@@ -105,8 +105,8 @@ def detect(
     return found
 
 
-# Rays are written in blocks of one cache line. Without blocks, a layer of 1,024 or more rays would
-# map the same ray of all layers to one set of the cache, which cannot hold them.
+# Rays are written in blocks of one cache line. Without blocks, and with 1,024 or more rays per
+# layer, the same ray of all layers would map to one set of the cache, which cannot hold them.
 BLOCK = 16
 
 

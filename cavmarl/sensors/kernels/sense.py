@@ -1,7 +1,7 @@
 """The end of a step: observations and reward terms of the agents of one shard.
 
-There is one function per sensor. It writes the sensor's features, scaled to [-1, 1], from position
-`at` on. The scales are defined here; names and meanings of the features are in `sensors/observed/`.
+One function per sensor writes the sensor's features, scaled to [-1, 1], starting at index `at`. The
+scales are defined here; names and meanings of the features are in `sensors/observed/`.
 """
 
 from __future__ import annotations
@@ -53,7 +53,7 @@ TO_GO_SCALE = 1000.0  # m
 LENGTH_SCALE = 20.0  # m
 WHEELBASE_SCALE = 10.0  # m
 HALF_S = 5.0  # a time of this length has a soonness of 0.5
-SLOWEST_MPS = 1.0  # the vehicle is assumed to approach at least this fast, even if it stands
+SLOWEST_MPS = 1.0  # the vehicle is assumed to approach at least this fast, even if stopped
 
 
 @kernel
@@ -113,7 +113,7 @@ def observe_route(
     sensors: Sensors,
     out: NDArray[np.float32],
 ) -> None:
-    """Write points of the path ahead in the ego frame; the last one repeats beyond its end."""
+    """Write points of the path ahead in the ego frame; beyond its end, repeat the last point."""
     cos_heading, sin_heading = cos_sin(row["heading"])
     scale = sensors.route_points * sensors.route_spacing_m
     lane = row["lane"]
@@ -140,9 +140,9 @@ def observe_route(
 def observe_neighbors(
     rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
 ) -> None:
-    """Write the nearest vehicles in the ego frame, nearest first; missing vehicles are zeros.
+    """Write the nearest vehicles in the ego frame, nearest first; 0 for missing vehicles.
 
-    Vehicles behind `sensors.walls` are left out.
+    Vehicles hidden by `sensors.walls` are left out.
     """
     if sensors.neighbors == 0:
         return
@@ -209,8 +209,8 @@ def observe_signal(
 ) -> None:
     """Write the next stop line on the path with a signal or a duty to yield.
 
-    With `signal_stop_signs`, this includes stop signs without foes, and the last feature tells
-    lines with a stop. `time`: time of the tick, in s since the world's reset.
+    With `signal_stop_signs`, this includes stop signs without foes, and the last feature marks stop
+    signs. `time`: time of the tick, in s since the world's reset.
     """
     at = sensors.signal_at
     stops = False
@@ -249,7 +249,7 @@ def observe_signal(
 def observe_lidar(
     rows: NDArray[np.void], i: int, grid: Grid, sensors: Sensors, out: NDArray[np.float32]
 ) -> None:
-    """Write the distances along the rays, 1 without a hit, then any relative speeds."""
+    """Write the distances along the rays (1 without a hit), then the relative speeds, if any."""
     rays = sensors.lidar_rays
     if rays == 0:
         return
@@ -268,7 +268,7 @@ def observe_lidar(
 
 @kernel
 def observe_frame(
-    roads: RoadArrays,  # of the world
+    roads: RoadArrays,  # roads of the world
     plans: NDArray[np.void],  # PLAN (G, L) that the vehicle follows
     travel: TripTables,
     rows: NDArray[np.void],
@@ -309,11 +309,11 @@ def sense(
     chosen: NDArray[np.bool_],
     outputs: Outputs,
 ) -> None:
-    """Write observations and terms of every owned agent of the chosen worlds, at its own index.
+    """Write observations and reward terms of all owned agents of the chosen worlds, by agent index.
 
-    A vehicle that entered during the step has not acted: it is observed, its terms are 0, and it
-    does not end. `observe_optional` and `fill_stacks` complete the observations.
-    `rewards.kernels.reward` sums the terms when all shards have written theirs.
+    A vehicle that entered during the step has not acted: it is observed, its terms are 0, and its
+    trip does not end. `observe_optional` and `fill_stacks` complete the observations.
+    `rewards.kernels.reward` sums the terms after all shards have written their terms.
 
     `worlds`: committed rows at the end of the step, including ghosts. `outputs`: cleared in the
     chosen worlds; written at the indices of owned agents.

@@ -44,7 +44,7 @@ def put_first(
     spare: NDArray[np.void],
     num_owned: NDArray[np.int64],
 ) -> int:
-    """Move the agents that a worker senses to the front; it owns these rows, the rest are ghosts.
+    """Move a worker's agents to the front; the worker owns these rows, all others are ghosts.
 
     Args:
         rows: VEHICLE (W, C), agents before the other vehicles.
@@ -55,7 +55,7 @@ def put_first(
         num_owned: (W,) overwritten with the number of owned rows.
 
     Returns:
-        the number of owned rows in all worlds.
+        The number of owned rows in all worlds.
     """
     total = 0
     for w in range(num_agents.size):

@@ -44,9 +44,9 @@ def measure_motion(
     before and after the tick; r' and pitch' are the slopes. The change of the slip angle is
     neglected, because the steering of the bicycle jumps.
 
-    `row`: VEHICLE after the tick. `pose`: POSE before it; if it is of another vehicle, the state of
-    `row` is used. `share`: elapsed share of the tick, in (0, 1]. `out`: (6,) m/s² and rad/s, along
-    the sensor's axes.
+    `row`: VEHICLE after the tick. `pose`: POSE before the tick; if it belongs to another vehicle,
+    the state of `row` is used. `share`: elapsed share of the tick, in (0, 1]. `out`: (6,) m/s² and
+    rad/s, along the sensor's axes.
     """
     left = 1.0 - share if pose["id"] == row["id"] else 0.0
     speed = row["speed"] + left * (pose["speed"] - row["speed"])
@@ -89,7 +89,7 @@ def measure_inertia(
 ) -> None:
     """Write the samples that are due for the owned agents.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (6,). `data`: (W, A, S, 6) force and rate.
+    `before`: POSE (W, A) at the previous tick. `scratch`: (6,). `data`: (W, A, S, 6) force, rate.
     """
     for w in range(worlds.ticks.size):
         num = due.num[w]
@@ -117,9 +117,9 @@ def measure_places(
     places: NDArray[np.float64],
     measured: NDArray[np.bool_],
 ) -> None:
-    """Write the antenna positions of the owned agents that are due.
+    """Write the due antenna positions of the owned agents.
 
-    `due`: at most one sample in this tick. `noise`: of the sensor, along the axes of the map.
+    `due`: at most one sample in this tick. `noise`: the sensor's errors, along the axes of the map.
     `scratch`: (2, 3, 3), overwritten. `places`: (W, A, 3) x, y, z in m. `measured`: (W, A) set for
     agents whose position is written.
     """
@@ -150,7 +150,7 @@ def measure_odometry(
     Of n samples in a tick, the k-th is interpolated at k / n between the states before and after
     the tick. A vehicle that entered in this tick has the same state before and after.
 
-    `before`: POSE (W, A) of the tick before. `scratch`: (3,). `data`: (W, A, S, 3) speed in m/s,
+    `before`: POSE (W, A) at the previous tick. `scratch`: (3,). `data`: (W, A, S, 3) speed in m/s,
     yaw rate in rad/s, distance in m since departure.
     """
     for w in range(worlds.ticks.size):
@@ -174,14 +174,14 @@ def measure_odometry(
                     data[w, agent, due.slot[w] + k, channel] = scratch[channel]
 
 
-_WINDOW_M = 15.0  # search window for the sensor's lane position, around the vehicle's
+_WINDOW_M = 15.0  # the sensor's lane position is searched this far around the vehicle's position
 
 
 @kernel
 def _way_ahead(
     roads: RoadArrays, plans: NDArray[np.void], row: np.void, ahead: float
 ) -> tuple[float, float]:
-    """Return x and y of a point on a vehicle's path, or of the path's end."""
+    """Return x and y of a point on a vehicle's path, or of the end of the path."""
     lane = row["lane"]
     s = row["s"] + ahead
     while s > roads.lanes[lane]["length_m"]:
@@ -200,8 +200,8 @@ def _way_ahead(
 def bend(x0: float, y0: float, x1: float, y1: float, x2: float, y2: float) -> float:
     """Return the curvature of the circle through three points in 1/m, positive to the left.
 
-    The curvature is four times the triangle's area over the product of its sides; 0 if two points
-    coincide.
+    The curvature is four times the triangle's area divided by the product of its sides; 0 if two
+    points coincide.
     """
     ax, ay = x1 - x0, y1 - y0
     bx, by = x2 - x1, y2 - y1
@@ -276,7 +276,7 @@ def report_events(
 
     Args:
         worlds: committed rows.
-        before: POSE (W, A) of the tick before.
+        before: POSE (W, A) at the previous tick.
         ticks_per_step: ticks per step; VEHICLE["events"] is cleared at each step.
         tick_s: seconds per tick.
         due: the worlds in which reports are due.
@@ -284,7 +284,7 @@ def report_events(
         dropout: probability that a report is lost.
         stamp_s: (W, A, S) in s since the reset.
         lost: (W, A, S) whether each report is lost.
-        fresh: (W, A) number of reports of this step so far.
+        fresh: (W, A) number of reports in this step so far.
         data: (W, A, S, 2) EVENT_* bits, and the id of the vehicle that was hit, or -1.
     """
     for w in range(worlds.ticks.size):

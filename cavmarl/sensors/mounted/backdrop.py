@@ -14,7 +14,7 @@ from cavmarl.roads.network import VEHICLE_CLASSES, RoadNetwork
 from cavmarl.sensors.kernels.panorama import SEMANTIC_OF_CLASS
 
 CELL_M = 32.0
-# Long straight strips are cut, because the index finds strips by their centres.
+# Longer straight strips are cut, because the index finds strips by their centres.
 STRIP_M = 24.0
 # Strips overlap slightly, so that no ground shows between neighbouring lanes.
 OVERLAP_M = 0.05
@@ -55,7 +55,7 @@ def _semantics(types: NDArray[np.void]) -> NDArray[np.uint8]:
     names = [_CLASS_NAMES.get(vclass, f"number {vclass}") for vclass in types["vclass"].tolist()]
     unknown = sorted(set(names) - set(SEMANTIC_OF_CLASS))
     if unknown:
-        raise ConfigError(f"vehicle class {', '.join(unknown)}: not in SEMANTIC_OF_CLASS")
+        raise ConfigError(f"vehicle class {', '.join(unknown)}: add it to SEMANTIC_OF_CLASS")
     return np.array([SEMANTIC_OF_CLASS[name] for name in names], np.uint8)
 
 
@@ -92,7 +92,7 @@ def lane_strips(network: RoadNetwork) -> tuple[NDArray[np.float64], NDArray[np.f
     # The last point repeats the direction of the segment before it.
     along = before + after
     size = hypot_all(along[:, 0], along[:, 1])
-    # A lane that turns back on the spot has no mean direction; use the direction after the turn.
+    # A lane that reverses at a point has no mean direction there; use the direction after the turn.
     along = np.where(
         size[:, np.newaxis] > 1e-6, along / np.maximum(size, 1e-6)[:, np.newaxis], after
     )

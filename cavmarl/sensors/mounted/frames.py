@@ -22,7 +22,7 @@ class SensorFrames(NamedTuple):
     fresh: NDArray[np.int64]  # (W, A) samples of the last step, including lost ones
 
     def part(self, first: int, last: int) -> SensorFrames:
-        """Return the frames of the worlds [first, last), as views."""
+        """Return views of the frames of the worlds [first, last)."""
         parts: list[Any] = [array[first:last] for array in self]
         return SensorFrames(*parts)
 

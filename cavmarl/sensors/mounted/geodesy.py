@@ -1,7 +1,7 @@
 """Conversion between map coordinates and WGS 84: latitude and longitude in degrees, height in m.
 
-If the map states its projection, that is used. Otherwise the map lies in the plane that touches the
-ellipsoid at an origin. z is the height above the origin.
+If the map states its projection, this projection is used. Otherwise the map is assumed to lie in
+the plane that touches the ellipsoid at an origin. z is the height above the origin.
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ class TangentPlane:
 
 
 def _turned(points: Points, axes: Points) -> Points:
-    """Return points (n, 3) times axes (3, 3); a BLAS's sums would depend on the processor."""
+    """Return points (n, 3) times axes (3, 3), without BLAS, whose sums depend on the processor."""
     found: Points = points[:, :1] * axes[0] + points[:, 1:2] * axes[1] + points[:, 2:] * axes[2]
     return found
 

@@ -20,14 +20,14 @@ from cavmarl.sensors.mounted.mounted_sensor import Bounds, ImagingSensor, Platfo
 C = TypeVar("C", LidarRigConfig, RadarConfig)
 Floats = NDArray[np.float64]
 
-ECHO_MARGIN_M = 0.05  # a ray that ends less than this below the range counts as one without echo
+ECHO_MARGIN_M = 0.05  # a ray that ends less than this before the range counts as without echo
 
 
 def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
-    """Return the azimuth of the first ray and the step in rad, counter-clockwise, and the number.
+    """Return the azimuth of the first ray, the step (both in rad), and the number of rays.
 
-    A full circle begins straight ahead; a smaller field of view goes from its right edge to its
-    left edge.
+    Azimuths are counter-clockwise. A full circle begins straight ahead; a smaller field of view
+    goes from its right edge to its left edge.
     """
     if fov_deg == 360.0 or rays == 1:
         return 0.0, 2.0 * math.pi / rays, rays
@@ -36,7 +36,7 @@ def azimuths(fov_deg: float, rays: int) -> tuple[float, float, int]:
 
 
 def elevations(lower_deg: float, upper_deg: float, layers: int) -> Floats:
-    """Return the elevation of each layer of a lidar in rad, the lowest first; a single one is 0."""
+    """Return the elevation of each layer of a lidar in rad, lowest first; 0 for a single layer."""
     if layers == 1:
         return np.zeros(1)
     return np.linspace(math.radians(lower_deg), math.radians(upper_deg), layers)
@@ -51,7 +51,7 @@ def lidar_directions(
 
 
 def has_echo(distances_m: Floats, range_m: float) -> NDArray[np.bool_]:
-    """Return which rays with these distances have hit something; the others hold the range."""
+    """Return which rays with these distances have hit something; other rays end at the range."""
     return distances_m < range_m - ECHO_MARGIN_M
 
 

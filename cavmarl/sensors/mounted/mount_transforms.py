@@ -26,7 +26,7 @@ def mount_rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Points:
 
 
 def mount_of(config: MountedConfig) -> Mount:
-    """Return the position and orientation of a sensor as a bundle for kernels."""
+    """Return the position and orientation of a sensor as a named tuple for kernels."""
     turn = mount_rotation(config.yaw_deg, config.pitch_deg, config.roll_deg)
     return Mount(np.array([config.x_m, config.y_m, config.z_m]), turn)
 
@@ -41,11 +41,11 @@ def mount_matrix(config: MountedConfig) -> NDArray[np.float64]:
 
 
 def check_place(name: str, config: MountedConfig, bodies: NDArray[np.void]) -> None:
-    """Refuse a sensor that lies outside a body on which it is mounted.
+    """Check that a sensor lies inside every body on which it is mounted.
 
     `bodies`: VTYPE (n,) of the vehicles that carry it.
 
-    Raises ConfigError: the sensor lies outside; the message has the nearest valid position.
+    Raises ConfigError: the sensor lies outside; the message states the nearest valid position.
     """
     if not len(bodies):
         return

@@ -36,7 +36,7 @@ class SensedScene(NamedTuple):
     travel: TripTables  # vehicle types
     worlds: Worlds  # the committed rows: the zone's own rows, then ghosts
     grid: Grid  # scratch: spatial index of one world, filled by the sensor that uses it
-    before: NDArray[np.void]  # POSE (W, A) of all agents at the tick before
+    before: NDArray[np.void]  # POSE (W, A) of all agents at the previous tick
 
 
 class Platform(NamedTuple):
@@ -44,12 +44,12 @@ class Platform(NamedTuple):
 
     network: RoadNetwork
     bodies: NDArray[np.void]  # VTYPE (A,) of agents' vehicles
-    population: PopulationConfig  # it says which agents carry which sensors
+    population: PopulationConfig  # states which agents carry which sensors
     num_worlds: int
     num_agents: int
     sim_dt_s: float
     ticks_per_step: int
-    capacity: int  # largest number of rows of a world
+    capacity: int  # largest number of rows per world
     backdrop: Backdrop  # static scene for cameras and rays
 
 
@@ -60,7 +60,7 @@ class MountedSensor(ABC, Generic[C]):
         name: name in the rig.
         config: settings of the sensor.
         mount: pose on the vehicle.
-        frame: name of the frame of its directions.
+        frame: name of the frame of the sensor's directions.
         carriers: (A,) the agents whose vehicles carry it.
         lines: (W, A, 2) lines [first, last) of each agent's frame that `sense` writes: all, unless
             other processes write the rest.
@@ -68,7 +68,7 @@ class MountedSensor(ABC, Generic[C]):
 
     dtype: ClassVar[DTypeLike]
     kernel: ClassVar[Callable[..., None]]  # called with the values of `arguments`
-    stamps_itself: ClassVar[bool] = False  # no rate: the kernel also writes stamps and counts
+    stamps_itself: ClassVar[bool] = False  # has no rate: the kernel also writes stamps and counts
 
     def __init__(self, name: str, config: C, platform: Platform) -> None:
         self.name = name
@@ -95,7 +95,7 @@ class MountedSensor(ABC, Generic[C]):
 
     @staticmethod
     def bounds(config: C) -> Bounds:
-        """Return the least and the largest values of a sample, in its shape; infinite if noisy."""
+        """Return the lower and upper bounds of a sample, with its shape; infinite if noisy."""
         return np.full(config.shape, -np.inf), np.full(config.shape, np.inf)
 
     @staticmethod
@@ -113,10 +113,10 @@ class MountedSensor(ABC, Generic[C]):
         """Return the kernel's arguments for the samples that are due in one zone."""
 
     def sense(self, scenes: Sequence[SensedScene], due: Due, frames: SensorFrames) -> None:
-        """Write the data of all samples that are due, for the agents that the scenes own.
+        """Write the data of all due samples, for the agents that the scenes own.
 
-        The data may depend only on the agent's row, the other rows within reach, and the tick. It
-        must not depend on the order of rows or on the zone.
+        The data may depend only on the agent's row, the other rows within reach, and the tick, but
+        not on the order of rows or on the zone.
 
         `scenes`: one per zone. `due`: number of samples, and their slots. `frames`: only `data` is
         written; the rig writes stamps, counts and losses.

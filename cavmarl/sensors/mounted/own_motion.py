@@ -120,7 +120,7 @@ class Gnss(MountedSensor[GnssConfig]):
 
 
 class Collision(MountedSensor[CollisionConfig]):
-    """EVENT_* bits of events of the present tick, and the vehicle that was hit."""
+    """Event sensor: EVENT_* bits of the present tick, and the vehicle that was hit."""
 
     dtype = np.int64
     kernel = report_events

@@ -47,11 +47,11 @@ def sense_here(scenes: Sequence[SensedScene], turns: Sequence[Turn]) -> None:
 class Rig:
     """The sensors of all agents of W worlds.
 
-    `settings`: settings of the sensors, by name. `frames`: destination of their samples. `ids`: (W,
+    `settings`: settings of the sensors, by name. `frames`: destination of the samples. `ids`: (W,
     A) int64, the vehicle of each agent's samples; kept from tick to tick.
 
     Attributes:
-        sense: writes the samples that are due.
+        sense: function that writes the due samples.
     """
 
     def __init__(
@@ -82,7 +82,7 @@ class Rig:
 
     @property
     def before(self) -> NDArray[np.void]:
-        """POSE (W, A) at the tick before."""
+        """POSE (W, A) at the previous tick."""
         return self._before
 
     def begin(self, scenes: Sequence[SensedScene]) -> None:
@@ -92,7 +92,7 @@ class Rig:
             self._note_poses(scene.worlds, self._before)
 
     def reset(self, scenes: Sequence[SensedScene], chosen: NDArray[np.bool_]) -> None:
-        """Clear the chosen worlds (W,) and take the samples that are due at the reset."""
+        """Clear the chosen worlds (W,) and take the samples due at the reset."""
         if self._is_new:  # load the kernels now, not in the first tick that needs them
             self._is_new = False
             for mounted in self._mounted:
@@ -104,7 +104,7 @@ class Rig:
         self._take(scenes, chosen)
 
     def end(self, scenes: Sequence[SensedScene]) -> None:
-        """Take the samples that are due in the present tick."""
+        """Take the samples due in the present tick."""
         ticks = scenes[0].worlds.ticks
         begins = (ticks - 1) % self._platform.ticks_per_step == 0
         if begins.any():
@@ -152,7 +152,7 @@ class _Mounted:
         self._deliver = specialized(deliver)
 
     def clear(self, chosen: NDArray[np.bool_]) -> None:
-        """Write zeros for the chosen worlds (W,) or agents (W, A)."""
+        """Set the frames of the chosen worlds (W,) or agents (W, A) to zero."""
         for array in self.frames:
             array[chosen] = 0
 
@@ -167,11 +167,11 @@ class _Mounted:
             array[...] = before
 
     def is_due(self, ticks: NDArray[np.int64], chosen: NDArray[np.bool_]) -> bool:
-        """Write how many samples are due in the chosen worlds (W,); return whether any is."""
+        """Count the samples due in the chosen worlds (W,); return whether any is due."""
         return self._call_due(self._schedule, ticks, chosen, self.turn.due)
 
     def deliver(self, scenes: Sequence[SensedScene]) -> None:
-        """Stamp and count the new samples, and drop some of them."""
+        """Stamp and count the new samples, and drop some samples."""
         sensor, frames = self.turn.sensor, self.frames
         if sensor.stamps_itself:
             return

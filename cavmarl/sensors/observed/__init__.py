@@ -2,7 +2,7 @@
 
 Each file defines the sensor's part of an observation, its reach and, for an optional sensor, the
 settings of its kernel. CONTRIBUTING.md shows how to add a sensor; `sensors.registry` registers
-those of other packages.
+sensors of other packages.
 """
 
 from __future__ import annotations
@@ -56,17 +56,17 @@ SENSORS: tuple[Sensor, ...] = (
     history_sensor.SENSOR,  # must be last: see `carried_from`
 )
 
-# Number of nearest vehicles that are tested for being hidden by walls.
+# Walls are checked only for this number of nearest vehicles.
 MAX_NEIGHBORS_TRIED = 256
 
 
 def sensors_of(config: SensorsConfig) -> tuple[Sensor, ...]:
-    """Return all sensors of the package, on or off, followed by the registered sensors in use."""
+    """Return all sensors of the package, on or off, then the registered sensors in use."""
     return (*SENSORS, *(REGISTERED_SENSORS[name] for name in config.registered))
 
 
 def feature_names(config: SensorsConfig) -> list[tuple[str, str]]:
-    """Return the sensor and the feature of each number of an observation frame."""
+    """Return the sensor and the feature of each number in an observation frame."""
     return [
         (sensor.name, feature.name)
         for sensor in sensors_of(config)
@@ -95,7 +95,7 @@ def carried_from(config: SensorsConfig) -> int:
     """Return the index from which an observation repeats values of earlier observations.
 
     The values before this index are observed anew in each step, or belong to the oldest frame,
-    which the next observation drops. If no value is repeated, the index is the observation's size.
+    which the next observation drops. If no value is repeated, the result is the observation's size.
     """
     if config.stack > 1:
         return frame_size(config)
@@ -104,7 +104,7 @@ def carried_from(config: SensorsConfig) -> int:
 
 
 def largest_radius_m(types: NDArray[np.void]) -> float:
-    """Return half the diagonal of the largest body, in m: an upper bound from centre to corner.
+    """Return half the diagonal of the largest body, in m: the bound from any centre to a corner.
 
     Args:
         types: VTYPE (num_types,), `TripTables.types`: the types of agents and of all other
@@ -116,10 +116,10 @@ def largest_radius_m(types: NDArray[np.void]) -> float:
 def sensing_reach_m(config: SensorsConfig, largest_radius_m: float) -> float:
     """Return the largest distance at which an agent can sense a vehicle, centre to centre, in m.
 
-    A vehicle that is further away changes no number of an observation and no reward term of the
-    package. Sensors that measure to vehicle centres reach as far as their range; `lanes` also
-    ignores vehicles that are further away in the plane. Rays end at bodies, whose centres can be
-    half a diagonal behind the hit. Reward terms, always computed, reach `TERMS_REACH_M`.
+    A vehicle further away changes no number of an observation and no reward term of the package.
+    Sensors that measure to vehicle centres reach as far as their range; `lanes` also ignores
+    vehicles further away in the plane. Rays end at bodies, whose centres can be half a diagonal
+    behind the hit. Reward terms are always computed and reach `TERMS_REACH_M`.
     """
     sensors = sensors_of(config)
     reaches = (sensor.reach_of_centres_m(config, largest_radius_m) for sensor in sensors)
@@ -196,7 +196,7 @@ def all_optional_arrays(
     most_told: int,
     capacity: int,
 ) -> OptionalSensors:
-    """Return the settings of the optional sensors, on or off; arguments as `optional_arrays`."""
+    """Return the settings of the optional sensors, on or off; arguments: see `optional_arrays`."""
     optional = [sensor for sensor in SENSORS if sensor.settings is not None]
     starts = _starts(config)
     goals = goal_places(network, plans)

@@ -16,7 +16,7 @@ def exchange_sides(config: SensorsConfig) -> tuple[NDArray[np.intp], NDArray[np.
     The exchange is its own inverse. It follows from the `Sides` of each sensor.
 
     Raises:
-        ConfigError: a sensor that is on does not say how, or cannot be exchanged.
+        ConfigError: a sensor in use does not define the exchange, or its settings do not allow it.
     """
     index: list[int] = []
     sign: list[float] = []

@@ -22,7 +22,7 @@ class Feature:
 
     name: str  # unique within the sensor
     meaning: str  # meaning of the number, with frame and sign
-    scale: str = ""  # the quantity that 1.0 stands for, with its unit; empty for flags
+    scale: str = ""  # the quantity that is scaled to 1.0, with its unit; empty for flags
     low: float = -1.0  # smallest value
     high: float = 1.0  # largest value
 
@@ -32,7 +32,7 @@ def features_of(rows: Iterable[Row]) -> list[Feature]:
 
 
 def numbered(count: int, subject: str, rows: Iterable[Row]) -> list[Feature]:
-    """Return the rows for each of `count` objects; `{}` in `subject` is the object's number."""
+    """Return the features of `count` objects; `{}` in `subject` stands for the object's number."""
     listed = list(rows)
     return [
         Feature(f"{name}_{k}", f"{subject.format(k)}: {meaning}", scale)
@@ -58,10 +58,10 @@ Source = Literal["own vehicle", "ideal sensors", "map", "V2X", "world's state"]
 
 @dataclass(frozen=True)
 class Reading:
-    """Something that an observation contains, and where a vehicle would have it from.
+    """A kind of information in an observation, and the source that a vehicle would have for it.
 
-    Ideal sensors measure without errors. Nothing on a vehicle knows the world's state, such as the
-    plans of other vehicles.
+    Ideal sensors measure without errors. No device on a vehicle knows the world's state, such as
+    the plans of other vehicles.
     """
 
     source: Source
@@ -89,13 +89,13 @@ def _never(config: SensorsConfig) -> str:
 
 @dataclass(frozen=True)
 class Sides:
-    """What happens to a sensor's features if left and right are exchanged, as in a mirror."""
+    """The change of a sensor's features if left and right are exchanged, as in a mirror."""
 
     # features whose sign changes, by name without the number at the end
     negated: tuple[str, ...] = ()
-    # name of the feature whose value a feature gets
+    # for the name of a feature, the name of the feature whose value it gets
     partner: Callable[[SensorsConfig, str], str] = _unchanged
-    # why these settings do not allow the exchange; empty: they do
+    # reason why the settings do not allow the exchange; empty if they do
     refusal: Callable[[SensorsConfig], str] = _never
 
     def is_negated(self, name: str) -> bool:
@@ -103,7 +103,7 @@ class Sides:
 
 
 def left_for_right(config: SensorsConfig, name: str) -> str:
-    """Return the name with `left` instead of `right`, and the reverse."""
+    """Exchange `left` and `right` in a name."""
     return "right".join(part.replace("right", "left") for part in name.split("left"))
 
 
@@ -111,23 +111,23 @@ def left_for_right(config: SensorsConfig, name: str) -> str:
 class Sensor:
     """A sensor that agents observe."""
 
-    name: str  # its key in the configuration
-    # its features in order; none if it is off
+    name: str  # key in the configuration
+    # features in order; none if the sensor is off
     features: Callable[[SensorsConfig], list[Feature]]
     reach_m: Callable[[SensorsConfig], float] = _nowhere  # sensing range, in m
-    # shape of its part of a Dict observation; -1 stands for the number of features
+    # shape of the sensor's part of a Dict observation; -1 stands for the number of features
     shape: Callable[[SensorsConfig], tuple[int, ...]] = _flat
     dtype: Callable[[SensorsConfig], DTypeLike] = _float32  # dtype of that part
-    # arguments of the kernel, for an optional sensor, which `observe_optional` writes
+    # arguments of the kernel, for optional sensors, which `observe_optional` writes
     settings: Callable[[SensorSetup], tuple[Any, ...]] | None = None
-    # whether the reach is to the nearest part of a body, not to its centre
+    # whether the reach is measured to the nearest part of a body, not to its centre
     sees_bodies: bool = False
     # computes the numbers of a sensor of another package from an AgentView or a BatchView
     sense: Callable[[Any], Any] | None = None
     batched: bool = False
-    # what it reads if it is on
+    # what the sensor reads if it is on
     reads: Callable[[SensorsConfig], list[Reading]] = _nothing
-    # what happens if left and right are exchanged; None: not known, or not possible
+    # change of the features if left and right are exchanged; None: not known, or not possible
     sides: Sides | None = None
 
     def reach_of_centres_m(self, config: SensorsConfig, largest_radius_m: float) -> float:

@@ -15,7 +15,7 @@ from cavmarl.sensors.observed.feature import Feature
 MAX_SPEED_MPS = 40.0  # Vehicle.MAX_SPEED
 LANE_WIDTH_M = 4.0  # AbstractLane.DEFAULT_WIDTH
 
-# No relative velocity is larger: driving/kernels/motion/motion.py keeps speeds within 0–60 m/s.
+# Upper bound of relative velocities: driving/kernels/motion/motion.py keeps speeds in 0–60 m/s.
 MAX_RELATIVE_MPS = 120.0
 
 _MEANINGS = {
@@ -51,7 +51,7 @@ NEGATED = ("y", "vy", "heading", "sin_h", "sin_d", "lat_off", "ang_off")
 
 
 def off_centre(ranges: Mapping[str, tuple[float, ...]], features: tuple[str, ...]) -> str:
-    """Return which feature cannot be negated, because its range is not symmetric; else nothing."""
+    """Return a feature that cannot be negated because its range is not symmetric, if any."""
     for name in NEGATED:
         if name in features and name in ranges and ranges[name][0] != -ranges[name][1]:
             low, high = ranges[name]
@@ -65,8 +65,8 @@ def off_centre(ranges: Mapping[str, tuple[float, ...]], features: tuple[str, ...
 def default_ranges(network: RoadNetwork) -> dict[str, tuple[float, ...]]:
     """Return highway-env's default ranges of features.
 
-    In highway-env, the range of `y` spans the lanes of the road of the first observation. Here it
-    spans the lanes of the widest road of the map, so that it is a constant of the map.
+    In highway-env, the range of `y` spans the lanes of the road in the first observation. Here it
+    spans the lanes of the widest road of the map, so that it is constant for a map.
     """
     outside = network.edges[~network.edges["internal"]]
     y = LANE_WIDTH_M * float(outside["num_lanes"].max())
@@ -111,7 +111,7 @@ def vehicle_feature(
     Args:
         name: one of `VEHICLE_FEATURES`.
         label: the feature's name in the observation.
-        subject: the vehicle; begins the meaning.
+        subject: text for the vehicle, at the start of the meaning.
         ranges: values that are mapped to [-1, 1], by feature.
         clip: whether mapped values are clipped.
     """

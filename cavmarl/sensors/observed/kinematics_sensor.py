@@ -20,7 +20,7 @@ from cavmarl.sensors.observed.highway import (
     vehicle_feature,
 )
 
-# The map sets the range of y; whatever its size, it is mapped to [-1, 1].
+# The map determines the range of y, which is mapped to [-1, 1] whatever its size.
 _DEFAULT_RANGES = {
     "x": (-200.0, 200.0), "y": (-4.0, 4.0), "vx": (-80.0, 80.0), "vy": (-80.0, 80.0)
 }  # fmt: skip
@@ -98,7 +98,7 @@ def _refusal(config: SensorsConfig) -> str:
     return off_centre(ranges, kinematics.features)
 
 
-# The mirror lies along the x axis, as positions are in the world's frame.
+# The mirror axis is the x axis, because positions are in the world's frame.
 SENSOR = Sensor(
     "kinematics",
     features,

@@ -10,7 +10,7 @@ from cavmarl.sensors.kernels.lidar_2d import ECHO
 from cavmarl.sensors.observed.feature import Feature, Reading, Sensor
 from cavmarl.sensors.observed.highway import MAX_RELATIVE_MPS
 
-# Within a body distances are negative, at most by the body's length.
+# Within a body, distances are negative, down to minus the body's length.
 LONGEST_BODY_M = 30.0
 
 
@@ -76,7 +76,7 @@ def reads(config: SensorsConfig) -> list[Reading]:
     return [Reading("ideal sensors", f"{what}; buildings hide nothing")]
 
 
-# Left and right cannot be exchanged: each cell extends clockwise from its direction only.
+# Left and right cannot be exchanged: each cell extends only clockwise from its direction.
 SENSOR = Sensor(
     "lidar_observation",
     features,

@@ -19,9 +19,9 @@ _TIMING = (
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """List the features of received messages; all are 0 where nothing is known.
+    """List the features of received messages; features without a message are 0.
 
-    There are eleven numbers per vehicle, eight per event, four of the signal, and three of its
+    There are eleven numbers per vehicle, eight per event, four for the signal, and three for its
     timing.
     """
     messages = config.messages

@@ -1,7 +1,7 @@
-"""What an observation contains, by its source: the label on the cards of drivers and environments.
+"""What an observation contains, by source, for the cards of drivers and environments.
 
-The sources are the vehicle itself, ideal sensors with their range and what hides vehicles, the map,
-messages (V2X), and the world's state, which nothing on a vehicle knows.
+The sources are the vehicle itself, ideal sensors (with their range and what hides vehicles), the
+map, messages (V2X), and the world's state, which no device on a vehicle knows.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ BUILT_IN_DRIVER = Reading(
 def readings_of(config: SensorsConfig, residual: bool = False) -> list[Reading]:
     """Return what a driver with these sensors reads, ordered by source.
 
-    `residual`: whether it also reads the built-in driver's action.
+    `residual`: whether the driver also reads the built-in driver's action.
     """
     on = layout(config)
     found = [

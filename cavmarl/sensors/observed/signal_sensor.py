@@ -15,7 +15,7 @@ _STOP = (
 
 
 def features(config: SensorsConfig) -> list[Feature]:
-    """List the features of the next stop line in range; all are 0 if there is none."""
+    """List the features of the next stop line in range; without a stop line, all are 0."""
     if not config.signal.enabled:
         return []
     rows = (

@@ -23,16 +23,16 @@ from cavmarl.signals.kernels.signal_steps import SignalRules, SignalWorlds
 IN_RANGE = record(
     ("x", np.float64),  # m, centre
     ("y", np.float64),
-    ("cos", np.float64),  # of the heading
+    ("cos", np.float64),  # cosine of the heading
     ("sin", np.float64),
     ("half_length", np.float64),  # m
     ("half_width", np.float64),
-    ("middle_z", np.float64),  # m, middle of its height
+    ("middle_z", np.float64),  # m, z of the middle of the body
     ("top_z", np.float64),
     ("zone", np.int32),
     ("row", np.int32),
     ("lane", np.int32),  # index of the watched lane
-    ("next", np.int32),  # another vehicle within the range of the same camera; -1: none
+    ("next", np.int32),  # next vehicle within the range of the same camera; -1: none
 )
 
 
@@ -41,7 +41,7 @@ class Cameras(NamedTuple):
 
     posts: LanePosts
     places: NDArray[np.float64]  # (S, 3) x, y, z in m
-    range_m: float  # along the lanes, from the stop line or from the start
+    range_m: float  # range along the lanes, from the stop line or from the start
     misses: float  # probability that a vehicle is missed
     in_range: NDArray[np.void]  # IN_RANGE (vehicles of a world,) scratch
     first: NDArray[np.int32]  # (S,) scratch
@@ -57,8 +57,8 @@ def count_by_cameras(
 ) -> None:
     """Count the vehicles on the watched lanes of the chosen worlds that cameras see.
 
-    A camera sees a vehicle within its range if no other vehicle within its range cuts the line to
-    the middle of the vehicle, and if the camera does not miss it.
+    A camera sees a vehicle within its range if no other vehicle within its range blocks the line to
+    the vehicle's middle, and if the camera does not miss the vehicle at random.
     """
     rows = worlds.rows[worlds.sides[0]]
     for w in range(chosen.size):
@@ -85,7 +85,7 @@ def _list_in_range(
     num_owned: NDArray[np.int64],
     w: int,
 ) -> int:
-    """Fill the scratch of the cameras with a world's vehicles; return their number."""
+    """Write a world's vehicles to the scratch of the cameras; return the number of vehicles."""
     cameras.first[:] = -1
     num = 0
     for zone in range(rows.shape[0]):
@@ -112,7 +112,7 @@ def _list_in_range(
 
 @kernel
 def _is_hidden(cameras: Cameras, i: int) -> bool:
-    """Return whether a vehicle hides another one, entry i of the scratch, from its camera."""
+    """Return whether another vehicle hides entry i of the scratch from its camera."""
     found = cameras.in_range[i]
     s = cameras.posts.signal[found["lane"]]
     x, y, z = cameras.places[s]

@@ -1,4 +1,4 @@
-"""Tables about the signals that agents control, for kernels."""
+"""Tables of the signals that agents control, for kernels."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ class ControlledSignals(NamedTuple):
     controller: NDArray[np.int32]  # (S,) index in a world's controllers
     first_phase: NDArray[np.int32]  # (S,) PHASE row of the first green
     num_greens: NDArray[np.int32]  # (S,)
-    incoming: NDArray[np.int32]  # (S, I) lanes before the signal, indices of lanes; -1: none
+    incoming: NDArray[np.int32]  # (S, I) indices of lanes before the signal; -1: none
     outgoing: NDArray[np.int32]  # (S, O) lanes behind the signal
     approach: NDArray[np.int32]  # (S, A) incoming lanes, and lanes that lead to them
     lane_row: NDArray[np.int32]  # (N,) LANE rows
-    lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N; -1: not watched
+    lane_index: NDArray[np.int32]  # (L,) index of each LANE among the N lanes; -1: not watched
     length_m: NDArray[np.float64]  # (N,)
     speed_mps: NDArray[np.float64]  # (N,) speed limits
     detector: NDArray[np.int32]  # (N,) DETECTOR rows of lanes before the signals; -1: none
@@ -34,7 +34,7 @@ class LaneWeights(NamedTuple):
 
 
 class LanePosts(NamedTuple):
-    """Where the watched lanes are observed: at the signal at their end, else at their start."""
+    """Where watched lanes are observed: from the signal at their end, or else at their start."""
 
     signal: NDArray[np.int32]  # (N,) index of the signal that observes the lane
     leads_in: NDArray[np.bool_]  # (N,) whether the signal is at the end of the lane

@@ -1,7 +1,6 @@
-"""Greens that agents choose: which choices are allowed, and the phases between two greens.
+"""Greens that agents choose: the allowed choices, and the phases between two greens.
 
-The phase is a function of the tick and of the last change, so repeated calls at one tick change
-nothing.
+The phase is a function of the tick and the last change, so repeated calls in a tick change nothing.
 """
 
 from __future__ import annotations
@@ -16,9 +15,9 @@ from cavmarl.signals.kernels.controlled_signals import ControlledSignals, Signal
 
 # Columns of the state (W, S, HELD) of the signals that agents control.
 PREVIOUS = 0  # the green before the last change
-GREEN = 1  # the present green, or the next one during yellow and all red
+GREEN = 1  # the present green, or the next green during yellow and all-red
 SINCE = 2  # tick of the last change
-REFUSED = 3  # choices of the episode that were not allowed
+REFUSED = 3  # number of choices in the episode that were not allowed
 HELD = 4
 
 KEEP = -1  # a choice: no change
@@ -30,15 +29,15 @@ NEVER_MS = 1 << 60  # time of the next check of a program that only its agent ch
 def choose_greens(
     controlled: ControlledSignals,
     durations: SignalTicks,
-    cyclic: bool,  # choices are 0: keep, 1: the next green; else the index of a green
+    cyclic: bool,  # whether choices are 0 (keep) and 1 (next green), else indices of greens
     choices: NDArray[np.int64],  # (W, S) KEEP, or a choice
     ticks: NDArray[np.int64],  # (W,)
     held: NDArray[np.int64],  # (W, S, HELD) updated
 ) -> None:
-    """Change the greens as agents have chosen, in worlds in which it is time for a decision.
+    """Change the greens as agents have chosen, in worlds in which a decision is due.
 
-    A choice that is not allowed counts as refused; the green stays, or ends if it has lasted for
-    its maximum.
+    A choice that is not allowed counts as refused; the green stays, or ends if it has reached its
+    maximum.
     """
     for w in range(ticks.size):
         if ticks[w] % durations.decide != 0:
@@ -107,7 +106,7 @@ def mask_choices(
     decides: NDArray[np.bool_],  # (W,) output: whether the next choices count
     masks: NDArray[np.bool_],  # (W, S, G) output: choices that are allowed
 ) -> None:
-    """Write which choices are allowed in the next step."""
+    """Write the choices that are allowed in the next step."""
     for w in range(ticks.size):
         decides[w] = ticks[w] % durations.decide == 0
         for s in range(controlled.row.size):

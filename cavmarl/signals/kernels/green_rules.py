@@ -20,7 +20,7 @@ from cavmarl.signals.kernels.lane_history import (
 LOST_FACTOR, LOST_EXTRA_S = 1.5, 5.0
 SHORTEST_CYCLE_S, LONGEST_CYCLE_S = 30.0, 120.0
 START_LOSS_S = (
-    2.0  # of a green until vehicles leave at the saturation flow (Highway Capacity Manual)
+    2.0  # time of a green until vehicles leave at the saturation flow (Highway Capacity Manual)
 )
 
 
@@ -28,16 +28,16 @@ START_LOSS_S = (
 def plan_greens(
     served: LaneWeights,  # see `SignalTable`
     num_greens: NDArray[np.int32],  # (S,)
-    num_openers: NDArray[np.int64],  # (N,) greens that open a lane
-    saturation: float,  # vehicles that leave a lane in an interval of permanent green
-    change_s: float,  # yellow and all red
+    num_openers: NDArray[np.int64],  # (N,) number of greens that open a lane
+    saturation: float,  # number of vehicles that leave a lane in an interval of permanent green
+    change_s: float,  # duration of yellow and all-red
     history: NDArray[np.int64],  # (W, N, HISTORY)
     green_s: NDArray[np.float64],  # (W, S, G) updated where a flow has been measured
 ) -> None:
     """Compute cycles and splits by Webster's formulas from the flows of the last interval.
 
-    The flow of a lane counts in equal parts for each green that opens the lane. The critical flow
-    of a green is the largest of its lanes.
+    The flow of a lane is divided equally among the greens that open the lane. The critical flow of
+    a green is the largest flow of its lanes.
     """
     most = green_s.shape[2]
     for w in range(green_s.shape[0]):
@@ -74,7 +74,7 @@ def find_followers(
     history: NDArray[np.int64],  # (W, N, HISTORY)
     follows: NDArray[np.bool_],  # (W, S) output
 ) -> None:
-    """Write whether vehicles follow each other over a detector that prolongs the present green."""
+    """Write whether vehicles follow each other over a detector of the present green."""
     most = (prolonging.first.size - 1) // follows.shape[1]
     for w in range(ticks.size):
         least_ms = ticks[w] * dt * 1e3 - gap_ms
@@ -91,7 +91,7 @@ def find_demanded(
     served: LaneWeights,  # see `SignalTable`
     num_greens: NDArray[np.int32],  # (S,)
     threshold: int,  # vehicle ticks
-    platoon: int,  # vehicles
+    platoon: int,  # number of vehicles
     counts: NDArray[np.int64],  # (W, N, COUNTS)
     states: NDArray[np.int64],  # (W, S, HELD)
     history: NDArray[np.int64],  # (W, N, HISTORY)
@@ -100,9 +100,9 @@ def find_demanded(
     """Write the green that red lanes demand, or the present green.
 
     A green is demanded if the vehicles on its red lanes have waited for `threshold` vehicle ticks.
-    The most demanded green is written; of equal ones, the first in cyclic order. The present green
-    stays while 1 to `platoon` vehicles are near the line on its lanes, so that it does not separate
-    them from the vehicles ahead.
+    The most demanded green is written; on a tie, the first green in cyclic order. The present green
+    stays while 1 to `platoon` vehicles are near the line on its lanes, so that the change does not
+    separate them from the vehicles ahead.
     """
     most = (served.first.size - 1) // max(num_greens.size, 1)
     for w in range(wanted.shape[0]):

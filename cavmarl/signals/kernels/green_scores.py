@@ -14,7 +14,7 @@ from cavmarl.signals.kernels.lane_history import RED_TICKS
 @kernel
 def choose_best(
     table: LaneWeights,
-    column: int,  # of the counts
+    column: int,  # column of the counts
     served: LaneWeights,  # see `SignalTable`
     longest_red: int,  # ticks, see `SignalTicks`
     cyclic: bool,  # see `green_choices.choose_greens`
@@ -24,13 +24,13 @@ def choose_best(
     states: NDArray[np.int64],  # (W, S, HELD)
     masks: NDArray[np.bool_],  # (W, S, G)
     decides: NDArray[np.bool_],  # (W,)
-    choices: NDArray[np.int64],  # (W, S) output; KEEP where it is not time for a decision
+    choices: NDArray[np.int64],  # (W, S) output; KEEP where no decision is due
 ) -> None:
-    """Choose the allowed green of the highest score; of equal ones, the first in cyclic order.
+    """Choose the allowed green with the highest score; on a tie, the first in cyclic order.
 
-    A green that opens a lane which has been red for `longest_red` or longer before a standing
-    vehicle comes first; of several, the green of the longest red. With cyclic choices, the next
-    green begins if any other green comes before the present one.
+    A green has priority if one of its lanes has been red before a stopped vehicle for at least
+    `longest_red`; of several such greens, the green of the longest red. With cyclic choices, the
+    next green starts if any other green ranks before the present green.
     """
     most = masks.shape[2]
     for w in range(decides.size):

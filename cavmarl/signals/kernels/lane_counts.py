@@ -15,16 +15,16 @@ from cavmarl.core.records.rows import is_off_lanes
 from cavmarl.roads.kernels.lanes_now import table_of
 from cavmarl.signals.kernels.controlled_signals import ControlledSignals
 
-# Columns of the counts (W, N, COUNTS) of lanes.
+# Columns of the counts (W, N, COUNTS) on lanes.
 VEHICLES = 0
 STANDING = 1
-STOOD_TICKS = 2  # sum of the ticks for which vehicles have stood on this lane
+STOOD_TICKS = 2  # sum of the ticks for which vehicles have been stopped on this lane
 SPEED_PPM = 3  # sum of speeds as shares of the desired speed, in millionths
 LENGTH_MM = 4  # sum of the lengths of vehicles
-NEAR_LINE = 5  # vehicles whose front is near the end of the lane
+NEAR_LINE = 5  # number of vehicles whose front is near the end of the lane
 COUNTS = 6
 
-STANDING_MPS = 0.1  # below this speed a vehicle stands, as in SUMO
+STANDING_MPS = 0.1  # below this speed a vehicle counts as stopped, as in SUMO
 NOT_COUNTED = -1
 
 _LANE_SHIFT = 32
@@ -55,12 +55,12 @@ def count_vehicle(
 
 @kernel
 def estimate_standing_time(
-    ticks: int,  # since the decision before
-    counts: NDArray[np.int64],  # (COUNTS,) of a lane; STOOD_TICKS is that of the decision before
+    ticks: int,  # ticks since the previous decision
+    counts: NDArray[np.int64],  # (COUNTS,) of a lane; STOOD_TICKS is from the previous decision
 ) -> None:
-    """Update the sum of standing times, which only a sensor that follows vehicles knows.
+    """Estimate the sum of stopped times, for sensors that cannot track vehicles.
 
-    Each vehicle that stands is taken to have stood since the decision before.
+    Each stopped vehicle is assumed to have been stopped since the previous decision.
     """
     stood = counts[STOOD_TICKS] + counts[STANDING] * ticks
     counts[STOOD_TICKS] = stood if counts[STANDING] > 0 else 0
@@ -73,7 +73,7 @@ def count_standing(
     lane_index: NDArray[np.int32],  # see `ControlledSignals`
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has passed
 ) -> None:
-    """Count for each vehicle how long it has stood on its lane, if the lane is watched."""
+    """Count how long each vehicle has been stopped on its lane, if the lane is watched."""
     for zone in range(rows.shape[0]):
         for w in range(rows.shape[1]):
             if not chosen[w]:

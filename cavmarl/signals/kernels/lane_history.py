@@ -1,7 +1,7 @@
-"""What controllers remember of lanes: detected vehicles, and red lights before vehicles.
+"""The history of lanes for controllers: detected vehicles, and red lights before vehicles.
 
-All values are whole numbers. They depend on the ticks and on the counts alone, so every process
-that runs a part of a world computes the same ones.
+All values are whole numbers. They depend only on the ticks and the counts, so every process that
+runs a part of a world computes the same values.
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from cavmarl.signals.kernels.green_choices import GREEN
 from cavmarl.signals.kernels.lane_counts import STANDING, VEHICLES
 
 # Columns of the history (W, N, HISTORY) of lanes.
-RED_TICKS = 0  # ticks for which the lane has been red before a standing vehicle, see `follow_lanes`
-RED_VEHICLE_TICKS = 1  # the same for each vehicle on the lane, standing or not, as a sum
+RED_TICKS = 0  # ticks for which the lane has been red before a stopped vehicle, see `follow_lanes`
+RED_VEHICLE_TICKS = 1  # sum of these ticks over all vehicles on the lane, stopped or not
 DETECTED_MS = 2  # time since the reset at which the lane's detector was last occupied
-PASSED = 3  # vehicles that the detector has counted in the present interval
-FLOW = 4  # vehicles that it counted in the last interval
+PASSED = 3  # number of vehicles that the detector has counted in the present interval
+FLOW = 4  # number of vehicles that the detector counted in the last interval
 HISTORY = 5
 
 NOT_MEASURED = -1  # FLOW: the first interval has not ended
@@ -41,9 +41,9 @@ def follow_detectors(
     detected_s: NDArray[np.float64],  # (W, D) see `roads.kernels.signal_phases.detect`
     history: NDArray[np.int64],  # (W, N, HISTORY) updated
 ) -> None:
-    """Count the vehicles that reach the detectors, at each tick.
+    """Count the vehicles that reach the detectors in each tick.
 
-    As with an induction loop, a vehicle counts if the detector was free at the tick before.
+    As with an induction loop, a vehicle counts if the detector was free in the previous tick.
     """
     for w in range(ticks.size):
         if not chosen[w]:
@@ -67,7 +67,7 @@ def follow_lanes(
     controlled: ControlledSignals,
     served: LaneWeights,  # see `SignalTable`
     durations: SignalTicks,
-    chosen: NDArray[np.bool_],  # (W,) worlds in which it is time for a decision
+    chosen: NDArray[np.bool_],  # (W,) worlds in which a decision is due
     ticks: NDArray[np.int64],  # (W,)
     states: NDArray[np.int64],  # (W, S, HELD)
     counts: NDArray[np.int64],  # (W, N, COUNTS)
@@ -75,8 +75,8 @@ def follow_lanes(
 ) -> None:
     """Add the time since the last decision to the lanes that are red, at each decision.
 
-    A lane is red unless the present green, or the next one during yellow and all red, opens a
-    movement from it. `RED_TICKS` begins again if no vehicle stands on the lane at a decision.
+    A lane is red unless the present green, or the next green during yellow and all-red, opens a
+    movement from it. `RED_TICKS` restarts if no vehicle is stopped on the lane at a decision.
     """
     num_signals = controlled.row.size
     if num_signals == 0:

@@ -1,6 +1,6 @@
-"""Induction loops before signals: what they detect, and how many vehicles there may be.
+"""Induction loops near signals: readings, and estimates of the number of vehicles.
 
-Each watched lane has a loop where vehicles enter its observed part, and one where they leave it.
+Each watched lane has a loop where vehicles enter its observed part, and a loop where they leave it.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ ENTRY = 0
 EXIT = 1
 
 # Columns of the readings (W, N, 2, READINGS) of loops at the last decision.
-COUNT = 0  # vehicles that came over the loop since the decision before
-COVERED_TICKS = 1  # ticks since then in which a vehicle was over it
-FREE_TICKS = 2  # ticks since the last vehicle was over it; 0: a vehicle is over it
+COUNT = 0  # number of vehicles that reached the loop since the previous decision
+COVERED_TICKS = 1  # ticks since the previous decision in which a vehicle was over the loop
+FREE_TICKS = 2  # ticks since the last vehicle left the loop; 0: a vehicle is over it
 READINGS = 3
 
 # Columns of the state (W, N, 2, DETECTED) of loops.
@@ -44,13 +44,13 @@ CAR_MM = 5000  # assumed length of a vehicle
 
 
 class Loops(NamedTuple):
-    """The loops of the watched lanes, and the rules for estimates."""
+    """The loops of the watched lanes, and parameters of the estimates."""
 
-    begin_m: NDArray[np.float64]  # (N, 2) positions on the lanes
+    begin_m: NDArray[np.float64]  # (N, 2) positions of the loops on the lanes
     end_m: NDArray[np.float64]  # (N, 2)
-    room: NDArray[np.int64]  # (N,) vehicles that stand from the entry to the exit
-    clear_ticks: NDArray[np.int64]  # (N,) in this time, a vehicle drives from loop to loop
-    standing_ticks: int  # a vehicle that covers a loop for this time stands
+    room: NDArray[np.int64]  # (N,) number of stopped vehicles that fit between entry and exit
+    clear_ticks: NDArray[np.int64]  # (N,) time in which a vehicle drives from loop to loop
+    standing_ticks: int  # a vehicle that covers a loop for this time counts as stopped
     detected: NDArray[np.int64]  # (W, N, 2, DETECTED)
     covered: NDArray[np.bool_]  # (N, 2) scratch
 
@@ -64,8 +64,8 @@ def read_loops(
 ) -> None:
     """Update the state of the loops at the end of a tick.
 
-    A loop is covered in a tick if a vehicle whose centre is on the lane was over it in this tick.
-    It counts a vehicle when it becomes covered.
+    A loop is covered in a tick if a vehicle with its centre on the lane was over the loop in this
+    tick. The loop counts a vehicle when it becomes covered.
     """
     rows = worlds.rows[worlds.sides[0]]
     for w in range(chosen.size):
@@ -117,9 +117,9 @@ def estimate_by_loops(
     loops: Loops,
     chosen: NDArray[np.bool_],  # (W,)
     readings: NDArray[np.int64],  # (W, N, 2, READINGS), overwritten in the chosen worlds
-    counts: NDArray[np.int64],  # (W, N, COUNTS) of the decision before, overwritten, too
+    counts: NDArray[np.int64],  # (W, N, COUNTS) of the previous decision; overwritten
 ) -> None:
-    """Write the readings of the loops, and estimate the vehicles between the two loops of a lane.
+    """Write the readings of the loops, and estimate the vehicles between both loops of a lane.
 
     Source of the balance of entries and exits: Sharma, Bullock, Bonneson, "Input-output and hybrid
         techniques for real-time prediction of delay and maximum queue length at signalized
@@ -136,7 +136,7 @@ def estimate_by_loops(
                 _read(loops.detected[w, n, which], tick, readings[w, n, which])
             between = max(between, 0) + entry[COUNT] - leaves[COUNT]
             if leaves[FREE_TICKS] >= loops.clear_ticks[n]:
-                between = min(between, entry[COUNT])  # earlier vehicles are no longer between
+                between = min(between, entry[COUNT])  # earlier vehicles have left the stretch
             if _stands(loops, w, n, ENTRY, tick):
                 between = loops.room[n]
             vehicles = max(between, 0) + (leaves[FREE_TICKS] == 0)
@@ -162,6 +162,6 @@ def _read(state: NDArray[np.int64], tick: int, reading: NDArray[np.int64]) -> No
 
 @kernel
 def _stands(loops: Loops, w: int, n: int, which: int, tick: int) -> bool:
-    """Return whether a vehicle stands over a loop."""
+    """Return whether a vehicle is stopped over a loop."""
     state = loops.detected[w, n, which]
     return bool(state[IS_COVERED] and tick - state[SINCE] >= loops.standing_ticks)

@@ -1,4 +1,4 @@
-"""Counts of the vehicles in the messages that roadside units at signals have received."""
+"""Counts of the vehicles in messages that roadside units at signals have received."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from cavmarl.signals.kernels.lane_counts import (
 )
 from cavmarl.signals.kernels.signal_steps import SignalRules, SignalWorlds
 
-LEAST_ALONG = 0.5  # cosine of the largest angle between a vehicle and the lane that it is on
+LEAST_ALONG = 0.5  # cosine of the largest angle between a vehicle and its lane
 
 
 class UnitLanes(NamedTuple):
@@ -38,7 +38,7 @@ class UnitLanes(NamedTuple):
     num_points: NDArray[np.int32]  # (N,)
     half_width_m: NDArray[np.float64]  # (N,)
     points: NDArray[np.void]  # POINT (num_points,) of the map
-    full: NDArray[np.int64]  # (1,) inboxes that were full, counted in every decision
+    full: NDArray[np.int64]  # (1,) number of full inboxes, summed over decisions
 
 
 @kernel
@@ -48,12 +48,12 @@ def count_by_messages(
     units: UnitLanes,
     inboxes: NDArray[np.void],  # REPORT (W, receivers, most), see `v2x.kernels.v2x_records`
     chosen: NDArray[np.bool_],  # (W,)
-    counts: NDArray[np.int64],  # (W, N, COUNTS) of the decision before, overwritten where chosen
+    counts: NDArray[np.int64],  # (W, N, COUNTS) of the previous decision, overwritten where chosen
 ) -> None:
-    """Count the vehicles in the inboxes of the units, on the lanes at their reported positions.
+    """Count the vehicles in the inboxes of the units, by lane at the reported positions.
 
-    A vehicle is on the lane whose centre line is nearest, if it is not beside the lane, and if it
-    has about the direction of the lane.
+    A vehicle is on the lane with the nearest centre line, if it is not beside this lane and has
+    about the same direction.
     """
     controlled = rules.controlled
     for w in range(chosen.size):
@@ -88,7 +88,7 @@ def count_by_messages(
 def _lane_of(
     controlled: ControlledSignals, units: UnitLanes, s: int, report: np.void
 ) -> tuple[int, float]:
-    """Return the lane of signal s on which a reported vehicle is, -1: none, and the place in m."""
+    """Return the lane of signal s on which a reported vehicle is, or -1, and its position in m."""
     cos, sin = cos_sin(report["heading"])
     found, place_m, least_m = -1, 0.0, math.inf
     for k in range(units.first[s], units.first[s + 1]):

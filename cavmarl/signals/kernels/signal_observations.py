@@ -20,8 +20,8 @@ from cavmarl.signals.kernels.lane_counts import (
     VEHICLES,
 )
 
-MIN_GAP_M = 2.5  # between standing vehicles, for the number of vehicles that a lane holds
-WAIT_SCALE_S = 100.0  # of the terms diff_wait and wait
+MIN_GAP_M = 2.5  # assumed gap between stopped vehicles, for the capacity of a lane
+WAIT_SCALE_S = 100.0  # scale of the terms diff_wait and wait
 
 
 @kernel
@@ -36,9 +36,9 @@ def observe_signals(
 ) -> None:
     """Write the observations of the chosen worlds.
 
-    An observation has the present green as one value of 1 among zeros; 1 if the green may end; the
-    density of each incoming lane; and the density of standing vehicles on each incoming lane. The
-    density is the number of vehicles as a share of the vehicles that the lane holds, at most 1.
+    An observation has the present green in one-hot encoding; 1 if the green may end, else 0; the
+    density of each incoming lane; and the density of stopped vehicles on each incoming lane. The
+    density is the number of vehicles divided by the capacity of the lane, at most 1.
     """
     for w in range(ticks.size):
         if not chosen[w]:
@@ -73,14 +73,14 @@ def reward_signals(
     dt: float,
     weights: NDArray[np.float64],  # (T,) of SIGNAL_TERMS
     chosen: NDArray[np.bool_],  # (W,) worlds whose rewards are written
-    observed: NDArray[np.bool_],  # (W,) worlds in which it is time for a decision
-    ends: bool,  # whether an interval between decisions has ended there; else the first one begins
+    observed: NDArray[np.bool_],  # (W,) worlds in which a decision is due
+    ends: bool,  # whether an interval between decisions has ended; else the first interval begins
     counts: NDArray[np.int64],  # (W, N, COUNTS)
     stood: NDArray[np.int64],  # (W, S) sum of ticks at the last decision, updated
     terms: NDArray[np.float32],  # (W, S, T) overwritten; 0 where no interval ends
     rewards: NDArray[np.float32],  # (W, S) overwritten; 0 where no interval ends
 ) -> None:
-    """Write the terms of the rewards for the interval since the last decision, and their sum."""
+    """Write the reward terms for the interval since the last decision, and their weighted sum."""
     for w in range(chosen.size):
         if not chosen[w]:
             continue

@@ -25,7 +25,7 @@ class SignalRules(NamedTuple):
     controlled: ControlledSignals
     served: LaneWeights  # see `SignalTable`
     durations: SignalTicks
-    cyclic: bool  # choices are 0: keep, 1: the next green; else the index of a green
+    cyclic: bool  # whether choices are 0 (keep) and 1 (next green), else they are indices of greens
     dt: float
     near_m: float  # see `count_lanes`
     weights: NDArray[np.float64]  # (T,) of SIGNAL_TERMS
@@ -41,20 +41,19 @@ class SignalWorlds(NamedTuple):
     detected_s: NDArray[np.float64]  # (W, D)
     lanes: NDArray[np.void]  # LANE (V, L), see `Worlds`
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
-    sides: NDArray[np.int64]  # (2,) the half of the rows with the committed rows; another number
+    sides: NDArray[np.int64]  # (2,) the half of `rows` with the committed rows; an unused number
     num_owned: NDArray[np.int64]  # (k, W)
 
 
 class SignalOutputs(NamedTuple):
     """State and outputs of S signals.
 
-    Observations and counts are those of the last decision, as far as `signals.sensing` knows them.
-    G is the number of greens of the signal that has most, N the number of watched lanes, T the
-    number of terms.
+    Observations and counts are from the last decision and the sensors of `signals.sensing`. G is
+    the largest number of greens of a signal, N the number of watched lanes, T the number of terms.
     """
 
     observations: NDArray[np.float32]  # (W, S, D)
-    rewards: NDArray[np.float32]  # (W, S) 0 in steps that do not end an interval of decisions
+    rewards: NDArray[np.float32]  # (W, S) 0 in steps that do not end an interval between decisions
     terms: NDArray[np.float32]  # (W, S, T)
     masks: NDArray[np.bool_]  # (W, S, G) choices that are allowed in the next step
     decides: NDArray[np.bool_]  # (W,) whether choices count in the next step
@@ -86,7 +85,7 @@ def end_signal_tick(
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
-    """Set the phases of the present tick, and count vehicles that stand or are detected."""
+    """Set the phases of the present tick, and count stopped and detected vehicles."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
     count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)
@@ -106,11 +105,11 @@ def count_truth(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
-    chosen: NDArray[np.bool_],  # (W,) worlds to observe, if it is time for a decision
+    chosen: NDArray[np.bool_],  # (W,) worlds to observe, if a decision is due
     observed: NDArray[np.bool_],  # (W,) output
     truth: NDArray[np.int64],  # (W, N, COUNTS), overwritten in the observed worlds
 ) -> None:
-    """Write what is allowed in the next step, and count all vehicles on the watched lanes."""
+    """Write the choices allowed in the next step, and count all vehicles on the watched lanes."""
     mask_choices(
         rules.controlled,
         rules.durations,
@@ -133,13 +132,13 @@ def observe_and_reward(
     rules: SignalRules,
     worlds: SignalWorlds,
     outputs: SignalOutputs,
-    chosen: NDArray[np.bool_],  # (W,) as in `count_truth`, like the next two
+    chosen: NDArray[np.bool_],  # (W,) as in `count_truth`, like the next two arguments
     observed: NDArray[np.bool_],  # (W,)
     truth: NDArray[np.int64],  # (W, N, COUNTS)
     stood: NDArray[np.int64],  # (W, S) see `reward_signals`
     rewarded: NDArray[np.bool_],  # (1,) whether an interval between decisions has ended
 ) -> None:
-    """Write the observations from what is known of the lanes, and the rewards from the truth."""
+    """Write the observations from sensed counts of lanes, and the rewards from true counts."""
     follow_lanes(
         rules.controlled,
         rules.served,

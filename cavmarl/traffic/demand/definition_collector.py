@@ -1,8 +1,8 @@
-"""`DefinitionCollector`: takes definitions as they are read and stores little of each.
+"""`DefinitionCollector`: collects the definitions of demand files in compact form.
 
-Names are resolved after all files have been read, so definitions may stand after their use, unlike
-in SUMO. Frequent content is stored once: routes, types and lists of stops become numbers, and each
-vehicle becomes one row of numbers.
+Names are resolved after all files have been read, so unlike in SUMO, definitions may follow their
+use. Equal content is stored once: routes, types and lists of stops become numbers, and each vehicle
+becomes one row of numbers.
 
 Departure times of flows follow SUMO's rules.
 """
@@ -38,7 +38,7 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element
 from cavmarl.traffic.demand.rerouting_device import device
 from cavmarl.traffic.demand.xml_files import STOPPING_PLACES
 
-DAY_MS = 86_400_000  # SUMO's length of a flow without an end
+DAY_MS = 86_400_000  # duration of a flow without an end, as in SUMO
 MIN_RATE = 1e-12  # 1/s, lower limit of rates
 
 _EXPONENTIAL = re.compile(r"exp\(([^()]*)\)")
@@ -73,10 +73,10 @@ def single_timing(depart_ms: int) -> Timing:
 def flow_timing(element: Element, horizon_ms: int) -> Timing:
     """Return the timing of a <flow>.
 
-    `horizon_ms`: end of a flow that names none; -1: one day after its begin.
+    `horizon_ms`: end of a flow without an `end`; -1: one day after its begin.
 
-    Raises DemandError: there is no rate or several, a rate is not positive, or the flow ends before
-    it begins.
+    Raises DemandError: there is not exactly one rate, the rate is not positive, or the flow ends
+    before it begins.
     """
     rates = [key for key in _RATES if key in element.attrs]
     if len(rates) > 1:
@@ -125,11 +125,12 @@ _NO_DEPARTURE = ("triggered", "containerTriggered", "split", "now")
 _WAY = ("from", "to", "via", "fromJunction", "toJunction", "viaJunctions", "fromTaz", "toTaz")
 _OFF_MAP = ("fromXY", "toXY", "viaXY", "fromLonLat", "toLonLat", "viaLonLat")
 _UNUSED = ("departEdge", "arrivalEdge", "departPosLat", "arrivalPosLat", "insertionChecks")
-# Checked, but without effect: a trip ends near the end of its last edge. The values are defaults.
+# These attributes are checked but have no effect: a trip ends near the end of its last edge. The
+# values are defaults.
 _ARRIVAL = {"arrivalLane": "current", "arrivalPos": "max", "arrivalSpeed": "current"}
-# Attributes of routes and stops that do not define the way.
+# Attributes of routes and stops that do not change the route.
 _LOOKS = frozenset(("color", "cost", "savings", "exitTimes", "routeLength", "reason"))
-# SUMO's old names, which its own files still contain.
+# SUMO's old names, which files of SUMO still contain.
 _RENAMED = {"beginLane": "departLane", "beginPos": "departPos", "beginSpeed": "departSpeed"}
 
 
@@ -140,7 +141,7 @@ class DefinitionCollector:
         named: elements by kind and id: vType, route, their distributions, stopping places,
             rerouters.
         routes: elements that define a route, one per definition: a <route>, or a trip.
-        types: the name of each used type, by first use.
+        types: the names of used types, in order of first use.
         stops: lists of <stop> elements; equal lists are stored once.
         ids: of vehicles, trips and flows, by row.
     """
@@ -151,8 +152,8 @@ class DefinitionCollector:
         begin_ms: int,
         end_ms: int,
         max_departures: int,
-        departs: Mapping[str, str],  # attributes of departures without their own
-        scale: float = 1.0,  # vehicles that depart for each departure
+        departs: Mapping[str, str],  # default attributes of departures
+        scale: float = 1.0,  # number of vehicles per departure
     ) -> None:
         self.report = report
         self.named: dict[str, dict[str, Element]] = {}
@@ -170,7 +171,7 @@ class DefinitionCollector:
         self._departs = departs
         self._scale = scale
         self._departures = 0.0
-        self._latest_ms: dict[str, int] = {}  # by file
+        self._latest_ms: dict[str, int] = {}  # latest departure by file
 
     def take(self, element: Element) -> None:
         """Store one definition.
@@ -239,7 +240,7 @@ class DefinitionCollector:
         self._check_room(element, timing)
         chance, period_ms = device(element)
         if _has_no_route(element):
-            chance = 1.0  # as in SUMO, it finds its way by the speeds at its departure
+            chance = 1.0  # as in SUMO, the speeds at its departure determine its route
         row: Iterable[float] = (
             self.report.files.index(element.path),
             element.line,
@@ -272,7 +273,7 @@ class DefinitionCollector:
         self._departures += self._scale * timing.expected(self._begin_ms, end)
         if self._departures > self._max_departures:
             raise element.error(
-                f"makes more than {self._max_departures} departures with those before it",
+                f"makes more than {self._max_departures} departures, including earlier elements",
                 "cut the demand, or raise max_departures if there is memory for it",
                 CapacityError,
             )
@@ -321,19 +322,19 @@ def _routes_inside(element: Element) -> list[Element]:
 
 
 def _has_no_route(element: Element) -> bool:
-    """Return whether a <trip> or <flow> has only places between which it finds its way."""
+    """Return whether a <trip> or <flow> has only places, so that its route must be searched."""
     named = "route" in element.attrs and element.name != "trip"
     return not named and not _routes_inside(element)
 
 
 def _key(element: Element) -> tuple[object, ...]:
-    """Return the content of an element that defines a way, without its place in the file."""
+    """Return the content of an element that defines a route, without its place in the file."""
     items = (item for item in element.attrs.items() if item[0] not in _LOOKS)
     return (element.name, *items, *(_key(child) for child in element.children))
 
 
 def _entry_and_exit(element: Element) -> tuple[float, ...]:
-    """Return the last fields of ELEMENT: entering and leaving, with SUMO 1.28's defaults."""
+    """Return the fields of ELEMENT for entering and leaving, with SUMO 1.28's defaults."""
     return (
         _lane(element, "departLane", LANE_BEST),
         *_coded(element, "departPos", POS_BASE),
@@ -351,11 +352,11 @@ def _lane(element: Element, key: str, default: int) -> int:
 
 
 def _coded(element: Element, key: str, default: int, least: float = -math.inf) -> tuple[int, float]:
-    """Return the code of a keyword, or the code for a given number and the number."""
+    """Return the code of a keyword, or the code for a number together with the number."""
     if key not in element.attrs:
         return default, 0.0
     code = CODES[key].get(element.attrs[key])
     if code is not None:
         return code, 0.0
-    # POS_GIVEN and SPEED_GIVEN are equal.
+    # POS_GIVEN and SPEED_GIVEN have the same value.
     return POS_GIVEN, element.number(key, 0.0, least=least, words=CODES[key])

@@ -1,4 +1,4 @@
-"""`DemandFile`: the demand of SUMO files on one map; immutable; episodes are drawn from it."""
+"""`DemandFile`: the immutable demand of SUMO files on a map, from which episodes are drawn."""
 
 from __future__ import annotations
 
@@ -49,32 +49,32 @@ _COPIED = (
 
 @dataclass(frozen=True, eq=False)
 class DemandFile:
-    """The vehicles that are to drive on a map; see `demand_records` for the dtypes."""
+    """The vehicles that drive on a map; see `demand_records` for the dtypes."""
 
     network: RoadNetwork  # the network that all rows refer to
     types: NDArray[np.void]
     type_ids: tuple[str, ...]  # names of `types`
     routes: NDArray[np.void]  # ROUTE (num_routes,); equal routes are stored once
     route_edges: NDArray[np.int32]  # EDGE rows that ROUTE points into
-    route_ids: tuple[str, ...]  # names of `routes`, "" for routes inside vehicles
+    route_ids: tuple[str, ...]  # names of `routes`; "" for routes defined inside vehicles
     stops: NDArray[np.void]  # STOP (num_stops,) that ROUTE and ELEMENT refer to
     elements: NDArray[np.void]  # ELEMENT (num_elements,), in the order of the files
     element_ids: tuple[str, ...]  # ids of vehicles, trips and flows
     type_choices: Choices  # lists of VTYPE rows with probabilities
     route_choices: Choices  # lists of ROUTE rows with probabilities
-    # sorted keys type * num_routes + route of vehicles that cannot drive their route; only filled
-    # if such vehicles are skipped
+    # sorted keys type * num_routes + route of vehicles that cannot drive their route; empty unless
+    # such vehicles are skipped
     bad_pairs: NDArray[np.int64]
     rerouters: Rerouters  # rules that reroute vehicles on certain edges
     device: DeviceOptions  # options of the rerouting device for all vehicles
     # (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none
     lane_table: NDArray[np.int32]
-    begin_ms: int  # start of the simulation that the files are meant for
-    has_begin: bool  # whether the files state it; otherwise it is 0; not part of the hash
-    end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files name none
+    begin_ms: int  # start of the simulation for which the files were made
+    has_begin: bool  # whether the files state `begin_ms`, else it is 0; not part of the hash
+    end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files state no end
     step_ms: int
-    scale: float  # number of vehicles that depart for one departure of the files
-    report: DemandReport  # counts of elements that were read and tolerated
+    scale: float  # number of vehicles per departure in the files
+    report: DemandReport  # counts of elements that were read or tolerated
 
     def __post_init__(self) -> None:
         for field in fields(self):
@@ -109,8 +109,8 @@ class DemandFile:
     def draw(self, key: int, until_s: float | None = None) -> NDArray[np.void]:
         """Draw the orders of one episode, a pure function of the key.
 
-        `key`: of the world and episode, see `math.rng.world_key`. `until_s`: no vehicle departs
-        at or after this time; None: the end of the files' simulation.
+        `key`: random key of the world and episode, see `math.rng.world_key`. `until_s`: no vehicle
+        departs at or after this time; None: the end of the files' simulation.
 
         Returns ORDER (n,), sorted by departure, then in the order of the files.
         """
@@ -153,7 +153,7 @@ class DemandFile:
     def _device_setting(
         self, field: str, element: NDArray[np.void], types: NDArray[np.int32], default: float
     ) -> NDArray[np.float64]:
-        """Return a device setting of vehicles (n,): their own, their type's, or the default."""
+        """Return a device setting of vehicles (n,), from the vehicle, its type, or the default."""
         setting: NDArray[np.float64] = self.types[field][types].astype(np.float64)
         setting = np.where(setting < 0.0, default, setting)
         return np.where(element[field] < 0, setting, element[field])
@@ -167,11 +167,11 @@ class DemandFile:
         key: int,
         stream: int,
     ) -> NDArray[np.int32]:
-        """Return what each vehicle (n,) draws from the choice of its element."""
+        """Return the row that each vehicle (n,) draws from the choice of its element."""
         return choices.pick(self.elements[field][rows], chances(key, rows, numbers, stream))
 
     def vehicle_id(self, order: np.void) -> str:
-        """Return SUMO's name of the vehicle of one ORDER ()."""
+        """Return SUMO's name of the vehicle of an ORDER ()."""
         row = int(order["element"])
         name = self.element_ids[row]
         numbered = self.elements[row]["flow"] or order["number"] > 0
@@ -187,11 +187,11 @@ class DemandFile:
         return tuple(self.report.lines())
 
     def begun(self, horizon_s: float) -> DemandFile:
-        """Return this demand with a begin at which vehicles depart within an episode.
+        """Return this demand with a begin from which vehicles depart within an episode.
 
         If the files state no begin, and no vehicle departs in the first `horizon_s`, the demand
-        begins in the second of its first departure. The report says so, and also if no vehicle
-        departs within an episode nevertheless.
+        begins in the second of its first departure. The report states this, and also if no vehicle
+        departs within an episode.
         """
         if self._departs_within(horizon_s):
             return self
@@ -250,17 +250,17 @@ def read_demand(
     """Read SUMO's files of vehicles, routes, types and stopping places.
 
     Args:
-        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a configuration of
-            SUMO (`.sumocfg`) stands for the files and options that it names.
+        paths: `.rou.xml` and `.add.xml` files, plain or gzipped, in any order; a SUMO configuration
+            (`.sumocfg`) stands for the files and options that it names.
         network: the map.
-        on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off
-            the route: refuse the file, or leave them out and count them in the report.
+        on_bad_route: how to handle vehicles whose class cannot drive their route, and stops off the
+            route: 'error' refuses the file, 'skip' leaves them out and counts them.
         max_departures: maximum number of vehicles.
         programs: files whose signal programs are read elsewhere, so that they are not counted.
 
     Raises:
         DemandError: files are missing, broken, contradictory, or made for another map.
-        RouteError: a route does not connect for a class that drives it.
+        RouteError: a route is not connected for a class that drives it.
         CapacityError: the files have more than `max_departures` vehicles.
     """
     if on_bad_route not in ("error", "skip"):
@@ -315,7 +315,7 @@ def _configuration(paths: Sequence[Path], report: DemandReport) -> SumoConfigFil
             files.append(path)
             continue
         if config is not None:
-            raise DemandError(f"{path}: is the second SUMO configuration; give one, or its files")
+            raise DemandError(f"{path}: a second SUMO configuration; give one, or its files")
         config = read_sumo_config(path, report)
         files.extend(config.files)
     if not files:

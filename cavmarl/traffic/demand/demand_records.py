@@ -1,4 +1,4 @@
-"""The arrays of a demand file: elements as in the file, and the orders drawn from them.
+"""The arrays of a demand file: elements of the file, and orders drawn from the elements.
 
 Units: m, s, m/s. Times of elements are whole milliseconds as in SUMO, so that a flow's vehicles
 depart at exactly SUMO's times. Indices without a target are -1.
@@ -19,7 +19,7 @@ from cavmarl.traffic.demand.element import Element
 LANE_FIRST = -1  # the lane nearest to the kerb that the class may use
 LANE_RANDOM = -2
 LANE_FREE = -3  # the lane with the fewest vehicles
-LANE_ALLOWED = -4  # of the lanes that the class may use, the one with the fewest vehicles
+LANE_ALLOWED = -4  # the lane with the fewest vehicles among those that the class may use
 LANE_BEST = -5  # the lane that the route can follow furthest
 LANE_CURRENT = -6  # arrival: the present lane
 
@@ -27,11 +27,11 @@ POS_GIVEN = 0
 POS_BASE = 1  # the rear bumper at the start of the lane (SUMO's default)
 POS_RANDOM = 2
 POS_FREE = 3  # the first gap
-POS_RANDOM_FREE = 4  # random; if that place is taken, the first gap
+POS_RANDOM_FREE = 4  # a random place; if it is taken, the first gap
 POS_LAST = 5  # behind the last vehicle
 POS_MAX = 6  # arrival: at the end of the lane
 POS_CENTER = 7  # arrival: in the middle of the lane
-POS_STOP = 8  # where the first stop ends, if it is on the first edge; only in definitions
+POS_STOP = 8  # the end of the first stop, if it is on the first edge; only in definitions
 
 SPEED_GIVEN = 0
 SPEED_RANDOM = 1
@@ -49,7 +49,7 @@ _DEPART_POS = {
     "random_free": POS_RANDOM_FREE,
     "last": POS_LAST,
     "stop": POS_STOP,
-    # SUMO puts these vehicles at the start of the lane, too.
+    # SUMO also puts these vehicles at the start of the lane.
     "splitFront": POS_BASE,
     "random_location": POS_BASE,
 }
@@ -62,7 +62,7 @@ _DEPART_SPEED = {
     "avg": SPEED_AVERAGE,
 }
 
-# The keywords that may replace a number, by attribute.
+# Keywords that may replace a number, by attribute.
 CODES = {
     "departLane": {
         "first": LANE_FIRST,
@@ -79,20 +79,20 @@ CODES = {
     "arrivalSpeed": {"current": SPEED_CURRENT},
 }
 
-UNTIL_ABSOLUTE = 0  # by the clock
-UNTIL_FLOW = 1  # by the clock for the first vehicle; later ones shift with their departure
-UNTIL_DEPARTURE = 2  # from the vehicle's departure (stops of standalone routes)
+UNTIL_ABSOLUTE = 0  # time of the simulation
+UNTIL_FLOW = 1  # the same for a flow's first vehicle; shifted by the departure for later vehicles
+UNTIL_DEPARTURE = 2  # time since the vehicle's departure (stops of standalone routes)
 
 FLOW_REGULAR = 0  # also single vehicles, as flows of one
 FLOW_EXPONENTIAL = 1  # gaps are exponentially distributed
 FLOW_PROBABILITY = 2  # one vehicle in each second with this probability
 
-MAX_NUMBER = 1 << 40  # of flows without a number: larger than every cap
+MAX_NUMBER = 1 << 40  # number of vehicles of flows without a number: larger than every cap
 
 _ENTRY_AND_EXIT = [
     ("depart_lane", np.int32),  # LANE_* or a lane, see above
     ("depart_pos_code", np.int8),  # POS_*
-    ("depart_pos", np.float64),  # m from the start of the edge, of the front bumper
+    ("depart_pos", np.float64),  # front bumper, m from the start of the edge
     ("depart_speed_code", np.int8),  # SPEED_*
     ("depart_speed", np.float64),  # m/s
     ("arrival_lane", np.int32),
@@ -100,37 +100,37 @@ _ENTRY_AND_EXIT = [
     ("arrival_pos", np.float64),
     ("arrival_speed_code", np.int8),
     ("arrival_speed", np.float64),
-    ("speed_factor", np.float64),  # of this vehicle; NaN: drawn for its type
+    ("speed_factor", np.float64),  # speed factor of this vehicle; NaN: drawn by type
 ]
 
 ELEMENT = record(
     ("file", np.int32),  # index in DemandReport.files
     ("line", np.int32),
-    ("flow", np.bool_),  # its vehicles are called id.0, id.1, …
+    ("flow", np.bool_),  # whether the vehicles are called id.0, id.1, …
     ("pattern", np.int8),  # FLOW_*
     ("begin_ms", np.int64),  # departure of the first vehicle
-    ("end_ms", np.int64),  # no vehicle departs at or after it
-    ("period_ms", np.int64),  # of FLOW_REGULAR
+    ("end_ms", np.int64),  # no vehicle departs at or after this time
+    ("period_ms", np.int64),  # period of FLOW_REGULAR
     ("number", np.int64),  # maximum number of vehicles
     ("rate", np.float64),  # FLOW_EXPONENTIAL: 1/s; FLOW_PROBABILITY: probability per second
     ("types", np.int32),  # choice among VTYPE rows
     ("routes", np.int32),  # choice among ROUTE rows
     ("first_stop", np.int32),  # STOP rows [first_stop, first_stop + num_stops)
     ("num_stops", np.int32),
-    ("reroute", np.float64),  # probability of a rerouting device; -1: as its type
-    ("reroute_period_ms", np.int64),  # period of searches; 0: one search, -1: as its type
+    ("reroute", np.float64),  # probability of a rerouting device; -1: as in the type
+    ("reroute_period_ms", np.int64),  # period of searches; 0: one search, -1: as in the type
     *_ENTRY_AND_EXIT,
 )
 
 ORDER = record(
     ("depart", np.float64),  # s
     ("element", np.int32),  # ELEMENT row
-    ("number", np.int32),  # of the vehicle in its flow, from 0
+    ("number", np.int32),  # number of the vehicle in its flow, from 0
     ("vtype", np.int32),  # VTYPE row
     ("route", np.int32),  # ROUTE row
     ("first_stop", np.int32),  # STOP rows, in the order of the route
     ("num_stops", np.int32),
-    ("reroute", np.bool_),  # whether the vehicle searches for its way after entering …
+    ("reroute", np.bool_),  # whether the vehicle searches for a route after entering …
     ("reroute_period_ms", np.int64),  # … and the period of further searches; 0: none
     *_ENTRY_AND_EXIT,
 )
@@ -138,25 +138,25 @@ ORDER = record(
 ROUTE = record(
     ("first_edge", np.int32),  # route_edges[first_edge : first_edge + num_edges]
     ("num_edges", np.int32),
-    ("exact", np.bool_),  # False: the edges are waypoints of a way still to be found
-    ("first_stop", np.int32),  # STOP rows that all its vehicles make
+    ("exact", np.bool_),  # False: the edges are waypoints of a route still to be searched
+    ("first_stop", np.int32),  # STOP rows of all vehicles on the route
     ("num_stops", np.int32),
 )
 
 STOP = record(
     ("lane", np.int32),  # LANE row
-    ("at_edge", np.int32),  # index of the stop's edge in the route; -1 on routes still to be found
-    ("start", np.float64),  # m on the lane (LANE["length_m"]), where the stop begins
-    ("end", np.float64),  # m on the lane, where the front bumper stops
-    ("duration", np.float64),  # s, minimum
-    ("until", np.float64),  # s, earliest end; -1: none
+    ("at_edge", np.int32),  # index of the stop's edge in the route; -1 if not `exact`
+    ("start", np.float64),  # m on the lane (LANE["length_m"]) at which the stop begins
+    ("end", np.float64),  # m on the lane at which the front bumper stops
+    ("duration", np.float64),  # minimum duration, s
+    ("until", np.float64),  # earliest end, s; -1: none
     ("until_from", np.int8),  # UNTIL_*: reference of `until`
-    ("parking", np.bool_),  # beside the road, so that others pass
+    ("parking", np.bool_),  # whether the vehicle stops beside the road, so that others can pass
 )
 
 
 class Options(NamedTuple):
-    """One choice: rows and their weights, in the order of the file."""
+    """The options of a choice: rows and their weights, in the order of the file."""
 
     rows: tuple[int, ...]
     weights: tuple[float, ...]
@@ -168,7 +168,7 @@ class Choices:
     Attributes:
         start: (C + 1,) options of choice c are [start[c], start[c + 1]).
         rows: (num_options,) the rows to choose from.
-        upper: (num_options,) choice + cumulative probability: one ascending array for all.
+        upper: (num_options,) choice + cumulative probability, ascending over all choices.
     """
 
     def __init__(self, lists: Sequence[Options]) -> None:
@@ -190,9 +190,9 @@ class Choices:
         return self.rows[self.start[choice] : self.start[choice + 1]]
 
     def pick(self, choices: NDArray[np.int32], chances: NDArray[np.float64]) -> NDArray[np.int32]:
-        """Return the rows (n,) that numbers (n,) in [0, 1) select from choices (n,)."""
+        """Return the rows (n,) that random numbers (n,) in [0, 1) select from choices (n,)."""
         place = np.searchsorted(self.upper, choices + chances, side="right")
-        # A sum can round up to the next list's range.
+        # Rounding can move a sum into the range of the next choice.
         return self.rows[np.clip(place, self.start[choices], self.start[choices + 1] - 1)]
 
 
@@ -200,7 +200,7 @@ MAX_WEIGHT = 1e9
 
 
 def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
-    """Return pairs of name and weight from two attributes.
+    """Return pairs of name and weight from the attributes of names and of probabilities.
 
     `key`: "vTypes" or "routes".
 
@@ -222,7 +222,7 @@ def listed(source: Element, key: str) -> list[tuple[str, float | None]]:
 def weighted(source: Element, found: Sequence[tuple[int, float]]) -> Options:
     """Return a choice of the members with a positive weight.
 
-    Raises DemandError: there are none.
+    Raises DemandError: no member has a positive weight.
     """
     kept = [(row, weight) for row, weight in found if weight > 0.0]
     if not kept:

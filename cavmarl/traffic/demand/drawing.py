@@ -1,4 +1,4 @@
-"""Drawing an episode's orders: each random number is a function of key, element and vehicle."""
+"""Draws an episode's orders: each random number is a function of key, element and vehicle."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ _CHUNK = 4096
 def chances(
     key: int, elements: NDArray[np.integer], numbers: NDArray[np.integer], stream: int
 ) -> NDArray[np.float64]:
-    """Return numbers (n,) in [0, 1), one for each vehicle of an element."""
+    """Return random numbers (n,) in [0, 1), one for each vehicle of an element."""
     drawn = np.empty(len(elements))
     fill_uniform(np.uint64(key), elements.astype(np.int64), numbers.astype(np.int64), stream, drawn)
     return drawn
@@ -40,7 +40,7 @@ def chances(
 def departures_ms(
     elements: NDArray[np.void], key: int, begin_ms: int, end_ms: int
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
-    """Return when vehicles of elements depart within [begin_ms, end_ms).
+    """Return the departures of elements within [begin_ms, end_ms).
 
     The three arrays (n,) are ELEMENT row, number of the vehicle in its flow, and time in ms.
     """
@@ -63,7 +63,7 @@ def _regular(
     first = np.maximum(-((start - begin_ms) // period), 0)
     span = np.minimum(elements["end_ms"], end_ms) - start
     beyond = np.minimum(-(-span // period), elements["number"])
-    # A flow with period 0 departs all at once.
+    # All vehicles of a flow with period 0 depart at once.
     at_once = (elements["period_ms"] == 0) & (start >= begin_ms) & (start < end_ms)
     beyond = np.where(elements["period_ms"] == 0, at_once * elements["number"], beyond)
     first = np.where(elements["period_ms"] == 0, 0, first)
@@ -77,8 +77,8 @@ def _regular(
 def scaled_flows(elements: NDArray[np.void], scale: float) -> NDArray[np.void]:
     """Return ELEMENT (n,) with the flows of a demand that is multiplied by `scale`.
 
-    As in SUMO, `scale` multiplies the number of vehicles of a flow, rounded, and divides its
-    period. `copied` multiplies flows with a probability, and vehicles outside of flows.
+    As in SUMO, `scale` multiplies the (rounded) number of vehicles of a flow, and divides the
+    flow's period. `copied` handles flows with a probability, and vehicles outside of flows.
     """
     found = elements.copy()
     regular = elements["flow"] & (elements["pattern"] == FLOW_REGULAR)
@@ -111,7 +111,7 @@ def copied(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return departures (m,) of a demand that is multiplied by `scale`; see `scaled_flows`.
 
-    As in SUMO, vehicles are counted by k in each flow with a probability, and outside of flows.
+    As in SUMO, k counts the vehicles in each flow with a probability, and those outside of flows.
     Vehicle k departs floor(scale) times, and once more if k · part mod 1000 < part, where `part` is
     the fraction of the scale in thousandths. In a flow, copies are numbered as further vehicles.
     Outside of flows, a departure has the number of the copy.
@@ -131,10 +131,10 @@ def copied(
 
 
 def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]:
-    """Return times as sums of random gaps after the start, one draw per vehicle.
+    """Return times that are sums of random gaps after the start, with one draw per vehicle.
 
-    Gaps are exponential, -ln(1 - u) / rate; or they are numbers of trials, one in each full second
-    whatever the step: with probability p, 1 + floor(ln(1 - u) / ln(1 - p)) until a success.
+    Gaps are exponential, -ln(1 - u) / rate; or they are numbers of trials until a success, with one
+    trial of probability p in each full second: 1 + floor(ln(1 - u) / ln(1 - p)).
     """
     trials = flow["pattern"] == FLOW_PROBABILITY
     rate, wanted = float(flow["rate"]), int(flow["number"])
@@ -157,7 +157,7 @@ def _random(flow: np.void, key: int, row: int, end_ms: int) -> NDArray[np.int64]
 def speed_factors(
     types: NDArray[np.void], orders: NDArray[np.void], key: int
 ) -> NDArray[np.float64]:
-    """Return the speed factors (n,) of ORDER (n,): given, or normally distributed by their type.
+    """Return the speed factors (n,) of ORDER (n,): given, or normally distributed by type.
 
     As in SUMO, a number beyond the type's bounds is drawn again; after `SPEED_FACTOR_TRIES` it is
     clipped.

@@ -1,6 +1,6 @@
-"""`Element`: one XML element with its place in the file, and checked access to its attributes.
+"""`Element`: an XML element with its place in the file, and checked access to attributes.
 
-`DemandReport` counts what was read from demand files, and what was tolerated in them.
+`DemandReport` counts what was read from demand files and what was tolerated.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from pathlib import Path
 
 from cavmarl.core.errors import CavmarlError, DemandError
 
-# A century: later times are mistakes, and it is far from integer overflow.
+# A century: later times are mistakes, and earlier times cannot overflow integers.
 MAX_TIME_MS = 100 * 366 * 86_400_000
 
 _NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
@@ -25,7 +25,7 @@ _UNIT_MS = (1000, 60_000, 3_600_000, 86_400_000)
 
 
 def parse_time_ms(text: str) -> int | None:
-    """Parse "12.5", "HH:MM:SS" or "D:HH:MM:SS" to ms, rounded like SUMO; None: not a time."""
+    """Parse "12.5", "HH:MM:SS" or "D:HH:MM:SS" to ms, rounded as in SUMO; None: not a time."""
     parts = text.strip().split(":")
     if len(parts) not in (1, 3, 4) or not all(map(_NUMBER.fullmatch, parts)):
         return None
@@ -43,7 +43,7 @@ def near(name: str, known: Iterable[str]) -> str:
 
 
 def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> str:
-    """Describe a demand of which no vehicle departs in the `horizon_s` from `begin_s`.
+    """Describe a demand in which no vehicle departs between `begin_s` and `begin_s + horizon_s`.
 
     `first_ms`: time of the first departure. `stays`: whether the episode begins at `begin_s`
     nevertheless, instead of at the first departure.
@@ -75,7 +75,7 @@ class Element:
     def error(
         self, problem: str, cure: str, failure: type[CavmarlError] = DemandError
     ) -> CavmarlError:
-        """Return an error that names this element, its place and the cure."""
+        """Return an error that states the problem, this element, its place and the cure."""
         known = f' id="{self.attrs["id"]}"' if "id" in self.attrs else ""
         return failure(f"{self.place}: <{self.name}{known}> {problem}: {cure}")
 
@@ -103,7 +103,7 @@ class Element:
     ) -> float:
         """Return a finite number in [least, most] and greater than `above`.
 
-        `words`: keywords that are also allowed, for the error.
+        `words`: keywords that are also allowed, for the error message.
         """
         if key not in self.attrs:
             return default
@@ -157,7 +157,7 @@ class Element:
 
 @dataclass
 class Tally:
-    """The number of tolerated cases of one kind, and the place of the first one."""
+    """The number of tolerated cases of one kind, and the place of the first case."""
 
     count: int
     first: str
@@ -165,12 +165,12 @@ class Tally:
 
 @dataclass
 class DemandReport:
-    """Counts of one reading."""
+    """Counts of the elements that were read or tolerated."""
 
     files: list[str] = field(default_factory=list)  # files that were read, in order
     # number of elements by kind: "vehicle", "flow", "route", …
     read: dict[str, int] = field(default_factory=dict)
-    # things left out or replaced, by a phrase that describes them
+    # omissions and replacements, by a phrase that describes them
     tolerated: dict[str, Tally] = field(default_factory=dict)
     program_files: frozenset[Path] = frozenset()  # files whose signal programs are read elsewhere
 
@@ -178,12 +178,12 @@ class DemandReport:
         self.read[kind] = self.read.get(kind, 0) + 1
 
     def tolerate(self, what: str, place: str, count: int = 1) -> None:
-        """Count occurrences of something that was tolerated."""
+        """Count occurrences of a tolerated problem."""
         tally = self.tolerated.setdefault(what, Tally(0, place))
         tally.count += count
 
     def lines(self) -> list[str]:
-        """Return for each tolerated thing its count, description and first place."""
+        """Return the count, description and first place of each tolerated problem."""
         return [
             f"{tally.count:>8} {what} (first: {tally.first})"
             for what, tally in sorted(self.tolerated.items())

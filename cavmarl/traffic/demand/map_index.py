@@ -1,4 +1,4 @@
-"""`MapIndex`: a road network's edges, lanes and connections by the names in demand files."""
+"""`MapIndex`: edges, lanes and connections of a map, by the names in demand files."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class MapIndex:
         """Return the EDGE rows of ids separated by blanks.
 
         Raises:
-            DemandError: the map lacks an edge; if it lacks most, the file is for another map.
+            DemandError: the map lacks an edge; if it lacks most edges, the file is for another map.
         """
         names = text.split()
         unknown = [name for name in names if name not in self.edge_row]
@@ -101,7 +101,7 @@ class MapIndex:
         return row
 
     def open_lane(self, edge: int, permissions: int) -> int:
-        """Return the lane nearest to the kerb that a class may use, else the first lane."""
+        """Return the lane nearest to the kerb that a class may use, or else the first lane."""
         row = self.network.edges[edge]
         lanes = self.network.lanes[row["first_lane"] : row["first_lane"] + row["num_lanes"]]
         return int(row["first_lane"]) + int(np.argmax(lanes["permissions"] & permissions != 0))
@@ -114,7 +114,7 @@ class MapIndex:
     def gap(
         self, edges: NDArray[np.int32] | tuple[int, ...], exact: bool, permissions: int
     ) -> str | None:
-        """Return the reason why a class cannot follow a row of edges, or None if it can.
+        """Return the reason why a class cannot follow a sequence of edges, or None if it can.
 
         `exact`: whether each edge must lead directly to the next. `permissions`: bits of the class.
         """

@@ -1,4 +1,4 @@
-"""<rerouter>s: rules that give vehicles another way, and edges that are closed for a time."""
+"""<rerouter>s: rules that give vehicles another route, and temporary closures of edges."""
 
 from __future__ import annotations
 
@@ -17,18 +17,18 @@ from cavmarl.traffic.demand.element import MAX_TIME_MS, DemandReport, Element, n
 from cavmarl.traffic.demand.map_index import MapIndex
 from cavmarl.traffic.demand.route_records import RouteTable
 
-MAX_INTERVALS = 30_000  # each has its own random numbers
-MAX_RULES = 300_000  # intervals times edges
+MAX_INTERVALS = 30_000  # each interval has its own random numbers
+MAX_RULES = 300_000  # number of intervals times edges
 KEEP_DESTINATION = -1  # in place of an EDGE row
 _ACTED_ON = ("closingReroute", "destProbReroute", "routeProbReroute")
 _NOT_MODELLED = ("timeThreshold", "radius", "file")
 
 RULE = record(
-    ("begin_s", np.float64),  # clock
+    ("begin_s", np.float64),  # time of the simulation
     ("end_s", np.float64),
     ("chance", np.float64),  # probability that a vehicle follows the rule
     ("edge", np.int32),  # EDGE row on which the rule applies
-    ("closes", np.bool_),  # whether it applies only to vehicles whose way uses a closed edge
+    ("closes", np.bool_),  # whether it applies only to vehicles whose route uses a closed edge
     ("goals", np.int32),  # choice among EDGE rows or KEEP_DESTINATION; -1: none
     ("routes", np.int32),  # choice among ROUTE rows; -1: none
     ("interval", np.int32),  # equal for all edges of an interval, so that vehicles draw once
@@ -44,7 +44,7 @@ CLOSING = record(
 
 @dataclass(frozen=True, eq=False)
 class Rerouters:
-    """All rerouters of the files."""
+    """The rerouters of all files."""
 
     rules: NDArray[np.void]  # RULE (n,), one per interval and edge, in the order of the files
     types: NDArray[np.bool_]  # (num_intervals, num_types) the VTYPE rows of an interval
@@ -75,8 +75,8 @@ def read_rerouters(
     """Read the rerouters of files; ignored parts are counted in `report`.
 
     `elements`: <rerouter>s with their children. `routes`: receives the routes that they name.
-    `type_ids`: names by VTYPE row. `known_types`: names of all types, including types that use
-    no road.
+    `type_ids`: names by VTYPE row. `known_types`: names of all types, including types that do not
+    use roads.
 
     Raises DemandError: an edge, route, type, time or probability is invalid; CapacityError: there
     are more than `MAX_INTERVALS` intervals, or more than `MAX_RULES` intervals times edges.
@@ -211,7 +211,7 @@ class _Reader:
 
 
 def _closed_classes(closing: Element) -> int:
-    """Return the bits of the classes an edge is closed to; all classes by default."""
+    """Return the bits of the classes to which an edge is closed; all classes by default."""
     if "allow" in closing.attrs and "disallow" in closing.attrs:
         raise closing.error("has allow and disallow", "leave one of them")
     for key in ("allow", "disallow"):

@@ -1,4 +1,4 @@
-"""SUMO's rerouting device: its share of vehicles, its period, and its measurements of speed."""
+"""SUMO's rerouting device: share of equipped vehicles, period, and measurement of speeds."""
 
 from __future__ import annotations
 
@@ -33,16 +33,16 @@ def device(element: Element) -> tuple[float, int]:
 
 
 class DeviceOptions(NamedTuple):
-    """Settings of the device in a `.sumocfg` for all vehicles; the defaults are SUMO's."""
+    """Settings of the device in a `.sumocfg` for all vehicles, with SUMO's defaults."""
 
     chance: float = 0.0  # probability of having the device, if neither vehicle nor type sets it
-    period_ms: int = 0  # between searches, if neither vehicle nor type sets it; 0: one search
-    adaptation_steps: int = 180  # number of averaged samples of the edges' speeds
-    adaptation_interval_ms: int = 1000  # between samples
+    period_ms: int = 0  # time between searches if neither vehicle nor type sets it; 0: one search
+    adaptation_steps: int = 180  # number of samples in the averages of edge speeds
+    adaptation_interval_ms: int = 1000  # time between samples
 
     @classmethod
     def of(cls, options: Mapping[str, Element]) -> DeviceOptions:
-        """Read the options of a configuration, each an element with a `value`.
+        """Read the settings from the options of a configuration, elements with a `value`.
 
         Raises DemandError: a value is invalid, or asks for an average that is not supported.
         """
@@ -60,7 +60,7 @@ class DeviceOptions(NamedTuple):
                 )
         found = cls()
         if "probability" in own:
-            # SUMO's default -1 means no vehicle.
+            # SUMO's default -1 means that no vehicle has the device.
             key = f"{_PREFIX}probability"
             chance = own["probability"].number(key, 0.0, least=-1.0, most=1.0)
             found = found._replace(chance=max(chance, 0.0))

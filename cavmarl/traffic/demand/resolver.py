@@ -31,9 +31,9 @@ from cavmarl.traffic.demand.type_table import TypeTable
 from cavmarl.traffic.trip_ways import TripWays
 
 log = logging.getLogger(__name__)
-NAMED = 5  # maximum number of ids in the warning about left-out vehicles
+NAMED = 5  # maximum number of ids in the warning about omitted vehicles
 
-# Classes whose own lanes are missing in road networks: see `sumo_net.selection`.
+# Classes whose lanes road networks leave out: see `sumo_net.selection`.
 _PARTLY_MAPPED = sum(1 << VEHICLE_CLASSES.index(name) for name in ("bicycle", "tram"))
 
 
@@ -51,7 +51,7 @@ class Resolver:
         collector: DefinitionCollector,
         index: MapIndex,
         skip: bool,
-        type_defaults: Mapping[str, str],  # attributes of types without their own
+        type_defaults: Mapping[str, str],  # default attributes of types
     ) -> None:
         self._index = index
         self._skip = skip
@@ -148,7 +148,7 @@ class Resolver:
         )
         counts = np.bincount(which.ravel(), minlength=len(seen))
         fits = np.ones(len(seen), dtype=bool)
-        # In the order of the files, so that the first mistake is reported.
+        # Check in the order of the files, so that the first mistake is reported.
         for case in np.argsort(first):
             types, routes, depart_lane, arrival_lane = (int(value) for value in seen[case])
             user = self._stub(elements, ids, int(first[case]))
@@ -166,7 +166,7 @@ class Resolver:
         return keep
 
     def _drives(self, types: int, routes: int, user: Element) -> bool:
-        """Return whether any option can be driven; unless bad routes are skipped, all must be."""
+        """Return whether any option can be driven; all must be, unless bad routes are skipped."""
         some = False
         for vtype in self._options(self._type_options, types).rows:
             permissions = self.types.permissions(vtype)
@@ -181,7 +181,7 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Return why a class cannot drive a route; to skip bad routes, also find ways of trips."""
+        """Return why a class cannot drive a route; if bad routes are skipped, also try trips."""
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:
@@ -192,7 +192,7 @@ class Resolver:
         return gap
 
     def _tolerates(self, vtype: int, user: Element) -> bool:
-        """Return whether vehicles of this type without a way are left out instead of refused."""
+        """Return whether vehicles of this type without a route are left out instead of refused."""
         if self.types.permissions(vtype) & ~_PARTLY_MAPPED == 0:
             what = f"type '{self.types.names[vtype]}' without a way: maps lack its own lanes"
             self._report.tolerate(what, user.place)
@@ -233,7 +233,7 @@ class Resolver:
         return not problem
 
     def _check_ids(self) -> None:
-        """Refuse vehicles with a name that a flow gives to its vehicles."""
+        """Refuse vehicles with the name of a flow's vehicle."""
         flows = {name: row for row, name in enumerate(self.ids) if self._elements[row]["flow"]}
         for row, name in enumerate(self.ids):
             stem, _, number = name.rpartition(".")

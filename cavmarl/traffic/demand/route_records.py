@@ -56,7 +56,7 @@ class StopReader:
         self._report = report
 
     def edges(self, stops: Sequence[Element]) -> list[int]:
-        """Return the EDGE rows of stops, which a trip with stops has to pass."""
+        """Return the EDGE rows of stops, over which a trip with these stops has to drive."""
         lanes = self._index.network.lanes
         return [int(lanes[self._lane(stop)]["edge"]) for stop in stops]
 
@@ -68,7 +68,7 @@ class StopReader:
         `stops`: the <stop> elements in the order of the file. `edges`: EDGE rows of the route.
         `exact`: whether the edges are the whole route, or waypoints.
 
-        Raises DemandError: a stop is not on the route after the one before it.
+        Raises DemandError: a stop is not on the route beyond the previous stop.
         """
         found: list[Stop] = []
         at, end = 0, -1.0
@@ -93,13 +93,13 @@ class StopReader:
         if not self.skip:
             name = self._index.network.edge_ids[edge]
             raise element.error(
-                f"on edge '{name}' lies off the route, or before the stop above it",
+                f"on edge '{name}' is off the route, or before the previous stop",
                 "put stops in the order of the route, or set traffic.on_bad_route = skip",
             )
         self._report.tolerate("stop off its route is left out", element.place)
 
     def _source(self, stop: Element) -> Element:
-        """Return the element with lane and positions: the stop or the stopping place it names."""
+        """Return the element that has lane and positions: the stop, or its stopping place."""
         for kind in sorted(STOPPING_PLACES & stop.attrs.keys()):
             name = stop.attrs[kind]
             place = self.places.get(name)
@@ -141,7 +141,7 @@ class StopReader:
         )
 
     def _span(self, source: Element, lane: int) -> tuple[float, float]:
-        """Return start and end in m on SUMO's lane; negative positions count from its end."""
+        """Return start and end in m on SUMO's lane; negative positions are from the lane's end."""
         network = self._index.network
         length = float(network.edges[network.lanes[lane]["edge"]]["length_m"])
         end = source.number("endPos", length)
@@ -151,7 +151,7 @@ class StopReader:
         if source.flag("friendlyPos", False):
             end = min(max(end, 0.0), length)
             start = min(max(start, 0.0), end)
-        # SUMO writes positions with two decimals.
+        # Allow for rounding: SUMO writes positions with two decimals.
         if not 0.0 <= start <= end <= length + 0.01:
             raise self._bad_span(source, length)
         return start, min(end, length)
@@ -164,19 +164,19 @@ class StopReader:
         )
 
 
-MAX_ROUTE_EDGES = 50_000_000  # sum over all routes
+MAX_ROUTE_EDGES = 50_000_000  # maximum total number of edges of all routes
 
-# Attributes that name a place and not an edge. As in SUMO, an edge replaces the first ones.
+# Attributes that name a place, not an edge. As in SUMO, an edge overrides the first attributes.
 _REPLACED_BY_EDGES = ("Junction", "Taz")
 _COORDINATES = ("XY", "LonLat")
 
 
 class RouteTable:
-    """ROUTE, STOP and edge rows, added as they are found; equal routes share a row.
+    """ROUTE, STOP and edge rows, added one by one; equal routes share a row.
 
     Attributes:
         stop_reader: finds the places of stops.
-        names: id by ROUTE row, "" for routes without one.
+        names: id by ROUTE row, "" for routes without an id.
     """
 
     def __init__(
@@ -226,11 +226,11 @@ class RouteTable:
         return self._edges[row]
 
     def exact(self, row: int) -> bool:
-        """Return whether a route is given by all its edges, or only by waypoints."""
+        """Return whether a route is given by all its edges, and not only by waypoints."""
         return self._rows[row][2]
 
     def stops_with(self, row: int, stops: Sequence[Element], until_from: int) -> tuple[int, int]:
-        """Return STOP rows (first, number) of a vehicle's own stops and those of its route."""
+        """Return STOP rows (first, number) of a vehicle's own stops and the stops of its route."""
         own = self.stop_reader.along(stops, self._edges[row], self.exact(row), until_from)
         _, _, exact, first, number = self._rows[row]
         both = self._stops[first : first + number] + own
@@ -271,7 +271,7 @@ class RouteTable:
         return self._store(edges, True, placed, source.attrs.get("id", ""))
 
     def _way(self, source: Element) -> int:
-        """Store a trip: the edges to pass in order, without immediate repetitions."""
+        """Store a trip: the edges to drive over in order, without immediate repetitions."""
         used = [f"{end}{place}" for end in ("from", "to", "via") for place in _COORDINATES]
         used += [
             f"{end}{place}"

@@ -20,7 +20,7 @@ from cavmarl.traffic.demand.rerouting_device import DeviceOptions
 
 MAX_SCALE = 1000.0
 
-# Why options are not obeyed, by kind or name; other options are "not modelled".
+# Reasons why options are ignored, by kind or name; other options are "not modelled".
 _REASONS = {
     "seed": "is not used: the seed of the world is",
     "unread": "is not read",
@@ -39,18 +39,18 @@ class SumoConfigFile:
     step_ms: int = 1000  # length of a step
     # options of the rerouting device
     rerouting: DeviceOptions = field(default_factory=DeviceOptions)
-    # attributes of departures and of types without their own
+    # default attributes of departures and of types
     departs: Mapping[str, str] = field(default_factory=dict)
     types: Mapping[str, str] = field(default_factory=dict)
-    scale: float = 1.0  # factor of the number of departures
+    scale: float = 1.0  # factor on the number of departures
     skips_bad_routes: bool = False  # whether vehicles that cannot drive their route are left out
 
 
 def read_sumo_config(path: Path, report: DemandReport | None = None) -> SumoConfigFile:
-    """Read a configuration of SUMO; `report` counts the options that are not obeyed.
+    """Read a configuration of SUMO; `report` counts the ignored options.
 
-    Raises DemandError: the file is missing or is no SUMO configuration, SUMO has no such option, an
-    option is set twice, a named file does not exist, or a value is invalid.
+    Raises DemandError: the file is missing or is not a SUMO configuration, SUMO has no such option,
+    an option is set twice, a named file does not exist, or a value is invalid.
     """
     given = read_options(path, DemandError)
     if report is not None:
@@ -62,7 +62,7 @@ def read_sumo_config(path: Path, report: DemandReport | None = None) -> SumoConf
 
     def time_ms(name: str) -> int | None:
         element = options.get(name)
-        # SUMO writes -1 for no end.
+        # -1 means no end in SUMO.
         if element is None or (name == "end" and element.attrs["value"].startswith("-1")):
             return None
         return element.time_ms("value")
@@ -70,7 +70,7 @@ def read_sumo_config(path: Path, report: DemandReport | None = None) -> SumoConf
     end_ms = time_ms("end")
     step_ms = time_ms("step-length")
     if step_ms == 0:
-        raise options["step-length"].error("is no valid step length", "write seconds above 0")
+        raise options["step-length"].error("is not a valid step length", "write seconds above 0")
     scale = options.get("scale")
     skips = options.get("ignore-route-errors")
     return SumoConfigFile(
@@ -92,9 +92,9 @@ def tell_ignored(
     report: DemandReport,
     ignored: Collection[str] = ("time", "seed", "traffic", "unread"),
 ) -> None:
-    """Count the options of a configuration that change traffic and are not obeyed.
+    """Count the options of a configuration that change traffic but are ignored.
 
-    `ignored`: kinds of options that are not obeyed; begin and end are obeyed.
+    `ignored`: kinds of options that are ignored; begin and end are never ignored.
     """
     for name, option in given.items():
         known = known_options()[name]
@@ -124,12 +124,12 @@ def _departs(options: Mapping[str, Element]) -> dict[str, str]:
 
 
 def _types(options: Mapping[str, Element]) -> dict[str, str]:
-    """Return the attributes of types that a configuration sets for types without their own."""
+    """Return the default attributes of types that a configuration sets."""
     found = {}
     model, deviation = options.get("default.carfollowmodel"), options.get("default.speeddev")
     if model is not None:
         found["carFollowModel"] = model.attrs["value"]
-    # SUMO's default -1 means the deviation of the class.
+    # SUMO's default -1 stands for the deviation of the class.
     if deviation is not None and deviation.number("value", -1.0) >= 0.0:
         found["speedDev"] = deviation.attrs["value"]
     return found

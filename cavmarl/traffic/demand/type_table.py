@@ -27,7 +27,7 @@ from cavmarl.traffic.demand.rerouting_device import device
 MIN_SPEED_FACTOR = 0.2  # SUMO's bounds of speed factors
 MAX_SPEED_FACTOR = 2.0
 
-# (minimum, maximum) for a road vehicle in SI units, with room for unusual studies.
+# (minimum, maximum) for a road vehicle in SI units, wide enough for unusual studies.
 _LIMITS = {
     "length": (0.1, 100.0),
     "width": (0.1, 10.0),
@@ -70,9 +70,9 @@ def vtype_record(
 ) -> NDArray[np.void] | None:
     """Return VTYPE () of a <vType>; None for a class that does not use roads.
 
-    `defaults`: attributes of types without their own.
+    `defaults`: default attributes of types.
 
-    Raises DemandError: a value is impossible.
+    Raises DemandError: a value is invalid.
     """
     attrs = dict(element.attrs)
     for child in element.children:
@@ -80,7 +80,7 @@ def vtype_record(
             attrs = {**child.attrs, **attrs}
             attrs.setdefault("carFollowModel", child.name.removeprefix(_MODEL_PREFIX))
     for key, value in (defaults or {}).items():
-        # A distribution of speed factors has its own deviation.
+        # A distribution of speed factors contains its deviation.
         if key != "speedDev" or not _SPEED_FACTOR.fullmatch(attrs.get("speedFactor", "").strip()):
             attrs.setdefault(key, value)
     element = Element(element.name, attrs, element.path, element.line, element.children)
@@ -122,7 +122,7 @@ def _number(element: Element, key: str, default: float) -> float:
 
 def _model(element: Element, report: DemandReport) -> int:
     name = element.attrs.get("carFollowModel", "Krauss").strip()
-    # SUMO 0.x also wrote carFollowing-Krauss here.
+    # SUMO 0.x also used the form carFollowing-Krauss.
     name = name.removeprefix(_MODEL_PREFIX)
     if name not in NEAREST_MODEL and not has_model(name):
         known = (*model_names(), *NEAREST_MODEL)
@@ -146,7 +146,7 @@ def _report_unused(element: Element, name: str, report: DemandReport) -> None:
 
 
 def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: float) -> None:
-    """Set mean, deviation and bounds from "1.1", "norm(m,d)", "normc(m,d,min,max)", speedDev."""
+    """Set mean, deviation and bounds from "1.1", "norm(m,d)", "normc(m,d,min,max)" or speedDev."""
     numbers = {"speedFactor": "1", "speedDev": element.attrs.get("speedDev", str(deviation))}
     numbers["least"], numbers["most"] = str(MIN_SPEED_FACTOR), str(MAX_SPEED_FACTOR)
     text = element.attrs.get("speedFactor", "1").strip()
@@ -171,7 +171,7 @@ def _set_speed_factor(record: NDArray[np.void], element: Element, deviation: flo
 
 
 class TypeTable:
-    """VTYPE rows of all types that the files define, and of SUMO's default types that they use.
+    """VTYPE rows of all types that the files define, and of SUMO's default types in use.
 
     Attributes:
         names: id by row.
@@ -181,7 +181,7 @@ class TypeTable:
         self,
         named: dict[str, dict[str, Element]],
         report: DemandReport,
-        defaults: Mapping[str, str],  # attributes of types without their own
+        defaults: Mapping[str, str],  # default attributes of types
     ) -> None:
         self.names: list[str] = []
         self._types = dict(named.get("vType", {}))
@@ -197,9 +197,9 @@ class TypeTable:
             self._types.setdefault(name, Element("vType", {"id": name, "vClass": vclass}, "", 0))
 
     def options(self, name: str, user: Element) -> Options | None:
-        """Return the choice of types under a name; None if its vehicles do not use roads.
+        """Return the choice of types with a name; None if these types do not use roads.
 
-        `name`: of a type or a distribution. `user`: the element that contains the name.
+        `name`: name of a type or a distribution. `user`: the element that contains the name.
 
         Raises DemandError: the name is unknown, or the choice is empty.
         """

@@ -1,4 +1,4 @@
-"""Reading demand files as streams, one definition with its lines at a time."""
+"""Reads demand files as streams, one definition at a time, with line numbers."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _DEFINITIONS = STOPPING_PLACES | frozenset(
     "vType vTypeDistribution route routeDistribution vehicle trip flow rerouter".split()
 )
 
-# Other elements in SUMO's files. Signal programs are read elsewhere.
+# Other elements of SUMO's files, which are ignored here.
 _SKIPPED = frozenset(
     "person personFlow container containerFlow calibrator variableSpeedSign vTypeProbe "
     "routeProbe e1Detector inductionLoop instantInductionLoop e2Detector laneAreaDetector "
@@ -96,7 +96,7 @@ class _Handler(ContentHandler):
     def _add(self, element: Element) -> None:
         self._inside += 1
         if self._inside > MAX_INSIDE:
-            raise self._tree[0].error(f"holds more than {MAX_INSIDE} elements", "split it")
+            raise self._tree[0].error(f"contains more than {MAX_INSIDE} elements", "split it")
         self._tree[-1].children.append(element)
         self._tree.append(element)
 
@@ -139,12 +139,13 @@ def _read(
 
 
 def read_elements(path: Path, report: DemandReport, take: Callable[[Element], None]) -> None:
-    """Pass the definitions of a file and its included files to `take`, in order.
+    """Pass the definitions of a file and of its included files to `take`, in order.
 
-    Flows inside an <interval> get its begin and end. Other elements are counted in `report`.
+    Flows inside an <interval> get the interval's begin and end. Other elements are counted in
+    `report`.
 
     `path`: a plain or gzipped file. `report`: receives files and counts of elements. `take`: gets
-    each <vType>, <route>, <vehicle>, … with its children when it has ended.
+    each <vType>, <route>, <vehicle>, … with its children at its end tag.
 
     Raises DemandError: the file is missing, is not XML, or has another root.
     """

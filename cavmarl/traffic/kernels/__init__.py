@@ -1,1 +1,1 @@
-"""Compiled loops of departures, entering, leaving and rerouting."""
+"""Compiled loops: departures, entering, leaving and rerouting."""

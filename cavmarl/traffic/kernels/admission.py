@@ -1,10 +1,10 @@
 """Admission of waiting departures: the departure queue assigns lanes, and shards find gaps.
 
 In one tick at most one vehicle tries to enter each lane, in the order of the queue. There are five
-calls: `rank_lanes` (each shard: how crowded lanes are), `assign_lanes` (the departure queue),
-`propose` (each shard: departures with a safe gap in its own zone), `accept` (the departure queue:
-in its order, while the world has room) and `admit` (each shard: add the vehicles to its rows or to
-its ghosts).
+calls. Each shard runs `rank_lanes` (how crowded lanes are), `propose` (departures with a safe gap
+in the shard's zone) and `admit` (add the vehicles to the shard's rows or ghosts). The departure
+queue runs `assign_lanes` before `propose`, and then `accept` (in queue order, while the world has
+room).
 """
 
 from __future__ import annotations
@@ -63,11 +63,11 @@ def rank_lanes(
 ) -> None:
     """Count vehicles around entry places in this zone, for departures that choose their lane.
 
-    A departure that enters behind the last vehicle of a lane gets its place from the zone where
-    the lane ends: only this zone sees all vehicles in view of the end.
+    For a departure that enters behind the last vehicle of a lane, the zone where the lane ends
+    determines the place: only this zone sees all vehicles in view of the end.
 
     `zone`: zone of this shard. `departures`: `ranks` is written for places in this zone, `last_s`
-    for lanes that end in it. `worlds`: `next_rows` is read.
+    for lanes that end in this zone. `worlds`: `next_rows` is read.
     """
     for w in range(worlds.ticks.shape[0]):
         indexed = False
@@ -119,7 +119,7 @@ def assign_lanes(
 ) -> None:
     """Assign each queued departure the lane on which it tries to enter, or -1.
 
-    A lane is assigned to the longest-waiting departure, even if it finds no gap there.
+    A lane is assigned to the departure that has waited longest, even if there is no gap for it.
 
     `departures`: `tries` and `lane_taken` are written. `lanes`: LANE (V, L), see `Worlds`.
     """
@@ -140,7 +140,7 @@ def assign_lanes(
 
 @kernel
 def _touches(own: np.void, other: np.void) -> bool:
-    """Return whether an entering vehicle, enlarged by a margin, touches another vehicle."""
+    """Return whether an entering vehicle, enlarged by a margin, would touch another vehicle."""
     half_length = 0.5 * own["length"] + ENTER_ROOM_M
     half_width = 0.5 * own["width"] + ENTER_ROOM_M
     dx = other["x"] - own["x"]
@@ -174,7 +174,7 @@ def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
 
 @kernel
 def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
-    """Return the link at the end of an entrant's lane: on its way, else the first; -1: none."""
+    """Return the link at the end of an entrant's lane: on its route, or the first; -1: none."""
     _, _, link = next_step(roads, travel, row["lane"], row["way"])
     here = roads.lanes[row["lane"]]
     return here["first_link"] if link < 0 and here["num_links"] > 0 else link
@@ -182,7 +182,7 @@ def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
 
 @inlined_kernel
 def _num_behind(roads: RoadArrays, row: np.void) -> int:
-    """Count the lanes that lead to the entrant's lane or beside it; 0 far from the lane's start."""
+    """Count the lanes that lead to or beside the entrant's lane; 0 far from the lane's start."""
     far = row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M
     return 0 if far else int(roads.lanes[fed_lane(roads, row["lane"])]["num_into"])
 
@@ -199,7 +199,7 @@ def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
 def may_entry_be_swept(
     roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch
 ) -> bool:
-    """Return whether a vehicle enters near swept areas: ahead, or behind with a vehicle in them."""
+    """Return whether a vehicle would enter near swept areas ahead, or occupied ones behind."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:
@@ -226,7 +226,7 @@ def may_entry_be_swept(
 
 @kernel
 def is_entry_swept(roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch) -> bool:
-    """Return whether a vehicle enters an area that another one sweeps, ahead or behind it."""
+    """Return whether a vehicle would enter an area swept by a vehicle ahead or behind."""
     here = roads.lanes[row["lane"]]
     half = 0.5 * row["length"]
     to_line = here["length_m"] - row["s"]
@@ -253,7 +253,7 @@ def propose(
     worlds: Worlds,
     scratch: Scratch,
 ) -> None:
-    """Write departures that find a safe gap in this zone into `departures.passing`.
+    """Write the departures with a safe gap in this zone to `departures.passing`.
 
     `demand`: the generator's tables. `zone`: zone of this shard. `departures`: `passing` and
     `places` are written. `worlds`: `next_rows` is read.
@@ -309,7 +309,8 @@ def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int
     """Accept proposals in the order of the queue; the other departures stay queued.
 
     `departures`: the accepted proposals remain in `passing`; queue and counts are written.
-    `running`: (W,) vehicles of each world in all zones. `capacity`: maximum number per world.
+    `running`: (W,) vehicles of each world in all zones. `capacity`: maximum number of vehicles per
+    world.
     """
     for w in range(running.size):
         proposed = departures.num_passing[w]
@@ -336,7 +337,7 @@ def accept(departures: DepartureQueue, running: NDArray[np.int64], capacity: int
 
 @kernel
 def _take_from_queue(departures: DepartureQueue, w: int, taken: int) -> None:
-    """Remove the accepted departures, whose places are in ascending order, from the queue."""
+    """Remove the accepted departures, given by ascending places, from the queue."""
     if taken == 0:
         return
     kept = departures.places[w, 0]
@@ -354,9 +355,9 @@ def _take_from_queue(departures: DepartureQueue, w: int, taken: int) -> None:
 def admit(
     zones: ZoneArrays, halo: Halo, zone: int, departures: DepartureQueue, worlds: Worlds
 ) -> None:
-    """Write accepted departures into `next_rows`: as owned rows in their zone, as ghosts near it.
+    """Write accepted departures to `next_rows`: owned rows in their zone, ghosts near the zone.
 
-    `halo`: how far this zone sees. `zone`: zone of this shard. `departures`: `passing` is read.
+    `halo`: region that this zone sees. `zone`: zone of this shard. `departures`: `passing` is read.
     `worlds`: `next_rows` and the numbers of rows are written.
     """
     for w in range(worlds.ticks.shape[0]):

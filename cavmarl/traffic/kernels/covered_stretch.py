@@ -17,7 +17,7 @@ def covered_stretch(
     lane: np.void,  # LANE
     body: NDArray[np.float64],  # (n, 2) sample points of the body, m
 ) -> tuple[float, float]:
-    """Return the first and last place on the lane below the body; if none, first is inf."""
+    """Return the first and last position of the lane below the body; inf first if none."""
     reach = 0.5 * lane["width_m"]
     first, last = math.inf, -math.inf
     for k in range(len(body)):

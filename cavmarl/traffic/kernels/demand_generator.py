@@ -1,7 +1,7 @@
-"""The seeded demand generator, the queue of departures, and the settlement of leaving vehicles.
+"""The seeded demand generator, the departure queue, and the replacement of leaving vehicles.
 
 A departure gets its number and random draws when it is ordered. It waits in the queue, which is
-sorted by id, until it finds a safe gap at its place. No departure is dropped.
+sorted by id, until there is a safe gap at its place. No departure is dropped.
 """
 
 from __future__ import annotations
@@ -54,14 +54,14 @@ from cavmarl.roads.kernels.map_choice import map_of
 from cavmarl.traffic.kernels.entering import speed_at
 from cavmarl.traffic.kernels.own_plans import follows_plan, take_plan
 
-PLACE_TRIES = 24  # places tried for a vehicle at reset; then the vehicle is queued
+PLACE_TRIES = 24  # number of places tried for a vehicle at reset; then the vehicle is queued
 PLACE_GAP_M = 10.0  # m between bumpers of vehicles placed at reset
 END_ROOM_M = 12.0  # m between a new vehicle and the end of its lane, if the lane is long enough
 PLACE_SHARE = 0.7  # initial speed of vehicles placed at reset, as a share of the speed limit
 WANDER_M = 150.0  # m; in a closed world, a vehicle this near to its goal picks another goal
 GOAL_TRIES = 8
 REROUTE_S = 45.0  # s; a stuck vehicle with a route takes a detour after this wait
-GIVE_UP_S = 10.0  # s; a stuck vehicle without a route takes another way after this wait
+GIVE_UP_S = 10.0  # s; a stuck vehicle without a route chooses another goal after this wait
 
 
 @kernel
@@ -76,7 +76,7 @@ def _order(
     agent: int,
     trips: TripTable,
 ) -> None:
-    """Number and draw one departure and append it to the queue."""
+    """Number and draw a departure, and append it to the queue."""
     key = keys[w]
     own_map = map_of(key, roads.maps.shape[0])
     departure = departures.queue[w, _number(demand, departures, ticks[w], key, w)]
@@ -96,7 +96,7 @@ def _order(
 
 @kernel
 def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint64, w: int) -> int:
-    """Append a numbered departure of the generator's type to the queue; return its place."""
+    """Append a numbered departure of the generator to the queue; return its place."""
     vehicle = departures.next_id[w]
     departures.next_id[w] = vehicle + 1
     place: int = departures.num_queue[w]
@@ -119,7 +119,7 @@ def _number(demand: Demand, departures: DepartureQueue, tick: int, key: np.uint6
 
 @inlined_kernel
 def _drawn_type(demand: Demand, key: np.uint64, vehicle: int) -> int:
-    """Draw the VTYPE row, and thus the driver, of a vehicle of the generator."""
+    """Draw the VTYPE row, and so the driver, of a vehicle of the generator."""
     last = demand.drawn_types.shape[0] - 1
     share = uniform(key, vehicle, 0, STREAM_MODEL) if last > 0 else 0.0
     k = 0
@@ -139,10 +139,10 @@ def insert(
     ticks: NDArray[np.int64],
     keys: NDArray[np.uint64],
 ) -> None:
-    """Append the vehicles that are inserted from outside to the queue.
+    """Append the vehicles that the caller inserts to the queue.
 
-    The vehicle drives to the first goal farther than `WANDER_M`, starting from a random goal. If
-    its lane leads to none, it stops at the lane's end.
+    Goals are tried in order, starting from a random goal; the vehicle drives to the first goal
+    farther than `WANDER_M`. If its lane leads to no goal, it stops at the lane's end.
     """
     lanes = roads.lanes.shape[0]
     for w in range(ticks.size):
@@ -250,12 +250,12 @@ def populate(
     worlds: Worlds,
     chosen: NDArray[np.bool_],
 ) -> None:
-    """Fill the chosen worlds at reset, each vehicle at a free place: agents, then background.
+    """Fill the chosen worlds at reset: place agents, then background vehicles, at free places.
 
-    A vehicle for which all of `PLACE_TRIES` places were occupied waits in the queue.
+    A vehicle waits in the queue if all `PLACE_TRIES` places that were tried are occupied.
 
-    `demand`: the generator's tables. `worlds`: written where chosen; ticks and keys must already
-    be those of the new episode.
+    `demand`: the generator's tables. `worlds`: chosen worlds are written; ticks and keys must
+    already belong to the new episode.
     """
     for w in range(worlds.ticks.shape[0]):
         if not chosen[w]:
@@ -302,10 +302,10 @@ def populate(
 
 @kernel
 def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Return whether a vehicle needs another goal: near its goal if trips are endless, or stuck.
+    """Return whether a vehicle needs another goal: it is stuck, or near the end of endless trips.
 
     A background vehicle is stuck if it has waited for `GIVE_UP_S` at the end of a lane that its
-    way does not follow, or if a network has driven it to a lane without a way. Agents are never
+    route does not follow, or if a network has driven it to a lane without a route. Agents are never
     stuck.
     """
     if row["driver"] == DRIVER_AGENT:
@@ -313,7 +313,7 @@ def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.v
     if row["driver"] != DRIVER_BACKGROUND and row["driver"] != DRIVER_LEARNED:
         return False
     if row["driver"] == DRIVER_LEARNED and row["to_go"] == math.inf:
-        return True  # it has taken a turn from which no way leads to its goal
+        return True  # it has taken a turn from which no route leads to its goal
     if row["order"] >= 0:
         return row["goal"] >= 0 and _is_stuck(roads, travel, row, REROUTE_S)
     if not demand.reenter and row["to_go"] <= WANDER_M:
@@ -332,7 +332,7 @@ def _is_stuck(roads: RoadArrays, travel: TripTables, row: np.void, patience_s: f
 
 @kernel
 def _take_detour(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Let a vehicle of the demand file take a way to its goal without the missed lane change."""
+    """Put a vehicle of the demand file on a route to its goal without the missed lane change."""
     way = travel.first_detour + row["goal"] * roads.lanes.shape[0]
     step = travel.steps[way + row["lane"]]
     if step["next"] < 0 or way == row["way"]:
@@ -353,9 +353,9 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give vehicles of `next_rows` that need another goal one within reach, if any.
+    """Give vehicles of `next_rows` that need another goal a reachable goal, if any.
 
-    Runs once a second. A goal farther away does not count as lost progress of an agent.
+    Call once a second. A more distant goal does not count as lost progress of an agent.
     """
     turns = max(1, round(1.0 / dt))
     for w in range(worlds.ticks.shape[0]):
@@ -412,13 +412,13 @@ def settle(
     keys: NDArray[np.uint64],
     dt: float,
 ) -> None:
-    """Count the vehicles that have left, and order their successors.
+    """Count the vehicles that have left, and order departures that replace them.
 
-    Vehicles are handled in the order of their ids, so that their successors get the same numbers
+    Vehicles are handled in the order of their ids, so that their replacements get the same numbers
     wherever the rows were stored.
 
     `demand`: the generator's tables. `departures`: counts, sums and queue are written; `passing`
-    holds the vehicles that left, and is emptied.
+    contains the vehicles that left, and is emptied.
     """
     for w in range(ticks.size):
         for n in range(departures.num_passing[w]):

@@ -1,6 +1,6 @@
 """The place and speed at which a waiting departure enters, and whether it can enter now.
 
-A departure requests a lane of its edge, a place on it and a speed, as numbers or as SUMO's
+A departure requests a lane of its edge, a place on that lane and a speed, as numbers or as SUMO's
 keywords. It enters only if the gap is safe for itself and for its follower.
 """
 
@@ -41,8 +41,8 @@ from cavmarl.roads.kernels.lanes_now import is_closed
 ENTER_GAP_M = 1.0  # m between bumpers, minimum gap of an entering vehicle
 LEADER_M = 150.0  # m; search distance for a leader
 ENTER_DECEL = 2.0  # m/s², maximum braking imposed on a follower, or needed at the lane's end
-BEST_LANE_M = 3000.0  # m; lanes that a way can follow this far are equally good, as in SUMO
-SAME_LENGTH = 0.99  # lanes with this share of the best distance are equal: lengths differ in bends
+BEST_LANE_M = 3000.0  # m; lanes that a route can follow this far are equally good, as in SUMO
+SAME_LENGTH = 0.99  # lanes with this share of the best distance count as equal, because of bends
 DRAW_LANE = 0  # offset of draws in STREAM_DEPARTURE
 DRAW_SPEED = 1
 
@@ -73,12 +73,13 @@ def entry_lane(
 ) -> int:
     """Return the LANE row where a departure enters in this tick, or -1 if it must wait.
 
-    A departure that chooses by traffic takes the usable lane with the fewest vehicles (`best`: of
-    the lanes that its way follows furthest without a lane change); on a tie, the right one.
+    A departure that chooses by traffic takes the usable lane with the fewest vehicles (with `best`,
+    among the lanes that its route follows furthest without a lane change); on a tie, the right
+    lane.
 
-    `roads`: of the world. `departure`: the departure. `ranks`: how crowded each lane of its edge
-    is; read if traffic decides. `taken`: (L,) lanes on which another departure tries to enter in
-    this tick.
+    `roads`: roads of the world. `ranks`: how crowded each lane of the departure's edge is; read if
+    it chooses by traffic. `taken`: (L,) lanes on which another departure tries to enter in this
+    tick.
     """
     code = departure["lane_code"]
     if code == LANE_GIVEN:
@@ -89,7 +90,7 @@ def entry_lane(
     first = edge["first_lane"]
     end = first + edge["num_lanes"]
     usable = 0
-    furthest = 0.0  # m that the way follows a lane without a lane change
+    furthest = 0.0  # largest distance in m that the route follows a lane without a lane change
     for lane in range(first, end):
         if _may_use(roads, travel, departure, lane):
             usable += 1
@@ -131,10 +132,10 @@ def entry_place(
     tick: int,
     scratch: Scratch,
 ) -> float:
-    """Return the place on its lane where the centre of a departure enters, in m.
+    """Return the position on its lane at which the centre of a departure enters, in m.
 
     The front is before the line and the rear is on the lane. If the lane is shorter than the body,
-    the rear is behind the start of the lane.
+    the rear is before the start of the lane.
     """
     length = roads.lanes[lane]["length_m"]
     half = 0.5 * kind["length"]
@@ -197,7 +198,7 @@ def _wanted_speed(
     leader: int,
     scratch: Scratch,
 ) -> float:
-    """Return the speed in m/s with which a departure would enter at `s` of an endless lane.
+    """Return the speed in m/s at which a departure would enter at `s` of an endless lane.
 
     `leader`: the entry of the leader, or -1.
     """
@@ -228,7 +229,7 @@ def _behind_last_m(
     most: float,
     scratch: Scratch,
 ) -> float:
-    """Return how far (m) before `most`, the lane's last place, a departure with code `last` enters.
+    """Return how far (m) before `most`, the last place, a departure with POS_LAST enters.
 
     Behind the last vehicle in view of the lane's end, the departure keeps the gap that it needs to
     stop. Without such a vehicle it keeps its reaction time to the end, because there may be
@@ -265,9 +266,9 @@ def entry_speed(
     s: float,
     scratch: Scratch,
 ) -> float:
-    """Return the speed in m/s with which a departure can enter; -1: its leader is too near.
+    """Return the speed in m/s at which a departure can enter; -1: its leader is too near.
 
-    An agent that changes lanes and still protrudes into this lane also counts as a leader.
+    An agent that is changing lanes and still covers a part of this lane also counts as a leader.
     """
     half = 0.5 * kind["length"]
     j = ahead_on(scratch, lane, s, departure["id"], travel.view_m)
@@ -290,7 +291,7 @@ def entry_speed(
         k, apart = next_askew(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
-    # Behind the last vehicle, or with a fixed speed, the departure waits for that speed.
+    # Behind the last vehicle, or with a fixed speed, the departure waits until that speed is safe.
     code = departure["speed_code"]
     slows = (code == SPEED_MAX or code == SPEED_RANDOM) and departure["pos_code"] != POS_LAST
     if safe < 0.0 or (safe < wanted and not slows):
@@ -310,7 +311,7 @@ def _safe_at_fork(
 ) -> float:
     """Return the safe speed in m/s behind vehicles that have just turned off from the lane.
 
-    Only vehicles with their rear before the fork count. -1: one is too near; inf: there is none.
+    Only vehicles whose rear is before the fork count. -1: a vehicle is too near; inf: no vehicle.
     """
     here = roads.lanes[lane]
     to_end = here["length_m"] - s
@@ -331,7 +332,7 @@ def _safe_at_fork(
 
 @kernel
 def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: Scratch) -> float:
-    """Return the mean speed in m/s of vehicles on a lane in view of `s`; the limit if none."""
+    """Return the mean speed in m/s of vehicles on a lane in view of `s`; else the limit."""
     total, number = 0.0, 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
         other = scratch.entries[k]
@@ -343,7 +344,7 @@ def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: S
 
 @kernel
 def _safe_behind(kind: np.void, leader: np.void, to_centre: float) -> float:
-    """Return the safe speed in m/s behind an entry `to_centre` m ahead; -1: it is too near."""
+    """Return the safe speed in m/s behind an entry `to_centre` m ahead; -1: too near."""
     gap = to_centre - leader["half"]
     if gap < ENTER_GAP_M:
         return -1.0
@@ -384,9 +385,9 @@ def _one_that_turns_off_brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Return whether a vehicle on another turn from a preceding lane brakes hard for an entrant.
+    """Return whether a vehicle on another turn from a previous lane brakes hard for an entrant.
 
-    Such vehicles leave for another lane, but their bodies still overlap the entrant's lane.
+    Such vehicles turn to another lane, but their bodies still cover a part of the entrant's lane.
     """
     half = 0.5 * kind["length"]
     here = roads.lanes[lane]

@@ -1,7 +1,7 @@
-"""Rows that the caller poses or drives: their moves, their places on the lanes, and new rows.
+"""Rows that the caller poses or drives: motion, positions on the lanes, and new rows.
 
-The lane of such a row depends on its pose only. A body that touches no lane has its nearest lane,
-and is farther from it than `LOST_M`, so that drivers ignore it.
+The lane of such a row depends only on its pose. A body that touches no lane is assigned to the
+nearest lane, at a distance above `LOST_M`, so that drivers ignore it.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.motion import MAX_SPEED_MPS, account, before_tick
 from cavmarl.driving.kernels.motion.tracking import LEVEL_M, side_lane
 
-OFF_M = LOST_M + 1.0  # least distance from its lane of a body that touches no lane
-# Added to the distance of a lane that the body does not touch, on which its centre is not, or that
-# leads the other way.
+OFF_M = LOST_M + 1.0  # smallest distance from its lane of a body that touches no lane
+# Penalties on the distance of a lane: the body does not touch it, its centre is not on it, or it
+# leads in the opposite direction.
 UNTOUCHED_M = 1000.0
 BESIDE_M = 100.0
 OPPOSITE_M = 20.0
-ASKEW_M = 4.0  # times 1 - cos of the angle to the lane
+ASKEW_M = 4.0  # penalty: this times 1 - cos of the angle to the lane
 
 
 @inlined_kernel
@@ -40,7 +40,7 @@ def _is_within(grid: LaneGrid, column: int, line: int) -> bool:
 
 @kernel
 def find_place(roads: RoadArrays, grid: LaneGrid, row: np.void) -> bool:
-    """Set lane, s, d, link and side lane of a body for its pose. Return whether it is on a lane."""
+    """Set lane, s, d, link and side lane of a body by its pose; return whether it is on a lane."""
     column = int((row["x"] - grid.min_x) // grid.cell_m)
     line = int((row["y"] - grid.min_y) // grid.cell_m)
     best = -1
@@ -97,7 +97,7 @@ def find_place(roads: RoadArrays, grid: LaneGrid, row: np.void) -> bool:
 
 @kernel
 def _stand(roads: RoadArrays, grid: LaneGrid, row: np.void, z: float, pitch: float) -> None:
-    """Set the place on the lanes, and the height and the pitch where they are NaN."""
+    """Set the position on the lanes, and height and pitch if they are NaN."""
     is_on_lane = find_place(roads, grid, row)
     lane = roads.lanes[row["lane"]]
     _, _, ground, _, _, slope = lane_pose(
@@ -113,7 +113,7 @@ def _stand(roads: RoadArrays, grid: LaneGrid, row: np.void, z: float, pitch: flo
 def _drive(
     row: np.void, kind: np.void, told: np.void, accel_limit: float, steering_limit: float, dt: float
 ) -> None:
-    """Move a driven row as the bicycle of an agent: braking ends at a standstill."""
+    """Move a driven row like the bicycle of an agent; braking ends at a standstill."""
     throttle = clamp(told["throttle"], -accel_limit, accel_limit)
     steering = clamp(told["steering"], -steering_limit, steering_limit)
     throttle = clamp(throttle, -kind["most_decel"], kind["most_accel"])
@@ -133,7 +133,7 @@ def _drive(
 
 @inlined_kernel
 def _approach(row: np.void, told: np.void, ticks_left: int, dt: float) -> None:
-    """Move a posed row by its share of the way to its pose."""
+    """Move a posed row by this tick's share of the distance to its pose."""
     share = 1.0 / ticks_left
     x = row["x"]
     y = row["y"]
@@ -174,18 +174,18 @@ def move_external(
     grid: LaneGrid,
     held: NDArray[np.void],  # EXTERNAL (W, E), the present commands
     leaving: NDArray[np.bool_],  # (W, E) slots whose vehicles leave in this tick
-    first: int,  # the rows of the slots [first, end) move
+    first: int,  # only the rows of the slots [first, end) move
     end: int,
     zoned: ZoneState,  # the owned rows of `side` are written
     side: int,
     ticks: NDArray[np.int64],  # (W,)
     ticks_per_step: int,
-    reach_m: float,  # a row farther from its pose leaves, and enters there again
-    accel_limit: float,  # m/s², of the throttle
-    steering_limit: float,  # rad, of the front wheels
+    reach_m: float,  # a row farther from its pose than this leaves, and enters again at the pose
+    accel_limit: float,  # limit of the throttle, m/s²
+    steering_limit: float,  # limit of the front wheels, rad
     dt: float,
 ) -> int:
-    """Move external rows of all zones for one tick, and mark those that leave as arrived.
+    """Move external rows of all zones for one tick, and mark leaving rows as arrived.
 
     Returns the number of rows that leave.
     """
@@ -223,7 +223,7 @@ def move_external(
 
 @kernel
 def enter_at(roads: RoadArrays, grid: LaneGrid, told: np.void, row: np.void) -> None:
-    """Set the body and the pose of a new row to those of an EXTERNAL."""
+    """Copy the body and the pose of an EXTERNAL to a new row."""
     row["vtype"] = int(told["vtype"])
     row["length"] = told["length"]
     row["width"] = told["width"]
@@ -244,10 +244,10 @@ def write_external(
     roads: RoadArrays,
     grid: LaneGrid,
     told: np.void,  # EXTERNAL
-    vehicle: int,  # its id
+    vehicle: int,  # id of the vehicle
     slot: int,
-    nowhere: int,  # the way of a vehicle without a route
-    key: np.uint64,  # of the world
+    nowhere: int,  # VEHICLE["way"] of a vehicle without a route
+    key: np.uint64,  # random key of the world
     tick: int,
     row: np.void,  # VEHICLE, blank; written
 ) -> None:
@@ -273,14 +273,14 @@ def add_external(
     coming: NDArray[np.bool_],  # (W, E) slots whose vehicles enter in this tick
     ids: NDArray[np.int64],  # (W, E), written
     blank: NDArray[np.void],  # VEHICLE (1,), template of every vehicle's record
-    nowhere: int,  # the way of a vehicle without a route
+    nowhere: int,  # VEHICLE["way"] of a vehicle without a route
     departures: DepartureQueue,  # passing is written
     ticks: NDArray[np.int64],  # (W,)
     keys: NDArray[np.uint64],  # (W,)
 ) -> None:
     """Add a row with a new id to `departures.passing` for each vehicle that enters.
 
-    A slot gets at most one vehicle in a tick, so tick and slot make a new id.
+    A slot gets at most one vehicle per tick, so tick and slot determine a new id.
     """
     for w in range(coming.shape[0]):
         for slot in range(coming.shape[1]):

@@ -1,6 +1,6 @@
 """Removal of vehicles from their shard when their trip has ended.
 
-`demand_generator.settle` counts these vehicles and orders their successors.
+`demand_generator.settle` counts these vehicles and orders replacements.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def _has_ended(row: np.void, driver: int, ticks_per_step: int) -> bool:
 
 @kernel
 def _remove_outer(worlds: Worlds, w: int, rows: NDArray[np.void], i: int, last: int) -> None:
-    """Remove row i from the rows that other zones may see, and renumber row `last` to i."""
+    """Remove row i from the list of rows that other zones may see, and rename row `last` to i."""
     outer = worlds.outer[w]
     num = worlds.num_outer[w]
     place = 0
@@ -58,14 +58,14 @@ def leave(
     driver: int,
     ticks_per_step: int,
 ) -> None:
-    """Move owned vehicles of one driver kind whose trip has ended into `departures.passing`.
+    """Move owned vehicles of one kind of driver whose trip has ended to `departures.passing`.
 
     Trips of background vehicles end at arrival. Trips of agents that have acted, and of background
     vehicles that a network drives, also end after a collision or off the road.
 
     `departures`: `passing` is written. `worlds`: the numbers of rows are written. `rows`: VEHICLE
-    (W, C), the rows to take from. `ticks_per_step`: ticks of a step; agents that entered within
-    the last step have not acted.
+    (W, C), the rows from which vehicles are removed. `ticks_per_step`: ticks of a step; agents that
+    entered within the last step have not acted.
     """
     for w in range(worlds.ticks.shape[0]):
         is_background = driver == DRIVER_BACKGROUND or driver == DRIVER_LEARNED

@@ -1,6 +1,6 @@
-"""SUMO's vehicles as rows: each at the place that SUMO reports for the same tick.
+"""SUMO's vehicles as rows, each at the place that SUMO reports for the same tick.
 
-SUMO reports the middle of the front bumper, its place on the lane, and degrees clockwise from
+SUMO reports the middle of the front bumper, its position on the lane, and degrees clockwise from
 north. A row describes the centre of the body.
 """
 
@@ -27,18 +27,18 @@ from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_bef
 from cavmarl.driving.kernels.motion.tracking import side_lane
 
 BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
-BLINKS_RIGHT = 1  # bits of SUMO's vehicle signals
+BLINKS_RIGHT = 1  # bit of SUMO's vehicle signals, like the next constant
 BLINKS_LEFT = 2
-EDGES_BEHIND = 2  # the centre is at most this many edges behind the front's edge, or one ahead
+EDGES_BEHIND = 2  # the centre is at most this many edges behind the front's edge, or one beyond
 
 
 class Paths(NamedTuple):
-    """Routes of SUMO as ways of this package, one per route and vehicle class."""
+    """SUMO's routes as values of VEHICLE["way"], one path per route and vehicle class."""
 
-    first: NDArray[np.int64]  # (P + 1,) path p has the rows [first[p], first[p + 1]) below
-    edges: NDArray[np.int32]  # EDGE rows, -1: not on this map
+    first: NDArray[np.int64]  # (P + 1,) path p has the rows [first[p], first[p + 1]) of:
+    edges: NDArray[np.int32]  # EDGE rows; -1: not on this map
     ways: NDArray[np.int64]  # VEHICLE["way"] on that edge
-    nowhere: int  # the way of a vehicle on no edge of its route
+    nowhere: int  # VEHICLE["way"] of a vehicle on no edge of its route
 
 
 @kernel
@@ -54,8 +54,8 @@ def mirror(
 ) -> int:
     """Update a world's mirrored rows, in all zones, to the state that SUMO reports.
 
-    `seen`: SEEN (n,) by ascending number; the route field holds paths. `zoned`: the owned rows of
-    `side` are written; vehicles that SUMO no longer has are marked as arrived. `side`: 0 or 1.
+    `seen`: SEEN (n,) by ascending number; the field `route` contains paths. `zoned`: the owned rows
+    of `side` are written; vehicles that SUMO has removed are marked as arrived. `side`: 0 or 1.
 
     Returns the number of arrived vehicles.
     """
@@ -150,14 +150,14 @@ def send_on(
     side: int,
     w: int,
 ) -> int:
-    """Put the package's drivers on other routes that SUMO has found for them.
+    """Put vehicles of this package on the new routes that SUMO has found for them.
 
-    A vehicle that is on no edge of its new route keeps the old one.
+    A vehicle that is on no edge of its new route keeps the old route.
 
     `numbers`: (n,) VEHICLE["order"] of the vehicles, ascending. `chosen`: (n,) their new paths.
     `zoned`: the owned rows of `side` are written. `side`: 0 or 1.
 
-    Returns the number of vehicles that take their new route.
+    Returns the number of vehicles on a new route.
     """
     taken = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -188,7 +188,7 @@ def find_blocked(
     w: int,
     out: NDArray[np.void],
 ) -> int:
-    """Copy the owned rows of a demand whose way leads over a closed road into `out`.
+    """Copy the owned rows of a demand whose route leads over a closed road to `out`.
 
     Rows in a junction or with a stop ahead are left out. `lanes`: LANE (L,) of the world.
 
@@ -212,7 +212,7 @@ def find_blocked(
 def _is_blocked(
     roads: RoadArrays, travel: TripTables, lanes: NDArray[np.void], row: np.void
 ) -> bool:
-    """Return whether a road ahead on the way of a row outside junctions is closed to it."""
+    """Return whether a road ahead on the route of a row outside junctions is closed to it."""
     permissions = travel.types[row["vtype"]]["permissions"]
     lane = row["lane"]
     edge = roads.lanes[lane]["edge"]
@@ -242,7 +242,7 @@ def _is_blocked(
 def _is_closed(
     roads: RoadArrays, lanes: NDArray[np.void], edge: int, permissions: np.uint32
 ) -> bool:
-    """Return whether a vehicle may use lanes of an edge on the map, but none of them now."""
+    """Return whether all lanes of an edge that a vehicle may use on the map are now closed."""
     first = roads.edges[edge]["first_lane"]
     is_open = False
     was_open = False
@@ -299,7 +299,7 @@ def _stand_in(
 
 @inlined_kernel
 def _place_centre(roads: RoadArrays, seen: np.void, row: np.void) -> None:
-    """Set lane, s and d of the centre, which may be on a lane before that of the front."""
+    """Set lane, s and d of the centre, which may be on a lane before the front's lane."""
     lane = seen["lane"]
     here = roads.lanes[lane]
     if here["internal"]:
@@ -330,7 +330,7 @@ def _edge_to_be(roads: RoadArrays, lane: int) -> int:
 
 @inlined_kernel
 def _way_at(roads: RoadArrays, paths: Paths, path: int, at: int, lane: int) -> int:
-    """Return the way of a vehicle whose front is on the `at`-th edge of its route."""
+    """Return VEHICLE["way"] of a vehicle whose front is on the `at`-th edge of its route."""
     edge = _edge_to_be(roads, lane)
     first = paths.first[path]
     num = paths.first[path + 1] - first

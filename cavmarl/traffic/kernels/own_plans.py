@@ -1,4 +1,4 @@
-"""Vehicles that take the plans of their world, because its lanes differ from the map."""
+"""Vehicles that follow plans of their own world, because its lanes differ from the map."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def follows_plan(row: np.void) -> bool:
 
 @kernel
 def prolong_trip(roads: RoadArrays, travel: TripTables, row: np.void) -> None:
-    """Give an agent's trip at least the time that its present way takes from here."""
+    """Extend an agent's trip to at least the time that the present route takes from here."""
     if row["due"] < 0 or travel.trip_horizon <= 0.0 or roads.lanes[row["lane"]]["internal"]:
         return
     most_s = route_time_s(roads, travel, row, row["tick"] * travel.tick_s)
@@ -35,12 +35,12 @@ def prolong_trip(roads: RoadArrays, travel: TripTables, row: np.void) -> None:
 
 @kernel
 def take_plan(roads: RoadArrays, travel: TripTables, row: np.void, w: int) -> int:
-    """Put a vehicle on the present plan to its goal; return 1 if this changes its route, else 0.
+    """Put a vehicle on the present plan to its goal; return 1 if its route changes, else 0.
 
-    A background vehicle that cannot change to another link or lane any more keeps its plan until
-    the next call. A longer way does not count as lost progress of an agent.
+    A background vehicle that can no longer change to another link or lane keeps its plan until the
+    next call. A longer route does not count as lost progress of an agent.
 
-    `roads`: of world w. `row`: VEHICLE that follows a plan, written.
+    `roads`: roads of world w. `row`: VEHICLE that follows a plan, written.
     """
     lane = row["lane"]
     way = row["goal"] * roads.lanes.shape[0] + travel.shifts[w]
@@ -66,9 +66,9 @@ def take_plan(roads: RoadArrays, travel: TripTables, row: np.void, w: int) -> in
 
 @kernel
 def renew_distances(roads: RoadArrays, travel: TripTables, worlds: Worlds, w: int) -> None:
-    """Set the remaining distances of a world's agents to those of its plans, which have changed.
+    """Update the remaining distances of a world's agents after its plans have changed.
 
-    `worlds`: the owned committed rows are written, before a step begins.
+    `worlds`: the owned committed rows are written. Call before a step begins.
     """
     here = roads if shares_lanes(worlds.lanes) else roads_in(roads, worlds.lanes, w)
     for i in range(worlds.num_owned[w]):

@@ -1,7 +1,7 @@
-"""Searches for ways of single vehicles: which vehicles search, costs of ways, storage.
+"""Searches for routes of single vehicles: which vehicles search, costs, and storage.
 
-A way found at run time is stored in a slot: room for the steps of one way at the end of
-`TripTables.steps`. Each slot belongs to a world; the world's vehicles determine which are free.
+A route found at run time is stored in a slot: room for the steps of one route at the end of
+`TripTables.steps`. Each slot belongs to a world; a slot that no vehicle of the world uses is free.
 
 The measured speed of each edge is sampled, smoothed, and used instead of the limit, as in SUMO's
 rerouting device (Behrisch, Krajzewicz, Wang: "Comparing performance and quality of traffic
@@ -23,7 +23,7 @@ from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
-REACTION_S = 1.0  # s at the present speed before a driver brakes for another turn
+REACTION_S = 1.0  # s at the present speed before a driver brakes for a new turn
 CHANGE_ROOM_M = 30.0  # m needed for each lane change before the next junction
 
 
@@ -38,15 +38,15 @@ def find_asking(
     changed_at: int,
     asking: NDArray[np.int64],
 ) -> int:
-    """List the vehicles that search for a way in this second, by ascending id.
+    """List the vehicles that search for a route in this second, by ascending id.
 
-    These are background vehicles of the demand that are outside junctions, have no stop ahead, and
-    are due for a search, have come to an edge with rerouters, or have not reacted to the last
-    change of lanes.
+    These are background vehicles of the demand outside junctions and without a stop ahead that are
+    due for a search, have reached an edge with rerouters, or have not reacted to the last change of
+    lanes.
 
     `has_rules`: (num_edges,) whether an edge has rerouters. `looks`: LOOK, by VEHICLE["order"];
-    edges without rerouters are noted as seen.
-    `changed_at`: tick of the last change, or -1. `asking`: receives the rows of the vehicles.
+    edges without rerouters are marked as seen. `changed_at`: tick of the last change, or -1.
+    `asking`: receives the rows of the vehicles.
 
     Returns the number of vehicles.
     """
@@ -84,7 +84,7 @@ def find_way(
     steps: NDArray[np.void],
     cost: NDArray[np.float64],
 ) -> int:
-    """Write the steps of the way from a lane along a plan.
+    """Write the steps of the route from a lane along a plan.
 
     Args:
         roads: the road arrays, with the current speeds as limits.
@@ -96,7 +96,7 @@ def find_way(
         cost: scratch, as long as `steps`.
 
     Returns:
-        the number of steps written; 0 if there is no way or it does not fit into `steps`.
+        The number of steps written; 0 if there is no route or it does not fit into `steps`.
     """
     if plan[lane]["to_go"] == math.inf:
         return 0
@@ -113,9 +113,9 @@ def find_way(
 
 @kernel
 def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -> float:
-    """Return seconds from the start of a lane to the end of its way, including lane changes.
+    """Return the time in s from the start of a lane to the end of a route, with lane changes.
 
-    `roads`: the road arrays, with the current speeds. `steps`: PLAN that contains the way. `way`:
+    `roads`: the road arrays, with the current speeds. `steps`: PLAN that contains the route. `way`:
     VEHICLE["way"].
     """
     total: float = 0.0
@@ -143,10 +143,10 @@ def time_left(roads: RoadArrays, steps: NDArray[np.void], way: int, lane: int) -
 def has_room(
     roads: RoadArrays, travel: TripTables, row: np.void, steps: NDArray[np.void], way: int
 ) -> bool:
-    """Return whether a vehicle can change to another way from its lane without hard braking.
+    """Return whether a vehicle can change to another route from its lane without hard braking.
 
-    `travel`: types, and the present way. `row`: VEHICLE outside junctions. `steps`: PLAN that
-    contains the other way. `way`: its place there, as VEHICLE["way"].
+    `travel`: types, and the present route. `row`: VEHICLE outside junctions. `steps`: PLAN that
+    contains the other route. `way`: value of VEHICLE["way"] for that route.
     """
     step = steps[way + row["lane"]]
     present = travel.steps[row["way"] + row["lane"]]
@@ -168,7 +168,7 @@ def mark_slots(
     slot_steps: int,
     used: NDArray[np.bool_],
 ) -> None:
-    """Mark the slots of a world that hold the way of a vehicle.
+    """Mark the slots of a world that vehicles use.
 
     `first_slot`: PLAN row of the world's first slot. `used`: (num_slots,), written.
     """
@@ -181,7 +181,7 @@ def mark_slots(
 
 @kernel
 def slot_of(roads: RoadArrays, row: np.void, first_slot: int, slot_steps: int) -> int:
-    """Return the slot of a vehicle's way, or -1 if the way is not in a slot."""
+    """Return the slot of a vehicle's route, or -1 if the route is not in a slot."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
@@ -200,11 +200,11 @@ def take_slot(
     slot_steps: int,
     used: NDArray[np.bool_],
 ) -> bool:
-    """Store the steps of a new way in a slot, and put the vehicle on it.
+    """Store the steps of a new route in a slot, and put the vehicle on that route.
 
-    `travel`: its steps from `first_slot` on are written. `row`: VEHICLE, written. `found`: PLAN,
-    the steps; the steps of the vehicle's edge come first. `first_slot`: PLAN row of the world's
-    first slot. `used`: (num_slots,) occupied slots, written.
+    `travel`: steps in the slots are written. `row`: VEHICLE, written. `found`: PLAN, the steps; the
+    steps of the vehicle's edge come first. `first_slot`: PLAN row of the world's first slot.
+    `used`: (num_slots,) occupied slots, written.
 
     Returns whether a slot was free.
     """
@@ -225,13 +225,13 @@ def take_slot(
 
 @kernel
 def put_on_way(travel: TripTables, row: np.void, way: int) -> None:
-    """Put a vehicle outside junctions on another way from its lane on."""
+    """Put a vehicle outside junctions on another route that starts from its lane."""
     row["way"] = way
     row["leg"] += 1
     row["to_go"] = travel.steps[way + row["lane"]]["to_go"] - row["s"]
 
 
-CLOSED_S = 1e9  # s to drive along a closed lane; any way around it is faster
+CLOSED_S = 1e9  # s to drive along a closed lane; any detour is faster
 LEAST_MPS = 0.001  # minimum speed, so that a jam has a finite travel time
 
 
@@ -242,7 +242,7 @@ def _millimetres(speed: float) -> int:
 
 @kernel
 def limit_speeds(roads: RoadArrays, past: NDArray[np.int32], speed_sums: NDArray[np.int64]) -> None:
-    """Set all samples to the speeds of an empty map.
+    """Set all samples to the speed limits, as on an empty map.
 
     `past`: (N, num_edges) mm/s, written. `speed_sums`: (num_edges,) mm/s, written: the sums over
     the N samples.
@@ -268,13 +268,14 @@ def sample_speeds(
     lane_counts: NDArray[np.int64],
     lane_sums: NDArray[np.int64],
 ) -> None:
-    """Sample the mean speed of every edge; the sample replaces the oldest one.
+    """Sample the mean speed of every edge; the sample replaces the oldest sample.
 
-    A lane without vehicles counts as one vehicle at its limit; vehicles that make a stop or follow
-    a script do not count.
+    A lane without vehicles counts as one vehicle at the speed limit; vehicles at a stop and
+    scripted vehicles do not count.
 
     `number`: samples since the reset. `past`: (N, num_edges) the last samples in mm/s.
-    `speed_sums`: (num_edges,) their sums. `lane_counts`: (L,) scratch. `lane_sums`: (L,) scratch.
+    `speed_sums`: (num_edges,) sums of these samples. `lane_counts`: (L,) scratch. `lane_sums`: (L,)
+    scratch.
     """
     lane_counts[:] = 0
     lane_sums[:] = 0
@@ -310,7 +311,7 @@ def slow_lanes(
     permission: int,
     lanes: NDArray[np.void],
 ) -> None:
-    """Write the current speeds into a copy of the lanes, for plans that consider traffic.
+    """Write the current speeds to a copy of the lanes, for plans that consider traffic.
 
     Args:
         roads: the road arrays.

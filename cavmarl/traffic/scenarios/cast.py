@@ -1,6 +1,6 @@
 """`Cast`: the agents and actors of a scene as rows of a world.
 
-The first agent starts in the conflict, the other agents start behind it.
+The first agent starts in the conflict; the other agents start behind it.
 """
 
 from __future__ import annotations
@@ -36,16 +36,16 @@ from cavmarl.traffic.scenarios.movement_scripts import actor_types, bodies_of, c
 from cavmarl.traffic.scenarios.scene import Scene, Seat
 from cavmarl.traffic.scenarios.streets import Streets
 
-APART_M = 6.0  # m between the centres of consecutive agents,
-APART_S = 2.0  # plus the distance driven in this time
+APART_M = 6.0  # m between the centres of consecutive agents, plus …
+APART_S = 2.0  # … the distance driven in this time
 START_M = 5.0  # m at the start of a lane where no vehicle is placed
 
 
 def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
-    """Return the seats of `num` agents, that of the scene first.
+    """Return the seats of `num` agents, starting with the seat of the scene.
 
-    The other agents follow on the approach of the first, with its speed and goal. Their lanes are
-    outside junctions, and no actor rides along them, because actors do not react to vehicles.
+    The other agents follow on the approach of the first, with the same speed and goal. Their lanes
+    are outside junctions, and no actor rides along them, because actors do not react to vehicles.
 
     Raises ConfigError: there is no room for this many agents behind the first.
     """
@@ -73,7 +73,7 @@ def take_seats(streets: Streets, scene: Scene, num: int) -> list[Seat]:
     return seats
 
 
-SEAT_CLEAR_M = 30.0  # m around the seat of every agent except the first
+SEAT_CLEAR_M = 30.0  # m that are kept clear around every seat except the first
 
 
 @dataclass(frozen=True)
@@ -85,9 +85,9 @@ class Cast:
     firsts: list[int]  # first FRAME of each actor
     types: NDArray[np.void]  # VTYPE rows of all bodies
     vtypes: list[int]  # (n,) VTYPE row of each actor, among all types of a world
-    seats: list[Seat]  # of the agents
-    goals: list[int]  # row of the plans' table, of each agent
-    grid: LaneGrid  # of the map
+    seats: list[Seat]  # seats of the agents
+    goals: list[int]  # row of the table of plans of each agent
+    grid: LaneGrid  # grid of the map
 
     @staticmethod
     def of(
@@ -100,8 +100,8 @@ class Cast:
     ) -> Cast:
         """Return the cast of a scene.
 
-        `goals`: row of the plans' table by EDGE. `first_type`: number of vehicle types before those
-        of the actors. `num_agents`: agents per world.
+        `goals`: row of the table of plans by EDGE. `first_type`: number of vehicle types before the
+        actors' types. `num_agents`: agents per world.
 
         Raises ConfigError: the scene has no room for this many agents.
         """
@@ -125,8 +125,8 @@ class Cast:
 
         Other vehicles in the scene are removed. Agents keep their ids, and actors get the next ids.
 
-        `worlds`: the rows of world w are written; it is not divided yet. `blank`: VEHICLE (1,),
-        template of every vehicle's record.
+        `worlds`: the rows of world w are written; the world is not yet divided. `blank`: VEHICLE
+        (1,), template of every vehicle's record.
         """
         rows = worlds.rows[w]
         others = rows[: worlds.num_owned[w]]
@@ -169,12 +169,12 @@ class Cast:
         w: int,
         blank: NDArray[np.void],
         first_slot: int,  # slot of the first replayed road user
-        first_commands: NDArray[np.void],  # EXTERNAL (L,), the state of those at the reset
-        nowhere: int,  # the way of a vehicle without a route
+        first_commands: NDArray[np.void],  # EXTERNAL (L,), state of the replayed users at the reset
+        nowhere: int,  # VEHICLE["way"] of a vehicle without a route
     ) -> None:
-        """Place the logged vehicles that are present at the reset, besides those of the agents.
+        """Place the logged vehicles that are present at the reset, except agents' vehicles.
 
-        Vehicles with an order get the next ids, replayed vehicles the ids of their slots.
+        Vehicles with an order get the next ids; replayed vehicles get the ids of their slots.
         """
         log = self.scene.log
         assert log is not None, "the scene of a file has a log"
@@ -214,7 +214,7 @@ class Cast:
         return clear
 
     def _departure(self, roads: RoadArrays, agent: int, seat: Seat) -> np.void:
-        """Return a DEPARTURE with the fields that the entry of an agent reads."""
+        """Return a DEPARTURE with the fields that the entry of an agent uses."""
         departure: np.void = np.zeros(1, DEPARTURE)[0]
         for name in ("order", "stop", "stops_end"):
             departure[name] = -1

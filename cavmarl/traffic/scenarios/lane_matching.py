@@ -8,9 +8,9 @@ from cavmarl.core.math.elementary import cos_sin
 from cavmarl.roads.network import CARS, RoadNetwork
 from cavmarl.roads.routing import lane_grid
 
-ON_LANE_M = 2.0  # farther from the middle of a lane, a vehicle is not on it
-_ASKEW_M = 4.0  # times 1 - cos of the angle to the lane
-_ALONG_COS = 0.7  # 45°
+ON_LANE_M = 2.0  # a vehicle on a lane is at most this far from the middle of the lane
+_ASKEW_M = 4.0  # penalty in the ranking: this times 1 - cos of the angle to the lane
+_ALONG_COS = 0.7  # cosine of the largest angle to the lane, 45°
 
 
 class LanePlace(NamedTuple):
@@ -49,14 +49,14 @@ class LaneMatcher:
         return [LanePlace(lane, s, d) for _, lane, s, d in sorted(found)]
 
     def place(self, x: float, y: float, heading: float) -> LanePlace | None:
-        """Return the best place of a pose; None: it is on no lane in its direction."""
+        """Return the best place of a pose; None if the pose is on no lane of its direction."""
         return next(iter(self.lanes(x, y, heading)), None)
 
     def way(self, start: int, end: int, most: int = 4) -> list[int] | None:
-        """Return the edges from a lane's edge to another one, over at most `most` junctions.
+        """Return the edges from a lane's edge to another lane's, over at most `most` junctions.
 
-        A lane over a junction stands for the lane before it if it is the start, otherwise for the
-        lane after it. None: there is no such way.
+        If the start is a lane over a junction, the lane before it is used; for the end, the lane
+        after it. None: there is no such path.
         """
         first, last = self.edge(start, is_start=True), self.edge(end, is_start=False)
         paths = [[first]]

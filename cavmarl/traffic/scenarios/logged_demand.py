@@ -1,4 +1,4 @@
-"""The demand of a logged scene: vehicles that built-in drivers drive along their logged ways."""
+"""The demand of a logged scene: vehicles whose built-in drivers follow the logged routes."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from cavmarl.traffic.scenarios.scene import LoggedTraffic
 
 
 def check_logged_world(config: EnvConfig) -> None:
-    """Check the keys that a logged scene excludes. Raises ConfigError."""
+    """Raise ConfigError if the configuration has keys that a logged scene excludes."""
     traffic, population = config.traffic, config.population
     for key, value, allowed in (
         ("population.background", population.background, 0),
@@ -33,7 +33,7 @@ def check_logged_world(config: EnvConfig) -> None:
 def demand_of_log(
     log: LoggedTraffic, network: RoadNetwork, traffic: TrafficConfig
 ) -> DemandFile | None:
-    """Return the demand of the vehicles that react; None: there are none.
+    """Return the demand of the vehicles that react; None if no vehicle reacts.
 
     Raises ConfigError: `traffic.model` does not name one car-following model.
     """
@@ -61,7 +61,7 @@ def _routes(traffic: LoggedTraffic, network: RoadNetwork, model: str) -> str:
         edges = " ".join(network.edge_ids[edge] for edge in one.edges)
         front_m = min(seat.s + 0.5 * body.length, float(lane["length_m"]))
         index, position = int(lane["index"]), f"{max(front_m, 0.0):.3f}"
-        if lane["internal"]:  # it is placed at the reset
+        if lane["internal"]:  # the vehicle is placed at the reset
             index, position = 0, "0"
         limit = float(lane["speed_mps"])
         lines += [

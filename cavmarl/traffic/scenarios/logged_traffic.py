@@ -1,7 +1,7 @@
 """The vehicles of a logged scene as agents, replayed vehicles and built-in drivers.
 
-A replayed vehicle is posed as if the caller of the environment posed it (`ExternalComponent`). A
-vehicle that reacts is a departure of a demand file, with the logged way as its route.
+A replayed vehicle is posed as if by the caller of the environment (`ExternalComponent`). A vehicle
+that reacts is a departure of a demand file, with the logged path as its route.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ from cavmarl.traffic.scenarios.scene import (
 )
 
 TRUCK_M = 7.0  # a longer vehicle is a truck
-GOAL_STEPS = 10  # samples between two places that are tried as the goal of an agent
+GOAL_STEPS = 10  # number of samples between two places that are tried as an agent's goal
 _LARGEST = EXTERNAL_TYPES["bus"]
 
 
@@ -85,7 +85,7 @@ def _planned(
 
 
 class _Casting:
-    """Chooses what each track becomes."""
+    """Chooses for each track: an agent, a replayed vehicle, or a vehicle that reacts."""
 
     def __init__(self, scene: LoggedScene, network: RoadNetwork, first: int) -> None:
         self._log, self._network, self._first = scene, network, first
@@ -127,7 +127,7 @@ class _Casting:
         return Scene(self._log.name, body.x, body.y, seats[0], (), seats=seats, log=traffic)
 
     def _seated(self, wanted: Sequence[str], agents: int) -> dict[str, Seat]:
-        """Return the seats of the agents, by track."""
+        """Return the agents' seats by track."""
         if wanted:
             if len(wanted) != agents:
                 raise ConfigError(
@@ -163,12 +163,12 @@ class _Casting:
             if track.name != name and isinstance(self._seat(track), Seat)
         ]
         raise ConfigError(
-            f"scenario.seats: '{name[:80]}' {seat}; name another track, for example "
+            f"scenario.seats: '{name[:80]}' {seat}; use another track, for example "
             f"{', '.join(some[:8]) or 'none is suitable'}, or change scenario.params.start_s"
         )
 
     def _seat(self, track: Track) -> Seat | str:
-        """Return the seat in a track's vehicle, or why there is none."""
+        """Return the seat in a track's vehicle, or the reason why an agent cannot drive it."""
         if track.kind != "vehicle":
             return f"is a {track.kind}, not a vehicle"
         if not track.valid[self._first]:
@@ -178,7 +178,7 @@ class _Casting:
             return "is not on a lane in its direction"
         if self._overlaps(track):
             return f"overlaps another road user at {self._first * self._log.step_s:g} s"
-        # Where lanes diverge, the lane that leads farthest along the log is that of the vehicle.
+        # Where lanes diverge, choose the lane that leads farthest along the log.
         goals = [self._goal(track, place) for place in places]
         best = max(range(len(places)), key=lambda k: (goals[k][0], -k))
         return self._seat_at(track, places[best], self._first, goals[best][1])
@@ -201,7 +201,7 @@ class _Casting:
         return bool(boxes_meet(poses, half)[number].any())
 
     def _goal(self, track: Track, start: LanePlace) -> tuple[int, int]:
-        """Return the last time whose logged edge a way leads to, and that edge."""
+        """Return the last time at which the logged edge can be reached, and that edge."""
         times = track.times[track.times >= self._first][::-1]
         tried: set[int] = set()
         for time in times[::GOAL_STEPS].tolist():
@@ -218,7 +218,7 @@ class _Casting:
         return self._first, self._matcher.edge(start.lane, is_start=False)
 
     def _reaction(self, track: Track) -> ReactingVehicle | None:
-        """Return the way of a vehicle that drives by itself; None: it has to be replayed."""
+        """Return the route of a vehicle that reacts; None if it has to be replayed."""
         times = track.times[track.times >= self._first]
         first = int(times[0])
         start = self._place(track, first)
@@ -250,7 +250,7 @@ class _Casting:
 
 
 def clipped_size(track: Track) -> tuple[float, float, float]:
-    """Return length, width and height, at most those of a bus."""
+    """Return length, width and height, limited to the size of a bus."""
     length, width, height = track.size_m
     return (
         min(length, _LARGEST.length),
@@ -260,7 +260,7 @@ def clipped_size(track: Track) -> tuple[float, float, float]:
 
 
 def speeds_of(track: Track, step_s: float) -> NDArray[np.float64]:
-    """Return (T,) the speed along the heading, of the move to each sample or from the first one."""
+    """Return (T,) speeds along the heading, to each sample (for the first sample, from it)."""
     moves = np.diff(track.poses[:, :2], axis=0)
     heading = track.poses[:, 2].tolist()
     speeds = np.zeros(len(track.valid))
@@ -285,10 +285,10 @@ def type_of(track: Track) -> str:
 def logged_commands(
     traffic: LoggedTraffic | None, type_rows: Mapping[str, int], step_s: float
 ) -> NDArray[np.void]:
-    """Return EXTERNAL (K + 2, L): the commands to the replayed road users.
+    """Return EXTERNAL (K + 2, L): the commands for the replayed road users.
 
-    Row 0 is their state at the reset, row k the command of step k - 1. The last row removes all.
-    `step_s`: duration of a step, between whose ends poses are interpolated.
+    Row 0 is the state at the reset, and row k the command of step k - 1. The last row removes all
+    users. `step_s`: duration of a step, between whose ends poses are interpolated.
     """
     if traffic is None:
         return np.zeros((1, 0), dtype=EXTERNAL)

@@ -18,7 +18,7 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import registratio
 from cavmarl.roads.network import RoadNetwork
 
 ACCEL_MPS2 = 2.5  # acceleration and braking of actors
-CREEP_MPS = 0.2  # minimum speed on the last centimetres before standstill
+CREEP_MPS = 0.2  # minimum speed in the last centimetres before standstill
 
 
 class Pose(NamedTuple):
@@ -28,19 +28,19 @@ class Pose(NamedTuple):
     y: float
     heading: float
     speed: float  # m/s along the heading, negative backwards
-    beside: int  # LANE row at whose height the actor is
+    beside: int  # LANE row whose height the actor has
     pitch: float = 0.0
     # lane, s and d of an actor that rides along lanes; None: it moves freely
     on: tuple[int, float, float] | None = None
     link: int = -1  # LINK row that the actor is on or entered last
     # (distance to the stop line, LINK row) of each link that it is on or will be on soon
     claims: tuple[tuple[float, int], ...] = ()
-    cue: int = -1  # number of the cue it waits for, or -1
+    cue: int = -1  # number of the cue for which the actor waits, or -1
 
 
 @dataclass(frozen=True)
 class Wait:
-    """Stand for some seconds."""
+    """Stay in place for some seconds."""
 
     seconds: float
 
@@ -54,7 +54,7 @@ class Wait:
 
 @dataclass(frozen=True)
 class Await:
-    """Wait until a cue of the scene has come, given by its number."""
+    """Wait for a cue of the scene, given by its number."""
 
     cue: int
 
@@ -69,10 +69,10 @@ class Await:
 class Move:
     """Move freely along a line, from standstill to standstill."""
 
-    # (n, 3) x, y and heading, dense enough for linear interpolation; a single row is a place to
-    # stand at
+    # (n, 3) x, y and heading, dense enough for linear interpolation; with a single row, the actor
+    # stays there
     line: NDArray[np.float64]
-    beside: int  # LANE row of the road on or beside which the line lies
+    beside: int  # LANE row of the road on which, or beside which, the line is
     speed_mps: float = 0.0  # speed between the ends
     backwards: bool = False  # whether a vehicle reverses
 
@@ -81,8 +81,8 @@ class Move:
     ) -> Iterator[Pose]:
         """Yield the pose of each tick.
 
-        `length`: of the body, m. `last`: the previous pose; None at the start of the script, when
-        the first pose is yielded as well.
+        `length`: length of the body, m. `last`: the previous pose; None at the start of the script,
+        when the first pose is yielded as well.
         """
         line = self.line
         if last is None:
@@ -106,8 +106,8 @@ class Ride:
     """Ride along the centre of lanes like a built-in driver, but without reacting to others."""
 
     lanes: tuple[int, ...]  # consecutive LANE rows, including those inside junctions
-    start_m: float  # of the centre, from the start of the first lane
-    end_m: float  # of the centre, from the start of the first lane
+    start_m: float  # first position of the centre, from the start of the first lane
+    end_m: float  # last position of the centre, from the start of the first lane
     speed_mps: float  # speed between the ends
     start_mps: float = 0.0  # speed at the beginning
     end_mps: float = 0.0  # speed at the end
@@ -138,7 +138,7 @@ class Ride:
         )
 
     def _place(self, network: RoadNetwork, u: float) -> tuple[int, float]:
-        """Return lane and s of a place on the way; beyond its ends, s exceeds the end lane."""
+        """Return lane and s of a place on the path; beyond the path, s is outside the end lane."""
         for lane in self.lanes[:-1]:
             here = float(network.lanes["length_m"][lane])
             if u < here:
@@ -151,7 +151,7 @@ class Ride:
         return x, y
 
     def _entered(self, network: RoadNetwork, lane: int) -> int:
-        """Return the last link entered on the way to a lane."""
+        """Return the last link that the actor entered before a lane."""
         at = self.lanes.index(lane)
         for before, after in reversed(list(pairwise(self.lanes[: at + 1]))):
             if (link := _link_between(network, before, after)) >= 0:
@@ -184,7 +184,7 @@ Act = Move | Ride | Wait | Await
 
 
 def path_of(network: RoadNetwork, link: int) -> tuple[int, ...]:
-    """Return the lanes of a link, from the lane it leaves to the lane it reaches."""
+    """Return the lanes of a link, from the lane before the junction to the lane after it."""
     row = network.links[link]
     lanes = [int(row["from_lane"]), int(row["next_lane"])]
     while network.lanes["internal"][lanes[-1]]:
@@ -208,7 +208,7 @@ def arc(
         backwards: whether the vehicle reverses.
     """
     x, y, heading = start
-    # Forwards, the centre of the circle lies on the side that the heading turns to.
+    # Forwards, the centre of the circle is on the side to which the heading turns.
     side = math.copysign(1.0, turn_rad) * (-1.0 if backwards else 1.0)
     headings = heading + np.linspace(0.0, turn_rad, max(2, int(abs(turn_rad) / 0.05) + 1))
     middle_x, middle_y = (
@@ -228,7 +228,7 @@ def arc(
 def _course(
     far: float, start: float, speed: float, end: float, dt: float
 ) -> Iterator[tuple[float, float]]:
-    """Yield distance and speed after each tick over `far` m, with speeds in m/s."""
+    """Yield the distance in m and the speed in m/s after each tick, over `far` m."""
     u, present = 0.0, start
     while u < far:
         braking = math.sqrt(end * end + 2.0 * ACCEL_MPS2 * (far - u))

@@ -1,11 +1,11 @@
 """Scripts of pedestrians and vehicles, compiled for kernels into one FRAME per tick.
 
 An actor performs its acts one after the other: it moves freely, rides along lanes, waits for a
-time, or waits for a cue. For built-in drivers, its body occupies every lane that it covers. While
-it moves freely, it also occupies lanes that it will cover within `FORESIGHT_S`, so that drivers
-brake for actors about to step onto their lane.
+time, or waits for a cue. For built-in drivers, the actor's body occupies every lane that it covers.
+While the actor moves freely, it also occupies lanes that it will cover within `FORESIGHT_S`, so
+that drivers brake for actors about to step onto their lane.
 
-`Shadows` finds the lanes that a body covers, and the covered stretch of each.
+`Shadows` finds the lanes that a body covers, and the covered stretch of each lane.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from cavmarl.traffic.scenarios.motions import Act, Pose
 
 SAMPLE_M = 0.5  # spacing of the sample points of a body
 LEVEL_M = 4.0  # lanes with a larger difference in height are on different levels
-BESIDE_M = 1.0  # bodies farther than this beside a lane never cover it, despite rounding
+BESIDE_M = 1.0  # bodies farther than this beside a lane never cover it, even with rounding
 FARTHEST_M = 200.0  # maximum distance from an actor to a lane
 ON_ROAD = (1 << len(VEHICLE_CLASSES)) - 1
 
@@ -41,7 +41,7 @@ class Shadow(NamedTuple):
 
     start: float  # m along the lane
     end: float  # m along the lane
-    speed: float  # of the body along the lane in m/s, at least 0
+    speed: float  # speed of the body along the lane in m/s, at least 0
 
     def joined(self, other: Shadow) -> Shadow:
         """Return the smallest stretch that contains both stretches."""
@@ -59,9 +59,9 @@ class Shadows:
     def of(self, pose: Pose, length: float, width: float) -> Mapping[int, Shadow]:
         """Return the stretch of each LANE row that a body of this size covers at its pose."""
         place = (pose.x, pose.y, pose.heading, pose.speed, pose.beside)
-        key = struct.pack("7d", *place, length, width)  # with the signs of zeros
+        key = struct.pack("7d", *place, length, width)  # distinguishes the signs of zeros
         found = self._found.get(key)
-        if found is None:  # bodies keep one pose for many ticks
+        if found is None:  # cached, because bodies keep a pose for many ticks
             found = self._found[key] = self._covered(pose, length, width)
         return found
 
@@ -80,7 +80,7 @@ class Shadows:
         return found
 
     def nearest(self, pose: Pose) -> tuple[int, float, float]:
-        """Return the lane nearest to a place, with s and d there."""
+        """Return the lane nearest to a place, and s and d of the place on it."""
         best, best_off = (pose.beside, 0.0, 0.0), math.inf
         for lane in self._around(pose.x, pose.y):
             if not self._is_level(lane, pose.beside):
@@ -161,13 +161,13 @@ FRAME = record(
     ("heading", np.float64),
     ("pitch", np.float64),
     ("speed", np.float64),
-    ("s", np.float64),  # on `lane`, the nearest lane
+    ("s", np.float64),  # position on `lane`, the nearest lane
     ("d", np.float64),
     ("lane", np.int32),
     ("link", np.int32),
     ("following", np.int32),  # FRAME of the next tick; the last frame points to itself
     ("cue", np.int32),  # CUE that the actor waits for; -1: it continues at once
-    ("released_to", np.int32),  # goal to which a built-in driver takes the actor from here, or -1
+    ("released_to", np.int32),  # goal to which a built-in driver drives the actor from here, or -1
     ("first_cover", np.int32),  # COVER rows
     ("num_covers", np.int32),
     ("first_claim", np.int32),  # CLAIM rows
@@ -182,15 +182,15 @@ COVER = record(
 )
 
 CLAIM = record(
-    ("dist", np.float64),  # of the centre to the stop line, m; negative beyond it
+    ("dist", np.float64),  # from the centre to the stop line, m; negative beyond the line
     ("link", np.int32),
 )
 
 CUE = record(
-    ("x", np.float64),  # an agent's centre is within `radius_m` of this place
+    ("x", np.float64),  # the cue is given if an agent's centre is within `radius_m` of this place
     ("y", np.float64),
     ("radius_m", np.float64),
-    ("tick", np.int64),  # or this tick has come; -1: no tick
+    ("tick", np.int64),  # or at this tick; -1: no tick
 )
 
 NO_SCRIPTS = Scripts(
@@ -230,12 +230,12 @@ class Actor:
 
     body: str  # a name of `BODIES`
     acts: Sequence[Act]  # performed in order; each begins where the previous one ends
-    # EDGE to which a built-in driver takes the actor at the end; None: it stays
+    # EDGE to which a built-in driver drives the actor at the end; None: the actor stays
     released_to: int | None = None
 
 
 def actor_types() -> NDArray[np.void]:
-    """Return the VTYPE rows of `BODIES`; they drive like the generator's car."""
+    """Return the VTYPE rows of `BODIES`, with the driver of the generator's car."""
     types = generated_types().repeat(len(BODIES))
     for row, body in zip(types, BODIES.values(), strict=True):
         for name, value in body._asdict().items():
@@ -270,7 +270,7 @@ def compile_scripts(
     """Return the compiled scripts of all actors, and the first FRAME of each.
 
     `actors`: actors with a script. `cues`: indexed by the numbers in `Await`. `goals`: row of the
-    plans' table by EDGE, for released actors.
+    table of plans by EDGE, for released actors.
     """
     tables = _Tables()
     shadows = Shadows(network)
@@ -336,7 +336,7 @@ def _write(
 def _foreseen(
     own: list[Mapping[int, Shadow]], poses: list[Pose], k: int, ahead: int
 ) -> dict[int, Shadow]:
-    """Return what an actor covers now or soon, up to its next wait for a cue."""
+    """Return the stretches that an actor covers now or soon, up to its next wait for a cue."""
     seen = dict(own[k])
     for later in range(k, min(k + ahead, len(own) - 1)):
         if poses[later].cue >= 0:

@@ -1,7 +1,7 @@
 """`Scene`: the actors, their scripts and the agent's start, as made by scenarios.
 
-Parameters of scenarios are dataclass fields with a range, a unit and a description. The helpers for
-streams of scripted vehicles that cross or join the agent's way are here as well.
+Parameters of scenarios are dataclass fields with a range, a unit and a description. This module
+also has helpers for streams of scripted vehicles that cross or join the agent's path.
 """
 
 from __future__ import annotations
@@ -24,31 +24,31 @@ class Seat:
     """The start of an agent's vehicle."""
 
     lane: int
-    s: float  # m, of the centre on the lane
+    s: float  # m, position of the centre on the lane
     speed_mps: float  # initial speed, and the speed that its built-in driver keeps
     goal_edge: int  # EDGE row where the trip ends
-    body: SeatBody | None = None  # None: on the lane, with the size of its type
+    body: SeatBody | None = None  # None: in the middle of the lane, with the size of the type
 
 
 class SeatBody(NamedTuple):
     """The exact pose and the size of a vehicle at its start."""
 
-    x: float  # m, of the centre
+    x: float  # m, position of the centre
     y: float
     heading: float  # rad
-    d: float  # m, left of the middle of the lane
+    d: float  # m to the left of the middle of the lane
     length: float  # m
     width: float
     height: float
 
 
 class ReactingVehicle(NamedTuple):
-    """A logged vehicle that a built-in driver drives along the logged way."""
+    """A logged vehicle that a built-in driver drives along the logged route."""
 
     track: Track
     seat: Seat
-    edges: tuple[int, ...]  # EDGE rows of its way
-    depart_s: float  # after the reset
+    edges: tuple[int, ...]  # EDGE rows of the route
+    depart_s: float  # departure in s after the reset
 
 
 class LoggedTraffic(NamedTuple):
@@ -58,8 +58,8 @@ class LoggedTraffic(NamedTuple):
     first: int  # number of the sample at the reset
     seated: Sequence[Track]  # tracks whose vehicles the agents drive
     replayed: Sequence[Track]
-    reacting: Sequence[ReactingVehicle]  # by departure
-    notes: tuple[str, ...]  # what was changed, with counts
+    reacting: Sequence[ReactingVehicle]  # sorted by departure
+    notes: tuple[str, ...]  # changes to the log, with counts
 
 
 class Outage(NamedTuple):
@@ -71,7 +71,7 @@ class Outage(NamedTuple):
 
 @dataclass(frozen=True)
 class Scene:
-    """One conflict staged for an agent; other agents may follow behind it."""
+    """A conflict staged for an agent; other agents may follow behind it."""
 
     place: str  # name of the place on the map
     x: float  # m, centre of the scene
@@ -80,8 +80,8 @@ class Scene:
     actors: Sequence[Actor]  # the scripted actors
     cues: Sequence[Cue] = ()  # cues by the numbers in the actors' `Await`s
     clear_m: float = 90.0  # radius around the centre without other vehicles at the start
-    outages: Sequence[Outage] = ()  # signals that go dark and stay dark
-    seats: Sequence[Seat] = ()  # of all agents, if they have places of their own
+    outages: Sequence[Outage] = ()  # signals that fail and stay off
+    seats: Sequence[Seat] = ()  # seats of all agents, if each agent has its own place
     log: LoggedTraffic | None = None
 
     @property
@@ -92,7 +92,7 @@ class Scene:
 
     @property
     def num_rows(self) -> int:
-        """Number of vehicles besides the agents and those with an order."""
+        """Number of vehicles besides agents' vehicles and vehicles with an order."""
         return len(self.actors) + (0 if self.log is None else len(self.log.replayed))
 
 
@@ -109,7 +109,7 @@ def switch(default: bool, what: str) -> Any:
 
 
 def describe(parameters: type[Any]) -> list[tuple[str, str, str, str]]:
-    """Return (name, default, range with unit, description) of each parameter of a dataclass."""
+    """Return name, default, range with unit, and description of each field of a dataclass."""
     return [(f.name, f"{f.default:g}" if _is_number(f) else str(f.default).lower(), _range(f),
              f.metadata["what"]) for f in fields(parameters)]  # fmt: skip
 
@@ -157,9 +157,9 @@ FREE_M = 20.0  # distance beyond the junction at which a built-in driver takes o
 
 
 def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Seat | None:
-    """Return a seat `far_m` before the end of the link's first lane; None if that is too short.
+    """Return a seat `far_m` before the link's stop line; None if the lane is too short.
 
-    `link`: LINK row that the agent is to drive over. `far_m`: from its centre to the lane's end.
+    `link`: LINK row over which the agent has to drive. `far_m`: from its centre to the lane's end.
     """
     row = streets.network.links[link]
     lane, beyond = int(row["from_lane"]), int(row["to_lane"])
@@ -172,7 +172,7 @@ def approach(streets: Streets, link: int, far_m: float, speed_mps: float) -> Sea
 def stream(
     streets: Streets, link: int, middle_m: float, speed_mps: float, times_s: list[float]
 ) -> list[Actor] | None:
-    """Return cars that drive over a link without reacting to others; None if there is no room.
+    """Return cars that drive over a link without reacting to others; None without room.
 
     `middle_m`: a place on the link, from the stop line. `speed_mps`: constant speed of all cars.
     `times_s`: time of each car's centre at that place, ascending.
@@ -198,9 +198,9 @@ def meet_stream(
 ) -> Scene | None:
     """Stage an agent that meets the first car of a stream at constant speed; None: no room.
 
-    `place`: where both ways meet. `far_m`: initial distance from the agent to the junction.
-    `parameters`: of the scenario: `speed_mps` of the agent, number of `cars`, `gap_s` between
-    their centres, `lead_s` of the first car before the agent.
+    `place`: where both paths meet. `far_m`: initial distance from the agent to the junction.
+    `parameters`: the scenario's `speed_mps` of the agent, number of `cars`, `gap_s` between the
+    cars' centres, and `lead_s` of the first car before the agent.
     """
     seat = approach(streets, place.link, far_m, parameters.speed_mps)
     if seat is None:
@@ -221,7 +221,7 @@ def meetings(
     stream_mps: float,
     parameters: Any,
 ) -> dict[str, Meeting]:
-    """Return, for each lane, its first crossing with room for a stream, and the scene there."""
+    """Return, for each lane, the first crossing with room for a stream, and its scene."""
     found: dict[str, Meeting] = {}
     for crossing in crossings:
         name = streets.name(int(streets.network.links["from_lane"][crossing.link]))

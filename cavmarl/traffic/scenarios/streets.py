@@ -1,4 +1,4 @@
-"""`Streets`: queries on a road network, used by scenarios to find and describe places."""
+"""`Streets`: queries on a road network, with which scenarios find and describe places."""
 
 from __future__ import annotations
 
@@ -16,16 +16,16 @@ from cavmarl.roads.routing import lane_grid
 STRAIGHT_RAD = 0.05  # maximum change of direction of a straight lane
 BESIDE_M = 8.0  # maximum distance between the centres of neighbouring lanes of a road
 LOOK_MARGIN_M = 0.3
-ACROSS_M = 1.0  # maximum distance of the centre of an area shared by two ways from each way
+ACROSS_M = 1.0  # maximum distance between an area shared by two paths and each of the paths
 
 
 class Crossing(NamedTuple):
     """Two movements over a junction that share an area."""
 
     link: int  # LINK row of the first movement
-    foe: int  # LINK row of the second
+    foe: int  # LINK row of the second movement
     middle_m: float  # centre of the area, from the stop line of the first movement
-    foe_middle_m: float  # centre of the area, from the stop line of the second
+    foe_middle_m: float  # centre of the area, from the stop line of the second movement
 
 
 class Opposite(NamedTuple):
@@ -51,7 +51,7 @@ class Streets:
 
     @property
     def _sides(self) -> tuple[str, str]:
-        """Fields of the neighbours towards the kerb and towards the middle of the road."""
+        """Names of the LANE fields of the neighbours towards the kerb and towards the middle."""
         return ("left", "right") if self.network.left_hand else ("right", "left")
 
     @property
@@ -80,7 +80,7 @@ class Streets:
         return [lane for lane in np.flatnonzero(good).tolist() if self._bend(lane) < STRAIGHT_RAD]
 
     def kerbs_m(self, lane: int, s: float) -> tuple[float, float]:
-        """Return how far the road reaches from a lane's centre, to the kerb and beyond."""
+        """Return the distances in m from a lane's centre to the near and far side of the road."""
         lanes = self.network.lanes
         sides = []
         for side in self._sides:
@@ -95,7 +95,7 @@ class Streets:
         return near, far
 
     def opposite(self, lane: int, s: float) -> Opposite | None:
-        """Return the neighbour of a lane in the opposite direction, if it is the next lane."""
+        """Return the adjacent lane in the opposite direction, if there is one."""
         here = self.network.lanes[lane]
         if here[self._sides[1]] >= 0:
             return None
@@ -111,10 +111,10 @@ class Streets:
         return Opposite(other, place, abs(d))
 
     def crossings(self, directions: str, *, yields: bool, merges: bool) -> Iterator[Crossing]:
-        """Yield pairs of car movements that share an area at the centre of both, or at their end.
+        """Yield pairs of car movements that share an area in the middle or at the end of both.
 
         `directions`: SUMO's letters for the first movement, such as `s` or `lL`. `yields`: whether
-        it must give way to the second. `merges`: whether both lead into one lane.
+        the first movement must yield to the second. `merges`: whether both lead into one lane.
         """
         links, conflicts, lanes = self.network.links, self.network.conflicts, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
@@ -153,7 +153,7 @@ class Streets:
         return nearest
 
     def movements(self, directions: str) -> list[int]:
-        """Return LINK rows of car movements over junctions with SUMO's letters, as `s` or `lL`."""
+        """Return LINK rows of car movements with SUMO's direction letters, such as `s` or `lL`."""
         links, lanes = self.network.links, self.network.lanes
         ends = lanes["permissions"][links["from_lane"]] & lanes["permissions"][links["to_lane"]]
         good = (ends & CARS != 0) & (links["first_internal"] >= 0)
@@ -162,9 +162,9 @@ class Streets:
         return found
 
     def onward(self, lane: int) -> int | None:
-        """Return the car lane that follows a lane beyond a junction, preferably straight on.
+        """Return the next lane for cars beyond a junction, preferably straight on.
 
-        None if cars cannot continue.
+        The result is None if cars cannot continue.
         """
         links, lanes = self.network.links, self.network.lanes
         first = int(lanes["first_link"][lane])
@@ -194,7 +194,8 @@ class Streets:
     def upstream(self, lane: int, far_m: float) -> tuple[tuple[int, ...], float] | None:
         """Return lanes that lead to a lane, and the total length up to its end.
 
-        The given lane is the last. None if there are less than `far_m`.
+        The given lane is the last. The result is None if the lanes are shorter than `far_m` in
+        total.
         """
         found, way_m = [lane], self.length_m(lane)
         while way_m < far_m:
@@ -206,7 +207,7 @@ class Streets:
         return tuple(found), way_m
 
     def before(self, lane: int) -> int | None:
-        """Return the first lane from which cars enter a lane; None: there is none."""
+        """Return the first lane from which cars enter a lane, or None."""
         lanes, into = self.network.lanes, self.network.into
         row = lanes[lane]
         ends = into[row["first_into"] : row["first_into"] + row["num_into"]]

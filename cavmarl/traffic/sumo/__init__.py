@@ -1,1 +1,1 @@
-"""SUMO as global traffic: one process for each world, and the data exchanged with it."""
+"""SUMO as global traffic: one process per world, and the data exchanged with it."""

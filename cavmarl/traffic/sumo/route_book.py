@@ -1,6 +1,7 @@
 """`RouteBook` and `StopBook`: routes and stops of SUMO's vehicles, stored while worlds run.
 
-Routes are stored as ways at the end of the table of all ways.
+Routes are stored at the end of the table of the steps of all routes. A *way* is the offset of a
+route in that table, as in VEHICLE["way"].
 """
 
 from __future__ import annotations
@@ -17,15 +18,15 @@ from cavmarl.roads.network import RoadNetwork
 from cavmarl.traffic.demand.demand_records import STOP, UNTIL_ABSOLUTE
 from cavmarl.traffic.kernels.mirroring import Paths
 
-MAX_WAY_STEPS = 8_000_000  # limit for all worlds; memory that is never written takes no space
+MAX_WAY_STEPS = 8_000_000  # limit for all worlds; memory is used only when it is written
 
 
 class RouteBook:
-    """The paths of W worlds; a path is a route for vehicles that may use certain lanes.
+    """The paths of W worlds; a path is a route together with the lanes that vehicles may use.
 
-    `steps`: PLAN, the table of all ways. `first`: start of the room for these worlds, which ends
-    the table. `permissions`: (num_types,) of VTYPE rows. `plan_steps`: steps of each world's own
-    plans, which precede the room.
+    `steps`: PLAN, the table of all steps. `first`: start of the room for these worlds, at the end
+    of the table. `permissions`: (num_types,) permissions of VTYPE rows. `plan_steps`: number of
+    steps of each world's own plans, which precede the room.
     """
 
     def __init__(
@@ -44,8 +45,8 @@ class RouteBook:
         nowhere["next"] = nowhere["link"] = -1
         nowhere["to_go"] = np.inf
         self._nowhere = first
-        # A way is the row of a step minus the row of a lane. Unused steps before the first one keep
-        # the ways of these worlds greater than all other ways.
+        # A way is the row of a step minus the row of a lane. Unused steps before the first step
+        # keep the ways of these worlds greater than all other ways.
         self._first = first + 2 * lanes
         self._of_world = (len(steps) - self._first) // num_worlds
         self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)
@@ -65,19 +66,19 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def single(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert ways of rows of a world, VEHICLE or departures, to those of a single world."""
+        """Convert the ways of a world's rows, VEHICLE or departures, to those in a single world."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         of_book = rows["way"] >= self._nowhere
         rows["way"] -= own * (w * self._of_world) + of_book * self._later
 
     def placed(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert the ways of rows of a single world to those of world w."""
+        """Convert the ways of a single world's rows to those in world w."""
         own = rows["way"] >= self._first - self._later - len(self._network.lanes)
         of_book = rows["way"] >= self._nowhere - self._later
         rows["way"] += own * (w * self._of_world) + of_book * self._later
 
     def enter(self, w: int, routes: list[list[int]]) -> None:
-        """Add routes that SUMO has reported, each as EDGE rows, numbered in this order."""
+        """Add routes that SUMO has reported, each given as EDGE rows; number them in this order."""
         self._worlds[w].routes += [np.array(edges, dtype=np.int32) for edges in routes]
 
     def look_up(
@@ -103,7 +104,7 @@ class RouteBook:
         if known is not None:
             return known
         rows = self._network.edges
-        # A route with edges that this map has left out is driven on the other edges.
+        # If this map lacks edges of a route, vehicles drive on the remaining edges.
         num_lanes = np.where(edges >= 0, rows["num_lanes"][edges], 0)
         first_lane = np.where(edges >= 0, rows["first_lane"][edges], 0)
         begin = pages.end
@@ -127,7 +128,7 @@ class _Pages:
     """The routes and paths of one world.
 
     Attributes:
-        begin: first of the world's steps.
+        begin: first step of the world.
         end: end of the steps in use.
         routes: EDGE rows of each route, by SUMO's number.
         path_of: path by route and class, or -1.
@@ -164,7 +165,7 @@ class _Pages:
 
 
 def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
-    """Return the array, or a copy with twice the wanted room, since paths come one by one."""
+    """Return the array, or a copy with twice the needed room, because paths come one by one."""
     if wanted <= len(array):
         return array
     larger = np.zeros(2 * wanted, dtype=array.dtype)
@@ -172,7 +173,7 @@ def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
     return larger
 
 
-MAX_STOPS = 2_000_000  # limit for all worlds; memory that is never written takes no space
+MAX_STOPS = 2_000_000  # limit for all worlds; memory is used only when it is written
 OF_WORLD = 200_000
 
 ReportedStop = tuple[int, float, float, float, float, bool]
@@ -216,9 +217,9 @@ class StopBook:
         self._known[w] = {}
 
     def enter(self, w: int, stops: Sequence[Sequence[float]]) -> StopRange:
-        """Return where the stops of a vehicle are in the table; new stops are written.
+        """Return the range of a vehicle's stops in the table; new stops are written.
 
-        `stops`: `ReportedStop` of each, in the order of the vehicle's route.
+        `stops`: a `ReportedStop` per stop, in the order of the vehicle's route.
 
         Raises CapacityError: there is no room for more stops.
         """
@@ -251,7 +252,7 @@ class StopBook:
         return StopRange(first, end)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the stops of rows, VEHICLE or departures, to those of world w + `worlds`."""
+        """Convert the stops of rows, VEHICLE or departures, to those in world w + `worlds`."""
         has_some = rows["stop"] >= 0
         for name in ("stop", "stops_end"):
             rows[name] += has_some * (worlds * self._of_world)

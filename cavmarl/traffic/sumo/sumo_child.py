@@ -1,11 +1,11 @@
 """The program of a SUMO process: it runs libsumo, or TraCI if libsumo is not installed.
 
-It is run by its file name and imports nothing of this package, so that it starts as fast as
-libsumo does. It receives the layouts of all records at its start. A message is a head of 32-bit
-numbers and then bytes: records, signal letters, and a line of JSON for rare events.
+The program is run by its file name and imports nothing of this package, so that it starts as fast
+as libsumo does. At its start it receives the layouts of all records. A message consists of a head
+of 32-bit numbers, and of bytes: records, signal letters, and a line of JSON for rare events.
 
-libsumo holds one simulation per process: a second start would silently replace the first. So the
-running simulation is closed before the next is started.
+libsumo allows one simulation per process: a second start would silently replace the first. So the
+running simulation is closed before the next simulation is started.
 """
 
 from __future__ import annotations
@@ -30,14 +30,14 @@ START, STEP, LOOK_UP = 0, 1, 2  # kinds of requests
 DONE, REFUSED = 0, 1  # kinds of answers
 
 NOWHERE = ""  # lane of a vehicle on no lane: waiting to enter, or being teleported
-PUPPET = "cavmarl."  # prefix of the names of vehicles that are moved from outside
-FREE = 2  # moveToXY: anywhere, on a road or not
+PUPPET = "cavmarl."  # prefix of the names of puppets, vehicles that SUMO does not move
+FREE = 2  # mode of moveToXY: anywhere, on a road or not
 PARKS = 1 | 64  # flags of a stop: beside the road, at a parking area
-BY_ITSELF = 0  # speed and lane change modes in which SUMO decides nothing
+BY_ITSELF = 0  # speed mode and lane change mode in which SUMO decides nothing
 LANE_CHANGE = -1  # `kind` of the record of a lane that changes
-SIZE_M = 1e-4  # sizes that differ by less are equal
+SIZE_M = 1e-4  # sizes that differ by less than this count as equal
 
-# Getters read for each vehicle, by field of its record; _FIELDS_SEEN only if SUMO drives.
+# Getters that are read for each vehicle, by field of its record; _FIELDS_SEEN only if SUMO drives.
 _FIELDS = {"at": "getRouteIndex", "pos": "getLanePosition"}
 _FIELDS_SEEN = {
     "angle": "getAngle",
@@ -51,7 +51,7 @@ class SumoSimulation:
     """The simulation of this process.
 
     Args:
-        setup: sent once: names of lanes, edges, signals and types, layouts of records.
+        setup: sent once; names of lanes, edges, signals and types, and layouts of records.
     """
 
     def __init__(self, setup: dict[str, Any]) -> None:
@@ -66,7 +66,7 @@ class SumoSimulation:
         self._edges: list[str] = setup["edges"]
         self._signals: list[str] = setup["signals"]
         self._type_row: dict[str, int] = setup["types"]
-        self._is_seen: bool = setup["drives"]  # whether places of its vehicles are read
+        self._is_seen: bool = setup["drives"]  # whether the positions of SUMO's vehicles are read
         self._lane_names: list[str] = setup["lanes"]
         self._classes: list[list[str]] = setup["classes"]  # SUMO's classes by bit of a class
         self._reroutes: str = setup["reroutes"]  # see `population.reroute`
@@ -76,7 +76,7 @@ class SumoSimulation:
 
     def _forget(self) -> None:
         self._number: dict[str, int] = {}  # vehicle on the road: its number
-        self._types: list[int] = []  # by number
+        self._types: list[int] = []  # type by number of the vehicle
         self._route_row: dict[str, int] = {}
         self._puppets: dict[int, str] = {}
         self._allowed: dict[str, tuple[str, ...]] = {}  # classes of changed lanes, as on the map
@@ -85,7 +85,7 @@ class SumoSimulation:
         self._waiting: set[str] = set()  # loaded vehicles that have not entered
         self._goals: dict[int, str] = {}  # last edge of each route, by its number
         self._goal_of: dict[int, str] = {}  # last edge of each vehicle's route
-        self._slot_of: dict[str, int] = {}  # by person
+        self._slot_of: dict[str, int] = {}  # slot by person
         self._to_fail = dict(self._outages_ms)
         self._free_slots = list(reversed(range(self._num_slots)))
 
@@ -118,9 +118,9 @@ class SumoSimulation:
         }
 
     def step(self, moved: NDArray[np.void]) -> tuple[NDArray[np.void], bytes, dict[str, Any]]:
-        """Run one step: lanes change, puppets are placed, SUMO moves all other vehicles.
+        """Run one step: change lanes, place puppets, and let SUMO move all other vehicles.
 
-        If no puppets are placed, the records that are not lanes are vehicles that ask for a way.
+        If no puppets are placed, the records that are not lanes are vehicles that ask for a route.
         """
         is_lane = moved["kind"] == LANE_CHANGE
         if is_lane.any():
@@ -136,14 +136,14 @@ class SumoSimulation:
         return seen, letters, news | line
 
     def _fail_signals(self) -> None:
-        """Switch off the signals that are off after the next step."""
+        """Switch off the signals that fail by the end of the next step."""
         after_ms = self._time_ms() + round(1000.0 * self._sumo.simulation.getDeltaT())
         for name in [name for name, at_ms in self._to_fail.items() if at_ms <= after_ms]:
             del self._to_fail[name]
             self._sumo.trafficlight.setProgram(name, "off")
 
     def _change_lanes(self, changes: NDArray[np.void]) -> None:
-        """Set the classes and the limits of lanes, and let vehicles find other routes."""
+        """Set the classes and the speed limits of lanes, and let vehicles find other routes."""
         lanes = self._sumo.lane
         for bits, limit_mps, row in zip(
             changes["id"].tolist(), changes["x"].tolist(), changes["edge"].tolist(), strict=True
@@ -161,14 +161,14 @@ class SumoSimulation:
         present = set(self._vehicle.getIDList())
         puppets = set(self._puppets.values())
         absent = set(self._vehicle.getLoadedIDList()) - present - puppets
-        # The time of departure is negative before the departure.
+        # Before the departure, its time is negative.
         self._waiting |= {name for name in absent if self._vehicle.getDeparture(name) < 0.0}
         self._renew_routes(present - puppets)
 
     def _after_closures(self) -> dict[str, Any]:
-        """Renew routes after a step; return the vehicles that SUMO has dropped, by name.
+        """Renew routes after a step; return the names of vehicles that SUMO has dropped.
 
-        SUMO drops a vehicle whose first edge is closed to it when the vehicle departs.
+        SUMO drops a vehicle whose first edge is closed to it at its departure.
         """
         simulation = self._sumo.simulation
         puppets = set(self._puppets.values())
@@ -209,7 +209,7 @@ class SumoSimulation:
                 self._unsure.add(name)
 
     def _find_ways(self, asking: NDArray[np.void], line: dict[str, Any]) -> list[list[int]]:
-        """Return number, route and type of each vehicle that has a way to its goal."""
+        """Return number, route and type of each vehicle that has a route to its goal."""
         found: dict[tuple[int, str, int], int] = {}
         ways = []
         for number, edge, kind in zip(
@@ -223,7 +223,7 @@ class SumoSimulation:
         return ways
 
     def _find_way(self, start: str, goal: str, kind: int, line: dict[str, Any]) -> int:
-        """Return the number of the fastest route that is open to a type; -1: there is none."""
+        """Return the number of the fastest route that is open to a type, or -1."""
         name = next(name for name, row in self._type_row.items() if row == kind)
         try:
             edges = self._sumo.simulation.findRoute(start, goal, name).edges
@@ -264,9 +264,9 @@ class SumoSimulation:
         return seen, letters, line
 
     def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
-        """Return the records of persons on foot; `line` receives how many find no slot.
+        """Return the records of persons on foot; `line` receives the number without a slot.
 
-        A slot is free for one step before another person gets it.
+        A slot stays free for one step before another person gets it.
         """
         person = self._sumo.person
         names = [name for name in person.getIDList() if not person.getVehicle(name)]
@@ -294,7 +294,7 @@ class SumoSimulation:
     def _on_road(
         self,
     ) -> tuple[Sequence[str], NDArray[np.int32], NDArray[np.int32], list[list[Any]]]:
-        """Find the vehicles on the map's lanes, and register newly entered vehicles.
+        """Find the vehicles on the map's lanes, and register vehicles that have entered.
 
         Returns names, numbers and LANE rows, and the reports of newly entered vehicles.
         """
@@ -327,21 +327,21 @@ class SumoSimulation:
         """Return the row of a type; a vehicle's own type, `type@vehicle`, has the row of `type`."""
         row = self._type_row.get(kind, self._type_row.get(kind.partition("@")[0]))
         if row is None:
-            raise LookupError(f"type '{kind}' is in none of the files")
+            raise LookupError(f"type '{kind}' is not in the files")
         return row
 
     def _register(self, name: str, kind: int) -> list[Any]:
-        """Number a vehicle that has entered, or entered again; return its report."""
+        """Assign a number to a vehicle that has entered, or entered again; return its report."""
         self._number[name] = len(self._types)
         self._types.append(kind)
         stops = [] if self._is_seen else self._stops(name)
         return [self._number[name], name, self._vehicle.getSpeedFactor(name), stops]
 
     def _stops(self, name: str) -> list[list[Any]]:
-        """Return the coming stops of a vehicle: LANE row, start, end, duration, until, parking.
+        """Return the future stops of a vehicle: LANE row, start, end, duration, until, parking.
 
-        Times are in s, -1 if not given. Stops with neither time, off the map's lanes, or with a
-        waypoint's speed are left out.
+        Times are in s, -1 if not given. The result omits stops with neither time, stops off the
+        map's lanes, and stops with the speed of a waypoint.
         """
         found = []
         for stop in self._vehicle.getStops(name):
@@ -397,7 +397,7 @@ class SumoSimulation:
         self._vehicle.add(name, route, typeID=f"{PUPPET}{kind}")
         self._vehicle.setSpeedMode(name, BY_ITSELF)
         self._vehicle.setLaneChangeMode(name, BY_ITSELF)
-        # A vehicle with a size of its own gets a type of its own.
+        # A vehicle whose size differs from its type gets its own type.
         if abs(self._vehicle.getLength(name) - length) > SIZE_M:
             self._vehicle.setLength(name, length)
         if abs(self._vehicle.getWidth(name) - width) > SIZE_M:
@@ -409,10 +409,10 @@ class SumoSimulation:
 
 
 def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
-    """Return a getter by name that skips the Python wrapper which SWIG generates for libsumo.
+    """Return a getter by name, without the Python wrapper that SWIG generates for libsumo.
 
-    The wrapper only passes its arguments on, and takes a fifth of the call. If the interface has
-    no such inner function, as TraCI, return the usual getter.
+    The wrapper only forwards its arguments, but takes a fifth of the time. If the interface has no
+    such inner function, like TraCI, return the usual getter.
     """
     inner = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     usual: Callable[[str], Any] = getattr(getattr(sumo, domain), getter)
@@ -447,7 +447,7 @@ def _program(interface: str) -> str:
 
 
 def _read(wire: socket.socket, size: int) -> bytes:
-    """Read `size` bytes; if the other side has closed, end this process."""
+    """Read `size` bytes; if the other side has closed the connection, end this process."""
     parts = []
     while size:
         part = wire.recv(size)
@@ -474,9 +474,9 @@ def _answer(
 
 
 def limit_memory(most_bytes: int) -> None:
-    """Limit the memory that this process may allocate from now on; Linux only.
+    """Limit the memory that this process may allocate; Linux only.
 
-    Its children get the same limit.
+    Child processes inherit the limit.
     """
     if sys.platform == "linux":
         hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
@@ -490,8 +490,8 @@ def limit_memory(most_bytes: int) -> None:
 def _serve(wire: socket.socket, most_bytes: int) -> NoReturn:
     _, _, setup = _request(wire)
     simulation = SumoSimulation(setup)
-    # The files decide from here on how much memory is needed. An import that fails for want of
-    # memory raises almost any error, so the limit applies only after it.
+    # From here, the files determine how much memory is needed. An import that runs out of memory
+    # may raise almost any error, so the limit is set after the imports.
     limit_memory(most_bytes)
     while True:
         kind, records, line = _request(wire)
@@ -505,7 +505,7 @@ def _serve(wire: socket.socket, most_bytes: int) -> NoReturn:
                 found = simulation.read_state()
             else:
                 found = simulation.step(np.frombuffer(records, simulation.moved))
-        except Exception as error:  # SUMO's own error types are unknown to the other side
+        except Exception as error:  # the other side does not know SUMO's error types
             _answer(wire, REFUSED, {"error": f"{type(error).__name__}: {error}"})
             continue
         seen, letters, news = found

@@ -1,4 +1,4 @@
-"""`SumoDemand`: SUMO files that are checked against a map, and all that is needed to run them."""
+"""`SumoDemand`: SUMO files checked against a map, with all that is needed to run them."""
 
 from __future__ import annotations
 
@@ -43,25 +43,25 @@ _SAME_NAME = ("length", "width", "height", "min_gap", "accel", "decel", "emergen
 
 @dataclass(frozen=True, eq=False)
 class SumoDemand:
-    """The settings with which each SUMO of an environment is started."""
+    """The settings with which each SUMO process of an environment is started."""
 
     network: RoadNetwork
     map_file: Path  # the network, as SUMO reads it
     given: SumoInput  # demand and options
     drives: bool  # whether SUMO moves its vehicles (`sumo-traffic`), or only orders departures
-    max_vehicles: int  # maximum per world
-    replay_bytes: int  # room for one world's log of an episode, see `ToldLog`
+    max_vehicles: int  # maximum number per world
+    replay_bytes: int  # maximum size of a world's log of an episode, see `ToldLog`
     dt_s: float
     interface: str  # `libsumo` or `traci`
     version: str  # version of SUMO
     types: NDArray[np.void]  # VTYPE (num_types,) of the road vehicles
-    # VTYPE (n,) of this package's vehicles besides the car; they follow `types` in a world's table
+    # VTYPE (n,) of this package's vehicles besides the car; follow `types` in a world's table
     puppets: NDArray[np.void]
-    num_persons: int  # persons that a world mirrors at the same time
-    num_callers: int  # vehicles that the caller may pose or drive; persons follow them
+    num_persons: int  # maximum number of persons that a world mirrors at a time
+    num_callers: int  # number of slots for vehicles of the caller, which persons' slots follow
     outages: Mapping[str, float]  # time of failure by signal, in s since the reset
     reroutes: str  # which vehicles take another route if lanes change; empty: lanes do not change
-    type_ids: tuple[str, ...]  # names of `types`, then of types that use no road
+    type_ids: tuple[str, ...]  # names of `types`, then of types that do not use roads
     content_hash: str  # hash of all files
 
     @property
@@ -70,7 +70,7 @@ class SumoDemand:
         return self.given.tolerated
 
     def setup(self) -> dict[str, Any]:
-        """Return the setup that a process receives once, with VTYPE rows of the world's table."""
+        """Return the setup that a process receives once; VTYPE rows refer to the world's table."""
         return _names(self.network, self.interface) | {
             "drives": self.drives,
             "reroutes": self.reroutes,
@@ -86,11 +86,11 @@ class SumoDemand:
         }
 
     def words(self, folder: Path, seed: int) -> list[str]:
-        """Return SUMO's command line; `folder` is for files that it reads."""
+        """Return SUMO's command line; `folder` is for files that SUMO reads."""
         words = _words(
             self.map_file, self.given, folder, self.dt_s, self.max_vehicles, seed, self._puppets()
         )
-        # Otherwise SUMO ends if a vehicle enters whose route leads over a closed road.
+        # Without this, SUMO exits if a vehicle enters whose route leads over a closed road.
         return [*words, "--ignore-route-errors=true"] if self.reroutes else words
 
     def _puppets(self) -> dict[int, np.void]:
@@ -124,7 +124,7 @@ def read_sumo_demand(
     try:
         with tempfile.TemporaryDirectory() as folder:
             words = _words(map_file, given, Path(folder), config.clock.sim_dt_s, 1, 0, {})
-            # Read all of the demand, not only its first minutes.
+            # Read the whole demand, not only its first minutes.
             found = process.look_up([*words, "--route-steps=0"])
     except ConfigError as error:
         own = f", {given.net_file}" if given.net_file else ""
@@ -194,7 +194,7 @@ def _words(
     puppets.write_text(_puppets(others, has_walking_areas), encoding="utf-8")
     own = int(given.options.get("max-num-vehicles", "-1"))
     more = {
-        # This package detects contacts; SUMO removes no vehicle for one.
+        # This package detects contacts; SUMO must not remove vehicles after a contact.
         "collision.action": "none",
         "max-num-vehicles": str(min(own, most) if own > 0 else most),
         "random": "false",  # true would draw an unknown seed
@@ -208,13 +208,13 @@ def _has_walking_areas(map_file: Path, changed_ns: int) -> bool:
 
 
 def _puppets(others: Mapping[int, np.void], has_walking_areas: bool) -> str:
-    """Return types for vehicles that SUMO does not move; they are never teleported.
+    """Return types for vehicles that SUMO neither moves nor teleports.
 
     `others`: VTYPE of all such vehicles besides the car, by VTYPE row. `has_walking_areas`: whether
-    the map has areas for pedestrians: SUMO would crash if it put a vehicle there.
+    the map has areas for pedestrians, in which SUMO would crash with a vehicle.
     """
     car = {row: (kind, "") for row, kind in enumerate(generated_types())}
-    # SUMO's drivers take the car to brake like a car of SUMO.
+    # SUMO's drivers assume that the car brakes like a car of SUMO.
     rest = {
         row: (
             kind,
@@ -252,7 +252,7 @@ def _puppet_types(config: EnvConfig, num_persons: int) -> NDArray[np.void]:
 
 
 def _types(described: list[dict[str, Any]]) -> NDArray[np.void]:
-    """Return VTYPE (n,) of SUMO's types; drivers of this package follow Krauss's model."""
+    """Return VTYPE (n,) of SUMO's types, with Krauss's model for drivers of this package."""
     types = np.zeros(len(described), dtype=VTYPE)
     for row, kind in zip(types, described, strict=True):
         for name in _SAME_NAME:

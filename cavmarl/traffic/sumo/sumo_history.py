@@ -1,7 +1,7 @@
-"""`ToldLog`: the places of this package's vehicles that SUMO has received, tick by tick.
+"""`ToldLog`: the positions of this package's vehicles that SUMO has received, tick by tick.
 
-SUMO's state follows from its files, its seed and this log. A SUMO that is restarted and receives
-the same log reaches the same state, so a successor of a dead process needs nothing else.
+Files, seed and this log determine SUMO's state. A SUMO that is restarted and receives the same log
+reaches the same state, so a process that replaces a dead process needs nothing else.
 
 `SEEN` and `MOVED` are the records that a world and its SUMO exchange.
 """
@@ -17,34 +17,34 @@ from numpy.typing import NDArray
 from cavmarl.core.errors import SumoError
 
 # A vehicle of SUMO in SUMO's conventions: the middle of the front bumper, degrees clockwise from
-# north, the place on the lane by the lane's length attribute. If SUMO only orders departures, all
-# fields from `x` on are 0, except `pos`. A person has `number` -1 - slot; `pos` is its length and
-# `lat` its width.
+# north, and the position relative to the lane's length attribute. If SUMO only orders departures,
+# all fields from `x` on are 0, except `pos`. For a person, `number` is -1 - slot, `pos` the length
+# and `lat` the width.
 SEEN = np.dtype(
     [
         ("number", np.int32),  # in the order of entering
         ("vtype", np.int32),  # VTYPE row
         ("lane", np.int32),  # LANE row of the front
         ("route", np.int32),  # number of the route; in this package, number of the path
-        ("at", np.int32),  # index of its present edge in the route
+        ("at", np.int32),  # index of the present edge in the route
         ("signals", np.int32),  # SUMO's bits: 1 right, 2 left, 8 brake
         ("x", np.float64),  # m
         ("y", np.float64),
         ("z", np.float64),
         ("angle", np.float64),  # degrees
         ("speed", np.float64),  # m/s
-        ("pos", np.float64),  # m, of the front
+        ("pos", np.float64),  # m, position of the front on the lane
         ("lat", np.float64),  # m to the left of the lane's centre
     ]
 )
 
 # A vehicle of this package in SUMO's conventions. Or a lane that changes: `kind` is `LANE_CHANGE`,
-# `edge` the LANE row, `id` the bits of the classes that it is closed to, `x` its limit in m/s. Or,
-# if SUMO only orders departures, a vehicle that asks for a way: `id` is its VEHICLE["order"].
+# `edge` the LANE row, `id` the bits of the classes to which it is closed, `x` its limit in m/s. Or,
+# if SUMO only orders departures, a vehicle that asks for a route: `id` is its VEHICLE["order"].
 MOVED = np.dtype(
     [
         ("id", np.int64),  # VEHICLE["id"]
-        ("x", np.float64),  # m, of the front bumper
+        ("x", np.float64),  # m, position of the front bumper
         ("y", np.float64),
         ("angle", np.float64),  # degrees
         ("length", np.float32),  # m
@@ -56,20 +56,20 @@ MOVED = np.dtype(
 LANE_CHANGE = -1
 
 
-_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether recording stopped
+_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether it is cut off
 _WORD = 8
-_RECORD = MOVED.itemsize // _WORD  # words
+_RECORD = MOVED.itemsize // _WORD  # number of words per record
 
 
 class ToldLog:
-    """The log of one world in one episode.
+    """The log of a world in an episode.
 
     Args:
-        most_bytes: maximum size; if an episode needs more, nothing of it is kept.
+        most_bytes: maximum size; if an episode needs more, its log is discarded.
 
     Attributes:
         episode: number of episodes begun by this process.
-        HEAD: number of words that change; words behind them are only appended.
+        HEAD: number of words at the start that change; later words are only appended.
     """
 
     HEAD: Final = _HEAD
@@ -80,7 +80,7 @@ class ToldLog:
         self.begin()
 
     def begin(self) -> None:
-        """Clear the log; arrays returned earlier stay as they are."""
+        """Clear the log; arrays returned earlier do not change."""
         self.episode += 1
         self._words = np.zeros(_HEAD, dtype=np.int64)
         self._words[_SIZE] = _HEAD
@@ -91,7 +91,7 @@ class ToldLog:
         return self._words[: self._words.item(_SIZE)]
 
     def note(self, moved: NDArray[np.void]) -> None:
-        """Record the places that SUMO receives for one more tick.
+        """Record the positions that SUMO receives for the next tick.
 
         Args:
             moved: MOVED (n,).
@@ -119,13 +119,13 @@ class ToldLog:
         self._words = np.array(words, dtype=np.int64)
 
     def ticks(self, count: int) -> Iterator[NDArray[np.void]]:
-        """Return the places that SUMO received in each of the first ticks: MOVED (n,).
+        """Return the positions that SUMO received in each of the first `count` ticks: MOVED (n,).
 
         Args:
             count: number of ticks since the reset.
 
         Raises:
-            SumoError: fewer ticks are recorded.
+            SumoError: the log has fewer ticks.
         """
         words = self._words
         if words[_IS_CUT]:

@@ -1,6 +1,6 @@
 """The input of SUMO: a map, demand files, and the options of a `.sumocfg` that change traffic.
 
-Also SUMO's command line, which is the same wherever SUMO is run.
+This module also makes SUMO's command line, which is the same wherever SUMO is run.
 """
 
 from __future__ import annotations
@@ -31,13 +31,13 @@ _PERSONS = ("person", "personFlow")
 _OFF_ROAD = (*_PERSONS, "container", "containerFlow")
 _ONLY = "moves in SUMO only"
 _PERSONS_CURE = "; traffic.source = sumo-traffic mirrors persons, with sumo.max_persons above 0"
-_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attribute of the begin
+_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attributes of the begin
 # Kinds of options that are passed to SUMO.
 _PASSED = ("read", "traffic", "beyond")
-# A file without these words makes SUMO write nothing. A character reference may hide them.
+# A file without these words does not make SUMO write. A character reference may hide the words.
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
 _COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
-_ELSEWHERE = re.compile(r",|\$\{")  # a list of files; a variable of the environment
+_ELSEWHERE = re.compile(r",|\$\{")  # a list of files; an environment variable
 _READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` SUMO reads
 _NOWHERE = "NUL"  # SUMO's name of the null device
 _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
@@ -49,12 +49,12 @@ class SumoInput:
 
     route_files: tuple[Path, ...]  # demand that SUMO reads during the run
     additional_files: tuple[Path, ...]  # types, stops, signal programs; read first
-    begin_s: float = 0.0  # when the demand begins
-    has_begin: bool = False  # whether the configuration states it
+    begin_s: float = 0.0  # begin of the demand
+    has_begin: bool = False  # whether the configuration states the begin
     # options of the configuration that change traffic
     options: dict[str, str] = field(default_factory=dict)
     net_file: Path | None = None  # the map named by the configuration
-    tolerated: tuple[str, ...] = ()  # options that are not obeyed, one per line
+    tolerated: tuple[str, ...] = ()  # ignored options, one per line
 
 
 def read_input(demand: Sequence[Path]) -> SumoInput:
@@ -64,7 +64,7 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
         demand: one configuration of SUMO, or files of routes, trips and flows and additional files.
 
     Raises:
-        ConfigError: there is no file, a file cannot be read, or it is no demand.
+        ConfigError: there is no file, a file cannot be read, or a file is not demand.
     """
     if not demand:
         raise ConfigError("no demand: give --demand FILE (.rou.xml, .add.xml or .sumocfg)")
@@ -79,16 +79,16 @@ def read_input(demand: Sequence[Path]) -> SumoInput:
             additional.append(path.resolve())
         else:
             raise ConfigError(
-                f"{path}: <{root}> is no demand; give files of <routes> or <additional>, or one "
+                f"{path}: <{root}> is not demand; give files of <routes> or <additional>, or one "
                 ".sumocfg alone"
             )
     return SumoInput(tuple(routes), tuple(additional))
 
 
 def begun(given: SumoInput, horizon_s: float) -> SumoInput:
-    """Return an input with a begin at which vehicles depart within an episode; see `DemandFile`.
+    """Return an input with a begin from which vehicles depart in an episode; see `DemandFile`.
 
-    Files that cannot be read are left to SUMO.
+    Files that cannot be read are skipped: SUMO reports the error.
     """
     firsts: list[tuple[int, str]] = []
     begin_ms = round(1000.0 * given.begin_s)
@@ -113,10 +113,11 @@ def begun(given: SumoInput, horizon_s: float) -> SumoInput:
 def read_unmirrored(
     given: SumoInput, off_road: Mapping[str, str], most_persons: int
 ) -> tuple[list[str], bool]:
-    """Return a line with a count for all that moves in SUMO only, and whether there are persons.
+    """Return lines that count what moves only in SUMO, and whether there are persons.
 
-    `off_road`: vehicle classes of types that use no road, by name. `most_persons`: number of
-    persons that a world mirrors. Files that cannot be read are left to SUMO, and may have persons.
+    `off_road`: vehicle classes of types that do not use roads, by name. `most_persons`: number of
+    persons that a world mirrors. Files that cannot be read count as files with persons; SUMO
+    reports the error.
     """
     skipped, found, is_read = DemandReport(), DemandReport(), False
 
@@ -139,15 +140,15 @@ def read_unmirrored(
 
 
 def without_outputs(path: Path, folder: Path) -> Path:
-    """Return a map or demand file that makes SUMO write nothing: itself, or a copy in `folder`.
+    """Return a map or demand file without SUMO outputs: itself, or a copy in `folder`.
 
     Raises:
-        ConfigError: the file includes another file, its encoding cannot be searched, or SUMO
-            would read its name as that of another file.
+        ConfigError: the file includes another file, its encoding cannot be searched, or SUMO would
+            read its name as the name of another file.
     """
     if found := _ELSEWHERE.search(str(path)):
         raise ConfigError(
-            f"{path}: SUMO reads a name with {found[0]!r} as that of another file; rename the file"
+            f"{path}: SUMO reads a name with {found[0]!r} as another file's name; rename the file"
         )
     if not _may_write(path, path.stat().st_mtime_ns):
         return path
@@ -166,15 +167,15 @@ def _may_write(path: Path, changed_ns: int) -> bool:
     encoding = declared_encoding(content).lower() or "utf-8"
     if encoding not in _ASCII_BELOW or 0 in content[:4]:  # UTF-16 and UTF-32 begin with a zero byte
         raise ConfigError(f"{path}: encoded as {encoding} or UTF-16; save it as UTF-8")
-    if b"<![CDATA[" not in content:  # CDATA may contain text like a comment
-        content = _COMMENT.sub(b"", content)  # netconvert writes its options into a comment
+    if b"<![CDATA[" not in content:  # CDATA may contain text that looks like a comment
+        content = _COMMENT.sub(b"", content)  # netconvert writes its options to a comment
     return bool(_MAY_WRITE.search(content))
 
 
 def _silence(element: Element, path: Path) -> bool:
-    """Redirect the files that an element makes SUMO write; return whether there are any."""
+    """Redirect the outputs that an element requests; return whether it requests any."""
     if element.tag == "include":
-        raise ConfigError(f"{path}: <include> is not followed; put the content into the file")
+        raise ConfigError(f"{path}: <include> is not supported; put the content into the file")
     changes = {}
     for name, value in element.attrib.items():
         if name == "file" and element.tag in _READ_FILES:
@@ -196,7 +197,7 @@ def _read_config(path: Path) -> SumoInput:
     begin_ms = parse_time_ms(begin)
     if begin_ms is None:
         raise ConfigError(
-            f"{path}: begin = '{begin}' is no time; give seconds or hours:minutes:seconds"
+            f"{path}: begin = '{begin}' is not a time; give seconds or hours:minutes:seconds"
         )
     return SumoInput(
         route_files=_resolved(files_of(path, given, ["route-files"], ConfigError)),
@@ -223,7 +224,7 @@ def _root(path: Path) -> Element:
 
 
 def _root_tag(path: Path) -> str:
-    """Return the root tag without reading the rest: a day's demand is too long to read twice."""
+    """Return the root tag without reading the rest, because demand of a day is long."""
     with _readable(path):
         content = BytesIO(read_bytes(path))
         _, root = next(defusedxml.ElementTree.iterparse(content, ("start",), forbid_dtd=True))
@@ -258,9 +259,9 @@ def command_words(
 ) -> list[str]:
     """Return the arguments of SUMO's command line.
 
-    `map_file`: a SUMO network. `folder`: for copies of files that make SUMO write nothing. `seed`:
-    seed of SUMO's random numbers. `more`: options that override those of the demand's
-    configuration. `additional`: further additional files.
+    `map_file`: a SUMO network. `folder`: destination for copies of files without outputs. `seed`:
+    seed of SUMO's random numbers. `more`: options that override the demand's configuration.
+    `additional`: further additional files.
     """
     copies = folder / "additional"
     copies.mkdir(exist_ok=True)
@@ -283,7 +284,7 @@ def command_words(
 
 
 def free_libsumo() -> object:
-    """Return this process's libsumo, in which no simulation runs.
+    """Return libsumo, in which no simulation runs in this process.
 
     Raises MissingExtraError: libsumo is not installed; SumoError: a simulation runs in it, which a
     second start would silently replace.
@@ -291,7 +292,7 @@ def free_libsumo() -> object:
     libsumo = require("libsumo", "sumo")
     if libsumo.isLoaded():
         raise SumoError(
-            "libsumo holds one simulation per process, and one runs in this process; close it, or "
+            "libsumo allows one simulation per process, and one runs in this process; close it, or "
             "start the other one in its own process"
         )
     return libsumo

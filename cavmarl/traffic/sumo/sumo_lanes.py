@@ -1,4 +1,4 @@
-"""`SumoLanes`: the lanes of W worlds as their SUMOs know them, and changes they have to learn."""
+"""`SumoLanes`: the lanes of W worlds as SUMO knows them, and changes to send to SUMO."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _EVERY_CLASS = (1 << len(VEHICLE_CLASSES)) - 1  # bits of LANE["permissions"]
 
 
 class SumoLanes:
-    """The closed classes and the limits that the SUMO of each world has received.
+    """The closures and the speed limits that the SUMO of each world has received.
 
     `on_map`: LANE (L,). `now`: LANE (W, L) of each world; (0, L): lanes do not change.
     """
@@ -30,7 +30,7 @@ class SumoLanes:
             self._limits_mps[w] = self._on_map["speed_mps"]
 
     def news(self, w: int) -> NDArray[np.void]:
-        """Return MOVED (n,): the lanes that differ from what SUMO knows; now SUMO knows them."""
+        """Return MOVED (n,): the lanes that SUMO does not know yet, and mark them as known."""
         if not len(self.now):
             return np.zeros(0, dtype=MOVED)
         now = self.now[w]
@@ -44,7 +44,7 @@ class SumoLanes:
         return found
 
     def learn(self, w: int, told: NDArray[np.void]) -> None:
-        """Note what SUMO has received; `told`: MOVED (n,)."""
+        """Record the lanes that SUMO has received; `told`: MOVED (n,)."""
         lanes = told[told["kind"] == LANE_CHANGE]
         if len(lanes):
             self._bits[w, lanes["edge"]] = lanes["id"]

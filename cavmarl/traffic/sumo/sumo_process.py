@@ -29,9 +29,9 @@ from cavmarl.roads.sumo_net.xml_source import limit
 from cavmarl.traffic.sumo import sumo_child as child
 from cavmarl.traffic.sumo.sumo_history import MOVED, SEEN
 
-ANSWER_S = 120.0  # a step that takes longer counts as hung
+ANSWER_S = 120.0  # a process whose step takes longer counts as hung
 MAX_SUMO_BYTES = 1 << 35
-MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that changes this limit
+MEMORY_LIMIT = "CAVMARL_MAX_SUMO_BYTES"  # environment variable that overrides this limit
 END_S = 2.0  # time for the process to end by itself
 # Messages of SUMO, Python and the system when memory runs out.
 OUT_OF_MEMORY = ("bad_alloc", "MemoryError", "Cannot allocate memory")
@@ -41,12 +41,12 @@ class SumoAnswer(NamedTuple):
     """SUMO's answer after a step."""
 
     seen: NDArray[np.void]  # SEEN (n,) by ascending number
-    letters: bytes  # character codes of all signals, one after the other
+    letters: bytes  # letters of all signals, one signal after the other
     line: dict[str, Any]  # rare events: `departed`, `teleported`, `routes`
 
 
 def choose_interface(wanted: str) -> str:
-    """Return the wanted interface; for `auto`, `libsumo`, or `traci` if that is not installed.
+    """Return the interface to use; for `auto`, `libsumo` or, if not installed, `traci`.
 
     Raises MissingExtraError: the interface is not installed.
     """
@@ -61,7 +61,7 @@ class SumoProcess:
     """A process that runs SUMO and serves one request at a time.
 
     Args:
-        setup: sent once; the layouts of records are added.
+        setup: sent once, together with the layouts of records.
 
     Attributes:
         pid: process id.
@@ -75,7 +75,7 @@ class SumoProcess:
         with theirs:
             process = start_python(
                 [child.__file__, str(theirs.fileno()), str(self._most_bytes)],
-                # SUMO's memory access is scattered; huge pages save up to a sixth of a step.
+                # SUMO's memory access is scattered, so huge pages save up to a sixth of a step.
                 {"OMP_NUM_THREADS": "1", **huge_heap()},
                 stdin=subprocess.DEVNULL,
                 stdout=output,
@@ -94,7 +94,7 @@ class SumoProcess:
         return self._finalizer.alive
 
     def look_up(self, words: list[str]) -> dict[str, Any]:
-        """Start SUMO with a command line, and return the content of its files.
+        """Start SUMO with a command line, and return the content of the files.
 
         Raises ConfigError: SUMO refuses the files; SumoError: the process has ended.
         """
@@ -110,7 +110,7 @@ class SumoProcess:
         """Start a step without waiting for its answer.
 
         Args:
-            moved: MOVED (n,), the places of this package's vehicles after the step.
+            moved: MOVED (n,), the positions of this package's vehicles after the step.
 
         Raises:
             SumoError: the process has ended.
@@ -142,7 +142,7 @@ class SumoProcess:
             error = f"{line['error']}{self._last_words()}"
             if _is_too_large(error):
                 raise SumoError(self._too_large())
-            raise ConfigError(f"SUMO refuses: {error}")
+            raise ConfigError(f"SUMO reports an error: {error}")
         return SumoAnswer(np.frombuffer(records, SEEN), bytes(letters), line)
 
     def _read(self, size: int) -> bytearray:

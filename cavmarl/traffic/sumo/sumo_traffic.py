@@ -1,14 +1,14 @@
-"""`SumoTraffic`: SUMO's part in a tick of W worlds, in one place for any division.
+"""`SumoTraffic`: SUMO's part of a tick of W worlds, in one place for any division.
 
-`sumo-traffic`: SUMO moves its vehicles, which are rows here, and sees the vehicles of this
+With `sumo-traffic`, SUMO moves its vehicles, which are rows here, and sees the vehicles of this
 package. Both sides compute the state at tick t + 1 from the state at t. This package moves its
-vehicles first; then SUMO receives their new places and takes its step.
+vehicles first; then SUMO receives their new positions and takes its step.
 
-`sumo-demand`: SUMO runs the demand by itself. A vehicle that departs there is ordered here at the
-same tick, with its type, route, stops, lane and speed factor. A vehicle that is rerouted there is
-rerouted here. Signals show SUMO's phases.
+With `sumo-demand`, SUMO runs the demand by itself. A vehicle that departs in SUMO is ordered here
+at the same tick, with its type, route, stops, lane and speed factor. A vehicle that SUMO reroutes
+is also rerouted here. Signals show SUMO's phases.
 
-If lanes change, SUMO receives the changes before its step, in which this package obeys them, too.
+If lanes change, SUMO receives the changes before its step, in which they also apply here.
 """
 
 from __future__ import annotations
@@ -47,14 +47,14 @@ from cavmarl.traffic.sumo.sumo_worlds import SumoWorlds
 class _Shown(NamedTuple):
     """The last state of a world's signals."""
 
-    letters: NDArray[np.uint8]  # character codes of all signals, one after the other
+    letters: NDArray[np.uint8]  # letters of all signals, one signal after the other
     phase: NDArray[np.int32]  # (num_signals,) PHASE rows
 
 
 class ShownSignals:
-    """Finds the phase of each signal by its letters.
+    """Finds the phase of each signal from the letters that it shows.
 
-    `network`: the roads, with all programs that SUMO has.
+    `network`: the roads, with all programs of SUMO.
     """
 
     def __init__(self, network: RoadNetwork, num_worlds: int) -> None:
@@ -78,14 +78,15 @@ class ShownSignals:
     def show(self, w: int, letters: bytes, phase: NDArray[np.int32]) -> None:
         """Write the PHASE rows of a world's signals.
 
-        `letters`: letters of all signals, one after the other. `phase`: (num_signals,) is written.
+        `letters`: letters of all signals, one signal after the other. `phase`: (num_signals,),
+        written.
 
         Raises SumoError: a signal shows letters that no program of the map has.
         """
         codes, last = np.frombuffer(letters, dtype=np.uint8), self._last[w]
         if last is None:
             changed, rows = np.arange(len(self._parts)), np.zeros(len(self._parts), dtype=np.int32)
-        else:  # most signals show the same letters as in the tick before
+        else:  # most signals show the same letters as in the previous tick
             changed, rows = np.unique(self._signal_of[codes != last.letters]), last.phase
         for signal in changed.tolist():
             part = letters[self._parts[signal]]
@@ -93,7 +94,7 @@ class ShownSignals:
             if row is None:
                 self._last[w] = None
                 raise SumoError(
-                    f"signal '{self._ids[signal]}' shows '{part.decode()}', which is no "
+                    f"signal '{self._ids[signal]}' shows '{part.decode()}', which is not a "
                     "phase of its programs; give all of its programs as <tlLogic> in the map "
                     "or in an additional file of the demand"
                 )
@@ -103,12 +104,11 @@ class ShownSignals:
 
 
 class SumoTraffic:
-    """SUMO beside W worlds.
+    """The simulations of SUMO for W worlds.
 
-    `travel`: types and ways, with room for SUMO's routes at the end. `first_step`: start of that
-    room. `zoned`: the rows of all zones. `blank`: VEHICLE (1,), template of every vehicle's
-    record. `lanes`: LANE (W, L) of each world; (0, L): lanes do not change.
-    `plan_steps`: see `RouteBook`.
+    `travel`: types and routes, with room for SUMO's routes at the end. `first_step`: start of that
+    room. `zoned`: the rows of all zones. `blank`: VEHICLE (1,), template of every vehicle's record.
+    `lanes`: LANE (W, L) of each world; (0, L): lanes do not change. `plan_steps`: see `RouteBook`.
 
     Attributes:
         drives: whether SUMO moves its vehicles.
@@ -165,9 +165,9 @@ class SumoTraffic:
         self._lanes.begin(w)
 
     def keep_logs(self) -> tuple[ToldLog, ...]:
-        """Log what SUMO receives from the next reset on, one log per world, for `catch_up`.
+        """Log what SUMO receives after the next reset, one log per world, for `catch_up`.
 
-        Returns the logs; empty if SUMO receives nothing: it moves no vehicles, and no lanes change.
+        Returns the logs; empty if SUMO moves no vehicles and lanes do not change.
         """
         if self._tells and not self.worlds.logs:
             num_worlds = self._zoned.rows.shape[2]
@@ -180,9 +180,9 @@ class SumoTraffic:
         return self.drives or len(self._lanes.now) > 0
 
     def catch_up(self, worlds: Worlds) -> None:
-        """Bring SUMO to the worlds' ticks, from the beginning of their episodes.
+        """Run SUMO from the beginning of the episodes to the worlds' ticks.
 
-        Raises SumoError: SUMO had received vehicles or lanes, and they are not recorded.
+        Raises SumoError: what SUMO received in these ticks is not recorded.
         """
         for w, (key, tick) in enumerate(zip(worlds.keys, worlds.ticks.tolist(), strict=True)):
             logged: Iterable[NDArray[np.void]] = repeat(np.zeros(0, dtype=MOVED), tick)
@@ -203,7 +203,7 @@ class SumoTraffic:
         self.worlds.step(ticks, lambda w: self._told(w, side, ticks[w]))
 
     def _told(self, w: int, side: int, tick: int) -> NDArray[np.void]:
-        """Return MOVED (n,): all that the SUMO of a world receives before its step."""
+        """Return MOVED (n,): everything that the SUMO of a world receives before its step."""
         lanes = self._lanes.news(w)
         if self.drives:
             return np.concatenate([lanes, self._moved(w, side)])
@@ -211,7 +211,7 @@ class SumoTraffic:
         return np.concatenate([lanes, self._asking(w, side)]) if asks else lanes
 
     def _asking(self, w: int, side: int) -> NDArray[np.void]:
-        """Return MOVED (n,) by ascending id: vehicles whose ways lead over closed roads.
+        """Return MOVED (n,) by ascending id: vehicles whose routes lead over closed roads.
 
         SUMO's own copies of these vehicles may have passed the road before it was closed.
         """
@@ -227,7 +227,7 @@ class SumoTraffic:
         return asking
 
     def mirror(self, worlds: Worlds, side: int) -> int:
-        """Move SUMO's vehicles to their places after its step; arguments as in `step`.
+        """Move SUMO's vehicles to their positions after its step; arguments as in `step`.
 
         Returns the number of vehicles that leave, in all worlds.
         """
@@ -251,7 +251,7 @@ class SumoTraffic:
         return [self.worlds.at(w).people for w in range(self._zoned.rows.shape[2])]
 
     def forgive(self, departures: DepartureQueue) -> None:
-        """Clear the events of leaving vehicles that SUMO has teleported: they have not arrived."""
+        """Clear the events of leaving vehicles that SUMO has teleported, which have not arrived."""
         for w, num in enumerate(departures.num_passing.tolist()):
             leaving = departures.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
@@ -260,11 +260,11 @@ class SumoTraffic:
     def let_in(
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> bool:
-        """Fill `departures.passing` with vehicles that SUMO has inserted; return whether any.
+        """Fill `departures.passing` with vehicles that SUMO has inserted; return if there are any.
 
         `running`: (W,) vehicles in each world.
 
-        Raises CapacityError: a world has too little room.
+        Raises CapacityError: a world has too few rows.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -289,7 +289,7 @@ class SumoTraffic:
     def order(self, departures: DepartureQueue, worlds: Worlds) -> None:
         """Queue the vehicles that SUMO has inserted, with their routes.
 
-        Raises CapacityError: more vehicles wait than there is room for.
+        Raises CapacityError: the queue has too little room.
         """
         for w in range(len(worlds.ticks)):
             now = self.worlds.at(w)
@@ -307,7 +307,7 @@ class SumoTraffic:
                 departures.num_queue[w] += 1
 
     def send_on(self, departures: DepartureQueue, worlds: Worlds, side: int) -> None:
-        """Put this package's vehicles, driving and waiting, on the routes that SUMO has changed."""
+        """Put this package's vehicles, driving or waiting, on the routes that SUMO has changed."""
         for w in range(len(worlds.ticks)):
             now, paths = self.worlds.at(w), self.worlds.paths(w)
             if len(now.ways):
@@ -326,9 +326,9 @@ class SumoTraffic:
                 row["way"] = self._way(w, path, 0, int(row["lane"]))
 
     def _take_ways(self, w: int, side: int, ways: NDArray[np.int64]) -> int:
-        """Put vehicles on the ways that they have asked for, if they have room to turn off.
+        """Put vehicles on the routes that they have asked for, if they have room to turn off.
 
-        `ways`: (k, 2) VEHICLE["order"] and path. Returns the number of vehicles on a new way.
+        `ways`: (k, 2) VEHICLE["order"] and path. Returns the number of vehicles on a new route.
         """
         taken = 0
         chosen = dict(ways.tolist())
@@ -350,15 +350,15 @@ class SumoTraffic:
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
     def single(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert rows of a world, VEHICLE or departures, to those of a single world.
+        """Convert rows of a world, VEHICLE or departures, to rows of a single world.
 
-        Ways and stops are written, because each world has its own part of their tables.
+        Only `way` and stops change, because each world has its own part of their tables.
         """
         self.worlds.book.single(rows, w)
         self.worlds.stops.shift(rows, -w)
 
     def placed(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert rows of a single world to those of world w; see `single`."""
+        """Convert rows of a single world to rows of world w; see `single`."""
         self.worlds.book.placed(rows, w)
         self.worlds.stops.shift(rows, w)
 
@@ -384,7 +384,7 @@ class SumoTraffic:
         return moved
 
     def _fill(self, row: np.void, seen: np.void, w: int) -> None:
-        """Write the place, type and route with which a vehicle departs."""
+        """Write the place, type and route of a departing vehicle."""
         lane = int(seen["lane"])
         edge = self._roads.edges[self._roads.lanes[lane]["edge"]]
         row["agent"] = row["goal"] = -1
@@ -396,7 +396,7 @@ class SumoTraffic:
         row["way"] = self._way(w, int(seen["route"]), int(seen["at"]), lane)
 
     def _way(self, w: int, path: int, at: int, lane: int) -> int:
-        """Return the way from a lane along a path, from its `at`-th edge on."""
+        """Return VEHICLE["way"] from a lane along a path, starting at the path's `at`-th edge."""
         paths = self.worlds.paths(w)
         part = slice(int(paths.first[path]) + at, int(paths.first[path + 1]))
         places = np.flatnonzero(paths.edges[part] == self._edge_of_lane[lane])
@@ -405,6 +405,6 @@ class SumoTraffic:
     def _check_room(self, wanted: int) -> None:
         if wanted > len(self._others):
             raise CapacityError(
-                f"SUMO's demand needs room for {wanted} vehicles, the world has {len(self._others)}"
+                f"SUMO's demand needs {wanted} rows for vehicles, the world has {len(self._others)}"
                 "; raise sumo.max_vehicles"
             )

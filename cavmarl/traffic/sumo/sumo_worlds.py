@@ -1,7 +1,7 @@
-"""`SumoWorlds`: W simulations of SUMO beside W worlds, tick by tick.
+"""`SumoWorlds`: a simulation of SUMO for each of W worlds, tick by tick.
 
-Each has its own process and seed. A tick that is repeated gets the stored answer, so no SUMO takes
-a step twice.
+Each simulation has its own process and seed. A repeated tick gets the stored answer, so no SUMO
+takes a step twice.
 """
 
 from __future__ import annotations
@@ -34,27 +34,27 @@ class SumoTick(NamedTuple):
     seen: NDArray[np.void]  # SEEN (n,) by ascending number; the route field holds paths
     letters: bytes  # letters of all signals
     departed: NDArray[np.int64]  # (m,) numbers of vehicles that have entered, ascending
-    speed_factors: NDArray[np.float64]  # (m,) of the departed vehicles
-    # (m, 2) STOP rows [first, end) of their stops, -1: none; (0, 2) if SUMO moves them
+    speed_factors: NDArray[np.float64]  # (m,) speed factors of the departed vehicles
+    # (m, 2) STOP rows [first, end) of their stops, -1: none; (0, 2) if SUMO moves the vehicles
     stops: NDArray[np.int64]
-    teleported: tuple[int, ...]  # numbers of vehicles taken off the road
+    teleported: tuple[int, ...]  # numbers of teleported vehicles
     rerouted: NDArray[np.int64]  # (r,) numbers of vehicles with a changed route, ascending
     people: NDArray[np.void]  # SEEN (p,) persons on foot, by slot
-    ways: NDArray[np.int64]  # (k, 2) numbers of vehicles that have asked for a way, and paths
+    ways: NDArray[np.int64]  # (k, 2) numbers of vehicles that have asked for a route, and paths
 
 
 class SumoWorlds:
     """The SUMO processes and their last answers.
 
-    `book`: receives their routes. `stops`: receives their stops.
+    `book`: receives the vehicles' routes. `stops`: receives their stops.
 
     Attributes:
-        book: their routes.
-        stops: their stops.
-        names: by world, SUMO's names of the vehicles by number.
-        teleports: (W,) vehicles that SUMO has teleported since each reset.
-        dropped: (W,) vehicles that SUMO has dropped before departure since each reset.
-        logs: by world, what SUMO has received since its reset; empty: not kept.
+        book: the vehicles' routes.
+        stops: the vehicles' stops.
+        names: for each world, SUMO's names of the vehicles by number.
+        teleports: (W,) number of vehicles that SUMO has teleported since each reset.
+        dropped: (W,) number of vehicles that SUMO has dropped before departure since each reset.
+        logs: for each world, what SUMO has received since its reset; empty: no logs.
     """
 
     def __init__(
@@ -71,7 +71,7 @@ class SumoWorlds:
         self._begin_ms = round(1000.0 * demand.given.begin_s)
         self._processes: list[SumoProcess | None] = [None] * num_worlds
         self._ticks: list[SumoTick | None] = [None] * num_worlds
-        self._has_warned = [False] * num_worlds  # of persons without room, in this episode
+        self._has_warned = [False] * num_worlds  # about persons without room, in this episode
         self._path_of = [np.zeros(0, dtype=np.int32) for _ in range(num_worlds)]
 
     @property
@@ -81,7 +81,7 @@ class SumoWorlds:
     def begin(self, w: int, key: int) -> None:
         """Restart a world's SUMO for an episode.
 
-        `key`: root of its random numbers.
+        `key`: root of the random numbers.
 
         Raises ConfigError: SUMO refuses its files; SumoError: the process ended.
         """
@@ -118,16 +118,16 @@ class SumoWorlds:
 
         Args:
             ticks: (W,) since the reset, before the step.
-            moved: returns MOVED (n,) of a world: its vehicles after the step.
+            moved: returns MOVED (n,) of a world, its vehicles after the step.
 
         Raises:
-            SumoError: a process has ended, and its world has to be reset; or a world and its SUMO
-                are at different ticks.
+            SumoError: a process has ended, so that its world has to be reset; or a world and its
+                SUMO are at different ticks.
         """
         asked = []
         for w, tick in enumerate(ticks):
             last = self.at(w)
-            if last.tick == tick + 1:  # the tick has been run before
+            if last.tick == tick + 1:  # a repeated tick
                 continue
             if last.tick != tick:
                 raise SumoError(

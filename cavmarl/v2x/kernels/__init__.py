@@ -1,1 +1,1 @@
-"""Compiled loops: sending, the channel, receiving, inboxes."""
+"""Compiled loops: sending, channel, receiving, and inboxes."""

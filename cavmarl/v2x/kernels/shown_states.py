@@ -1,8 +1,8 @@
-"""States in a SPAT report of links whose signal the caller has overridden.
+"""The states of links in a SPAT report whose signal the caller has overridden.
 
-Such a report has the code −1 − PHASE row. Fields that SPAT reports do not use have 4 bits per link,
-by the index of its letter: 0, or 1 + the SIGNAL_* code. The state of an overridden link with a
-higher index is not sent.
+Such a report has the code −1 − PHASE row. Fields that SPAT reports do not use otherwise have 4 bits
+per link, by the index of the link's letter: 0, or 1 + the SIGNAL_* code. If these fields have no
+room for an index, the state of the overridden link is not sent.
 """
 
 from __future__ import annotations

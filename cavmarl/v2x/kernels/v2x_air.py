@@ -1,9 +1,9 @@
-"""The packets of one tick in the channel: by position and sender, and the channel load.
+"""The packets of a tick in the channel, sorted by position and sender, and the channel load.
 
 Most packets are CAMs, one per vehicle. A receiver first lists all packets within reach. Their
 distances and random numbers are then computed in one loop over contiguous memory, which the
-compiler vectorizes; only table look-ups are done one by one. Functions that take whole bundles of
-arrays are inlined: passing a bundle per receiver would take longer than the rest.
+compiler vectorizes; only table look-ups are done one by one. Functions with named tuples of arrays
+as arguments are inlined: passing a tuple per receiver would take longer than the rest.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from cavmarl.v2x.kernels.v2x_records import (
 def _fill_air(
     air: Air, packets: NDArray[np.void], num: int, cams: bool, access: NDArray[np.bool_]
 ) -> None:
-    """Sort the packets that have channel access into cells: the CAMs, or all others."""
+    """Sort the packets with channel access into cells: the CAMs, or all other packets."""
     start = air.cells.start
     cell = air.cells.cell
     start[:] = 0
@@ -81,7 +81,7 @@ def count_within(air: Air, x: float, y: float, radius_m: float) -> int:
 
 @inlined_kernel
 def load_around(channel: Channel, scratch: V2xScratch, x: float, y: float) -> float:
-    """Return the channel load around a position; above 1, not all packets fit in the tick."""
+    """Return the channel load around a position; above 1, not all packets fit in a tick."""
     count = count_within(scratch.cams, x, y, channel.sensing_m)
     count += count_within(scratch.others, x, y, channel.sensing_m)
     return channel.load * count
@@ -89,7 +89,7 @@ def load_around(channel: Channel, scratch: V2xScratch, x: float, y: float) -> fl
 
 @kernel
 def _first_slot(sender: int, slots: int) -> int:
-    """Return the first slot to search for a sender in a table of `slots` places, a power of 2."""
+    """Return the first slot to search for a sender in a table of `slots` slots, a power of 2."""
     place: int = np.int64(mix(np.uint64(sender)) & np.uint64(slots - 1))  # type: ignore[assignment]
     return place
 
@@ -120,7 +120,7 @@ def find_cam(scratch: V2xScratch, packets: NDArray[np.void], sender: int) -> int
 def grant_access(
     channel: Channel, mail: Mail, w: int, slot: int, key: np.uint64, scratch: V2xScratch
 ) -> None:
-    """Grant channel access and sort the packets of a tick by place; an overload blocks some."""
+    """Grant channel access and sort a tick's packets by place; overload blocks some packets."""
     packets = mail.packets[w, slot]
     num = mail.num_packets[w, slot]
     scratch.access[:num] = True
@@ -145,7 +145,7 @@ def grant_access(
 def hears(
     channel: Channel, me: np.void, level: int, word: np.uint64, x: float, y: float, squared: float
 ) -> bool:
-    """Return whether a receiver receives a packet that is sent within reach from (x, y)."""
+    """Return whether a receiver receives a packet sent within reach from (x, y)."""
     if channel.sure:
         return True
     number = draw(me["word"], word)
@@ -154,7 +154,7 @@ def hears(
 
 @inlined_kernel
 def band_of(distance_m: float) -> int:
-    """Return the distance band in which a packet is counted."""
+    """Return the band of a distance, by which packets are counted."""
     return min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
 
 
@@ -169,7 +169,7 @@ def refresh_by_cams(
     box: NDArray[np.void],
     num: int,
 ) -> None:
-    """Update the reports of known senders with their own newest CAMs."""
+    """Update the reports of known senders with the senders' newest CAMs."""
     limit = channel.reach_m * channel.reach_m
     for k in range(num):
         p = find_cam(scratch, packets, box[k]["subject"])
@@ -199,7 +199,8 @@ def _list_within(
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
-        # Write the place before the test, here and below: a branch would often be mispredicted.
+        # Here and below, write the place before the test, because branches would often be
+        # mispredicted.
         for b in range(begin, end):
             dx = air.x[b] - x
             dy = air.y[b] - y
@@ -213,7 +214,7 @@ def _list_within(
 
 @inlined_kernel
 def _drop_lost(channel: Channel, me: np.void, level: int, scratch: V2xScratch, num: int) -> int:
-    """Keep those of the first `num` in `scratch.heard` that are received; return their number."""
+    """Keep the received packets among the first `num` of `scratch.heard`; return their number."""
     air = scratch.cams
     place = scratch.heard.place
     squared = scratch.heard.squared

@@ -1,6 +1,6 @@
 """One tick of a message bus: stations send, packets travel, receivers store what they receive.
 
-The contents of an inbox do not depend on the order of packets: first, known subjects get their
+The content of an inbox does not depend on the order of packets: first, known subjects get their
 newest reports; then, the nearest new subjects are added.
 """
 
@@ -109,7 +109,7 @@ def _receive_objects(
     box: NDArray[np.void],
     num: int,
 ) -> int:
-    """Receive reports about vehicles, from the vehicles themselves or stations that see them."""
+    """Receive reports about vehicles, from these vehicles or from stations that see them."""
     packets = mail.packets[w, slot]
     reports = mail.reports[w, slot]
     refresh_by_cams(channel, me, level, packets, reports, scratch, box, num)
@@ -199,7 +199,7 @@ def deliver(
     """Deliver the packets of one slot to all receivers of a world.
 
     `mail`: inboxes and counts are written. `slot`: slot of the packets that are received now.
-    `latency`: ticks since they were sent. `scratch`: `receivers` filled.
+    `latency`: ticks since the packets were sent. `scratch`: `receivers` must be filled.
     """
     kinds = scratch.kinds
     kinds[:] = 0
@@ -231,7 +231,7 @@ def _expire_and_sort(
 
 @kernel
 def age(mail: Mail, w: int, r: int, tick: int, scratch: V2xScratch) -> None:
-    """Remove expired reports from a receiver's inboxes, and sort the rest."""
+    """Remove expired reports from a receiver's inboxes, and sort the remaining reports."""
     me = scratch.receivers[r]
     _expire_and_sort(mail.objects[w, r], tick, scratch.squared, me["x"], me["y"])
     _expire_and_sort(mail.events[w, r], tick, scratch.squared, me["x"], me["y"])
@@ -244,8 +244,8 @@ def receive_packet(
 ) -> None:
     """Deliver one packet to one receiver, as decided by a network simulator.
 
-    `mail`: inboxes and counts are written. `r`: an existing receiver. `delay`: ticks since it was
-    sent. `scratch`: `receivers` filled.
+    `mail`: inboxes and counts are written. `r`: an existing receiver. `delay`: ticks since the
+    packet was sent. `scratch`: `receivers` must be filled.
     """
     me = scratch.receivers[r]
     packet = mail.packets[w, slot, p]
@@ -326,7 +326,7 @@ def exchange_messages(
     mail: Mail,
     scratch: V2xScratch,
 ) -> None:
-    """Send what is due in the present tick of some worlds, and receive what arrives in it.
+    """Send the messages due in the present tick of some worlds, and receive arriving messages.
 
     Args:
         sending: schedule of the stations.
@@ -336,7 +336,7 @@ def exchange_messages(
         units: UNIT (num_units,), the roadside units.
         common: clocks, keys and signals of the worlds.
         zoned: vehicles of all zones.
-        side: side of the zones' rows that holds the committed ones.
+        side: side of the zones' rows that holds the committed rows.
         first: first world.
         last: end of the worlds, exclusive.
         mail: state that outlives the tick; written.
@@ -373,8 +373,8 @@ def hand_out(
     """Deliver the receptions of this tick that a network simulator has returned.
 
     `receptions`: RECEPTION (n,), of packets in flight and existing receivers. `latency`: the
-    longest delay, in ticks. `mail`: inboxes and counts are written. `scratch`: `receivers` as left
-    by `exchange_messages`.
+    longest delay, in ticks. `mail`: inboxes and counts are written. `scratch`: `receivers` as
+    written by `exchange_messages`.
     """
     for r in range(scratch.receivers.size):
         if scratch.receivers[r]["id"] >= 0:

@@ -10,7 +10,7 @@ from cavmarl.core.compiled import kernel
 
 @kernel
 def empty(box: NDArray[np.void], first: int) -> None:
-    """Remove the reports from place `first` on."""
+    """Remove all reports at indices `first` and above."""
     for k in range(first, box.size):
         report = box[k]
         report["subject"] = -1
@@ -19,7 +19,7 @@ def empty(box: NDArray[np.void], first: int) -> None:
 
 @kernel
 def forget(box: NDArray[np.void], tick: int) -> int:
-    """Remove expired reports; return the number of the remaining ones, moved to the front."""
+    """Remove expired reports and move the others to the front; return their number."""
     num = 0
     for k in range(box.size):
         if box[k]["sender"] < 0:
@@ -33,7 +33,7 @@ def forget(box: NDArray[np.void], tick: int) -> int:
 
 @kernel
 def find(box: NDArray[np.void], num: int, subject: int) -> int:
-    """Return the place of a subject in the inbox, or -1."""
+    """Return the index of a subject's report in the inbox, or -1."""
     for k in range(num):
         if box[k]["subject"] == subject:
             return k
@@ -42,9 +42,9 @@ def find(box: NDArray[np.void], num: int, subject: int) -> int:
 
 @kernel
 def is_better(report: np.void, other: np.void) -> bool:
-    """Return whether a report of a subject replaces another one: the newer report wins.
+    """Return whether a report replaces another report of a subject: the newer report wins.
 
-    Of reports of one tick, the subject's own report wins, then the report with the smallest sender.
+    Among reports of one tick, the subject's own report wins, then that of the smallest sender.
     """
     if report["tick"] != other["tick"]:
         return bool(report["tick"] > other["tick"])
@@ -66,7 +66,7 @@ def sort_by_distance(
 ) -> None:
     """Sort the first `num` reports by distance, then by subject.
 
-    `box`: REPORT (N,). `squared`: (at least N,) their squared distances from (x, y) in m²,
+    `box`: REPORT (N,). `squared`: (at least N,) squared distances of the reports from (x, y) in m²,
     overwritten.
     """
     is_sorted = True
@@ -76,7 +76,7 @@ def sort_by_distance(
             is_sorted = False
     if is_sorted:
         return
-    # Insertion sort, since the order of the last tick is nearly right.
+    # Insertion sort, because the order of the last tick is nearly right.
     for k in range(1, num):
         place = k
         while place > 0 and not _is_before(
@@ -96,7 +96,7 @@ def _is_before(
 
 @kernel
 def _swap(box: NDArray[np.void], squared: NDArray[np.float64], place: int) -> None:
-    """Swap a report with the one before it."""
+    """Swap a report with the previous report."""
     a = box[place - 1]
     b = box[place]
     a["subject"], b["subject"] = b["subject"], a["subject"]
@@ -127,10 +127,10 @@ def insert(
     x: float,
     y: float,
 ) -> int:
-    """Insert a report of a new subject by distance, if it is near enough; return the new number.
+    """Insert a report of a new subject by distance, if near enough; return the new number.
 
-    `box`: REPORT (N,), sorted. `squared`: their squared distances, in m². `report`: of a subject
-    that is not in the box. `x`, `y`: position of the receiver, m.
+    `box`: REPORT (N,), sorted. `squared`: squared distances of the reports, in m². `report`: a
+    report of a subject that is not in the box. `x`, `y`: position of the receiver, m.
     """
     distance = _squared(report, x, y)
     place = num

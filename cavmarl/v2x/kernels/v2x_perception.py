@@ -27,18 +27,18 @@ def visible(
     A vehicle is hidden if a nearer body or a wall blocks the straight line to its centre.
 
     Args:
-        scratch: `bodies` filled; `seen` gets rows of `vehicles`, nearest first.
-        own: row of the station itself; -1: the station is no vehicle.
+        scratch: `bodies` must be filled; `seen` gets rows of `vehicles`, nearest first.
+        own: row of the station; -1: the station is not a vehicle.
         x: position of the station, m.
         y: position of the station, m.
         z: height of the station, m; vehicles on another level are not seen.
         range_m: sensing range.
         most: largest number of vehicles.
         walls: walls of buildings.
-        over_bodies: whether the station sees over bodies, from a mast.
+        over_bodies: whether the station sees over bodies, as from a mast.
 
     Returns:
-        the number of vehicles.
+        The number of vehicles.
     """
     bodies = scratch.bodies.bodies
     near = nearest_bodies(

@@ -1,8 +1,8 @@
 """Records of messages, and the working memory of a message bus.
 
-A packet is one transmission of a station. It carries reports: a CAM one on its sender, a CPM one
-on each perceived vehicle. `v2x/v2x_messages.py` is the external schema. Records that outlive a
-tick have no padding, because the hash of the state covers all their bytes.
+A packet is one transmission of a station. It carries reports: a CAM carries a report on its sender,
+and a CPM a report on each perceived vehicle. `v2x/v2x_messages.py` is the external schema. Records
+that outlive a tick have no padding, because the hash of the state covers all their bytes.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ FIRST_ROADSIDE_ID = 1 << 46
 FIRST_CLOSED_ROAD = 1 << 47
 
 # Indices of Mail.counts; counts are since the reset.
-COUNT_SENT = 0  # four numbers, by kind
+COUNT_SENT = 0  # packets sent: four numbers, by kind
 COUNT_OVERFLOW = 4  # packets beyond the capacity
-COUNT_NO_ACCESS = 5  # packets that never got access to the channel
+COUNT_NO_ACCESS = 5  # packets that never got channel access
 COUNT_REACHABLE = 6  # receivers within reach, summed over packets
 COUNT_RECEIVED = 7  # receivers that received the packet, summed over packets
 NUM_COUNTS = 8
 MAX_DELAYS = 65  # number of delay bins, in ticks
-NUM_BANDS = 40  # number of distance bands for receptions; the last one has no upper bound
+NUM_BANDS = 40  # number of distance bands for receptions; the last band has no upper bound
 BAND_M = 25.0
 BANDS_PER_M = 1.0 / BAND_M
 MAX_NEAR = 64  # number of nearest bodies that a station examines
@@ -56,7 +56,7 @@ REPORT = record(
     ),  # subject: a vehicle, or a SIGNAL row; for an event, its sender or a closed road
     ("sender", np.int64),  # station; -1: no report
     ("tick", np.int64),  # tick of the reported state
-    ("expires", np.int64),  # last tick in which a receiver keeps it
+    ("expires", np.int64),  # last tick in which a receiver keeps the report
     ("kind", np.int32),  # KIND_*
     ("code", np.int32),  # vehicle class, cause of an event, or PHASE row (see `shown_states`)
     ("x", np.float64),  # m, world frame
@@ -78,14 +78,14 @@ PACKET = record(
     ("y", np.float64),
     ("word", np.uint64),  # part of the random number of a reception, see `packet_word`
     ("kind", np.int32),
-    ("first", np.int32),  # index of its first report
+    ("first", np.int32),  # index of the packet's first report
     ("count", np.int64),
 )
 
 # A station that can send or receive in this tick.
 STATION = record(
     ("id", np.int64),
-    ("zone", np.int32),  # zone that holds its row
+    ("zone", np.int32),  # zone that holds the station's row
     ("row", np.int32),
 )
 
@@ -140,7 +140,7 @@ class Sending(NamedTuple):
 class Mail(NamedTuple):
     """State that outlives a tick, of W worlds with R receivers: agents, then roadside units.
 
-    Packets in flight lie in L + 1 slots; packets of tick t lie in slot t modulo L + 1.
+    Packets in flight are in L + 1 slots; packets of tick t are in slot t modulo L + 1.
     """
 
     objects: NDArray[np.void]  # REPORT (W, R, N) vehicles, nearest first
@@ -166,7 +166,7 @@ class Air(NamedTuple):
     """Packets of one tick, sorted by position."""
 
     cells: Grid  # bodies are not used
-    x: NDArray[np.float64]  # (P,) in order of the cells
+    x: NDArray[np.float64]  # (P,) m, in the order of the cells
     y: NDArray[np.float64]
     sender: NDArray[np.int64]
     word: NDArray[np.uint64]  # see PACKET
@@ -184,7 +184,7 @@ class HeardCams(NamedTuple):
 
 
 class V2xScratch(NamedTuple):
-    """Working memory of a tick; holds nothing between ticks."""
+    """Working memory of a tick; its content is lost between ticks."""
 
     stations: NDArray[np.void]  # STATION (C,)
     spare: NDArray[np.void]  # STATION (C,)
@@ -199,7 +199,7 @@ class V2xScratch(NamedTuple):
     others: Air  # all other packets
     kinds: NDArray[np.int64]  # (NUM_KINDS,) number of packets received in this tick
     access: NDArray[np.bool_]  # (P,) whether a packet has channel access
-    cam_of: NDArray[np.int32]  # (a power of 2,) hash table of the CAM of a sender, or -1
+    cam_of: NDArray[np.int32]  # (a power of 2,) hash table: the CAM of a sender, or -1
     heard: HeardCams
     tally: NDArray[np.int64]  # (2 NUM_BANDS,) packets lost and received by distance band
     squared: NDArray[np.float64]  # (largest inbox,)

@@ -37,7 +37,7 @@ from cavmarl.v2x.kernels.v2x_records import (
     V2xScratch,
 )
 
-# Conditions for sending a CAM that is due (ETSI EN 302 637-2, 6.1.3).
+# Conditions under which a due CAM is sent (ETSI EN 302 637-2, 6.1.3).
 CAM_DISTANCE_M = 4.0
 CAM_HEADING_RAD = math.radians(4.0)
 CAM_SPEED_MPS = 0.5
@@ -50,8 +50,8 @@ def gather(
 ) -> int:
     """List the vehicles of all zones of a world by id, and return their number.
 
-    `side`: side of the zones' rows to read. `stations`: STATION (C,), overwritten. `spare`: of the
-    same size, overwritten.
+    `side`: side of the zones' rows to read. `stations`: STATION (C,), overwritten. `spare`: scratch
+    of the same size.
     """
     num = 0
     for zone in range(zoned.num_owned.shape[0]):
@@ -96,9 +96,9 @@ def phase_left_s(
     tick: int,
     sending: Sending,
 ) -> float:
-    """Return the remaining time of the present phase in s; the shortest one if it is actuated.
+    """Return the remaining time of the present phase in s; if actuated, the shortest possible time.
 
-    A green that is chosen ends at the next decision after its minimum, or later.
+    A chosen green ends at the first decision after its minimum, or later.
     """
     time = tick * sending.dt_s
     program = roads.programs[program_at(roads, signal, time, sending.dt_s)]
@@ -178,7 +178,7 @@ def _cause(row: np.void, sending: Sending) -> int:
 
 @kernel
 def _is_due(tick: int, station: int, period: int) -> bool:
-    """Return whether a station sends in this tick; stations take turns by number."""
+    """Return whether a station sends in this tick; stations take turns by their numbers."""
     return period > 0 and (tick + station) % period == 0
 
 
@@ -376,7 +376,7 @@ def send_from_units(
 def _write_overrides(
     report: np.void, roads: RoadArrays, signal: int, phase: NDArray[np.int32]
 ) -> None:
-    """Write the states that the caller shows at the links of a signal, if there are any."""
+    """Write the states that the caller shows at the links of a signal, if any."""
     for link in range(roads.links.shape[0]):
         shown = overridden_state(roads, link, phase)
         if roads.links[link]["signal"] == signal and shown != NOT_OVERRIDDEN:
@@ -388,7 +388,7 @@ def _write_overrides(
 def _write_unit(
     report: np.void, unit: np.void, sender: int, kind: int, code: int, tick: int
 ) -> None:
-    """Write a report of a roadside unit's own position."""
+    """Write a report on a roadside unit itself, with its position."""
     report["sender"] = sender
     report["tick"] = tick
     report["kind"] = kind

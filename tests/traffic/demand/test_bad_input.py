@@ -242,4 +242,4 @@ def test_the_number_of_nested_elements_of_a_definition_is_limited(demand: Reader
     body = (
         f'<vehicle id="a" depart="0"><routeDistribution>{route * 101}</routeDistribution></vehicle>'
     )
-    refused(demand, body, '<vehicle id="a">', "holds more than 100000 elements", "split it")
+    refused(demand, body, '<vehicle id="a">', "contains more than 100000 elements", "split it")

@@ -157,7 +157,7 @@ def test_options_without_effect_on_traffic_are_ignored(read: Read, option: str) 
 
 def test_two_configurations_are_refused(read: Read, town: RoadNetwork, tmp_path: Path) -> None:
     read("")
-    with pytest.raises(DemandError, match="is the second SUMO configuration"):
+    with pytest.raises(DemandError, match="a second SUMO configuration"):
         read_demand([tmp_path / "x.cfg", tmp_path / "x.cfg"], town)
 
 

@@ -63,7 +63,11 @@ def test_a_trip_turns_round_if_no_other_movement_exists(net: Path) -> None:
 def test_a_trip_without_a_way_is_refused(net: Path) -> None:
     with pytest.raises(cavmarl.RouteError) as caught:
         world(net, ROUND + "\n" + LOST)
-    for word in ("x.rou.xml, line 3", "no way from edge 'BC' to edge 'AB'", "on_bad_route = skip"):
+    for word in (
+        "x.rou.xml, line 3",
+        "no route from edge 'BC' to edge 'AB'",
+        "on_bad_route = skip",
+    ):
         assert word in str(caught.value)
 
 

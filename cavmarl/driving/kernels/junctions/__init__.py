@@ -1,6 +1,6 @@
-"""Right of way: whether a driver may enter a junction, or go on from a place inside.
+"""Right of way: whether a driver may enter a junction, or leave a waiting position inside.
 
-Open `junctions` first. Before any driver decides, `approach` registers each vehicle at the link
+Read `junctions` first. Before any driver decides, `approach` registers each vehicle at the link
 that it is on and at the links that it takes next. `stop_line_registration` defines the distance at
 which a vehicle registers, and the registered vehicles for which no driver has to wait. For each
 driver that approaches a stop line, `junctions` then checks the signal, the foes with the right of

@@ -1,6 +1,6 @@
 """Approaches: each vehicle registers at the link that it is on and at the links that it takes next.
 
-The lists are contiguous in memory and hold the values of a foe that decide the right of way.
+The lists are contiguous in memory. They hold the values of a foe that decide the right of way.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ from cavmarl.driving.kernels.lanes.route_following import (
 )
 
 MAX_LINKS_AHEAD = 2
-STANDS_BEFORE_M = 15.0  # distance of a vehicle's centre to the lane end while it waits to change
-LEAST_M = 1e-9  # smallest distance beyond the line of a vehicle on the junction; 0: at the line
+STANDS_BEFORE_M = 15.0  # distance from centre to lane end while a vehicle waits to change lanes
+LEAST_M = 1e-9  # a vehicle on the junction is at least this far beyond the line; 0: at the line
 BLOCK = 64  # number of rows that stay in the cache between both loops
 
 APPROACH = np.dtype(
     [
         ("link", np.int32),
         ("row", np.int32),  # VEHICLE row
-        ("dist", np.float64),  # of its centre to the stop line, m; negative beyond it
-        ("speed", np.float64),  # m/s
-        ("half", np.float64),  # half its length, m
+        ("dist", np.float64),  # from the centre to the stop line, m; negative beyond the line
+        ("speed", np.float64),  # speed of the vehicle, m/s
+        ("half", np.float64),  # half the length of the vehicle, m
         ("id", np.int64),
     ],
     align=True,
@@ -56,7 +56,7 @@ def register_links(
     step_at: NDArray[np.int64],  # (C,) positions of `step` in the table, see `Worlds`; updated
     scratch: Scratch,  # the lists by link, approach and largest are written
 ) -> None:
-    """Write, for each link, the vehicles that are on it or approach it to `scratch.approach`.
+    """List, for each link, the vehicles on it or approaching it in `scratch.approach`.
 
     Approaching vehicles are listed only for links with conflicts.
     """
@@ -64,9 +64,9 @@ def register_links(
     scratch.largest[:] = 0
     for first in range(0, num, BLOCK):
         last = min(first + BLOCK, num)
-        # Read the steps in a loop of their own: in a city each step is a cache miss, and a loop
-        # that does nothing else overlaps many of these misses. For most rows the step is still that
-        # of the previous tick.
+        # Read the steps in a separate loop: in a city each step is a cache miss, and a loop that
+        # does nothing else overlaps many of these misses. For most rows the step has not changed
+        # since the previous tick.
         for i in range(first, last):
             if i + SOON < num:
                 prefetch(roads.lanes, rows[i + SOON]["lane"], 0)
@@ -125,7 +125,7 @@ def _append(
 def _register_claims(
     roads: RoadArrays, travel: TripTables, row: np.void, i: int, pairs: int, scratch: Scratch
 ) -> int:
-    """Register a row that follows a script, at the links of its script."""
+    """Register a scripted row at the links of its script."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_claim"], frame["first_claim"] + frame["num_claims"]):
         claim = travel.scripts.claims[c]
@@ -137,7 +137,7 @@ def _register_claims(
 def _link_into(roads: RoadArrays, row: np.void) -> int:
     """Return the link by which a vehicle came to its lane, or -1.
 
-    If the vehicle entered the road on that lane or has changed lanes, the result is the first link
+    If the vehicle entered the road on this lane or has changed lanes, the result is the first link
     that leads to the lane or to an adjacent lane.
     """
     link = int(row["link"])
@@ -168,8 +168,8 @@ def _register_row(
         driven_m = max(here["link_offset_m"] + s, LEAST_M)
         pairs = _append(roads, scratch, pairs, here["link"], row, i, -driven_m)
     elif s - 0.5 * row["length"] < SWEPT_BEYOND_M:
-        # The centre has left the junction, but the rear has not left the junction, the fork, or a
-        # swept area.
+        # The centre has left the junction, but the rear is still in the junction, at the fork, or
+        # in a swept area.
         link = _link_into(roads, row)
         if link >= 0:
             left = roads.links[link]
@@ -187,7 +187,7 @@ def _register_row(
     distance = here["length_m"] - s
     way = row["way"]
     found = 0
-    far = not can_be_ignored(row)  # vehicles that turn into its lane may have to yield to it
+    far = not can_be_ignored(row)  # vehicles that turn into this lane may have to yield to the row
     while distance < reach or (far and distance < MERGES_M and roads.lanes[lane]["merges"]):
         before, before_way = lane, way
         if lane == row["lane"] and way == row["way"]:
@@ -195,8 +195,8 @@ def _register_row(
         else:
             lane, way, link = next_step(roads, travel, lane, way)
         if lane < 0:
-            # The vehicle has to change lanes before the end, and blocks vehicles that turn from
-            # there, or its route ends there.
+            # The vehicle has to change lanes before the end of the lane, where it blocks turning
+            # vehicles, or its route ends there.
             last = roads.lanes[before]
             ends = travel.steps[before_way + before]["change"] == 0
             if (ends or distance < STANDS_BEFORE_M) and found == 0 and last["num_links"] > 0:

@@ -1,7 +1,7 @@
 """Deadlocks of vehicles that yield to one another where no road has the right of way.
 
-On equal roads each vehicle yields to the vehicle on its right, so a full cycle of vehicles waits
-for ever. As in SUMO, vehicles of such a cycle let the others go in random ticks.
+On equal roads each vehicle yields to the vehicle on its right, so a full cycle of vehicles would
+wait forever. As in SUMO, each vehicle of such a cycle lets the others go in random ticks.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ def on_equal_road(roads: RoadArrays, link: int) -> bool:
 
 @inlined_kernel
 def drives_as_sumo(travel: TripTables, row: np.void) -> bool:
-    """Return whether a vehicle is a background vehicle whose driver behaves as in SUMO."""
+    """Return whether a vehicle is a background vehicle with a driver model of SUMO."""
     if row["driver"] != DRIVER_BACKGROUND:
         return False
     as_sumo: bool = travel.types[row["vtype"]]["as_sumo"]
@@ -44,9 +44,9 @@ def drives_as_sumo(travel: TripTables, row: np.void) -> bool:
 
 @inlined_kernel
 def resolves_deadlocks(roads: RoadArrays, travel: TripTables, row: np.void, link: int) -> bool:
-    """Return whether the driver of a vehicle resolves deadlocks at `link`, which it takes next.
+    """Return whether the driver of a vehicle resolves deadlocks at its next link, `link`.
 
-    Drivers as in SUMO do so before a junction of equal roads.
+    Drivers with a model of SUMO do so before a junction of equal roads.
     """
     breaks: bool = on_equal_road(roads, link) and drives_as_sumo(travel, row)
     return breaks
@@ -58,8 +58,8 @@ def _first_foe(
 ) -> int:
     """Return the link of the nearest foe that has the right of way over `link`, or -1.
 
-    The nearest foe is the one with the smallest distance to its stop line. If a foe comes from
-    `lane`, the result is `link` itself.
+    The nearest foe has the smallest distance to its stop line. If a foe comes from `lane`, the
+    result is `link` itself.
     """
     nearest, nearest_m, nearest_id = -1, math.inf, 0
     first = roads.links[link]["first_conflict"]
@@ -99,11 +99,11 @@ def yields_in_deadlock(
     roads: RoadArrays,
     rows: NDArray[np.void],
     row: np.void,  # VEHICLE
-    link: int,  # LINK that it takes next
+    link: int,  # next LINK of the vehicle
     asking: np.void,  # VEHICLE whose driver asks: `row`, or a vehicle that yields to it
     scratch: Scratch,
 ) -> bool:
-    """Return whether a driver that `resolves_deadlocks` is in a deadlock and now lets others go."""
+    """Return whether a driver that resolves deadlocks is in a deadlock and now lets others go."""
     if row["hold"] != HOLD_YIELD or row["speed"] > STANDING_MPS or row["wait_s"] == 0.0:
         return False
     share = STRAIGHT_SHARE if roads.links[link]["direction"] == STRAIGHT else TURNING_SHARE

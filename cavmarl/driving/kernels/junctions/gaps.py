@@ -1,8 +1,8 @@
-"""Gap acceptance at junctions: whether a foe occupies the shared area at the same time.
+"""Gap acceptance at junctions: whether two vehicles would occupy the shared area together.
 
 The gap model matches SUMO's. If the foe is before its line, both vehicles are assumed to need the
 whole junction, and the foe is assumed to keep its acceleration. If the foe is on the junction, only
-the shared area counts. If one of both vehicles is steered, other time gaps apply.
+the shared area counts. If one of the two vehicles is steered, other time gaps apply.
 """
 
 from __future__ import annotations
@@ -37,26 +37,26 @@ from cavmarl.driving.kernels.junctions.stop_line_registration import (
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_state
 
-BRISK_ACCEL = 2.5  # m/s²: assumed acceleration of a driver towards a shared area
-GENTLE_ACCEL = 1.8  # m/s²: to be safe, assumed acceleration out of a shared area
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # relative to the acceleration of any vehicle
-HARD_STOP = 5.0  # m/s²: a vehicle that needs more to stop before the line will not stop
+BRISK_ACCEL = 2.5  # m/s²: assumed acceleration towards a shared area
+GENTLE_ACCEL = 1.8  # m/s²: assumed acceleration out of a shared area, lower to be safe
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # the same as a share of a vehicle's acceleration
+HARD_STOP = 5.0  # m/s²: a vehicle that would have to brake harder for the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the ego line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the ego driver has waited long
-STEERED_AHEAD_S = 3.0  # time gap if one of both vehicles is steered, which may take longer
-STEERED_MERGE_AHEAD_S = 1.5  # time gap if both then drive into one lane, where one can follow
-SPEEDING_UP_MPS2 = 0.1  # from this acceleration on, a foe is assumed to keep accelerating
+STEERED_AHEAD_S = 3.0  # time gap if one vehicle is steered, because it may be slower
+STEERED_MERGE_AHEAD_S = 1.5  # the same if both enter one lane, where the later can follow
+SPEEDING_UP_MPS2 = 0.1  # a foe with at least this acceleration is assumed to keep accelerating
 GAP_S = 1.0  # time between the exit of one vehicle from a shared area and the entry of another
-SET_OFF_S = 0.5  # a standing vehicle starts this long before another vehicle leaves the area
+SET_OFF_S = 0.5  # a stopped vehicle starts this long before another vehicle leaves the area
 ROOM_M = 3.0  # free space behind a vehicle that clears a junction
 IMPATIENCE_S = 180.0  # after this wait, a driver that yields fully expects foes to brake
 FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
-# Share of the distance to a possible stop on which a vehicle can accelerate before it has to brake.
+# A vehicle can accelerate on this share of the distance to a possible stop, then it has to brake.
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # `STUCK_S` if both drive as in SUMO, which would teleport a vehicle then
-STOP_SIGN_S = 0.5  # time to stand at a stop sign, and before a tie is broken
+RESCUED_S = 300.0  # `STUCK_S` if both have models of SUMO, which teleports vehicles after it
+STOP_SIGN_S = 0.5  # time to wait at a stop sign, and before a tie is broken
 STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
 STATE_MAJOR = ord("M")
@@ -80,7 +80,7 @@ def link_signal(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> int:
 
 @kernel
 def is_red(roads: RoadArrays, link: int, phase: NDArray[np.int32]) -> bool:
-    """Return whether a link's signal is red, or red and yellow."""
+    """Return whether a link's signal shows red, alone or with yellow."""
     signal = link_signal(roads, link, phase)
     return signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
 
@@ -99,7 +99,7 @@ def earliest(distance: float, speed: float, limit: float, accel: float) -> float
 
 @inlined_kernel
 def must_stop(roads: RoadArrays, link: int, signal: int) -> bool:
-    """Return whether each vehicle has to stop once before `link`, whose signal shows `signal`."""
+    """Return whether all vehicles must stop once before `link`, whose signal shows `signal`."""
     state = roads.links[link]["state"]
     signed = signal == SIGNAL_NONE and (state == STATE_STOP or state == STATE_ALLWAY_STOP)
     return signed or signal == SIGNAL_STOP_THEN_GO
@@ -130,14 +130,14 @@ def _has_turn(row: np.void, link: int) -> bool:
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
-    """Return whether a standing vehicle yields at `link`; an agent stopped at its line does."""
+    """Return whether a stopped vehicle yields at `link`; an agent stopped at the line does."""
     stands: bool = is_steered(row) and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
 
 @inlined_kernel
 def _in_turn(state: int) -> bool:
-    """Return whether, at links of this state, the vehicle that has waited longer goes first."""
+    """Return whether vehicles take turns at links of this state: the longest wait goes first."""
     return state == STATE_EQUAL or state == STATE_ALLWAY_STOP
 
 
@@ -155,16 +155,16 @@ def may_ignore(
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
     `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
-    a wait of `stuck_s` s, the driver may also ignore a foe that stands and yields.
+    a wait of `stuck_s` s, the driver may also ignore a stopped foe that yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
         return True
     if signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR:
-        return True  # vehicles that cannot stop were checked before
+        return True  # foes that cannot stop were checked before
     if can_be_ignored(foe):
         return True
     if signal == SIGNAL_NONE and foe_state == STATE_ALLWAY_STOP and foe["stopped_at"] != foe_link:
-        return True  # the foe has to stop once, too, and has not yet stopped
+        return True  # the foe also has to stop once, and has not yet stopped
     if foe["speed"] > STANDING_MPS or not _is_yielding(foe, foe_link):
         return False
     # If the foe's signal is off and blinks, the foe has to yield as well.
@@ -174,7 +174,7 @@ def may_ignore(
     # On equal roads all vehicles could wait for one another, so waiting vehicles are ignored.
     if (state == STATE_EQUAL and row["wait_s"] > IMPATIENT_S) or _has_turn(row, link):
         return True
-    # Both wait: the vehicle that has waited longer takes its turn first.
+    # Both wait: the vehicle that has waited longer goes first.
     if row["wait_s"] < STOP_SIGN_S or row["speed"] > STANDING_MPS:
         return False
     longer: bool = row["wait_s"] > foe["wait_s"]
@@ -203,14 +203,14 @@ def _is_harmless(
     phase: NDArray[np.int32],
     equal: bool,
 ) -> bool:
-    """Return whether an APPROACH can be ignored, whenever it reaches the shared area.
+    """Return whether an APPROACH can be ignored, no matter when it reaches the shared area.
 
     `front` is the distance in m from the front of the foe to the place where it can still stop.
-    `apart` is the distance in m by which the foe's rear leaves the shared area before the own
+    `apart` is the distance in m by which the foe's rear leaves the shared area before the ego
     front. `comes_last` says that the foe has to yield.
     """
     if front <= 0.0:
-        # A foe that stands before the shared area is kept out of it by another vehicle.
+        # Another vehicle blocks a foe that is stopped before the shared area.
         before_area = foe["dist"] + conflict["foe_enter_m"] - foe["half"] > 0.0
         if before_area and foe["speed"] < STANDING_MPS and rows[foe["row"]]["wait_s"] > IMPATIENT_S:
             return True
@@ -232,7 +232,7 @@ def _is_harmless(
     stuck_s = RESCUED_S if alike else STUCK_S
     if may_ignore(row, other, link, foe_link, signal, state, foe_state, stuck_s):
         return True
-    # A vehicle that has been given its turn goes on if the foe can still brake for it.
+    # A vehicle that has taken its turn continues if the foe can still brake for it.
     brakes: bool = foe["speed"] * foe["speed"] < 2.0 * FORCED_STOP * front
     return brakes and _has_turn(row, link)
 
@@ -248,7 +248,7 @@ def assumed_accel_of(travel: TripTables, row: np.void) -> float:
 
 @inlined_kernel
 def stays_inside(foe: np.void) -> bool:
-    """Return whether a vehicle on a junction stays there: it stands or is blocked."""
+    """Return whether a vehicle on a junction stays there because it is stopped or blocked."""
     stands = (foe["speed"] < STANDING_MPS) & (foe["wait_s"] > IMPATIENT_S)
     stays: bool = stands | (foe["hold"] == HOLD_EXIT_BLOCKED)
     return stays
@@ -258,11 +258,11 @@ def stays_inside(foe: np.void) -> bool:
 def _comes_to_steered(
     row: np.void, conflict: np.void, foe: np.void, front: float, leaves_mps: float, time_out: float
 ) -> bool:
-    """Return `_comes` for the case that one of both vehicles is steered.
+    """Return `_comes` for two vehicles of which one is steered.
 
     `front` is the distance in m from the front of the foe to the place where it can still stop.
     """
-    # The longer a driver has waited, the more it expects the foe to brake. A slow stream lets it
+    # The longer a driver has waited, the harder it expects the foe to brake. A slow stream lets it
     # merge.
     patience = min(row["wait_s"] / IMPATIENCE_S, 1.0)
     if conflict["merging"] and STANDING_MPS < foe["speed"] < CRAWL_MPS:
@@ -273,7 +273,7 @@ def _comes_to_steered(
     ahead_s = STEERED_MERGE_AHEAD_S if conflict["merging"] else STEERED_AHEAD_S
     faster_mps = foe["speed"] - leaves_mps
     if conflict["merging"] and is_steered(row) and faster_mps > 0.0:
-        # A steered car is slow after a turn, so a fast foe needs room to brake.
+        # A steered car leaves a turn slowly, so a fast foe needs room to brake.
         ahead_s = max(ahead_s, faster_mps * faster_mps / (2.0 * FORCED_STOP * foe["speed"]))
     comes: bool = arrives < time_out + ahead_s
     return comes
@@ -290,7 +290,7 @@ def _comes(
     time_out: float,
     leaves_mps: float,
 ) -> bool:
-    """Return whether an APPROACH, of VEHICLE row `other`, reaches its line too soon for a row.
+    """Return whether the foe `other`, an APPROACH, reaches its line too soon for a row.
 
     The row is at its line in `time_in` s, and leaves the junction in `time_out` s with `leaves_mps`
     m/s. If both drive into the same lane, the foe has to be able to slow down to that speed. The
@@ -304,7 +304,7 @@ def _comes(
         arrives = to_line / max(foe["speed"], STANDING_MPS)
     if conflict["merging"]:
         mean_mps = max(to_line / max(arrives, 0.1), STANDING_MPS)
-        # A standing foe may start at once, so patience does not apply to it.
+        # A stopped foe may start at once, so the driver's patience does not count.
         patience = min(row["wait_s"] / IMPATIENCE_S, 1.0) if foe["speed"] > STANDING_MPS else 0.0
         brakes, left = FORCED_STOP, to_line
         if patience > 0.0:
@@ -346,7 +346,7 @@ def _blocks_inside(
         apart = distance + conflict["leave_m"] - half - to_clear
         return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
     if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
-        return HOLD_NONE  # stopping again would lose the turn; the row can wait before the area
+        return HOLD_NONE  # a stop would give up the turn; the row can wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
@@ -360,7 +360,7 @@ def _blocks_inside(
     elif row["speed"] <= STANDING_MPS and not equal and not _has_turn(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
             time_in = min(SET_OFF_S, time_in)
-        else:  # in turn: the row starts so that it need not brake before the area
+        else:  # the row's turn: it starts late enough not to brake before the area
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
             time_in = earliest(free, row["speed"], limit, assumed_accel)
             if other["accel"] > SPEEDING_UP_MPS2:
@@ -381,11 +381,11 @@ def hold_for_foe(
     foe: np.void,
     gives_way: bool,
     phase: NDArray[np.int32],
-    equal: bool = False,  # whether both drivers resolve deadlocks of equal roads, see `deadlocks`
+    equal: bool = False,  # whether both drivers resolve deadlocks on equal roads, see `deadlocks`
 ) -> int:
-    """Return whether an APPROACH occupies the shared area while `row` would, or goes first.
+    """Return the HOLD_* code of a foe: whether it would be in the shared area, or goes first.
 
-    HOLD_EXIT_BLOCKED means that the foe stays there, HOLD_YIELD that it will come or leave.
+    HOLD_EXIT_BLOCKED means that the foe stays in the area, HOLD_YIELD that it will come or leave.
     """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0 or (foe["dist"] < foe["half"] and not conflict["near"]):
@@ -394,12 +394,12 @@ def hold_for_foe(
     foe_link = roads.links[conflict["foe"]]
     if foe_link["from_lane"] == target["from_lane"]:
         return HOLD_NONE  # the vehicle ahead goes first, see `behind_fork`
-    # Distance of the foe's front to the line at which it can still stop: its stop line or, if it
-    # passes that line and the shared area is further on, its waiting position inside.
+    # Distance from the foe's front to the line at which it can still stop. This is its stop line
+    # or, if it passes that line and the shared area is further on, its waiting position inside.
     front = foe["dist"] - foe["half"] - roads.lanes[foe_link["from_lane"]]["stop_back_m"]
     comes_last = not (gives_way and conflict["must_yield"])
     if comes_last and front > 0.0 and not _is_committed(foe, front):
-        return HOLD_NONE  # early exit for most foes, which does not read the VEHICLE row
+        return HOLD_NONE  # early exit for most foes, without reading the VEHICLE row
     wait_m = foe_link["wait_m"]
     other = rows[foe["row"]]
     steered = is_steered(row) or is_steered(other)
@@ -430,7 +430,7 @@ def hold_for_foe(
         inside = to_line < 0.0 and target["wait_m"] < math.inf
         ahead = to_line + target["wait_m"] if inside else to_line
         to_line -= min(max(ahead, 0.0), LINE_MARGIN_M)
-    over += min(to_line, 0.0)  # from a waiting position, only the rest counts
+    over += min(to_line, 0.0)  # from a waiting position, only the remaining distance counts
     reached = math.sqrt(speed * speed + 2.0 * assumed_accel * max(over, 0.0))
     leaves_mps = min(reached, max(limit, speed))
     time_line = earliest(to_line, speed, limit, GENTLE_SHARE * assumed_accel)

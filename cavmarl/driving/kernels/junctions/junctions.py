@@ -4,7 +4,7 @@ A driver enters a link if no foe occupies the shared area at the same time, if t
 no foe with the right of way, and if there is room behind the junction. Some links have a waiting
 position inside the junction, for example for oncoming traffic before a left turn. Foes beyond that
 position are checked there and not at the stop line. All results are minima or disjunctions over the
-foes, so they do not depend on the order of rows.
+foes, so the order of rows does not matter.
 """
 
 from __future__ import annotations
@@ -50,21 +50,21 @@ from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M
 from cavmarl.driving.kernels.models.following import before_line, behind, no_constraint
 from cavmarl.roads.kernels.lanes_now import is_closed
 
-# m/s²: a driver stops at yellow if this deceleration suffices. Drivers as in SUMO stop if their
-# full deceleration suffices.
+# m/s²: a driver stops at yellow if this deceleration suffices. Drivers with a model of SUMO stop if
+# their full deceleration suffices.
 COMFORT_STOP = 3.0
 STEERED_MPS = 5.0  # assumed top speed of a steered car in a turn
 SEE_FOES_M = 4.5  # up to this distance, a driver that yields is ready to stop, as in SUMO
-LAST_CHANCE_M = 3.0  # distance of the front to the line at which a driver still goes at yellow
+LAST_CHANCE_M = 3.0  # a driver whose front is this close to the line still goes at yellow
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
-EXIT_LOOK_M = 75.0  # limit of that search: room for ten cars
-SWAP_TICKS = 64  # turn of one of two vehicles that wait for room on each other's lane
+EXIT_LOOK_M = 75.0  # largest distance of that search: room for ten cars
+SWAP_TICKS = 64  # length of a turn for two vehicles that wait for room on each other's lane
 # A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
 CREPT_M = 2.4
 CREPT_MPS = 2.0
 INSIDE_M = 1.0  # closer than this to a waiting position, a vehicle may be waiting there
-STOP_LINE_M = 5.0  # a vehicle that stands with its front closer than this stands at the line
+STOP_LINE_M = 5.0  # a stopped vehicle whose front is closer than this is at the line
 # The same for agents' vehicles, which may have to wait further back, with some slack.
 STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 
@@ -85,9 +85,9 @@ def _hold_for_foes(
 ) -> int:
     """Return whether a foe keeps row i, `distance` m before its line, from driving on `link`.
 
-    The shared areas before the waiting position at `wait_m` are checked or, if `inside`, those
-    beyond it. For a standing vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority over
-    HOLD_YIELD: others need not wait for a vehicle that cannot go.
+    If `inside`, the shared areas beyond the waiting position at `wait_m` are checked, else those
+    before it. For a stopped vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority over
+    HOLD_YIELD: other drivers need not wait for a vehicle that cannot go.
     """
     row = rows[i]
     hold = HOLD_NONE
@@ -143,7 +143,7 @@ def _hold_for_foes(
 
 @inlined_kernel
 def _stops_all(signal: int) -> bool:
-    """Return whether no vehicle that is still before the previous junction passes this signal."""
+    """Return whether this signal stops all vehicles that are still before the previous junction."""
     red = signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW
     return red or signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR
 
@@ -152,11 +152,11 @@ def _stops_all(signal: int) -> bool:
 def _waits_at(
     roads: RoadArrays, link: int, road_m: float, needed: float, phase: NDArray[np.int32]
 ) -> bool:
-    """Return whether a vehicle has to expect to wait before `link`, beyond the next junction.
+    """Return whether a vehicle must expect to wait before `link`, beyond the next junction.
 
-    It does so at red and yellow, and where it yields during green: it may not go before red. But if
-    the road before `link`, `road_m` m long, has no room for the vehicle, it cannot wait there until
-    others let it go. At links without a signal it expects to go, as in SUMO.
+    The vehicle may have to wait at red and yellow, and where it yields during green. But if the
+    road before `link`, `road_m` m long, has no room for the vehicle, it cannot wait there for
+    others. At links without a signal it expects to go, as in SUMO.
     """
     signal = link_signal(roads, link, phase)
     yields = signal != SIGNAL_NONE and (
@@ -170,8 +170,8 @@ def _waits_at(
 def _room_inside(roads: RoadArrays, link: int, phase: NDArray[np.int32], scratch: Scratch) -> float:
     """Return how far beyond its line a vehicle that yields on `link` can wait, in m.
 
-    It is 0 if the vehicle has to wait at the line: at red and yellow, without a waiting position
-    inside, and if another vehicle is on the way there.
+    The result is 0 if the vehicle has to wait at the line: at red and yellow, if there is no
+    waiting position inside, and if another vehicle is on the way there.
     """
     lane, wait_m = roads.links[link]["next_lane"], roads.links[link]["wait_m"]
     taken = scratch.lane_start[lane] < scratch.lane_end[lane]
@@ -186,14 +186,14 @@ def _goes_first_in_swap(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,  # VEHICLE
-    link: int,  # that it takes next
-    other: np.void,  # VEHICLE that stands on the road beyond, without room for the row behind it
+    link: int,  # next LINK of the row
+    other: np.void,  # VEHICLE stopped on the road beyond, without room for the row behind it
     room: float,  # behind that vehicle, m
 ) -> bool:
     """Return whether a row enters a junction without room beyond, to swap places with `other`.
 
-    Two vehicles that wait for room on each other's lane would wait for ever. One of them goes, and
-    stops inside the junction, if its own lane is clear of it there. They try by turns.
+    Two vehicles that wait for room on each other's lane would wait forever. One of them goes and
+    stops inside the junction, if it then clears its own lane. They take turns to try.
     """
     if other["hold"] != HOLD_EXIT_BLOCKED or other["wait_s"] <= IMPATIENT_S:
         return False
@@ -219,12 +219,12 @@ def exit_blocked(
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     scratch: Scratch,
 ) -> bool:
-    """Return whether a row could not clear the junction behind the next vehicle that waits ahead.
+    """Return whether a row could not clear the junction because of the next vehicle waiting ahead.
 
-    The vehicles that move in between need room as well. The next line at which a vehicle of that
-    road, or the row itself, has to wait ends the room. The inside of a junction is no room, except
-    up to a waiting position that is free.
-    Vehicles more than `EXIT_LOOK_M` beyond the junction do not count.
+    Vehicles that move in between need room as well. The room ends at the next line at which a
+    vehicle on that road, or the row itself, has to wait. The inside of a junction does not count as
+    room, except up to a free waiting position. Vehicles more than `EXIT_LOOK_M` beyond the junction
+    do not count.
     """
     target = roads.links[link]
     if target["may_block"]:
@@ -296,7 +296,7 @@ def hold_at_line(
         return HOLD_EXIT_BLOCKED
     stops = kind["decel"] if kind["as_sumo"] else COMFORT_STOP
     if (signal == SIGNAL_YELLOW_MINOR or signal == SIGNAL_YELLOW_MAJOR) and needed < stops:
-        # A vehicle that yielded at the line during green goes now, because the others stop.
+        # A vehicle that yielded at the line during green goes now, because the other vehicles stop.
         if row["hold"] != HOLD_YIELD or front > LAST_CHANCE_M:
             return HOLD_SIGNAL
     target = roads.links[link]
@@ -324,10 +324,10 @@ def has_crept_over_red(
     roads: RoadArrays,
     row: np.void,  # VEHICLE
     link: int,  # LINK row
-    over_m: float,  # distance of its front beyond the line, m
+    over_m: float,  # distance of the front beyond the line, m
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
 ) -> bool:
-    """Return whether an agent's vehicle has crept over a red line and has to stay there."""
+    """Return whether an agent's vehicle has crept over the line at red and has to stay there."""
     if not is_steered(row) or row["speed"] > CREPT_MPS:
         return False
     if over_m >= min(CREPT_M, roads.links[link]["wait_m"] - INSIDE_M):
@@ -341,12 +341,12 @@ def has_crept_over_red(
 def note_stop(
     roads: RoadArrays,
     plans: NDArray[np.void],
-    row: np.void,  # VEHICLE of an agent before its tick; stopped_at is written
+    row: np.void,  # VEHICLE of an agent before the tick; `stopped_at` is written
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
 ) -> None:
-    """Record the stop sign at which an agent's vehicle has stopped, until it leaves that lane.
+    """Record the stop sign at which an agent's vehicle has stopped; leaving the lane clears it.
 
-    If the lane before the sign is short, the vehicle may stand on a previous lane.
+    If the lane before the sign is short, the vehicle may have stopped on a previous lane.
     """
     lane = row["lane"]
     to_end = -row["s"] - 0.5 * row["length"]
@@ -377,7 +377,7 @@ def behind_merging(
     distance: float,  # from the vehicle's centre to the end of its lane, m
     scratch: Scratch,
 ) -> float:
-    """Return the constraint of vehicles on the junction that drive into the same lane.
+    """Return the constraint of vehicles on the junction that turn into the same lane.
 
     These vehicles are slow in a turn, so a fast vehicle brakes early for them.
     """
@@ -442,7 +442,7 @@ def before_waiting(
     row: np.void,
     link: int,
     place: float,  # distance of the front beyond the stop line, m
-    waits: int,  # reason to stop at the waiting position, HOLD_*
+    waits: int,  # HOLD_*, reason to stop at the waiting position
     minor: bool,  # whether the driver yields and, as in SUMO, approaches ready to stop
     dt: float,
 ) -> float:
@@ -468,7 +468,7 @@ def constraint_inside(
     dt: float,  # length of a tick, s
     scratch: Scratch,  # with the lane and link indices of this tick
 ) -> tuple[float, int, int]:
-    """Return the constraint of foes on the junction on row i, whose front has passed its line.
+    """Return the constraint on row i of foes on the junction; row i's front has passed its line.
 
     Of two vehicles in conflict, the vehicle nearer to the shared area goes first; at equal
     distance, the vehicle with the smaller id. If both drive into the same lane, the other
@@ -476,7 +476,7 @@ def constraint_inside(
 
     Returns:
         The constraint; the reason why the vehicle cannot go on (HOLD_*), including a foe that stays
-        in its way; the reason to stop at the waiting position only.
+        in its way; the reason to stop that comes from the waiting position.
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]
@@ -544,7 +544,7 @@ def _constraint_of(
         if conflict["merging"] and gap > to_area:
             return behind(kind, row["speed"], gap, foe["speed"], kind["decel"])
         return before_line(kind, row["speed"], to_area, dt)
-    # Both are in the shared area: the vehicle nearer to its end goes first, the other follows.
+    # Both are in the shared area: the vehicle nearer to the end of the area goes first.
     if foe_to_area > 0.0:
         return no_constraint(kind)
     rest = conflict["leave_m"] - front

@@ -19,7 +19,7 @@ def time_to_change(
     roads: RoadArrays,
     # CONTROLLER (num_controllers,), the state of the actuated programs
     controllers: NDArray[np.void],
-    link: int,  # LINK row that has a signal
+    link: int,  # LINK row with a signal
     phase: NDArray[np.int32],  # (num_signals + …,) see `Worlds.signal_phase`
     time: float,  # s since the world's reset
     dt: float,  # length of a tick, s
@@ -27,9 +27,9 @@ def time_to_change(
     """Return the time in s until the signal of a link changes its state.
 
     If the state never changes, the result is the length of the cycle. For an actuated program, and
-    for one whose greens are chosen, it is the earliest possible time: each phase counts with its
-    minimum duration, and any green may be chosen next. A state that the caller shows can change at
-    any time.
+    for a program whose greens are chosen, it is the earliest possible time: each phase counts with
+    its minimum duration, and any green may be chosen next. A state that the caller shows can change
+    at any time.
     """
     if overridden_state(roads, link, phase) != NOT_OVERRIDDEN:
         return 0.0
@@ -68,11 +68,11 @@ def time_to_change(
 def soonest_choice(
     roads: RoadArrays, program: np.void, row: int, index: int, end_s: float, by_green: bool
 ) -> float:
-    """Return the earliest time in s at which a letter changes if greens are chosen; inf: never.
+    """Return the earliest time in s at which the state changes if greens are chosen; inf: never.
 
-    `row`: active PHASE row, which ends in `end_s`, or may end then if it is a green. `by_green`:
+    `row`: active PHASE row, which ends in `end_s` s, or can end then if it is a green. `by_green`:
     whether only changes between green and other letters count. The phases of such a program are its
-    greens, and for each pair of greens the phases between them; see `signals.agent_programs`.
+    greens and, for each pair of greens, the phases between them; see `signals.agent_programs`.
     """
     now = _shown(roads, row, index, by_green)
     left = end_s
@@ -108,7 +108,7 @@ def soonest_choice(
 
 @kernel
 def _shown(roads: RoadArrays, row: int, index: int, by_green: bool) -> int:
-    """Return the letter of a link in a PHASE row; `by_green`: 1 if it is green, else 0."""
+    """Return the letter of a link in a PHASE row or, if `by_green`, 1 for green and 0 otherwise."""
     letter = roads.phase_states[roads.phases[row]["first_state"] + index]
     if by_green:
         return int(letter == SIGNAL_GREEN_MAJOR or letter == SIGNAL_GREEN_MINOR)

@@ -32,10 +32,10 @@ from cavmarl.driving.kernels.models.following import before_line, behind, no_con
 
 VAN_M, BUS_M = SIZE_LENGTHS_M
 CAR_BODY_M, VAN_BODY_M, BUS_BODY_M = SIZE_BODIES_M
-EASY_STOP = 2.0  # m/s²: a vehicle that needs more to stop before the area is about to enter it
-HARD_STOP = 3.5  # m/s²: a vehicle that needs more to stop before the area goes first
-AT_AREA_M = 0.01  # tolerance: a vehicle that stands right before an area is outside of it
-MIN_STOP_M = 0.01  # smaller distances count as this
+EASY_STOP = 2.0  # m/s²: a vehicle that would have to brake harder is about to enter the area
+HARD_STOP = 3.5  # m/s²: a vehicle that would have to brake harder goes first
+AT_AREA_M = 0.01  # tolerance: a vehicle stopped right before an area is outside of it
+MIN_STOP_M = 0.01  # lower bound of stopping distances
 SOON_M = 3.5  # a vehicle this close to the area may enter it at once
 LONG_FORK_M = 6.0  # additional distance at a fork until long vehicles are clear of one another
 WAIT_EARLIER_M = 3.0  # a long vehicle waits at most this far before the map's waiting position
@@ -51,7 +51,7 @@ def size_of(half: float) -> int:
 
 @inlined_kernel
 def _body_m(half: float, size: int) -> float:
-    """Return the length in m that counts for a vehicle: at least that of the body of its class."""
+    """Return the length in m of a vehicle, at least the body length of its size class."""
     least = VAN_BODY_M if size == 1 else (BUS_BODY_M if size == 2 else CAR_BODY_M)
     return float(max(2.0 * half, least))
 
@@ -60,7 +60,7 @@ def _body_m(half: float, size: int) -> float:
 def _nothing_sweeps(roads: RoadArrays, size: int, link: int, scratch: Scratch) -> bool:
     """Return whether no vehicle at the junction is large enough to sweep over a car on `link`.
 
-    This early exit, for most vehicles, does not read the areas.
+    This is an early exit for most vehicles, which does not read the areas.
     """
     row = roads.links[link]
     nothing: bool = size == 0 and row["swept_by"] > scratch.largest[row["junction"]]
@@ -74,14 +74,14 @@ def stop_before_foe_sweep(
     i: int,  # row of the vehicle
     link: int,  # LINK that the vehicle is on, or takes next
     place: float,  # distance of its front beyond the stop line, m
-    # if the vehicle has to stop anyway: it leaves room for foes this close to their lines, m; else
+    # m; if the vehicle has to stop anyway, it leaves room for foes this close to their lines; else
     # -inf
     room_m: float,
     scratch: Scratch,
 ) -> float:
-    """Return how far beyond its stop line the front of row i may go without being swept by a foe.
+    """Return how far beyond its stop line row i may go before a foe sweeps over it.
 
-    The result is in m, infinite if no foe sweeps over the vehicle.
+    The result is in m, for the front of row i; infinite if no foe sweeps over it.
     """
     row = rows[i]
     size = size_of(0.5 * row["length"])
@@ -99,7 +99,7 @@ def stop_before_foe_sweep(
         if sweep["own"] != own or rear > sweep["leave_m"]:
             continue
         if has_left and place > sweep["enter_m"] + AT_AREA_M:
-            continue  # row i has left the junction and clears the area
+            continue  # row i has left the junction and is about to clear the area
         if own == STEERED and room_m > 0.0 and -MOST_BACK_M < sweep["enter_m"] <= 0.0:
             stop = min(stop, max(sweep["enter_m"], place))  # wait where no foe sweeps over row i
         same_lane = roads.links[sweep["foe"]]["from_lane"] == roads.links[link]["from_lane"]
@@ -113,9 +113,9 @@ def stop_before_foe_sweep(
             if same_lane and foe["half"] - foe["dist"] < place:
                 continue  # the foe is behind the row
             if own == STEERED and _stands_in_the_way(roads, row, link, place, sweep, foe):
-                continue  # the foe has to brake hard for the row anyway, so the row does not stop
+                continue  # the foe has to brake hard in any case, so the row does not stop
             if _is_in_the_way(rows, row, foe, sweep, place, room_m):
-                # A vehicle inside the area stops where it is. If the foe stands, or may have to
+                # A vehicle inside the area stops where it is. If the foe is stopped, or may have to
                 # stop for the row, the row waits before the junction: otherwise neither could go.
                 stop = min(stop, max(sweep["enter_m"], place))
                 if place <= 0.0 and (
@@ -129,13 +129,13 @@ def stop_before_foe_sweep(
 def foe_would_sweep_over(
     roads: RoadArrays,
     row: np.void,  # VEHICLE that enters
-    link: int,  # LINK that it takes next
+    link: int,  # next LINK of the vehicle
     place: float,  # distance of its front beyond the stop line, m
     scratch: Scratch,
 ) -> bool:
     """Return whether a foe would sweep over a vehicle that enters the road here.
 
-    Such a foe is in the area, or can stop before the area only by hard braking. Areas of steered
+    Such a foe is in the area, or could stop before the area only by hard braking. Areas of steered
     cars do not count: otherwise no vehicle could enter where roads overlap.
     """
     own = size_of(0.5 * row["length"])
@@ -179,11 +179,11 @@ def _must_yield(roads: RoadArrays, link: int, other: int) -> bool:
 def _stands_in_the_way(
     roads: RoadArrays, row: np.void, link: int, place: float, sweep: np.void, foe: np.void
 ) -> bool:
-    """Return whether a row that stops for the sweep of a fast foe would stand in the foe's path.
+    """Return whether a row that stops for the sweep of a fast foe would be in the foe's path.
 
-    The front of the row is at `place`, and the foe is before its line. If the row yields, it would
-    stop beyond the start of the swept area. If the row has the right of way, its present place
-    counts.
+    The front of the row is at `place`, and the foe is before its line. If the row yields, the
+    result says whether it would stop beyond the start of the swept area. If the row has the right
+    of way, its present place counts.
     """
     front = foe["dist"] - foe["half"]
     if front <= 0.0 or not _needs(foe["speed"], front, HARD_STOP):
@@ -203,7 +203,7 @@ def _stands_in_the_way(
 
 @inlined_kernel
 def room_m(at_line: int, inside: int) -> float:
-    """Return `room_m` of `stop_before_foe_sweep` for the reasons to wait at the line and inside."""
+    """Return the argument `room_m` of `stop_before_foe_sweep`, by the reasons to wait (HOLD_*)."""
     if at_line != HOLD_NONE:
         return APPROACH_STANDING_M
     return math.inf if inside != HOLD_NONE else -math.inf
@@ -211,10 +211,10 @@ def room_m(at_line: int, inside: int) -> float:
 
 @kernel
 def wait_place(roads: RoadArrays, link: int, half: float) -> float:
-    """Return where inside a junction a vehicle on `link` waits, in m beyond its stop line.
+    """Return the waiting position inside a junction on `link`, in m beyond the stop line.
 
-    The result is the map's waiting position. Long vehicles wait up to `WAIT_EARLIER_M` earlier if
-    others would sweep over them. Cars wait earlier only if a foe approaches
+    The result is the map's waiting position. A long vehicle waits up to `WAIT_EARLIER_M` earlier if
+    others would sweep over it. A car waits earlier only if a foe approaches
     (`stop_before_foe_sweep`).
     """
     size = size_of(half)
@@ -240,7 +240,7 @@ def _is_in_the_way(
         return False
     other = rows[foe["row"]]
     if other["wait_s"] > GIVE_UP_S and other["hold"] == HOLD_EXIT_BLOCKED:
-        return False  # the foe waits for the row, whose own wait ends with its first movement
+        return False  # the foe waits for the row, which is about to move
     inside = place > sweep["enter_m"] + AT_AREA_M
     foe_inside = foe_place > sweep["foe_enter_m"] + AT_AREA_M
     if foe_inside and not inside:
@@ -258,7 +258,7 @@ def _is_in_the_way(
     # Background vehicles do not know the areas of steered vehicles, so they do not wait there.
     unaware = sweep["own"] == STEERED and sweep["other"] != STEERED
     own_to_area = sweep["enter_m"] - place
-    # If both can hardly stop before the area, the vehicle that has to brake less waits.
+    # If both vehicles can hardly stop before the area, the vehicle that has to brake less waits.
     foe_needs = _decel_to_stop(foe["speed"], to_area)
     own_needs = _decel_to_stop(row["speed"], own_to_area)
     if max(foe_needs, own_needs) > HARD_STOP and foe_needs != own_needs:
@@ -266,7 +266,7 @@ def _is_in_the_way(
     soon = to_area < SOON_M or _needs(foe["speed"], to_area, EASY_STOP)
     if unaware:
         return soon and (foe["speed"] > STANDING_MPS or _is_ahead(foe, foe_place, row, place))
-    # A foe that can be ignored is held by its leader, which may itself wait for this row.
+    # A foe that can be ignored is blocked by its leader, which may itself wait for this row.
     return soon and not can_be_ignored(other) and _is_ahead(foe, foe_place, row, place)
 
 
@@ -278,7 +278,7 @@ def _decel_to_stop(speed: float, distance: float) -> float:
 
 @inlined_kernel
 def _needs(speed: float, distance: float, decel: float) -> bool:
-    """Return whether a stop within a distance needs a larger deceleration than `decel`."""
+    """Return whether a stop within a distance needs more deceleration than `decel`."""
     needs: bool = speed * speed > 2.0 * decel * distance
     return needs
 
@@ -320,7 +320,7 @@ def before_foe_sweep(
 def before_foe_sweep_beyond_junction(
     roads: RoadArrays, rows: NDArray[np.void], i: int, kind: np.void, dt: float, scratch: Scratch
 ) -> float:
-    """Return the constraint of areas that foes sweep beyond the junction that row i has left."""
+    """Return the constraint of areas that foes sweep beyond the junction; row i has left it."""
     row = rows[i]
     link, half = row["link"], 0.5 * row["length"]
     if row["s"] - half >= SWEPT_BEYOND_M or link < 0 or roads.links[link]["to_lane"] != row["lane"]:
@@ -331,7 +331,7 @@ def before_foe_sweep_beyond_junction(
 
 @inlined_kernel
 def before_line_gently(kind: np.void, row: np.void, gap: float, dt: float) -> float:
-    """Return the constraint of a line, limited so that followers can brake as hard."""
+    """Return the constraint of a line, limited so that followers can brake equally hard."""
     constraint = before_line(kind, row["speed"], gap, dt)
     if kind["as_sumo"]:
         return float(min(constraint, kind["decel"] * dt - row["speed"]))
@@ -345,7 +345,7 @@ def behind_fork(
     row: np.void,
     lane: int,
     chosen: int,  # LINK that the row takes, -1: none
-    distance: float,  # from its centre to the end of the lane, m; negative beyond it
+    distance: float,  # from the row's centre to the end of the lane, m; negative beyond it
     dt: float,
     scratch: Scratch,
 ) -> float:
@@ -381,9 +381,9 @@ def _before_meeting_again(
     other: np.void,
     dt: float,
 ) -> float:
-    """Return the constraint of an APPROACH whose path meets that of `link` again after the fork.
+    """Return the constraint of an APPROACH whose path meets the path of `link` after the fork.
 
-    A vehicle in the shared area goes first, or else the vehicle that is further from the fork.
+    A vehicle in the shared area goes first; if there is none, the vehicle further from the fork.
     """
     front, foe_front = 0.5 * row["length"] - distance, other["half"] - other["dist"]
     first = roads.links[link]["first_conflict"]

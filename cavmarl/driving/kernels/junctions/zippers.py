@@ -1,7 +1,7 @@
-"""Zipper merging: vehicles of two lanes that become one lane take turns, and none of them stops.
+"""Zipper merging: where two lanes become one, vehicles take turns and none of them stops.
 
 As in SUMO, no vehicle has the right of way. Each driver follows the vehicles that pass before it,
-also while these are on the other lane. Where paths of zipper links cross, drivers yield to the
+even while these are on the other lane. Where paths of zipper links cross, drivers yield to the
 vehicles that pass before them. Both drivers of a pair compute the same order.
 """
 
@@ -27,7 +27,7 @@ BRAKES_S = 1.0  # a vehicle ahead goes first if the other can brake for it withi
 
 @inlined_kernel
 def is_zipper(roads: RoadArrays, link: int) -> bool:
-    """Return whether vehicles on `link` take turns with those of another lane."""
+    """Return whether vehicles on `link` take turns with vehicles of another lane."""
     target = roads.links[link]
     zipper: bool = (target["state"] == STATE_ZIPPER) & (target["signal"] < 0)
     return zipper
@@ -35,9 +35,10 @@ def is_zipper(roads: RoadArrays, link: int) -> bool:
 
 @inlined_kernel
 def _can_brake_for(to_line: float, row: np.void, decel: float, ahead_m: float, mps: float) -> bool:
-    """Return whether a row stays behind a vehicle `ahead_m` m before its line by braking briefly.
+    """Return whether a row can fall behind another vehicle by braking briefly.
 
-    `mps` is the speed of that vehicle, which has to be nearer to its line than the row.
+    That vehicle is `ahead_m` m before its line and drives `mps` m/s; it must be nearer to its line
+    than the row to its own.
     """
     apart = to_line - ahead_m
     brakes: bool = apart > 0.0 and apart > BRAKES_S * (row["speed"] - decel * BRAKES_S - mps)
@@ -48,7 +49,7 @@ def _can_brake_for(to_line: float, row: np.void, decel: float, ahead_m: float, m
 def _arrival_s(
     roads: RoadArrays, travel: TripTables, row: np.void, link: int, to_line: float
 ) -> float:
-    """Return the time in s in which a vehicle `to_line` m before its line can reach the line."""
+    """Return the shortest time in s in which a vehicle reaches its line, `to_line` m ahead."""
     limit = roads.lanes[roads.links[link]["from_lane"]]["speed_mps"]
     return earliest(to_line, row["speed"], limit, assumed_accel_of(travel, row))
 
@@ -59,11 +60,11 @@ def passes_first(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     row: np.void,  # VEHICLE
-    link: int,  # zipper link that it takes next
-    to_line: float,  # from its front to the line, m
+    link: int,  # next link of the row, a zipper link
+    to_line: float,  # from the row's front to the line, m
     foe: np.void,  # APPROACH of a vehicle at another zipper link
 ) -> bool:
-    """Return whether a foe passes a zipper before a row whose front is before its own line."""
+    """Return whether a foe passes a zipper before a row; the row's front is before its line."""
     foe_to_line, other = foe["dist"] - foe["half"], rows[foe["row"]]
     if foe_to_line <= 0.0:
         return True
@@ -86,9 +87,9 @@ def behind_in_zipper(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     i: int,  # row of the vehicle
-    kind: np.void,  # its VTYPE
-    link: int,  # zipper link that it takes next
-    distance: float,  # from its centre to the end of its lane, m; its front is before the line
+    kind: np.void,  # VTYPE of the row
+    link: int,  # next link of the row, a zipper link
+    distance: float,  # from the row's centre to the lane's end, m; the front is before the line
     scratch: Scratch,  # with the lane and link indices of this tick
 ) -> float:
     """Return the constraint of the foes that pass a zipper before row i."""

@@ -1,6 +1,6 @@
 """Lanes: the vehicles near a driver, and the lane that the driver chooses.
 
-Open `lane_choice` first. Before any driver decides, `lane_index` sorts the vehicles by lane and
+Read `lane_choice` first. Before any driver decides, `lane_index` sorts the vehicles by lane and
 position. In a tick, a driver follows its route from lane to lane (`route_following`), reacts to
 leaders on adjacent lanes (`adjacent_leaders`) and to the end of its lane (`lane_ends`), and then
 chooses a lane: `lane_choice` finds the vehicles concerned, `lane_change` evaluates the change by

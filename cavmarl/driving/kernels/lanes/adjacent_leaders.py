@@ -1,4 +1,4 @@
-"""Leaders on adjacent lanes: on lanes that a vehicle also covers, or reaching into its own lane."""
+"""Leaders on adjacent lanes that a vehicle also covers, or that reach into the vehicle's lane."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from cavmarl.driving.kernels.lanes.lane_index import ahead_on, beside_s, last_on
 from cavmarl.driving.kernels.models.following import behind, no_constraint
 from cavmarl.roads.kernels.plans import TURNAROUND
 
-STICKS_OUT_M = 0.1  # from this distance beyond the side of its lane on, a vehicle sticks out
+STICKS_OUT_M = 0.1  # a vehicle this far beyond the side of its lane sticks out
 ASKEW_RAD = 0.15  # with a smaller angle to its lane, a vehicle does not stick out
 SWINGS_BACK_M = 3.0  # how far the rear of a 12 m bus moves back during a U-turn on its path
 
@@ -33,7 +33,7 @@ def behind_entry(kind: np.void, speed: float, gap: float, leader: np.void) -> fl
 def rear_swing_m(
     roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], leader: np.void
 ) -> float:
-    """Return how far a leader's rear may move back, in m: a bus's rear does so in a U-turn."""
+    """Return how far a leader's rear may move back, in m, as the rear of a bus does in a U-turn."""
     if leader["half"] <= 0.5 * BUS_M:
         return 0.0
     other = rows[leader["row"]]
@@ -49,7 +49,7 @@ def rear_swing_m(
 def behind_adjacent_leader(
     roads: RoadArrays, travel: TripTables, kind: np.void, row: np.void, lane: int, scratch: Scratch
 ) -> float:
-    """Return the constraint of the leader on an adjacent lane that the body covers, or will."""
+    """Return the constraint of the leader on a lane that the body also covers or will cover."""
     target = roads.lanes[lane]
     s = beside_s(roads, row["lane"], lane, row["s"])
     half = 0.5 * row["length"]
@@ -99,7 +99,7 @@ def next_askew(
     lane: int,
     s: float,
     own_id: int,
-    to_left: bool,  # whether to search the left neighbour lane, else the right one
+    to_left: bool,  # search the left neighbour lane, else the right neighbour lane
     scratch: Scratch,
 ) -> tuple[int, float]:
     """Find the next steered vehicle ahead of `s` that sticks out from a neighbour lane.

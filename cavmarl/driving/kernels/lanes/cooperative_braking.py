@@ -18,10 +18,10 @@ COOPERATIVE_DECEL = 3.0  # m/s², largest deceleration to let a vehicle merge or
 def brake_for_merging(
     roads: RoadArrays, travel: TripTables, rows: NDArray[np.void], row: np.void, scratch: Scratch
 ) -> None:
-    """Slow down the follower on the lane that a vehicle needs to change to.
+    """Slow down the follower on the lane to which a vehicle has to change.
 
-    If that lane is free behind the vehicle, the next follower on each lane that leads there slows
-    down.
+    If that lane is free behind the vehicle, slow down the next follower on each lane that leads to
+    it.
     """
     lane = roads.lanes[row["lane"]]
     target = lane["left"] if row["blinker"] > 0 else lane["right"]

@@ -9,7 +9,7 @@ from __future__ import annotations
 from cavmarl.core.compiled import kernel
 
 POLITENESS = 0.0  # weight of the followers' gains, from 0 (selfish) to 1
-MIN_ACCEL_GAIN = 0.2  # m/s², smallest gain for which a driver changes lanes
+MIN_ACCEL_GAIN = 0.2  # m/s², smallest gain of acceleration for which a driver changes lanes
 MAX_BRAKING_IMPOSED = 2.0  # m/s², a change that imposes harder braking is unsafe
 LANE_CHANGE_DELAY_S = 1.0  # time between two decisions of a driver
 MIN_SPEED_MPS = 1.0  # slower cars do not change lanes
@@ -17,14 +17,13 @@ MIN_SPEED_MPS = 1.0  # slower cars do not change lanes
 
 @kernel
 def mobil_accepts(
-    own_accel: float,  # of the car that considers the change, now
-    own_accel_after: float,  # of the same car after the change
-    new_follower_accel: float,  # of the car that would be behind, now; 0 if there is none
-    new_follower_accel_after: float,  # of that car after the change; 0 if there is none
-    old_follower_accel: float,  # of the car that is behind, now; 0 if there is none
-    old_follower_accel_after: float,  # of that car after the change; 0 if there is none
-    # the route needs the change, so safety alone decides. The caller checks that the route needs
-    # this side
+    own_accel: float,  # acceleration of the car that considers the change, now
+    own_accel_after: float,  # the same after the change
+    new_follower_accel: float,  # acceleration of the car that would be behind, now; 0: no such car
+    new_follower_accel_after: float,  # the same after the change; 0: no such car
+    old_follower_accel: float,  # acceleration of the car that is behind, now; 0: no such car
+    old_follower_accel_after: float,  # the same after the change; 0: no such car
+    # the route needs a change to this side, so safety alone decides; the caller checks the side
     mandatory: bool,
     max_braking: float = MAX_BRAKING_IMPOSED,  # m/s², harder braking makes the change unsafe
 ) -> bool:

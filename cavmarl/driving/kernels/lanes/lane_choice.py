@@ -1,6 +1,6 @@
 """Lane choice: the lane that a driver wants, for its route or for speed, and whether it may change.
 
-MOBIL decides (`lane_change`). This file finds the vehicles concerned, and the lane changes that the
+MOBIL decides (`lane_change`). This file finds the vehicles that count and the lane changes that the
 route needs.
 """
 
@@ -36,26 +36,26 @@ from cavmarl.roads.kernels.lanes_now import is_closed
 from cavmarl.roads.kernels.plans import is_barred
 
 LOOK_BACK_M = 60.0  # distance within which followers count for a lane change
-# Drivers start to look for a gap this far, plus this travel time, before a mandatory change.
+# Drivers start to look for a gap before a mandatory change at this distance plus this travel time.
 CHANGE_EARLY_M = 80.0
 CHANGE_EARLY_S = 12.0
 MAX_BRAKING_ACCEPTED = 4.0  # m/s², largest deceleration that a driver accepts behind a new leader
 MAX_BRAKING_NEEDED = 4.0  # m/s², largest deceleration that a mandatory change imposes
 QUEUED_M = 7.5  # length of lane per vehicle in a queue
-TURN_IN_M = 5.0  # distance behind a junction where long vehicles still turn into adjacent lanes
+TURN_IN_M = 5.0  # up to this far behind a junction, turning long vehicles cover adjacent lanes
 SPARE_M = 2.0  # on a short lane, `TURN_IN_M` is reduced so that this much room is left
 SLOW_MPS = 2.0  # below this speed, a lane change needs side clearance to stopped vehicles
-CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible to the very end of the lane
+CREEP_MPS = 1.0  # up to this speed, a mandatory change is possible up to the lane's very end
 SIDEWAYS_S = 2.5  # duration of a lane change, which has to end before the lane does
 BRAKE_TIME_S = 0.5  # braking that ends within this time does not count
 SIDE_GAP_M = 1.0  # smallest gap between bumpers with which a lane change starts
-# A driver that has to leave a lane waits this far before its end to change right, and a vehicle's
-# length further back to change left. So two vehicles that swap lanes do not block each other.
+# To change to the right, a driver waits this far before the end of its lane; to change to the left,
+# it waits a vehicle length earlier. So two vehicles that swap lanes do not block each other.
 MERGE_ROOM_M = 2.0
 SWAP_ROOM_M = 3.0
 # Smallest swap room of a background vehicle, if its rear would otherwise be in the junction.
 LEAST_SWAP_M = SIDE_GAP_M + 0.2
-LINE_SLACK_M = 0.3  # a vehicle may stand this far before the place where it waits
+LINE_SLACK_M = 0.3  # a vehicle may stop this far before the place where it should wait
 MERGE_ROOM_SHARE = 0.25  # largest room for a change to the right, as a share of the lane's length
 
 
@@ -79,7 +79,7 @@ def needed_change(roads: RoadArrays, travel: TripTables, row: np.void, step: np.
 
 @inlined_kernel
 def room_for_further_changes(lane: np.void, row: np.void, step: np.void) -> float:
-    """Return the room in m for all lane changes of a steered vehicle but the first one."""
+    """Return the room in m for all lane changes of a steered vehicle except the first."""
     further = (step["changes"] - 1) * (row["length"] + SWAP_ROOM_M)
     return float(min(further, max(MERGE_ROOM_SHARE * lane["length_m"] - MERGE_ROOM_M, 0.0)))
 
@@ -113,7 +113,7 @@ def wish_on_lane(
 
 @inlined_kernel
 def _has_rear_close_beyond(scratch: Scratch, lane: np.void, front: float, gap_m: float) -> bool:
-    """Return whether the rear of a vehicle that leaves a lane is less than `gap_m` m ahead.
+    """Return whether the rear of a vehicle that is leaving a lane is less than `gap_m` m ahead.
 
     `front` is the distance in m from the ego front to the end of the lane.
     """
@@ -162,7 +162,7 @@ def imposed_on_followers(
 ) -> float:
     """Return the lowest acceleration in m/s² that a change to `s` on `target` imposes on others.
 
-    The result is -inf if a follower is beside that place. A fast follower far behind may have to
+    The result is -inf if a vehicle is beside that place. A fast follower far behind may have to
     brake harder than a stopped follower nearby, so every lane that leads to `target` is searched.
     """
     kind = travel.types[row["vtype"]]
@@ -181,7 +181,7 @@ def imposed_on_followers(
         limit = free_speed(roads.lanes[target], theirs, other["speed_factor"])
         net = gap - follower["half"] - half
         asked = accel_behind(theirs, pace, limit, net, row["speed"], kind["decel"])
-        # A standing or slow vehicle cannot brake for long, whatever the model returns.
+        # A stopped or slow vehicle cannot brake for long, whatever the model returns.
         least = min(least, max(asked, -pace / BRAKE_TIME_S))
     return least
 
@@ -197,7 +197,7 @@ def change_is_safe(
     mandatory: bool,
     scratch: Scratch,
 ) -> bool:
-    """Return whether MOBIL accepts that row i changes to lane `target`; also check the gaps."""
+    """Return whether MOBIL accepts that row i changes to lane `target`, and the gaps suffice."""
     row = rows[i]
     kind = travel.types[row["vtype"]]
     speed = row["speed"]
@@ -239,10 +239,10 @@ def change_is_safe(
 
 @inlined_kernel
 def rear_is_inside(lane: np.void, row: np.void) -> bool:
-    """Return whether a vehicle's rear is in or near the junction, where others turn in beside it.
+    """Return whether a vehicle's rear is in or near the junction, where others may turn in.
 
-    The rule does not hold on lanes too short for two vehicles and room to swap: there, a vehicle
-    waits with its rear in the junction (`lane_ends`), and would never change lanes.
+    The result is False on lanes too short for two vehicles and room to swap: there, a vehicle waits
+    with its rear in the junction (`lane_ends`), and would never change lanes.
     """
     room = SWAP_ROOM_M
     if not is_steered(row):
@@ -266,7 +266,7 @@ def _may_change(
     own_wish: float,
     scratch: Scratch,
 ) -> bool:
-    """Return whether row i wants to change to a side, for its route or for speed, and can do so."""
+    """Return whether row i wants to change to a side, for its route or speed, and can do so."""
     row = rows[i]
     lane = roads.lanes[row["lane"]]
     target = lane["left"] if side > 0 else lane["right"]
@@ -314,9 +314,9 @@ def _may_change(
 def considers_lane_change(row: np.void, needed: int, tick: int, dt: float) -> bool:
     """Return whether a driver considers a lane change in this tick.
 
-    Each driver does so once per LANE_CHANGE_DELAY_S and side, in ticks that depend on its id. A
-    moving driver whose route needs the change does so in every tick. Suggestions for agents are
-    computed in every step.
+    Each driver considers each side once per LANE_CHANGE_DELAY_S, in ticks that depend on its id. A
+    moving driver whose route needs the change considers it in every tick. Suggestions for agents
+    are computed in every step.
     """
     if is_steered(row) or (needed != 0 and row["speed"] > 0.0):
         return True
@@ -339,8 +339,8 @@ def choose_lane(
     """Return the lane change of row i in this tick: 1 left, -1 right, 0 none.
 
     In even ticks background drivers may change only to the left, in odd ticks only to the right. So
-    two of them never take the same gap from both sides in one tick, whatever the order of rows. The
-    rule does not hold for agents, because their suggestions are not binding.
+    two vehicles never enter the same gap from both sides in one tick, whatever the order of rows.
+    The rule does not apply to agents, because their suggestions are not binding.
     """
     row = rows[i]
     if is_steered(row):

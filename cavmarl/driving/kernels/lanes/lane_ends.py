@@ -103,7 +103,7 @@ def behind_over_line(
     distance: float,
     scratch: Scratch,
 ) -> float:
-    """Return the constraint of a vehicle beyond short lanes whose rear is still before the line.
+    """Return the constraint of a vehicle on short lanes ahead whose rear is before the line.
 
     `lane` is the first lane behind the line, which is `distance` m ahead.
     """
@@ -137,9 +137,9 @@ def constraint_over_lane_end(
 ) -> float:
     """Return the constraint on row i of bodies that reach over the end of a lane.
 
-    The end is `distance` m ahead. A vehicle that has left the lane by any link may still have its
-    rear over the end. If the end `is_near`, a background driver also waits for vehicles that sweep
-    over it.
+    The end is `distance` m ahead. The rear of a vehicle that has left the lane by any link may
+    still reach over the end. If the end `is_near`, a background driver also waits for vehicles that
+    sweep over it.
     """
     row = rows[i]
     constraint = behind_fork(roads, kind, row, lane, -1, distance, dt, scratch)

@@ -1,9 +1,9 @@
 """Lane index: the vehicles of one world sorted by lane and position, and searches in the index.
 
 For each lane, the index lists the vehicles by increasing (s, id). A vehicle whose body also covers
-an adjacent lane is in both lists. A vehicle that follows a script is in the lists of all lanes that
-it covers or is about to cover. A lost vehicle is in no list. The values that others read are copied
-to the entries, which are contiguous in memory. The index does not depend on the order of rows.
+an adjacent lane is in both lists. A scripted vehicle is in the lists of all lanes that it covers or
+is about to cover. A lost vehicle is in no list. The values that other drivers read are copied to
+the entries, which are contiguous in memory. The index does not depend on the order of rows.
 """
 
 from __future__ import annotations
@@ -23,18 +23,18 @@ from cavmarl.core.records.rows import is_lost
 from cavmarl.driving.kernels.junctions.stop_line_registration import registration_distance_m
 
 MAX_LOOK_BACK_LANES = 4
-GOES_ON_M = 1.0  # lanes of one road end at the same place, up to this difference
-VIEW_M = 250.0  # the largest view along the road that a world can have
+GOES_ON_M = 1.0  # lanes of one road end at the same place, within this tolerance
+VIEW_M = 250.0  # upper limit of a world's viewing distance along the road
 
 ENTRY = np.dtype(
     [
-        ("s", np.float64),  # of the centre on this lane, m
-        ("speed", np.float64),  # m/s
-        ("half", np.float64),  # half its length, m
+        ("s", np.float64),  # position of the centre on this lane, m
+        ("speed", np.float64),  # speed of the vehicle, m/s
+        ("half", np.float64),  # half the length of the vehicle, m
         ("decel", np.float64),  # comfortable deceleration, m/s², positive
         ("id", np.int64),
         ("row", np.int32),  # VEHICLE row
-        ("blinker", np.int32),  # lane change wanted: 1 left, -1 right
+        ("blinker", np.int32),  # desired lane change: 1 left, -1 right
         ("side", np.bool_),  # the body covers this lane, but the centre is on an adjacent lane
     ],
     align=True,
@@ -43,10 +43,10 @@ ENTRY = np.dtype(
 
 @kernel
 def beside_s(roads: RoadArrays, lane: int, neighbor: int, s: float) -> float:
-    """Return the position in m on a neighbour lane of a place on a lane.
+    """Convert a position on a lane to the position beside it on a neighbour lane, in m.
 
-    If the neighbour lane continues beside a junction (`goes_on_m`), the distance driven inside the
-    junction is added.
+    If the neighbour lane continues beside a junction (`goes_on_m`), add the distance driven inside
+    the junction.
     """
     row = roads.lanes[lane]
     driven = 0.0
@@ -139,7 +139,7 @@ def _insert(
 
 @inlined_kernel
 def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Return the index of a new entry of a lane by (s, id), and move the later entries up."""
+    """Make room for a new entry of a lane by (s, id), and return its index."""
     first = scratch.lane_start[lane]
     k = scratch.lane_end[lane]
     scratch.lane_end[lane] = k + 1
@@ -155,7 +155,7 @@ def _make_place(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 
 @kernel
 def _count_covers(travel: TripTables, row: np.void, scratch: Scratch) -> None:
-    """Count the entries of a row that follows a script."""
+    """Count the entries of a scripted row."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
         add(scratch.lanes, travel.scripts.covers[c]["lane"])
@@ -163,7 +163,7 @@ def _count_covers(travel: TripTables, row: np.void, scratch: Scratch) -> None:
 
 @kernel
 def _insert_covers(travel: TripTables, row: np.void, i: int, scratch: Scratch) -> None:
-    """Insert a row that follows a script for all lanes that it covers or is about to cover."""
+    """Insert a scripted row for all lanes that it covers or is about to cover."""
     frame = travel.scripts.frames[row["goal"]]
     for c in range(frame["first_cover"], frame["first_cover"] + frame["num_covers"]):
         cover = travel.scripts.covers[c]
@@ -193,8 +193,8 @@ def _first_after(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
 def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) -> int:
     """Return the index of the next other vehicle on `lane` ahead of `s`, or -1.
 
-    Vehicles further than `view_m` are not found. At equal s, the vehicle with the larger id counts
-    as ahead, so that one of two vehicles is always the leader.
+    Vehicles beyond `view_m` are ignored. At equal s, the vehicle with the larger id counts as
+    ahead, so that one of two vehicles is always the leader.
     """
     k = _first_after(scratch, lane, s, own_id)
     end = scratch.lane_end[lane]
@@ -205,7 +205,7 @@ def ahead_on(scratch: Scratch, lane: int, s: float, own_id: int, view_m: float) 
 
 @kernel
 def first_from(scratch: Scratch, lane: int, s: float, own_id: int) -> int:
-    """Return the index of the rearmost other vehicle on `lane` from `s` on, or -1."""
+    """Return the index of the rearmost other vehicle on `lane` at or beyond `s`, or -1."""
     k = _first_after(scratch, lane, s, -1)
     end = scratch.lane_end[lane]
     while k < end and scratch.entries[k]["id"] == own_id:
@@ -224,7 +224,7 @@ def last_on(scratch: Scratch, lane: int, own_id: int, distance: float, view_m: f
     """Return the index of the rearmost other vehicle on `lane`, or -1.
 
     The ego vehicle is `distance` m before the start of the lane. Vehicles further from it than
-    `view_m` are not found.
+    `view_m` are ignored.
     """
     k = int(scratch.lane_start[lane])
     end = scratch.lane_end[lane]
@@ -255,8 +255,8 @@ def _search_incoming(
 ) -> tuple[int, float]:
     """Find the nearest vehicle that comes from lane `before` to a place `s` m behind its end.
 
-    The result is that of `behind_by`. A vehicle that is too far to register at the line, because it
-    stands or is slow, is skipped.
+    The result has the form of `behind_by`. A vehicle that is too far to register at the line,
+    because it is stopped or slow, is skipped.
     """
     distance = s
     for _ in range(MAX_LOOK_BACK_LANES):
@@ -273,8 +273,8 @@ def _search_incoming(
         distance += row["length_m"]
         if row["num_into"] == 0:
             break
-        # Beyond a junction only the first incoming lane is searched: the right of way decides
-        # about the other ones.
+        # Further back, only the first incoming lane is searched: the right of way decides about the
+        # other lanes.
         before = roads.into[row["first_into"]]
     return -1, math.inf
 
@@ -286,7 +286,7 @@ def behind_by(
     lane: int,
     s: float,
     own_id: int,
-    n: int,  # number of the incoming lane; 0 if there is none
+    n: int,  # number of the incoming lane to search; 0 if there is none
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
@@ -295,7 +295,7 @@ def behind_by(
     If the lane is free behind `s`, the search continues on the n-th incoming lane, across lane
     borders up to `reach_m` away, for a vehicle that registers at the line
     (`registration_distance_m`). A vehicle on the lane itself is returned only for n = 0, so that
-    all n together return each follower once.
+    calls for all n return each follower once.
 
     Returns:
         The index of the entry and the distance in m, or (-1, inf) if there is none within `view_m`.

@@ -3,8 +3,8 @@
 All plans are stored in one table, `TripTables.steps`. A vehicle's `way` is an offset into it: the
 step of a lane outside junctions is `steps[way + lane]`. The plan of a goal covers every lane, so
 the `way` of such a vehicle never changes. An explicit route has steps for its own edges only, edge
-by edge; each step contains the shift of the `way` on the next edge. Inside junctions, a lane has
-one successor.
+by edge; each step contains the change of `way` on the next edge. Inside junctions, a lane has one
+successor.
 """
 
 from __future__ import annotations
@@ -15,12 +15,12 @@ from cavmarl.core.compiled import inlined_kernel, kernel
 from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.roads.kernels.signal_phases import program_at
 
-MOST_CHANGES = 8  # lane changes at the end of one lane
+MOST_CHANGES = 8  # largest number of lane changes at the end of one lane
 
 
 @inlined_kernel
 def own_step(roads: RoadArrays, row: np.void) -> int:
-    """Return the `TripTables.steps` row of a vehicle's lane; in a junction, of the next lane."""
+    """Return the `TripTables.steps` row of a vehicle's lane or, in a junction, of the next lane."""
     lane = row["lane"]
     if roads.lanes[lane]["internal"]:
         lane = roads.links[roads.lanes[lane]["link"]]["to_lane"]
@@ -37,7 +37,7 @@ def next_step_from(roads: RoadArrays, step: np.void, lane: int, way: int) -> tup
 
 @inlined_kernel
 def next_step(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> tuple[int, int, int]:
-    """Return what follows the end of a lane: (lane, `way` there, link that is entered).
+    """Return the next lane after the end of a lane, the `way` on it, and the link to it.
 
     The lane is -1 if the route ends or continues from another lane. The link is -1 inside
     junctions.
@@ -50,7 +50,7 @@ def next_step(roads: RoadArrays, travel: TripTables, lane: int, way: int) -> tup
 
 @inlined_kernel
 def fed_lane(roads: RoadArrays, lane: int) -> int:
-    """Return a lane or, if no link leads into it, an adjacent lane into which a link leads."""
+    """Return a lane or, if no link leads to it, an adjacent lane to which a link leads."""
     row = roads.lanes[lane]
     if row["num_into"] == 0:
         for side in (row["left"], row["right"]):
@@ -92,7 +92,7 @@ def next_step_of_plan(
 
 @inlined_kernel
 def free_speed(lane: np.void, kind: np.void, speed_factor: float) -> float:
-    """Return the speed in m/s of a vehicle alone on a LANE, by its VTYPE and speed factor."""
+    """Return the speed in m/s of a vehicle alone on a LANE, from its VTYPE and speed factor."""
     limit = min(lane["speed_mps"], kind["desired_max_speed"])
     return float(min(limit * speed_factor, kind["max_speed"]))
 
@@ -101,8 +101,8 @@ def free_speed(lane: np.void, kind: np.void, speed_factor: float) -> float:
 def route_time_s(roads: RoadArrays, travel: TripTables, row: np.void, begin_s: float) -> float:
     """Return the time in s after which a trip counts as too long.
 
-    The result is the time at the speed limits times `TripTables.trip_horizon`, plus for each signal
-    one cycle of the program that is active at `begin_s`.
+    The result is the travel time at the speed limits times `TripTables.trip_horizon`, plus one
+    signal cycle per signal on the route, of the program that is active at `begin_s`.
     """
     lane, way = row["lane"], row["way"]
     free_s = -row["s"] / roads.lanes[lane]["speed_mps"]

@@ -14,7 +14,7 @@ from cavmarl.driving.kernels.lanes.lane_index import beside_s
 
 LONGEST_HALF_M = 10.0  # half the length of the longest vehicle
 STAYS_ASIDE = 2  # value of `lane_change`: wait between two lanes
-MARGIN_M = 0.1  # on each side of the ego body
+MARGIN_M = 0.1  # required clearance on each side of the ego body
 ASIDE_MPS = 5.0  # up to this speed, a vehicle between two lanes checks its side clearance
 
 
@@ -24,14 +24,14 @@ def has_side_clearance(
     rows: NDArray[np.void],  # VEHICLE (C,)
     row: np.void,  # VEHICLE that moves, or would move, to the middle of a lane
     target: int,  # LANE to whose middle it moves
-    s: float,  # position of its centre on that lane, m
-    d: float,  # offset of its centre from the middle of that lane, m, positive to the left
-    side: int,  # to which it moves: 1 left, -1 right
+    s: float,  # position of the vehicle's centre on that lane, m
+    d: float,  # offset of the centre from the middle of that lane, m, positive to the left
+    side: int,  # direction of the move: 1 left, -1 right
     scratch: Scratch,
 ) -> bool:
     """Return whether a vehicle touches no stopped vehicle on the side to which it moves.
 
-    Vehicles on the lane and on the adjacent lanes count, and vehicles right before or behind these
+    The check covers vehicles on the lane, on the adjacent lanes, and right before or behind these
     lanes.
     """
     lane = roads.lanes[target]
@@ -92,7 +92,7 @@ def _is_touched(
 def has_to_stay_aside(
     roads: RoadArrays, rows: NDArray[np.void], row: np.void, scratch: Scratch
 ) -> bool:
-    """Return whether a vehicle between two lanes has to stay there to touch no stopped vehicle."""
+    """Return whether a vehicle between two lanes must stay there to avoid a stopped vehicle."""
     if row["d"] == 0.0 or row["speed"] > ASIDE_MPS:
         return False
     side = -1 if row["d"] > 0.0 else 1

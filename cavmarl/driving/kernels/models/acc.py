@@ -1,4 +1,4 @@
-"""Adaptive cruise control (ACC): the acceleration of a controller that was fitted to measurements.
+"""Adaptive cruise control (ACC): the acceleration of a controller fitted to measurements.
 
 Milanés, Shladover: "Modeling cooperative and autonomous adaptive cruise control dynamic responses
 using experimental data", Transportation Research C 48, 2014; Xiao, Wang, van Arem: "Realistic
@@ -21,15 +21,15 @@ from cavmarl.driving.kernels.models.acceleration_models import acceleration_mode
 from cavmarl.driving.kernels.models.car_following_model import CarFollowingModel
 from cavmarl.driving.kernels.models.krauss import safe_speed
 
-# Gains of the distance error in 1/s² (`…_SPACE`) and of the speed difference in 1/s (`…_SPEED`).
-SPEED_MODE_S = 2.0  # speed mode: the time gap is larger than this, and the leader is ignored
+# Gains for the distance error in 1/s² (`…_SPACE`) and for the speed difference in 1/s (`…_SPEED`).
+SPEED_MODE_S = 2.0  # speed mode: if the time gap is larger than this, the leader is ignored
 SPEED_GAIN = 0.4  # 1/s
 CONTROL_SPACE, CONTROL_SPEED = 0.23, 0.07  # gap control mode
-CONTROL_M, CONTROL_MPS = 0.2, 0.1  # largest distance error and speed difference of that mode
+CONTROL_M, CONTROL_MPS = 0.2, 0.1  # largest distance error and speed difference in that mode
 CLOSING_SPACE, CLOSING_SPEED = 0.04, 0.8  # gap closing mode
 AVOIDING_SPACE, AVOIDING_SPEED = 0.8, 0.23  # collision avoidance mode: the gap is too small
 EMERGENCY_MPS = 2.0
-# Room in addition to the time gap: `SLOW_ROOM_M` below the first speed, none above the second one.
+# Room in addition to the time gap: `SLOW_ROOM_M` below the first speed, none above the second.
 SLOW_MPS, FAST_MPS = 10.8, 15.0
 SLOW_ROOM_M = 2.0
 
@@ -47,7 +47,7 @@ def acc_acceleration(
     speed: float,  # m/s
     allowed: float,  # desired speed on a free road, m/s
     room: float,  # gap to the leader minus the gap at rest, m; infinite without a leader
-    front_speed: float,  # of the leader, m/s
+    front_speed: float,  # speed of the leader, m/s
     front_decel: float,  # the leader's comfortable deceleration, m/s², positive
     tau: float,  # desired time gap, s
     accel: float,  # largest acceleration, m/s²

@@ -1,7 +1,6 @@
-"""Models that compute an acceleration for each leader: the lowest acceleration is applied.
+"""Models that compute an acceleration for each leader; drivers apply the lowest acceleration.
 
-Such a model needs only one function of its own. Before lines, its drivers brake as in Krauss's
-model.
+Such a model needs only one function of its own. Before lines, drivers brake as in Krauss's model.
 """
 
 from __future__ import annotations
@@ -17,8 +16,8 @@ from cavmarl.core.math.scalars import clamp
 from cavmarl.driving.kernels.models.car_following_model import LINE_MARGIN_M, FollowingFunctions
 from cavmarl.driving.kernels.models.krauss import safe_speed
 
-# The acceleration in m/s² of a driver with (VTYPE, speed, allowed speed, gap between the bumpers,
-# the leader's speed, the leader's comfortable deceleration). On a free road the gap is infinite.
+# Returns the acceleration in m/s² of a driver for (VTYPE, speed, allowed speed, gap between the
+# bumpers, leader's speed, leader's comfortable deceleration). On a free road the gap is infinite.
 Acceleration: TypeAlias = Callable[[np.void, float, float, float, float, float], float]
 
 
@@ -42,7 +41,7 @@ def _speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: fl
 
 
 def acceleration_model(acceleration: Acceleration) -> FollowingFunctions:
-    """Return the functions of a model that is given by a compiled function of the acceleration."""
+    """Return the functions of a model, made from a compiled function of the acceleration."""
 
     @inlined_function
     def behind(

@@ -1,9 +1,9 @@
-"""The form of a car-following model: six functions, which each model's file defines.
+"""The interface of a car-following model: six functions, which each model's file defines.
 
-A leader or a line imposes a *constraint* on a driver; of several constraints the largest one is
-binding. Constraints are comparable only for one driver. What their number means is up to the model:
-for IDM the interaction that reduces the free acceleration (m/s²), for Krauss's model the negated
-safe speed (m/s), for `acceleration_models` the negated acceleration (m/s²).
+A leader or a line imposes a *constraint* on a driver; of several constraints the largest is
+binding. Constraints are comparable only for one driver. The meaning of the number depends on the
+model: for IDM the interaction that reduces the free acceleration (m/s²), for Krauss's model the
+negated safe speed (m/s), for `acceleration_models` the negated acceleration (m/s²).
 """
 
 from __future__ import annotations

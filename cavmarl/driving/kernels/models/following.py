@@ -1,6 +1,6 @@
-"""Car following for the vehicles of all models: each function calls that of the vehicle's model.
+"""Car following for all models: each function calls the same function of the vehicle's model.
 
-`MODELS` lists the models of the package, `car_following_model` describes what a model defines.
+`MODELS` lists the models of the package; `car_following_model` describes what a model defines.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from cavmarl.driving.kernels.models.idm import IDM
 from cavmarl.driving.kernels.models.krauss import KRAUSS
 from cavmarl.driving.kernels.models.registered_models import REGISTERED
 
-# A driver's VTYPE["model"] is compared with the codes in this order: put frequent models first.
+# A driver's VTYPE["model"] is compared with the codes in this order, so frequent models come first.
 MODELS = (KRAUSS, IDM, ACC)
 
-# A function of a model, with all arguments after the VTYPE row in one tuple.
+# A function of a model; all arguments after the VTYPE row are in one tuple.
 _Dispatcher: TypeAlias = Callable[[np.void, tuple[float, ...]], float]
 
 
 def _by_model(name: str) -> _Dispatcher:
-    """Return a function that calls the function `name` of the model of a VTYPE row."""
+    """Return a function that calls the function `name` of the model in a VTYPE row."""
     function: Callable[..., float] = getattr(REGISTERED, name)
 
     @inlined_function
@@ -38,7 +38,7 @@ def _by_model(name: str) -> _Dispatcher:
 
 
 def _branch(code: int, function: Callable[..., float], otherwise: _Dispatcher) -> _Dispatcher:
-    """Return a function that calls `function` for the model of a code, else `otherwise`."""
+    """Return a function that calls `function` if the model has this code, else `otherwise`."""
 
     @inlined_function
     def branch(kind: np.void, numbers: tuple[float, ...]) -> float:
@@ -66,9 +66,9 @@ def no_constraint(kind: np.void) -> float:
 @kernel
 def behind(
     kind: np.void,  # VTYPE of the driver
-    speed: float,  # of the driver, m/s
+    speed: float,  # speed of the driver, m/s
     gap: float,  # between the bumpers, m
-    front_speed: float,  # of the leader, m/s
+    front_speed: float,  # speed of the leader, m/s
     front_decel: float,  # the leader's comfortable deceleration, m/s², positive
 ) -> float:
     """Return the constraint that a leader imposes."""
@@ -83,7 +83,7 @@ def before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
 
 @kernel
 def wish(kind: np.void, speed: float, allowed: float, constraint: float) -> float:
-    """Return the acceleration in m/s² that a driver would like; lane changes are based on it."""
+    """Return the desired acceleration of a driver in m/s²; lane changes are based on it."""
     return _wish(kind, (speed, allowed, constraint))
 
 
@@ -105,7 +105,7 @@ def speed_behind(kind: np.void, gap: float, front_speed: float, front_decel: flo
 def response(
     kind: np.void,  # VTYPE of the driver
     speed: float,  # m/s
-    allowed: float,  # the speed that limits and the vehicle allow, m/s
+    allowed: float,  # the speed allowed by speed limits and by the vehicle, m/s
     constraint: float,  # the binding constraint
     share: float,  # a random number in [0, 1), for models with imperfect driving
     dt: float,  # length of the tick, s

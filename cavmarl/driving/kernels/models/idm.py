@@ -26,9 +26,7 @@ from cavmarl.driving.kernels.models.car_following_model import (
 
 ACCEL_MAX = 3.0  # m/s², desired acceleration from rest on a free road
 DECEL_COMFORT = 5.0  # m/s², comfortable deceleration, positive
-JAM_DISTANCE_M = (
-    10.0  # between the centres of two standing cars of 5 m; their bumpers are 5 m apart
-)
+JAM_DISTANCE_M = 10.0  # between the centres of two stopped cars of 5 m; their bumpers are 5 m apart
 TIME_HEADWAY_S = 1.5  # desired time gap
 ACCEL_LIMIT = 6.0  # m/s², limit of acceleration and of deceleration
 
@@ -54,8 +52,8 @@ def idm_free(
 @kernel
 def idm_interaction(
     speed: float,  # m/s
-    distance: float,  # to the leader, m, measured as `jam_distance`; kept 1 cm away from 0
-    front_speed: float,  # of the leader along the follower's heading, m/s
+    distance: float,  # to the leader, m, measured like `jam_distance`; kept 1 cm away from 0
+    front_speed: float,  # speed of the leader along the follower's heading, m/s
     accel_max: float,  # m/s², see `ACCEL_MAX`
     decel_comfort: float,  # m/s², positive, see `DECEL_COMFORT`
     jam_distance: float,  # m, see `JAM_DISTANCE_M`

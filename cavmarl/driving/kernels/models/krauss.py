@@ -1,4 +1,4 @@
-"""Krauss's model: the speed from which a driver can still stop behind its leader.
+"""Krauss's model: the largest speed at which a driver can still stop behind its leader.
 
 Krauss: "Microscopic modeling of traffic flow: investigation of collision free vehicle dynamics",
 DLR-Forschungsbericht 98-08, 1998, eq. 2.13, in the form that is SUMO's default: the leader's
@@ -22,10 +22,10 @@ from cavmarl.driving.kernels.models.car_following_model import (
 
 @kernel
 def safe_speed(
-    gap: float,  # m that may be used up; a negative gap gives 0 m/s
-    front_speed: float,  # of the leader, m/s; 0 for a line
-    decel: float,  # of the driver, m/s², positive
-    front_decel: float,  # of the leader, m/s², positive
+    gap: float,  # distance that may be used up, m; a negative gap gives 0 m/s
+    front_speed: float,  # speed of the leader, m/s; 0 for a line
+    decel: float,  # deceleration of the driver, m/s², positive
+    front_decel: float,  # deceleration of the leader, m/s², positive
     reaction_s: float,  # time before the driver brakes, s
 ) -> float:
     """Return the largest speed in m/s at which braking after `reaction_s` does not use up the gap.
@@ -45,10 +45,10 @@ def dawdle(
     accel: float,  # the largest acceleration, m/s²
     sigma: float,  # imperfection in [0, 1]
     share: float,  # a random number in [0, 1)
-    dt: float,  # seconds of the tick
+    dt: float,  # length of the tick, s
 ) -> float:
-    """Return the speed in m/s after the random loss of imperfect driving."""
-    # At low speed the loss is proportional to the speed, so that a standing vehicle can start.
+    """Return the speed in m/s reduced by a random amount, for imperfect driving."""
+    # At low speed the loss is proportional to the speed, so that a stopped vehicle can start.
     return max(speed - dt * sigma * min(accel, speed) * share, 0.0)
 
 
@@ -71,7 +71,7 @@ def _before_line(kind: np.void, speed: float, gap: float, dt: float) -> float:
 
 @inlined_kernel
 def _wish(kind: np.void, speed: float, allowed: float, constraint: float) -> float:
-    # The next speed is reached within a reaction time, whatever the length of a tick.
+    # The next speed is reached within one reaction time, whatever the length of a tick.
     wanted = min(-constraint, allowed, speed + kind["accel"] * kind["tau"])
     return float((wanted - speed) / kind["tau"])
 

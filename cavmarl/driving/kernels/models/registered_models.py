@@ -1,7 +1,7 @@
 """Driver models that a user registers: kernels call them through a table of addresses.
 
-Compiled kernels refer to the table by the name of a symbol and not to its content. So their code is
-the same, whichever models are registered.
+Compiled kernels refer to the table by a symbol name and not by its content. So their code is the
+same, whichever models are registered.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _COMPILED: dict[int, Any] = {}  # keeps the machine code of the addresses
 
 
 def put_model(code: int, model: Callable[..., float]) -> None:
-    """Compile a model, and enter it in the table for `ask_model`; it is not kept on disk.
+    """Compile a model and add it to the table of `ask_model`; its code is not cached on disk.
 
     Raises:
         MissingExtraError: Numba is not installed.
@@ -43,7 +43,7 @@ def put_model(code: int, model: Callable[..., float]) -> None:
 
 
 def _generate_call(typing: Any, code: Any, *numbers: Any) -> Any:
-    """Generate a call of the function whose address the table holds for a code."""
+    """Generate a call of the function whose address is in the table at a code."""
     from llvmlite import ir
     from numba.core import types
 
@@ -80,7 +80,7 @@ def ask_model(
     accel: float,
     decel: float,
 ) -> float:
-    """Return the acceleration in m/s² that a registered model asks for."""
+    """Return the acceleration in m/s² that a registered model returns."""
     return float(_MODELS[code](speed, allowed, gap, front_speed, min_gap, tau, accel, decel))
 
 
@@ -96,4 +96,4 @@ def _acceleration(
     return ask_model(code, speed, allowed, gap, front_speed, min_gap, tau, accel, decel)
 
 
-REGISTERED = acceleration_model(_acceleration)  # of all registered models
+REGISTERED = acceleration_model(_acceleration)  # functions of all registered models

@@ -19,16 +19,16 @@ MIN_SPEED_MPS = -40.0
 
 @kernel
 def bicycle_step(
-    x: float,  # m, of the centre
-    y: float,  # m, of the centre
+    x: float,  # m, position of the centre
+    y: float,  # m, position of the centre
     heading: float,  # rad
     speed: float,  # m/s along the heading, negative backwards
     accel: float,  # m/s²
     steering: float,  # angle of the front wheels in rad, within (-pi/2, pi/2), positive to the left
-    length: float,  # of the car, m; the distance from the centre to each axle is half of it
+    length: float,  # m; each axle is half the car's length from the centre
     dt: float,  # s
 ) -> tuple[float, float, float, float, float]:
-    """Move a car for one tick by explicit Euler, with the speed before the tick.
+    """Move a car by one tick with explicit Euler, using the speed before the tick.
 
         slip    = atan(tan(steering) / 2)
         x      += speed · cos(heading + slip) · dt

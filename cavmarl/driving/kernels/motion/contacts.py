@@ -12,7 +12,7 @@ from cavmarl.core.math.elementary import cos_sin, cosine, sine
 from cavmarl.core.math.geometry import boxes_overlap
 from cavmarl.core.math.neighbors import Grid, cell_at, cell_columns, cell_rows, move_area
 
-APART_M = 1e-6  # larger than rounding errors of a distance
+APART_M = 1e-6  # tolerance, larger than rounding errors of a distance
 
 
 @kernel
@@ -53,7 +53,7 @@ def find_contacts(
     rows: NDArray[np.void],  # VEHICLE (C,)
     num: int,  # live rows of the world; at most the grid's capacity
     grid: Grid,  # `newest` and `spots` are overwritten
-    # (C,) for each row the smallest id of the vehicles that it touches, or -1; overwritten up to
+    # (C,) for each row the smallest id of the vehicles in contact with it, or -1; overwritten up to
     # `num`
     hit: NDArray[np.int64],
 ) -> bool:
@@ -110,6 +110,6 @@ def _touches_earlier(
 
 @kernel
 def _keep_smallest(hit: NDArray[np.int64], row: int, vehicle_id: int) -> None:
-    """Keep the smallest id."""
+    """Keep the smaller id; -1 means no id."""
     if hit[row] < 0 or vehicle_id < hit[row]:
         hit[row] = vehicle_id

@@ -1,7 +1,7 @@
-"""Controllers of lane and speed: those of highway-env's `ControlledVehicle`.
+"""Controllers of lane and speed, as in highway-env's `ControlledVehicle`.
 
 The lateral controller is a cascade: lateral offset → lateral speed → heading → yaw rate → steering
-angle, each step proportional.
+angle; each step is a proportional controller.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def steering_control(
     speed: float,  # m/s
     d: float,  # lateral offset from the lane's centre in m, positive to the left
     heading_error: float,  # lane's direction `speed · PURSUIT_S` ahead minus the car's heading, rad
-    length: float,  # of the car, m
+    length: float,  # length of the car, m
 ) -> float:  # angle within ±`MAX_STEERING_RAD`, positive to the left
     """Return the steering angle in rad that moves a car to the centre of a lane."""
     divisor = not_zero(speed)
@@ -41,5 +41,5 @@ def steering_control(
 
 @kernel
 def speed_control(speed: float, target_speed: float) -> float:
-    """Return the acceleration in m/s², without a limit, towards a target speed in m/s."""
+    """Return the unlimited acceleration in m/s² towards a target speed in m/s."""
     return KP_ACCEL * (target_speed - speed)

@@ -1,8 +1,8 @@
 """Motion of one vehicle over one tick, in place in its record.
 
-Background vehicles move along their lanes: `s` follows from the decided acceleration, `d` moves
-towards the lane's centre, and the body is a chord of the path. Agents' vehicles are kinematic
-bicycles; `tracking.locate` then finds their place on the lanes.
+Background vehicles move along their lanes: the decided acceleration changes `s`, `d` moves towards
+the lane's centre, and the body is a chord of the path. Agents' vehicles are kinematic bicycles;
+`tracking.locate` then finds their place on the lanes.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ from cavmarl.driving.kernels.motion.tracking import locate, side_lane
 
 LATERAL_MPS = 1.4  # largest lateral speed of a lane change
 LATERAL_RATIO = 0.35  # largest lateral speed as a share of the speed
-LATERAL_MIN_MPS = 0.5  # least value of that limit, so that no vehicle is stuck between two lanes
-MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle that changes lanes and its lane
-MAX_SWING_M = 0.3  # largest distance by which its corners swing out
+LATERAL_MIN_MPS = 0.5  # lower bound of that limit, so that no vehicle is stuck between two lanes
+MAX_DRIFT_RAD = 0.12  # largest angle between a vehicle and its lane during a lane change
+MAX_SWING_M = 0.3  # largest distance by which the vehicle's corners then swing out
 MAX_BODY_LANES = 8  # lanes that a body can cover, in each direction from its centre
 STANDING_MPS = 0.1
 # A trip ends this far before the end of its goal edge; for a background vehicle, its front counts.
@@ -46,7 +46,7 @@ CROSSINGS_PER_TICK = 16  # largest number of lane borders crossed in one tick
 
 
 class Before(NamedTuple):
-    """The fields of the committed record that motion needs after it has overwritten them."""
+    """Values of the record before the tick, which motion needs after it has overwritten them."""
 
     speed: float  # m/s
     accel: float  # m/s²
@@ -58,7 +58,7 @@ class Before(NamedTuple):
 
 @inlined_kernel
 def before_tick(row: np.void) -> Before:
-    """Return these fields of a record, before it moves."""
+    """Copy these values from a record before it moves."""
     return Before(row["speed"], row["accel"], row["heading"], row["lane"], row["link"], row["way"])
 
 
@@ -66,7 +66,7 @@ def before_tick(row: np.void) -> Before:
 def _way_point(
     roads: RoadArrays, travel: TripTables, row: np.void, s: float
 ) -> tuple[float, float]:
-    """Return x and y of a point of a vehicle's path, `s` m from the start of its lane."""
+    """Return x and y of the point of a vehicle's path that is `s` m from the start of its lane."""
     lane = row["lane"]
     way = row["way"]
     for _ in range(MAX_BODY_LANES):
@@ -145,7 +145,7 @@ def place_on_lane(roads: RoadArrays, travel: TripTables, row: np.void) -> float:
 def account(row: np.void, before: Before, free_mps: float, dt: float) -> None:
     """Update the rates, distances and waiting time of a record after any kind of motion.
 
-    `free_mps`: the vehicle's `free_speed` on the lane before the tick.
+    `free_mps`: the vehicle's `free_speed` on its lane before the tick.
     """
     row["accel"] = (row["speed"] - before.speed) / dt
     row["jerk"] = (row["accel"] - before.accel) / dt
@@ -160,7 +160,7 @@ def account(row: np.void, before: Before, free_mps: float, dt: float) -> None:
 
 @kernel
 def _cross_borders(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Move a row whose s is beyond its lane's end to the next lanes; False if the route ends."""
+    """Move a row whose s is beyond its lane's end to the next lanes; return False at route end."""
     for _ in range(CROSSINGS_PER_TICK):
         length = roads.lanes[row["lane"]]["length_m"]
         if row["s"] < length:
@@ -181,7 +181,7 @@ def _cross_borders(roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
 
 @inlined_kernel
 def _stand(row: np.void, throttle: float, dt: float) -> None:
-    """Update the record of a background vehicle that stands still."""
+    """Update the record of a stopped background vehicle."""
     row["throttle"] = throttle
     row["jerk"] = -row["accel"] / dt
     row["accel"] = 0.0
@@ -197,14 +197,14 @@ def move_background(
     roads: RoadArrays,
     travel: TripTables,
     row: np.void,  # VEHICLE, the committed record; updated
-    step: np.void,  # PLAN of its lane before the tick
+    step: np.void,  # PLAN of the vehicle's lane before the tick
     accel: float,  # decided acceleration, m/s²
     lane_change: int,  # 1 left, -1 right, 0 none, or STAYS_ASIDE
     dt: float,  # length of the tick, s
 ) -> None:
     """Advance a background vehicle by one tick.
 
-    The new speed holds for the whole tick (semi-implicit Euler), as the safe speed of Krauss's
+    The new speed applies to the whole tick (semi-implicit Euler), as the safe speed of Krauss's
     model assumes.
     """
     before = before_tick(row)

@@ -9,10 +9,10 @@ from cavmarl.core.records.arrays import RoadArrays, TripTables
 from cavmarl.core.records.codes import UNTIL_DEPARTURE
 
 STANDING_MPS = 0.1
-STOPPED_M = 3.0  # a vehicle has reached a stop if its front is at most this far before it
-PASSED_M = 1.0  # a vehicle has missed a stop if its front is this far beyond it
+STOPPED_M = 3.0  # a vehicle is at a stop if its front is at most this far before the stop
+PASSED_M = 1.0  # a vehicle has missed a stop if its front is this far beyond the stop
 STAY = 2  # result of `change_for_stop`
-LANE_EARLY_M = 100.0  # distance before a stop at which the driver changes to its lane
+LANE_EARLY_M = 100.0  # distance before a stop at which the driver changes to the stop's lane
 
 
 @inlined_kernel

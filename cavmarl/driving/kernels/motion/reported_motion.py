@@ -1,6 +1,6 @@
-"""Rows whose motion another simulator reports: their aims, their places on the lanes, their rates.
+"""Rows whose motion another simulator reports: aims, positions on the lanes, and rates.
 
-A row first moves as cavmarl would move it. If the report differs, the row is corrected, so that a
+A row first moves as cavmarl would move it, and is corrected only if the report differs. So a
 simulator that moves vehicles exactly as cavmarl does changes no bit.
 """
 
@@ -30,7 +30,7 @@ from cavmarl.driving.kernels.motion.motion import ARRIVE_M, MAX_SPEED_MPS, STAND
 from cavmarl.driving.kernels.motion.tracking import WINDOW_M, locate, side_lane
 from cavmarl.roads.kernels.lanes_now import plans_of
 
-AIM_S = 0.6  # distance of a vehicle's aim, as driving time
+AIM_S = 0.6  # driving time from a vehicle to the point that it aims at
 AIM_MIN_M = 4.0
 AIM_LANES = 8  # largest number of lanes between a vehicle and its aim
 
@@ -41,9 +41,9 @@ def find_aims(
     travel: TripTables,
     places: NDArray[np.int64],  # (n,) rows
     rows: NDArray[np.void],  # VEHICLE (C,)
-    aims: NDArray[np.float64],  # (n, 2) is written: x and y; NaN for agents
+    aims: NDArray[np.float64],  # (n, 2) x and y, overwritten; NaN for agents
 ) -> None:
-    """Find the point on the middle of its way that each vehicle should steer to."""
+    """Find the point in the middle of its path to which each vehicle should steer."""
     for k in range(places.shape[0]):
         row = rows[places[k]]
         if row["driver"] == DRIVER_AGENT:
@@ -80,7 +80,7 @@ def is_as_reported(row: np.void, told: np.void) -> bool:
 
 @inlined_kernel
 def _take_report(row: np.void, was: np.void, told: np.void, dt: float) -> None:
-    """Copy a report to a row, and compute the rates that depend on it."""
+    """Copy a report to a row and compute the rates that depend on the report."""
     row["x"] = told["x"]
     row["y"] = told["y"]
     row["heading"] = wrap_angle(told["heading"])
@@ -96,7 +96,7 @@ def _take_report(row: np.void, was: np.void, told: np.void, dt: float) -> None:
 def _correct_background(
     roads: RoadArrays, row: np.void, was: np.void, told: np.void, dt: float
 ) -> None:
-    """Correct the position on the lane by the difference between the report and the row."""
+    """Correct the vehicle's lane position by the difference between the report and the row."""
     lane = roads.lanes[row["lane"]]
     first = lane["first_point"]
     num = lane["num_points"]
@@ -123,7 +123,7 @@ def _correct_agent(
     phase: NDArray[np.int32],
     dt: float,
 ) -> None:
-    """Find the position on the lanes again, as after `move_agent`."""
+    """Find the vehicle's position on the lanes again, as after `move_agent`."""
     _take_report(row, was, told, dt)
     row["lane"] = was["lane"]
     row["s"] = was["s"]
@@ -149,8 +149,8 @@ def follow_reports(
     w: int,  # the world
     grid: LaneGrid,  # the lanes near each place
     places: NDArray[np.int64],  # (n,) rows to correct
-    was: NDArray[np.void],  # VEHICLE (n,), these rows before the tick
-    told: NDArray[np.void],  # MOTION (n,), the reports about them
+    was: NDArray[np.void],  # VEHICLE (n,), the rows at `places` before the tick
+    told: NDArray[np.void],  # MOTION (n,), the reports for the rows at `places`
     rows: NDArray[np.void],  # VEHICLE (C,), as cavmarl has moved them; updated
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     dt: float,  # length of the tick, s
@@ -162,7 +162,7 @@ def follow_reports(
             continue
         if row["driver"] == DRIVER_AGENT:
             if was[k]["events"] & EVENTS_THAT_END:
-                continue  # its trip is over: it does not move
+                continue  # the trip is over, so the vehicle does not move
             own_plans = plans[plans_of(plans, row, w)]
             _correct_agent(roads, own_plans, grid, row, was[k], told[k], phase, dt)
         else:

@@ -1,7 +1,7 @@
 """Rows that follow a script: pedestrians and the vehicles of scenarios.
 
 A script is computed before the first step. It has one FRAME per tick, and each FRAME names the next
-one. At some frames, the row waits for a cue. The place of a row depends only on its frame and on
+FRAME. At some frames, the row waits for a cue. The place of a row depends only on its frame and on
 the cues, so every owner moves the row in the same way.
 """
 
@@ -46,11 +46,11 @@ def _let_go(roads: RoadArrays, travel: TripTables, row: np.void, goal: int) -> N
 def follow_script(
     roads: RoadArrays,
     travel: TripTables,  # with the scripts
-    cues: NDArray[np.int64],  # (T,) the tick in which each cue came, -1: not yet
+    cues: NDArray[np.int64],  # (T,) tick in which each cue was given, -1: not yet
     row: np.void,  # VEHICLE, the committed record; updated
     dt: float,  # length of the tick, s
 ) -> None:
-    """Advance a row that follows a script by one tick."""
+    """Advance a scripted row by one tick."""
     before = before_tick(row)
     frame = travel.scripts.frames[row["goal"]]
     if frame["cue"] < 0 or cues[frame["cue"]] >= 0:
@@ -68,10 +68,10 @@ def note_cues(
     cues: NDArray[np.void],  # CUE (T,)
     rows: NDArray[np.void],  # VEHICLE (k, W, C), the committed rows of all zones
     num_owned: NDArray[np.int64],  # (k, W)
-    ticks: NDArray[np.int64],  # (W,) since reset
-    came: NDArray[np.int64],  # (W, T) the tick in which each cue came, -1: not yet; updated
+    ticks: NDArray[np.int64],  # (W,) ticks since reset
+    came: NDArray[np.int64],  # (W, T) tick in which each cue was given, -1: not yet; updated
 ) -> None:
-    """Record the cues that come in this tick: at their time, or when an agent is near their place.
+    """Record the cues of this tick: a cue is given at its time, or when an agent is near its place.
 
     The result does not depend on the order of rows or on their owners.
     """

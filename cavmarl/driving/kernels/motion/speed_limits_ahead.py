@@ -11,7 +11,7 @@ from cavmarl.core.math.elementary import atan2
 from cavmarl.core.records.arrays import RoadArrays
 
 LIMIT_DECEL = 2.0  # m/s², deceleration before a bend or a lower limit
-LIMIT_LEAD_S = 1.0  # the limit is reached this much earlier, as the model reacts with a delay
+LIMIT_LEAD_S = 1.0  # the limit is reached this much earlier, because the model reacts late
 LATERAL_ACCEL = 2.5  # m/s², lateral acceleration of a steered car in a bend
 # A bend is a change of direction by more than `MIN_BEND_RAD` within `BEND_M`.
 MIN_BEND_RAD = 0.2
@@ -20,10 +20,10 @@ BEND_M = 6.0
 
 @kernel
 def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> float:
-    """Return the largest present speed in m/s with which a steered car can take a lane's bends.
+    """Return the largest present speed in m/s at which a steered car can take a lane's bends.
 
     `distance` is the distance in m to the start of the lane, negative on the lane. `before` is the
-    previous lane, or the lane itself if the car is on it.
+    previous lane or, if the car is on the lane, the lane itself.
     """
     row = roads.lanes[lane]
     first = row["first_point"]
@@ -58,7 +58,7 @@ def bend_speed(roads: RoadArrays, before: int, lane: int, distance: float) -> fl
 def speed_before_limit(
     kind: np.void, limit: float, distance: float, speed: float, dt: float
 ) -> float:
-    """Return the speed in m/s from which a driver can slow down to a limit `distance` m ahead."""
+    """Return the highest speed in m/s that can be reduced to a limit `distance` m ahead."""
     decel = LIMIT_DECEL
     lead_s = LIMIT_LEAD_S
     if kind["as_sumo"]:

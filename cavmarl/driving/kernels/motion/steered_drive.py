@@ -15,8 +15,8 @@ from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed
 from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
-ACCEL = 1.5  # m/s², out of a bend
-MOST_MPS = 10.0  # top speed, so that successive poses, a tick apart, are close to one another
+ACCEL = 1.5  # m/s², acceleration out of a bend
+MOST_MPS = 10.0  # top speed, so that the poses of successive ticks are close to one another
 LEAST_MPS = 1.0
 LANES_AHEAD = 4  # number of lanes ahead whose bends limit the speed
 
@@ -46,8 +46,8 @@ def steered_poses(
     wheelbase: float,  # m
     steering_rad: float,  # largest steering angle
     link: int,  # LINK that the car takes
-    begin_m: float,  # start, before the stop line
-    end_m: float,  # end, behind the junction
+    begin_m: float,  # distance of the start before the stop line
+    end_m: float,  # distance of the end behind the junction
     dt: float,  # s
     # (m, 6) distance from the stop line, x, y, z, cosine and sine of the heading; overwritten
     poses: NDArray[np.float64],

@@ -30,27 +30,27 @@ AIM_M = 4.0
 AIM_S = 0.6
 AIM_RAD = 0.1
 MAX_AIM_LANES = 8  # largest number of lanes up to that point
-# In turns at junctions, the distance is `TURN_AIM_M`, plus `AIM_EARLIER` times the distance by
+# In turns at junctions, the aim distance is `TURN_AIM_M`, plus `AIM_EARLIER` times the distance by
 # which an arc of the turning circle starts before the arc of the path. It is limited to
 # `AIM_M_PER_RAD` times the angle of the turn, and to `MOST_AIM_M`.
 TURN_AIM_M = 3.0
 AIM_EARLIER = 1.5
 AIM_M_PER_RAD = 2.6
 MOST_AIM_M = 7.0
-MOST_TURN_RAD = 2.8  # sharper turns count as this
+MOST_TURN_RAD = 2.8  # upper bound of the angle of a turn
 CUT_RADIUS_M = 6.0  # a turn of this radius is cut
 WIDE_RADIUS_M = 9.0  # a turn of this radius is followed exactly
 NEAR_TURN_M = 10.0  # distance to a junction at which its turn counts
-TURN_MPS = 3.5  # in and behind junctions, slower cars steer as at this speed
-TURNING_RATIO = 1.118  # radius of the turning circle over the wheelbase, wheels turned by 45°
-SLOW_MPS = 3.0  # a slower car that changes lanes may stop askew
-SWING_OUT_M = 0.1  # largest distance of the front of such a car beyond the far side of the lane
-CHORD_M = 1.5  # lanes have corners: their direction is that of a chord of twice this length
+TURN_MPS = 3.5  # in and behind junctions, slower cars steer as if at this speed
+TURNING_RATIO = 1.118  # turning circle radius divided by the wheelbase, wheels turned by 45°
+SLOW_MPS = 3.0  # a slower car may stop at an angle during a lane change
+SWING_OUT_M = 0.1  # the front of such a car reaches at most this far beyond the lane's far side
+CHORD_M = 1.5  # lanes have corners, so their direction is taken from a chord of twice this length
 
 
 @kernel
 def nearest_speed(target_speeds: NDArray[np.float64], speed: float) -> int:
-    """Return the index of the target speed nearest to `speed`; of two, the lower one."""
+    """Return the index of the target speed nearest to `speed`; on a tie, of the lower speed."""
     best = 0
     for k in range(1, target_speeds.shape[0]):
         if abs(target_speeds[k] - speed) < abs(target_speeds[best] - speed):
@@ -64,8 +64,8 @@ def take_meta_action(
 ) -> None:
     """Set target lane and target speed of a vehicle as highway-env's `MDPVehicle` does.
 
-    FASTER and SLOWER select the next target speed up or down. A lane change selects the neighbour
-    of the present lane, and has no effect if there is none.
+    FASTER and SLOWER select the next higher or lower target speed. A lane change selects the
+    neighbour of the present lane, and has no effect if there is no neighbour.
     """
     k = nearest_speed(target_speeds, row["target_speed"])
     if action == ACTION_FASTER:
@@ -85,8 +85,8 @@ def steer_to_lane(
 ) -> float:
     """Return the steering angle in rad that moves a vehicle to the middle of a lane.
 
-    If `target_lane` is neither the vehicle's lane nor a neighbour of it, the vehicle's lane counts.
-    Beyond the end of the lane, the next lane of the plan counts. `wheelbase` is in m.
+    If `target_lane` is neither the vehicle's lane nor a neighbour lane, the vehicle's lane is used.
+    Beyond the end of the lane, the next lane of the plan is used. `wheelbase` is in m.
     """
     lane = row["lane"]
     here = roads.lanes[lane]
@@ -125,8 +125,8 @@ def _aim_m(
 ) -> tuple[float, float]:
     """Return the aim distance in m in a bend, and how exactly the car follows the path (0 to 1).
 
-    The sharper a turn is, the larger the aim distance is, and the more the car cuts the corner at
-    the kerb, so that its front does not swing over the middle of the road.
+    In sharper turns, the aim distance is larger and the car cuts the corner at the kerb more, so
+    that its front does not swing over the middle of the road.
     """
     here = roads.lanes[lane]
     link = here["link"]
@@ -157,7 +157,7 @@ def _aim(
 ) -> float:
     """Return the steering angle in rad for a bend, or inf if there is no bend.
 
-    Pure pursuit: the car drives on an arc through a point of the path ahead. So the car turns in
+    Pure pursuit: the car drives on an arc through a point of the path ahead. So it turns early
     before a bend that is sharper than its turning circle. Coulter: "Implementation of the pure
     pursuit path tracking algorithm", CMU-RI-TR-92-01.
     """
@@ -190,7 +190,7 @@ def _aim(
 def _point_at(
     roads: RoadArrays, plans: NDArray[np.void], goal: int, lane: int, s: float
 ) -> tuple[float, float]:
-    """Return the point at `s` of a lane; beyond its end, the point is on the lanes of the plan."""
+    """Return the point at `s` of a lane; beyond the lane's end, follow the lanes of the plan."""
     here = roads.lanes[lane]
     for _ in range(MAX_AIM_LANES):
         following = plans[goal, lane]["next"]

@@ -1,4 +1,4 @@
-"""Tracking: the lane and the position on it of a freely steered vehicle.
+"""Tracking: the lane of a freely steered vehicle, and its position on that lane.
 
 The vehicle's lane, its neighbours and the next lanes are checked first. If the vehicle is on none
 of them, all lanes near its place are searched: it may have crossed to another road, be on the wrong
@@ -24,15 +24,15 @@ END_MARGIN_M = 1.0  # gaps up to this size between the end and the start of lane
 SEAM_M = 1.0  # gaps up to this size between adjacent lanes, in bends, are road
 WINDOW_M = 40.0
 TURNING_M = 6.0  # slightly more than the radius of a car's turning circle
-SIDE_MARGIN_M = 0.1  # a body this close to a neighbour lane covers it, as it may stand askew
-LEVEL_M = 4.0  # lanes further above or below belong to another road
+SIDE_MARGIN_M = 0.1  # a body this close to a neighbour lane covers it, as it may be at an angle
+LEVEL_M = 4.0  # lanes more than this above or below belong to another road
 
 
 @kernel
 def side_lane(roads: RoadArrays, row: np.void) -> int:
     """Return the neighbour lane that a vehicle's body also covers, or -1.
 
-    Inside a junction beside which the neighbour of the previous lane continues, it is that
+    Where the neighbour of the previous lane continues beside the junction, the result is that
     neighbour until the rear has passed its end.
     """
     lane = roads.lanes[row["lane"]]
@@ -71,7 +71,7 @@ def _on(
 def _follow(roads: RoadArrays, plans: NDArray[np.void], row: np.void) -> None:
     """Move a vehicle that has passed its lane's end to the next lanes.
 
-    The planned lane is preferred unless the vehicle is closer to the middle of another lane.
+    Choose the planned lane unless the vehicle is closer to the middle of another lane.
     """
     for _ in range(4):
         lane = roads.lanes[row["lane"]]
@@ -166,7 +166,7 @@ def locate(
     """Update lane, s, d and link of a steered vehicle for its new position.
 
     A vehicle that is on no lane of its direction keeps its last lane. Then s is limited to that
-    lane, and d is the distance beyond the lane's start or end if that is larger.
+    lane, and if the distance beyond the lane's start or end is larger than d, it replaces d.
 
     Returns:
         EVENT_OFF_ROAD, EVENT_WRONG_WAY or 0.
@@ -212,8 +212,8 @@ def locate(
 def _drives_along(roads: RoadArrays, row: np.void) -> bool:
     """Return whether the vehicle heads within 90° of its lane's direction, here or close by.
 
-    Lanes may turn more sharply than a car, which then turns earlier or later than its lane. Inside
-    a junction, the directions of the incoming and the outgoing road count as well.
+    Lanes may turn more sharply than a car can, so a car may turn earlier or later than its lane.
+    Inside a junction, the directions of the incoming and the outgoing road count as well.
     """
     lane = roads.lanes[row["lane"]]
     if _heads_along(roads, row, lane, row["s"]):

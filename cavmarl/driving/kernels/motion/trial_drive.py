@@ -1,4 +1,4 @@
-"""Trial drives of a single car with the built-in driver's steering: does it stay on its road?"""
+"""Trial drives of a car with the built-in driver's steering: whether it stays on its road."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from cavmarl.driving.kernels.motion.bicycle import bicycle_step
 from cavmarl.driving.kernels.motion.steering import steer_to_lane
 from cavmarl.driving.kernels.motion.tracking import locate
 
-TRIAL_MPS = 3.5  # approximate speed of drivers in sharp bends
+TRIAL_MPS = 3.5  # approximate speed in sharp bends
 FASTER_MPS = 4.2  # approximate speed in bends of 90°
 TRIAL_DT_S = 0.1
 SWING_M = 0.5  # tolerated distance of a body beyond the middle of a road
@@ -24,7 +24,7 @@ MOST_TICKS = 5000
 
 @kernel
 def _reaches_over(roads: RoadArrays, row: np.void, lane: int, inwards: int) -> bool:
-    """Return whether a corner of a body is far beyond the inner side of a road's innermost lane."""
+    """Return whether a corner of a body is more than `SWING_M` beyond the middle of a road."""
     here = roads.lanes[lane]
     if inwards == 0 or (here["left"] if inwards > 0 else here["right"]) >= 0:
         return False
@@ -53,13 +53,13 @@ def stays_on_road(
     last_lane: int,  # LANE where the drive ends
     end_m: float,  # position on that lane
     steering_rad: float,  # largest steering angle
-    # 1: the middle of the road is to the left, -1: to the right, 0: it does not matter
+    # side of the middle of the road: 1 left, -1 right, 0: not checked
     inwards: int,
     speed: float,  # m/s
 ) -> bool:
     """Return whether a slow car stays on its road and on the correct side of it.
 
-    No corner of its body may extend far beyond the middle of either road, where others drive.
+    No corner of the body may extend more than `SWING_M` beyond the middle of either road.
     """
     here = roads.lanes[lane]
     x, y, z, cos, sin, _ = lane_pose(roads.points, here["first_point"], here["num_points"], begin_m)

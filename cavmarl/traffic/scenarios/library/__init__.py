@@ -1,4 +1,4 @@
-"""Scenarios: one file each, in this folder or anywhere else.
+"""Scenarios: one file per scenario, in this folder or elsewhere.
 
 The docstring of a file describes the scenario. The file defines
 
@@ -61,14 +61,14 @@ def load_scenario(name: str) -> Any:
         )
     module = _run(path)
     if missing := [part for part in PARTS if not hasattr(module, part)]:
-        raise ConfigError(f"{path}: not a scenario; define {', '.join(missing)}")
+        raise ConfigError(f"{path}: this is not a scenario; define {', '.join(missing)}")
     return module
 
 
 def _run(path: Path) -> ModuleType:
     spec = importlib.util.spec_from_file_location(f"cavmarl_scenario_{path.stem}", path)
     if spec is None or spec.loader is None:
-        raise ConfigError(f"{path}: not a Python file")
+        raise ConfigError(f"{path}: this is not a Python file")
     module = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = module  # dataclasses resolve their annotations in this module
     try:
@@ -88,7 +88,7 @@ def summary_of(name: str) -> str:
 def plan_scene(config: ScenarioConfig, network: RoadNetwork, agents: int = 1) -> Scene | None:
     """Return the scene for a map; None without a scenario.
 
-    `agents`: number of agents; a logged scene has a seat for each of them.
+    `agents`: number of agents; a logged scene has a seat for each agent.
 
     Raises ConfigError: the scenario or the place does not exist, or a parameter is unknown or out
     of range; ScenarioError: the map has no place for the scenario; MapError: the file of a logged
@@ -121,7 +121,7 @@ def plan_scene(config: ScenarioConfig, network: RoadNetwork, agents: int = 1) ->
     return scene
 
 
-@lru_cache(maxsize=16)  # the worlds of an environment ask one after the other
+@lru_cache(maxsize=16)  # the worlds of an environment call it one after the other
 def _places(name: str, network: RoadNetwork, parameters: Any) -> dict[str, Any]:
     found: dict[str, Any] = load_scenario(name).places(Streets(network), parameters)
     return found

@@ -1,4 +1,4 @@
-"""An oncoming car attempts a U-turn, fails and stands across the agent's lane.
+"""An oncoming car attempts a U-turn, fails and blocks the agent's lane.
 
 The car reverses, turns further and drives off in front of the agent: a three-point turn.
 """
@@ -21,7 +21,7 @@ NEEDS = "a straight road of 85 m or more with an adjacent lane in the opposite d
 
 ROAD_M = 85.0
 BEHIND_M = 30.0  # length of road beyond the start of the turn
-RADIUS_M = 5.0  # of the turning circle
+RADIUS_M = 5.0  # radius of the turning circle
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage the car so that it blocks the lane just before an agent that keeps its speed."""
+    """Stage the car so that it blocks the lane just ahead of an agent that keeps its speed."""
     begin_s = streets.length_m(place) - BEHIND_M
     other = streets.opposite(place, begin_s)
     assert other is not None, "a place that `places` has not found"
@@ -74,7 +74,7 @@ def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
 
 
 def _first_turn(other: Opposite) -> float:
-    """Return how far the heading turns in the first part, in rad.
+    """Return the change of heading in the first part of the turn, in rad.
 
     Three arcs of one radius r through α, π - 2 α and α move a car sideways by 2 r (1 - 2 cos α),
     which has to be the distance between the lanes.

@@ -1,4 +1,4 @@
-"""A car stops in the middle of a junction, across the agent's way, and later drives on."""
+"""A car stops in the middle of a junction, across the agent's path, and later drives on."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ NEEDS = "a junction where a straight movement crosses another movement, with 65 
 
 FAR_M = 60.0  # initial distance from the agent to the junction
 ROLL_M = 12.0  # initial distance from the other car to its stop line
-NEAR_M = 30.0  # distance from the agent to the junction at which the blockage's time starts
+NEAR_M = 30.0  # distance from the agent to the junction at which the time of the blockage starts
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, Crossing]:
 
 
 def stage(streets: Streets, place: Crossing, parameters: Parameters) -> Scene:
-    """Stage a car that blocks the junction before an agent arrives, until it had to wait."""
+    """Stage a car that blocks the junction before an agent arrives, and drives on later."""
     seat = approach(streets, place.link, FAR_M, parameters.speed_mps)
     assert seat is not None, "a place that `places` has not found"
     path = path_of(streets.network, place.foe)

@@ -1,4 +1,4 @@
-"""A pedestrian steps onto the road away from crosswalks, just as the agent comes.
+"""A pedestrian steps onto the road, away from crosswalks, just as the agent arrives.
 
 If `occluded` is set, a van parked beside the road hides the pedestrian until the last moment.
 """
@@ -19,9 +19,9 @@ NEEDS = "a straight road for cars of 85 m or more"
 ROAD_M = 85.0
 BEHIND_M = 25.0  # length of road beyond the pedestrian
 KERB_M = 1.4  # distance of the pedestrian's start and end from the road
-VAN_GAP_M = 0.3  # between road and van
+VAN_GAP_M = 0.3  # distance between road and van
 VAN_M = (6.5, 2.16)
-STEP_M = 1.0  # between van and pedestrian
+STEP_M = 1.0  # distance between van and pedestrian
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage a pedestrian to start so that a vehicle that keeps its speed would collide."""
+    """Stage a pedestrian whose start makes a vehicle collide if it keeps its speed."""
     lane, s = place, streets.length_m(place) - BEHIND_M
     near, far = streets.kerbs_m(lane, s)
     side = near + KERB_M

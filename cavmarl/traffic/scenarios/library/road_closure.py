@@ -1,6 +1,6 @@
-"""The road behind the next junction is closed: a van stands on each of its lanes.
+"""The road behind the next junction is closed: a van blocks each of its lanes.
 
-The agent stops before them until the road is opened, or reaches its goal on another way.
+The agent stops before the vans until the road is opened, or reaches its goal on another route.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ NEEDS = (
 )
 
 FAR_M = 40.0  # initial distance from the agent to the junction
-INTO_M = 50.0  # from the start of the closed road to the vans
+INTO_M = 50.0  # distance from the start of the closed road to the vans
 ROAD_M = INTO_M + FREE_M + 10.0
-NEAR_M = 35.0  # distance from the agent to the vans at which the time until they leave starts
-MARGIN_M = 30.0  # margin around the scene without other vehicles at the start
+NEAR_M = 35.0  # the time until the vans leave starts at this distance of the agent
+MARGIN_M = 30.0  # margin around the scene that has no other vehicles at the start
 
 
 @dataclass(frozen=True)
@@ -51,7 +51,7 @@ def places(streets: Streets, parameters: Parameters) -> dict[str, int]:
 
 
 def stage(streets: Streets, place: int, parameters: Parameters) -> Scene:
-    """Stage vans that stand on the road from the start and leave after the agent had to wait."""
+    """Stage vans that block the road from the start and leave after the agent has arrived."""
     seat = approach(streets, place, FAR_M, parameters.speed_mps)
     closed = int(streets.network.links["to_lane"][place])
     goal = streets.onward(closed)

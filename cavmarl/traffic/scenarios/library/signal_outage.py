@@ -1,4 +1,4 @@
-"""The signals of a junction go dark as the agent comes on the road that then has to yield.
+"""The signals of a junction fail as the agent arrives on the road that then has to yield.
 
 Cars on the other road do not slow down for the agent.
 """
@@ -50,7 +50,7 @@ def _loses_its_signal(streets: Streets, crossing: Crossing) -> bool:
 
 
 def stage(streets: Streets, place: Meeting, parameters: Parameters) -> Scene:
-    """Stage the first car to meet an agent that keeps its speed in the dark junction."""
+    """Stage the first car to meet an agent that keeps its speed, in the junction."""
     crossing, scene = place
     signal = int(streets.network.links["signal"][crossing.link])
     outage = Outage(streets.network.signal_ids[signal], parameters.dark_s)
