@@ -293,7 +293,7 @@ def test_an_area_named_like_the_total_has_a_separate_row(
 def exit_code(*words: str) -> int:
     with pytest.raises(SystemExit) as end:
         main(words)
-    return int(end.value.exit_code or 0)
+    return int(end.value.code or 0)
 
 
 def test_the_command_writes_a_page_and_an_environment(
