@@ -227,7 +227,7 @@ def test_verify_determinism_fails_and_names_the_first_difference(
             ("suite", "standard", "--maps", "no-folder"),
             "is no environment and no file in no-folder",
         ),
-        (("report", "no-folder"), "no-folder: no manifest.json"),
+        (("report", "no-folder"), "no-folder: has no manifest.json"),
         (("verify", "determinism", "merge", "--steps", "0"), "steps = 0: must be"),
         (("verify", "determinism", "merg"), "did you mean merge"),
         (("verify", "zones", "merge", "--steps", "0"), "steps = 0: must be"),

@@ -113,7 +113,7 @@ def test_bad_actions_and_actions_for_other_nodes_are_refused() -> None:
     for word, value in ((0, -1), (0, 5), (1, 4), (2, 4), (6, -1)):
         other = words.copy()
         other[word] = value
-        with pytest.raises(MessageError, match="no actions of agents"):
+        with pytest.raises(MessageError, match="not actions of agents"):
             taken.read(memoryview(other.tobytes()), 0, owner)
 
 

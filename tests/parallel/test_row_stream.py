@@ -243,7 +243,7 @@ def test_bad_frames_about_agents_are_refused(change: bytes | None) -> None:
     if change is None:
         data[8:16] = (8).to_bytes(8, "little")  # valid agents are 0 to 7
     owner = np.full(8, -1, dtype=np.int32)
-    with pytest.raises(MessageError, match="no frame about agents"):
+    with pytest.raises(MessageError, match="not a frame about agents"):
         AgentStream(there).read(memoryview(data if change is None else change), 5, owner)
     assert (owner == -1).all()
 

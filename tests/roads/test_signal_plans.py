@@ -201,7 +201,7 @@ BROKEN = {
     "no id": ("", (' id="c"', ""), "has no attribute 'id'"),
     "empty id": ("", ('id="c"', 'id=""'), "has an empty id"),
     "no type": ("", ('type="static" ', ""), "a program 'night' without type"),
-    "other map": ("", ('id="c"', 'id="z"'), "line 3: .*no signal 'z'.*another map"),
+    "other map": ("", ('id="c"', 'id="z"'), "line 3: .*no signal 'z'.*is for this map"),
     "letters": ("", ('state="rGG"', 'state="rG"'), "different numbers of links"),
     "name taken": ("", ('programID="night"', 'programID="0"'), "two programs '0'"),
     "no duration": ("", ('<phase duration="5"', "<phase"), "line 4: <phase> has no attribute"),

@@ -77,7 +77,7 @@ def test_no_route_is_slower_than_the_route_of_duarouter(name: str, tmp_path: Pat
     assert sum(other is not None for other in theirs) > 20
     for pair, other in zip(pairs, theirs, strict=True):
         if other is None:
-            with pytest.raises(RouteError, match="no way"):
+            with pytest.raises(RouteError, match="no route"):
                 ways.edges(np.array(pair, dtype=np.int32), CARS)
             continue
         own = ways.edges(np.array(pair, dtype=np.int32), CARS).tolist()
