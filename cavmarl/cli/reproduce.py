@@ -105,7 +105,7 @@ def _chosen(
     if not (names or quick or every or listed):
         raise ConfigError("nothing to repeat: name lines, or use --quick, --all or --list")
     if unknown := [name for name in names if name not in lines]:
-        raise ConfigError(f"{unknown[0]}: is no line; `cavmarl reproduce --list` shows all lines")
+        raise ConfigError(f"{unknown[0]}: is not a line; `cavmarl reproduce --list` lists them")
     if slow := [name for name in names if quick and not lines[name].is_quick]:
         raise ConfigError(f"{slow[0]}: --quick does not repeat this line; leave out --quick")
     return {

@@ -191,7 +191,7 @@ def _finite_number(text: str) -> float:
 
 
 def _refuse_constant(name: str) -> NoReturn:
-    raise ValueError(f"{name} is no number")
+    raise ValueError(f"{name} is not a number")
 
 
 class StrictRoute(APIRoute):

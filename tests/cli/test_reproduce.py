@@ -121,7 +121,7 @@ def test_published_lines_are_listed(checkout: Path, capsys: pytest.CaptureFixtur
     ("words", "message"),
     [
         ((), "nothing to repeat: name lines, or use --quick, --all or --list"),
-        (("gone",), "gone: is no line; `cavmarl reproduce --list` shows all lines"),
+        (("gone",), "gone: is not a line; `cavmarl reproduce --list` lists them"),
         (("--quick", "--all"), "--quick and --all: use only one of the two"),
         (("rate", "--all"), "--all and rate: name lines, or leave out the names"),
         (("--quick", "--file", "MAPS"), "--file MAPS: must be WORD=PATH, for example MAPS=maps"),
