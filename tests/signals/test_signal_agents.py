@@ -628,7 +628,10 @@ def test_adapters_for_vehicles_refuse_signal_agents(adapter: Any) -> None:
 
 
 def test_a_followed_world_refuses_signal_agents(tmp_path: Path) -> None:
-    with closing(world()) as env, pytest.raises(ConfigError, match="a followed world has only vehicles as agents"):
+    with (
+        closing(world()) as env,
+        pytest.raises(ConfigError, match="a followed world has only vehicles as agents"),
+    ):
         FollowedWorld(env, tmp_path / "socket")
 
 

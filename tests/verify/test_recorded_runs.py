@@ -278,7 +278,9 @@ def test_commands_with_another_dtype_are_refused(
         return rows[[column for column in rows.dtype.names if column != "controls"]]
 
     monkeypatch.setattr(Recording, "extra", changed)
-    with pytest.raises(RecordingError, match="the column controls of its commands does not fit this world"):
+    with pytest.raises(
+        RecordingError, match="the column controls of its commands does not fit this world"
+    ):
         repeat_recording(*recording_of_commands)
 
 
