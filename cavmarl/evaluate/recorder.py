@@ -161,7 +161,7 @@ class Recorder:
         rows = np.zeros(self._world_steps.size, dtype=EPISODE)
         for name in ("zone_imbalance", *MESSAGE_COLUMNS, *BACKGROUND_COLUMNS):
             rows[name] = np.nan
-        num_agents = self._steps.shape[1]
+        num_agents = self._steps.shape[1] or np.nan  # no agents: the means are NaN
         trips = self.trips()
         bounds = np.searchsorted(trips["episode"], np.arange(rows.size + 1))
         hours = np.maximum(self._world_steps, 1) * self._step_s / 3600.0

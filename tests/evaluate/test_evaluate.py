@@ -65,6 +65,14 @@ def test_the_same_seed_gives_the_same_report(by_chance: EvaluationReport) -> Non
     assert results(other) != results(by_chance)
 
 
+def test_a_world_without_agents_reports_the_other_vehicles() -> None:
+    report = evaluate("merge", "idm", **SMALL | {"agents": 0})
+    (found,) = report.policies.values()
+    assert found.trips == 0
+    assert found.metrics["background_co2_g_per_km"].mean > 0.0
+    assert found.metrics["episode_return"].mean is None
+
+
 def test_a_report_is_json(by_chance: EvaluationReport) -> None:
     document = json.loads(json.dumps(by_chance.to_dict(), allow_nan=False))
     assert list(document["manifest"]["policies"]) == ["random_actions"]
