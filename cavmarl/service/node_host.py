@@ -15,8 +15,6 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-import uvicorn
-
 from cavmarl.core.errors import CavmarlError, ServiceError
 from cavmarl.core.scratch_folder import scratch_folder
 from cavmarl.core.server_address import listen
@@ -33,7 +31,7 @@ from cavmarl.service.node_link import (
     must_register,
     until_answered,
 )
-from cavmarl.service.server import ServerOptions, check_transport, uvicorn_config
+from cavmarl.service.server import HttpServer, ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
 from cavmarl.service.zone_processes import ZoneProcesses
 
@@ -109,7 +107,7 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
     }
     link = NodeLink(options.service, options.secret, body, options.is_supposed_idle, **trust)
     host = _Host(link, SessionWorlds(options.slots), tell)
-    server = uvicorn.Server(
+    server = HttpServer(
         uvicorn_config(
             make_node_app(link, host.worlds),
             ServerOptions(certificate=options.certificate, key=options.key),
@@ -121,7 +119,7 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
         loop = asyncio.get_running_loop()
         with contextlib.suppress(NotImplementedError):
             loop.add_signal_handler(signal.SIGTERM, _end, host)
-        serving = asyncio.create_task(_serve(server, listener))
+        serving = asyncio.create_task(server.serve([listener]))
         await _beat_until_end(host)
         server.should_exit = True
         await serving
@@ -133,13 +131,6 @@ async def _run(options: NodeOptions, tell: Callable[[str], None]) -> None:
         listener.close()
     if host.failure is not None:
         raise host.failure
-
-
-async def _serve(server: uvicorn.Server, listener: Any) -> None:
-    """Run the server without uvicorn's signal handlers, as the node has its own."""
-    server.config.load()
-    server.lifespan = server.config.lifespan_class(server.config)
-    await server._serve([listener])
 
 
 def _end(host: _Host) -> None:

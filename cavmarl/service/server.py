@@ -6,7 +6,8 @@ import asyncio
 import signal
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 
@@ -85,7 +86,7 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         limits = RateLimit(options.rate_hz, 2.0 * options.rate_hz), RateLimit(20.0, 100.0)
         service = Service(broker, access, *limits)
         config = uvicorn_config(make_app(service), options)
-        server = uvicorn.Server(config)
+        server = HttpServer(config)
 
         def end() -> None:
             server.should_exit = True
@@ -109,12 +110,24 @@ def serve(options: ServerOptions, tell: Callable[[str], None]) -> None:
         store.close()
 
 
-async def _run(server: uvicorn.Server, listener: socket.socket) -> None:
-    """Run the server until SIGINT or SIGTERM, after which uvicorn itself would kill the process."""
+class HttpServer(uvicorn.Server):
+    """uvicorn's server, which leaves signals to this program.
+
+    uvicorn raises a signal again at its end, so that the program would die before its last write.
+    """
+
+    @contextmanager
+    def capture_signals(self) -> Generator[None, None, None]:
+        """Set no signal handlers."""
+        yield
+
+
+async def _run(server: HttpServer, listener: socket.socket) -> None:
+    """Run the server until SIGINT or SIGTERM."""
     loop = asyncio.get_running_loop()
     for number in (signal.SIGINT, signal.SIGTERM):
         loop.add_signal_handler(number, server.handle_exit, number, None)
-    await server._serve([listener])
+    await server.serve([listener])
 
 
 def follow_store(

@@ -112,8 +112,7 @@ class WebServer:
         for stage in self._stages:
             stage.audience.begin(asyncio.get_running_loop())
         self._begun()
-        # `serve` would install signal handlers, which belong to the main thread.
-        await self._server._serve(sockets=[self._listener])
+        await self._server.serve(sockets=[self._listener])
 
 
 class DroppedWhenDone(WebSocketsSansIOProtocol):
