@@ -380,7 +380,8 @@ def test_a_job_restarts_on_another_node_if_its_node_dies(
 ) -> None:
     cluster.start("late")
     world = own_world(tmp_path)
-    keys: dict[str, Any] = {"episodes": 2, "repeats": 1, "agents": 3}
+    # The evaluation takes several heartbeats, so the client sees its progress.
+    keys: dict[str, Any] = {"episodes": 50, "repeats": 1, "agents": 3}
     job = client.submit(world, node="late", wait_s=30.0, **keys)
     killed = False
 
