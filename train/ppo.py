@@ -471,7 +471,7 @@ def opened(args: Args, ranks: Ranks) -> Iterator[Run]:
     import_plugins(plugins)
     args = options.with_form_of(args, args.start)
     own = driver_keys(args.start) if args.start else {}
-    given = parse_settings([word for word in args.settings.split(",") if word], plugins)
+    given = parse_settings(options.split_settings(args.settings), plugins)
     vec = make_vec(
         args.env,
         num_envs=num_envs,

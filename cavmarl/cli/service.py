@@ -7,6 +7,7 @@ import os
 import time
 from collections.abc import Iterable
 from contextlib import suppress
+from math import inf
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -263,7 +264,7 @@ def submit(
     console = Console()
     keys = {**world.keywords, "overrides": dict(world.overrides)}
     del keys["max_cycles"]
-    environment, names, keys["drivers"] = _uploads(world.env, policy or ["idm"])
+    environment, names, keys["drivers"] = uploads(world.env, policy or ["idm"])
     seeds = run_seeds(world.seed, repeats) if spread else [world.seed]
     with connect(service, secret_file, authority, plain_http) as client:
         jobs = [
@@ -292,7 +293,7 @@ def submit(
     _print(f"job: {', '.join(jobs)}\nresults: {folder} (`cavmarl report` shows them again)")
 
 
-def _uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict[str, Path]]:
+def uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict[str, Path]]:
     """Return the environment, the names of the drivers, and the folders of those to upload."""
     environment: str | Path = env
     if env not in entries() and Path(env).exists():
@@ -332,8 +333,11 @@ def artefacts(
     write_json(json_path, found)
 
 
-def _collect(client: Client, job: str, folder: Path, bar: Progress) -> None:
-    """Wait for a job while showing its progress, and write its results and events to a folder."""
+def _collect(client: Client, job: str, folder: Path, bar: Progress) -> dict[str, Any]:
+    """Wait for a job while showing its progress, and write its results and events to a folder.
+
+    Return the job.
+    """
     make_folder(folder)
     task = bar.add_task(job)
     told_reasons = {""}
@@ -345,9 +349,10 @@ def _collect(client: Client, job: str, folder: Path, bar: Progress) -> None:
         done, total = found["progress"] or (0, None)
         bar.update(task, description=f"{job}: {found['state']}", completed=done, total=total)
 
-    client.wait(job, folder, told=show)
+    ended = client.wait(job, folder, inf, told=show)
     told = "".join(json.dumps(event) + "\n" for event in client.events(job))
     (folder / "service_events.jsonl").write_text(told, encoding="utf-8")
+    return ended
 
 
 def nodes(
@@ -389,13 +394,23 @@ def sessions(
             metavar="SESSION",
         ),
     ] = None,
+    collect: Annotated[
+        str | None,
+        about("Wait for the end of this job, and write its results to --out.", metavar="JOB"),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        about("Folder for the results [default: runs/submit/JOB].", metavar="DIR", panel=OUTPUT),
+    ] = None,
     service: Url = DEFAULT_URL,
     secret_file: UserSecretFile = None,
     authority: Authority = None,
     plain_http: PlainHttp = False,
     json_path: JsonPath = None,
 ) -> None:
-    """Show the sessions and jobs that you may see, or open the page of one session."""
+    """Show your sessions and jobs, open the page of a session, or fetch the results of a job."""
+    if out is not None and collect is None:
+        raise ConfigError("--out: is for the results of a job; add --collect JOB")
     with connect(service, secret_file, authority, plain_http) as client:
         if page is not None:
             told = client.take_up(page).page()
@@ -403,6 +418,12 @@ def sessions(
             _print(f"token: {told['token']}")
             _print(f"token to watch only: {told['watch_token']}")
             write_json(json_path, told)
+            return
+        if collect is not None:
+            folder, console = out or Path("runs/submit") / collect, Console()
+            with progress_bar(console) as bar:
+                write_json(json_path, _collect(client, collect, folder, bar))
+            _print(f"results: {folder}")
             return
         found = client.get("/sessions")
     rows = [

@@ -151,6 +151,7 @@ class Client:
         return RemoteWorld(self, flows)
 
     submit = blocking(ServiceFlows.submit)
+    train = blocking(ServiceFlows.train)
     wait = blocking(ServiceFlows.wait)
     events = blocking(ServiceFlows.events)
     get = blocking(ServiceFlows.get)
@@ -273,6 +274,7 @@ class AsyncClient:
         return AsyncWorld(self, flows)
 
     submit = awaitable(ServiceFlows.submit)
+    train = awaitable(ServiceFlows.train)
     wait = awaitable(ServiceFlows.wait)
     events = awaitable(ServiceFlows.events)
     get = awaitable(ServiceFlows.get)

@@ -199,6 +199,31 @@ class ServiceFlows:
         }
         return plain_name((yield from self.post_once("/jobs", body, RETRIED_S))["id"])
 
+    def train(
+        self,
+        /,
+        environment: str | Path,
+        *,
+        settings: Mapping[str, bool | int | float | str] | None = None,
+        node: str | None = None,
+        needs: Sequence[str] = (),
+        wait_s: float | None = None,
+        **keys: Any,
+    ) -> Flow[str]:
+        """Submit a training with `train/ppo.py`, and return the id of the job.
+
+        `settings` are settings of the program that are not part of the world. If no node is free,
+        the job waits at most `wait_s` and then fails.
+        """
+        body = {
+            "configuration": (yield from self.add_configuration(environment, keys)),
+            "settings": dict(settings or {}),
+            "node": node,
+            "needs": list(needs),
+            "wait_s": wait_s,
+        }
+        return plain_name((yield from self.post_once("/trainings", body, RETRIED_S))["id"])
+
     def wait(
         self,
         job: str,

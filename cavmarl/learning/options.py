@@ -7,6 +7,7 @@ from `Annotated[type, "text"]`.
 from __future__ import annotations
 
 import argparse
+import re
 import signal
 import sys
 import threading
@@ -71,6 +72,11 @@ def settings_of(kind: type[S], given: Mapping[str, Any]) -> S:
     path = options.pop("config", None)
     settings = validate(kind, read_yaml(path), str(path)) if path else kind()
     return replace(settings, **options)
+
+
+def split_settings(text: str) -> list[str]:
+    """Return the parts KEY=VALUE of a comma-separated text; values may be JSON with commas."""
+    return [word for word in re.split(r",(?=[A-Za-z_.]+=)", text.strip(",")) if word]
 
 
 def check_at_least(settings: object, least: Mapping[str, float]) -> None:

@@ -28,7 +28,7 @@ _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9
 YAML = ".yaml"  # the only files that the service reads itself
 MOST_YAML_BYTES = 1 << 18  # of all YAML files of a configuration; reading 64 KiB takes a second
 MOST_FILES_BYTES = 1 << 30  # of all files of a configuration, which a node keeps for each session
-_RESERVED = ("agents", "configs", "envs")  # folders in which names are looked up
+_RESERVED = ("agents", "configs", "envs", "runs")  # folders of installed entries and of runs
 _OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
 
 

@@ -15,7 +15,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from cavmarl.core.errors import CavmarlError, ServiceError
+from cavmarl.core.errors import CavmarlError, ServiceError, require
 from cavmarl.core.scratch_folder import scratch_folder
 from cavmarl.core.server_address import listen
 from cavmarl.evaluate.evaluation import evaluate
@@ -31,8 +31,10 @@ from cavmarl.service.node_link import (
     must_register,
     until_answered,
 )
+from cavmarl.service.node_training import run_files, train
 from cavmarl.service.server import HttpServer, ServerOptions, check_transport, uvicorn_config
 from cavmarl.service.session_worlds import SessionWorlds
+from cavmarl.service.training_settings import CAPABILITY, RUN
 from cavmarl.service.zone_processes import ZoneProcesses
 
 TELL_S = 0.5  # time between two progress reports of a job
@@ -70,6 +72,7 @@ class _Host:
     # job whose outcome the service has → number of the next heartbeat then
     reported: dict[str, int] = field(default_factory=dict)
     steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # steps of jobs: done, total
+    paused: set[str] = field(default_factory=set)  # trainings that another node is to continue
     zones: ZoneProcesses = field(default_factory=ZoneProcesses)
     telling: asyncio.Task[None] | None = None
     failure: ServiceError | None = None
@@ -80,9 +83,12 @@ def host_node(options: NodeOptions, tell: Callable[[str], None]) -> None:
     """Run a node until it is drained or interrupted; SIGTERM drains it.
 
     Raises:
-            ServiceError: the service refuses the node, or an address that other machines reach has
-            no TLS.
+        ServiceError: the service refuses the node, or an address that other machines reach has no
+            TLS.
+        MissingExtraError: the node is to train, and torch is not installed.
     """
+    if CAPABILITY in options.capabilities:
+        require("torch", "train")
     check_transport(options.host, options.certificate, options.key)
     with scratch_folder():  # files of sessions, recordings and jobs
         asyncio.run(_run(options, tell))
@@ -159,7 +165,8 @@ async def _beat_until_end(host: _Host) -> None:
                 host.telling = asyncio.create_task(_tell_transfers(host))
             if link.is_draining:
                 drained_s = min(drained_s, loop.time())
-                if not told["sessions"] or (host.is_ending and loop.time() > drained_s + DRAIN_S):
+                is_empty = host.paused.issuperset(told["sessions"])
+                if is_empty or (host.is_ending and loop.time() > drained_s + DRAIN_S):
                     await link.leave()
                     host.tell(f"node {link.name}: drained")
                     return
@@ -179,6 +186,9 @@ def _start_jobs(host: _Host, jobs: list[dict[str, Any]], beat: int) -> None:
     for job in jobs:
         # After the report of its outcome, a job is told again only if this node is to repeat it.
         is_repeated = host.reported.get(job["id"], beat + 1) <= beat
+        if job["id"] in host.paused and not host.link.is_draining:
+            host.paused.discard(job["id"])
+            is_repeated = True
         if job["id"] not in host.jobs or is_repeated:
             host.reported.pop(job["id"], None)
             host.jobs[job["id"]] = asyncio.create_task(_run_job(host, job))
@@ -198,7 +208,7 @@ async def _tell_transfers(host: _Host) -> None:
 
 
 async def _run_job(host: _Host, job: dict[str, Any]) -> None:
-    """Run an evaluation in a new process, and upload its files to the service."""
+    """Run an evaluation or a training in a new process, and upload its files to the service."""
     link, path = host.link, f"/jobs/{job['id']}"
     status, message = "done", ""
     started: list[subprocess.Popen[bytes]] = []
@@ -209,16 +219,23 @@ async def _run_job(host: _Host, job: dict[str, Any]) -> None:
             if files is not None:
                 ended.enter_context(files)
             what = f"job {job['id']}"
-            place = Path(folder) / "results"
 
             def hear(done: int, total: int) -> None:
                 host.steps[job["id"]] = done, total
 
-            await asyncio.to_thread(
-                call_in_fresh_process, what, run_evaluation, document, job, place,
-                None if files is None else files.name, hear=hear, began=started.append,
-            )  # fmt: skip
-            for file in sorted(place.iterdir()):
+            if "settings" in job:
+                work = Path(folder if files is None else files.name)
+                if not await train(link, job, document, work, hear):
+                    host.paused.add(job["id"])
+                    return
+                place = work / RUN
+            else:
+                place = Path(folder) / "results"
+                await asyncio.to_thread(
+                    call_in_fresh_process, what, run_evaluation, document, job, place,
+                    None if files is None else files.name, hear=hear, began=started.append,
+                )  # fmt: skip
+            for file in run_files(place):
                 await _report(link, "PUT", f"{path}/results/{file.name}", content=file.read_bytes())
         except CavmarlError as error:
             status, message = "failed", without_folders(str(error))[:MOST_MESSAGE]

@@ -20,6 +20,7 @@ Place = Annotated[  # of a file in a folder
     ),
 ]
 Sha256 = Annotated[str, StringConstraints(pattern=r"^[0-9a-f]{64}$")]
+Text = Annotated[str, StringConstraints(max_length=200)]
 Share = Annotated[float, Field(ge=0.0, le=1.0, allow_inf_nan=False)]
 Port = Annotated[int, Field(ge=1, le=65535)]
 Whole = Annotated[int, Field(ge=0, lt=1 << 53)]  # JSON represents these integers exactly
@@ -140,6 +141,23 @@ class JobBody(_Body):
     repeats: Annotated[int, Field(ge=1, le=1000)] = 1
     node: Name | None = None
     needs: Words = []
+    # longest wait for the first node in s; None: no limit
+    wait_s: Annotated[float, Field(ge=0.0, le=MAX_WAIT_S)] | None = None
+
+
+class TrainingBody(_Body):
+    """A client's request for a training with `train/ppo.py`, in worlds with a configuration.
+
+    `settings` are settings of the program that differ from their defaults.
+    """
+
+    configuration: Sha256
+    settings: Annotated[
+        dict[Word, bool | int | Annotated[float, Field(allow_inf_nan=False)] | Text],
+        Field(max_length=64, json_schema_extra=NO_OTHERS),
+    ] = {}
+    node: Name | None = None
+    needs: Annotated[list[Word], Field(max_length=63)] = []
     # longest wait for the first node in s; None: no limit
     wait_s: Annotated[float, Field(ge=0.0, le=MAX_WAIT_S)] | None = None
 

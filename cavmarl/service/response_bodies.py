@@ -115,6 +115,14 @@ class JobOrder(_Answer):
     repeats: int
 
 
+class TrainingOrder(_Answer):
+    """A training that a node must run."""
+
+    id: str
+    configuration: Sha256
+    settings: dict[str, bool | int | float | str]
+
+
 class NodeScore(_Answer):
     """A node as pages show it."""
 
@@ -132,7 +140,7 @@ class Duties(_Answer):
     sessions: list[str]
     zones_of: list[Door]
     without_door: list[str]
-    jobs: list[JobOrder]
+    jobs: list[JobOrder | TrainingOrder]
     scores: list[NodeScore]  # the first hundred nodes by name, if a page is open
 
 
@@ -173,6 +181,12 @@ class Job(_Answer):
     repeats: int
 
 
+class Training(_Answer):
+    """A training."""
+
+    settings: dict[str, bool | int | float | str]
+
+
 class Session(_Answer):
     """A session, or a job if `job` is set."""
 
@@ -180,7 +194,7 @@ class Session(_Answer):
     owner: str
     owner_name: str
     configuration: Sha256
-    job: Job | None
+    job: Job | Training | None
     needs: list[str]
     preferred: str | None
     wait_s: float | None  # longest wait of a job for its first node

@@ -38,6 +38,7 @@ from cavmarl.service.route_common import (
     make_router,
 )
 from cavmarl.service.service_records import STATE_HEADER, SessionRecord
+from cavmarl.service.training_settings import CAPABILITY, check_training
 
 open_routes = make_router("/v1", "open")
 nodes = make_router("/v1/nodes", "nodes")
@@ -272,6 +273,28 @@ async def submit(
         preferred=body.node,
         needs=body.needs,
         job=body.model_dump(include={"policies", "episodes", "repeats"}),
+        wait_s=body.wait_s,
+        key=key,
+    )
+    return session_answer(service, session)
+
+
+@worlds.post("/trainings", status_code=201)
+async def train(
+    identity: Clients,
+    service: TheService,
+    body: request_bodies.TrainingBody,
+    key: IdempotencyKey = "",
+) -> response_bodies.Session:
+    """Train a driver on a node that offers it; the job waits if no node is free."""
+    found = configurations.read_configuration(service.broker.log, body.configuration)
+    check_training(found, body.settings)
+    session = service.broker.open(
+        identity,
+        body.configuration,
+        preferred=body.node,
+        needs=[*body.needs, CAPABILITY],
+        job=body.model_dump(include={"settings"}),
         wait_s=body.wait_s,
         key=key,
     )

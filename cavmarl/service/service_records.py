@@ -60,7 +60,7 @@ class SessionRecord:
     owner: str
     owner_name: str
     configuration: str  # hash
-    job: dict[str, Any] | None  # policy, episodes, repeats; None: a session of a client
+    job: dict[str, Any] | None  # an evaluation or a training; None: a session of a client
     needs: list[str]  # capabilities
     preferred: str | None  # name of a node
     opened_s: float = 0.0  # by the wall clock

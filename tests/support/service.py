@@ -6,7 +6,7 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -86,17 +86,17 @@ class Cluster:
     service: RunningService
     processes: dict[str, ForkedProcess] = field(default_factory=dict)
 
-    def start(self, *names: str, secret: str = "") -> None:
+    def start(self, *names: str, secret: str = "", options: Sequence[str] = ()) -> None:
         for name in names:
-            self._begin(name, secret or self.service.grant(name, "node"))
+            self._begin(name, secret or self.service.grant(name, "node"), options)
         for name in names:
             stdout = self.processes[name].stdout
             assert stdout is not None
             assert name in stdout.readline()
 
-    def _begin(self, name: str, secret: str) -> None:
+    def _begin(self, name: str, secret: str, options: Sequence[str]) -> None:
         words = ["-m", "cavmarl", "node", "--service", self.service.url]
-        words += ["--name", name, "--snapshot", "idle"]
+        words += ["--name", name, "--snapshot", "idle", *options]
         environment = {**os.environ, "CAVMARL_SECRET": secret}
         self.processes[name] = ForkedProcess(
             words, env=environment, stdout=subprocess.PIPE, text=True
