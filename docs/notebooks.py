@@ -3,7 +3,7 @@
     python -m docs.notebooks [NAME ...]
 
 A line `# %%` begins a cell of code, `# %% [markdown]` a cell of text. Each script is run, and its
-output is stored in the notebook; the script with a training takes some minutes.
+output is stored in the notebook; the script with a training takes a few minutes.
 """
 
 from __future__ import annotations

@@ -52,7 +52,7 @@ def main(paths: list[str]) -> int:
         found = broken_rules(path)
         missed = sum(asked == 0 for asked, _ in found.values())
         issues = sum(broken for _, broken in found.values())
-        print(f"{path}: {len(found) - missed} of {len(found)} rules asked, {issues} places broken")
+        print(f"{path}: {len(found) - missed} of {len(found)} rules checked, {issues} violations")
         for rule, (_, broken) in found.items():
             if broken:
                 print(f"  {rule}: {broken}")

@@ -82,7 +82,7 @@ def gallery() -> str:
         (about,) = re.findall(r"^!\[([^\]]*)\]", text, re.MULTILINE)[:1] or [name]
         lines += [f"### [{name}](../envs/{name}/README.md)", ""]
         lines += [f"![{about}](images/{name}.png)", ""]
-    lines += ["## Sensors", "", "What each tells one agent: drawn around it, or as numbers.", ""]
+    lines += ["## Sensors", "", "Sensor data of one agent, as drawings or numbers.", ""]
     for path in sorted(ROOT.glob("docs/images/sensors/*.png")):
         name = path.stem.replace("rig_", "rig.")
         lines += [f"### {name}", "", f"![{name}](images/sensors/{path.name})", ""]
@@ -94,7 +94,7 @@ def gallery() -> str:
 
 def reference() -> str:
     """Return the reference: a part for each public name, from its docstring."""
-    lines = ["# Reference", "", "What the packages name in `__all__`; keys of environments are in"]
+    lines = ["# Reference", "", "Names in `__all__` of packages; keys of environments are in"]
     lines += ["[environments](environments.md), commands in `cavmarl --help`.", ""]
     for module in PUBLIC:
         lines += [f"## {module}", ""]

@@ -1,7 +1,7 @@
-"""Draw figures of the two papers from own measurements; see docs/explanation/papers.md.
+"""Draw figures of the two papers from our own measurements; see docs/explanation/papers.md.
 
-`python -m docs.pictures.paper_figures docs/images` draws `drift.svg` again in a minute. The plot of
-the sensor workers is that of `python -m benchmarks sensors --plot`.
+`python -m docs.pictures.paper_figures docs/images` draws `drift.svg` again in a minute. `python -m
+benchmarks sensors --plot` draws the plot of the sensor workers.
 """
 
 from __future__ import annotations

@@ -118,4 +118,4 @@ def test_two_exports_of_a_map_have_equal_bytes(export: Path, tmp_path: Path) -> 
 def test_the_checker_of_asam_finds_no_violation(export: Path) -> None:
     words = [str(CHECKER), "-m", "docs.opendrive_rules", str(export)]
     result = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
-    assert "23 of 23 rules asked, 0 places broken" in result.stdout, result.stdout + result.stderr
+    assert "23 of 23 rules checked, 0 violations" in result.stdout, result.stdout + result.stderr
