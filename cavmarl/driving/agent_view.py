@@ -190,6 +190,6 @@ class RegisteredFunction:
             before, after = numbers[wrong][0].tolist(), again[wrong][0].tolist()
             raise RegisteredFunctionError(
                 f"registered function '{self._name}' depends on {changed}: it returned {before} "
-                f"before and {after} after a change; use values that do not, such as the "
-                "nearest, the minimum or the sum over each agent's others"
+                f"before and {after} after a change; return values that do not depend on it, such "
+                "as the nearest, the minimum or the sum over each agent's others"
             )

@@ -315,7 +315,7 @@ def _configuration(paths: Sequence[Path], report: DemandReport) -> SumoConfigFil
             files.append(path)
             continue
         if config is not None:
-            raise DemandError(f"{path}: a second SUMO configuration; give one, or its files")
+            raise DemandError(f"{path}: a second SUMO configuration; give only one of them")
         config = read_sumo_config(path, report)
         files.extend(config.files)
     if not files:
