@@ -1,7 +1,7 @@
 """Vehicles that the caller poses or drives: their commands and ids, and their part of a tick.
 
-The replayed road users of a logged scene are such vehicles, too. Their slots follow those of the
-caller, and their commands come from a table. The slots of SUMO's persons come last, and SUMO's step
+The replayed road users of a logged scene are such vehicles, too. Their slots follow the caller's
+slots, and their commands come from a table. The slots of SUMO's persons come last, and SUMO's step
 determines their poses.
 """
 
@@ -269,7 +269,7 @@ class ExternalPhases(OutsideTraffic):
         tick.admit()
 
     def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return the number (W,) of other vehicles and of slots, as all slots are reserved."""
+        """Return how many places (W,) other vehicles take, or are reserved for the slots."""
         return self._taken
 
 

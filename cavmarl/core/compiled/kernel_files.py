@@ -68,7 +68,7 @@ class KernelFile:
     def load(self) -> CompiledKernel | None:
         """Return the kernel for these types, or for other types that accept such arguments.
 
-        Return None if there is no such file, or only damaged ones.
+        Return None if there is no such file, or if all such files are damaged.
         """
         if self._frozen is None:
             return None

@@ -50,10 +50,7 @@ def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> 
     """
     none = f"no vehicle departs in the {horizon_s:g} s from {begin_s:g} s"
     if stays:
-        return (
-            f"{none}; the first departs at {first_ms // 1000} s: change horizon_s, or begin in the "
-            ".sumocfg"
-        )
+        return f"{none}, only from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
     return f"the demand begins at {first_ms // 1000} s, as {none}"
 
 

@@ -182,10 +182,7 @@ def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
 
 @inlined_kernel
 def _num_behind(roads: RoadArrays, row: np.void) -> int:
-    """Count the lanes that lead to an entrant's lane, or to a lane beside it if there are none.
-
-    The result is 0 if the entrant is far from the lane's start.
-    """
+    """Count the lanes that lead to `fed_lane` of an entrant's lane; 0 far from the lane's start."""
     far = row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M
     return 0 if far else int(roads.lanes[fed_lane(roads, row["lane"])]["num_into"])
 

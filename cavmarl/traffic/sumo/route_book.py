@@ -66,10 +66,7 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def single(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert the ways of world w's rows to ways in an environment with one world.
-
-        `rows`: VEHICLE or DEPARTURE (n,), written.
-        """
+        """Convert ways of world w's VEHICLE or DEPARTURE rows to an environment with one world."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         of_book = rows["way"] >= self._nowhere
         rows["way"] -= own * (w * self._of_world) + of_book * self._later

@@ -385,8 +385,7 @@ def hold_for_foe(
 ) -> int:
     """Return the HOLD_* code of a foe: whether it would be in the shared area, or goes first.
 
-    HOLD_EXIT_BLOCKED means that the foe stays in the area; HOLD_YIELD means that it will enter the
-    area, or leave it.
+    HOLD_EXIT_BLOCKED: the foe stays in the area. HOLD_YIELD: the foe will enter or leave the area.
     """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0 or (foe["dist"] < foe["half"] and not conflict["near"]):
