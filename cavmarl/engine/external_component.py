@@ -172,7 +172,7 @@ class ExternalComponent(Component):
     def wrong_rows(self, ids: NDArray[np.int64], rows: NDArray[np.void], is_whole: bool) -> str:
         """Return what is wrong with the ids (E,) of a world's slots and rows VEHICLE (n,).
 
-        `is_whole`: whether these are the rows of all zones, so that no slot lacks its vehicle.
+        `is_whole`: whether these are the rows of all zones, which contain each slot's vehicle.
         """
         rows = rows[rows["driver"] == DRIVER_EXTERNAL]
         slots = rows["order"]

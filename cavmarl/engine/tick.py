@@ -185,7 +185,7 @@ class Tick:
             self.admit()
 
     def admit(self) -> None:
-        """Add admitted vehicles to the rows of the zones in which they are."""
+        """Add admitted vehicles to the rows of their zones."""
         self.executor.admit(self.departures)
         self.coordination.entered(self.departures)
         self.departures.num_passing[:] = 0

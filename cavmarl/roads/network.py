@@ -225,8 +225,8 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
-# Maps with files below this size are copied to memory with huge pages. In a larger, mapped file with
-# small pages, ticks take a tenth longer, as they read many places, but processes share the memory.
+# Maps with files below this size are copied to memory with huge pages. With a larger, mapped file,
+# ticks take a tenth longer, because they read many small pages, but processes share the memory.
 COPIED = 1 << 27
 
 # Fields of a network for kernels, in the order of `RoadArrays`.

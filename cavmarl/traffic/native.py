@@ -115,7 +115,7 @@ class NativeTraffic:
     blank: NDArray[np.void]  # VEHICLE (1,), template of every vehicle's record
     dt: float
     horizon_s: float  # length of an episode in s
-    file: DemandFile | None = None  # demand whose vehicles drive besides generated vehicles
+    file: DemandFile | None = None  # demand in addition to generated vehicles
     num_worlds: int = 1
     # allocates the table of steps if vehicles search for routes while the world runs
     zeros: Zeros = np.zeros

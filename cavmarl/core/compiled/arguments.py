@@ -3,7 +3,7 @@
 The caller passes the address of an array of words to a compiled kernel (`entry_point.py`). A number
 takes one word, an array the address of its Python object, a record the address of its data, a
 tuple or a bundle the words of its items in order, and `None` no word. The words of the result
-follow those of the arguments.
+follow the words of the arguments.
 """
 
 from __future__ import annotations

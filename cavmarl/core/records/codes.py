@@ -47,7 +47,7 @@ SPEED_LIMIT = 4
 SPEED_LAST = 5  # speed of the last vehicle on the lane
 SPEED_AVERAGE = 6
 
-# STOP["until_from"]: what the earliest end of a stop (`until`) is relative to
+# STOP["until_from"]: the time to which the earliest end of a stop (`until`) is relative
 UNTIL_ABSOLUTE = 0
 UNTIL_FLOW = 1
 UNTIL_DEPARTURE = 2

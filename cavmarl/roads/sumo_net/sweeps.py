@@ -186,7 +186,7 @@ def find_pair(
 def _before_and_beyond(
     poses: NDArray[np.float64], length_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split poses into those with centres before the end of a junction, and the rest."""
+    """Split poses by whether their centres are before the end of a junction."""
     before = poses[:, 0] <= length_m
     return poses[before], poses[~before]
 

@@ -55,7 +55,7 @@ FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # replaces `STUCK_S` if both have models of SUMO, which teleports them then
+RESCUED_S = 300.0  # replaces `STUCK_S` if both have models of SUMO; SUMO then teleports vehicles
 STOP_SIGN_S = 0.5  # time to wait at a stop sign, and before a tie is broken
 STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
@@ -154,7 +154,7 @@ def may_ignore(
 ) -> bool:
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
-    `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
+    `signal` is the state of the foe's signal; `state` and `foe_state` are the links' states. After
     a wait of `stuck_s` s, the driver may also ignore a stopped foe that yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:

@@ -418,7 +418,7 @@ def hold_inside(
 ) -> int:
     """Return the reason (HOLD_*) for row i to stop at the waiting position of `link`, if any.
 
-    The arguments are those of `hold_at_line`. The distance is negative inside the junction.
+    The arguments are the same as for `hold_at_line`. The distance is negative inside the junction.
     """
     wait_m = roads.links[link]["wait_m"]
     if wait_m == math.inf:
