@@ -269,7 +269,7 @@ class ExternalPhases(OutsideTraffic):
         tick.admit()
 
     def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return how many places (W,) other vehicles take, or are reserved for the slots."""
+        """Return the number (W,) of places that vehicles take or that are reserved for slots."""
         return self._taken
 
 

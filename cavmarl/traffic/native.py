@@ -694,5 +694,5 @@ def _capacity(
 
 
 def _centre_sees_line_m(kind: np.void, speed: float) -> float:
-    """Return the distance in m, from its centre to a line, at which a vehicle checks the line."""
+    """Return the distance in m from a vehicle's centre to a line at which it checks the line."""
     return float(see_line_m(kind, speed) + 0.5 * kind["length"])

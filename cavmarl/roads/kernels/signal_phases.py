@@ -27,7 +27,7 @@ from cavmarl.roads.kernels.map_choice import map_of
 # Maximum distance from a detector to the centre of a vehicle that occupied it in this tick.
 DETECTOR_REACH_M = 30.0
 
-SECOND_MS = 1000  # SUMO prolongs phases to whole seconds, and checks a phase after 1 s at first
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; first check after at least this time
 
 
 @kernel

@@ -39,7 +39,7 @@ from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_st
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: assumed acceleration out of a shared area, lower to be safe
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # ratio of the two, applied to a vehicle's acceleration
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # `GENTLE_ACCEL` as a share of acceleration
 HARD_STOP = 5.0  # m/s²: a vehicle that would have to brake harder for the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the ego line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the ego driver has waited long
