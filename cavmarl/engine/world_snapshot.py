@@ -247,7 +247,7 @@ def _of_rerouting(parts: Parts) -> Iterator[Array]:
 
 
 def _put(target: Array, saved: Array) -> None:
-    """Copy the part that both arrays have, as the room for an episode's orders grows on demand."""
+    """Copy the common part of two arrays; the room for an episode's orders grows on demand."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
 

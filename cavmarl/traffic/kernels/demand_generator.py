@@ -353,7 +353,7 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give vehicles of `next_rows` that need another goal a reachable goal, if any.
+    """Give a reachable goal, if any, to each vehicle of `next_rows` that needs another goal.
 
     Call once a second. A more distant goal does not count as lost progress of an agent.
     """

@@ -332,7 +332,7 @@ def _safe_at_fork(
 
 @kernel
 def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: Scratch) -> float:
-    """Return the mean speed in m/s of vehicles on a lane in view of `s`; else the limit."""
+    """Return the mean speed in m/s of vehicles on a lane in view of `s`; the limit if none."""
     total, number = 0.0, 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
         other = scratch.entries[k]

@@ -251,7 +251,7 @@ class SumoTraffic:
         return [self.worlds.at(w).people for w in range(self._zoned.rows.shape[2])]
 
     def forgive(self, departures: DepartureQueue) -> None:
-        """Clear the events of leaving vehicles that SUMO has teleported, which have not arrived."""
+        """Clear the events of vehicles that SUMO has teleported: they leave without arriving."""
         for w, num in enumerate(departures.num_passing.tolist()):
             leaving = departures.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)

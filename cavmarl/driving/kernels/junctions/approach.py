@@ -160,7 +160,7 @@ def _register_row(
     pairs: int,
     scratch: Scratch,
 ) -> int:
-    """Append the entries of row i, whose PLAN is `step`, and return the new number of pairs."""
+    """Append the entries of row i, whose PLAN is `step`, and return the new number of entries."""
     lane = row["lane"]
     here = roads.lanes[lane]
     s = row["s"]
