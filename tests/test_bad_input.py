@@ -359,7 +359,7 @@ def test_an_invalid_number_of_worlds_is_refused(num_envs: Any) -> None:
             ("terms.weights", "speeeding", "speeding"),
         ),
         ({"overrides": {"terms.weights": {"speeding": float("inf")}}}, ("terms.weights",)),
-        ({"overrides": {"traffic.min_trip_m": 1e5}}, ("traffic.min_trip_m", "longest way")),
+        ({"overrides": {"traffic.min_trip_m": 1e5}}, ("traffic.min_trip_m", "longest route")),
         ({"overrides": {"traffic.origins": ["nowhere"]}}, ("traffic.origins", "nowhere")),
         ({"overrides": {"traffic.destinations": ["x"]}}, ("traffic.destinations", "x")),
         ({"agents": 3, "overrides": {"population.agents": 4}}, ("population.agents", "keyword")),

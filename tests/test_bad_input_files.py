@@ -90,7 +90,7 @@ def test_trips_on_a_map_in_two_parts_stay_in_their_part(write: Write) -> None:
 
 
 def test_a_trip_between_unconnected_parts_is_refused(write: Write) -> None:
-    with pytest.raises(ConfigError, match=r"no trip|no way"):
+    with pytest.raises(ConfigError, match=r"no trip|no route"):
         parallel_env(
             write(NET), overrides={"traffic.origins": ["a"], "traffic.destinations": ["b"]}
         )

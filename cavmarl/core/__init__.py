@@ -1,4 +1,4 @@
 """Basics of all folders: errors, seeds, memory, and shared kernels.
 
-It imports nothing from the rest of the package.
+This package imports nothing from the rest of cavmarl.
 """

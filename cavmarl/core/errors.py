@@ -55,8 +55,8 @@ class CavmarlError(Exception):
 class ConfigError(CavmarlError):
     """An invalid configuration: unknown key, wrong value, impossible combination.
 
-    Also raised for zones that overlap or see less far than exact results need, loads or workers
-    that allow no placement of a shard, and scenarios that are unknown or invalid.
+    Also raised for zones that overlap or whose view is too short for exact results, loads or
+    workers that allow no placement of a shard, and scenarios that are unknown or invalid.
     """
 
 

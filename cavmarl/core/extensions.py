@@ -1,8 +1,8 @@
 """Extensions that users register by name: one `Registry` for each kind.
 
-Plugins are modules that register extensions when they are imported: those that a configuration
-names, and those that installed packages declare as entry points of the group `ENTRY_POINTS`.
-Worker processes import the same modules.
+Plugins are modules that register extensions when they are imported. A configuration names plugins,
+and installed packages declare plugins as entry points of the group `ENTRY_POINTS`. Worker processes
+import the same modules.
 """
 
 from __future__ import annotations

@@ -68,14 +68,14 @@ def die_with_parent() -> None:
 def occupy_standard_descriptors() -> None:
     """Open the null device for each of standard input, output and error that is closed.
 
-    Otherwise a new descriptor gets such a number, and a child process that should inherit it gets
-    its own standard input instead.
+    Otherwise a new descriptor gets one of these numbers, and a child process that should inherit
+    the descriptor gets its own standard input instead.
     """
     for number in range(3):
         try:
             os.fstat(number)
         except OSError:
-            # The system assigns the lowest free number, which is this one.
+            # The system assigns the lowest free number, which is `number`.
             os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)
 
 

@@ -21,7 +21,7 @@ def check_seed(seed: Any) -> int:
 
 
 def first_seed(given: Any, default: int | None) -> int:
-    """Return the seed of a reset: the given seed, else the default, else a random one.
+    """Return the seed of a reset: the given seed, else the default, else a random seed.
 
     Raises:
         ConfigError: the given seed is not valid; see `check_seed`.

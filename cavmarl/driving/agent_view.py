@@ -17,7 +17,7 @@ from cavmarl.core.errors import RegisteredFunctionError
 from cavmarl.driving.vehicles import GHOST_FIELDS, STATE_FIELDS
 from cavmarl.roads.network import RoadNetwork
 
-ORDER_CHECKS = 32  # per function, the number of views with two or more others that are checked
+ORDER_CHECKS = 32  # number of views per function that are checked; each has two or more others
 _OWN = list(STATE_FIELDS)
 _OTHERS = list(GHOST_FIELDS)
 
@@ -190,6 +190,6 @@ class RegisteredFunction:
             before, after = numbers[wrong][0].tolist(), again[wrong][0].tolist()
             raise RegisteredFunctionError(
                 f"registered function '{self._name}' depends on {changed}: it returned {before} "
-                f"before and {after} after a change; use values that do not, such as the "
-                "nearest, the minimum or the sum over each agent's others"
+                f"before and {after} after a change; return values that do not depend on it, such "
+                "as the nearest, the minimum or the sum over each agent's others"
             )

@@ -39,10 +39,10 @@ from cavmarl.roads.sumo_net.sweeps import (
 LENGTH_M, WIDTH_M = 5.0, 2.0
 HALF_M = 0.5 * SIZE_BODIES_M[0]
 BODY = SweptBody(HALF_M, 0.5 * WIDTH_M + 0.25)
-TICKS_S = (0.05, 0.1)  # the longer a tick, the further out a car drives
+TICKS_S = (0.05, 0.1)  # tick lengths of the drives; in longer ticks, a car drives further out
 SETTLE_M = 20.0  # additional start distance, so that the car reaches the speed of the bend
 MOST_POSES = 2000
-FORMAT = "steered-4"  # change it when the rows of the same map change
+FORMAT = "steered-4"  # change this version if the rows of a map change
 
 
 def load_steered(path: str | Path) -> RoadNetwork:

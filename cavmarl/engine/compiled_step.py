@@ -17,7 +17,7 @@ from cavmarl.engine.tick import Tick
 from cavmarl.shards.shard import Commands
 from cavmarl.shards.shard_group import ShardGroup
 
-# Components with `tick_calls` and `step_calls`, or that act in `begin` alone.
+# Components that have `tick_calls` and `step_calls`, or act only in `begin`.
 COMPILED = SignalComponent | LimitComponent | LaneComponent
 
 

@@ -35,7 +35,7 @@ class ComponentContext(NamedTuple):
     outputs: Outputs  # outputs of the agents
     zeros: Zeros  # allocates the arrays that outlive a tick
     frames: Frames  # samples of the agents' rigs
-    lane_plans: LanePlans | None = None  # of worlds whose lanes may differ from the map
+    lane_plans: LanePlans | None = None  # plans of worlds whose lanes may differ from the map
     # (W,) the tick in which lanes last changed, -1: never; see `NativeTraffic`
     changed_at: NDArray[np.int64] = np.zeros(0, dtype=np.int64)
     num_persons: int = 0  # slots of SUMO's persons

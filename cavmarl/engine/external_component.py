@@ -1,7 +1,7 @@
 """Vehicles that the caller poses or drives: their commands and ids, and their part of a tick.
 
-The replayed road users of a logged scene are such vehicles, too. Their slots follow those of the
-caller, and their commands come from a table. The slots of SUMO's persons come last, and SUMO's step
+The replayed road users of a logged scene are such vehicles, too. Their slots follow the caller's
+slots, and their commands come from a table. The slots of SUMO's persons come last, and SUMO's step
 determines their poses.
 """
 
@@ -172,7 +172,7 @@ class ExternalComponent(Component):
     def wrong_rows(self, ids: NDArray[np.int64], rows: NDArray[np.void], is_whole: bool) -> str:
         """Return what is wrong with the ids (E,) of a world's slots and rows VEHICLE (n,).
 
-        `is_whole`: whether these are the rows of all zones, so that no slot lacks its vehicle.
+        `is_whole`: whether these are the rows of all zones, which contain each slot's vehicle.
         """
         rows = rows[rows["driver"] == DRIVER_EXTERNAL]
         slots = rows["order"]
@@ -269,7 +269,7 @@ class ExternalPhases(OutsideTraffic):
         tick.admit()
 
     def running(self, peers: Peers) -> NDArray[np.int64]:
-        """Return the number (W,) of other vehicles and of slots, as all slots are reserved."""
+        """Return the number (W,) of places that vehicles take or that are reserved for slots."""
         return self._taken
 
 

@@ -20,9 +20,8 @@ _MOST_TICKS = 1 << 40
 class LaneComponent(Component):
     """Writes the changes of the caller, and limits of roadside units, to `Worlds.lanes`.
 
-    It renews the plans of the worlds.
-
-    All processes of a world write the same limits, permissions and plans.
+    The component also renews the plans of the worlds. All processes of a world write the same
+    limits, permissions and plans.
     """
 
     def __init__(self, host: ComponentContext) -> None:
@@ -54,7 +53,7 @@ class LaneComponent(Component):
         self.renew_plans()
 
     def limit(self, unit_mps: NDArray[np.float64]) -> None:
-        """Let limits (W, L) hold where they are below the present ones, until the next call."""
+        """Apply limits (W, L) where they are below the present limits, until the next call."""
         if not np.array_equal(unit_mps, self._unit_mps):
             self._unit_mps[:] = unit_mps
             self._follow()

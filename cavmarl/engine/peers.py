@@ -19,7 +19,7 @@ from cavmarl.handoff.division import ZonedShards
 class Peers:
     """Collective operations: each call returns when all processes have called it in the same tick.
 
-    By default there are no other processes: this one has all zones, and nothing is exchanged.
+    By default, there are no other processes: this process has all zones and exchanges nothing.
 
     Attributes:
         are_none: whether this process runs all zones.

@@ -1,4 +1,4 @@
-"""What the agents of signals know of the lanes: `signals.sensing`."""
+"""Sensing of the lanes for the agents of signals, as `signals.sensing` says."""
 
 from __future__ import annotations
 
@@ -100,7 +100,7 @@ class SignalSensing:
             self._bus.reset(chosen)
 
     def tell_of_full_inboxes(self) -> None:
-        """Log once that roadside units may know more vehicles than they can keep."""
+        """Log once that inboxes of roadside units were full, so that vehicles were not counted."""
         if self._bus is None or self._full is None or not self._full[0]:
             return
         log.warning(

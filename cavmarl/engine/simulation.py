@@ -232,7 +232,7 @@ class Simulation(WorldViews):
         tick.peers.resume_from(tick.departures, tick.division.side)
 
     def load_own(self, saved: Sequence[NDArray[Any]], home: int) -> None:
-        """Resume like `load` if zones are divided among processes; `home` is a zone of this one."""
+        """Resume like `load` if several processes have zones; `home`: a zone of this process."""
         self._put_back(saved, home)
         tick = self._tick
         tick.outside.catch_up(self._shard.worlds)

@@ -117,7 +117,7 @@ class SimulatorComponent(Component):
             self._end(place)
 
     def refill(self) -> None:
-        """Resume from the loaded rows: give them to the simulators, and start those that ended.
+        """Resume from the loaded rows: give them to the simulators, and restart ended simulators.
 
         The vehicles enter in the next tick, like vehicles that enter the world.
         """

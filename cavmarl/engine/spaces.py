@@ -157,7 +157,7 @@ def sensed_observation(frames: Frames) -> dict[str, NDArray[Any]]:
 
 
 def named_observation(
-    parts: Mapping[str, ObservationPart],  # as from `observation_parts`
+    parts: Mapping[str, ObservationPart],  # see `observation_parts`
     frames: NDArray[np.float32],  # (…, stack, frame size): flat observations, reshaped
 ) -> dict[str, NDArray[Any]]:  # one array (…, *shape) per sensor
     """Split flat observations by sensor, as views; images are converted to bytes."""
@@ -239,7 +239,7 @@ def observation_table(config: SensorsConfig) -> str:
 
 
 def _lines(sensor: str, start: int, features: list[Feature]) -> list[str]:
-    """Return one line per feature name without numbers; its first feature gives the meaning."""
+    """Return one line for each group of features whose names differ only in numbers."""
     groups: dict[str, list[int]] = {}
     for k, feature in enumerate(features):
         groups.setdefault(re.sub(r"(_\d+)+$", "", feature.name), []).append(k)

@@ -184,7 +184,7 @@ class StateForm(NamedTuple):
             first, phase = own["first_phase"], controllers["phase"]
             if ((phase != 0) & ((phase < first) | (phase >= first + own["num_phases"]))).any():
                 return "a controller has a phase of another program"
-            # A check is due at least every `longest_ms`, and those due before this tick are done.
+            # A check is due at least every `longest_ms`; checks due before this tick are done.
             now_ms = np.floor(named["ticks"] * self.traffic.dt * 1e3)[:, np.newaxis]
             tick_ms = np.ceil(self.traffic.dt * 1e3)
             longest_ms = 1000 + max(roads.phases["min_ms"].max(), roads.phases["max_ms"].max())

@@ -81,7 +81,7 @@ class Tick:
         return self._shard.worlds
 
     def run(self, commands: Commands, is_first: bool, is_last: bool) -> None:
-        """Begin → components → begin the step → advance … signals → components → sense → end.
+        """Run begin → components → begin the step → advance … signals → components → sense → end.
 
         Args:
             commands: the commands of the step.
@@ -116,7 +116,7 @@ class Tick:
             self.traffic.insert(self.departures, self.worlds, commands.inserted)
 
     def _advance(self, commands: Commands) -> None:
-        """Advance → leave → exchange → resolve → enter → commit → signals."""
+        """Run advance → leave → exchange → resolve → enter → commit → signals."""
         self.executor.advance(commands)
         self.outside.follow(self)
         self.leave()
@@ -136,7 +136,7 @@ class Tick:
         self.outside.switch_signals(self)
 
     def sense(self, chosen: NDArray[np.bool_]) -> None:
-        """Clear → sense → settle → credit, in the chosen worlds (W,)."""
+        """Run clear → sense → settle → credit in the chosen worlds (W,)."""
         if not self._has_agents:
             return
         self.shared.clear_outputs(chosen)
@@ -185,7 +185,7 @@ class Tick:
             self.admit()
 
     def admit(self) -> None:
-        """Add admitted vehicles to the rows of the zones in which they are."""
+        """Add admitted vehicles to the rows of their zones."""
         self.executor.admit(self.departures)
         self.coordination.entered(self.departures)
         self.departures.num_passing[:] = 0

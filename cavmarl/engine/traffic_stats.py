@@ -33,7 +33,7 @@ class TrafficStats:
     mean_speed_mps: float  # mean over the vehicles in the world now
     mean_trip_m: float  # mean over the arrived vehicles
     mean_trip_s: float  # mean over the arrived vehicles
-    # mean over the arrived vehicles: trip time minus time at the speed of limit, driver and type
+    # mean over arrived vehicles: trip time minus time at the speed that limit, driver, type allow
     mean_delay_s: float
 
 

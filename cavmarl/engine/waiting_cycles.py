@@ -122,7 +122,7 @@ def _next(
 
 
 def _cycles(waits: Mapping[int, Sequence[int]]) -> list[list[int]]:
-    """Return a cycle through each edge that closes one in a search from every vehicle."""
+    """Return the cycles that a depth-first search finds, one for each edge back to its path."""
     found: list[list[int]] = []
     done: set[int] = set()
     for start in sorted(waits):

@@ -212,7 +212,7 @@ def _demand_files(config: EnvConfig, base_dir: Path) -> list[Path]:
 
 
 def _program_files(config: EnvConfig, base_dir: Path) -> list[Path]:
-    """Return the files with signal programs: `map.programs`, and those that a map names.
+    """Return the files with signal programs: `map.programs`, and the files that a map names.
 
     If SUMO runs the traffic, it reads the files that its configuration names.
     """

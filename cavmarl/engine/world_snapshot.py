@@ -210,7 +210,7 @@ def join(parts: Parts, shares: Sequence[Sequence[Array]]) -> list[Array]:
 def _shifted(
     parts: Parts, sumo: SumoTraffic, share: Sequence[Array], worlds: int
 ) -> Sequence[Array]:
-    """Return a copy of a share with its rows and queue moved up by a number of worlds."""
+    """Return a copy of a world's share with rows and queue converted to world `worlds`."""
     found = list(share)
     queue = sum(1 for _ in _fixed(parts))
     for n in (queue, *range(len(found) - parts.division.count, len(found))):
@@ -247,7 +247,7 @@ def _of_rerouting(parts: Parts) -> Iterator[Array]:
 
 
 def _put(target: Array, saved: Array) -> None:
-    """Copy the part that both arrays have, as the room for an episode's orders grows on demand."""
+    """Copy the common part of two arrays; the room for an episode's orders grows on demand."""
     shared = tuple(slice(min(pair)) for pair in zip(target.shape, saved.shape, strict=True))
     target[shared] = saved[shared]
 

@@ -106,7 +106,7 @@ class WorldViews:
 
     @property
     def external(self) -> ExternalComponent:
-        """The slots of the vehicles that the caller poses or drives, and of replayed ones."""
+        """The slots of vehicles that the caller poses or drives, and of replayed vehicles."""
         missing = "population.external = 0: there is no room for such vehicles; set it higher"
         return self._part(ExternalComponent, missing)
 

@@ -90,7 +90,7 @@ def _weight(call: KernelCall) -> int:
 
 
 class _Progress:
-    """Prints the number of compiled kernels, and the remaining time estimated from it."""
+    """Prints the number of compiled kernels, and an estimate of the remaining time."""
 
     def __init__(self, calls: Sequence[KernelCall], output: TextIO) -> None:
         self._count = len(calls)

@@ -11,7 +11,7 @@ _PACKAGE = Path(__file__).parents[1]
 _DECORATORS = {"kernel", "inlined_kernel"}
 # Functions and classes that make kernels, or collect kernels for other kernels.
 _FACTORIES = {"for_each_zone", "acceleration_model", "CarFollowingModel"}
-_CORE = ("core.math", "core.records")  # folders of kernels besides those named `kernels`
+_CORE = ("core.math", "core.records")  # folders of kernels besides all folders `kernels`
 
 
 def called_kernels() -> frozenset[str]:

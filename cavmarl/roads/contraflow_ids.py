@@ -11,5 +11,5 @@ def contraflow_of(road: str) -> str:
 
 
 def is_contraflow(road: str) -> bool:
-    """Return whether an id is that of contraflow lanes."""
+    """Return whether an id is the id of contraflow lanes."""
     return road.startswith(CONTRAFLOW)

@@ -13,8 +13,8 @@ LEAST_S, MOST_S, ROUND_S = 60.0, 900.0, 10.0
 def horizon_of(network: RoadNetwork) -> float:
     """Return the duration in s of three trips along the width and the height of the map.
 
-    The speed is the average of a car that drives every lane once at the speed limit. The result is
-    rounded to tens and limited to [60, 900]. For several maps, it is the longest duration.
+    The assumed speed is the mean speed of a car that drives every lane once at the speed limit. The
+    result is rounded to tens and limited to [60, 900]. For several maps, the longest one is used.
     """
     return max(_horizon_on(network, number) for number in range(len(network.maps)))
 

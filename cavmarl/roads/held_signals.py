@@ -1,4 +1,4 @@
-"""Finds signals that hold one phase so long that an episode ends before the next one.
+"""Finds signals that hold one phase so long that an episode ends before the next phase.
 
 Maps of games have such signals, which a player switches.
 """
@@ -38,5 +38,5 @@ def held_signals_note(network: RoadNetwork) -> str:
     verb = "signal holds" if len(ids) == 1 else "signals hold"
     return (
         f"{len(ids)} {verb} a phase with red for {HELD_S:,.0f} s or more, so that vehicles wait: "
-        f"{shown}; programs of your own replace theirs (map.programs)"
+        f"{shown}; to replace their programs, set map.programs"
     )

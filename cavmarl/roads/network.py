@@ -67,7 +67,7 @@ LANE = record(
     ("speed_mps", np.float64),  # speed limit
     ("width_m", np.float64),
     ("internal", np.bool_),  # inside a junction
-    # whether vehicles that turn into the road at the lane's end yield to those within `MERGES_M`
+    # whether vehicles that turn into the road at the lane's end yield to vehicles within `MERGES_M`
     ("merges", np.bool_),
     ("left", np.int32),  # LANE row of the left neighbour in the same direction
     ("right", np.int32),
@@ -147,8 +147,8 @@ CONFLICT = record(
 SWEEP = record(
     ("foe", np.int32),  # LINK of the same junction, but from another lane
     ("own", np.int32),  # size class (`SIZE_LENGTHS_M`) of the vehicle on this link
-    ("other", np.int32),  # size class of the vehicle on the foe
-    # distances from the stop line at which a front begins to obstruct the foe and a rear stops to;
+    ("other", np.int32),  # size class of the vehicle on the foe's path
+    # distances from the stop line at which a front begins, and a rear ceases, to obstruct the foe;
     # may be outside the junction; if the body is longer than the shared area, leave < enter
     ("enter_m", np.float64),
     ("leave_m", np.float64),
@@ -225,8 +225,8 @@ MAP = record(
     ("num_programs", np.int32),
 )
 
-# Maps with smaller files are copied to memory with huge pages. A tick reads many places of a map.
-# With the small pages of a mapped file, ticks take a tenth longer, but processes share the memory.
+# Maps with files below this size are copied to memory with huge pages. With a larger, mapped file,
+# ticks take a tenth longer, because they read many small pages, but processes share the memory.
 COPIED = 1 << 27
 
 # Fields of a network for kernels, in the order of `RoadArrays`.
@@ -338,7 +338,7 @@ class RoadNetwork:
 
     @cached_property
     def room_m(self) -> tuple[float, float, float, float]:
-        """(min_x, min_y, max_x, max_y) of an area in which each of the maps fits, if moved."""
+        """(min_x, min_y, max_x, max_y) of an area into which each of the maps can be moved."""
         if len(self.maps) == 1:
             return self.extent_m
         extents = np.array([self.extent_of(number) for number in range(len(self.maps))])

@@ -10,7 +10,7 @@ from cavmarl.roads.network import RoadNetwork
 
 RoadKind = Literal["right_hand", "left_hand", "stop_signs"]
 
-_STOP_SIGNS = (ord("s"), ord("w"))  # LINK["state"]: stop, and stop of all ways
+_STOP_SIGNS = (ord("s"), ord("w"))  # LINK["state"]: stop sign, and all-way stop
 
 
 def road_kinds(network: RoadNetwork) -> tuple[RoadKind, ...]:

@@ -1,4 +1,4 @@
-"""Where the signals of a map are."""
+"""The positions of a map's signals."""
 
 from __future__ import annotations
 

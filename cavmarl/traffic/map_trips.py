@@ -183,14 +183,14 @@ class MapTrips:
         name = self.network.name_of(self.number)
         if _is_within(to_go, limits_m).any():
             return ConfigError(
-                f"no trip on the map '{name}': every way between origins and "
+                f"no trip on the map '{name}': every route between origins and "
                 "destinations begins with a lane change, or has a turn that is too tight for a "
                 "car; change traffic.origins or traffic.destinations, or mend the map"
             )
         reachable = to_go[np.isfinite(to_go)]
-        longest = "no way leads to a goal"
+        longest = "no route leads to a goal"
         if reachable.size:
-            longest = f"the longest way is {reachable.max():.0f} m"
+            longest = f"the longest route is {reachable.max():.0f} m"
         return ConfigError(
             f"traffic.min_trip_m = {self.traffic.min_trip_m:g}, traffic.max_trip_m = "
             f"{self.traffic.max_trip_m:g}: no trip of that length on the map '{name}' ({longest}); "

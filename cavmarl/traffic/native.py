@@ -52,7 +52,7 @@ from cavmarl.traffic.way_search import WaySlots, seekers, way_slots
 
 FAST_FACTOR = 1.5  # speed divided by the limit; few drivers of demand files want to drive faster
 JAM_GAP_M = 2.5  # m between the bumpers of queued vehicles
-PLACED_SHARE = 0.75  # share of their lanes that placed agents may occupy so that others find room
+PLACED_SHARE = 0.75  # share of the origin lanes that placed agents may occupy; the rest stays free
 
 
 class TrafficCalls:
@@ -115,7 +115,7 @@ class NativeTraffic:
     blank: NDArray[np.void]  # VEHICLE (1,), template of every vehicle's record
     dt: float
     horizon_s: float  # length of an episode in s
-    file: DemandFile | None = None  # demand whose vehicles drive besides generated vehicles
+    file: DemandFile | None = None  # demand in addition to generated vehicles
     num_worlds: int = 1
     # allocates the table of steps if vehicles search for routes while the world runs
     zeros: Zeros = np.zeros
@@ -379,7 +379,7 @@ class NativeTraffic:
         return self.rerouting is not None or self._own_steps > 0
 
     def moved_ways(self, ways: NDArray[np.int64], worlds: int) -> NDArray[np.int64]:
-        """Convert VEHICLE["way"] (n,) to the values in the world that is `worlds` numbers later."""
+        """Convert VEHICLE["way"] (n,) of world w to the values in world w + `worlds`."""
         first = self._first_own
         is_plan = (ways >= first) & (ways < first + self._own_steps)
         moved: NDArray[np.int64] = ways + is_plan * (worlds * self.plans.size)
@@ -604,7 +604,7 @@ class NativeTraffic:
 
     @property
     def placed_agents(self) -> int:
-        """Number of agents that can be placed at a reset on each map, whatever is drawn."""
+        """Number of agents that fit on every map at a reset, for any random draw."""
         return min(for_each_map(self.network, self._placed_agents))
 
     def _placed_agents(self, number: int) -> int:
@@ -694,5 +694,5 @@ def _capacity(
 
 
 def _centre_sees_line_m(kind: np.void, speed: float) -> float:
-    """Return how far before its centre a driver checks whether it may pass a line, in m."""
+    """Return the distance in m from a vehicle's centre to a line at which it checks the line."""
     return float(see_line_m(kind, speed) + 0.5 * kind["length"])

@@ -3,7 +3,7 @@
 Three mechanisms reroute vehicles. Vehicles react once to each change of lanes by the caller. SUMO's
 rerouting device searches for the fastest route by the speeds of the last minutes. <rerouter>s act
 on vehicles that drive on their edges. All mechanisms run once a second beside the departure queue,
-in one place for any division. Decision 011 gives the reasons.
+in one place even if the world is divided. Decision 011 gives the reasons.
 """
 
 from __future__ import annotations
@@ -192,7 +192,7 @@ class Rerouting:
         return int(rows["leg"][:num].sum() - legs)
 
     def _forget_seen(self, looks: NDArray[np.void], clock_s: float) -> None:
-        """Let vehicles ask again if a rule on their edge has started within the last second."""
+        """Let vehicles ask rerouters again if a rule on their edge began in the last second."""
         rules = self._schedule.demand.rerouters.rules
         before_s = clock_s - self._ticks_per_s * self._dt
         begun = (rules["begin_s"] <= clock_s) & (before_s < rules["begin_s"])
@@ -226,7 +226,7 @@ class Rerouting:
     def _ask_rerouters(
         self, search: WaySearch, i: int, row: np.void, look: np.void, clock_s: float
     ) -> None:
-        """Follow the first rerouter on the vehicle's edge that has another route for it."""
+        """Take the route of the first rule on the vehicle's edge that gives another route."""
         edge = self._roads.lanes[row["lane"]]["edge"]
         if look["seen"] == edge:
             return

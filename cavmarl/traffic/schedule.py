@@ -38,8 +38,8 @@ class Schedule:
 
     def __init__(self, demand: DemandFile, first_type: int, first_step: int) -> None:
         self.demand = demand
-        # number of departures by (key, horizon); checking and then loading a state asks for it
-        # twice
+        # number of departures by (key, horizon); it is needed twice when a state is checked and
+        # then loaded
         self._counts: dict[tuple[int, float], int] = {}
         self._network: RoadNetwork = demand.network
         self._first_type = first_type

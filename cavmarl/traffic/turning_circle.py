@@ -103,8 +103,8 @@ class _Trial:
         ends = lanes[0], begin_m, lanes[-1], end_m
         stays = self._drives(*ends)
         if stays:
-            # The first drive aims as for link 0. A car that aims at this turn may cut the corner,
-            # so the turn is too tight only if the centre leaves the road at each of the speeds.
+            # In the first drive, the plan contains link 0. With the true link, the car may cut the
+            # corner, so the turn is too tight only if the centre leaves the road at every speed.
             self._plan["link"][0, lanes[0]] = link
             stays = any(self._drives(*ends, speed, False) for speed in (TRIAL_MPS, FASTER_MPS))
             self._plan["link"][0, lanes[0]] = 0

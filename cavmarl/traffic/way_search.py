@@ -43,9 +43,8 @@ class WaySlots:
     number: int  # slots per world
     steps: int  # number of steps per slot
     num_worlds: int  # number of worlds with slots
-    # number of lanes of the map. As many unused steps precede the first slot, so that
-    # VEHICLE["way"] is greater in slots than elsewhere: it is the row of a step minus the row of a
-    # lane.
+    # number of lanes of the map; this many unused steps precede the first slot. VEHICLE["way"] is
+    # the row of a step minus the row of a lane, so it is greater in slots than elsewhere.
     num_lanes: int
 
     @property

@@ -26,5 +26,5 @@ def test_vehicles_enter_anywhere_if_no_usable_road_leads_into_the_map() -> None:
     assert len(drawn.entering) > 0
     assert not set(drawn.entering[:, 0]) & set(ways_in)
     plans["turnarounds"] = 1
-    with pytest.raises(ConfigError, match=r"no trip on the map .*: every way .* has a turn"):
+    with pytest.raises(ConfigError, match=r"no trip on the map .*: every route .* has a turn"):
         trips.drawn(plans, num_goals)

@@ -9,8 +9,8 @@ from typing import Any
 class AddressTable:
     """A table that kernels know by its symbol.
 
-    Each place from which kernels are loaded has its own copy: LLVM's loader of objects uses the
-    copy of this class, and each shared library contains one.
+    Each loader of kernels has its own copy of the table: LLVM's loader of objects uses the copy of
+    this class, and each shared library contains a copy.
     """
 
     def __init__(self, symbol: str, size: int) -> None:

@@ -3,7 +3,7 @@
 The caller passes the address of an array of words to a compiled kernel (`entry_point.py`). A number
 takes one word, an array the address of its Python object, a record the address of its data, a
 tuple or a bundle the words of its items in order, and `None` no word. The words of the result
-follow those of the arguments.
+follow the words of the arguments.
 """
 
 from __future__ import annotations
@@ -181,7 +181,7 @@ _LAYOUT = re.compile(r"\[(\d+)([CFA])( readonly)?( unaligned)?\]")
 
 
 def type_key(argument: Any) -> Any:
-    """Return a value that is equal for two arguments if and only if their types are."""
+    """Return a value that is equal for two arguments if and only if their types are equal."""
     python = type(argument)
     if python is np.ndarray:
         return argument.dtype, argument.ndim, _FLAGS[argument.flags.num & _TYPED]

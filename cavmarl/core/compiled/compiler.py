@@ -47,7 +47,7 @@ from numba.np import arrayobj
 
 from cavmarl.core.compiled.entry_point import EntryPoint, result_text
 
-# Passes for features that no kernel uses, as it creates no arrays: array expressions and more.
+# Passes for features that no kernel uses, such as array expressions: kernels create no arrays.
 _NEEDLESS = {InlineClosureLikes, InlineInlinables, InlineOverloads, NopythonRewrites}
 
 
@@ -83,7 +83,7 @@ def _is_bundle(kind: Any) -> bool:
 def _borrow(builder: Any, address: Any, is_fixed: bool) -> Any:
     """Load the value at an address as borrowed; LLVM reads only the parts that are used.
 
-    `is_fixed`: whether the address and what it holds are the same in the whole function.
+    `is_fixed`: whether the address and the value there are the same in the whole function.
     """
     value = builder.load(address)
     value.borrowed = True
@@ -207,7 +207,7 @@ class _KernelLower(_Lower):  # type: ignore[misc]
         return self._bundles[name] if name in self._bundles else super().loadvar(name)
 
     def storevar(self, value: Any, name: str, argidx: Any = None) -> None:
-        """Store a value without reading the variable's previous one; of a bundle, its address."""
+        """Store a value, or the address of a bundle, without reading the variable's old value."""
         if self.context.enable_nrt or name in self._singly_assigned_vars:
             super().storevar(value, name, argidx)
         elif _is_bundle(self.typeof(name)):
@@ -321,7 +321,7 @@ class _KernelLowering(NativeLowering):
 
 
 _Flags: Any = Flags
-_HASH = hash(_Flags())  # shared by all: Numba hashes the names of the options
+_HASH = hash(_Flags())  # the same for all flags: Numba hashes only the names of the options
 
 
 class _QuickFlags(_Flags):  # type: ignore[misc]

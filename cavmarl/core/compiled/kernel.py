@@ -109,7 +109,7 @@ class TypedKernel:
         count = sum(kind.count for kind in self.types)
         results, self.read_result = result_reader(code.result, count)
         self.num_words = count + results
-        self.words: list[Words] = []  # free memory, of which each call takes one item
+        self.words: list[Words] = []  # free memory; each call takes one item
 
     def __call__(self, arguments: tuple[Any, ...]) -> Any:
         """Call with arguments of these types; no reference to them is kept."""
@@ -141,11 +141,11 @@ class TypedKernel:
 def specialized(kernel: Callable[P, R], checks: bool = True) -> Callable[P, R]:
     """Return a kernel for one caller whose arguments have the same types in every call.
 
-    The first call determines the types. A later call stores only the arguments, and items of
-    bundles, that are other objects than in the previous call; for that, a call keeps its arguments
-    alive until the next one. An argument of another type is a TypeError. Without `checks`, types
-    are not compared. This is for loops in which one process waits for another process, and for
-    frames, whose few callers ensure the types.
+    The first call determines the types. A later call stores an argument, or an item of a bundle,
+    only if it is another object than in the previous call. Each call therefore keeps its arguments
+    alive until the next call. An argument of another type is a TypeError. Without `checks`, types
+    are not compared: for loops in which one process waits for another process, and for frames,
+    whose few callers ensure the types.
 
     With `NUMBA_DISABLE_JIT=1`, this is the kernel itself.
     """

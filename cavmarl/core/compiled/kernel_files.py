@@ -66,9 +66,9 @@ class KernelFile:
         self._pattern = f"{readable}.{kernel}.*{SUFFIX}"
 
     def load(self) -> CompiledKernel | None:
-        """Return the kernel for these types, or for other types that accept such arguments.
+        """Return the kernel for these types, or for other types whose code accepts such arguments.
 
-        Return None if there is no such file, or only damaged ones.
+        Return None if there is no such file, or if all such files are damaged.
         """
         if self._frozen is None:
             return None
@@ -163,7 +163,7 @@ def numba_version() -> str:
 
 
 def _frozen_values(function: Callable[..., Any]) -> str | None:
-    """Return a description of the constants of a kernel from outside of the package.
+    """Return a description of the constants of a kernel that is defined outside of the package.
 
     Numba turns closure variables into constants. Return None if one of them cannot be described;
     such a kernel is not cached.

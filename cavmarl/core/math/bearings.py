@@ -11,7 +11,7 @@ ANGLE_ERROR_RAD = 0.005
 
 @kernel
 def rough_atan2(y: float, x: float) -> float:
-    """Return the angle of (x, y), not both zero, with an error below `ANGLE_ERROR_RAD`.
+    """Return the angle of a point other than (0, 0), with an error below `ANGLE_ERROR_RAD`.
 
     Rajan, Wang, Inkol, Joyal: "Efficient approximations for the arctangent function", IEEE Signal
     Processing Magazine 23(3), 2006, their equation for 0.0038 rad.

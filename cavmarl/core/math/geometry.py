@@ -71,7 +71,7 @@ def lane_pose(
 def _nearest_segment(
     points: NDArray[np.void], start: int, stop: int, x: float, y: float
 ) -> tuple[int, float]:
-    """Return the first of the nearest segments [start, stop), a POINT row, and distance²."""
+    """Return the POINT row of the first nearest segment in [start, stop), and the distance²."""
     nearest = start
     smallest = np.inf
     for i in range(start, stop):

@@ -1,4 +1,4 @@
-"""A grid with the vehicles of one world in square cells, and searches for the nearest of them.
+"""A grid with the vehicles of one world in square cells, and searches for nearby vehicles.
 
 `fill_grid` sorts the vehicles into cells once per tick. It copies the data that neighbours read
 into `bodies`: compact records with sine and cosine of the heading computed once. Within a cell,

@@ -74,7 +74,7 @@ class TripTables(NamedTuple):
     num_fixed: int  # the world writes steps from this index on while it runs
     scripts: Scripts
     shifts: NDArray[np.int64]  # (W,) steps from each plan to the world's own plan, see `LanePlans`
-    trip_horizon: float = 0.0  # limit of agents' trips, in multiples of free time; 0: no limit
+    trip_horizon: float = 0.0  # limit of agents' trips, in free-flow times; 0: no limit
     tick_s: float = 0.1
 
 
@@ -120,7 +120,7 @@ class Worlds(NamedTuple):
     ]  # PLAN (W, C) the step of each row's lane, see `route_following.own_step`
     step_at: NDArray[np.int64]  # (W, C) 1 + its index in `TripTables.steps`, 0: none yet
     outer: NDArray[np.void]  # OUTER (W, C) owned next rows that other zones may see, ascending
-    num_outer: NDArray[np.int64]  # (W,) -1: not up to date with the rows
+    num_outer: NDArray[np.int64]  # (W,) length of these lists; -1: outdated
     cues: NDArray[np.int64]  # (W, T) tick of each cue of the script, -1: not yet
     # LANE (V, L) the lanes as they are now, see `lanes_now`; V is 1 if no world may change lanes,
     # else 1 + W
@@ -187,7 +187,7 @@ class Demand(NamedTuple):
     num_ids: int  # agents of an episode
     num_background: int
     reenter: bool  # whether a vehicle that leaves is replaced by a new one
-    endless: bool  # whether agents get another goal before they reach theirs
+    endless: bool  # whether agents get another goal before they reach their goal
     seats: bool  # whether an agent's new vehicle keeps the agent's id
     speed_factor_spread: float
     blank: NDArray[np.void]  # VEHICLE (1,) initial value of a new record

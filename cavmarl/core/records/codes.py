@@ -47,7 +47,7 @@ SPEED_LIMIT = 4
 SPEED_LAST = 5  # speed of the last vehicle on the lane
 SPEED_AVERAGE = 6
 
-# STOP["until_from"]: the start of the time after which a stop ends
+# STOP["until_from"]: the time to which the earliest end of a stop (`until`) is relative
 UNTIL_ABSOLUTE = 0
 UNTIL_FLOW = 1
 UNTIL_DEPARTURE = 2
@@ -103,7 +103,7 @@ NUM_COUNTS = 4
 # DepartureQueue.sums, over vehicles that arrived
 SUM_DISTANCE_M = 0
 SUM_TIME_S = 1
-SUM_DELAY_S = 2  # time in excess of the route's duration at the speed of limit, driver and type
+SUM_DELAY_S = 2  # trip time minus time at the speed that limit, driver and type allow
 NUM_SUMS = 3
 
 # First bits of LANE["permissions"] that bar vehicle classes from changes to the left and right.

@@ -84,13 +84,13 @@ from cavmarl.driving.kernels.models.following import before_line, no_constraint,
 from cavmarl.driving.kernels.motion.ordered_stops import distance_to_stop
 from cavmarl.driving.kernels.motion.speed_limits_ahead import bend_speed, speed_before_limit
 
-SEE_LINE_M = 12.0  # for a stopped vehicle: swept areas begin up to 10.5 m before a line
+SEE_LINE_M = 12.0  # used for stopped vehicles: swept areas begin up to 10.5 m before a line
 CLOSER_M = 0.9  # a driver that resolves deadlocks stops this much closer than `LINE_MARGIN_M`
 # Around a corner, if the gap to the leader is below `NEAR_M` and the headings differ by more than
 # `ASKEW_RAD`, half the leader's width is subtracted from the gap.
 NEAR_M = 8.0
 ASKEW_RAD = 0.7
-NEXT_LINE_M = 5.0  # plus the braking distance: a vehicle with a leader looks this far for a line
+NEXT_LINE_M = 5.0  # a vehicle with a leader looks for a line this far beyond its braking distance
 # At this distance before the place where a lane change must be made, a driver adapts to the leader
 # on the other lane.
 FALL_IN_M = 100.0
@@ -243,7 +243,7 @@ def _road_ahead(
         allowed = min(allowed, bend_speed(roads, lane, lane, -row["s"]))
     constraint = no_constraint(kind)
     hold = HOLD_NONE
-    kept = no_constraint(kind)  # will be the constraint of the leader
+    kept = no_constraint(kind)  # the constraint of the leader; set below
     link_ahead = -1
     if here["internal"]:
         place = here["link_offset_m"] + row["s"]

@@ -4,10 +4,10 @@ Every motor vehicle has both values: the energy of a battery-electric car, and t
 van, truck, bus or motorcycle with a combustion engine, by vehicle class. As in SUMO, both are 0 for
 trams, bicycles and pedestrians.
 
-Source: SUMO 1.28. Energy: its class Energy/unknown with the default parameters, those of a Kia Soul
-    EV (Kurczveil, López and Schnieder 2014), without the friction of curves. CO₂: its default
-    HBEFA4 class of each vehicle class. `tests/driving/test_emissions.py` compares both with SUMO's
-    tool emissionsDrivingCycle.
+Source: SUMO 1.28. Energy: the class Energy/unknown with its default parameters, which describe a
+    Kia Soul EV (Kurczveil, López and Schnieder 2014), without the friction of curves. CO₂: the
+    default HBEFA4 class of each vehicle class. `tests/driving/test_emissions.py` compares both
+    values with SUMO's tool emissionsDrivingCycle.
 """
 
 from __future__ import annotations
@@ -53,10 +53,10 @@ def battery_wh(vclass: int, speed: float, accel: float, pitch: float, dt_s: floa
 
     Args:
         vclass: index in `roads.network.VEHICLE_CLASSES`; pedestrians have the next index.
-        speed: in m/s at the end of that time; negative backwards.
-        accel: in m/s² along the heading, during that time.
+        speed: in m/s at the end of the period; negative backwards.
+        accel: in m/s² along the heading, during the period.
         pitch: in rad, positive uphill.
-        dt_s: duration in s.
+        dt_s: duration of the period in s.
     """
     if vclass < 0 or vclass >= _NUM_CLASSES or _CO2[vclass][0] == 0.0:
         return 0.0
@@ -75,7 +75,7 @@ def battery_wh(vclass: int, speed: float, accel: float, pitch: float, dt_s: floa
 def co2_mg_per_s(vclass: int, speed: float, accel: float, pitch: float) -> float:
     """Return the CO₂ in mg/s; arguments as for `battery_wh`.
 
-    The result is 0 if the vehicle coasts, or brakes harder than by coasting.
+    The result is 0 if a moving vehicle decelerates more than it would by coasting.
     """
     if vclass < 0 or vclass >= _NUM_CLASSES:
         return 0.0

@@ -27,7 +27,7 @@ from cavmarl.roads.kernels.map_choice import map_of
 # Maximum distance from a detector to the centre of a vehicle that occupied it in this tick.
 DETECTOR_REACH_M = 30.0
 
-SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; also the least time to the first check
+SECOND_MS = 1000  # SUMO prolongs phases to whole seconds; first check after at least this time
 
 
 @kernel
@@ -40,7 +40,7 @@ def detect(
     dt: float,
     detected_s: NDArray[np.float64],
 ) -> None:
-    """Record when vehicles were on the detectors: now, or when a rear left in this tick.
+    """Record when vehicles were last on the detectors: now, or when a rear left during this tick.
 
     The latest time is kept, so the result does not depend on the order of rows or on their owners.
 
@@ -150,7 +150,7 @@ def _note(
     detector: int,
     detected_s: NDArray[np.float64],
 ) -> None:
-    """Record when a vehicle was on a detector that is `ahead` m behind its centre."""
+    """Record when a vehicle was on a detector; its centre is `ahead` m beyond the detector."""
     rear = ahead - 0.5 * row["length"]
     if ahead + 0.5 * row["length"] >= 0.0 and rear <= row["speed"] * dt:
         # The vehicle drove the whole tick at the speed at its end (semi-implicit Euler).

@@ -108,7 +108,7 @@ def overlap(path: LinkPath, foe: LinkPath, *, merging: bool) -> Overlap | None:
 def grazing(
     path: LinkPath, foe: LinkPath, way: LinkPath, foe_way: LinkPath, *, forked: bool = False
 ) -> Overlap | None:
-    """Return where cars on two paths would touch because they are oblique in bends, or None.
+    """Return where cars on two paths would touch because cars are oblique in bends, or None.
 
     The ways are the paths plus some metres of the lanes at their ends. If the paths are `forked`,
     they leave the same lane, and only the area where they meet again counts. As for `overlap`, the

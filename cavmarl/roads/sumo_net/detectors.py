@@ -106,7 +106,7 @@ class _Approaches:
         return int((beside & _MOTORIZED != 0).sum()) == 1
 
     def shortest_green_s(self, lane: int) -> float | None:
-        """Return the shortest minimum duration of the actuated phases that open the lane."""
+        """Return the shortest minimum duration of the actuated phases with green for the lane."""
         shortest = [
             phase.min_s
             for phase in self.program.phases

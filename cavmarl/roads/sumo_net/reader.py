@@ -62,7 +62,7 @@ if TYPE_CHECKING:
     from cavmarl.roads.sumo_net.sumo_xml import ParsedNet
 
 APPROACH_M = 12.0  # up to this far before a junction, bodies may be oblique to waiting vehicles
-FORK_WATCHED_M = 5.0  # up to this far after a junction, drivers that turn off watch rears
+FORK_WATCHED_M = 5.0  # up to this far after a junction, drivers turning off watch others' rears
 MAX_CROSSING_M = 2000  # paths are compared point by point, so memory grows with length squared
 MOST_CROSSING = "CAVMARL_MAX_CROSSING_M"  # environment variable that overrides this limit
 _NAMED = 5  # maximum number of changed lanes named in a note

@@ -120,7 +120,7 @@ def _radius(width_m: float) -> float:
 
 
 def _fillets(shape: Shape, corners: Sequence[Corner], radius: float) -> list[_Fillet]:
-    """Return the curves for corners, each extended over the gentle bends in its place."""
+    """Return the curves for corners; each curve also replaces the gentle bends in its range."""
     found: list[_Fillet] = []
     for number, corner in enumerate(corners):
         low = corners[number - 1].last if number else 0

@@ -40,7 +40,7 @@ class Road(NamedTuple):
 
 
 class Strip(NamedTuple):
-    """Two opposite edges of which some lanes are on the same strip."""
+    """Two opposite edges with lanes on the same strip."""
 
     one: Road
     other: Road

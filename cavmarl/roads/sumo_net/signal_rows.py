@@ -287,7 +287,7 @@ def _simplified(program: SignalProgram) -> bool:
 def parameter(program: SignalProgram, key: str, default: float) -> float:
     """Return a parameter of a program in seconds.
 
-    Raises MapError: it is not a number of at least 0.
+    Raises MapError: the parameter is not a number of at least 0.
     """
     text = program.params.get(key)
     if text is None:

@@ -113,7 +113,7 @@ class _Handler(ContentHandler):
         if option.name in self.given:
             first = self.given[option.name].line
             raise self._error(
-                name, f"sets {option.name} again, after line {first}", "leave one of them"
+                name, f"sets {option.name} again, after line {first}", "keep only one of them"
             )
         self.given[option.name] = GivenOption(value, self._locator.getLineNumber())
 

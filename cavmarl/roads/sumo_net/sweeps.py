@@ -40,8 +40,8 @@ class SweptBody(NamedTuple):
 # Bodies of the size classes: car; van or truck; bus. Lengths in between belong to the longer class.
 BODIES = tuple(map(SweptBody, (0.5 * m for m in SIZE_BODIES_M), (0.95, 1.25, 1.3)))
 STEP_M = 0.5
-# Bodies are examined from `BEFORE_M` (front before its line) to this distance of the rear after the
-# junction; a U-turn reaches farther over the adjacent lane.
+# Bodies are examined from `BEFORE_M` (front before its line) to `BEYOND_M` (rear after the
+# junction), or `TURN_BEYOND_M` in a U-turn, which reaches farther over the adjacent lane.
 BEFORE_M = 10.0
 BEYOND_M = 4.0
 TURN_BEYOND_M = 8.0
@@ -116,7 +116,7 @@ def sweep_rows(movements: Movements) -> tuple[NDArray[np.void], NDArray[np.int32
 
 
 def _by_own_size(row: tuple[float, ...]) -> tuple[float, ...]:
-    """Return a sort key that keeps rows of one size together, because a driver reads one size."""
+    """Return a sort key by the vehicle's own size, because a driver reads the rows of its size."""
     return (row[1], *row)
 
 
@@ -186,7 +186,7 @@ def find_pair(
 def _before_and_beyond(
     poses: NDArray[np.float64], length_m: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Split poses into those with centres before the end of a junction, and the rest."""
+    """Split poses by whether their centres are before the end of a junction."""
     before = poses[:, 0] <= length_m
     return poses[before], poses[~before]
 
@@ -220,7 +220,7 @@ def _find_behind(
     poses: dict[int, list[NDArray[np.float64]]],
     found: list[list[tuple[float, ...]]],
 ) -> None:
-    """Find contacts of a vehicle in a U-turn, and of its rear, with vehicles behind it."""
+    """Find contacts of a vehicle in a U-turn, and of its swinging rear, with vehicles behind it."""
     way = movements.ways[turn]
     assert way is not None
     length = float(movements.links["length_m"][turn])

@@ -80,11 +80,11 @@ def flow_timing(element: Element, horizon_ms: int) -> Timing:
     """
     rates = [key for key in _RATES if key in element.attrs]
     if len(rates) > 1:
-        raise element.error(f"has {' and '.join(rates)}", "leave one of them")
+        raise element.error(f"has {' and '.join(rates)}", "keep only one of them")
     if not rates and "number" not in element.attrs:
         raise element.error("has no rate", f"give it one of {', '.join(_RATES)} or number")
     if rates and "number" in element.attrs and "end" in element.attrs:
-        raise element.error(f"has {rates[0]}, number and end", "leave two of them")
+        raise element.error(f"has {rates[0]}, number and end", "keep only two of them")
     begin = element.time_ms("begin", 0)
     default_end = begin + DAY_MS if horizon_ms < 0 else max(horizon_ms, begin)
     end = element.time_ms("end", default_end)
@@ -263,7 +263,7 @@ class DefinitionCollector:
         depart = self._begin_ms if start == "begin" else element.time_ms("depart")
         latest = self._latest_ms.get(element.path, 0)
         if depart < latest:
-            what = "departure before that of a vehicle above it: sorted (SUMO drops it)"
+            what = "vehicle departs before a vehicle above it: sorted (SUMO drops it)"
             self.report.tolerate(what, element.place)
         self._latest_ms[element.path] = max(latest, depart)
         return single_timing(depart)

@@ -70,7 +70,7 @@ class DemandFile:
     # (num_edges, n) LANE row by SUMO's index on the edge, -1 if there is none
     lane_table: NDArray[np.int32]
     begin_ms: int  # start of the simulation for which the files were made
-    has_begin: bool  # whether the files state `begin_ms`, else it is 0; not part of the hash
+    has_begin: bool  # whether the files state `begin_ms`; if not, it is 0; not part of the hash
     end_ms: int  # end of the simulation; `MAX_TIME_MS` if the files state no end
     step_ms: int
     scale: float  # number of vehicles per departure in the files
@@ -315,7 +315,7 @@ def _configuration(paths: Sequence[Path], report: DemandReport) -> SumoConfigFil
             files.append(path)
             continue
         if config is not None:
-            raise DemandError(f"{path}: a second SUMO configuration; give one, or its files")
+            raise DemandError(f"{path}: a second SUMO configuration; give only one of them")
         config = read_sumo_config(path, report)
         files.extend(config.files)
     if not files:

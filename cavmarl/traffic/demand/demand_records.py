@@ -19,7 +19,7 @@ from cavmarl.traffic.demand.element import Element
 LANE_FIRST = -1  # the lane nearest to the kerb that the class may use
 LANE_RANDOM = -2
 LANE_FREE = -3  # the lane with the fewest vehicles
-LANE_ALLOWED = -4  # the lane with the fewest vehicles among those that the class may use
+LANE_ALLOWED = -4  # the lane with the fewest vehicles among the lanes open to the class
 LANE_BEST = -5  # the lane that the route can follow furthest
 LANE_CURRENT = -6  # arrival: the present lane
 

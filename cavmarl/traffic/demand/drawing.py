@@ -111,7 +111,7 @@ def copied(
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.int64]]:
     """Return departures (m,) of a demand that is multiplied by `scale`; see `scaled_flows`.
 
-    As in SUMO, k counts the vehicles in each flow with a probability, and those outside of flows.
+    As in SUMO, k counts vehicles in each flow with a probability, and vehicles outside of flows.
     Vehicle k departs floor(scale) times, and once more if k · part mod 1000 < part, where `part` is
     the fraction of the scale in thousandths. In a flow, copies are numbered as further vehicles.
     Outside of flows, a departure has the number of the copy.

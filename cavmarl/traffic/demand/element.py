@@ -39,7 +39,7 @@ def near(name: str, known: Iterable[str]) -> str:
     """Return names similar to an unknown one, for the end of a message."""
     names = list(known)
     matches = get_close_matches(name, names, n=3) or names[:3]
-    return f"similar names: {', '.join(matches)}" if matches else "the files have none"
+    return f"similar names: {', '.join(matches)}" if matches else "the files define none"
 
 
 def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> str:
@@ -50,7 +50,7 @@ def late_begin(begin_s: float, horizon_s: float, first_ms: int, stays: bool) -> 
     """
     none = f"no vehicle departs in the {horizon_s:g} s from {begin_s:g} s"
     if stays:
-        return f"{none}, but from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
+        return f"{none}, only from {first_ms // 1000} s: change horizon_s, or begin in the .sumocfg"
     return f"the demand begins at {first_ms // 1000} s, as {none}"
 
 

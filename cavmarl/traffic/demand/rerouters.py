@@ -165,7 +165,7 @@ class _Reader:
             if child.name in parts:
                 parts[child.name].append(child)
             else:
-                self._report.tolerate(f"<{child.name}> of rerouter is not acted on", child.place)
+                self._report.tolerate(f"<{child.name}> of rerouter has no effect here", child.place)
         for closing in parts["closingReroute"]:
             edge = self._index.edge(closing.text("id"), closing)
             self._closings.append((*span, edge, _closed_classes(closing)))
@@ -191,7 +191,7 @@ class _Reader:
         for child in children:
             weight = child.number("probability", 1.0, least=0.0, most=MAX_WEIGHT)
             if child.attrs.get("id") == "terminateRoute":
-                what = "destProbReroute terminateRoute is taken for keepDestination"
+                what = "destProbReroute terminateRoute is treated as keepDestination"
                 self._report.tolerate(what, child.place)
             found.append((row_of(child), weight))
         if not found:
@@ -213,7 +213,7 @@ class _Reader:
 def _closed_classes(closing: Element) -> int:
     """Return the bits of the classes to which an edge is closed; all classes by default."""
     if "allow" in closing.attrs and "disallow" in closing.attrs:
-        raise closing.error("has allow and disallow", "leave one of them")
+        raise closing.error("has allow and disallow", "keep only one of them")
     for key in ("allow", "disallow"):
         if key in closing.attrs:
             bits = _classes(closing, closing.attrs[key].split())

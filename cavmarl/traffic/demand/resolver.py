@@ -159,14 +159,14 @@ class Resolver:
                 what = "vehicle or flow that cannot drive its route is left out"
                 self._report.tolerate(what, user.place, int(counts[case]))
             elif arrival_lane >= 0 and self._missing_lane(routes, arrival_lane, -1):
-                what = "arrivalLane beyond the lanes of the edge is any lane"
+                what = "arrivalLane that the edge lacks is treated as any lane"
                 self._report.tolerate(what, user.place)
                 elements["arrival_lane"][which.ravel() == case] = LANE_CURRENT
         keep: NDArray[np.bool_] = fits[which.ravel()]
         return keep
 
     def _drives(self, types: int, routes: int, user: Element) -> bool:
-        """Return whether any option can be driven; all must be, unless bad routes are skipped."""
+        """Return whether any option can be driven; refuse the others unless they are tolerated."""
         some = False
         for vtype in self._options(self._type_options, types).rows:
             permissions = self.types.permissions(vtype)
@@ -181,7 +181,7 @@ class Resolver:
         return some
 
     def _gap(self, route: int, permissions: int) -> str | None:
-        """Return why a class cannot drive a route; if bad routes are skipped, also try trips."""
+        """Return why a class cannot drive a route, or None; with `skip`, also search trips."""
         edges, exact = self.routes.edges(route), self.routes.exact(route)
         gap = self._index.gap(edges, exact, permissions)
         if gap is None and self._skip and not exact:
@@ -194,7 +194,7 @@ class Resolver:
     def _tolerates(self, vtype: int, user: Element) -> bool:
         """Return whether vehicles of this type without a route are left out instead of refused."""
         if self.types.permissions(vtype) & ~_PARTLY_MAPPED == 0:
-            what = f"type '{self.types.names[vtype]}' without a way: maps lack its own lanes"
+            what = f"type '{self.types.names[vtype]}' without a route: maps lack its own lanes"
             self._report.tolerate(what, user.place)
             return True
         return self._skip

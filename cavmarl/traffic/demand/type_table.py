@@ -129,7 +129,7 @@ def _model(element: Element, report: DemandReport) -> int:
         raise element.error(f"has the unknown carFollowModel '{name}'", near(name, known))
     nearest = NEAREST_MODEL.get(name, name)
     if nearest != name:
-        report.tolerate(f"carFollowModel {name} is taken for {nearest}", element.place)
+        report.tolerate(f"carFollowModel {name} is treated as {nearest}", element.place)
     return model_code(nearest)
 
 

@@ -37,7 +37,7 @@ _PROGRAMS = frozenset(("tlLogic", "WAUT", "wautJunction"))
 
 
 class _Handler(ContentHandler):
-    """Builds the tree of each definition and passes it on when it ends."""
+    """Builds the tree of each definition, and passes the tree on at the definition's end tag."""
 
     def __init__(
         self,

@@ -1,10 +1,10 @@
 """Admission of waiting departures: the departure queue assigns lanes, and shards find gaps.
 
-In one tick at most one vehicle tries to enter each lane, in the order of the queue. There are five
-calls. Each shard runs `rank_lanes` (how crowded lanes are), `propose` (departures with a safe gap
-in the shard's zone) and `admit` (add the vehicles to the shard's rows or ghosts). The departure
-queue runs `assign_lanes` before `propose`, and then `accept` (in queue order, while the world has
-room).
+In one tick at most one vehicle tries to enter each lane, in the order of the queue. Five kernels
+run in this order: `rank_lanes` (in each shard: how crowded lanes are), `assign_lanes` (in the
+queue), `propose` (in each shard: departures with a safe gap in its zone), `accept` (in the queue,
+in its order, while the world has room) and `admit` (in each shard: add the vehicles to its rows or
+ghosts).
 """
 
 from __future__ import annotations
@@ -174,7 +174,7 @@ def _touches_any(rows: NDArray[np.void], num: int, own: np.void) -> bool:
 
 @kernel
 def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
-    """Return the link at the end of an entrant's lane: on its route, or the first; -1: none."""
+    """Return the link that an entrant takes from its lane, or the lane's first link; -1: none."""
     _, _, link = next_step(roads, travel, row["lane"], row["way"])
     here = roads.lanes[row["lane"]]
     return here["first_link"] if link < 0 and here["num_links"] > 0 else link
@@ -182,7 +182,7 @@ def _link_ahead(roads: RoadArrays, travel: TripTables, row: np.void) -> int:
 
 @inlined_kernel
 def _num_behind(roads: RoadArrays, row: np.void) -> int:
-    """Count the lanes that lead to or beside the entrant's lane; 0 far from the lane's start."""
+    """Count the lanes that lead to `fed_lane` of an entrant's lane; 0 far from the lane's start."""
     far = row["s"] - 0.5 * row["length"] > SWEPT_BEYOND_M
     return 0 if far else int(roads.lanes[fed_lane(roads, row["lane"])]["num_into"])
 
@@ -199,7 +199,7 @@ def _link_behind(roads: RoadArrays, row: np.void, n: int) -> int:
 def may_entry_be_swept(
     roads: RoadArrays, travel: TripTables, row: np.void, scratch: Scratch
 ) -> bool:
-    """Return whether a vehicle would enter near swept areas ahead, or occupied ones behind."""
+    """Return whether an entrant would be near swept areas ahead, or occupied swept areas behind."""
     to_line = roads.lanes[row["lane"]]["length_m"] - row["s"]
     ahead = _link_ahead(roads, travel, row) if to_line <= travel.see_m else -1
     if ahead >= 0 and roads.links[ahead]["num_sweeps"] > 0:

@@ -302,7 +302,7 @@ def populate(
 
 @kernel
 def _needs_goal(demand: Demand, roads: RoadArrays, travel: TripTables, row: np.void) -> bool:
-    """Return whether a vehicle needs another goal: it is stuck, or near the end of endless trips.
+    """Return whether a vehicle needs another goal: it is stuck, or near the end of an endless trip.
 
     A background vehicle is stuck if it has waited for `GIVE_UP_S` at the end of a lane that its
     route does not follow, or if a network has driven it to a lane without a route. Agents are never
@@ -353,7 +353,7 @@ def choose_goals(
     worlds: Worlds,
     dt: float,
 ) -> None:
-    """Give vehicles of `next_rows` that need another goal a reachable goal, if any.
+    """Give a reachable goal, if any, to each vehicle of `next_rows` that needs another goal.
 
     Call once a second. A more distant goal does not count as lost progress of an agent.
     """

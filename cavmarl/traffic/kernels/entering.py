@@ -229,7 +229,7 @@ def _behind_last_m(
     most: float,
     scratch: Scratch,
 ) -> float:
-    """Return how far (m) before `most`, the last place, a departure with POS_LAST enters.
+    """Return the distance in m from a POS_LAST departure's place to `most`, the last place.
 
     Behind the last vehicle in view of the lane's end, the departure keeps the gap that it needs to
     stop. Without such a vehicle it keeps its reaction time to the end, because there may be
@@ -291,7 +291,7 @@ def entry_speed(
         k, apart = next_askew(roads, travel, rows, lane, s, departure["id"], to_left, scratch)
         if k >= 0:
             safe = min(safe, _safe_behind(kind, scratch.entries[k], apart - half))
-    # Behind the last vehicle, or with a fixed speed, the departure waits until that speed is safe.
+    # With POS_LAST or a fixed speed, the departure waits until its wanted speed is safe.
     code = departure["speed_code"]
     slows = (code == SPEED_MAX or code == SPEED_RANDOM) and departure["pos_code"] != POS_LAST
     if safe < 0.0 or (safe < wanted and not slows):
@@ -332,7 +332,7 @@ def _safe_at_fork(
 
 @kernel
 def _mean_speed(limit_mps: float, lane: int, s: float, view_m: float, scratch: Scratch) -> float:
-    """Return the mean speed in m/s of vehicles on a lane in view of `s`; else the limit."""
+    """Return the mean speed in m/s of vehicles on a lane in view of `s`; the limit if none."""
     total, number = 0.0, 0
     for k in range(scratch.lane_start[lane], scratch.lane_end[lane]):
         other = scratch.entries[k]
@@ -424,7 +424,7 @@ def _brakes(
     speed: float,
     scratch: Scratch,
 ) -> bool:
-    """Return whether entry k, its centre `apart` m behind the entrant's rear, brakes hard."""
+    """Return whether entry k brakes hard; its centre is `apart` m behind the entrant's rear."""
     follower = scratch.entries[k]
     gap = apart - follower["half"]
     if gap < ENTER_GAP_M:

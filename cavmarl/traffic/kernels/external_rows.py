@@ -113,7 +113,7 @@ def _stand(roads: RoadArrays, grid: LaneGrid, row: np.void, z: float, pitch: flo
 def _drive(
     row: np.void, kind: np.void, told: np.void, accel_limit: float, steering_limit: float, dt: float
 ) -> None:
-    """Move a driven row like the bicycle of an agent; braking ends at a standstill."""
+    """Move a driven row by the bicycle model, as for an agent; braking ends at a standstill."""
     throttle = clamp(told["throttle"], -accel_limit, accel_limit)
     steering = clamp(told["steering"], -steering_limit, steering_limit)
     throttle = clamp(throttle, -kind["most_decel"], kind["most_accel"])

@@ -58,7 +58,7 @@ def leave(
     driver: int,
     ticks_per_step: int,
 ) -> None:
-    """Move owned vehicles of one kind of driver whose trip has ended to `departures.passing`.
+    """Move to `departures.passing` the owned vehicles of a kind of driver whose trips have ended.
 
     Trips of background vehicles end at arrival. Trips of agents that have acted, and of background
     vehicles that a network drives, also end after a collision or off the road.

@@ -27,9 +27,9 @@ from cavmarl.driving.kernels.motion.motion import account, before_tick, lane_bef
 from cavmarl.driving.kernels.motion.tracking import side_lane
 
 BODY_LANES = 8  # maximum number of lanes between the front and the centre of a body
-BLINKS_RIGHT = 1  # bit of SUMO's vehicle signals, like the next constant
+BLINKS_RIGHT = 1  # bit in SUMO's vehicle signals; so is BLINKS_LEFT
 BLINKS_LEFT = 2
-EDGES_BEHIND = 2  # the centre is at most this many edges behind the front's edge, or one beyond
+EDGES_BEHIND = 2  # the centre is searched from this many edges before the front's edge to one after
 
 
 class Paths(NamedTuple):
@@ -188,7 +188,7 @@ def find_blocked(
     w: int,
     out: NDArray[np.void],
 ) -> int:
-    """Copy the owned rows of a demand whose route leads over a closed road to `out`.
+    """Copy to `out` the owned rows of demand vehicles whose routes lead over a closed road.
 
     Rows in a junction or with a stop ahead are left out. `lanes`: LANE (L,) of the world.
 

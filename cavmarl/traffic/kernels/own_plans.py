@@ -26,7 +26,7 @@ def follows_plan(row: np.void) -> bool:
 
 @kernel
 def prolong_trip(roads: RoadArrays, travel: TripTables, row: np.void) -> None:
-    """Extend an agent's trip to at least the time that the present route takes from here."""
+    """Extend the time limit of an agent's trip if its present route takes longer from here."""
     if row["due"] < 0 or travel.trip_horizon <= 0.0 or roads.lanes[row["lane"]]["internal"]:
         return
     most_s = route_time_s(roads, travel, row, row["tick"] * travel.tick_s)

@@ -23,7 +23,7 @@ from cavmarl.core.records.codes import DRIVER_BACKGROUND, DRIVER_SCRIPTED, EVENT
 from cavmarl.roads.kernels.plans import change_cost
 from cavmarl.roads.kernels.route_steps import follow_plan, plan_route
 
-REACTION_S = 1.0  # s at the present speed before a driver brakes for a new turn
+REACTION_S = 1.0  # s driven at the present speed before a driver brakes for a new turn
 CHANGE_ROOM_M = 30.0  # m needed for each lane change before the next junction
 
 

@@ -50,7 +50,7 @@ class LoggedParameters:
     """Parameters of a logged scene."""
 
     start_s: float = setting(0.0, 0.0, 1e6, "s", "time in the log at which an episode begins")
-    reactive: bool = switch(False, "built-in drivers drive the other vehicles along their ways")
+    reactive: bool = switch(False, "built-in drivers drive the other vehicles along their routes")
 
 
 def plan_logged_scene(config: ScenarioConfig, network: RoadNetwork, agents: int) -> Scene:
@@ -109,7 +109,7 @@ class _Casting:
         unable = sum(track.kind == "vehicle" for track in replayed) if reactive else 0
         self._clipped += sum(clipped_size(track) != track.size_m for track in others)
         told = (
-            (self._clipped, "road users are larger than a bus: their sizes were reduced to its"),
+            (self._clipped, "road users are larger than a bus: reduced to the size of a bus"),
             (unable, "vehicles replayed, because they do not drive along lanes that are connected"),
         )
         seats = list(seated.values())
@@ -201,7 +201,7 @@ class _Casting:
         return bool(boxes_meet(poses, half)[number].any())
 
     def _goal(self, track: Track, start: LanePlace) -> tuple[int, int]:
-        """Return the last time at which the logged edge can be reached, and that edge."""
+        """Return the last tried sample whose edge is reachable from the start, and that edge."""
         times = track.times[track.times >= self._first][::-1]
         tried: set[int] = set()
         for time in times[::GOAL_STEPS].tolist():
@@ -260,7 +260,7 @@ def clipped_size(track: Track) -> tuple[float, float, float]:
 
 
 def speeds_of(track: Track, step_s: float) -> NDArray[np.float64]:
-    """Return (T,) speeds along the heading, to each sample (for the first sample, from it)."""
+    """Return (T,) speeds along the heading since the previous sample, else to the next sample."""
     moves = np.diff(track.poses[:, :2], axis=0)
     heading = track.poses[:, 2].tolist()
     speeds = np.zeros(len(track.valid))

@@ -63,7 +63,7 @@ class Streets:
         return int(self.network.lanes[self._sides[0]][lane]) < 0
 
     def inside(self, lane: int, s: float, aside_m: float) -> NDArray[np.float64]:
-        """Return `point`, `aside_m` closer to the middle of the road."""
+        """Return `point`, moved by `aside_m` towards the middle of the road."""
         return self.point(lane, s, self.inwards * aside_m)
 
     def edge(self, lane: int) -> int:

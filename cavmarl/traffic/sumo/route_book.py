@@ -51,7 +51,7 @@ class RouteBook:
         self._of_world = (len(steps) - self._first) // num_worlds
         self._masks, self._class_of_type = np.unique(permissions, return_inverse=True)
         self._worlds = [_Pages(self._first + w * self._of_world) for w in range(num_worlds)]
-        # The room of a single world would begin this many steps earlier.
+        # In an environment with one world, the room would begin this many steps earlier.
         self._later = (num_worlds - 1) * plan_steps
 
     @staticmethod
@@ -66,13 +66,13 @@ class RouteBook:
         return self._worlds[w].arrays(self._nowhere)
 
     def single(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert the ways of a world's rows, VEHICLE or departures, to those in a single world."""
+        """Convert ways of world w's VEHICLE or DEPARTURE rows to an environment with one world."""
         own = rows["way"] >= self._first - len(self._network.lanes)
         of_book = rows["way"] >= self._nowhere
         rows["way"] -= own * (w * self._of_world) + of_book * self._later
 
     def placed(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert the ways of a single world's rows to those in world w."""
+        """Convert the ways of rows back to ways in world w; see `single`."""
         own = rows["way"] >= self._first - self._later - len(self._network.lanes)
         of_book = rows["way"] >= self._nowhere - self._later
         rows["way"] += own * (w * self._of_world) + of_book * self._later
@@ -165,7 +165,7 @@ class _Pages:
 
 
 def _with_room(array: NDArray[Any], used: int, wanted: int) -> NDArray[Any]:
-    """Return the array, or a copy with twice the needed room, because paths come one by one."""
+    """Return the array; if it is too short, return a copy of length 2 * `wanted`."""
     if wanted <= len(array):
         return array
     larger = np.zeros(2 * wanted, dtype=array.dtype)
@@ -177,8 +177,8 @@ MAX_STOPS = 2_000_000  # limit for all worlds; memory is used only when it is wr
 OF_WORLD = 200_000
 
 ReportedStop = tuple[int, float, float, float, float, bool]
-"""A stop as SUMO reports it: LANE row, start and end in m on SUMO's lane, duration and until in s
-or -1, whether the vehicle parks beside the road."""
+"""A stop as SUMO reports it: LANE row; start and end in m on SUMO's lane; duration and until in s,
+or -1; whether the vehicle parks beside the road."""
 
 
 class StopRange(NamedTuple):
@@ -252,7 +252,7 @@ class StopBook:
         return StopRange(first, end)
 
     def shift(self, rows: NDArray[np.void], worlds: int) -> None:
-        """Convert the stops of rows, VEHICLE or departures, to those in world w + `worlds`."""
+        """Convert the stops of world w's VEHICLE or DEPARTURE rows to world w + `worlds`."""
         has_some = rows["stop"] >= 0
         for name in ("stop", "stops_end"):
             rows[name] += has_some * (worlds * self._of_world)

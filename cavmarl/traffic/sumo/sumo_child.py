@@ -264,7 +264,7 @@ class SumoSimulation:
         return seen, letters, line
 
     def _people(self, line: dict[str, Any]) -> NDArray[np.void]:
-        """Return the records of persons on foot; `line` receives the number without a slot.
+        """Return the records of persons on foot; `line` gets the number of persons without a slot.
 
         A slot stays free for one step before another person gets it.
         """
@@ -411,8 +411,8 @@ class SumoSimulation:
 def _bare(sumo: Any, domain: str, getter: str) -> Callable[[str], Any]:
     """Return a getter by name, without the Python wrapper that SWIG generates for libsumo.
 
-    The wrapper only forwards its arguments, but takes a fifth of the time. If the interface has no
-    such inner function, like TraCI, return the usual getter.
+    The wrapper only forwards its arguments, but takes a fifth of a call's time. If the interface
+    has no such inner function, as in TraCI, return the usual getter.
     """
     inner = getattr(getattr(sumo, "libsumo", None), "_libsumo", None)
     usual: Callable[[str], Any] = getattr(getattr(sumo, domain), getter)

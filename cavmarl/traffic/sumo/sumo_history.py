@@ -56,7 +56,7 @@ MOVED = np.dtype(
 LANE_CHANGE = -1
 
 
-_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether it is cut off
+_TICKS, _SIZE, _IS_CUT, _HEAD = 0, 1, 2, 3  # words: ticks, used words, whether the log was cut
 _WORD = 8
 _RECORD = MOVED.itemsize // _WORD  # number of words per record
 

@@ -31,13 +31,13 @@ _PERSONS = ("person", "personFlow")
 _OFF_ROAD = (*_PERSONS, "container", "containerFlow")
 _ONLY = "moves in SUMO only"
 _PERSONS_CURE = "; traffic.source = sumo-traffic mirrors persons, with sumo.max_persons above 0"
-_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attributes of the begin
+_BEGINS = {"vehicle": "depart", "trip": "depart", "flow": "begin"}  # attribute of departure
 # Kinds of options that are passed to SUMO.
 _PASSED = ("read", "traffic", "beyond")
-# A file without these words does not make SUMO write. A character reference may hide the words.
+# SUMO writes no output for a file without these words; a character reference may hide a word.
 _MAY_WRITE = re.compile(rb"\bfile\b|dest|output|&#|include", re.IGNORECASE)
 _COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
-_ELSEWHERE = re.compile(r",|\$\{")  # a list of files; an environment variable
+_ELSEWHERE = re.compile(r",|\$\{")  # a comma separates files; ${ begins an environment variable
 _READ_FILES = {"rerouter", "variableSpeedSign"}  # elements whose `file` SUMO reads
 _NOWHERE = "NUL"  # SUMO's name of the null device
 _ASCII_BELOW = {"utf-8", "utf8", "ascii", "us-ascii", "iso-8859-1", "latin-1", "windows-1252"}
@@ -292,7 +292,7 @@ def free_libsumo() -> object:
     libsumo = require("libsumo", "sumo")
     if libsumo.isLoaded():
         raise SumoError(
-            "libsumo allows one simulation per process, and one runs in this process; close it, or "
-            "start the other one in its own process"
+            "libsumo allows one simulation per process, and another one runs in this process; "
+            "close it, or start the new simulation in its own process"
         )
     return libsumo

@@ -1,4 +1,4 @@
-"""`SumoTraffic`: SUMO's part of a tick of W worlds, in one place for any division.
+"""`SumoTraffic`: SUMO's part of a tick of W worlds, in one place even if worlds are divided.
 
 With `sumo-traffic`, SUMO moves its vehicles, which are rows here, and sees the vehicles of this
 package. Both sides compute the state at tick t + 1 from the state at t. This package moves its
@@ -251,7 +251,7 @@ class SumoTraffic:
         return [self.worlds.at(w).people for w in range(self._zoned.rows.shape[2])]
 
     def forgive(self, departures: DepartureQueue) -> None:
-        """Clear the events of leaving vehicles that SUMO has teleported, which have not arrived."""
+        """Clear the events of vehicles that SUMO has teleported: they leave without arriving."""
         for w, num in enumerate(departures.num_passing.tolist()):
             leaving = departures.passing[w, :num]
             lifted = np.isin(leaving["order"], self.worlds.at(w).teleported)
@@ -260,7 +260,7 @@ class SumoTraffic:
     def let_in(
         self, departures: DepartureQueue, worlds: Worlds, running: NDArray[np.int64]
     ) -> bool:
-        """Fill `departures.passing` with vehicles that SUMO has inserted; return if there are any.
+        """Fill `departures.passing` with vehicles that SUMO has inserted; return whether any have.
 
         `running`: (W,) vehicles in each world.
 
@@ -350,7 +350,7 @@ class SumoTraffic:
             self._shown.show(w, self.worlds.at(w).letters, phase)
 
     def single(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert rows of a world, VEHICLE or departures, to rows of a single world.
+        """Convert rows of world w, VEHICLE or departures, to rows of an environment with one world.
 
         Only `way` and stops change, because each world has its own part of their tables.
         """
@@ -358,7 +358,7 @@ class SumoTraffic:
         self.worlds.stops.shift(rows, -w)
 
     def placed(self, rows: NDArray[np.void], w: int) -> None:
-        """Convert rows of a single world to rows of world w; see `single`."""
+        """Convert rows back to rows of world w; see `single`."""
         self.worlds.book.placed(rows, w)
         self.worlds.stops.shift(rows, w)
 

@@ -230,7 +230,7 @@ def test_elements_other_than_demand_are_counted(demand: Reader) -> None:
         "<e1Detector> is not read": 1,
         "unknown element <foo>": 1,
         "attribute lcStrategic of vType is not modelled": 1,
-        "carFollowModel EIDM is taken for IDM": 1,
+        "carFollowModel EIDM is treated as IDM": 1,
         "vehicle of a class that drives on no road is left out": 1,
         "vehicle that departs 'triggered' is left out": 1,
     }

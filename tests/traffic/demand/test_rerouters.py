@@ -82,7 +82,7 @@ def test_a_closing_applies_to_vehicle_classes(demand: Reader, attrs: str, classe
         (rerouter("", span='begin="-9" end="5"'), ["negative time"]),
         (rerouter('<closingReroute id="DE"/>'), ["DE"]),
         (rerouter("<closingReroute/>"), ["no id"]),
-        (rerouter('<closingReroute id="BC" allow="bus" disallow="bus"/>'), ["leave one"]),
+        (rerouter('<closingReroute id="BC" allow="bus" disallow="bus"/>'), ["keep only one"]),
         (rerouter('<closingReroute id="BC" allow="buss"/>'), ["unknown class", "bus"]),
         (rerouter('<destProbReroute id="DE"/>'), ["DE"]),
         (rerouter('<destProbReroute id="BC" probability="0"/>'), ["nothing to choose from"]),

@@ -180,7 +180,7 @@ def test_a_demand_without_departures_is_reported(read: Read, option: str) -> Non
     file = read(option, LATE).begun(60.0)
     assert file.begin_ms == 0
     (what,) = file.report.tolerated
-    assert what.startswith("no vehicle departs in the 60 s from 0 s, but from 25200 s: change")
+    assert what.startswith("no vehicle departs in the 60 s from 0 s, only from 25200 s: change")
 
 
 def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
@@ -193,7 +193,7 @@ def test_a_begin_of_the_configuration_is_kept(read: Read) -> None:
     ("option", "begin_s", "words"),
     [
         ("", 25_200.0, "the demand begins at 25200 s, as no vehicle"),
-        ('<begin value="0"/>', 0.0, "no vehicle departs in the 60 s from 0 s, but from 25200 s"),
+        ('<begin value="0"/>', 0.0, "no vehicle departs in the 60 s from 0 s, only from 25200 s"),
         ('<begin value="25190"/>', 25_190.0, None),
     ],
 )

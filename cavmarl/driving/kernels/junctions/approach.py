@@ -30,7 +30,7 @@ from cavmarl.driving.kernels.lanes.route_following import (
 
 MAX_LINKS_AHEAD = 2
 STANDS_BEFORE_M = 15.0  # distance from centre to lane end while a vehicle waits to change lanes
-LEAST_M = 1e-9  # a vehicle on the junction is at least this far beyond the line; 0: at the line
+LEAST_M = 1e-9  # least distance beyond the line of a vehicle on the junction; 0: at the line
 BLOCK = 64  # number of rows that stay in the cache between both loops
 
 APPROACH = np.dtype(
@@ -160,7 +160,7 @@ def _register_row(
     pairs: int,
     scratch: Scratch,
 ) -> int:
-    """Append the entries of row i, whose PLAN is `step`, and return the new number of pairs."""
+    """Append the entries of row i, whose PLAN is `step`, and return the new number of entries."""
     lane = row["lane"]
     here = roads.lanes[lane]
     s = row["s"]

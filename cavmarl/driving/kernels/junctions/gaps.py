@@ -39,12 +39,12 @@ from cavmarl.roads.kernels.signal_overrides import NOT_OVERRIDDEN, overridden_st
 
 BRISK_ACCEL = 2.5  # m/s²: assumed acceleration towards a shared area
 GENTLE_ACCEL = 1.8  # m/s²: assumed acceleration out of a shared area, lower to be safe
-GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # the same as a share of a vehicle's acceleration
+GENTLE_SHARE = GENTLE_ACCEL / BRISK_ACCEL  # `GENTLE_ACCEL` as a share of acceleration
 HARD_STOP = 5.0  # m/s²: a vehicle that would have to brake harder for the line will not stop
 AHEAD_S = 1.0  # time gap to a foe at its line (SUMO's gap of 1.0 s starts closer to the ego line)
 STOPPED_FOE_S = 30.0  # assumed delay of a foe that can stop, after the ego driver has waited long
 STEERED_AHEAD_S = 3.0  # time gap if one vehicle is steered, because it may be slower
-STEERED_MERGE_AHEAD_S = 1.5  # the same if both enter one lane, where the later can follow
+STEERED_MERGE_AHEAD_S = 1.5  # the same if both enter one lane, where one can follow
 SPEEDING_UP_MPS2 = 0.1  # a foe with at least this acceleration is assumed to keep accelerating
 GAP_S = 1.0  # time between the exit of one vehicle from a shared area and the entry of another
 SET_OFF_S = 0.5  # a stopped vehicle starts this long before another vehicle leaves the area
@@ -55,7 +55,7 @@ FORCED_STOP = 4.5  # m/s²: the deceleration that such a driver expects
 UNBRAKED_SHARE = FORCED_STOP / (FORCED_STOP + BRISK_ACCEL)
 CRAWL_MPS = 5.0  # a slower stream lets others merge
 STUCK_S = 90.0  # after this wait, a driver may also pass stopped vehicles that must yield to it
-RESCUED_S = 300.0  # `STUCK_S` if both have models of SUMO, which teleports vehicles after it
+RESCUED_S = 300.0  # replaces `STUCK_S` if both have models of SUMO; SUMO then teleports vehicles
 STOP_SIGN_S = 0.5  # time to wait at a stop sign, and before a tie is broken
 STOOD_S = 0.1  # `STOP_SIGN_S` of background vehicles, as in SUMO
 ARRIVES_M = 1.0  # a trip that ends at most this far behind a line does not cross the junction
@@ -130,14 +130,14 @@ def _has_turn(row: np.void, link: int) -> bool:
 
 @inlined_kernel
 def _is_yielding(row: np.void, link: int) -> bool:
-    """Return whether a stopped vehicle yields at `link`; an agent stopped at the line does."""
+    """Return whether a vehicle yields at `link`; an agent that has stopped there counts, too."""
     stands: bool = is_steered(row) and row["wait_s"] > 0.0
     return row["hold"] == HOLD_YIELD or (stands and row["stopped_at"] == link)
 
 
 @inlined_kernel
 def _in_turn(state: int) -> bool:
-    """Return whether vehicles take turns at links of this state: the longest wait goes first."""
+    """Return whether vehicles at links of this state go in the order in which they stopped."""
     return state == STATE_EQUAL or state == STATE_ALLWAY_STOP
 
 
@@ -154,7 +154,7 @@ def may_ignore(
 ) -> bool:
     """Return whether a driver at `link` may ignore a foe at `foe_link` with the right of way.
 
-    `signal` is the state of the foe's signal; `state` and `foe_state` are those of the links. After
+    `signal` is the state of the foe's signal; `state` and `foe_state` are the links' states. After
     a wait of `stuck_s` s, the driver may also ignore a stopped foe that yields.
     """
     if signal == SIGNAL_RED or signal == SIGNAL_RED_YELLOW:
@@ -258,7 +258,7 @@ def stays_inside(foe: np.void) -> bool:
 def _comes_to_steered(
     row: np.void, conflict: np.void, foe: np.void, front: float, leaves_mps: float, time_out: float
 ) -> bool:
-    """Return `_comes` for two vehicles of which one is steered.
+    """Return the result of `_comes` if at least one of the two vehicles is steered.
 
     `front` is the distance in m from the front of the foe to the place where it can still stop.
     """
@@ -344,9 +344,9 @@ def _blocks_inside(
         return HOLD_EXIT_BLOCKED
     if equal and conflict["merging"]:
         apart = distance + conflict["leave_m"] - half - to_clear
-        return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait until there is room behind it
+        return HOLD_YIELD if apart < ROOM_M else HOLD_NONE  # wait for room behind the foe
     if _in_turn(target["state"]) and _has_turn(row, link) and to_area > ROOM_M:
-        return HOLD_NONE  # a stop would give up the turn; the row can wait before the area
+        return HOLD_NONE  # go on, so as to keep the turn; the row can still wait before the area
     top = roads.lanes[roads.links[conflict["foe"]]["next_lane"]]["speed_mps"]
     if foe["speed"] > STANDING_MPS and other["accel"] > -GENTLE_ACCEL:
         # A foe that has just started will accelerate; a foe that brakes may have to stop.
@@ -360,7 +360,7 @@ def _blocks_inside(
     elif row["speed"] <= STANDING_MPS and not equal and not _has_turn(row, link):
         if target["state"] != STATE_ALLWAY_STOP:
             time_in = min(SET_OFF_S, time_in)
-        else:  # the row's turn: it starts late enough not to brake before the area
+        else:  # at an all-way stop, the row starts late enough not to brake before the area
             free = (to_area - LINE_MARGIN_M) * UNBRAKED_SHARE
             time_in = earliest(free, row["speed"], limit, assumed_accel)
             if other["accel"] > SPEEDING_UP_MPS2:
@@ -385,7 +385,7 @@ def hold_for_foe(
 ) -> int:
     """Return the HOLD_* code of a foe: whether it would be in the shared area, or goes first.
 
-    HOLD_EXIT_BLOCKED means that the foe stays in the area, HOLD_YIELD that it will come or leave.
+    HOLD_EXIT_BLOCKED: the foe stays in the area. HOLD_YIELD: the foe will enter or leave the area.
     """
     to_clear = foe["dist"] + conflict["foe_leave_m"] + foe["half"]
     if to_clear <= 0.0 or (foe["dist"] < foe["half"] and not conflict["near"]):

@@ -59,13 +59,13 @@ LAST_CHANCE_M = 3.0  # a driver whose front is this close to the line still goes
 STUB_LANES = 4  # number of lanes ahead that are searched for a stop sign
 EXIT_LANES = 4  # number of lanes behind a junction that are searched for room
 EXIT_LOOK_M = 75.0  # largest distance of that search: room for ten cars
-SWAP_TICKS = 64  # length of a turn for two vehicles that wait for room on each other's lane
+SWAP_TICKS = 64  # two vehicles that wait for room on each other's lane take turns of this length
 # A steered car that is slower than `CREPT_MPS` and at most `CREPT_M` beyond a red line stays there.
 CREPT_M = 2.4
 CREPT_MPS = 2.0
 INSIDE_M = 1.0  # closer than this to a waiting position, a vehicle may be waiting there
 STOP_LINE_M = 5.0  # a stopped vehicle whose front is closer than this is at the line
-# The same for agents' vehicles, which may have to wait further back, with some slack.
+# The same with some slack for agents' vehicles, which may have to wait further back.
 STOP_SIGN_M = MOST_BACK_M + 2.0 * LINE_MARGIN_M
 
 
@@ -83,11 +83,11 @@ def _hold_for_foes(
     phase: NDArray[np.int32],
     scratch: Scratch,
 ) -> int:
-    """Return whether a foe keeps row i, `distance` m before its line, from driving on `link`.
+    """Return the reason (HOLD_*) why foes keep row i, `distance` m before its line, from `link`.
 
-    If `inside`, the shared areas beyond the waiting position at `wait_m` are checked, else those
-    before it. For a stopped vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority over
-    HOLD_YIELD: other drivers need not wait for a vehicle that cannot go.
+    If `inside`, the shared areas beyond the waiting position at `wait_m` are checked, else the
+    areas before it. For a stopped vehicle, HOLD_EXIT_BLOCKED (a foe stays in the way) has priority
+    over HOLD_YIELD: other drivers need not wait for a vehicle that cannot go.
     """
     row = rows[i]
     hold = HOLD_NONE
@@ -188,7 +188,7 @@ def _goes_first_in_swap(
     row: np.void,  # VEHICLE
     link: int,  # next LINK of the row
     other: np.void,  # VEHICLE stopped on the road beyond, without room for the row behind it
-    room: float,  # behind that vehicle, m
+    room: float,  # free distance behind that vehicle, m
 ) -> bool:
     """Return whether a row enters a junction without room beyond, to swap places with `other`.
 
@@ -214,8 +214,8 @@ def exit_blocked(
     travel: TripTables,
     rows: NDArray[np.void],  # VEHICLE (C,)
     row: np.void,  # VEHICLE
-    link: int,  # that it takes next
-    way: int,  # its `way` beyond the junction
+    link: int,  # next LINK of the row
+    way: int,  # the row's `way` beyond the junction
     phase: NDArray[np.int32],  # (num_signals,) active PHASE rows
     scratch: Scratch,
 ) -> bool:
@@ -418,7 +418,7 @@ def hold_inside(
 ) -> int:
     """Return the reason (HOLD_*) for row i to stop at the waiting position of `link`, if any.
 
-    The arguments are those of `hold_at_line`. The distance is negative inside the junction.
+    The arguments are the same as for `hold_at_line`. The distance is negative inside the junction.
     """
     wait_m = roads.links[link]["wait_m"]
     if wait_m == math.inf:
@@ -476,7 +476,7 @@ def constraint_inside(
 
     Returns:
         The constraint; the reason why the vehicle cannot go on (HOLD_*), including a foe that stays
-        in its way; the reason to stop that comes from the waiting position.
+        in its way; the reason to stop at the waiting position (HOLD_*).
     """
     row = rows[i]
     kind = travel.types[row["vtype"]]

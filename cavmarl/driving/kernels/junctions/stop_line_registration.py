@@ -26,5 +26,5 @@ def can_be_ignored(row: np.void) -> bool:
     hold = row["hold"]
     kept = (hold == HOLD_SIGNAL) | (hold == HOLD_EXIT_BLOCKED)
     idle = (hold == HOLD_NONE) & (row["wait_s"] > IMPATIENT_S)
-    stands: bool = (row["speed"] <= STANDING_MPS) & (kept | idle)  # `&`: no branch to predict
+    stands: bool = (row["speed"] <= STANDING_MPS) & (kept | idle)  # `&` avoids a branch
     return stands

@@ -1,9 +1,9 @@
 """Swept areas: where a vehicle waits because a long or steered vehicle sweeps over its path.
 
 The right of way does not apply there. A vehicle inside the area goes first. Of two vehicles before
-the area, the vehicle that is further along goes first, unless another reason holds it. Waiting
-before a swept area does not change the right of way elsewhere: a driver that yields to the waiting
-vehicle may go.
+the area, the vehicle that is further along goes first, unless it has another reason to wait.
+Waiting before a swept area does not change the right of way elsewhere: a driver that yields to the
+waiting vehicle may go.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ def stop_before_foe_sweep(
     i: int,  # row of the vehicle
     link: int,  # LINK that the vehicle is on, or takes next
     place: float,  # distance of its front beyond the stop line, m
-    # m; if the vehicle has to stop anyway, it leaves room for foes this close to their lines; else
-    # -inf
+    # if the vehicle has to stop in any case, it leaves room for foes whose fronts are at most this
+    # far (m) before their lines; -inf: it does not have to stop
     room_m: float,
     scratch: Scratch,
 ) -> float:

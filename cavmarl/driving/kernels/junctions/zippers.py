@@ -37,8 +37,8 @@ def is_zipper(roads: RoadArrays, link: int) -> bool:
 def _can_brake_for(to_line: float, row: np.void, decel: float, ahead_m: float, mps: float) -> bool:
     """Return whether a row can fall behind another vehicle by braking briefly.
 
-    That vehicle is `ahead_m` m before its line and drives `mps` m/s; it must be nearer to its line
-    than the row to its own.
+    The other vehicle is `ahead_m` m before its line and drives `mps` m/s. The result is False if
+    the row is nearer to its own line.
     """
     apart = to_line - ahead_m
     brakes: bool = apart > 0.0 and apart > BRAKES_S * (row["speed"] - decel * BRAKES_S - mps)

@@ -17,12 +17,12 @@ MIN_SPEED_MPS = 1.0  # slower cars do not change lanes
 
 @kernel
 def mobil_accepts(
-    own_accel: float,  # acceleration of the car that considers the change, now
-    own_accel_after: float,  # the same after the change
-    new_follower_accel: float,  # acceleration of the car that would be behind, now; 0: no such car
-    new_follower_accel_after: float,  # the same after the change; 0: no such car
-    old_follower_accel: float,  # acceleration of the car that is behind, now; 0: no such car
-    old_follower_accel_after: float,  # the same after the change; 0: no such car
+    own_accel: float,  # present acceleration of the car that considers the change
+    own_accel_after: float,  # its acceleration after the change
+    new_follower_accel: float,  # present acceleration of the follower on the new lane; 0: none
+    new_follower_accel_after: float,  # its acceleration after the change; 0: no such car
+    old_follower_accel: float,  # present acceleration of the follower on the old lane; 0: none
+    old_follower_accel_after: float,  # its acceleration after the change; 0: no such car
     # the route needs a change to this side, so safety alone decides; the caller checks the side
     mandatory: bool,
     max_braking: float = MAX_BRAKING_IMPOSED,  # m/s², harder braking makes the change unsafe

@@ -298,7 +298,7 @@ def _may_change(
             return False
         early = (CHANGE_EARLY_M + CHANGE_EARLY_S * row["speed"]) * beyond["changes"]
         if beyond["change"] != 0:
-            # The vehicle has to return, and would then be behind the vehicles on its present lane.
+            # The vehicle would have to return, behind the vehicles that are ahead of it now.
             queue_m = QUEUED_M * num_ahead(scratch, row["lane"], row["s"], row["id"], travel.view_m)
             if beyond["room"] - row["s"] - queue_m < 2.0 * early:
                 return False

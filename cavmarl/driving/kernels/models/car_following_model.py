@@ -30,8 +30,8 @@ class FollowingFunctions(NamedTuple):
 class CarFollowingModel(NamedTuple):
     """A car-following model of the package."""
 
-    name: str  # in `traffic.model` and `carFollowModel`: SUMO's name of the model
+    name: str  # SUMO's name of the model, used in `traffic.model` and `carFollowModel`
     code: int  # MODEL_*
     functions: FollowingFunctions
     as_sumo: bool = False  # VTYPE["as_sumo"] of the types with this model
-    uses_sigma: bool = False  # otherwise the imperfection in demand files is ignored
+    uses_sigma: bool = False  # whether the model uses the imperfection that demand files set

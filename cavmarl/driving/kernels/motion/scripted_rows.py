@@ -19,7 +19,7 @@ from cavmarl.driving.kernels.motion.motion import account, before_tick
 
 @inlined_kernel
 def stand_at(frame: np.void, row: np.void) -> None:
-    """Set the position and the speed of a row to those of a FRAME."""
+    """Copy the position and the speed of a FRAME to a row."""
     row["x"] = frame["x"]
     row["y"] = frame["y"]
     row["z"] = frame["z"]

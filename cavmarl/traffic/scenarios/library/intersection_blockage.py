@@ -22,7 +22,7 @@ class Parameters:
 
     speed_mps: float = setting(8.0, 3.0, 10.0, "m/s", "speed of the agent when it starts")
     blocked_s: float = setting(
-        8.0, 6.0, 60.0, "s", "time for which the car stands once the agent is near"
+        8.0, 6.0, 60.0, "s", "time for which the car blocks the junction once the agent is near"
     )
 
 
