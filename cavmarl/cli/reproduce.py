@@ -37,8 +37,8 @@ def reproduce(
     files: Annotated[
         list[str] | None,
         about(
-            "File or folder in place of a word in commands, for example MAPS=maps. Repeat it for "
-            "more.",
+            "Replace a word in the commands by a file or folder, for example MAPS=maps. Repeat it "
+            "for more.",
             "--file",
             metavar="WORD=PATH",
         ),

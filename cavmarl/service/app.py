@@ -98,7 +98,7 @@ async def _sweep(service: Service, every_s: float) -> None:
 
 
 async def _check_older(service: Service, is_over: asyncio.Event) -> None:
-    """Check the events before the snapshot, in at most half of the time; end the service if bad."""
+    """Check events before the snapshot, at most half of the time; end the service on an error."""
     log = service.broker.log
     try:
         while not is_over.is_set() and not await asyncio.to_thread(log.check_older, CHECK_S):
@@ -165,5 +165,5 @@ class GuardedRequests:
         try:
             await self._app(scope, receive_in_time, send_with_headers)
         except Exception as error:
-            if scope.get(FAULT) is not error:  # otherwise it was logged and answered
+            if scope.get(FAULT) is not error:  # a fault was logged and answered already
                 raise

@@ -283,7 +283,7 @@ class Broker:
     def resolve(
         self, identity: IdentityRecord, number: str, unreachable: Sequence[str] = ()
     ) -> SessionRecord:
-        """Return a session on its node, or on another node if that one cannot serve it.
+        """Return a session on its node, or on another node if its own node cannot serve it.
 
         Another node is chosen if the session's node is lost, drained or unreachable for the client.
 
@@ -388,7 +388,7 @@ class Broker:
         return self.rules.beat_s * self.rules.missed_beats
 
     def limits_of(self, name: str) -> list[str]:
-        """Return why a node accepts no session now, and what to do; empty: it does."""
+        """Return why a node accepts no session now, and what to do; [] if it accepts some."""
         is_old = self.age_s(name) > self._max_age_s
         return limits_of(self.log.state.nodes[name], self.live[name], is_old, self.rules.load)
 

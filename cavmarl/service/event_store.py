@@ -189,7 +189,7 @@ class EventStore:
             raise self._lost(error) from error
 
     def check_lock(self) -> None:
-        """Check that the store is still that of this process.
+        """Check that this process still owns the store.
 
         Raises:
             ServiceError: the connection, and with it the lock, is lost; the service must end.
@@ -223,7 +223,7 @@ class EventStore:
         head: SignedHead | None = None,
         snapshot: SealedSnapshot | None = None,
     ) -> None:
-        """Write all of these, and delete the content `gone`, in one transaction.
+        """Write the given data, and delete the content `gone`, in one transaction.
 
         A head or a snapshot replaces the earlier one.
 
@@ -424,7 +424,7 @@ def _lock_file(path: Path) -> IO[bytes]:
     lock = os.fdopen(handle, "r+b")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite's own log has only one of the names
+        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite names its log after one of them
             raise ServiceError(f"store {path}: has {names} names; remove its other hard links")
         check_private("store", path)
     except BlockingIOError:

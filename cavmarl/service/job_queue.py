@@ -99,5 +99,5 @@ class JobQueue:
 
 
 def _kind_of(session: SessionRecord) -> tuple[str, ...]:
-    """Return what the choice of a node depends on; all other properties are alike for jobs."""
+    """Return the properties of a job that determine which nodes can run it."""
     return session.owner_name, *session.needs

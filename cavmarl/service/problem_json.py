@@ -20,7 +20,7 @@ from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS, without_folders
 from cavmarl.service.node_selection import NoNodeError
 
 MOST_EXCLUSIONS = 100  # maximum number of errors in an answer
-FAULT = "cavmarl.fault"  # key of the scope of a request that failed: the exception
+FAULT = "cavmarl.fault"  # key of an ASGI scope: the exception of a failed request
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
 _BEAT = re.compile(r"/v1/nodes/([^/]+)/beat")

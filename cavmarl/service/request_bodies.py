@@ -73,9 +73,9 @@ class BeatBody(_Body):
 class ConfigurationBody(_Body):
     """A world, with the keywords of `cavmarl.make_vec`.
 
-    `files` are artefacts of the caller, by their places in a folder. If `env.yaml` is one of them,
-    or the map that `environment` names, they are the environment. `drivers/NAME/` has the two files
-    of the driver NAME.
+    `files` are artefacts of the caller, by relative path. If they include `env.yaml`, or the map
+    that `environment` names, they are the environment. `drivers/NAME/` has the two files of the
+    driver NAME.
     """
 
     name: Name | None = None

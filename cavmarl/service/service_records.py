@@ -208,10 +208,10 @@ class Infrastructure:
                 self._replace_user(None, event.subject)
 
     def _apply_service(self, word: str, event: LogEvent) -> None:
-        """Change nothing for a start of the service, whose rules the event has."""
+        """Change nothing: the start of a service and its rules are only logged."""
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
-        """Change nothing for an anomaly of a clock."""
+        """Change nothing: an anomaly of a clock is only logged."""
 
     def _apply_node(self, word: str, event: LogEvent) -> None:
         if word == "registered":

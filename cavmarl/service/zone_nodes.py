@@ -91,7 +91,7 @@ class ZoneNodes:
 
     def _another(self, session: SessionRecord, members: Sequence[str]) -> str | None:
         anywhere = replace(session, preferred=None)
-        for avoided in (members, ()):  # a node without a part, else one that has a part
+        for avoided in (members, ()):  # prefer a node without a part of this session
             try:
                 return self._choose(anywhere, avoided).node
             except NoNodeError:

@@ -35,7 +35,7 @@ def step(
 ) -> BenchmarkReport:
     """Compare agent-steps per second on one core with highway-env.
 
-    Both have the same road, vehicles and rates.
+    Both simulators have the same road, vehicles and rates.
     """
     from cavmarl.bench.step_speed import measure_step_speed
 
