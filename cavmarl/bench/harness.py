@@ -154,7 +154,7 @@ def one_core() -> Iterator[None]:
 
 
 def check_range(**limits: tuple[float, float, float]) -> None:
-    """Refuse numbers below the second or above the third value of their limits."""
+    """Raise ConfigError for values out of range; `limits`: name=(value, least, most)."""
     for name, (value, least, most) in limits.items():
         if not least <= value <= most:
             bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:.15g}"

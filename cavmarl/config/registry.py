@@ -258,7 +258,7 @@ def find_settings(what: str, name: str) -> Path:
 
 
 def _refuse_code(keys: object, where: str) -> None:
-    """Raise an error if an env.yaml names code or programs, which only the caller may do."""
+    """Raise an error if an env.yaml names code or programs, which only the caller may name."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
     if isinstance(name, str) and path_of_code(name):

@@ -19,7 +19,7 @@ class ZonesConfig(Section, key="zones"):
     Attributes:
         layout: division method `grid`, `strips` or `bisection`; or a zone file, named like
             `map.source`.
-        count: number of zones; a zone file sets it itself.
+        count: number of zones; with a zone file, the number in the file.
         avoid_junctions: move borders if that keeps junctions in one zone.
         weight: quantity that `bisection` distributes evenly: length of lanes, or area.
         hysteresis_m: distance past a border at which a vehicle changes its zone.
@@ -33,8 +33,9 @@ class ZonesConfig(Section, key="zones"):
         journal: file for the coordinator's log; empty: none. It must not exist.
         check_invariants: check the invariants of ownership at run time.
         repartition_steps: steps between two checks whether bisection by vehicle positions would
-            balance the zones better. Results do not depend on it. 0: zones stay.
-        repartition_tolerance: by what share of the mean the fullest zone must shrink.
+            balance the zones better. Results do not depend on it. 0: never.
+        repartition_tolerance: smallest reduction of the fullest zone for which zones change, as a
+            share of the mean.
         simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
             a registered simulator (docs/guides/zone_simulators.md).
         simulator_failure: if a simulator fails or refuses a vehicle for too long: `error`, or

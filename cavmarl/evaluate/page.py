@@ -146,7 +146,7 @@ def _change(metric: Metric, found: PairedDifference) -> dict[str, str]:
 
 
 def _verdict(metric: Metric, found: PairedDifference) -> str:
-    """Return better or worse, or an empty text if the metric or the interval allows neither."""
+    """Return `better` or `worse`, or an empty text if the difference cannot be judged."""
     if not found.distinct or metric.better is None or found.mean is None:
         return ""
     return "better" if (found.mean > 0.0) == (metric.better == "more") else "worse"

@@ -63,7 +63,7 @@ class Found:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """A policy minus the first one, paired by run on the same seeds."""
+    """The difference of a policy from the first policy, paired by runs with equal seeds."""
 
     mean: float | None  # mean difference of run means; None without data
     # interval of that mean by Student's t for paired samples; None with fewer than two runs
@@ -93,7 +93,7 @@ class PolicyReport:
         return self.metrics[metric]
 
     def is_above(self, metric: Metric) -> bool:
-        """Return whether the true value is above the mean: no infraction in all kilometres."""
+        """Return whether the mean is only a lower bound, because there was no infraction."""
         if metric.name != KM_PER_INFRACTION or self[metric.name].mean is None:
             return False
         return not any(self[name].mean for name in INFRACTIONS)

@@ -66,8 +66,8 @@ def mean_interval(means: Values) -> Interval | None:
 def bounded_interval(means: Values, least: float) -> Interval | None:
     """Return `mean_interval` for values from `least` to 1, limited to this range.
 
-    It is Wilson's interval with Student's t, for the number of trips that gives the error of the
-    run means.
+    It is Wilson's interval with Student's t, for the number of trips that would have the same
+    standard error as the run means.
     """
     error = _error_of(means) / (1.0 - least) if least < 1.0 else 0.0
     if error == 0.0:

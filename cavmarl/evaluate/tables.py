@@ -98,7 +98,7 @@ TRANSFER = np.dtype(
         ("source", np.int64),
         ("target", np.int64),
         ("epoch", np.int64),
-        ("forced", np.bool_),  # state attached: the target was not ready in time
+        ("forced", np.bool_),  # the state was sent with the change, as the target was not ready
         ("removed", np.bool_),  # the vehicle left the world in that tick
         ("approached", np.int64),  # tick of the first state at the target; -1: none
         ("waited", np.int64),  # ticks with the old owner after the crossing
@@ -117,10 +117,10 @@ RESOURCE = np.dtype(
         ("process", np.int64),  # number of the worker or node; -1: the caller
         ("begin_s", np.float64),  # simulated time of the run at the begin of the window
         ("ticks", np.int64),  # length of the window
-        ("wall_s", np.float64),  # the same as wall time
+        ("wall_s", np.float64),  # wall time of the window
         ("cpu_s", np.float64),  # processor time in the window
         ("memory_bytes", np.float64),  # resident at the end of the window
-        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown, like the others
+        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown (also below)
         ("sent_bytes", np.float64),  # to other nodes and to the caller
         ("sent_frames", np.float64),
         ("vehicles", np.float64),  # owned at the end of the window, in all worlds

@@ -104,7 +104,7 @@ class RecordingHead:
         return ZonePartition((low_x, low_y, high_x, high_y), np.array(self.rects))
 
     def wrong(self) -> str:
-        """Return what is wrong with a head from a file; empty if nothing. Bad types may raise."""
+        """Return what is wrong with a head from a file; empty if nothing. Wrong types may raise."""
         self.partition  # noqa: B018 - raises for invalid zones
         texts = [self.network[key] for key in ("name", "source_sha256", "layout", "sha256")]
         texts += [self.environment, self.status, *self.terms, *chain(*self.features)]

@@ -19,7 +19,7 @@ from cavmarl.roads.network import CARS, RoadNetwork
 
 SHORTEST_M = 15.0  # on a shorter lane, no vehicle begins its trip
 MOST_EXITS = 8  # number of exits that are chosen if the plan names none
-FAR_SHARE = 0.6  # chosen exits are at least this share of the largest distance away
+FAR_SHARE = 0.6  # least distance of chosen exits, as a share of the largest distance
 RADIUS_SHARE = 0.4  # default area: share of the radius that contains 90 % of the roads
 AREA = "area"  # name of the default area
 
@@ -54,7 +54,7 @@ class EvacuationPlan(Section, key=""):
         start_s: time of the order to leave.
         within_s: vehicles depart evenly within this time after the order.
         horizon_s: simulated time.
-        background: vehicles of the generator, which drive to goals of their own.
+        background: vehicles of the generator, which drive to their own goals.
         reroute_s: time between two searches of a vehicle for a faster route, which considers the
             speeds of the last minutes; 0: one search, after its departure.
         events: roads that close, open, or slow down; see `map.events`.

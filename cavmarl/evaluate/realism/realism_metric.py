@@ -26,7 +26,7 @@ _EVENT_SMOOTHING = 0.001
 
 
 class MetricComponent(NamedTuple):
-    """A component of the meta-metric. `low`, `high`, `bins`: of its histogram; 0 bins: an event."""
+    """A component of the meta-metric, with range and bins of its histogram; 0 bins: an event."""
 
     weight: float
     bucket: str

@@ -14,7 +14,7 @@ from cavmarl.roads.network import RoadNetwork
 STANDING_MPS = 0.1
 LATE_S = 600  # length of the final period whose arrivals show whether a run jams
 
-# By vehicle id, of all vehicles that have departed.
+# Trips of all departed vehicles; the index is the vehicle's id.
 _TRIP = np.dtype(
     [
         ("departed_s", np.float64),  # NaN: not seen
@@ -36,8 +36,8 @@ class SignalFigures:
     never_departed: int  # vehicles whose departure was due, but that have not entered
     arrived: int  # vehicles that have reached the end of their trip
     delay_s: float | None  # mean over arrived vehicles: time lost against the desired speed
-    # RESCO's delay: mean over all trips, also unfinished ones and vehicles never let in, of the
-    # time lost and the delay of the departure
+    # RESCO's delay: time lost plus delay of the departure, mean over all trips, including
+    # unfinished trips and vehicles that never entered
     delay_of_all_s: float
     trip_s: float | None  # mean over arrived vehicles
     waiting_s: float  # mean over departed vehicles: time below 0.1 m/s
@@ -53,8 +53,8 @@ class SignalFigures:
 def is_jammed(arrived: int, arrived_late: int, seconds: float) -> bool | None:
     """Return whether traffic had broken down at the end of a run.
 
-    This is so if fewer than half as many vehicles per second arrived in the last `LATE_S` as
-    before. None: the run is shorter than twice that time.
+    Traffic has broken down if fewer than half as many vehicles per second arrived in the last
+    `LATE_S` as before. None: the run is shorter than twice `LATE_S`.
 
     Args:
         arrived: vehicles that arrived in the run.

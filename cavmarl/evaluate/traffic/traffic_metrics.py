@@ -38,7 +38,7 @@ EDGE_MINUTE = np.dtype(
 
 @dataclass(frozen=True)
 class TrafficCounts:
-    """Counts that only the simulator itself has, from beginning to end."""
+    """Counts of a whole run that only the simulator itself has."""
 
     departed: int  # vehicles that have entered
     waiting: int  # vehicles whose departure time has passed but that have not entered
