@@ -197,7 +197,7 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """Build a table with text in the first column and numbers in the others; a row None is a line.
+    """Build a table with text in the first column and numbers in the others; None draws a line.
 
     On a narrow terminal, text is wrapped but numbers are not.
     """

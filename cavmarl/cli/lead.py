@@ -274,7 +274,7 @@ def _actor_table(actors: Sequence[dict[str, Any]]) -> Table:
         for row in actors
     )
     heads = ("actor", "type", "poses", "late", "lost", "extrapolated", "stopped", "oldest, ms")
-    return grid(heads, rows, "poses of actors; extrapolated and stopped: in steps", lefts=2)
+    return grid(heads, rows, "poses of actors; extrapolated, stopped: number of steps", lefts=2)
 
 
 def _deadline_text(found: dict[str, Any]) -> str:

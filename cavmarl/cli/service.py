@@ -293,7 +293,7 @@ def submit(
 
 
 def _uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict[str, Path]]:
-    """Return the environment, the names of the drivers, and the folders of those to upload."""
+    """Return the environment, the names of the drivers, and the folders of drivers to upload."""
     environment: str | Path = env
     if env not in entries() and Path(env).exists():
         environment = Path(env)

@@ -212,7 +212,7 @@ class Client:
 
 
 class RemoteWorld:
-    """Worlds on a node, with arrays like those of `make_vec`."""
+    """Worlds on a node, with arrays in the same form as from `make_vec`."""
 
     def __init__(self, client: Client, flows: WorldFlows) -> None:
         self._client = client

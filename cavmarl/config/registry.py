@@ -141,7 +141,7 @@ def load_config(
         max_cycles: sets `horizon_s` to this number of steps.
         overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
             env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file. `plugins` are
-            added to those of the environment.
+            added to the plugins of the environment.
 
     Raises:
         UnknownEnvironmentError: nothing has that name.

@@ -135,7 +135,7 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
-    folder = folder.resolve()  # the name of `.` is that of the folder
+    folder = folder.resolve()  # replaces `.` by the folder's real name
     if not (folder / CARD_FILE).is_file():
         raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that says what it is")
     driver = entry_driver(folder)
@@ -257,7 +257,7 @@ def _entry(folder: Path, progress: Progress | None) -> BoardEntry:
         failure = f"{fault_in(folder, error)}; correct the script"
     try:
         return _described(folder, failure)
-    except Exception as error:  # a damaged result must not prevent the page of the others
+    except Exception as error:  # a damaged result must not prevent the page of other entries
         failure = failure or f"its result cannot be shown ({error}); evaluate the driver again"
         return BoardEntry(folder.name, sentence_about(folder), failure=failure)
 

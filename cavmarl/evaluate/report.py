@@ -82,7 +82,7 @@ class PolicyReport:
     """All results of one policy."""
 
     trips: int  # number of counted trips in all runs
-    metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
+    metrics: Mapping[str, Found]  # name in `metrics.METRICS` → results
     # metric → paired difference from the first policy; empty for the first policy
     minus_first: Mapping[str, PairedDifference]
     speed: tuple[Speed, ...]  # speed of each run; not reproducible
@@ -103,10 +103,10 @@ class PolicyReport:
 class EvaluationReport:
     """The results of policies over the same episodes."""
 
-    policies: Mapping[str, PolicyReport]  # by name, in the given order
-    repeats: int  # independent runs
-    episodes: int  # of each run
-    seeds: tuple[int, ...]  # of the runs
+    policies: Mapping[str, PolicyReport]  # name → results, in the given order
+    repeats: int  # number of independent runs
+    episodes: int  # number of episodes of each run
+    seeds: tuple[int, ...]  # seed of each run
     manifest: Mapping[str, Any]  # closed manifest of the results
     # rows of `rows_by_map` by policy; empty for one map
     by_map: Mapping[str, Sequence[Mapping[str, Any]]]

@@ -52,8 +52,8 @@ def within_run(values: Values, *, share: bool) -> Within:
 def mean_interval(means: Values) -> Interval | None:
     """Return the interval of the mean of independent runs (R,) by Student's t.
 
-    mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means. None for fewer than two
-    runs, or if all runs have the same value, which says nothing about the spread of other runs.
+    mean ± t(0.975, R - 1) · sd / √R, with the standard deviation sd of the run means. None for
+    fewer than two runs, or if all runs have the same value, which does not show the spread.
     """
     error = _error_of(means)
     if error == 0.0:

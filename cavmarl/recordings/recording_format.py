@@ -139,7 +139,7 @@ class RecordingHead:
         if name == "observations":
             terms, values = dtype["terms"].shape, dtype["values"].shape
             if terms != (len(self.terms),) or len(values) != 1 or values[0] < len(self.features):
-                return "the terms or features are not those of the observations"
+                return "the terms or features do not match the observations"
             if any(len(pair) != 2 for pair in self.features):
                 return "a feature has no sensor or no name"
         return ""

@@ -26,7 +26,7 @@ MAX_BODY_BYTES = 256 * 1024
 MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state, a result or an artefact
 _CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+|artefacts/[^/]+)")
 MAX_PATH_BYTES = 1024
-MAX_SECRET_BYTES = 64 * 1024  # of the body of POST /v1/token, which needs no token
+MAX_SECRET_BYTES = 64 * 1024  # maximum body of POST /v1/token, which needs no token
 NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the environment configures
     "tracing": False,
     "metrics": False,

@@ -27,8 +27,8 @@ from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
 T = TypeVar("T")
-MOST_UNPACKED_BYTES = 1 << 29  # of a compressed file
-MOST_ELEMENTS = 10_000_000  # of an XML file
+MOST_UNPACKED_BYTES = 1 << 29  # maximum content of a compressed file
+MOST_ELEMENTS = 10_000_000  # maximum number in an XML file
 MOST_YAML_BYTES = 1 << 20
 MOST_JSON_BYTES = 1 << 24
 _HEAD_BYTES = 1 << 17
@@ -49,7 +49,7 @@ class Artefacts:
 
     Args:
         log: the log of the service.
-        quota: of each identity.
+        quota: quota of each identity.
     """
 
     def __init__(self, log: EventLog, quota: Quota) -> None:

@@ -56,7 +56,7 @@ class BrokerRules:
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
-    artefacts: Quota = field(default_factory=Quota)  # of one identity
+    artefacts: Quota = field(default_factory=Quota)  # quota of one identity
     load: LoadRule = DEFAULT_RULE  # thresholds and weights for the load of a node
 
 

@@ -6,10 +6,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-MOST_LANES = 64  # of one road
+MOST_LANES = 64  # lanes of one road
 MOST_PARAMS = 64  # parameters of a scenario
 
-Id = Annotated[str, StringConstraints(min_length=1, max_length=256)]  # of a lane or road of a map
+Id = Annotated[str, StringConstraints(min_length=1, max_length=256)]  # id of a lane or road
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 World = Annotated[int, Field(ge=0, lt=1024)]
 Lanes = Annotated[list[Annotated[int, Field(ge=0, lt=MOST_LANES)]], Field(max_length=MOST_LANES)]

@@ -26,8 +26,8 @@ from cavmarl.service.service_records import ArtefactRecord
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9_-]+)+")
 YAML = ".yaml"  # the only files that the service reads itself
-MOST_YAML_BYTES = 1 << 18  # of all YAML files of a configuration; reading 64 KiB takes a second
-MOST_FILES_BYTES = 1 << 30  # of all files of a configuration, which a node keeps for each session
+MOST_YAML_BYTES = 1 << 18  # all YAML files of a configuration; reading 64 KiB takes a second
+MOST_FILES_BYTES = 1 << 30  # all files of a configuration, which a node keeps for each session
 _RESERVED = ("agents", "configs", "envs")  # folders in which names are looked up
 _OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
 

@@ -141,7 +141,7 @@ class EventLog:
         return [one.digest for one in self.store.read_valid(number - 1, until=number)]
 
     def _check_events_of(self, snapshot: SealedSnapshot) -> Iterator[None]:
-        """Replay the events before a snapshot, and compare the records with those in it."""
+        """Replay the events before a snapshot, and compare the records with the snapshot."""
         state, digest = Infrastructure(), ""
         for line in self._replayed(state, 0, "", snapshot.sequence):
             digest = line.digest

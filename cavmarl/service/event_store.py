@@ -104,7 +104,7 @@ class SignedHead(NamedTuple):
     """The end of the log, sealed with the service's key."""
 
     sequence: int  # number of events
-    digest: str  # of the last event
+    digest: str  # digest of the last event
     key: str  # id of the key
     seal: str  # HMAC-SHA256 of the other fields
 

@@ -38,7 +38,7 @@ class JobQueue:
         self._log, self._choose, self._assign, self._end = log, choose, assign, end
         self._failures = RateLimit(FAILURES_HZ, FAILURES, clock_s)
         self._next = ""  # the job at which the last pass stopped
-        self._reasons: dict[tuple[str, ...], str] = {}  # of the last failed search, by kind
+        self._reasons: dict[tuple[str, ...], str] = {}  # kind → why the last search failed
 
     def may_try(self) -> bool:
         """Return whether another search may fail without exceeding the rate limit."""

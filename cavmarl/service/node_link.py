@@ -40,8 +40,8 @@ class NodeLink:
     """A node's side of its connection to the service.
 
     Args:
-        url: of the service.
-        secret: of an identity with the role `node`.
+        url: URL of the service.
+        secret: secret of an identity with the role `node`.
         body: body of the registration; docs/guides/service.md lists its fields.
         is_supposed_idle: report no load, so that nodes are selected by their sessions alone.
 

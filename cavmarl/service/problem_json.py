@@ -121,7 +121,7 @@ async def _on_disconnect(request: Request, _: Exception) -> JSONResponse:
 
 
 def _methods_of(request: Request) -> set[str]:
-    """Return all methods of a path; the router itself names only those of its first route."""
+    """Return all methods of a path; the router itself names only the methods of its first route."""
     methods: set[str] = set()
     for route in request.app.state.routes:
         if route.path_regex.fullmatch(request.scope["path"]):

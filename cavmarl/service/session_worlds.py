@@ -46,7 +46,7 @@ class SessionWorld:
 
     Args:
         document: configuration of the worlds.
-        keys: further keywords of `make_vec`; its overrides are added to those of the document.
+        keys: further keywords of `make_vec`; its overrides are added to the document's.
         state: state that another node saved, or None for new worlds.
         number: number of commands that the state includes.
         files: folder with the files of the configuration, which `close` deletes; None: it has none.
@@ -190,7 +190,7 @@ class SessionWorld:
         """Execute a command and return its answer; a repeated command gets the same answer.
 
         Args:
-            number: of the command.
+            number: number of the command.
             act: executes it: `reset`, `step` or `change` with their arguments.
             is_quiet: whether to return nothing.
         """
@@ -334,7 +334,7 @@ class SessionWorld:
         return self._page is not None and self._page.is_watched
 
     def tell_scores(self, rows: list[dict[str, Any]]) -> None:
-        """Show these LoadScores on the pages, below those of the worlds' own nodes."""
+        """Show these LoadScores on the pages, below the LoadScores of the worlds' own nodes."""
         if self._page is not None:
             self._page.tell_others(rows)
 
@@ -439,7 +439,7 @@ class SessionWorlds:
         keys: dict[str, Any],
         files: TemporaryDirectory[str] | None = None,
     ) -> None:
-        """Create the worlds of a session; the arguments are those of `SessionWorld`."""
+        """Create the worlds of a session; for the arguments, see `SessionWorld`."""
         if len(self._worlds) >= self._slots:
             raise CapacityError(
                 f"this node has {self._slots} sessions already: resolve the session again later"

@@ -53,9 +53,9 @@ class AreaResult:
     clearance_50_s: float | None
     clearance_90_s: float | None
     clearance_s: float | None
-    last_arrival_s: float | None  # of the vehicles that arrived
+    last_arrival_s: float | None  # last arrival at an exit
     mean_trip_s: float | None  # from the planned departure to the exit
-    left_by_s: float | None  # when the last vehicle was seen on a road of the area
+    left_by_s: float | None  # time at which the last vehicle was seen on a road of the area
 
 
 @dataclass(frozen=True)
@@ -79,7 +79,7 @@ class EvacuationResult:
     contact_places: dict[str, int]
     contraflow: dict[str, int]  # vehicles of the areas that used the contraflow lanes of each road
     state_hash: str
-    series: dict[str, list[float]]  # by second: time_s, departed, arrived, standing
+    series: dict[str, list[float]]  # values per second: time_s, departed, arrived, standing
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

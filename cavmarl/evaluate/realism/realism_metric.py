@@ -53,7 +53,7 @@ BUCKETS = tuple(dict.fromkeys(one.bucket for one in COMPONENTS.values()))
 class Realism:
     """The realism of rollouts of one scene, all in [0, 1]."""
 
-    likelihoods: Mapping[str, float]  # by component
+    likelihoods: Mapping[str, float]  # component → likelihood
 
     @property
     def meta(self) -> float:

@@ -20,9 +20,9 @@ _TRIP = np.dtype(
         ("departed_s", np.float64),  # NaN: not seen
         ("late_s", np.float64),  # delay of the departure
         ("lost_s", np.float64),  # time of the trip so far, minus the time at the desired speed
-        ("waited_s", np.float64),  # below 0.1 m/s
+        ("waited_s", np.float64),  # time below 0.1 m/s
         ("stops", np.int64),
-        ("stands", np.bool_),  # at the last sample
+        ("stands", np.bool_),  # whether stopped at the last sample
     ],
     align=True,
 )
@@ -44,7 +44,7 @@ class SignalFigures:
     stops: float  # mean over departed vehicles
     queue: float | None  # vehicles below 0.1 m/s on lanes that end at a signal, mean of the samples
     most_queued: int | None  # maximum of `queue` over the samples
-    co2_g_per_km: float | None  # of a petrol car, see `emissions_of`
+    co2_g_per_km: float | None  # emissions of a petrol car, see `emissions_of`
     switches_per_h: float | None  # changes of the green of a signal, mean over signals
     longest_red_s: float | None  # longest time for which a lane was red with a stopped vehicle
     jams: bool | None  # see `is_jammed`

@@ -26,8 +26,8 @@ LONGEST_HEADWAY_S = 10.0  # vehicles farther behind do not follow
 EDGE_MINUTE = np.dtype(
     [
         ("edge", np.int32),  # EDGE row; never inside a junction
-        ("minute", np.int32),  # since the beginning
-        ("length_m", np.float64),  # of the edge
+        ("minute", np.int32),  # minutes since the beginning
+        ("length_m", np.float64),  # length of the edge
         ("density_per_km", np.float64),  # vehicles per kilometre of one lane
         ("flow_per_h", np.float64),  # vehicles per hour on one lane
         ("speed_mps", np.float64),  # flow over density
