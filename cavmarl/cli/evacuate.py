@@ -42,7 +42,7 @@ def evacuate(
         str,
         typer.Argument(
             metavar="MAP|PLAN",
-            help="Map file or environment, or a plan (.yaml) that names one.",
+            help="Map file, environment, or evacuation plan (.yaml).",
         ),
     ],
     vehicles: Annotated[

@@ -242,7 +242,7 @@ Zones = Annotated[
 Imports = Annotated[
     list[str] | None,
     about(
-        "Import this module first, for terms, sensors, driver models and backends of your own. "
+        "Import this module first; it may register terms, sensors, driver models or backends. "
         "Repeat it for more modules.",
         "--import",
         metavar="MODULE",

@@ -41,10 +41,10 @@ Vehicle = Annotated[
 Domain = Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")]
 ProfileName = Annotated[
     Literal["plain", "autoware"],
-    about("Topic names: `/car_0/…` (plain), or the names of Autoware, for one vehicle."),
+    about("Topic names: `/car_0/…` (plain), or Autoware's names (for one vehicle only)."),
 ]
 Distro = Annotated[
-    Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
+    Literal["humble", "jazzy", "kilted"], about("ROS 2 distribution of the message types.")
 ]
 Waits = Annotated[
     Literal["stamp", "newest"],

@@ -48,7 +48,7 @@ def submit_train(
     job_minutes: Annotated[
         int | None,
         about(
-            "Time after which a job is stopped and queued again; not with ray [default: a day].",
+            "Minutes after which a job is stopped and queued again; not with ray [default: a day].",
             metavar="MIN",
             min=1,
             panel=CLUSTER,

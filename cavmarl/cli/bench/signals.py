@@ -19,7 +19,7 @@ def signals(
     ],
     worlds: Annotated[
         list[int] | None,
-        about("Number of worlds. Repeat it for more. [default: 1, 16]", metavar="N"),
+        about("Number of worlds. Repeat it for more [default: 1, 16].", metavar="N"),
     ] = None,
     after: Annotated[int, about("Simulated seconds before measuring.", metavar="S")] = 300,
     turn: Annotated[int, about("Decisions per measurement, one every 5 s.", metavar="N")] = 60,

@@ -55,8 +55,8 @@ def traffic(
     demand: Annotated[
         list[Path] | None,
         about(
-            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more. [default: MAP, if "
-            "it is a .sumocfg]",
+            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more [default: MAP, if "
+            "it is a .sumocfg].",
             "--demand",
             "-d",
             metavar="FILE",
