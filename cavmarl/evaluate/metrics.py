@@ -60,7 +60,7 @@ METRICS = (
     _share("arrived", "arrived", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
-    _share("unfinished", "unfinished", "trips that the horizon of the episode or trip cut",
+    _share("unfinished", "unfinished", "trips that were cut by the horizon of the episode or trip",
            "less"),
     _share("blocked", "blocked", "trips that were cut while stopped where the built-in driver "
            "would stop, too", "less"),
@@ -135,7 +135,7 @@ def metric_values(
 
 
 def _of_run(metric: Metric, trips: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return one value; none without trips, and none per kilometre without a kilometre."""
+    """Return one value (1,); it is missing (0,) without trips or, per km, without kilometres."""
     km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
     if metric.name == KM_PER_INFRACTION:
         infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)

@@ -117,8 +117,7 @@ def run_suite(
 
     If the suite sets the number of agents, trips that end are replaced (respawn), so that the
     number stays the same. `began` is called before each world. `overrides` are values of further
-    keys of every world. Policies, episodes, repeats,
-    seed, zones and backend are as in `evaluate`.
+    keys of every world. Policies, episodes, repeats, seed, zones and backend are as in `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {}

@@ -115,7 +115,7 @@ RESOURCE = np.dtype(
     [
         ("run", np.int64),
         ("process", np.int64),  # number of the worker or node; -1: the caller
-        ("begin_s", np.float64),  # simulated time of the run at the begin of the window
+        ("begin_s", np.float64),  # simulated time of the run at the beginning of the window
         ("ticks", np.int64),  # length of the window
         ("wall_s", np.float64),  # wall time of the window
         ("cpu_s", np.float64),  # processor time in the window

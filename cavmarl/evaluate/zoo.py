@@ -133,7 +133,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
 
     Raises:
         PolicyError: there is no such driver, or it is not trained.
-        ManifestError: there is no result, or weights or world differ from those it was made with.
+        ManifestError: there is no result, or the weights or the world have changed since then.
     """
     folder = _trained(policy)[1]
     return verify_result(folder, folder, progress)

@@ -34,7 +34,7 @@ NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the envir
     "auto_configure": False,
 }
 BODY_S = 10.0  # time limit for receiving a body
-CHECK_S = 0.05  # a thread checks older events for this time, and then pauses for as long
+CHECK_S = 0.05  # a thread checks older events for this time, then pauses for the same time
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -146,7 +146,7 @@ class GuardedRequests:
                 async with asyncio.timeout_at(until_s):
                     message = await receive()
             except TimeoutError:
-                raise HTTPException(408, f"the body did not come within {BODY_S:g} s") from None
+                raise HTTPException(408, f"the body was not received within {BODY_S:g} s") from None
             left -= len(message.get("body", b""))
             if left < 0:
                 raise HTTPException(413, "the body is too large for this route")

@@ -103,7 +103,7 @@ class Broker:
         if owner and owner.id != identity.id and not owner.revoked:
             raise problem("forbidden", f"node '{body.name}' belongs to another identity")
         if known is None and len(self.log.state.nodes) >= self.rules.max_nodes:
-            raise problem("too-many", f"{self.rules.max_nodes} nodes are registered", 60.0)
+            raise problem("too-many", f"the limit is {self.rules.max_nodes} nodes", 60.0)
         incarnation = known.incarnation + 1 if known else 1
         data = body.model_dump(exclude={"name"})
         data |= {"identity": identity.id, "incarnation": incarnation}
@@ -288,7 +288,7 @@ class Broker:
         Another node is chosen if the session's node is lost, drained or unreachable for the client.
 
         Raises:
-            NoNodeError: no node can accept it.
+            NoNodeError: no node can accept the session.
         """
         session = self.session(identity, number)
         if session.state in SESSION_OVER or session.job is not None:
@@ -362,7 +362,7 @@ class Broker:
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
         """Store a file that a job has produced."""
         if name not in session.results and len(session.results) >= MOST_RESULTS:
-            raise problem("too-many", f"{MOST_RESULTS} results of a job are kept")
+            raise problem("too-many", f"a job can have at most {MOST_RESULTS} results")
         sha256 = self.log.keep(content)
         self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
 

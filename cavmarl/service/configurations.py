@@ -91,7 +91,7 @@ def add_configuration(
     versions = log.state.configurations.get(name, [])
     if found not in versions:
         if log.state.configurations_of.get(identity.id, 0) >= MOST_CONFIGURATIONS:
-            detail = f"{MOST_CONFIGURATIONS} configurations of yours are kept: use those"
+            detail = f"you have {MOST_CONFIGURATIONS} configurations, the limit: use one of them"
             raise problem("too-many", detail)
         log.keep(content)
         data: dict[str, Any] = {"hash": found, "version": len(versions) + 1}

@@ -161,7 +161,7 @@ class EventLog:
             for_s: time after which to return.
 
         Raises:
-            ServiceError: they were modified, or do not give the records of the snapshot.
+            ServiceError: the events were modified, or do not give the records of the snapshot.
         """
         until_s = time.monotonic() + for_s
         return all(time.monotonic() < until_s for _ in self._older)
@@ -276,7 +276,7 @@ class EventLog:
         """Wait until all events recorded so far are on disk.
 
         Raises:
-            ServiceError: they cannot be written; the service must end.
+            ServiceError: the events cannot be written; the service must end.
         """
         if not self._lines and not self._blobs and self.durable >= self.sequence:
             return

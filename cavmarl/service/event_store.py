@@ -165,7 +165,7 @@ class EventStore:
             raise
 
     def try_lock(self) -> bool:
-        """Return whether this standby has the store for itself from now on.
+        """Return whether this standby owns the store from now on.
 
         The lock of another service ends with its connection.
 
@@ -322,7 +322,7 @@ class EventStore:
 
         Args:
             after: number of the line before the first one.
-            digest: its digest.
+            digest: digest of that line.
             until: number of the last line; None: all.
 
         Raises:

@@ -54,7 +54,7 @@ class JobQueue:
         self._reasons[_kind_of(session)] = str(error)
 
     def reason_of(self, session: SessionRecord) -> str:
-        """Return why a queued job waits; empty: no search has failed yet, or it does not wait."""
+        """Return why a queued job waits; empty: no search has failed yet, or not waiting."""
         if session.id not in self._log.state.waiting:
             return ""
         return self._reasons.get(_kind_of(session), "")

@@ -152,7 +152,7 @@ class NodeLink:
         """Return the claims that the service has signed for this node, a session and a purpose.
 
         Raises:
-            KeyError or jwt.InvalidTokenError: the token was not signed by the service for these.
+            KeyError or jwt.InvalidTokenError: the token was not signed by the service for them.
         """
         number = str(jwt.get_unverified_header(token).get("kid"))
         key = await self.public_key(number, pause_s)
@@ -170,7 +170,7 @@ class NodeLink:
         return found
 
     async def fetch_files(self, document: dict[str, Any]) -> TemporaryDirectory[str] | None:
-        """Return a new folder with the files of a configuration; None: it has none.
+        """Return a new folder with the files of a configuration; None: there are no files.
 
         Raises:
             ServiceError: a file is missing or does not have its hash.
@@ -248,7 +248,7 @@ class NodeLink:
             os.close(self._key_files.pop(session))
 
     def _in_memory(self, session: str, key: str) -> str:
-        """Return the path of a file with a key that vanishes when this process ends."""
+        """Return the path of a key file that is deleted when this process ends."""
         self.close_key_file(session)
         file = self._key_files[session] = os.memfd_create("cavmarl-key", os.MFD_CLOEXEC)
         os.fchmod(file, 0o600)

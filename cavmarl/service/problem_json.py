@@ -130,7 +130,7 @@ def _methods_of(request: Request) -> set[str]:
 
 
 async def _on_fault(request: Request, error: Exception) -> JSONResponse:
-    """Log an internal error: one line, and the first time at its place the traceback."""
+    """Log an internal error in one line, and with its traceback if it is the first at its place."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{last.filename}:{last.lineno}"
     is_new = place not in request.app.state.faults
@@ -138,4 +138,4 @@ async def _on_fault(request: Request, error: Exception) -> JSONResponse:
     shown = f"{type(error).__name__} at {place}: {str(error)[:200]!r}"
     _LOGGER.error(shown, exc_info=error if is_new else None)
     request.scope[FAULT] = error
-    return _refuse(request, "broken", "the service could not do this; nothing of it was kept")
+    return _refuse(request, "broken", "the service could not do this; nothing was changed")

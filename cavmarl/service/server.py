@@ -169,7 +169,7 @@ def check_transport(host: str, certificate: Path | None, key: Path | None) -> No
     """Check that secrets are encrypted on the way to other machines.
 
     Raises:
-        ServiceError: they would not be, or a file is missing.
+        ServiceError: secrets would not be encrypted, or a file is missing.
         ConfigError: other users can read the private key.
     """
     if (certificate is None) != (key is None):

@@ -191,7 +191,7 @@ class SessionWorld:
 
         Args:
             number: number of the command.
-            act: executes it: `reset`, `step` or `change` with their arguments.
+            act: executes the command: `reset`, `step` or `change` with their arguments.
             is_quiet: whether to return nothing.
         """
         if number == self.number and number and self._last:
@@ -285,7 +285,7 @@ class SessionWorld:
             raise problem(
                 "refused",
                 f"{key}: the state of these worlds cannot be saved, so another node could not "
-                "continue their recording; record them in a process of your own",
+                "continue their recording; record them in your own process",
             )
         self.recording = SessionRecording(self._vec, change.include, files=self._folder)
 

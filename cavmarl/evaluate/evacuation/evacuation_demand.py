@@ -210,7 +210,7 @@ def _shared_exits(
 ) -> NDArray[np.int64]:
     """Return the exit (n,) that each vehicle reaches first, in the order of departures.
 
-    `times_s`: (num_exits, n) from the vehicle to the exit. `lanes`: (num_exits,) of the exits.
+    `times_s`: (num_exits, n) time from vehicle to exit. `lanes`: (num_exits,) lanes of each exit.
     """
     free_s = np.full(len(times_s), -np.inf)
     chosen = np.zeros(len(depart_s), dtype=np.int64)

@@ -127,7 +127,7 @@ def roads_of(area: Area, name: str, network: RoadNetwork) -> NDArray[np.intp]:
 
 
 def edge_rows(names: Sequence[str], key: str, network: RoadNetwork) -> NDArray[np.intp]:
-    """Return the EDGE rows of some roads. Raises ConfigError for an unknown one."""
+    """Return the EDGE rows of some roads. Raises ConfigError for an unknown road."""
     known = {name: row for row, name in enumerate(network.edge_ids)}
     for name in names:
         if name not in known or network.edges["internal"][known[name]]:
@@ -144,7 +144,7 @@ def car_roads(network: RoadNetwork) -> NDArray[np.bool_]:
 
 
 def middle_of(network: RoadNetwork) -> tuple[float, float, float]:
-    """Return x and y of the middle of the roads in m, and the default radius of an area there."""
+    """Return x and y of the middle of the roads in m, and the default radius of an area."""
     x, y = _middles(network)
     usable = car_roads(network)
     at = float(np.median(x[usable])), float(np.median(y[usable]))

@@ -99,7 +99,7 @@ class SignalMeter:
 
         Args:
             rows: VEHICLE (n,) all vehicles.
-            tick: since the reset.
+            tick: ticks since the reset.
             due_ticks: (num_orders,) ticks at which vehicles of the demand were due to depart.
             codes: (num_links,) states of the links' signals; see `roads.shown_signals`.
         """
