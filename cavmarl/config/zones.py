@@ -26,11 +26,11 @@ class ZonesConfig(Section, key="zones"):
         max_deferred_ticks: ticks for which a vehicle that has crossed a border may stay with its
             old zone, if the new one does not acknowledge it; then the change is forced.
         backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
-        halo_m: how far zones see over their borders; default: the minimum for exact results. Less
-            is an error.
-        approach_ticks: how many ticks before its arrival, at its present speed, a vehicle is
-            announced to the next zone.
-        journal: file for the coordinator's log; empty: none. It must not exist.
+        halo_m: how far zones see over their borders; default: the minimum for exact results. A
+            smaller value is an error.
+        approach_ticks: time, in ticks at the present speed, before the crossing of a border at
+            which a vehicle is announced to the next zone.
+        journal: file for the coordinator's log, which must not exist yet; empty: no log.
         check_invariants: check the invariants of ownership at run time.
         repartition_steps: steps between two checks whether bisection by vehicle positions would
             balance the zones better. Results do not depend on it. 0: never.

@@ -131,7 +131,7 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
     "metrics": (
         lambda entry: change_manifest(entry, metrics_version=1),
         ManifestError,
-        "its metrics are of version 1, .*: evaluate again",
+        "has metrics of version 1, .*: evaluate again",
     ),
     "job": (
         lambda entry: change_manifest(entry, job={}),
