@@ -154,7 +154,7 @@ def one_core() -> Iterator[None]:
 
 
 def check_range(**limits: tuple[float, float, float]) -> None:
-    """Refuse numbers below the second or above the third value of their limits."""
+    """Raise ConfigError for values out of range; `limits`: name=(value, least, most)."""
     for name, (value, least, most) in limits.items():
         if not least <= value <= most:
             bounds = f"at least {least:g}" if math.isinf(most) else f"from {least:g} to {most:.15g}"
@@ -197,7 +197,7 @@ def make_table(
     rows: Iterable[Sequence[str] | None],
     caption: str | None = None,
 ) -> Table:
-    """Build a table with text in the first column and numbers in the others; a row None is a line.
+    """Build a table with text in the first column and numbers in the others; None draws a line.
 
     On a narrow terminal, text is wrapped but numbers are not.
     """

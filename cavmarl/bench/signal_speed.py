@@ -1,7 +1,7 @@
 """Speed of worlds whose signals follow max pressure, compared with sumo-rl on libsumo.
 
 Both sides decide every 5 s. A step of cavmarl has 25 ticks of 0.2 s; a step of sumo-rl has five
-simulation steps of 1 s. The sides take turns on the same core; processor time counts.
+simulation steps of 1 s. The sides take turns on the same core; rates use processor time.
 """
 
 from __future__ import annotations
@@ -147,5 +147,5 @@ def _answer(process: subprocess.Popen[str], wanted: str) -> str:
     words = process.stderr.read().strip().splitlines()
     raise ConfigError(
         f"sumo-rl ended: {words[-1] if words else 'no output'}\nCure: install sumo-rl and "
-        f"eclipse-sumo's libsumo in a Python, and name it in {PYTHON}"
+        f"eclipse-sumo's libsumo in a Python, and set {PYTHON} to it"
     )

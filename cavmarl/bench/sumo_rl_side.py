@@ -21,7 +21,7 @@ def main() -> None:
     os.environ.setdefault("SUMO_HOME", sumo.SUMO_HOME)
     import pettingzoo.utils as utils
 
-    if not hasattr(utils, "agent_selector"):  # its name before PettingZoo 1.25
+    if not hasattr(utils, "agent_selector"):  # the name before PettingZoo 1.25, which sumo_rl needs
         utils.agent_selector = utils.AgentSelector
     import sumo_rl
 
@@ -55,7 +55,7 @@ def _step(environment: Any, count: int) -> None:
 
 
 def _max_pressure(sumo: Any, signal: Any) -> int:
-    """Return the green whose movements have the largest sum of vehicles before minus behind."""
+    """Return the green with the largest pressure: vehicles before minus behind its movements."""
     count = sumo.lane.getLastStepVehicleNumber
     links = sumo.trafficlight.getControlledLinks(signal.id)
     best, best_score = signal.green_phase, None

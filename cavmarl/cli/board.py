@@ -25,7 +25,7 @@ from cavmarl.cli.output import (
 from cavmarl.core.progress import progress_bar
 
 app = typer.Typer(
-    cls=CliGroup, help="Check entries of drivers, and show them on a page.", no_args_is_help=True
+    cls=CliGroup, help="Check and show the entries of a board of drivers.", no_args_is_help=True
 )
 
 
@@ -41,7 +41,7 @@ def build(
     imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Drive the results of all entries again, and write one page.
+    """Repeat the recorded evaluation of each entry, and write one page.
 
     Entries that fail are marked on the page with the reason. If an entry fails, exit with 1. The
     scripts of entries are run: build boards only of entries that you trust.
@@ -67,9 +67,9 @@ def check(
     imports: Imports = None,
     json_path: JsonPath = None,
 ) -> None:
-    """Check an entry before it is submitted: its files, and its result by driving again.
+    """Check an entry before it is submitted: read its files, and repeat its evaluation.
 
-    The script of the entry, if there is one, is run.
+    If the entry has a script, the script is run.
     """
     from cavmarl.evaluate.board import check_entry
 

@@ -19,10 +19,10 @@ def carla(
     world: WorldSpec,
     port: Annotated[
         int,
-        about("Port of the calls; streams have the next port.", metavar="N", panel=SERVICE),
+        about("Port for RPC calls; streams use the next port.", metavar="N", panel=SERVICE),
     ] = 2000,
     host: Annotated[
-        str, about("Address to listen at.", metavar="HOST", panel=SERVICE)
+        str, about("Address to listen on.", metavar="HOST", panel=SERVICE)
     ] = "127.0.0.1",
     any_host: Annotated[
         bool,
@@ -56,7 +56,7 @@ def carla(
     ] = 64,
     max_unsent_mb: Annotated[
         int,
-        about("Maximum data that wait for a slow client.", metavar="MB", panel=SERVICE),
+        about("Maximum size of data queued for a slow client.", metavar="MB", panel=SERVICE),
     ] = 64,
 ) -> None:
     """Let programs for CARLA use a world, through CARLA's own client, until interrupted."""

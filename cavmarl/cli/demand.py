@@ -30,7 +30,7 @@ def random(
     out: Annotated[Path, about("The .rou.xml file to write.", "--out", "-o", metavar="FILE")],
     vehicles: Annotated[int, about("Number of cars.", metavar="N")] = 1000,
     within: Annotated[
-        float, about("Length of the interval in which the cars depart, evenly spaced.", metavar="S")
+        float, about("Seconds during which the cars depart, evenly spaced.", metavar="S")
     ] = 60.0,
     route: Annotated[float, about("Minimum length of a route in metres.", metavar="M")] = 10_000.0,
     seed: Seed = 0,

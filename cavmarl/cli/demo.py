@@ -234,8 +234,8 @@ def compared(found: EvaluationReport) -> str:
         if is_better
     ]  # fmt: skip
     return (
-        f"{text} Its arrivals take {delay:.1f} s longer than free driving, those of {RULES} "
-        f"{rules_delay:.1f} s. So the adapted driver is better in "
+        f"{text} Its successful trips take {delay:.1f} s longer than at the limits, the trips of "
+        f"{RULES} {rules_delay:.1f} s. The adapted driver is better in "
         f"{' and '.join(wins) if wins else 'neither'}; it collides in "
         f"{100.0 * (ours['collision'].mean or 0.0):.1f} % of its trips, {RULES} in "
         f"{100.0 * (others['collision'].mean or 0.0):.1f} %."

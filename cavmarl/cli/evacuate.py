@@ -42,7 +42,7 @@ def evacuate(
         str,
         typer.Argument(
             metavar="MAP|PLAN",
-            help="Map file or environment, or a plan (.yaml) that names one.",
+            help="Map file, environment, or evacuation plan (.yaml).",
         ),
     ],
     vehicles: Annotated[
@@ -55,7 +55,7 @@ def evacuate(
     ] = None,
     around: Annotated[
         str | None,
-        about("Middle of the area, in m [default: the middle of the roads].", metavar="X,Y"),
+        about("Centre of the area, in m [default: the centre of the roads].", metavar="X,Y"),
     ] = None,
     radius: Annotated[
         float | None,
@@ -64,7 +64,7 @@ def evacuate(
     exits: Annotated[
         list[str] | None,
         about(
-            "Road by which vehicles leave; repeat it for more [default: far dead ends].",
+            "Road by which vehicles leave; repeat it for more [default: distant dead ends].",
             "--exit",
             metavar="EDGE",
         ),
@@ -78,9 +78,9 @@ def evacuate(
         about("Road that the evacuation closes; repeat it for more.", metavar="EDGE"),
     ] = None,
     within_s: Annotated[
-        float | None, about("Vehicles depart within this time.", metavar="S", min=0.0)
+        float | None, about("Seconds in which all vehicles depart.", metavar="S", min=0.0)
     ] = None,
-    seconds: Annotated[float | None, about("Longest simulated time.", metavar="S", min=1.0)] = None,
+    seconds: Annotated[float | None, about("Maximum simulated time.", metavar="S", min=1.0)] = None,
     repeats: Annotated[
         int, about("Number of runs, with consecutive seeds.", "--repeats", "-r", metavar="N", min=1)
     ] = 1,
@@ -116,7 +116,7 @@ def evacuate(
     else:
         count = VEHICLES if vehicles is None else vehicles
         base = Path()
-        network = load_world(where, agents=0, background=0).network  # kept, so it is read once
+        network = load_world(where, agents=0, background=0).network  # read only once
         plan = _plan_of_map(where, network, count, around, radius)
     plan = _changed(plan, exits, contraflow, close, within_s, seconds)
     folder = results_folder(out, "evacuate", where)
@@ -187,7 +187,7 @@ def _changed(
     within_s: float | None,
     seconds: float | None,
 ) -> EvacuationPlan:
-    """Return the plan with the values of options."""
+    """Return the plan with the values of the given options."""
     from cavmarl.config.road_events import RoadEvent
 
     more: tuple[RoadEvent, ...] = ()

@@ -105,9 +105,8 @@ def evaluate(
     )  # fmt: skip
     _check_page(html)
     console = Console()
-    world = with_sensors_of_drivers(
-        world, drivers
-    )  # prints to the terminal: before the progress bar
+    # This call may print, so it comes before the progress bar.
+    world = with_sensors_of_drivers(world, drivers)
     folder = out or _new_folder(world.env)
     more: dict[str, Any] = {
         "episodes": episodes,
@@ -217,7 +216,7 @@ def place_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
 
 
 def resource_table(policy: str, rows: Sequence[Mapping[str, Any]]) -> Table:
-    """Return a table of what each process of a run used."""
+    """Return a table of the processor time, memory and messages of each process of a run."""
     heads = ["process", "CPU, %", "MB", "wait, %", "kB/tick", "frames/tick", "slowest, %", "moved"]
     lines = [
         [
@@ -329,7 +328,7 @@ def _caption(repeats: int) -> str:
 
 
 def driver_cell(metric: Metric, driver: PolicyReport) -> str:
-    """Return `report_cell` of a driver; `>` before a lower bound."""
+    """Return `report_cell` of a driver, with `>` in front of a lower bound."""
     return ("> " if driver.is_above(metric) else "") + report_cell(metric, driver[metric.name])
 
 

@@ -25,7 +25,7 @@ from cavmarl.core.errors import ConfigError
 def follow(
     env: Environment,
     at: Annotated[
-        str, about("Unix socket or port at which the world listens.", "--at", metavar="ADDRESS")
+        str, about("Unix socket or port of the world.", "--at", metavar="ADDRESS")
     ] = DEFAULT_PLACE,
     vehicles: Annotated[
         str, about("Agents to drive, comma-separated.", metavar="NAME,…")
@@ -43,7 +43,7 @@ def follow(
     ] = None,
     settings: Settings = None,
     imports: Imports = None,
-    joins_s: Annotated[float, about("Seconds in which the world must answer.", metavar="S")] = 60.0,
+    joins_s: Annotated[float, about("Seconds to wait for the world.", metavar="S")] = 60.0,
     secret_file: SecretFile = None,
     json_path: JsonPath = None,
 ) -> None:

@@ -88,7 +88,7 @@ def lead(
         float, about("Seconds that a step waits for its followers.", metavar="S")
     ] = 10.0,
     joins_s: Annotated[
-        float, about("Seconds in which the followers must join.", metavar="S")
+        float, about("Seconds to wait until all followers have joined.", metavar="S")
     ] = 600.0,
     secret_file: SecretFile = None,
     on_lost: Annotated[
@@ -118,7 +118,7 @@ def lead(
     deadline_s: Annotated[
         float | None,
         about(
-            "Count steps that need longer than this with --pace, by phase [default: one step].",
+            "With --pace: count steps that take longer than this, by phase [default: one step].",
             "--deadline",
             metavar="S",
         ),
@@ -126,7 +126,7 @@ def lead(
     trace: Annotated[
         list[Path] | None,
         about(
-            "Play recorded poses of other bodies from a CSV file. Repeat it for more files.",
+            "Play recorded poses of other road users from a CSV file. Repeat it for more files.",
             "--trace",
             metavar="FILE",
             exists=True,
@@ -144,7 +144,7 @@ def lead(
 ) -> None:
     """Run a world whose agents are driven by programs that join over a socket.
 
-    A program can also bring vehicles, people and roadside units of its own.
+    A program can also add its own vehicles, people and roadside units.
     """
     from cavmarl.cosim.actors.pose_traces import read_traces
     from cavmarl.cosim.followers.followed_world import FollowedWorld
@@ -274,7 +274,7 @@ def _actor_table(actors: Sequence[dict[str, Any]]) -> Table:
         for row in actors
     )
     heads = ("actor", "type", "poses", "late", "lost", "extrapolated", "stopped", "oldest, ms")
-    return grid(heads, rows, "poses of actors; extrapolated and stopped: in steps", lefts=2)
+    return grid(heads, rows, "poses of actors; extrapolated, stopped: number of steps", lefts=2)
 
 
 def _deadline_text(found: dict[str, Any]) -> str:

@@ -64,21 +64,21 @@ def build(
     traffic_side: Annotated[
         Literal["auto", "left", "right"],
         about(
-            "Side of the road to drive on; auto: the country's side (OSM), or the rule of the "
-            "roads (OpenDRIVE).",
+            "Side of the road to drive on; auto: the side of the country (OSM), or the attribute "
+            "`rule` of the roads (OpenDRIVE).",
         ),
     ] = "auto",
     origin: Annotated[
         str | None,
         about(
-            "Geographic position of x = y = 0 [default: UTM, the corner of the roads].",
+            "Geographic position of x = y = 0 [default: the corner of the roads, in UTM].",
             metavar="LAT,LON",
         ),
     ] = None,
     limit_grade: Annotated[
         float | None,
         about(
-            "Flatten roads to this grade, for example 0.15 [default: no limit].",
+            "Flatten steeper roads to this grade, for example 0.15 [default: no limit].",
             metavar="X",
             min=0.01,
         ),

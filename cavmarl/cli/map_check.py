@@ -45,8 +45,8 @@ def check(
     carla: Annotated[
         bool,
         flag(
-            "Also read the map with CARLA's client (CAVMARL_CARLA_PYTHON: a Python that has it), "
-            "and compare."
+            "Also read the map with CARLA's client, and compare. The environment variable "
+            "CAVMARL_CARLA_PYTHON names a Python that has the client."
         ),
     ] = False,
     page: Annotated[

@@ -74,7 +74,7 @@ def fidelity(
     ] = "icp",
     buildings: Annotated[
         Path | None,
-        about("OSM file or SUMO polygons; their walls join the map's surface.", metavar="FILE"),
+        about("OSM file or SUMO polygons whose walls are added to the map.", metavar="FILE"),
     ] = None,
     points: Annotated[
         Path | None, about_file("Write the distance of each point (.csv, .ply).")

@@ -35,7 +35,7 @@ def node(
     ] = None,
     join: Annotated[
         str | None,
-        about("Address at which the caller of a world listens.", "--join", metavar="HOST:PORT"),
+        about("Address of the caller, which has made the world.", "--join", metavar="HOST:PORT"),
     ] = None,
     key_file: Annotated[
         Path | None, about("With --join: file with the key of the caller.", metavar="FILE")
@@ -45,12 +45,12 @@ def node(
     ] = False,
     imports: Imports = None,
     wait_s: Annotated[
-        float, about("With --join and --mpi: seconds in which the caller must answer.", metavar="S")
+        float, about("With --join and --mpi: seconds to wait for the caller.", metavar="S")
     ] = 300.0,
     service: Annotated[
         str | None,
         about(
-            "URL of the coordination service to work for; after a comma, those of its standbys.",
+            "URL of the coordination service; URLs of standbys may follow, comma-separated.",
             "--service",
             metavar="URL",
             panel=SERVICE,
@@ -93,7 +93,7 @@ def node(
     allow: Annotated[
         list[str] | None,
         about(
-            "Identity that the node serves. Repeat it for more [default: all].",
+            "Identity whose sessions the node accepts. Repeat it for more [default: all].",
             metavar="NAME",
             panel=SERVICE,
         ),

@@ -41,7 +41,7 @@ _WRITER: ContextVar[str] = ContextVar("command whose results are written as JSON
 def _json_file(
     context: typer.Context, option: typer.CallbackParam, path: Path | None
 ) -> Path | None:
-    """Note the command for `write_json`, and check the file."""
+    """Store the name of the command for `write_json`, and check that the file can be written."""
     program, *words = context.command_path.split()
     _WRITER.set(" ".join(word for word in words if not word.startswith("-")) or program)
     return _writable(option, path)
@@ -83,7 +83,7 @@ def _import_all(modules: list[str] | None) -> list[str] | None:
     return modules
 
 
-# Optional modules of outputs, with their extras.
+# Optional modules that outputs need, with the extras that install them.
 PAGE_EXTRAS = {"matplotlib": "report", "jinja2": "report"}
 WINDOW_EXTRAS = {"pygame": "render"}
 VIDEO_EXTRAS = WINDOW_EXTRAS | {"imageio_ffmpeg": "render"}
@@ -242,7 +242,7 @@ Zones = Annotated[
 Imports = Annotated[
     list[str] | None,
     about(
-        "Import this module first, for terms, sensors, driver models and backends of your own. "
+        "Import this module first; it may register terms, sensors, driver models or backends. "
         "Repeat it for more modules.",
         "--import",
         metavar="MODULE",
@@ -366,9 +366,9 @@ def with_world(
 ) -> Callable[[Callable[..., Made]], Callable[..., Made]]:
     """Return a decorator for commands that take a `world: WorldSpec`.
 
-    The command line gets the options from which the WorldSpec is made instead: ENV, --import and
-    the options called `names`, by default all of them. A parameter of the function with the name
-    of such an option replaces that option, and the function receives its value, too.
+    On the command line, `world` is replaced by the options that define it: ENV, --import and the
+    options in `names`, by default all. If the function has a parameter with the name of such an
+    option, the declaration of the parameter is used, and the function also receives the value.
 
     `is_here`: whether the world is made in this process; otherwise, --import is not offered.
     """
@@ -415,8 +415,8 @@ def parse_settings(
 ) -> dict[str, Any]:
     """Return overrides from texts like `sensors.lidar.rays=32`, with the imports as `plugins`.
 
-    A value that is not JSON is text. Raises ConfigError if a text is not KEY=VALUE, has no value,
-    or names a key that another text has named.
+    A value that is not JSON is kept as text. Raises ConfigError if a text is not KEY=VALUE or has
+    no value, or if two texts have the same key.
     """
     overrides: dict[str, Any] = {}
     for setting in settings or ():

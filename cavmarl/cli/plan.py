@@ -77,7 +77,7 @@ def plan(
     cut: Annotated[
         Path | None,
         about(
-            "Write a zone file whose zones have about equal measured costs (an extension).",
+            "Write a zone file whose zones have about equal measured costs.",
             "--write-zones",
             metavar="FILE",
         ),

@@ -39,7 +39,7 @@ if TYPE_CHECKING:
 def replay(
     path: Annotated[
         Path,
-        typer.Argument(metavar="RECORDING", help="Folder of --record, or a folder of recordings."),
+        typer.Argument(metavar="RECORDING", help="Recording, or a folder of recordings."),
     ],
     world: Annotated[int, about("Number of the world, from 0.", metavar="N")] = 0,
     episode: Annotated[int, about("Number of the episode, from 0.", metavar="N")] = 0,
@@ -54,20 +54,20 @@ def replay(
     ghosts_of: Annotated[
         int | None, about("Outline the ghosts of this zone.", metavar="ZONE")
     ] = None,
-    fcd: Annotated[Path | None, about_file("Write floating car data as SUMO does.")] = None,
+    fcd: Annotated[Path | None, about_file("Write floating car data in SUMO's format.")] = None,
     emissions: Annotated[
-        Path | None, about_file("Write energy, CO₂ and fuel of each vehicle as SUMO does.")
+        Path | None, about_file("Write energy, CO₂ and fuel of each vehicle in SUMO's format.")
     ] = None,
-    csv: Annotated[Path | None, about_file("Write one line per vehicle and frame.")] = None,
+    csv: Annotated[Path | None, about_file("Write CSV with a line per vehicle and frame.")] = None,
     mcap: Annotated[Path | None, about_file("Write an MCAP file for Foxglove.")] = None,
     rosbag2: Annotated[
         Path | None,
-        about("Write a bag of ROS 2, a new folder.", metavar="FOLDER", panel=OUTPUT),
+        about("Write a rosbag2 bag to a new folder.", metavar="FOLDER", panel=OUTPUT),
     ] = None,
     minari: Annotated[
         Path | None,
         about(
-            "Write the agents' trips of all worlds as a data set of Minari, a new folder.",
+            "Write the agents' trips of all worlds as a Minari data set to a new folder.",
             metavar="FOLDER",
             panel=OUTPUT,
         ),
@@ -85,7 +85,7 @@ def replay(
 ) -> None:
     """Show a recording from above, or export it.
 
-    A folder that holds several recordings is listed.
+    If the folder contains several recordings, list them.
     """
     from cavmarl.core.errors import ConfigError, RecordingError, require_all
 

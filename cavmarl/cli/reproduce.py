@@ -27,18 +27,18 @@ ALL_SHOWN = 4  # a longer line shows only its wrong numbers, and a count
 def reproduce(
     names: Annotated[
         list[str] | None,
-        typer.Argument(metavar="LINE", help="Names of lines.", show_default=False),
+        typer.Argument(metavar="LINE", help="Names of lines, see --list.", show_default=False),
     ] = None,
     quick: Annotated[
-        bool, flag("Repeat only lines that take seconds and are equal on every machine.", "--quick")
+        bool, flag("Repeat quick lines only, whose numbers are equal on all machines.", "--quick")
     ] = False,
     every: Annotated[bool, flag("Repeat all lines; takes hours.", "--all")] = False,
     listed: Annotated[bool, flag("List the lines and run nothing.", "--list")] = False,
     files: Annotated[
         list[str] | None,
         about(
-            "File or folder in place of a word in commands, for example MAPS=maps. Repeat it for "
-            "more.",
+            "Replace a word in the commands by a file or folder, for example MAPS=maps. Repeat it "
+            "for more.",
             "--file",
             metavar="WORD=PATH",
         ),

@@ -41,10 +41,10 @@ Vehicle = Annotated[
 Domain = Annotated[int, about("ROS_DOMAIN_ID.", metavar="N")]
 ProfileName = Annotated[
     Literal["plain", "autoware"],
-    about("Topic names: `/car_0/…` (plain), or the names of Autoware, for one vehicle."),
+    about("Topic names: `/car_0/…` (plain), or Autoware's names (for one vehicle only)."),
 ]
 Distro = Annotated[
-    Literal["humble", "jazzy", "kilted"], about("Distribution whose types are used.")
+    Literal["humble", "jazzy", "kilted"], about("ROS 2 distribution of the message types.")
 ]
 Waits = Annotated[
     Literal["stamp", "newest"],
@@ -54,16 +54,16 @@ Waits = Annotated[
     ),
 ]
 Deadline = Annotated[
-    float, about("Maximum real time that a step waits for a command, in s.", metavar="S")
+    float, about("Maximum seconds of real time that a step waits for a command.", metavar="S")
 ]
-Lag = Annotated[int, about("A command may be this many steps old.", metavar="N")]
+Lag = Annotated[int, about("Maximum age of a command in steps.", metavar="N")]
 Ready = Annotated[
-    float, about("Maximum time that the first step waits for a publisher of commands.", metavar="S")
+    float, about("Maximum seconds that the first step waits for a publisher.", metavar="S")
 ]
 Truth = Annotated[bool, flag("Publish the true states of the driven and of all other vehicles.")]
 Names = Annotated[
     Path | None,
-    about("File with names of topics and frames by sensor.", metavar="FILE", exists=True),
+    about("File with the names of topics and frames of each sensor.", metavar="FILE", exists=True),
 ]
 Bag = Annotated[
     Path | None,
@@ -157,7 +157,7 @@ def _refuse_world_options(world: WorldSpec, rig: str | None, pace: float | None)
     wrong = [name for name, value in given.items() if value]
     if wrong:
         raise ConfigError(
-            f"{wrong[0]}: a bridge that joins makes no world; pass it to `cavmarl lead`"
+            f"{wrong[0]}: with --join, the world already runs; give this option to `cavmarl lead`"
         )
 
 

@@ -219,7 +219,7 @@ def realism(
     agents: Annotated[
         int | None,
         about(
-            "Number of agents [default: as configured, 1 for a file].",
+            "Number of agents [default: as configured; 1 for a scene file].",
             metavar="N",
             min=1,
             panel=WORLD,

@@ -48,7 +48,7 @@ DEFAULT_URL = "http://127.0.0.1:8700"
 Url = Annotated[
     str,
     about(
-        "URL of the service; after a comma, those of its standbys.",
+        "URL of the service; URLs of its standbys may follow, comma-separated.",
         "--service",
         metavar="URL",
         envvar=URL_VARIABLE,
@@ -67,7 +67,7 @@ UserSecretFile = Annotated[
 Authority = Annotated[
     Path | None,
     about(
-        "Certificate of the authority that signed the certificate of the service.",
+        "Certificate (PEM) of the authority that signed the service's certificate.",
         metavar="FILE",
         panel=SERVICE,
     ),
@@ -75,7 +75,7 @@ Authority = Annotated[
 PlainHttp = Annotated[
     bool,
     flag(
-        "Send secrets to other machines without TLS, too, in a network that you trust.",
+        "Send secrets to other machines even without TLS; only for networks that you trust.",
         "--plain-http",
         panel=SERVICE,
     ),
@@ -143,8 +143,8 @@ def serve(
     snapshot_events: Annotated[
         int,
         about(
-            "Events after which a snapshot is written, from which the next start continues; 0: "
-            "none, and delete the last one, so that a start replays and checks all events.",
+            "Number of events between two snapshots. A start replays only the events after the "
+            "last snapshot. 0: delete the snapshot, write none, and always replay all events.",
             metavar="N",
             min=0,
         ),
@@ -217,16 +217,16 @@ def submit(
         str,
         typer.Argument(
             metavar="ENV",
-            help="Name of an environment that the service and its nodes have, or the path of a "
-            "folder or map of yours, whose files are uploaded once.",
+            help="Environment: a name that the service and its nodes know, or the path of your "
+            "own folder or map, which is uploaded once.",
         ),
     ],
     policy: Annotated[
         list[str] | None,
         about(
-            "Driver to evaluate: the name of one that the service and its nodes have, or the "
-            "folder of a trained driver of yours, which is uploaded once. Repeat the option to "
-            "compare drivers with the first one [default: idm].",
+            "Driver to evaluate: a name that the service and its nodes know, or the folder of "
+            "your own trained driver, which is uploaded once. Repeat the option to compare other "
+            "drivers with the first driver [default: idm].",
             "--policy",
             "-p",
             metavar="POLICY",
@@ -241,8 +241,8 @@ def submit(
     spread: Annotated[
         bool,
         flag(
-            "Submit each run as a job of its own, so that the nodes share them, and merge the "
-            "results."
+            "Submit each run as a separate job, so that several nodes share the work, and merge "
+            "the results."
         ),
     ] = False,
     out: Annotated[
@@ -294,7 +294,7 @@ def submit(
 
 
 def uploads(env: str, policies: list[str]) -> tuple[str | Path, list[str], dict[str, Path]]:
-    """Return the environment, the names of the drivers, and the folders of those to upload."""
+    """Return the environment, the names of the drivers, and the folders of drivers to upload."""
     environment: str | Path = env
     if env not in entries() and Path(env).exists():
         environment = Path(env)
@@ -390,7 +390,7 @@ def sessions(
     page: Annotated[
         str | None,
         about(
-            "Open a page of this session on its node, and print its address and tokens.",
+            "Open a page for this session on its node, and print the page's address and tokens.",
             metavar="SESSION",
         ),
     ] = None,
@@ -531,7 +531,7 @@ def _state(node: dict[str, Any]) -> str:
 
 
 def _print_reasons(rows: Iterable[tuple[str, str]]) -> None:
-    """Print under a table why nodes accept nothing, or why jobs wait."""
+    """Print the reasons why nodes accept no sessions, or why jobs wait, below a table."""
     for name, reason in rows:
         Console().print(f"{name}: {reason}", markup=False, highlight=False)
 

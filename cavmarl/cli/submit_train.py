@@ -62,7 +62,7 @@ def submit_train(
     job_minutes: Annotated[
         int | None,
         about(
-            "Time after which a job is stopped and queued again, with slurm and local [default: a "
+            "Minutes after which a job is stopped and queued again, with slurm and local [default: a "
             "day].",
             metavar="MIN",
             min=1,

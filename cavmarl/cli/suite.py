@@ -97,7 +97,9 @@ def suite(
         console.print(f"not in {maps}, left out: {', '.join(missing)}", highlight=False)
     if loaded.controllers is not None:
         if policy:
-            raise ConfigError(f"--policy: the suite {name} evaluates signal controllers")
+            raise ConfigError(
+                f"--policy: the suite {name} evaluates signal controllers; leave it out"
+            )
         if (zones, backend, workers) != (None, None, None):
             raise ConfigError(
                 f"--zones, --backend and --workers: the suite {name} runs signal controllers in "

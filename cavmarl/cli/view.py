@@ -78,7 +78,7 @@ def view(
     host: WebHost = "127.0.0.1",
     token: WebToken = "",
     watch_token: WatchToken = "",
-    watch_only: Annotated[bool, flag("Forbid pages to pause, step or drive.", panel=PAGE)] = False,
+    watch_only: Annotated[bool, flag("Do not let pages pause, step or drive.", panel=PAGE)] = False,
     worlds: Annotated[
         int, about("Number of worlds; the page can show each of them.", metavar="N", panel=PAGE)
     ] = 1,

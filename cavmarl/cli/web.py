@@ -19,7 +19,7 @@ WebPort = Annotated[
 WebHost = Annotated[
     str,
     about(
-        "Address that the page is served at; an address other than this machine's needs a token.",
+        "Address to serve the page on. An address that other machines can reach needs a token.",
         "--host",
         metavar="ADDRESS",
         panel=PAGE,

@@ -135,7 +135,7 @@ def verify(
 def cross(
     world: WorldSpec,
     policy: Annotated[
-        list[str], about("Driver. Give two or more.", "--policy", "-p", metavar="POLICY")
+        list[str], about("Drivers, at least two.", "--policy", "-p", metavar="POLICY")
     ],
     episodes: Annotated[
         int, about("Number of episodes of each pair.", "--episodes", "-n", metavar="N")

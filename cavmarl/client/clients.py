@@ -36,7 +36,7 @@ class _Awaitable(Protocol[Flows]):
 
 
 def _method(flow: Callable[..., Flow[Any]]) -> Any:
-    """Return a method that calls `flow` of the object's `flows`, and executes the result."""
+    """Return a method that calls `flow` with the object's `flows`, and runs the returned flow."""
 
     @wraps(flow)
     def method(self: Any, *arguments: Any, **named: Any) -> Any:
@@ -48,14 +48,14 @@ def _method(flow: Callable[..., Flow[Any]]) -> Any:
 def blocking(
     flow: Callable[Concatenate[Flows, P], Flow[T]],
 ) -> Callable[Concatenate[_Blocking[Flows], P], T]:
-    """Return a flow as a method that returns its result."""
+    """Return a method that runs a flow and returns the result."""
     return _method(flow)  # type: ignore[no-any-return]
 
 
 def awaitable(
     flow: Callable[Concatenate[Flows, P], Flow[T]],
 ) -> Callable[Concatenate[_Awaitable[Flows], P], Coroutine[Any, Any, T]]:
-    """Return a flow as a method that returns a coroutine."""
+    """Return a method that returns a coroutine, which runs a flow."""
     return _method(flow)  # type: ignore[no-any-return]
 
 
@@ -98,11 +98,11 @@ class Client:
     """A synchronous client.
 
     Args:
-        url: URL of the service; after a comma, URLs of its standbys.
+        url: URL of the service; URLs of its standbys may follow, comma-separated.
         secret: secret of an identity, as printed by `cavmarl serve` or `cavmarl grant`.
         verify: certificate file of the authority that signed the service's certificate; True
             accepts the authorities that the system trusts.
-        allow_plain_http: send the secret and tokens to other machines without TLS, too.
+        allow_plain_http: send the secret and tokens to other machines even without TLS.
     """
 
     def __init__(
@@ -213,7 +213,7 @@ class Client:
 
 
 class RemoteWorld:
-    """Worlds on a node, with arrays like those of `make_vec`."""
+    """Worlds on a node, with arrays in the same form as from `make_vec`."""
 
     def __init__(self, client: Client, flows: WorldFlows) -> None:
         self._client = client

@@ -30,7 +30,7 @@ def unpack_recordings(parts: Mapping[str, bytes], folder: str | Path) -> list[Pa
             with zipfile.ZipFile(io.BytesIO(content)) as packed:
                 if sum(one.file_size for one in packed.infolist()) > MOST_BYTES:
                     raise RecordingError(f"{name}: has over {MOST_BYTES} bytes; it is not written")
-                packed.extractall(path)  # it writes nothing outside of the folder
+                packed.extractall(path)  # extractall never writes outside of the folder
         except zipfile.BadZipFile as error:
             raise RecordingError(f"{name}: is not a ZIP file ({error}); fetch it again") from error
         found.append(path)

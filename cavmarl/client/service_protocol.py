@@ -55,8 +55,8 @@ class ServiceFlows:
     """Requests to a service, with a token that is renewed in time.
 
     Args:
-        url: URL of the service; after a comma, URLs of its standbys. If one does not answer, the
-            next one is asked.
+        url: URL of the service; URLs of its standbys may follow, comma-separated. If a service does
+            not answer, the next one is asked.
         secret: secret of an identity.
     """
 
@@ -105,7 +105,7 @@ class ServiceFlows:
     ) -> Flow[httpx.Response]:
         """Return the answer to a request; raise ServiceError if it is refused.
 
-        `is_repeatable`: a `POST` that has the same effect if a standby receives it again.
+        `is_repeatable`: whether a `POST` has the same effect if a standby receives it again.
         """
         is_safe = method != "POST" or bool(key) or is_repeatable
         for is_second in (False, True):
@@ -148,7 +148,7 @@ class ServiceFlows:
         yield from self.ask("DELETE", path)
 
     def upload(self, files: Iterable[Upload], licence: str = "") -> Flow[None]:
-        """Store the files that the service does not have from this identity yet."""
+        """Upload the files that this identity has not stored with the service yet."""
         wanted = {one.sha256: one for one in files}
         for one in (yield from self.get("/artefacts", own=1))["artefacts"]:
             wanted.pop(one["sha256"], None)
@@ -291,8 +291,8 @@ def plain_name(name: Any) -> str:
     """Return the name of a result or a job; refuse a name that could lead out of a folder.
 
     Raises:
-        ServiceError: it does not consist of letters, digits, `_`, `.` and `-`, after a letter or
-            digit.
+        ServiceError: the name does not start with a letter or digit, or has characters other than
+            letters, digits, `_`, `.` and `-`.
     """
     if not isinstance(name, str) or not _NAME.fullmatch(name):
         raise ServiceError(f"{name!r}: is not a name; the server is not a cavmarl service")

@@ -26,7 +26,7 @@ class Upload(NamedTuple):
 
 
 def environment_files(environment: str | Path) -> tuple[str, dict[str, Upload]]:
-    """Return the name of an environment, and its files by place if it is a path.
+    """Return the name of an environment and, if it is a path, its files by relative path.
 
     Raises:
         ServiceError: the path is neither a folder with an env.yaml nor a file.
@@ -49,7 +49,7 @@ def environment_files(environment: str | Path) -> tuple[str, dict[str, Upload]]:
 
 
 def driver_files(drivers: Mapping[str, str | Path]) -> dict[str, Upload]:
-    """Return the files of trained drivers by place.
+    """Return the files of trained drivers by relative path.
 
     Raises:
         ServiceError: a folder does not contain a trained driver.

@@ -142,7 +142,7 @@ class WorldFlows:
         seed: int = 0,
         params: Mapping[str, bool | float] | None = None,
     ) -> Flow[None]:
-        """Make the worlds again with a scenario; an empty name: without one. Then reset them.
+        """Recreate the worlds with a scenario (empty name: without one), and reset them.
 
         The arguments are the keys of `scenario` in an env.yaml. An open page of the worlds closes.
         """
@@ -172,7 +172,7 @@ class WorldFlows:
     def save_state(self) -> Flow[bytes]:
         """Store state and recording with the service now, and return the state.
 
-        `load_state` of the same environment from `make_vec` takes it.
+        `make_vec(...).load_state` of the same environment can load it.
         """
         answer = yield from self._asked("POST", SentCommand("save", {}))
         self._trim(answer)
@@ -181,7 +181,7 @@ class WorldFlows:
     def frames(self, final: bool = False) -> Flow[dict[str, SensorFrames]]:
         """Return the samples of the mounted sensors, as `frames` of `make_vec` does.
 
-        With `final`, return those before the reset, as `final_frames` does.
+        With `final`, return the samples before the reset, as `final_frames` does.
         """
         params = {"final": 1} if final else {}
         answer = yield from self._asked("GET", SentCommand("frames", params))

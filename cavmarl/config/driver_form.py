@@ -110,7 +110,7 @@ def common_form(forms: Mapping[str, Form]) -> Form:
         raise PolicyError(
             f"The drivers {', '.join(forms)} need different sensors or actions: "
             f"{'; '.join(lines)}. All drivers of a run must have the same sensors and actions. Run "
-            "each of these drivers in a run of its own"
+            "each of these drivers in a separate run"
         )
     return form
 

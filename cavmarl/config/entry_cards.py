@@ -10,7 +10,7 @@ CARD_FILE = "README.md"
 
 
 def sentence_about(path: Path) -> str:
-    """Return the first sentence about an entry: of its README.md, or of a script's docstring.
+    """Return the first sentence of an entry's README.md, or of a script's docstring.
 
     If there is none, return the path of the entry.
     """

@@ -36,8 +36,8 @@ class MapConfig(Section, key="map"):
 
     Attributes:
         source: a map file: relative to the entry's folder, absolute, or `sumo:PATH` for a file of
-            the eclipse-sumo wheel. A `.sumocfg` gives its network and signal programs. Or a
-            list of map files, or a folder of them; the seed then draws a map for each episode of
+            the eclipse-sumo wheel. A `.sumocfg` gives its network and signal programs. With a
+            list of map files, or a folder of map files, the seed draws a map for each episode of
             each world.
         programs: additional files with signal programs, named like `source`. If a signal has
             several programs, the last one runs.
@@ -48,8 +48,8 @@ class MapConfig(Section, key="map"):
             closed (`close_road`), or with a lower speed limit (`damage_road`). If it is above 0,
             each world has its own table of lanes and its own plans.
         contraflow: ids of roads that can be reversed (`close_road`). The map gets lanes in the
-            opposite direction on them, which are closed until the road is reversed. A reversed road
-            counts in `map.changed_lanes` with the lanes of both directions.
+            opposite direction on them, which are closed until the road is reversed. For a reversed
+            road, the lanes of both directions count towards `map.changed_lanes`.
         events: roads that close, open, slow down or are reversed during each episode; see
             `config.road_events.RoadEvent`.
     """
@@ -343,7 +343,7 @@ class EnvConfig(Section, key=""):
 
     @property
     def tells_sumo(self) -> bool:
-        """Whether SUMO receives commands during an episode, so that it departs from its demand.
+        """Whether SUMO receives commands during an episode, so that it deviates from its demand.
 
         SUMO receives cavmarl's vehicles if it moves vehicles, and changes of lanes.
         """
@@ -369,7 +369,7 @@ class EnvConfig(Section, key=""):
         return found if found is not None and found.have_agents else None
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` cannot have agents beside the road; empty if there are none."""
+        """Return why `what` cannot have agents beside the road; empty without such agents."""
         return "" if self.roadside is None else self.roadside.refusal_of_agents(what)
 
     @property

@@ -65,7 +65,7 @@ class FleetPart:
         type: `car`, `truck`, `bus`, or one of `population.own_types`.
         rig: names of the sensors of `rig` that these vehicles carry; default: all.
         driver: driver of these agents for the policy `fleet`; default: the built-in driver `idm`.
-        share: of the agents, relative to the other parts.
+        share: share of the agents, relative to the shares of the other parts.
     """
 
     type: str = "car"

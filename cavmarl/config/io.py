@@ -124,7 +124,7 @@ def validate(
         kind: a frozen dataclass.
         raw: mappings, sequences, strings, numbers, bools, None.
         where: start of every message, such as the file of `raw`.
-        extra: what happens to unknown keys.
+        extra: whether unknown keys raise an error or are ignored.
 
     Raises:
         ConfigError: a key is unknown or missing, a type is wrong, or `kind` refuses a value. Each

@@ -32,15 +32,15 @@ class LimitsConfig(Section, key="limits"):
         agents: `none`; `all` units; or a list of names of units. Other units set no limit.
         controller: what chooses the limits: `agents` of the environment, or `feedback`; then all
             agents are vehicles.
-        speeds_mps: the limits to choose from, ascending. On a lane with a lower limit on the map,
-            the map's limit holds.
+        speeds_mps: the limits to choose from, ascending. If the map has a lower limit on a
+            lane, that limit applies.
         decide_s: time between two decisions; a whole number of steps of `clock.ctrl_dt_s`.
-        most_change: largest change per decision, in places of `speeds_mps`; 0: no limit.
+        most_change: largest change per decision, in entries of `speeds_mps`; 0: no limit.
         forbidden: a choice that the action mask excludes is ignored and counted (`ignore`), or is
             an ActionError (`error`).
         terms: weights of the reward's terms; see `LIMIT_TERMS`.
         wanted_per_km: above this density, in vehicles per km and lane, `feedback` sets the lowest
-            limit that is allowed; otherwise, the limit rises by one place.
+            allowed limit; otherwise, the limit rises to the next entry of `speeds_mps`.
         watched: section whose density `feedback` reads; empty: the last section.
     """
 
@@ -126,7 +126,7 @@ class LimitsConfig(Section, key="limits"):
         )
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` does not support agents for limits; empty if there are none."""
+        """Return why `what` does not support agents for limits; empty without such agents."""
         if not self.have_agents:
             return ""
         return (

@@ -40,9 +40,9 @@ class PopulationConfig(Section, key="population"):
         external_agents: whether such vehicles can carry the sensors of `rig`; then they are agents
             of a PettingZoo environment while they are in the world: `external_0` and so on.
         reroute: which vehicles take another route if lanes change (`map.changed_lanes`). `never`:
-            none; they wait before a closed road. `blocked`: those whose route leads over a closed
-            lane. `always`: all vehicles for which another route is faster, also if a speed limit
-            changes.
+            none; vehicles wait before a closed road. `blocked`: vehicles whose route leads over a
+            closed lane. `always`: all vehicles for which another route is faster, also after a
+            speed limit has changed.
     """
 
     mode: Literal["closed", "open", "respawn"] = "closed"

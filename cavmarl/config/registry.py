@@ -141,7 +141,7 @@ def load_config(
         max_cycles: sets `horizon_s` to this number of steps.
         overrides: dotted key → value, for all other keys: `{"sensors.lidar.rays": 64}`. As in an
             env.yaml, `rig` may be the name of a rig in `configs/rigs`, or of a file. `plugins` are
-            added to those of the environment.
+            added to the plugins of the environment.
 
     Raises:
         UnknownEnvironmentError: nothing has that name.
@@ -258,7 +258,7 @@ def find_settings(what: str, name: str) -> Path:
 
 
 def _refuse_code(keys: object, where: str) -> None:
-    """Raise an error if an env.yaml names code or programs, which only the caller may do."""
+    """Raise an error if an env.yaml names code or programs, which only the caller may name."""
     scenario = keys.get("scenario") if isinstance(keys, dict) else None
     name = scenario.get("name") if isinstance(scenario, dict) else None
     if isinstance(name, str) and path_of_code(name):

@@ -157,7 +157,7 @@ def _other_rates(rate: Fraction, sim_dt_s: float, in_batches: bool) -> str:
     if rate < 1:
         ticks = math.floor(1 / rate)
         near = [1.0 / (n * sim_dt_s) for n in (ticks + 1, ticks)]
-        way_out = "; or set schedule: accumulate, which meets it on average"
+        way_out = "; or set schedule: accumulate, which keeps the rate on average"
     else:
         near = (
             [n / sim_dt_s for n in (math.floor(rate), math.ceil(rate))]

@@ -63,7 +63,7 @@ class SensorSection(Section, key=""):
         return any(getattr(self, name) for name in self.switches)
 
     def plain(self) -> Self:
-        """Return the section; if the sensor is off, with the defaults of its other keys.
+        """Return the section; if the sensor is off, its other keys are set to their defaults.
 
         The keys of a sensor that is off have no effect.
         """
@@ -361,12 +361,12 @@ class ConflictsConfig(
         count: maximum number of vehicles; 0 switches the sensor off.
         range_m: distance up to which vehicles are seen.
         through_walls: false hides vehicles whose centre is behind a wall of `map.buildings`.
-        heard: true adds vehicles known only from messages (`v2x`), extrapolated; and two numbers
-            per vehicle, see `seen` and `age`.
+        heard: true adds vehicles known only from messages (`v2x`), at extrapolated positions. It
+            also adds two numbers per vehicle, see `seen` and `age`.
         indicators: true assumes that seen vehicles follow their lanes and the direction that they
             indicate at their present or next junction; and adds one number per vehicle, see `turn`.
         indicators_m: distance to the junction from which vehicles indicate; before that, their turn
-            is unknown. 0: they indicate at any distance, which only the world's state can tell.
+            is unknown. 0: they indicate at any distance, as read from the world's state.
     """
 
     count: Annotated[int, Whole(0, 64)] = 0

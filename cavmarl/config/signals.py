@@ -43,7 +43,7 @@ class SignalsConfig(Section, key="signals"):
         min_green_s: a green lasts at least this long.
         max_green_s: at a decision, a green that has lasted this long ends; 0: no maximum.
         longest_red_s: `longest_queue` and `max_pressure` first choose a green for a lane that has
-            been red this long while a vehicle waits; 0: they do not.
+            been red this long while a vehicle waits; 0: off.
         saturation_per_h: `webster`: vehicles per hour of green that leave a lane.
         flow_interval_s: `webster` plans from the vehicles counted in the last interval of this
             length.
@@ -150,7 +150,7 @@ class SignalsConfig(Section, key="signals"):
         return self.are_controlled and self.controller == BY_AGENTS
 
     def refusal_of_agents(self, what: str) -> str:
-        """Return why `what` does not support agents at signals; empty if there are none."""
+        """Return why `what` does not support agents at signals; empty without such agents."""
         if not self.have_agents:
             return ""
         choices = ", ".join(SIGNAL_CONTROLLERS)

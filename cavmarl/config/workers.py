@@ -18,7 +18,7 @@ class WorkersConfig(Section, key="workers"):
         timeout_s: time after which a worker that is still busy with one step or reset is replaced.
             A worker that is stopped or sleeps is noticed within a second.
         max_retries: number of retries of a step after a worker dies.
-        pin: bind each worker to a core of its own. If false, the system may run two on one core. If
+        pin: bind each worker to a core of its own. If false, two workers may run on one core. If
             true, several environments on one machine share the same cores.
         balance_steps: steps between two rounds in which worlds, or zones of a divided world, may
             move to another worker, based on their measured cost; 0: they never move. Results do
@@ -27,8 +27,8 @@ class WorkersConfig(Section, key="workers"):
             division by at most this share.
         max_moves: maximum number of worlds or zones that move in one round.
         monitor_cpu: measure the load of other programs on the workers' cores, and give no more work
-            to workers above a threshold; if false, cores are assumed to be free. Zone nodes measure
-            their machines for `balance_steps`.
+            to workers whose load is above a threshold; if false, cores are assumed to be free. Zone
+            nodes measure their machines for `balance_steps`.
         sensors: processes that compute the sensors of `rig`, for each process that runs worlds;
             0: each process computes its own. Results do not depend on it. See
             docs/guides/sensor_workers.md.

@@ -19,22 +19,23 @@ class ZonesConfig(Section, key="zones"):
     Attributes:
         layout: division method `grid`, `strips` or `bisection`; or a zone file, named like
             `map.source`.
-        count: number of zones; a zone file sets it itself.
+        count: number of zones; with a zone file, the number in the file.
         avoid_junctions: move borders if that keeps junctions in one zone.
         weight: quantity that `bisection` distributes evenly: length of lanes, or area.
         hysteresis_m: distance past a border at which a vehicle changes its zone.
         max_deferred_ticks: ticks for which a vehicle that has crossed a border may stay with its
             old zone, if the new one does not acknowledge it; then the change is forced.
         backoff_ticks: ticks for which a zone that has refused a vehicle is not asked again.
-        halo_m: how far zones see over their borders; default: the minimum for exact results. Less
-            is an error.
-        approach_ticks: how many ticks before its arrival, at its present speed, a vehicle is
-            announced to the next zone.
-        journal: file for the coordinator's log; empty: none. It must not exist.
+        halo_m: how far zones see over their borders; default: the minimum for exact results. A
+            smaller value is an error.
+        approach_ticks: time, in ticks at the present speed, before the crossing of a border at
+            which a vehicle is announced to the next zone.
+        journal: file for the coordinator's log, which must not exist yet; empty: no log.
         check_invariants: check the invariants of ownership at run time.
         repartition_steps: steps between two checks whether bisection by vehicle positions would
-            balance the zones better. Results do not depend on it. 0: zones stay.
-        repartition_tolerance: by what share of the mean the fullest zone must shrink.
+            balance the zones better. Results do not depend on it. 0: never.
+        repartition_tolerance: smallest reduction of the fullest zone for which zones change, as a
+            share of the mean.
         simulators: zones that other simulators run, by number: `carla://HOST:PORT`, or the name of
             a registered simulator (docs/guides/zone_simulators.md).
         simulator_failure: if a simulator fails or refuses a vehicle for too long: `error`, or

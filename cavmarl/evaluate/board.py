@@ -1,4 +1,4 @@
-"""The board: a page of drivers whose results were reproduced by driving again.
+"""The board: a page of drivers whose recorded results were verified by repeating the evaluation.
 
 An entry is a folder NAME with a card (README.md), a closed evaluation of one driver (`result/`),
 and the driver: `model.safetensors`, `config.json` and the manifest of the training, or a script
@@ -104,7 +104,7 @@ def entry_driver(folder: Path) -> Path:
     """Return the driver of an entry: its folder if trained, else the script or the model file.
 
     Raises:
-        PolicyError: there is none.
+        PolicyError: the entry has no driver.
     """
     name = folder.name
     if (folder / WEIGHTS_FILE).is_file():
@@ -122,7 +122,7 @@ def entry_driver(folder: Path) -> Path:
 
 
 def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
-    """Check that an entry is complete and that driving again reproduces the bytes of its result.
+    """Check that an entry is complete, and that repeating the evaluation gives the same bytes.
 
     The driver's script, if there is one, is run. A model file of another library is neither read
     nor run: the files of the verification are then empty.
@@ -131,11 +131,11 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
         ConfigError: there is no such folder, or no card.
         PolicyError: there is no driver, or it cannot be read.
         ManifestError: a manifest is missing, of another version or of other files, a file was
-            changed, or driving again gave other bytes.
+            changed, or the repeated evaluation gave other bytes.
     """
     if not folder.is_dir():
         raise ConfigError(f"{folder}: is not a folder; give the folder of an entry")
-    folder = folder.resolve()  # the name of `.` is that of the folder
+    folder = folder.resolve()  # replaces `.` by the folder's real name
     if not (folder / CARD_FILE).is_file():
         raise ConfigError(f"{folder}: has no {CARD_FILE}; write a card that says what it is")
     driver = entry_driver(folder)
@@ -151,10 +151,10 @@ def check_entry(folder: Path, progress: Progress | None = None) -> Verification:
         raise PolicyError(f"{driver}: ends the program ({error!r}); remove this call") from error
     if found.differing:
         raise ManifestError(
-            f"{folder / RESULT_FOLDER}: {', '.join(found.differing)} of driving again on "
+            f"{folder / RESULT_FOLDER}: {', '.join(found.differing)} of the evaluation repeated on "
             f"{found.found_on} differ from those made on {found.expected_on}; check that the "
-            "driver uses no random numbers but those of `reset(seed)` and no clock, and evaluate "
-            "it again with this version"
+            "driver uses no clock and no random numbers other than from `reset(seed)`, and "
+            "evaluate it again with this version"
         )
     return found
 
@@ -167,8 +167,8 @@ def entries_in(folders: Iterable[Path], only: Collection[str] = ()) -> list[Path
         only: names of the wanted entries; empty: all.
 
     Raises:
-        ConfigError: a folder does not exist, there are no entries, two have the same name, or a
-            wanted one is missing.
+        ConfigError: a folder does not exist, there are no entries, two entries have the same name,
+            or a wanted entry is missing.
     """
     found: dict[str, Path] = {}
     for folder in folders:
@@ -240,7 +240,7 @@ def _read_result(folder: Path, driver: Path) -> dict[str, Any]:
             )
     if len(document["policies"]) != 1:
         raise ManifestError(
-            f"{result}: is of {len(document['policies'])} drivers; evaluate this driver alone: "
+            f"{result}: has {len(document['policies'])} drivers; evaluate this driver alone: "
             f"cavmarl evaluate ENV --policy {driver} --out {result}"
         )
     return document
@@ -257,7 +257,7 @@ def _entry(folder: Path, progress: Progress | None) -> BoardEntry:
         failure = f"{fault_in(folder, error)}; correct the script"
     try:
         return _described(folder, failure)
-    except Exception as error:  # a damaged result must not prevent the page of the others
+    except Exception as error:  # a damaged result must not prevent the page of other entries
         failure = failure or f"its result cannot be shown ({error}); evaluate the driver again"
         return BoardEntry(folder.name, sentence_about(folder), failure=failure)
 

@@ -60,7 +60,7 @@ def world_maker(
         demand: demand that replaces the environment's vehicles, with ticks of `TICK_S`.
         layout: shape of the zones, or a zone file.
         seconds: length of the episode in s.
-        keys: of the world; with `demand`, numbers of vehicles are ignored.
+        keys: keys of the world; with `demand`, numbers of vehicles are ignored.
     """
     spec = WorldSpec.of(env, **keys)
     if demand:

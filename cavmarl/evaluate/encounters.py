@@ -47,7 +47,7 @@ class EncounterWatch:
         self._seen_agent = np.full(shape, -1, dtype=np.int32)
 
     def locate(self, worlds: Worlds) -> None:
-        """Note the places of the agents in the present state of the worlds."""
+        """Record the places of the agents in the present state of the worlds."""
         locate_agents(worlds.rows, worlds.num_owned, self._recorder.places_m)
 
     def encounters(

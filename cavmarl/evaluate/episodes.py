@@ -46,7 +46,7 @@ from cavmarl.zones.partition.zone_statistics import imbalance
 MAX_VEHICLES = 100_000  # maximum number in all worlds that are stepped together
 MAX_WORLDS = 128
 TRACK_S = 0.5  # time between two points of a track
-TIMED_TICKS = 16  # one of this many ticks is timed zone by zone
+TIMED_TICKS = 16  # in one of 16 ticks, the time of each zone is measured
 
 Progress = Callable[
     [str, int, int], None
@@ -76,8 +76,8 @@ class Speed:
     policy_ms: float  # milliseconds of the policy for one step of one world
     agent_steps_per_s: float  # decisions a second, simulation and policy
     worlds: int  # number of worlds stepped together
-    # time of the slowest zone in a tick over the mean of all zones, by the
-    # processor time of all worlds; None: not measured
+    # processor time of the slowest zone over the mean of all zones, summed over all worlds;
+    # None: not measured
     zone_time_imbalance: float | None = None
 
 

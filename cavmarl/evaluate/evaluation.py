@@ -113,8 +113,8 @@ def evaluate(
     sensors. Two or more runs are driven in new processes, one after the other.
 
     Args:
-        env: as in `make_vec`, like the keywords that are not listed here.
-        policies: as in `load_policy`: one, several, or a mapping from names in the results.
+        env: as in `make_vec`, like all keywords that are not listed here.
+        policies: as in `load_policy`: one, several, or a mapping: name in the results → policy.
         episodes: number of episodes of each run.
         repeats: number of independent runs.
         out: folder for manifest and raw results; None: only the report is returned.
@@ -124,14 +124,15 @@ def evaluate(
         failures: number of failed trips on the page `failures.html` in `out`; 0: no page.
         zones: sets zones.count, as in `make_vec`.
         backend: where the worlds run, as in `make_vec`. Results do not depend on it, except for
-            `zone_imbalance`, since nodes change owners only between steps. If other processes run
-            the worlds, this process copies their state after each step, and the report lists what
-            each process used.
+            `zone_imbalance`, because on nodes, vehicles change their zone only between steps. If
+            other processes run the worlds, this process copies their state after each step, and the
+            report lists what each process used.
         progress: called after every step of a run with the policy's name, the steps done in this
             run, and the maximum number of steps.
         watcher: called with the worlds that are stepped together; it returns a function that is
             called after each reset and step, outside of the measured time. With one run only.
-        keys: keys of the world; the seed is that of the first run and determines the others.
+        keys: keys of the world; `seed` is the seed of the first run, from which the seeds of the
+            other runs follow.
 
     Raises:
         ConfigError: a wrong number or key, an override that contradicts a trained driver, `out`
@@ -204,14 +205,14 @@ def load_report(folder: Path) -> EvaluationReport:
 def read_evaluation(folder: Path) -> dict[str, Any]:
     """Return the closed manifest of an evaluation with the metrics of this version.
 
-    Raises ManifestError if it is missing or open, if a table is not listed or was changed, or for
-    other metrics.
+    Raises ManifestError if it is missing or open, if a table is not listed or was changed, or if
+    another version of the metrics was used.
     """
     manifest = read_closed(folder)
     version = manifest.get("metrics_version", 1)
     if version != METRICS_VERSION:
         raise ManifestError(
-            f"{folder}: its metrics are of version {version}, those of this cavmarl of version "
+            f"{folder}: has metrics of version {version}, but this cavmarl has version "
             f"{METRICS_VERSION}; figures of different versions cannot be compared: evaluate again"
         )
     for name in (TRIPS_FILE, EPISODES_FILE):

@@ -127,7 +127,7 @@ class FailureClips:
     def _sensed(
         self, frame: WorldFrame, kept: NDArray[np.float32] | None, agent: int, vehicle: int
     ) -> list[Shape]:
-        """Return what the agent observed at a moment, if it was in this vehicle."""
+        """Return shapes of the observation of an agent, if the agent was in this vehicle."""
         mine = frame.vehicles[frame.vehicles["id"] == vehicle]
         if kept is None or not len(mine) or int(mine["agent"][0]) != agent:
             return []
@@ -164,8 +164,8 @@ def clip_of(frames: Sequence[WorldFrame], center: tuple[float, float]) -> dict[s
     """Return the vehicles near a place in some frames, as numbers for a page.
 
     Returns:
-        `vehicles`: by id [length, width, agent]; `frames`: of each the tick and [id, x, y, heading,
-            speed, lights] of each vehicle; lights: 1 brakes, 2 left, 4 right.
+        `vehicles`: id → [length, width, agent]; `frames`: for each frame, the tick and a row [id,
+            x, y, heading, speed, lights] per vehicle; lights: 1 brakes, 2 left, 4 right.
     """
     vehicles: dict[str, list[float]] = {}
     shown = []

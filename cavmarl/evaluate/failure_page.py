@@ -34,7 +34,7 @@ def write_failures(
         path: the file to write.
         failures: the failures that were kept.
         most: number of failures to show.
-        found: number of all failures, including those not kept.
+        found: number of all failures, including failures that were not kept.
         network: the map; lanes far from all failures are left out.
         environment: name for the title.
 

@@ -91,7 +91,7 @@ function draw() {
   canvas.dataset.sensed = sensed.map((shape) => shape.name).join(" ");
 }
 
-// Rays of a sensor to what they met, or links to vehicles that were seen.
+// Draws the rays of a sensor to the objects that they hit, or links to vehicles that were seen.
 function sense(shape, [, x, y, heading], px, py) {
   const turn = shape.axes === "map" ? 0 : heading, cos = Math.cos(turn), sin = Math.sin(turn);
   const at = (ax, ay) => [px(x + ax * cos - ay * sin), py(y + ax * sin + ay * cos)];

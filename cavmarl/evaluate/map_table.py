@@ -17,7 +17,7 @@ SHOWN = ("success", "collision", "off_road", "red_light", "stood", "blocked", KM
 def rows_by_map(
     tables: Mapping[str, tuple[NDArray[np.void], NDArray[np.void]]], names: Sequence[str]
 ) -> dict[str, list[dict[str, Any]]]:
-    """Return for each policy one row per map, worst success first; nothing for one map.
+    """Return for each policy one row per map, worst success first; {} for one map.
 
     `tables`: TRIP and EPISODE records. `names`: names of the maps. Maps without counted trips are
     left out.

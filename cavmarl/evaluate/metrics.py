@@ -60,7 +60,7 @@ METRICS = (
     _share("arrived", "arrived", "trips that arrived", "more"),
     _share("collision", "collision", "trips that ended by touching a vehicle", "less"),
     _share("off_road", "off road", "trips that ended off the road", "less"),
-    _share("unfinished", "unfinished", "trips that a horizon cut: the episode's, or their own",
+    _share("unfinished", "unfinished", "trips that were cut by the horizon of the episode or trip",
            "less"),
     _share("blocked", "blocked", "trips that were cut while stopped where the built-in driver "
            "would stop, too", "less"),
@@ -70,14 +70,14 @@ METRICS = (
     _share("red_light", "red light", "trips that passed a red light", "less"),
     _share("wrong_way", "wrong way", "trips that drove against a lane", "less"),
     Metric(KM_PER_INFRACTION, "way per infraction", "km", "run",
-           "kilometres driven for each collision, way off the road, red light and wrong way; with "
-           "none, all kilometres (a lower bound)", "more"),
+           "kilometres driven per collision, departure from the road, red light or wrong way; "
+           "without any, all kilometres (a lower bound)", "more"),
     Metric("agent_arrivals_per_h", "agents arriving", "1/h", "episode",
            "agents that arrived in an hour of simulated time", "more"),
     Metric("background_arrivals_per_h", "others arriving", "1/h", "episode",
            "background vehicles that arrived in an hour of simulated time", "more"),
-    _arrived("delay_s", "delay", "time lost against driving at the limit, or at the type's maximum "
-             "speed", "less"),
+    _arrived("delay_s", "delay", "time lost compared with driving at the limit or the type's "
+             "maximum speed", "less"),
     _arrived("duration_s", "duration", "from the first decision to the goal"),
     Metric("mean_speed_mps", "speed", "m/s", "trip", "progress towards the goal over time"),
     Metric("energy_wh_per_km", "energy", "Wh/km", "run",
@@ -92,7 +92,7 @@ METRICS = (
            "mean speed above the limit, as a share of it", "less", scale=100.0),
     Metric("mean_jerk_mps3", "jerk", "m/s³", "trip", "mean |jerk|", "less"),
     Metric("least_ttc_s", "least TTC", "s", "trip",
-           "least time to collision of a trip; 4 stands for that and above", "more"),
+           "least time to collision of a trip; 4 means 4 s or more", "more"),
     Metric("short_ttc_share", "TTC < 1.5 s", "% time", "trip",
            "share of a trip with a time to collision below 1.5 s", "less", bounded=True,
            scale=100.0),
@@ -107,14 +107,14 @@ METRICS = (
            "vehicles of the fullest zone over the mean of all zones, mean over the steps: 1 is "
            "even", "less"),
     _percent("v2x_reception_ratio", "packets received",
-             "share of the packets within reach of a receiver that it received", "more"),
+             "share of received packets among the packets within reach of a receiver", "more"),
     Metric("v2x_latency_s", "latency of packets", "s", "episode",
            "mean time from sending to receiving", "less"),
     _percent("v2x_busy_ratio", "channel busy ratio",
-             "share of the time in which receivers hear others send", "less"),
+             "share of the time in which a receiver finds the channel busy", "less"),
     *(
         Metric(reward_column(term), f"return from {term.replace('_', ' ')}", "", "episode",
-               f"that part of the return: weight · sum of `{term}`")
+               f"part of the return: weight · sum of `{term}`")
         for term in TERMS
     ),
 )  # fmt: skip
@@ -135,7 +135,7 @@ def metric_values(
 
 
 def _of_run(metric: Metric, trips: NDArray[np.void]) -> NDArray[np.float64]:
-    """Return one value; none without trips, and none per kilometre without a kilometre."""
+    """Return one value (1,); it is missing (0,) without trips or, per km, without kilometres."""
     km = np.maximum(trips["distance_m"], 0.0).sum(keepdims=True) / 1000.0
     if metric.name == KM_PER_INFRACTION:
         infractions = sum(int(trips[name].sum()) for name in INFRACTIONS)

@@ -146,7 +146,7 @@ def _change(metric: Metric, found: PairedDifference) -> dict[str, str]:
 
 
 def _verdict(metric: Metric, found: PairedDifference) -> str:
-    """Return better or worse, or an empty text if the metric or the interval allows neither."""
+    """Return `better` or `worse`, or an empty text if the difference cannot be judged."""
     if not found.distinct or metric.better is None or found.mean is None:
         return ""
     return "better" if (found.mean > 0.0) == (metric.better == "more") else "worse"
@@ -245,7 +245,7 @@ FIGURES = (
             lambda found: found.latency_ticks),
     _Figure("latency behind the border", "ticks", "for which the old owner moved the vehicle",
             lambda found: found.waited_ticks),
-    _Figure("latency", "ms", "the same as wall time; not repeatable",
+    _Figure("latency", "ms", "the same in wall time; not repeatable",
             lambda found: found.latency_ms),
     _Figure("state", "bytes", "size of the state of a vehicle", lambda found: found.state_bytes),
     _Figure("depth at PREPARE", "m", "outside of the old zone at the first state; inside: below 0",

@@ -63,7 +63,7 @@ class Found:
 
 @dataclass(frozen=True)
 class PairedDifference:
-    """A policy minus the first one, paired by run on the same seeds."""
+    """The difference of a policy from the first policy, paired by runs with equal seeds."""
 
     mean: float | None  # mean difference of run means; None without data
     # interval of that mean by Student's t for paired samples; None with fewer than two runs
@@ -82,7 +82,7 @@ class PolicyReport:
     """All results of one policy."""
 
     trips: int  # number of counted trips in all runs
-    metrics: Mapping[str, Found]  # by the names of `metrics.METRICS`
+    metrics: Mapping[str, Found]  # name in `metrics.METRICS` → results
     # metric → paired difference from the first policy; empty for the first policy
     minus_first: Mapping[str, PairedDifference]
     speed: tuple[Speed, ...]  # speed of each run; not reproducible
@@ -93,7 +93,7 @@ class PolicyReport:
         return self.metrics[metric]
 
     def is_above(self, metric: Metric) -> bool:
-        """Return whether the true value is above the mean: no infraction in all kilometres."""
+        """Return whether the mean is only a lower bound, because there was no infraction."""
         if metric.name != KM_PER_INFRACTION or self[metric.name].mean is None:
             return False
         return not any(self[name].mean for name in INFRACTIONS)
@@ -103,10 +103,10 @@ class PolicyReport:
 class EvaluationReport:
     """The results of policies over the same episodes."""
 
-    policies: Mapping[str, PolicyReport]  # by name, in the given order
-    repeats: int  # independent runs
-    episodes: int  # of each run
-    seeds: tuple[int, ...]  # of the runs
+    policies: Mapping[str, PolicyReport]  # name → results, in the given order
+    repeats: int  # number of independent runs
+    episodes: int  # number of episodes of each run
+    seeds: tuple[int, ...]  # seed of each run
     manifest: Mapping[str, Any]  # closed manifest of the results
     # rows of `rows_by_map` by policy; empty for one map
     by_map: Mapping[str, Sequence[Mapping[str, Any]]]

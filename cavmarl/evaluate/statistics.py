@@ -52,8 +52,8 @@ def within_run(values: Values, *, share: bool) -> Within:
 def mean_interval(means: Values) -> Interval | None:
     """Return the interval of the mean of independent runs (R,) by Student's t.
 
-    mean ± t(0.975, R - 1) · sd / √R, where sd is that of the run means. None for fewer than two
-    runs, or if all runs have the same value, which says nothing about the spread of other runs.
+    mean ± t(0.975, R - 1) · sd / √R, with the standard deviation sd of the run means. None for
+    fewer than two runs, or if all runs have the same value, which does not show the spread.
     """
     error = _error_of(means)
     if error == 0.0:
@@ -66,8 +66,8 @@ def mean_interval(means: Values) -> Interval | None:
 def bounded_interval(means: Values, least: float) -> Interval | None:
     """Return `mean_interval` for values from `least` to 1, limited to this range.
 
-    It is Wilson's interval with Student's t, for the number of trips that gives the error of the
-    run means.
+    It is Wilson's interval with Student's t, for the number of trips that would have the same
+    standard error as the run means.
     """
     error = _error_of(means) / (1.0 - least) if least < 1.0 else 0.0
     if error == 0.0:

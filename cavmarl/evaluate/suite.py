@@ -31,7 +31,7 @@ class Suite:
     maps: tuple[str, ...]  # names of environments, or map files in the folder of maps
     agents: tuple[int, ...] | None = None  # numbers of agents
     background: int | None = None  # background vehicles of every world
-    horizon_s: float | None = None  # of every episode
+    horizon_s: float | None = None  # horizon of every episode
     # controllers of all signals, see `run_controller`; None: the suite evaluates policies
     controllers: tuple[str, ...] | None = None
     more_maps: tuple[str, ...] = ()  # maps that are left out if the folder does not have them
@@ -49,7 +49,7 @@ class Suite:
 class SuiteWorld:
     """One world of a suite."""
 
-    label: str  # its name in results, and its folder
+    label: str  # name in results, and name of the folder
     env: str  # as in `make_vec`
     agents: int | None  # number of agents; None: as configured by the environment
 
@@ -117,8 +117,7 @@ def run_suite(
 
     If the suite sets the number of agents, trips that end are replaced (respawn), so that the
     number stays the same. `began` is called before each world. `overrides` are values of further
-    keys of every world. Policies, episodes, repeats,
-    seed, zones and backend are as in `evaluate`.
+    keys of every world. Policies, episodes, repeats, seed, zones and backend are as in `evaluate`.
     """
     reports = {}
     keys: dict[str, object] = {}

@@ -31,7 +31,7 @@ TRIP = np.dtype(
         ("run", np.int64),
         ("episode", np.int64),
         ("agent", np.int64),  # index of the agent
-        ("map", np.int64),  # number of the map among those of the environment
+        ("map", np.int64),  # number of the map among the environment's maps
         ("began_s", np.float64),  # time of the episode at its first decision
         ("counted", np.bool_),  # whether it began in the first half of its episode
         ("arrived", np.bool_),  # how it ended: exactly one of these four
@@ -52,8 +52,8 @@ TRIP = np.dtype(
         ("mean_speed_mps", np.float64),  # distance over duration
         ("delay_s", np.float64),  # time lost compared with driving at `free_speed`
         ("mean_jerk_mps3", np.float64),  # mean |jerk|
-        ("energy_wh", np.float64),  # of an electric car, less what it recuperated
-        ("co2_g", np.float64),  # of a combustion engine
+        ("energy_wh", np.float64),  # energy of an electric car, minus recuperation
+        ("co2_g", np.float64),  # CO₂ of a combustion engine
         ("mean_speeding", np.float64),  # mean speed above the limit, as a share of it
         ("least_ttc_s", np.float64),  # least time to collision, at most TTC_HORIZON_S
         ("short_ttc_share", np.float64),  # share of the trip with less than SHORT_TTC_S
@@ -70,12 +70,12 @@ EPISODE = np.dtype(
         ("duration_s", np.float64),
         ("trips", np.int64),  # number of trips that ended or were cut in the episode
         ("episode_return", np.float64),  # sum of rewards of an agent id, mean over the ids
-        ("agent_arrivals_per_h", np.float64),  # of simulated time
+        ("agent_arrivals_per_h", np.float64),  # arrivals per hour of simulated time
         ("background_arrivals_per_h", np.float64),
         ("background_energy_wh_per_km", np.float64),  # as in TRIP; NaN: no background vehicle
         ("background_co2_g_per_km", np.float64),
-        ("jain_speed", np.float64),  # of the mean speeds of its trips that count
-        ("gini_delay", np.float64),  # of the delays per kilometre of these trips
+        ("jain_speed", np.float64),  # Jain's index of the mean speeds of counted trips
+        ("gini_delay", np.float64),  # Gini's coefficient of their delays per kilometre
         ("zone_imbalance", np.float64),  # max / mean of vehicles by zone; NaN: undivided
         ("v2x_reception_ratio", np.float64),  # packets received over packets in range; NaN: no V2X
         ("v2x_latency_s", np.float64),  # mean, from sending to receiving
@@ -98,7 +98,7 @@ TRANSFER = np.dtype(
         ("source", np.int64),
         ("target", np.int64),
         ("epoch", np.int64),
-        ("forced", np.bool_),  # state attached: the target was not ready in time
+        ("forced", np.bool_),  # the state was sent with the change, as the target was not ready
         ("removed", np.bool_),  # the vehicle left the world in that tick
         ("approached", np.int64),  # tick of the first state at the target; -1: none
         ("waited", np.int64),  # ticks with the old owner after the crossing
@@ -115,12 +115,12 @@ RESOURCE = np.dtype(
     [
         ("run", np.int64),
         ("process", np.int64),  # number of the worker or node; -1: the caller
-        ("begin_s", np.float64),  # simulated time of the run at the begin of the window
+        ("begin_s", np.float64),  # simulated time of the run at the beginning of the window
         ("ticks", np.int64),  # length of the window
-        ("wall_s", np.float64),  # the same as wall time
+        ("wall_s", np.float64),  # wall time of the window
         ("cpu_s", np.float64),  # processor time in the window
         ("memory_bytes", np.float64),  # resident at the end of the window
-        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown, like the others
+        ("waited_s", np.float64),  # time a node waited for frames; NaN: unknown (also below)
         ("sent_bytes", np.float64),  # to other nodes and to the caller
         ("sent_frames", np.float64),
         ("vehicles", np.float64),  # owned at the end of the window, in all worlds

@@ -1,7 +1,7 @@
-"""The zoo: trained drivers with results that can be verified by driving again.
+"""The zoo: trained drivers with results that can be verified by repeating the evaluation.
 
 An entry is the folder of a trained driver with a folder `result/`: a closed evaluation of `cavmarl
-evaluate`. To verify an entry, the same episodes are driven again and the bytes compared.
+evaluate`. To verify an entry, its evaluation is repeated and the bytes are compared.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class ZooEntry:
 
 @dataclass(frozen=True)
 class Verification:
-    """An entry's result compared with driving the same episodes again.
+    """An entry's result compared with a repetition of its evaluation.
 
     Attributes:
         name: name of the driver.
@@ -120,7 +120,7 @@ class Cross:
 
 
 def zoo_entries() -> list[ZooEntry]:
-    """Return the named trained drivers; an unreadable one states the reason."""
+    """Return the named trained drivers; if a driver is unreadable, its entry states the reason."""
     return [_told(name, path) for name, path in sorted(agent_entries().items()) if path.is_dir()]
 
 
@@ -133,7 +133,7 @@ def verify_entry(policy: str | Path, progress: Progress | None = None) -> Verifi
 
     Raises:
         PolicyError: there is no such driver, or it is not trained.
-        ManifestError: there is no result, or weights or world differ from those it was made with.
+        ManifestError: there is no result, or the weights or the world have changed since then.
     """
     folder = _trained(policy)[1]
     return verify_result(folder, folder, progress)
@@ -180,8 +180,8 @@ def cross(
 ) -> Cross:
     """Evaluate each driver among the vehicles of each other driver.
 
-    All pairs drive the same episodes. Agents with even numbers belong to the driver, odd ones to
-    the other driver.
+    All pairs drive the same episodes. Agents with even numbers belong to the driver, agents with
+    odd numbers to the other driver.
 
     Raises:
         ConfigError: the environment has fewer than two agents.
@@ -268,7 +268,7 @@ def entry_job(document: Mapping[str, Any], folder: Path) -> EntryJob:
         folder: folder of the driver.
 
     Raises:
-        ManifestError: the manifest does not contain it.
+        ManifestError: the manifest does not state how the result was made.
     """
     job = document.get("job")
     if (

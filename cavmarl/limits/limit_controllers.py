@@ -45,7 +45,7 @@ class LimitController(Protocol):
 
 
 class Feedback:
-    """Sets the lowest limit if the density is above the target; otherwise, raises it by one place.
+    """Sets the lowest limit if the density is above the target; otherwise, raises it by one step.
 
     A low limit before a queue reduces the inflow for a while, so that the queue dissolves.
 

@@ -123,7 +123,7 @@ def extra_rows(path: Path, table: Any, dtype: np.dtype[Any]) -> tuple[Any, NDArr
 def take_rows(extras: Mapping[str, NDArray[np.void]], episode: int, tick: int) -> Any:
     """Yield (table, `ExtraRows`) of a frame; rows of later ticks belong to the previous episode.
 
-    Such rows belong to the step in which the world restarted.
+    In a step in which the world restarts, the tick of the frame is smaller than before.
     """
     for name, rows in extras.items():
         late = rows["tick"] > tick

@@ -88,7 +88,7 @@ def _wrong_vehicles(frames: Sequence[RecordedFrame], rows: NDArray[np.void], num
         wrong_size = ~((rows[name] > 0.0) & (rows[name] <= MOST_SIZE_M))
         if wrong_size.any():
             row = rows[np.argmax(wrong_size)]
-            return f"vehicle {row['id']} has {name} = {row[name]:g}: 0 to {MOST_SIZE_M:g} m"
+            return f"vehicle {row['id']} has {name} = {row[name]:g}, not in (0, {MOST_SIZE_M:g}] m"
     is_after = np.diff(rows["id"]) > 0
     starts = np.cumsum([len(one.frame.vehicles) for one in frames])
     starts = starts[(starts > 0) & (starts < len(rows))]

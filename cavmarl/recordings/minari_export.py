@@ -52,7 +52,7 @@ def write_minari(recording: Recording, folder: Path) -> tuple[int, int]:
     shapes = first.observations.shape[1:], first.actions.shape[1:], first.actions.dtype.kind == "i"
     if shapes != (observed.shape, acted.shape, isinstance(acted, spaces.Discrete)):
         raise RecordingError(
-            f"{recording.path}: its observations and actions are not those of the settings in its "
+            f"{recording.path}: its observations and actions do not match the settings in its "
             "manifest; use the version of cavmarl that wrote it, or record the run again"
         )
     data = folder / DATA_FOLDER

@@ -95,8 +95,8 @@ def _check_columns(recording: Recording) -> None:
     for name, allowed in wanted.items():
         if kinds[name] not in allowed:
             raise RecordingError(
-                f"{recording.path}: column {name} of its observations is {kinds[name]}: is "
-                "damaged; get the recording again"
+                f"{recording.path}: column {name} of its observations has the type {kinds[name]}; "
+                "the recording is damaged: get it again"
             )
 
 

@@ -26,8 +26,8 @@ MOST_RATIO = 256  # limit of bytes in memory / bytes in the file; LZ4 cannot com
 def damaged(path: Path, why: str) -> RecordingError:
     """Return the error for a damaged file."""
     return RecordingError(
-        f"{path}: is damaged ({' '.join(why.split())}); restore it, or remove the files with that "
-        "name and the later ones to read the earlier parts"
+        f"{path}: is damaged ({' '.join(why.split())}); restore it; or, to read the "
+        "earlier parts, remove the files with this number and larger numbers from all folders"
     )
 
 
@@ -70,8 +70,8 @@ def read_table(path: Path, schema: Any) -> Any:
         return table
     except FileNotFoundError:
         raise RecordingError(
-            f"{path}: is missing, although its part was committed; restore it, or remove the files "
-            "with that name and the later ones to read the earlier parts"
+            f"{path}: is missing, although its part was committed; restore it; or, to read the "
+            "earlier parts, remove the files with this number and larger numbers from all folders"
         ) from None
     except MemoryError as error:
         raise damaged(path, "its rows need more memory than there is") from error

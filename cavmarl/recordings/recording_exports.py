@@ -167,7 +167,7 @@ def write_mcap(
             for event in events.pop(frame.tick, ()):
                 _write(writer, event_channel, now_ns, event._asdict())
             count += 1
-        for tick, late in sorted(events.items()):  # the last frame of their step is missing
+        for tick, late in sorted(events.items()):  # events of a last step whose frame is missing
             for event in late:
                 now_ns = round(tick * recording.head.sim_dt_s * 1e9)
                 _write(writer, event_channel, now_ns, event._asdict())

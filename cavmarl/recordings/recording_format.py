@@ -104,7 +104,7 @@ class RecordingHead:
         return ZonePartition((low_x, low_y, high_x, high_y), np.array(self.rects))
 
     def wrong(self) -> str:
-        """Return what is wrong with a head from a file; empty if nothing. Bad types may raise."""
+        """Return what is wrong with a head from a file; empty if nothing. Wrong types may raise."""
         self.partition  # noqa: B018 - raises for invalid zones
         texts = [self.network[key] for key in ("name", "source_sha256", "layout", "sha256")]
         texts += [self.environment, self.status, *self.terms, *chain(*self.features)]
@@ -139,7 +139,7 @@ class RecordingHead:
         if name == "observations":
             terms, values = dtype["terms"].shape, dtype["values"].shape
             if terms != (len(self.terms),) or len(values) != 1 or values[0] < len(self.features):
-                return "the terms or features are not those of the observations"
+                return "the terms or features do not match the observations"
             if any(len(pair) != 2 for pair in self.features):
                 return "a feature has no sensor or no name"
         return ""

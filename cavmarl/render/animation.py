@@ -15,7 +15,7 @@ class AnimationWriter:
     """Writes uint8 frames to an animated WebP file that repeats; use it in a `with` block.
 
     All frames stay in memory until the end, reduced to 256 colours each: use `VideoWriter` for more
-    than some hundred frames. Without frames, no file is written.
+    than a few hundred frames. Without frames, no file is written.
 
     `path`: ends in `.webp`.
 

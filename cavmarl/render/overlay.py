@@ -113,7 +113,7 @@ PANEL_ALPHA = 225
 TITLE_PX = 23
 TEXT_PX = 17
 LABEL_PX = 15
-SCALE_OF_LABELS_ON_CARS = 8.0  # pixels per metre from which a car is wider than its number
+SCALE_OF_LABELS_ON_CARS = 8.0  # scale in pixels per metre from which a car is wider than its number
 SCALE_BAR_PX = 140
 
 

@@ -81,7 +81,7 @@ class TopDownRenderer:
 
     `size`: width and height of the picture in pixels; by default derived from the map's shape.
     `focus`: (min_x, min_y, max_x, max_y) in metres to show; by default all roads or, if there are
-    several maps, those of the vehicles' map. `goal_edges`: EDGE rows (M, G) by MAP row and
+    several maps, the roads of the vehicles' map. `goal_edges`: EDGE rows (M, G) by MAP row and
     `VEHICLE["goal"]`; if given, each agent's destination is marked.
 
     Raises MissingExtraError: pygame-ce is not installed.

@@ -143,7 +143,7 @@ def owner_paints(
 def draw_transfers(
     surface: Surface, view: ZoneView, vehicles: NDArray[np.void], camera: Viewport
 ) -> None:
-    """Draw a ring in the target's colour around each vehicle in transfer, with a head towards it.
+    """Draw a ring in the target's colour around each vehicle in transfer, with an arrow head.
 
     `vehicles`: all vehicles; a transfer of a vehicle that has left is not drawn.
     """
@@ -163,9 +163,9 @@ def draw_transfers(
 def _towards(
     partition: ZonePartition, transfer: TransferInFlight, place: NDArray[np.float64], heading: float
 ) -> tuple[float, float]:
-    """Return the direction in the plane from the source zone to the target, seen at their border.
+    """Return the direction in the plane from the source zone to the target zone, near a vehicle.
 
-    If the vehicle is on the border itself, the result is its own direction.
+    If the vehicle is on the border itself, the result is the direction of the vehicle.
     """
     source, target = partition.reaching[[transfer.source, transfer.target]]
     way = np.clip(place, target[:2], target[2:]) - np.clip(place, source[:2], source[2:])

@@ -31,7 +31,7 @@ ACCESS_S = 900.0
 REFRESH_S = 8 * 3600.0
 KEYS_KEPT = 2  # keys whose tokens are accepted: the current and the previous one
 MOST_VERIFIED = 10_000
-STATE_S = 3600.0  # validity of the signature of a state; longer than clocks are apart
+STATE_S = 3600.0  # validity of the signature of a state; exceeds any difference between clocks
 
 Admit = Callable[[str], None]
 
@@ -98,18 +98,18 @@ class Access:
 
         Args:
             secret: as `add_identity` returned it.
-            admit: called with the id of its identity before anything is done; it may raise.
+            admit: called first, with the id of the identity; may raise an error.
         """
         identity = self._by_secret(secret)
         admit(identity.id)
         return self._tokens(identity)
 
     def refresh(self, refresh_token: str, admit: Admit = lambda _: None) -> dict[str, Any]:
-        """Return new tokens for an unused refresh token; `admit` is that of `exchange`."""
+        """Return new tokens for an unused refresh token; for `admit`, see `exchange`."""
         claims = self._verify(refresh_token, "refresh")
         identity = self._identity(claims["sub"])
         admit(identity.id)
-        if claims["jti"] in identity.used:  # a used token means that it, or its answer, was stolen
+        if claims["jti"] in identity.used:  # the token, or the answer to its first use, was stolen
             self._log.record("identity.withdrawn", identity.id)
             raise problem(
                 "bad-token",

@@ -26,7 +26,7 @@ MAX_BODY_BYTES = 256 * 1024
 MAX_CONTENT_BYTES = 64 * 1024 * 1024  # maximum size of a saved state, a result or an artefact
 _CONTENT = re.compile(r"/v1/(sessions/[^/]+/state|jobs/[^/]+/results/[^/]+|artefacts/[^/]+)")
 MAX_PATH_BYTES = 1024
-MAX_SECRET_BYTES = 64 * 1024  # of the body of POST /v1/token, which needs no token
+MAX_SECRET_BYTES = 64 * 1024  # maximum body of POST /v1/token, which needs no token
 NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the environment configures
     "tracing": False,
     "metrics": False,
@@ -34,7 +34,7 @@ NO_TELEMETRY: TelemetryConfig = {  # do not export telemetry, whatever the envir
     "auto_configure": False,
 }
 BODY_S = 10.0  # time limit for receiving a body
-CHECK_S = 0.05  # a thread checks older events for this time, and then pauses for as long
+CHECK_S = 0.05  # a thread checks older events for this time, then pauses for the same time
 HEADERS = {
     b"x-content-type-options": b"nosniff",
     b"cache-control": b"no-store",
@@ -98,7 +98,7 @@ async def _sweep(service: Service, every_s: float) -> None:
 
 
 async def _check_older(service: Service, is_over: asyncio.Event) -> None:
-    """Check the events before the snapshot, in at most half of the time; end the service if bad."""
+    """Check events before the snapshot, at most half of the time; end the service on an error."""
     log = service.broker.log
     try:
         while not is_over.is_set() and not await asyncio.to_thread(log.check_older, CHECK_S):
@@ -146,7 +146,7 @@ class GuardedRequests:
                 async with asyncio.timeout_at(until_s):
                     message = await receive()
             except TimeoutError:
-                raise HTTPException(408, f"the body did not come within {BODY_S:g} s") from None
+                raise HTTPException(408, f"the body was not received within {BODY_S:g} s") from None
             left -= len(message.get("body", b""))
             if left < 0:
                 raise HTTPException(413, "the body is too large for this route")
@@ -165,5 +165,5 @@ class GuardedRequests:
         try:
             await self._app(scope, receive_in_time, send_with_headers)
         except Exception as error:
-            if scope.get(FAULT) is not error:  # otherwise it was logged and answered
+            if scope.get(FAULT) is not error:  # a fault was logged and answered already
                 raise

@@ -1,4 +1,4 @@
-"""Routes of artefacts: files of users for configurations of their own."""
+"""Routes of artefacts: files that users upload for their own configurations."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def _answer(owner: str, sha256: str, one: ArtefactRecord) -> response_bodies.Art
 async def list_artefacts(
     identity: Readers,
     service: TheService,
-    own: Annotated[bool, Query(description="Only those of the caller")] = False,
+    own: Annotated[bool, Query(description="Return only artefacts of the caller")] = False,
 ) -> response_bodies.ArtefactList:
     """Return artefacts: a client's own, or all of them."""
     known = service.broker.log.state.artefacts.items()

@@ -1,4 +1,4 @@
-"""Artefacts: files of users, identified by their SHA-256, for configurations of their own.
+"""Artefacts: files that users upload for their configurations, identified by their SHA-256.
 
 An artefact is data: a map, demand, a zone file, a configuration, or the weights of a driver. Code
 is refused. Each identity has quotas. An artefact that is not used is deleted after its lifetime.
@@ -27,8 +27,8 @@ from cavmarl.service.event_log import EventLog
 from cavmarl.service.service_records import SESSION_OVER, ArtefactRecord, IdentityRecord
 
 T = TypeVar("T")
-MOST_UNPACKED_BYTES = 1 << 29  # of a compressed file
-MOST_ELEMENTS = 10_000_000  # of an XML file
+MOST_UNPACKED_BYTES = 1 << 29  # maximum content of a compressed file
+MOST_ELEMENTS = 10_000_000  # maximum number in an XML file
 MOST_YAML_BYTES = 1 << 20
 MOST_JSON_BYTES = 1 << 24
 _HEAD_BYTES = 1 << 17
@@ -49,7 +49,7 @@ class Artefacts:
 
     Args:
         log: the log of the service.
-        quota: of each identity.
+        quota: quota of each identity.
     """
 
     def __init__(self, log: EventLog, quota: Quota) -> None:
@@ -57,10 +57,10 @@ class Artefacts:
         self._checks = ThreadPoolExecutor(1, "checks-of-artefacts")
 
     async def check(self, call: Callable[[], T]) -> T:
-        """Return the result of `call`, which the thread of checks runs.
+        """Run `call` in the thread for checks, and return its result.
 
-        A check of large files takes seconds. All checks share one thread, so that the event loop,
-        and threads that write the log, have time meanwhile.
+        A check of large files takes seconds. All checks share one thread, so that the event loop
+        and the threads that write the log can run meanwhile.
         """
         return await asyncio.get_running_loop().run_in_executor(self._checks, call)
 
@@ -132,7 +132,8 @@ class Artefacts:
                 raise problem("not-found", f"there is no artefact {sha256} of yours: upload it")
         until_s = self._until_s()
         for sha256 in sorted(set(files)):
-            if own[sha256].until_s < until_s - 864.0 * self._quota.days:  # a hundredth has passed
+            # Record the extension only after 1 % of the lifetime.
+            if own[sha256].until_s < until_s - 864.0 * self._quota.days:
                 data = {"until_s": until_s}
                 self._log.record("artefact.used", sha256, data, owner=identity.id)
 
@@ -148,7 +149,7 @@ class Artefacts:
         return self._log.wall_s() + 86_400.0 * self._quota.days
 
     def check_quota(self, identity: IdentityRecord, sha256: str, more: int) -> None:
-        """Refuse a file of `more` bytes that an identity may not store."""
+        """Refuse a file of `more` bytes if it would exceed the quota of an identity."""
         own = self.of(identity.id)
         if sha256 in own:
             return
@@ -178,8 +179,8 @@ def check_content(name: str, sha256: str, content: bytes) -> None:
     """Check that a file has its hash, and is what the suffix of its name says.
 
     Raises:
-        ServiceError: it has another hash, the suffix is not that of a kind of data, or the content
-            is of another kind.
+        ServiceError: the hash differs, the suffix belongs to no kind of data, or the content is of
+            another kind.
     """
     found = hashlib.sha256(content).hexdigest()
     if found != sha256:
@@ -197,7 +198,7 @@ def suffix_of(name: str) -> str:
     """Return the suffix that says what a file is.
 
     Raises:
-        ServiceError: the name has no suffix of data.
+        ServiceError: the suffix of the name belongs to no kind of data.
     """
     for suffix in _CHECKS:
         if name.endswith(suffix):
@@ -207,7 +208,7 @@ def suffix_of(name: str) -> str:
 
 
 def is_same_kind(name: str, other: str) -> bool:
-    """Return whether the content of two names is checked in the same way; errors: `suffix_of`."""
+    """Return whether two names have the same kind of content; raises as `suffix_of` does."""
     return _CHECKS[suffix_of(name)] is _CHECKS[suffix_of(other)]
 
 

@@ -56,7 +56,7 @@ class BrokerRules:
     max_skew_s: float = 5.0  # tolerated difference of the clocks of a node and of the service
     max_nodes: int = 10_000
     max_sessions: int = 1000  # open sessions of one identity
-    artefacts: Quota = field(default_factory=Quota)  # of one identity
+    artefacts: Quota = field(default_factory=Quota)  # quota of one identity
     load: LoadRule = DEFAULT_RULE  # thresholds and weights for the load of a node
 
 
@@ -103,7 +103,7 @@ class Broker:
         if owner and owner.id != identity.id and not owner.revoked:
             raise problem("forbidden", f"node '{body.name}' belongs to another identity")
         if known is None and len(self.log.state.nodes) >= self.rules.max_nodes:
-            raise problem("too-many", f"{self.rules.max_nodes} nodes are registered", 60.0)
+            raise problem("too-many", f"the limit is {self.rules.max_nodes} nodes", 60.0)
         incarnation = known.incarnation + 1 if known else 1
         data = body.model_dump(exclude={"name"})
         data |= {"identity": identity.id, "incarnation": incarnation}
@@ -283,12 +283,12 @@ class Broker:
     def resolve(
         self, identity: IdentityRecord, number: str, unreachable: Sequence[str] = ()
     ) -> SessionRecord:
-        """Return a session on its node, or on another node if that one cannot serve it.
+        """Return a session on its node, or on another node if its own node cannot serve it.
 
         Another node is chosen if the session's node is lost, drained or unreachable for the client.
 
         Raises:
-            NoNodeError: no node can accept it.
+            NoNodeError: no node can accept the session.
         """
         session = self.session(identity, number)
         if session.state in SESSION_OVER or session.job is not None:
@@ -362,7 +362,7 @@ class Broker:
     def add_result(self, session: SessionRecord, name: str, content: bytes) -> None:
         """Store a file that a job has produced."""
         if name not in session.results and len(session.results) >= MOST_RESULTS:
-            raise problem("too-many", f"{MOST_RESULTS} results of a job are kept")
+            raise problem("too-many", f"a job can have at most {MOST_RESULTS} results")
         sha256 = self.log.keep(content)
         self._tell(session, "result", {"name": name, "sha256": sha256, "bytes": len(content)})
 
@@ -388,7 +388,7 @@ class Broker:
         return self.rules.beat_s * self.rules.missed_beats
 
     def limits_of(self, name: str) -> list[str]:
-        """Return why a node accepts no session now, and what to do; empty: it does."""
+        """Return why a node accepts no session now, and what to do; [] if it accepts some."""
         is_old = self.age_s(name) > self._max_age_s
         return limits_of(self.log.state.nodes[name], self.live[name], is_old, self.rules.load)
 

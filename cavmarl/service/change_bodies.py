@@ -6,15 +6,15 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, StringConstraints
 
-MOST_LANES = 64  # of one road
+MOST_LANES = 64  # lanes of one road
 MOST_PARAMS = 64  # parameters of a scenario
 
-Id = Annotated[str, StringConstraints(min_length=1, max_length=256)]  # of a lane or road of a map
+Id = Annotated[str, StringConstraints(min_length=1, max_length=256)]  # id of a lane or road
 Finite = Annotated[float, Field(allow_inf_nan=False)]
 World = Annotated[int, Field(ge=0, lt=1024)]
 Lanes = Annotated[list[Annotated[int, Field(ge=0, lt=MOST_LANES)]], Field(max_length=MOST_LANES)]
 Plain = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9_]{1,64}$")]  # never a path
-Table = Literal["observations", "samples", "messages"]  # those of several worlds
+Table = Literal["observations", "samples", "messages"]  # possible with several worlds
 
 
 class _Change(BaseModel):
@@ -69,7 +69,7 @@ class DeclareEvent(_Change):
 
 
 class SetScenario(_Change):
-    """Make the worlds again with a scenario, or without one; the next command must be a reset."""
+    """Recreate the worlds with or without a scenario; the next command must be a reset."""
 
     kind: Literal["scenario"]
     name: Annotated[str, StringConstraints(pattern=r"^[a-z0-9_]{0,64}$")]  # empty: none
@@ -99,8 +99,8 @@ class KeptRecording(_Change):
 
 
 class KeptSession(_Change):
-    """What a saved state of a session has beside the state of its worlds."""
+    """The part of a session's saved state that is not the state of its worlds."""
 
     begun_anew: list[bool]  # worlds that a page has restarted since the last command
-    scenario: SetScenario | None  # None: that of the configuration
+    scenario: SetScenario | None  # None: the scenario of the configuration
     recording: KeptRecording | None

@@ -1,6 +1,6 @@
 """Files of a configuration: an environment and drivers that a client has uploaded as artefacts.
 
-A configuration names the files by their places in a folder. `drivers/NAME/` has the two files of a
+A configuration maps relative paths ("places") to files. `drivers/NAME/` has the two files of a
 trained driver; the other files belong to the environment.
 """
 
@@ -26,8 +26,8 @@ from cavmarl.service.service_records import ArtefactRecord
 _PLAIN = re.compile(r"[A-Za-z0-9_+:#,() -]{0,64}")
 _INSTALLED_MAP = re.compile(r"sumo:[A-Za-z0-9_-]+(/[A-Za-z0-9_-]+)*(\.[A-Za-z0-9_-]+)+")
 YAML = ".yaml"  # the only files that the service reads itself
-MOST_YAML_BYTES = 1 << 18  # of all YAML files of a configuration; reading 64 KiB takes a second
-MOST_FILES_BYTES = 1 << 30  # of all files of a configuration, which a node keeps for each session
+MOST_YAML_BYTES = 1 << 18  # all YAML files of a configuration; reading 64 KiB takes a second
+MOST_FILES_BYTES = 1 << 30  # all files of a configuration, which a node keeps for each session
 _RESERVED = ("agents", "configs", "envs", "runs")  # folders of installed entries and of runs
 _OF_OTHERS = ("zones.journal", "zones.simulators", "workers.key_file")
 
@@ -54,10 +54,11 @@ def environment_of(environment: str, files: Mapping[str, str], folder: str | Pat
 
 
 def check_files(environment: str, files: Mapping[str, str]) -> None:
-    """Check the places of the files of a configuration.
+    """Check the relative paths of the files of a configuration.
 
     Raises:
-        ServiceError: a driver is incomplete, or a file belongs to nothing.
+        ServiceError: a driver is incomplete, or a file belongs neither to a driver nor to the
+            environment.
     """
     for name in drivers_of(files):
         there = sorted(place.split("/", 2)[2] for place in files if _is_of_driver(place, name))
@@ -85,15 +86,14 @@ def _is_of_driver(place: str, name: str) -> bool:
 
 
 def check_artefacts(files: Mapping[str, str], own: Mapping[str, ArtefactRecord]) -> None:
-    """Check that each place of a file has the kind of its artefact, and check sizes.
+    """Check the sizes of files, and that the suffix of each path fits the content.
 
     Args:
-        files: hashes by place.
-        own: artefacts by hash; each was checked as the kind that the suffix of its name states.
+        files: hashes by relative path.
+        own: artefacts by hash; the content of each was checked to fit the suffix of its name.
 
     Raises:
-        ServiceError: a place has the suffix of another kind or of no kind, or the files are too
-            large.
+        ServiceError: the suffix of a path does not fit the content, or the files are too large.
     """
     for place, sha256 in files.items():
         if not is_same_kind(place, own[sha256].name):
@@ -118,7 +118,7 @@ def check_artefacts(files: Mapping[str, str], own: Mapping[str, ArtefactRecord])
 def load_uploaded(
     environment: str, files: Mapping[str, bytes], keys: Mapping[str, Any]
 ) -> EnvConfig:
-    """Return the configuration of an uploaded environment; `files` are its files by place.
+    """Return the configuration of an uploaded environment; `files`: content by relative path.
 
     Only the content of YAML files is needed.
 
@@ -184,7 +184,7 @@ def placed_policies(policies: Sequence[str], files: Mapping[str, str], folder: s
 def placed_overrides(
     environment: str, keys: Mapping[str, Any], files: Mapping[str, str], folder: str
 ) -> dict[str, Any]:
-    """Return overrides that give background vehicles the uploaded drivers that they name."""
+    """Return overrides that replace names of uploaded drivers in `traffic.model` by their paths."""
     own = drivers_of(files)
     if not own:
         return {}

@@ -49,7 +49,7 @@ class NewConfiguration(NamedTuple):
 
     name: str
     document: dict[str, Any]
-    contents: dict[str, bytes]  # of its YAML files by place; those of other files are empty
+    contents: dict[str, bytes]  # content of YAML files by relative path; b"" for other files
 
     def check(self) -> None:
         """Check the configuration; this takes seconds if it has many files.
@@ -66,7 +66,7 @@ def collect_configuration(
     """Return a configuration with the files that its check needs.
 
     Raises:
-        ServiceError: a file is missing, of another kind than its place, or too large.
+        ServiceError: a file is missing, is too large, or does not fit the suffix of its path.
     """
     document = body.model_dump(exclude={"name"})
     files: dict[str, str] = document["files"]
@@ -91,7 +91,7 @@ def add_configuration(
     versions = log.state.configurations.get(name, [])
     if found not in versions:
         if log.state.configurations_of.get(identity.id, 0) >= MOST_CONFIGURATIONS:
-            detail = f"{MOST_CONFIGURATIONS} configurations of yours are kept: use those"
+            detail = f"you have {MOST_CONFIGURATIONS} configurations, the limit: use one of them"
             raise problem("too-many", detail)
         log.keep(content)
         data: dict[str, Any] = {"hash": found, "version": len(versions) + 1}
@@ -113,7 +113,7 @@ def read_configuration(log: EventLog, sha256: str) -> dict[str, Any]:
 def check_policies(policies: list[str], files: Mapping[str, Any] | None = None) -> None:
     """Refuse texts that are not names of drivers, as a path could run code or name any folder.
 
-    `files`: those of the configuration, with the uploaded drivers.
+    `files`: the files of the configuration, which include uploaded drivers.
     """
     known = [*agent_entries(), *drivers_of(files or {})]
     for policy in policies:

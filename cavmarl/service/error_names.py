@@ -60,5 +60,5 @@ def problem(name: str, detail: str, retry_s: float | None = None) -> ServiceErro
 
 
 def without_folders(text: str) -> str:
-    """Return a text for clients: of absolute paths, it keeps the name of the file only."""
+    """Return a text for clients, in which absolute paths are reduced to file names."""
     return _PATH.sub(r"\1", text)

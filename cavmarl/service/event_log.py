@@ -36,10 +36,10 @@ class EventLog:
     """The service records and the only way to change them.
 
     Args:
-        store: where events are kept; those after its snapshot are replayed. Call `check_older` to
-            check the events before the snapshot.
+        store: where events are kept. The events after its snapshot are replayed; call
+            `check_older` to check the events before the snapshot.
         wall_s: the wall clock.
-        is_own: whether the store is that of this process; a standby calls `catch_up` until it is.
+        is_own: whether this process owns the store; a standby calls `catch_up` until it owns it.
         snapshot_events: events after which a snapshot is written; 0: use and write none.
 
     Attributes:
@@ -87,7 +87,7 @@ class EventLog:
         for line in self._replayed(self.state, before, self._digest):
             self.sequence, self._digest = line.sequence, line.digest
         self.durable = self.sequence
-        self.state.take_unused()  # it was deleted with the events that made it unused
+        self.state.take_unused()  # the writer of the events has deleted unused content
         return self.sequence - before
 
     def _replayed(
@@ -141,7 +141,7 @@ class EventLog:
         return [one.digest for one in self.store.read_valid(number - 1, until=number)]
 
     def _check_events_of(self, snapshot: SealedSnapshot) -> Iterator[None]:
-        """Replay the events before a snapshot, and compare the records with those in it."""
+        """Replay the events before a snapshot, and compare the records with the snapshot."""
         state, digest = Infrastructure(), ""
         for line in self._replayed(state, 0, "", snapshot.sequence):
             digest = line.digest
@@ -161,13 +161,13 @@ class EventLog:
             for_s: time after which to return.
 
         Raises:
-            ServiceError: they were modified, or do not give the records of the snapshot.
+            ServiceError: the events were modified, or do not give the records of the snapshot.
         """
         until_s = time.monotonic() + for_s
         return all(time.monotonic() < until_s for _ in self._older)
 
     def check_head(self) -> None:
-        """Check that the stored head is that of the events; raise ServiceError if it is not."""
+        """Raise ServiceError if the stored head does not match the events."""
         if self.store.head() != self._signed_head():
             raise ServiceError(
                 f"store {self.store.where}: its signed head is not that of its events: the log was "
@@ -224,13 +224,13 @@ class EventLog:
         self._write(*self._take(is_last=True))
 
     def _take(self, *, is_last: bool = False) -> _Batch:
-        """Return what is to be written; call it in the thread that records events."""
+        """Return the pending batch of writes; call it in the thread that records events."""
         taken = self._lines, self._blobs, self._gone, self._signed_head(), self._snapshot(is_last)
         self._lines, self._blobs, self._gone, self._in_flight = [], {}, set(), taken[1]
         return taken
 
     def _snapshot(self, is_last: bool) -> SealedSnapshot | None:
-        """Return a snapshot of the records if it is due, or at the end."""
+        """Return a snapshot of the records if it is due or this is the last batch."""
         new = self.sequence - self._snapshot_at
         if not self._snapshot_events or new < (1 if is_last else self._snapshot_events):
             return None
@@ -276,7 +276,7 @@ class EventLog:
         """Wait until all events recorded so far are on disk.
 
         Raises:
-            ServiceError: they cannot be written; the service must end.
+            ServiceError: the events cannot be written; the service must end.
         """
         if not self._lines and not self._blobs and self.durable >= self.sequence:
             return

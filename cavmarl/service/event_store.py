@@ -104,7 +104,7 @@ class SignedHead(NamedTuple):
     """The end of the log, sealed with the service's key."""
 
     sequence: int  # number of events
-    digest: str  # of the last event
+    digest: str  # digest of the last event
     key: str  # id of the key
     seal: str  # HMAC-SHA256 of the other fields
 
@@ -165,7 +165,7 @@ class EventStore:
             raise
 
     def try_lock(self) -> bool:
-        """Return whether this standby has the store for itself from now on.
+        """Return whether this standby owns the store from now on.
 
         The lock of another service ends with its connection.
 
@@ -189,7 +189,7 @@ class EventStore:
             raise self._lost(error) from error
 
     def check_lock(self) -> None:
-        """Check that the store is still that of this process.
+        """Check that this process still owns the store.
 
         Raises:
             ServiceError: the connection, and with it the lock, is lost; the service must end.
@@ -223,7 +223,7 @@ class EventStore:
         head: SignedHead | None = None,
         snapshot: SealedSnapshot | None = None,
     ) -> None:
-        """Write all of these, and delete the content `gone`, in one transaction.
+        """Write the given data, and delete the content `gone`, in one transaction.
 
         A head or a snapshot replaces the earlier one.
 
@@ -322,7 +322,7 @@ class EventStore:
 
         Args:
             after: number of the line before the first one.
-            digest: its digest.
+            digest: digest of that line.
             until: number of the last line; None: all.
 
         Raises:
@@ -424,7 +424,7 @@ def _lock_file(path: Path) -> IO[bytes]:
     lock = os.fdopen(handle, "r+b")
     try:
         fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite's own log has only one of the names
+        if (names := os.fstat(handle).st_nlink) > 1:  # SQLite names its log after one of them
             raise ServiceError(f"store {path}: has {names} names; remove its other hard links")
         check_private("store", path)
     except BlockingIOError:

@@ -38,7 +38,7 @@ class JobQueue:
         self._log, self._choose, self._assign, self._end = log, choose, assign, end
         self._failures = RateLimit(FAILURES_HZ, FAILURES, clock_s)
         self._next = ""  # the job at which the last pass stopped
-        self._reasons: dict[tuple[str, ...], str] = {}  # of the last failed search, by kind
+        self._reasons: dict[tuple[str, ...], str] = {}  # kind → why the last search failed
 
     def may_try(self) -> bool:
         """Return whether another search may fail without exceeding the rate limit."""
@@ -54,7 +54,7 @@ class JobQueue:
         self._reasons[_kind_of(session)] = str(error)
 
     def reason_of(self, session: SessionRecord) -> str:
-        """Return why a queued job waits; empty: no search has failed yet, or it does not wait."""
+        """Return why a queued job waits; empty: no search has failed yet, or not waiting."""
         if session.id not in self._log.state.waiting:
             return ""
         return self._reasons.get(_kind_of(session), "")
@@ -99,5 +99,5 @@ class JobQueue:
 
 
 def _kind_of(session: SessionRecord) -> tuple[str, ...]:
-    """Return what the choice of a node depends on; all other properties are alike for jobs."""
+    """Return the properties of a job that determine which nodes can run it."""
     return session.owner_name, *session.needs

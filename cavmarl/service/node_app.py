@@ -43,7 +43,7 @@ router = APIRouter(
 
 ARRAYS = "An .npz of numpy, without compression: {}"
 OF_STEPS = (
-    "observations, rewards, terminations, truncations, infos/…; of spaces of parts, each part"
+    "observations, rewards, terminations, truncations, infos/…; a Dict space has an array per key"
 )
 ANSWER: dict[int | str, dict[str, Any]] = {
     200: {
@@ -51,7 +51,7 @@ ANSWER: dict[int | str, dict[str, Any]] = {
         "content": {OCTETS: {"schema": {"type": "string", "format": "binary"}}},
         "headers": {
             "Cavmarl-Saved": {
-                "description": "Commands that the saved state includes: keep those after it",
+                "description": "Number of commands in the saved state; keep the later commands",
                 "schema": {"type": "integer"},
             }
         },
@@ -69,9 +69,9 @@ ACTIONS = {
     }
 }
 Number = Annotated[
-    int, Query(ge=1, description="Of this command, from 1; a repeated one is answered again")
+    int, Query(ge=1, description="Number of the command; a repeated number gets the same answer")
 ]
-Quiet = Annotated[bool, Query(description="Answer nothing: it was answered elsewhere before")]
+Quiet = Annotated[bool, Query(description="Return no content, as the client already has it")]
 
 
 def _link(request: Request) -> NodeLink:
@@ -132,7 +132,7 @@ async def open_worlds(
     request: Request,
     session: str,
     configuration: Opened,
-    save: Annotated[bool, Query(description="Leave their state with the service first")] = False,
+    save: Annotated[bool, Query(description="Store the state with the service first")] = False,
 ) -> response_bodies.WorldDescription:
     """Create or find the worlds of a session; they continue from their saved state."""
     link, worlds = _link(request), _worlds(request)
@@ -238,9 +238,8 @@ async def _command(
     def command() -> bytes:
         return world.command(number, act, is_quiet)
 
-    world.is_commanded = (
-        True  # pages wait: their change would be neither in this command nor in the saved state
-    )
+    # Pages wait: their changes would be neither in this command nor in the saved state.
+    world.is_commanded = True
     try:
         if number == world.number + 1:
             await _save_before(link, worlds, session)
@@ -303,7 +302,7 @@ async def get_frames(
     request: Request,
     session: str,
     _: Opened,
-    final: Annotated[bool, Query(description="Of worlds that were reset: the last ones")] = False,
+    final: Annotated[bool, Query(description="Return the samples before a reset")] = False,
 ) -> Response:
     """Return the samples of the mounted sensors as an .npz file with `SENSOR/FIELD`."""
     worlds = _worlds(request)
@@ -374,7 +373,7 @@ async def _save(link: NodeLink, worlds: SessionWorlds, session: str) -> None:
 
 
 async def _store_parts(link: NodeLink, session: str, world: SessionWorld) -> None:
-    """Store the parts of a recording that have ended; a refused one ends the recording."""
+    """Store the parts of a recording that have ended; a refused part ends the recording."""
     recording = world.recording
     while recording is not None and recording.waiting:
         part = recording.waiting[0]

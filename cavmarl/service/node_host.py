@@ -50,17 +50,16 @@ class NodeOptions:
     name: str
     host: str = "127.0.0.1"
     port: int = 0  # port for clients; 0 picks a free port
-    simulator_port: int | None = None  # port that clients are told; None: `port`
+    simulator_port: int | None = None  # port that clients connect to; None: `port`
     slots: int = 4
     capabilities: tuple[str, ...] = ()
     allowed: tuple[str, ...] = ()
     is_supposed_idle: bool = False  # report no load
     certificate: Path | None = None
     key: Path | None = None
-    authority: str | None = (
-        None  # certificate of the authority that signed the service's certificate
-    )
-    allow_plain_http: bool = False  # send the secret to a service elsewhere without TLS
+    # certificate of the authority that signed the service's certificate
+    authority: str | None = None
+    allow_plain_http: bool = False  # send the secret to another machine even without TLS
 
 
 @dataclass
@@ -69,7 +68,7 @@ class _Host:
     worlds: SessionWorlds
     tell: Callable[[str], None]
     jobs: dict[str, asyncio.Task[None]] = field(default_factory=dict)
-    # job whose outcome the service has → number of the next heartbeat then
+    # job whose outcome was reported → number of the first heartbeat after the report
     reported: dict[str, int] = field(default_factory=dict)
     steps: dict[str, tuple[int, int]] = field(default_factory=dict)  # steps of jobs: done, total
     paused: set[str] = field(default_factory=set)  # trainings that another node is to continue
@@ -184,7 +183,7 @@ async def _beat_until_end(host: _Host) -> None:
 def _start_jobs(host: _Host, jobs: list[dict[str, Any]], beat: int) -> None:
     """Run the jobs in the answer to a heartbeat, and end all others."""
     for job in jobs:
-        # After the report of its outcome, a job is told again only if this node is to repeat it.
+        # If an answer names a job after its outcome was reported, this node has to repeat the job.
         is_repeated = host.reported.get(job["id"], beat + 1) <= beat
         if job["id"] in host.paused and not host.link.is_draining:
             host.paused.discard(job["id"])
@@ -264,14 +263,14 @@ def run_evaluation(
     files: str | None,
     tell: Callable[[int, int], None],
 ) -> None:
-    """Run a job in a process of its own.
+    """Run a job in a separate process.
 
     Args:
         document: the configuration.
         job: the job.
         folder: where to write the results.
         files: folder with the files of the configuration, which becomes the working directory, so
-            that the results name no folder of the node; None: it has none.
+            that the results name no folder of the node; None: there are no files.
         tell: called twice a second with the steps done and the total.
     """
     if files is not None:

@@ -31,7 +31,7 @@ GPU_EVERY = 5  # heartbeats between two measurements of the GPUs
 JOIN_S = 60.0  # time in which the nodes of a session's zones must connect
 ANSWER_S = 0.5  # time between two attempts to reach the service
 KEYS_S = 1.0  # shortest time between two requests for the service's keys
-KEYS_KEPT_S = 60.0  # after which known keys are asked for again; the service may have new ones
+KEYS_KEPT_S = 60.0  # age at which known keys are requested again; the service may have new ones
 MOST_MESSAGE = 2000  # characters of the reason why a session or a job has failed
 MOST_ROWS = 1000  # transfers in one body, which is limited to 256 KiB
 
@@ -40,8 +40,8 @@ class NodeLink:
     """A node's side of its connection to the service.
 
     Args:
-        url: of the service.
-        secret: of an identity with the role `node`.
+        url: URL of the service.
+        secret: secret of an identity with the role `node`.
         body: body of the registration; docs/guides/service.md lists its fields.
         is_supposed_idle: report no load, so that nodes are selected by their sessions alone.
 
@@ -77,7 +77,7 @@ class NodeLink:
         found = await self.ask("POST", "/nodes", json=self._body)
         self.incarnation = found.json()["incarnation"]
         self.is_draining = found.json()["draining"]
-        psutil.cpu_percent(None)  # the next call returns the use since this call
+        psutil.cpu_percent(None)  # the next call returns the processor use since this call
 
     async def beat(
         self,
@@ -130,8 +130,8 @@ class NodeLink:
 
         Args:
             number: id of the key.
-            pause_s: time after a request to the service in which it is not asked again for an
-                unknown key, so that tokens of clients with invented keys cost little.
+            pause_s: shortest time between two requests to the service for unknown keys, so that
+                tokens with invented keys cost little.
         """
         async with self._asking_for_keys:
             until_s = self._keys_s + (KEYS_KEPT_S if number in self._keys else pause_s)
@@ -139,7 +139,7 @@ class NodeLink:
                 self._keys_s = time.monotonic()
                 try:
                     keys = (await self.ask("GET", "/keys")).json()["keys"]
-                except ServiceError:  # without it, sessions continue until their leases end
+                except ServiceError:  # sessions continue until their leases end
                     if number not in self._keys:
                         raise
                 else:
@@ -149,10 +149,10 @@ class NodeLink:
     async def claims(
         self, token: str, use: str, session: str, pause_s: float = KEYS_S
     ) -> dict[str, Any]:
-        """Return what the service has signed for this node, a session and a use.
+        """Return the claims that the service has signed for this node, a session and a purpose.
 
         Raises:
-            KeyError or jwt.InvalidTokenError: the token was not signed by the service for these.
+            KeyError or jwt.InvalidTokenError: the token was not signed by the service for them.
         """
         number = str(jwt.get_unverified_header(token).get("kid"))
         key = await self.public_key(number, pause_s)
@@ -170,7 +170,7 @@ class NodeLink:
         return found
 
     async def fetch_files(self, document: dict[str, Any]) -> TemporaryDirectory[str] | None:
-        """Return a new folder with the files of a configuration; None: it has none.
+        """Return a new folder with the files of a configuration; None: there are no files.
 
         Raises:
             ServiceError: a file is missing or does not have its hash.
@@ -225,7 +225,7 @@ class NodeLink:
         await self.ask("PUT", path, content=state, params={"at": number})
 
     async def open_door(self, session: str, document: dict[str, Any]) -> dict[str, Any]:
-        """Ask other nodes to host zones of a session; return keywords of `make_vec` for that."""
+        """Ask other nodes to host zones of a session; return keywords of `make_vec` for them."""
         if not document.get("nodes"):
             return {}
         host: str = self._body["address"]
@@ -248,7 +248,7 @@ class NodeLink:
             os.close(self._key_files.pop(session))
 
     def _in_memory(self, session: str, key: str) -> str:
-        """Return the path of a file with a key that vanishes when this process ends."""
+        """Return the path of a key file that is deleted when this process ends."""
         self.close_key_file(session)
         file = self._key_files[session] = os.memfd_create("cavmarl-key", os.MFD_CLOEXEC)
         os.fchmod(file, 0o600)

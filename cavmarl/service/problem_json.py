@@ -20,7 +20,7 @@ from cavmarl.service.error_names import PROBLEM_TYPE, PROBLEMS, without_folders
 from cavmarl.service.node_selection import NoNodeError
 
 MOST_EXCLUSIONS = 100  # maximum number of errors in an answer
-FAULT = "cavmarl.fault"  # key of the scope of a request that failed: the exception
+FAULT = "cavmarl.fault"  # key of an ASGI scope: the exception of a failed request
 
 _BY_STATUS = {404: "not-found", 405: "wrong-method", 408: "slow-body", 413: "too-large"}
 _BEAT = re.compile(r"/v1/nodes/([^/]+)/beat")
@@ -121,7 +121,7 @@ async def _on_disconnect(request: Request, _: Exception) -> JSONResponse:
 
 
 def _methods_of(request: Request) -> set[str]:
-    """Return all methods of a path; the router itself names only those of its first route."""
+    """Return all methods of a path; the router itself names only the methods of its first route."""
     methods: set[str] = set()
     for route in request.app.state.routes:
         if route.path_regex.fullmatch(request.scope["path"]):
@@ -130,7 +130,7 @@ def _methods_of(request: Request) -> set[str]:
 
 
 async def _on_fault(request: Request, error: Exception) -> JSONResponse:
-    """Log an internal error: one line, and the first time at its place the traceback."""
+    """Log an internal error in one line, and with its traceback if it is the first at its place."""
     last = traceback.extract_tb(error.__traceback__)[-1]
     place = f"{last.filename}:{last.lineno}"
     is_new = place not in request.app.state.faults
@@ -138,4 +138,4 @@ async def _on_fault(request: Request, error: Exception) -> JSONResponse:
     shown = f"{type(error).__name__} at {place}: {str(error)[:200]!r}"
     _LOGGER.error(shown, exc_info=error if is_new else None)
     request.scope[FAULT] = error
-    return _refuse(request, "broken", "the service could not do this; nothing of it was kept")
+    return _refuse(request, "broken", "the service could not do this; nothing was changed")

@@ -13,7 +13,7 @@ Name = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,6
 Word = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.+-]{0,63}$")]
 Host = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9:][A-Za-z0-9:.-]{0,254}$")]
 Subject = Annotated[str, StringConstraints(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,127}$")]
-Place = Annotated[  # of a file in a folder
+Place = Annotated[  # relative path of a file
     str,
     StringConstraints(
         pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}(/[A-Za-z0-9][A-Za-z0-9_.-]{0,63}){0,2}$"
@@ -29,7 +29,7 @@ Words = Annotated[list[Word], Field(max_length=64)]
 
 
 NO_OTHERS: Any = {"additionalProperties": False}  # refuse keys that do not match the pattern
-MOST_WORLDS = 1024  # of a session
+MOST_WORLDS = 1024  # worlds of a session
 MAX_WAIT_S = 7 * 86_400.0  # largest `wait_s` of a job
 
 
@@ -74,9 +74,9 @@ class BeatBody(_Body):
 class ConfigurationBody(_Body):
     """A world, with the keywords of `cavmarl.make_vec`.
 
-    `files` are artefacts of the caller, by their places in a folder. If `env.yaml` is one of them,
-    or the map that `environment` names, they are the environment. `drivers/NAME/` has the two files
-    of the driver NAME.
+    `files` are artefacts of the caller, by relative path. If they include `env.yaml`, or the map
+    that `environment` names, they are the environment. `drivers/NAME/` has the two files of the
+    driver NAME.
     """
 
     name: Name | None = None

@@ -214,8 +214,8 @@ class Session(_Answer):
     zone_nodes: int
     members: list[str]
     told_number: int
-    progress: list[int] | None  # of a job: steps done, total; null: not reported yet
-    waits_for: str  # of a queued job: why no node takes it; empty: nothing is known
+    progress: list[int] | None  # steps of a job: done, total; null: not reported yet
+    waits_for: str  # why no node takes a queued job; empty: unknown
 
 
 class SessionList(_Answer):

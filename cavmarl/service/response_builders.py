@@ -132,7 +132,7 @@ async def event_stream(
     owner = identity.id if identity.role == "client" else None
     generation = identity.generation
     with service.holding(identity):
-        while identity.generation == generation:  # its tokens were revoked: end the stream
+        while identity.generation == generation:  # else tokens were revoked: end the stream
             last = log.durable
             for line in log.store.read(after, until=last, owner=owner) if last > after else ():
                 text = event_answer(line).model_dump_json()

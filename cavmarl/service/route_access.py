@@ -50,7 +50,7 @@ class Service:
     def holding(self, identity: IdentityRecord) -> Iterator[None]:
         """Count a stream or a waiting request while it is open; raise `too-many` at the limit."""
         if self.held[identity.id] >= MOST_HELD:
-            detail = f"{MOST_HELD} requests of yours wait or follow events: end some"
+            detail = f"{MOST_HELD} event streams and waiting requests are yours: end some"
             raise problem("too-many", detail, 5.0)
         self.held[identity.id] += 1
         try:
@@ -59,12 +59,12 @@ class Service:
             self.held[identity.id] -= 1
 
     def admit_exchange(self, identity: str) -> None:
-        """Count an exchange of a right secret; the limit is not shared with other requests."""
+        """Count an exchange of a valid secret; the limit is not shared with other requests."""
         self.by_identity.take(f"exchange {identity}")
 
     @contextmanager
     def counting_wrong_secrets(self, request: Request) -> Iterator[None]:
-        """Count wrong secrets by address; right ones are not, so callers do not block others."""
+        """Count wrong secrets by address, but not valid ones, so callers do not block others."""
         try:
             yield
         except ServiceError as error:
@@ -119,7 +119,7 @@ class may(Rule, SecurityBase):
     def identify(self, request: Request) -> IdentityRecord:
         """Return the identity of a token. Invalid tokens have no rate limit.
 
-        At a limit of their address, the clients there would not learn that they need a new token.
+        With a limit per address, a client could be told to wait instead of to get a new token.
         """
         service = service_of(request)
         kind, _, token = request.headers.get("authorization", "").partition(" ")

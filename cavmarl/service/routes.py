@@ -340,7 +340,7 @@ async def events(
     limit: Annotated[int, Query(ge=1, le=PAGE)] = 100,
     subject: Annotated[request_bodies.Subject | None, Query()] = None,
 ) -> response_bodies.EventList:
-    """Return events after a sequence number: a client's own, or those of all subjects."""
+    """Return events after a sequence number; a client gets only its own events."""
     owner = identity.id if identity.role == "client" else None
     await service.broker.log.settle()
     found = service.broker.log.store.read(after, limit, owner=owner, subject=subject)

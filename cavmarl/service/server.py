@@ -43,7 +43,7 @@ class ServerOptions:
     key: Path | None = None
     rate_hz: float = 200.0  # rate limit of one identity
     rules: BrokerRules = field(default_factory=BrokerRules)
-    is_standby: bool = False  # follow the store of another service until that one ends
+    is_standby: bool = False  # follow the store of another service until that service ends
     snapshot_events: int = SNAPSHOT_EVENTS  # events after which a snapshot is written; 0: none
 
 
@@ -136,7 +136,7 @@ def follow_store(
     """Return the log of a store as soon as no other service has the store.
 
     Until then, the log is read as the other service writes it. So taking over takes the same time
-    for a log of any length. When the records are complete, a line is told; then the events before
+    for a log of any length. When the records are complete, `tell` is called; then the events before
     the snapshot are checked.
 
     Raises:
@@ -169,7 +169,7 @@ def check_transport(host: str, certificate: Path | None, key: Path | None) -> No
     """Check that secrets are encrypted on the way to other machines.
 
     Raises:
-        ServiceError: they would not be, or a file is missing.
+        ServiceError: secrets would not be encrypted, or a file is missing.
         ConfigError: other users can read the private key.
     """
     if (certificate is None) != (key is None):

@@ -16,7 +16,7 @@ BUCKETS_S = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.5)
 _TOLD = {  # reported by nodes with their heartbeats
     "ticks": "Ticks of worlds.",
     "steps": "Steps of worlds.",
-    "wait_s": "Seconds that commands of clients waited for others.",
+    "wait_s": "Seconds that commands of clients waited for other commands.",
     "transfers": "Vehicles that changed the zone that owns them.",
 }
 

@@ -14,7 +14,7 @@ Role = Literal["viewer", "client", "operator", "admin", "node"]
 ROLES: tuple[Role, ...] = ("viewer", "client", "operator", "admin", "node")
 
 SessionState = Literal["queued", "active", "closed", "done", "failed"]
-STATE_HEADER = "Cavmarl-State"  # of an answer with a state: the service's signature of it
+STATE_HEADER = "Cavmarl-State"  # header with the service's signature of a state
 SESSION_OVER = ("closed", "done", "failed")
 KEPT_OWNERS = 10_000  # maximum number of owners that are kept for each world
 
@@ -23,14 +23,14 @@ class LogEvent(NamedTuple):
     """One line of the log."""
 
     sequence: int  # from 1
-    time_s: float  # of the wall clock
+    time_s: float  # wall-clock time
     kind: str
     actor: str  # identity that caused the event, or `service`
-    subject: str  # its subject: a node, session, identity or configuration
+    subject: str  # name or id of a node, session, identity or configuration
     owner: str  # identity that owns the subject and may read the event
     data: dict[str, Any]  # public data
     private: dict[str, Any]  # private data: hashes of secrets, keys
-    digest: str  # of this line and the digest of the previous line
+    digest: str  # digest of this line and of the previous line's digest
 
 
 @dataclass
@@ -63,14 +63,14 @@ class SessionRecord:
     job: dict[str, Any] | None  # an evaluation or a training; None: a session of a client
     needs: list[str]  # capabilities
     preferred: str | None  # name of a node
-    opened_s: float = 0.0  # by the wall clock
+    opened_s: float = 0.0  # wall-clock time
     wait_s: float | None = None  # longest wait of a job for its first node in s; None: no limit
     state: SessionState = "queued"
     node: str | None = None
     incarnation: int = 0  # incarnation of `node`
     placements: int = 0
     reason: str = ""  # why that node was chosen
-    score: float = 0.0  # of that node when it was chosen
+    score: float = 0.0  # LoadScore of that node when it was chosen
     excluded: list[dict[str, Any]] = field(
         default_factory=list
     )  # some excluded nodes, with reasons
@@ -99,7 +99,7 @@ class OwnerTable:
 class ArtefactRecord:
     """A file that an identity has stored."""
 
-    name: str  # its suffix is that of its kind
+    name: str  # the suffix states the kind of file
     licence: str
     size_bytes: int
     until_s: float  # wall-clock time at which it is deleted unless it is used
@@ -112,7 +112,7 @@ class IdentityRecord:
     id: str
     name: str
     role: Role
-    digest: str  # of its secret
+    digest: str  # hash of the secret
     generation: int = 0  # tokens of earlier generations are invalid
     revoked: bool = False
     used: dict[str, float] = field(default_factory=dict)  # refresh tokens: id → when they expire
@@ -208,10 +208,10 @@ class Infrastructure:
                 self._replace_user(None, event.subject)
 
     def _apply_service(self, word: str, event: LogEvent) -> None:
-        """Change nothing for a start of the service, whose rules the event has."""
+        """Change nothing: the start of a service and its rules are only logged."""
 
     def _apply_clock(self, word: str, event: LogEvent) -> None:
-        """Change nothing for an anomaly of a clock."""
+        """Change nothing: an anomaly of a clock is only logged."""
 
     def _apply_node(self, word: str, event: LogEvent) -> None:
         if word == "registered":

@@ -57,7 +57,7 @@ class SessionRecording:
 
     @property
     def kept(self) -> KeptRecording:
-        """What a saved state needs to continue with the next part."""
+        """The data in a saved state from which a recording continues with its next part."""
         return KeptRecording(include=list(self._include), part=self._part)
 
     def begin(self, vec: CavVectorEnv) -> None:
@@ -77,7 +77,7 @@ class SessionRecording:
         vec.record(None)
         place = Path(self._folder.name) / "recording"
         head = json.loads((place / HEAD_FILE).read_text(encoding="utf-8"))
-        head["manifest"]["command"] = COMMAND  # the real one names folders of the node
+        head["manifest"]["command"] = COMMAND  # the real command names folders of the node
         told = json.dumps(head)
         if self._files:  # a path of letters, digits, _ and - needs no escapes in JSON
             for folder in (f"{self._files}/{DRIVER_FOLDER}/", f"{self._files}/"):

@@ -38,7 +38,7 @@ from cavmarl.viewer.web_options import WebOptions
 
 SAVED_EVERY = 50  # number of commands between two saved states
 TOLD_OF_TRANSFERS = ("episode", "tick", "vehicle", "source", "target", "epoch")
-_SIZE_BYTES = 4  # of the number at the end of a saved state
+_SIZE_BYTES = 4  # size of the length field at the end of a saved state
 
 
 class SessionWorld:
@@ -46,7 +46,7 @@ class SessionWorld:
 
     Args:
         document: configuration of the worlds.
-        keys: further keywords of `make_vec`; its overrides are added to those of the document.
+        keys: further keywords of `make_vec`; its overrides are added to the document's.
         state: state that another node saved, or None for new worlds.
         number: number of commands that the state includes.
         files: folder with the files of the configuration, which `close` deletes; None: it has none.
@@ -71,7 +71,7 @@ class SessionWorld:
         self.number = self.saved = number
         self.recording: SessionRecording | None = None
         self._document, self._keys = document, keys
-        self._scenario: SetScenario | None = None  # None: that of the configuration
+        self._scenario: SetScenario | None = None  # None: the scenario of the configuration
         self._take(self._made(None))
         self._last = b""  # the answer to the last command
         self.is_changed = self.is_commanded = False
@@ -139,9 +139,9 @@ class SessionWorld:
         try:
             kept = KeptSession.model_validate_json(state[max(end, 0) : end + size])
         except ValidationError as error:
-            raise problem("damaged", "the end of the saved state does not describe it") from error
+            raise problem("damaged", "the end of the saved state is not valid") from error
         if end < 0 or len(kept.begun_anew) != len(self._anew):
-            raise problem("damaged", "the saved state does not have a mark for each world")
+            raise problem("damaged", "the saved state is for another number of worlds")
         try:
             if kept.scenario is not None:
                 self._begin_scenario(kept.scenario)
@@ -156,7 +156,7 @@ class SessionWorld:
     def state(self) -> bytes | None:
         """Return the saved state, and end the present part of the recording.
 
-        None: part of the state is in SUMO or in a journal, or there has been no reset yet.
+        Return None if part of the state is in SUMO or in a journal, or before the first reset.
         """
         if not self._vec.is_ready:
             return None
@@ -190,8 +190,8 @@ class SessionWorld:
         """Execute a command and return its answer; a repeated command gets the same answer.
 
         Args:
-            number: of the command.
-            act: executes it: `reset`, `step` or `change` with their arguments.
+            number: number of the command.
+            act: executes the command: `reset`, `step` or `change` with their arguments.
             is_quiet: whether to return nothing.
         """
         if number == self.number and number and self._last:
@@ -270,7 +270,7 @@ class SessionWorld:
         if self.recording is not None:
             self.recording.end_part(self._vec)
         if self._page is not None:
-            self._page.close()  # it shows the earlier worlds
+            self._page.close()  # the page shows the earlier worlds
             self._page = None
         self._vec.close()
         self._scenario = scenario
@@ -285,7 +285,7 @@ class SessionWorld:
             raise problem(
                 "refused",
                 f"{key}: the state of these worlds cannot be saved, so another node could not "
-                "continue their recording; record them in a process of your own",
+                "continue their recording; record them in your own process",
             )
         self.recording = SessionRecording(self._vec, change.include, files=self._folder)
 
@@ -334,7 +334,7 @@ class SessionWorld:
         return self._page is not None and self._page.is_watched
 
     def tell_scores(self, rows: list[dict[str, Any]]) -> None:
-        """Show these LoadScores on the pages, below those of the worlds' own nodes."""
+        """Show these LoadScores on the pages, below the LoadScores of the worlds' own nodes."""
         if self._page is not None:
             self._page.tell_others(rows)
 
@@ -439,7 +439,7 @@ class SessionWorlds:
         keys: dict[str, Any],
         files: TemporaryDirectory[str] | None = None,
     ) -> None:
-        """Create the worlds of a session; the arguments are those of `SessionWorld`."""
+        """Create the worlds of a session; for the arguments, see `SessionWorld`."""
         if len(self._worlds) >= self._slots:
             raise CapacityError(
                 f"this node has {self._slots} sessions already: resolve the session again later"
@@ -480,7 +480,7 @@ class SessionWorlds:
                 "name": f"{one['name']}, node of the service",
                 "zones": f"{one['sessions']} sessions",
                 "score": one["score"],
-                "note": "no load told" if one["state"] == "up" else one["state"],
+                "note": "no load reported" if one["state"] == "up" else one["state"],
             }
             for one in scores
         ]

@@ -36,8 +36,8 @@ SNAPSHOT_SCHEMA = (
 class SealedSnapshot(NamedTuple):
     """The records after an event, sealed with the service's key."""
 
-    sequence: int  # of that event
-    digest: str  # of that event
+    sequence: int  # number of the event
+    digest: str  # digest of the event
     schema: str
     key: str  # id of the key
     content: str  # the records as JSON
@@ -73,7 +73,7 @@ def records_of(text: str) -> Infrastructure:
 
 
 def is_same(one: Infrastructure, other: Infrastructure) -> bool:
-    """Return whether the records are equal, also in the order of dicts that have one."""
+    """Return whether records are equal, including the order of dicts whose order matters."""
     ordered = [(list(each.keys), list(each.waiting), list(each.sessions)) for each in (one, other)]
     return one == other and ordered[0] == ordered[1]
 

@@ -1,10 +1,9 @@
-"""Selection of the nodes that host the zones of a session, if there is more than one.
+"""Selection of the nodes that host the zones of a session on several nodes.
 
 The session's own node leads: it receives the commands, and waits for the other nodes at an address
 that it reports. The other nodes are selected like nodes of sessions, on as many machines as
-possible.
-A node that is lost or drained is replaced, and the worlds continue from the states that other nodes
-keep (docs/guides/nodes.md).
+possible. A node that is lost or drained is replaced, and the worlds continue from the states that
+other nodes keep (docs/guides/nodes.md).
 """
 
 from __future__ import annotations
@@ -72,7 +71,7 @@ class ZoneNodes:
         self._doors.pop(session.id, None)
 
     def open_door(self, session: SessionRecord, door: DoorBody) -> None:
-        """Record the address at which the session's node waits for the others."""
+        """Record the address at which the session's node waits for the other nodes."""
         self._doors[session.id] = door
 
     def tasks(self, name: str) -> list[dict[str, Any]]:
@@ -91,7 +90,7 @@ class ZoneNodes:
 
     def _another(self, session: SessionRecord, members: Sequence[str]) -> str | None:
         anywhere = replace(session, preferred=None)
-        for avoided in (members, ()):  # a node without a part, else one that has a part
+        for avoided in (members, ()):  # prefer a node without a part of this session
             try:
                 return self._choose(anywhere, avoided).node
             except NoNodeError:

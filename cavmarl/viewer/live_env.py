@@ -25,7 +25,7 @@ from cavmarl.viewer.web_options import DEFAULT_PORT, WebOptions
 FRAME_HEIGHT_PX = 560  # height of the page in a notebook
 
 
-# Pages of `show` by the id of their environment, which each page keeps alive.
+# Pages of `show` by the id of their environment; a page keeps its environment alive.
 _SHOWN: WeakValueDictionary[int, ShownEnv] = WeakValueDictionary()
 
 
@@ -40,7 +40,7 @@ class ShownEnv:
             worlds.
         title: description of what drives the worlds.
         looks_itself: whether to call `look` after each reset and step of `env`. If not, the caller
-            calls `look`, or `turn` and `moved` where it must not wait.
+            calls `look`, or, if the caller must not wait, `turn` and `moved`.
         tell: called with lines of text: the address, and a generated token.
         reset: restarts the episode of a world by index; None: pages may not restart episodes.
 

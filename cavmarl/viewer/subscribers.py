@@ -78,8 +78,8 @@ class Audience:
     """The watchers of one world.
 
     Args:
-        beside: audience of another world that the same thread runs; `wait` of either returns on a
-            request to any of them.
+        beside: audience of another world that the same thread runs; `wait` of either audience
+            returns if a page of any of these worlds sends a request.
 
     Attributes:
         wishes: replaced as a whole, so that the world's thread may read it at any time.

@@ -164,7 +164,7 @@ def _observed(env: ViewedEnv, world: int, agent: int) -> list[list[Any]]:
 
 
 def named_numbers(names: Sequence[Sequence[str]], numbers: Any) -> list[list[Any]]:
-    """Return sensor, feature and value of each of the newest numbers, given their names."""
+    """Return sensor, feature and value of each number of the newest frame, given their names."""
     newest = numbers[-len(names) :] if len(names) else []
     rows = [[*name, _number(value)] for name, value in zip(names, newest, strict=True)]
     return rows[:MOST_NUMBERS]

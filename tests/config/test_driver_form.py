@@ -103,7 +103,7 @@ def test_the_error_for_different_forms_names_the_keys() -> None:
     said = str(caught.value)
     assert said.startswith("The drivers cities_residual, merge_ippo need different sensors")
     assert "sensors.history.steps is 3 for cities_residual, 0 for merge_ippo" in said
-    assert said.endswith("Run each of these drivers in a run of its own")
+    assert said.endswith("Run each of these drivers in a separate run")
     with pytest.raises(PolicyError, match="need different sensors"):
         form_of_driver("cities_residual+merge_ippo")
 

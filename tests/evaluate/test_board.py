@@ -131,7 +131,7 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
     "metrics": (
         lambda entry: change_manifest(entry, metrics_version=1),
         ManifestError,
-        "its metrics are of version 1, .*: evaluate again",
+        "has metrics of version 1, .*: evaluate again",
     ),
     "job": (
         lambda entry: change_manifest(entry, job={}),
@@ -168,7 +168,7 @@ SPOILT: dict[str, tuple[Spoil, type[CavmarlError], str]] = {
     "drivers": (
         lambda entry: change_manifest(entry, policies={"a": {}, "b": {}}),
         ManifestError,
-        "is of 2 drivers; evaluate this driver alone",
+        "has 2 drivers; evaluate this driver alone",
     ),
     "card": (
         lambda entry: (entry / "README.md").unlink(),
@@ -216,7 +216,9 @@ def test_results_that_differ_from_a_repeated_evaluation_are_refused(entry: Path)
     job = document["job"] | {"episodes": 1, "seed": 3}
     seeds = run_seeds(3, len(document["seeds"]))
     change_manifest(entry, job=job, episodes=1, seeds=seeds)
-    with pytest.raises(ManifestError, match=r"trips\.csv, .* of driving again on .* differ from"):
+    with pytest.raises(
+        ManifestError, match=r"trips\.csv, .* of the evaluation repeated on .* differ from"
+    ):
         check_entry(entry)
 
 
@@ -237,7 +239,7 @@ def test_a_board_shows_verified_and_failed_entries(entry: Path, tmp_path: Path) 
     found = {one.name: one for one in build_board(entries_in([folder]), out)}
     failures = {name: one.failure for name, one in found.items() if one.failure}
     assert sorted(failures) == ["bad", "clock"]
-    assert "of driving again on" in failures["clock"]
+    assert "of the evaluation repeated on" in failures["clock"]
     assert "KeyError" in failures["bad"]
     assert failures["bad"].endswith("; correct the script")
     assert found["brake"].kind == "scripted"

@@ -163,4 +163,4 @@ def test_further_keys_change_the_worlds_of_a_suite(tmp_path: Path) -> None:
     assert delay_s(*blind) > 2.0 * delay_s()
     refused = CliRunner().invoke(app, ["suite", str(suite), "--set", "horizon_s=9"])
     assert isinstance(refused.exception, ConfigError)
-    assert "horizon_s: the simulated time is given" in str(refused.exception)
+    assert "horizon_s: the argument `seconds` sets the simulated time" in str(refused.exception)

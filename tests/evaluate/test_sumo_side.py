@@ -96,7 +96,7 @@ def test_demand_of_another_map_is_refused_with_sumos_message() -> None:
 
 
 def test_a_refusal_names_the_map_of_a_configuration() -> None:
-    with pytest.raises(ConfigError, match=r"the map that it was made for, .*cross\.net\.xml"):
+    with pytest.raises(ConfigError, match=r"the map of this demand, .*cross\.net\.xml"):
         run_sumo(job(read_input([GAME / "cross_demo.sumocfg"])))
 
 

@@ -259,6 +259,6 @@ def test_settings_that_do_not_fit_the_recorded_data_are_refused(
     document = json.loads(head.read_text())
     document["manifest"]["world"]["config"][section][key] = value
     head.write_text(json.dumps(document))
-    with pytest.raises(RecordingError, match="are not those of the settings in its manifest; use"):
+    with pytest.raises(RecordingError, match="do not match the settings in its manifest; use"):
         write_minari(Recording.open(tmp_path / "run"), tmp_path / "set")
     assert not (tmp_path / "set").exists()

@@ -234,7 +234,7 @@ def test_the_results_and_transfers_of_a_node_are_limited(fleet: Fleet) -> None:
     for k in range(MOST_RESULTS):
         fleet.broker.add_result(session, f"{k}.csv", b"x")
     fleet.broker.add_result(session, "0.csv", b"y")
-    with pytest.raises(ServiceError, match="results of a job") as refused:
+    with pytest.raises(ServiceError, match="a job can have at most") as refused:
         fleet.broker.add_result(session, "another.csv", b"x")
     assert refused.value.problem == "too-many"
     body = TransfersBody(at=1, transfers=[[MOST_WORLDS, 0, 1, 2, 0, 1, 1]])

@@ -118,7 +118,7 @@ def test_the_number_of_configurations_of_an_identity_is_limited(tmp_path: Path) 
         if not refused:
             fleet.add_configuration(body)
             continue
-        with pytest.raises(ServiceError, match="configurations of yours"):
+        with pytest.raises(ServiceError, match="configurations, the limit"):
             fleet.add_configuration(body)
     fleet.close()
 

@@ -19,11 +19,11 @@ def signals(
     ],
     worlds: Annotated[
         list[int] | None,
-        about("Number of worlds. Repeat it for more. [default: 1, 16]", metavar="N"),
+        about("Number of worlds. Repeat it for more [default: 1, 16].", metavar="N"),
     ] = None,
-    after: Annotated[int, about("Simulated seconds before the first turn.", metavar="S")] = 300,
-    turn: Annotated[int, about("Decisions per turn, one every 5 s.", metavar="N")] = 60,
-    repeats: Annotated[int, about("Number of turns of each program.", metavar="N")] = 5,
+    after: Annotated[int, about("Simulated seconds before measuring.", metavar="S")] = 300,
+    turn: Annotated[int, about("Decisions per measurement, one every 5 s.", metavar="N")] = 60,
+    repeats: Annotated[int, about("Measurements of each program.", metavar="N")] = 5,
     seed: Seed = 0,
     say: Say = silent,
 ) -> BenchmarkReport:

@@ -24,7 +24,7 @@ def step(
         int, about("Number of controlled vehicles in each world.", metavar="N")
     ] = 100,
     worlds: Annotated[int, about("Number of parallel worlds.", metavar="N")] = 16,
-    repeats: Annotated[int, about("Number of measurements of each row.", metavar="N")] = 5,
+    repeats: Annotated[int, about("Number of measurements per row of the table.", metavar="N")] = 5,
     at_least: Annotated[
         float | None,
         about(
@@ -35,7 +35,7 @@ def step(
 ) -> BenchmarkReport:
     """Compare agent-steps per second on one core with highway-env.
 
-    Both have the same road, vehicles and rates.
+    Both simulators have the same road, vehicles and rates.
     """
     from cavmarl.bench.step_speed import measure_step_speed
 

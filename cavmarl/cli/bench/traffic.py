@@ -55,8 +55,8 @@ def traffic(
     demand: Annotated[
         list[Path] | None,
         about(
-            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more. [default: MAP, if "
-            "it is a .sumocfg]",
+            "Demand: a .rou.xml, .add.xml or .sumocfg file. Repeat it for more [default: MAP, if "
+            "it is a .sumocfg].",
             "--demand",
             "-d",
             metavar="FILE",
@@ -67,7 +67,7 @@ def traffic(
         about(
             "Without a demand: driver of generated vehicles, as in traffic.model (IDM, "
             "zoo:cities_ippo), or drivers with shares (zoo:cities_ippo=0.7,IDM=0.3). Repeat it to "
-            "compare several; SUMO gets the trips of the first.",
+            "compare several drivers; SUMO gets the trips of the first driver.",
             "--model",
             metavar="DRIVER",
         ),
@@ -89,12 +89,12 @@ def traffic(
         bool, flag("Compare the speed of the simulators instead of their traffic.", "--speed")
     ] = False,
     after: Annotated[
-        int, about("With --speed: simulated seconds before the first turn.", metavar="S")
+        int, about("With --speed: simulated seconds before the first measurement.", metavar="S")
     ] = 120,
     repeats: Annotated[
         int,
         about(
-            "With --speed: number of turns of each simulator; a turn is 10 simulated seconds.",
+            "With --speed: number of measurements of each simulator, of 10 simulated seconds each.",
             metavar="N",
         ),
     ] = 5,

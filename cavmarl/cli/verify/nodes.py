@@ -37,7 +37,7 @@ Env = Annotated[
 Nodes = Annotated[str, about("Numbers of node processes to compare.", "--nodes", metavar="N,N,…")]
 Kill = Annotated[
     int | None,
-    about("Kill N of the nodes at random times; at most all but one.", metavar="N"),
+    about("Kill N nodes at random times; at least one node must remain.", metavar="N"),
 ]
 Faults = Annotated[
     str | None,

@@ -19,7 +19,7 @@ def verify_recording(
     world: WorldSpec,
     recording: Annotated[
         Path,
-        about("Folder of --record, with --record-also commands.", "--recording", metavar="DIR"),
+        about("Folder written by --record --record-also commands.", "--recording", metavar="DIR"),
     ],
     zones: Zones = None,
     backend: Backend = None,

@@ -104,8 +104,8 @@ def _spreads(found: KillReport) -> Table:
     for text, kind, name in (
         ("killed during a step: detected after, ms", "SIGKILL", "noticed_ms"),
         ("stopped during a step: detected after, ms", "SIGSTOP", "noticed_ms"),
-        ("replacement has the command after, ms", None, "replaced_ms"),
-        ("replacement has finished it after, ms", None, "recovered_ms"),
+        ("replacement received the command after, ms", None, "replaced_ms"),
+        ("replacement finished the command after, ms", None, "recovered_ms"),
     ):
         values = [
             getattr(kill, name)

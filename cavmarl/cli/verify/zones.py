@@ -34,7 +34,7 @@ if TYPE_CHECKING:
 Zones = Annotated[
     str | None,
     about(
-        "Numbers of zones to compare [default: 1,2,4,9, or the number of a zone file].",
+        "Numbers of zones to compare [default: 1,2,4,9, or the number in a zone file].",
         metavar="K,K,…",
     ),
 ]

@@ -65,14 +65,14 @@ def find_evacuees(
     """Return the vehicles of a plan.
 
     The vehicles of an area are spread evenly over the length of its lanes, and drawn in random
-    order. Each takes the exit that it reaches first, if on each lane of an exit a vehicle passes
-    every `HEADWAY_S`.
+    order. Each vehicle takes the exit that it reaches first, if one vehicle passes each lane of an
+    exit every `HEADWAY_S`.
 
     Args:
         plan: the plan; roads in `contraflow` are closed.
         exits: ids of the exits.
         network: the map.
-        seed: of the order of departures.
+        seed: seed of the order of departures.
 
     Raises:
         ConfigError: an edge is unknown, an area has no vehicles, no road of an area has a way to an
@@ -196,7 +196,7 @@ def _origins(
 def _spread(
     network: RoadNetwork, lanes: NDArray[np.intp], count: int
 ) -> tuple[NDArray[np.intp], NDArray[np.float64]]:
-    """Return the lane (count,) and the place in m (count,) of vehicles in equal distances."""
+    """Return the lane (count,) and the place in m (count,) of vehicles at equal distances."""
     length_m = network.lanes["length_m"][lanes] - 2.0 * END_M
     ends = np.cumsum(length_m)
     at = (np.arange(count) + 0.5) / count * ends[-1]
@@ -210,7 +210,7 @@ def _shared_exits(
 ) -> NDArray[np.int64]:
     """Return the exit (n,) that each vehicle reaches first, in the order of departures.
 
-    `times_s`: (num_exits, n) from the vehicle to the exit. `lanes`: (num_exits,) of the exits.
+    `times_s`: (num_exits, n) time from vehicle to exit. `lanes`: (num_exits,) lanes of each exit.
     """
     free_s = np.full(len(times_s), -np.inf)
     chosen = np.zeros(len(depart_s), dtype=np.int64)

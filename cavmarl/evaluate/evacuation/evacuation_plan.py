@@ -19,7 +19,7 @@ from cavmarl.roads.network import CARS, RoadNetwork
 
 SHORTEST_M = 15.0  # on a shorter lane, no vehicle begins its trip
 MOST_EXITS = 8  # number of exits that are chosen if the plan names none
-FAR_SHARE = 0.6  # chosen exits are at least this share of the largest distance away
+FAR_SHARE = 0.6  # least distance of chosen exits, as a share of the largest distance
 RADIUS_SHARE = 0.4  # default area: share of the radius that contains 90 % of the roads
 AREA = "area"  # name of the default area
 
@@ -54,7 +54,7 @@ class EvacuationPlan(Section, key=""):
         start_s: time of the order to leave.
         within_s: vehicles depart evenly within this time after the order.
         horizon_s: simulated time.
-        background: vehicles of the generator, which drive to goals of their own.
+        background: vehicles of the generator, which drive to their own goals.
         reroute_s: time between two searches of a vehicle for a faster route, which considers the
             speeds of the last minutes; 0: one search, after its departure.
         events: roads that close, open, or slow down; see `map.events`.
@@ -127,7 +127,7 @@ def roads_of(area: Area, name: str, network: RoadNetwork) -> NDArray[np.intp]:
 
 
 def edge_rows(names: Sequence[str], key: str, network: RoadNetwork) -> NDArray[np.intp]:
-    """Return the EDGE rows of some roads. Raises ConfigError for an unknown one."""
+    """Return the EDGE rows of some roads. Raises ConfigError for an unknown road."""
     known = {name: row for row, name in enumerate(network.edge_ids)}
     for name in names:
         if name not in known or network.edges["internal"][known[name]]:
@@ -144,7 +144,7 @@ def car_roads(network: RoadNetwork) -> NDArray[np.bool_]:
 
 
 def middle_of(network: RoadNetwork) -> tuple[float, float, float]:
-    """Return x and y of the middle of the roads in m, and the default radius of an area there."""
+    """Return x and y of the middle of the roads in m, and the default radius of an area."""
     x, y = _middles(network)
     usable = car_roads(network)
     at = float(np.median(x[usable])), float(np.median(y[usable]))

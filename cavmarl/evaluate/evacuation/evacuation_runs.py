@@ -26,7 +26,7 @@ STEP_S = 1.0
 TICK_S = 0.1
 STANDING_MPS = 0.5
 SHARES = (0.5, 0.9, 1.0)
-RECOVERED_SHARE = 1.1  # recovered: at most this multiple of the stopped vehicles before
+RECOVERED_SHARE = 1.1  # stopped vehicles after recovery / before the closure, at most
 ENTRY, DEMAND = "env.yaml", "demand.rou.xml"
 Told = Callable[[int, int], None]
 
@@ -39,7 +39,7 @@ class PreparedEvacuation:
     exits: tuple[str, ...]
     network: RoadNetwork
     evacuees: Evacuees
-    folder: Path  # of the environment
+    folder: Path  # folder of the environment
 
 
 @dataclass(frozen=True)
@@ -49,13 +49,13 @@ class AreaResult:
     vehicles: int
     departed: int
     arrived: int
-    unserved: int  # that have not reached an exit, including vehicles that could not depart
+    unserved: int  # vehicles that have not reached an exit, including those unable to depart
     clearance_50_s: float | None
     clearance_90_s: float | None
     clearance_s: float | None
-    last_arrival_s: float | None  # of the vehicles that arrived
-    mean_trip_s: float | None  # from the departure that was due to the exit
-    left_by_s: float | None  # when the last vehicle was seen on a road of the area
+    last_arrival_s: float | None  # last arrival at an exit
+    mean_trip_s: float | None  # from the planned departure to the exit
+    left_by_s: float | None  # time at which the last vehicle was seen on a road of the area
 
 
 @dataclass(frozen=True)
@@ -69,17 +69,17 @@ class EvacuationResult:
     longest_queue: int  # largest number of vehicles stopped at the same time
     mean_queue: float
     queues: dict[str, int]  # longest queues: largest number of stopped vehicles by road
-    # time in s from the last opening of a road until as few vehicles are stopped as before the
-    # first closure; None: there is no closure that ends, or traffic did not recover
+    # time in s from the last opening of a road until the number of stopped vehicles is about as
+    # low as before the first closure; None: no closure ended, or traffic did not recover
     recovery_s: float | None
-    deadlocks: tuple[tuple[int, ...], ...]  # at the end
+    deadlocks: tuple[tuple[int, ...], ...]  # deadlocks at the end
     rerouted: int
     contacts: int  # number of vehicles that began to touch another vehicle
-    # of the roads and junctions with most contacts: vehicles in contact, summed over the samples
+    # roads and junctions with most contacts → vehicles in contact, summed over the samples
     contact_places: dict[str, int]
     contraflow: dict[str, int]  # vehicles of the areas that used the contraflow lanes of each road
     state_hash: str
-    series: dict[str, list[float]]  # by second: time_s, departed, arrived, standing
+    series: dict[str, list[float]]  # values per second: time_s, departed, arrived, standing
 
     def to_dict(self) -> dict[str, Any]:
         return asdict(self)

@@ -1,11 +1,9 @@
 """Kernels for places of agents and post-encroachment times after each step.
 
 A conflict area is the stretch that the paths of two movements over a junction share (a CONFLICT
-row).
-Post-encroachment time is the time from the moment at which the first vehicle's rear leaves the area
-to
-the moment at which the second vehicle's front enters it from the other path (Allen, Shin and Cooper
-1978).
+row). Post-encroachment time is the time from the moment at which the first vehicle's rear leaves
+the area to the moment at which the second vehicle's front enters it from the other path (Allen,
+Shin and Cooper 1978).
 """
 
 from __future__ import annotations
@@ -44,7 +42,7 @@ def locate_agents(
 def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
     """Return a vehicle's current or last link, and its centre's distance from the stop line.
 
-    (-1, 0) before the stop line and from one length behind the junction.
+    It is (-1, 0) before the stop line, and once the vehicle is one length past the junction.
     """
     lane = roads.lanes[row["lane"]]
     if lane["internal"]:
@@ -59,10 +57,9 @@ def _place_on_link(roads: RoadArrays, row: np.void) -> tuple[int, float]:
 def _stay(conflict: np.void, row: np.void, centre_m: float, dt: float) -> tuple[float, float]:
     """Return the times from now, in s, between which a vehicle covers an area, else (-1, -1).
 
-    The vehicle keeps its present speed. Only times within the step count, as other steps observe
-    the rest.
-    Only a vehicle whose centre has just passed the stop line may have entered earlier with its
-    front.
+    The vehicle is assumed to keep its present speed. Times are clipped to the step, because other
+    steps cover the rest. Only if the centre has just passed the stop line may the front have
+    entered the area earlier.
     """
     half = 0.5 * row["length"]
     ahead = centre_m + half - conflict["enter_m"]
@@ -91,12 +88,11 @@ def watch_encroachments(
     seen_agent: NDArray[np.int32],
     least_s: NDArray[np.float64],
 ) -> None:
-    """Update the least post-encroachment times of agents with the passes of one step.
+    """Update the least post-encroachment times of agents after one step.
 
     All vehicles first mark the areas that they cover. Then each vehicle reads the marks of the
-    other
-    paths, so the order of rows does not matter. Vehicles in an area at the same time have a time of
-    0.
+    other paths, so the order of rows does not matter. Vehicles in an area at the same time have a
+    time of 0.
 
     Args:
         roads: the road arrays.

@@ -67,7 +67,7 @@ def measure_realism(
         told: called with the number of finished steps and the number of steps.
 
     Raises:
-        ConfigError: the environment has no logged scene, or its steps are not those of the log.
+        ConfigError: the environment has no logged scene, or its step length differs from the log's.
         ScenarioError: the scene has no road edges, or too few samples.
     """
     if rollouts < 1:

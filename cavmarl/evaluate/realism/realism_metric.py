@@ -26,7 +26,7 @@ _EVENT_SMOOTHING = 0.001
 
 
 class MetricComponent(NamedTuple):
-    """A component of the meta-metric. `low`, `high`, `bins`: of its histogram; 0 bins: an event."""
+    """A component of the meta-metric, with range and bins of its histogram; 0 bins: an event."""
 
     weight: float
     bucket: str
@@ -53,7 +53,7 @@ BUCKETS = tuple(dict.fromkeys(one.bucket for one in COMPONENTS.values()))
 class Realism:
     """The realism of rollouts of one scene, all in [0, 1]."""
 
-    likelihoods: Mapping[str, float]  # by component
+    likelihoods: Mapping[str, float]  # component → likelihood
 
     @property
     def meta(self) -> float:

@@ -22,8 +22,8 @@ Numbers = NDArray[np.float64]
 NEVER_M = 1e10  # distance without another object
 CORNER_SHARE = 0.7  # radius of the corners of an object, as a share of half its shorter side
 MOST_TTC_S = 5.0
-_ASKEW_RAD = math.radians(75.0)  # a vehicle is followed up to this difference in heading,
-_SLIGHTLY_RAD = math.radians(10.0)  # or this one, if less than `_OVERLAP_M` is ahead
+_ASKEW_RAD = math.radians(75.0)  # largest difference in heading of follower and leader
+_SLIGHTLY_RAD = math.radians(10.0)  # the same, for a sideways overlap below `_OVERLAP_M`
 _OVERLAP_M = 0.5
 _CLOSED_M2 = 1.0  # a polyline whose ends are this close is a ring
 _POINTS = 4096  # points that are compared with a polyline at once
@@ -144,8 +144,8 @@ def _distances(objects: Trajectories, evaluated: int) -> Numbers:
 def signed_distances(objects: Trajectories, corners: Numbers, k: int) -> Numbers:
     """Return (N, T) the signed distance between the boxes of object k and of each object.
 
-    The distance of two rectangles that are apart is that of a corner of one of them to the other
-    one. If they overlap, it is the shortest move that separates them, negative.
+    If two boxes are apart, it is the shortest distance from a corner of one box to the other box.
+    If they overlap, it is the length of the shortest move that separates them, negated.
     """
     outside = np.full(objects.valid.shape, np.inf)
     gap = np.full(objects.valid.shape, -np.inf)

@@ -99,7 +99,7 @@ def make_scenario(
         scenario: name, or path of a file.
         env: as in `make_vec`, like the other keywords.
         params: parameters of the scenario.
-        place: place on the map; empty: drawn by the seed, which is also that of the first reset.
+        place: place on the map; empty: drawn by the seed, which also seeds the first reset.
         density: density of the other traffic, one of `DENSITIES`.
         zones: number of zones; None: as configured by the environment.
         keys: keys of the world; the first of the agents (default 1) is in the conflict, the others

@@ -66,7 +66,7 @@ def sweep_scenarios(
     Args:
         scenarios: names, or paths of files.
         maps: names, folders or map files of environments.
-        seeds: of place and traffic.
+        seeds: seeds of place and traffic.
         passes: driver that must pass.
         fails: driver that must fail.
         density: density of the other traffic.

@@ -14,15 +14,15 @@ from cavmarl.roads.network import RoadNetwork
 STANDING_MPS = 0.1
 LATE_S = 600  # length of the final period whose arrivals show whether a run jams
 
-# By vehicle id, of all vehicles that have departed.
+# Trips of all departed vehicles; the index is the vehicle's id.
 _TRIP = np.dtype(
     [
         ("departed_s", np.float64),  # NaN: not seen
         ("late_s", np.float64),  # delay of the departure
         ("lost_s", np.float64),  # time of the trip so far, minus the time at the desired speed
-        ("waited_s", np.float64),  # below 0.1 m/s
+        ("waited_s", np.float64),  # time below 0.1 m/s
         ("stops", np.int64),
-        ("stands", np.bool_),  # at the last sample
+        ("stands", np.bool_),  # whether stopped at the last sample
     ],
     align=True,
 )
@@ -36,15 +36,15 @@ class SignalFigures:
     never_departed: int  # vehicles whose departure was due, but that have not entered
     arrived: int  # vehicles that have reached the end of their trip
     delay_s: float | None  # mean over arrived vehicles: time lost against the desired speed
-    # RESCO's delay: mean over all trips, also unfinished ones and vehicles never let in, of the
-    # time lost and the delay of the departure
+    # RESCO's delay: time lost plus delay of the departure, mean over all trips, including
+    # unfinished trips and vehicles that never entered
     delay_of_all_s: float
     trip_s: float | None  # mean over arrived vehicles
     waiting_s: float  # mean over departed vehicles: time below 0.1 m/s
     stops: float  # mean over departed vehicles
     queue: float | None  # vehicles below 0.1 m/s on lanes that end at a signal, mean of the samples
     most_queued: int | None  # maximum of `queue` over the samples
-    co2_g_per_km: float | None  # of a petrol car, see `emissions_of`
+    co2_g_per_km: float | None  # emissions of a petrol car, see `emissions_of`
     switches_per_h: float | None  # changes of the green of a signal, mean over signals
     longest_red_s: float | None  # longest time for which a lane was red with a stopped vehicle
     jams: bool | None  # see `is_jammed`
@@ -53,8 +53,8 @@ class SignalFigures:
 def is_jammed(arrived: int, arrived_late: int, seconds: float) -> bool | None:
     """Return whether traffic had broken down at the end of a run.
 
-    This is so if fewer than half as many vehicles per second arrived in the last `LATE_S` as
-    before. None: the run is shorter than twice that time.
+    Traffic has broken down if fewer than half as many vehicles per second arrived in the last
+    `LATE_S` as before. None: the run is shorter than twice `LATE_S`.
 
     Args:
         arrived: vehicles that arrived in the run.
@@ -99,7 +99,7 @@ class SignalMeter:
 
         Args:
             rows: VEHICLE (n,) all vehicles.
-            tick: since the reset.
+            tick: ticks since the reset.
             due_ticks: (num_orders,) ticks at which vehicles of the demand were due to depart.
             codes: (num_links,) states of the links' signals; see `roads.shown_signals`.
         """

@@ -47,7 +47,7 @@ def run_controller(
         ConfigError: there is no such controller; or see `make_vec`.
     """
     if "horizon_s" in (overrides or {}):
-        raise ConfigError("horizon_s: the simulated time is given beside the keys; leave it out")
+        raise ConfigError("horizon_s: the argument `seconds` sets the simulated time; leave it out")
     keys = {
         "clock.sim_dt_s": TICK_S,
         "clock.ctrl_dt_s": 1.0,

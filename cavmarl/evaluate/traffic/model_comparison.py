@@ -47,7 +47,7 @@ class ModelComparison:
     """Result of the comparison."""
 
     map_name: str
-    vehicles: int  # at the beginning of each run
+    vehicles: int  # number at the beginning of each run
     seconds: int
     dt_s: float
     seed: int

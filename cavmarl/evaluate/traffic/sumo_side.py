@@ -109,7 +109,7 @@ def _refusal(job: SumoJob, log: Path, error: Exception) -> ConfigError:
     own = f", {job.demand.net_file}" if job.demand.net_file else ""
     return ConfigError(
         f"{job.map_file}: SUMO refuses this demand: {' '.join(lines) or error}\n"
-        f"Cure: give demand that was made for this map, or the map that it was made for{own}"
+        f"Cure: give a demand that was made for this map, or the map of this demand{own}"
     )
 
 

@@ -26,8 +26,8 @@ LONGEST_HEADWAY_S = 10.0  # vehicles farther behind do not follow
 EDGE_MINUTE = np.dtype(
     [
         ("edge", np.int32),  # EDGE row; never inside a junction
-        ("minute", np.int32),  # since the beginning
-        ("length_m", np.float64),  # of the edge
+        ("minute", np.int32),  # minutes since the beginning
+        ("length_m", np.float64),  # length of the edge
         ("density_per_km", np.float64),  # vehicles per kilometre of one lane
         ("flow_per_h", np.float64),  # vehicles per hour on one lane
         ("speed_mps", np.float64),  # flow over density
@@ -38,7 +38,7 @@ EDGE_MINUTE = np.dtype(
 
 @dataclass(frozen=True)
 class TrafficCounts:
-    """Counts that only the simulator itself has, from beginning to end."""
+    """Counts of a whole run that only the simulator itself has."""
 
     departed: int  # vehicles that have entered
     waiting: int  # vehicles whose departure time has passed but that have not entered

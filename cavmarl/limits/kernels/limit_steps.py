@@ -1,4 +1,4 @@
-"""The part of a tick that concerns roadside units that set speed limits.
+"""The part of a tick in which roadside units measure traffic and set speed limits.
 
 All sums over vehicles are whole numbers, so they do not depend on the order or the owners of
 vehicles. They include the ticks since the last decision, and give the density, flow and mean speed
@@ -46,7 +46,7 @@ class LimitRules(NamedTuple):
 
     decide: int  # ticks between decisions
     most_change: int  # largest change of a choice at a decision; 0: no limit
-    num_choices: int  # C
+    num_choices: int  # C, number of limits to choose from
     dt: float
     weights: NDArray[np.float64]  # (T,) of LIMIT_TERMS
 
@@ -71,7 +71,7 @@ def choose_limits(
     ticks: NDArray[np.int64],  # (W,)
     held: NDArray[np.int64],  # (W, U, HELD) updated
 ) -> None:
-    """Change the limits as chosen, in worlds in which it is time for a decision."""
+    """Apply the chosen limits, in worlds in which it is time for a decision."""
     for w in range(ticks.size):
         if ticks[w] % rules.decide != 0:
             continue

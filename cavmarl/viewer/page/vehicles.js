@@ -228,7 +228,7 @@ export class VehicleLayer {
       .concat([b[at + 2], b[at + 3]]);
   }
 
-  // The same, with an interpolated heading.
+  // Like `placeOf`, but with an interpolated heading and without speed.
   poseOf(row, share) {
     const [x, y] = this.placeOf(row, share);
     const [from, to] = [this.before[4 * row + 2], this.now[4 * row + 2]];

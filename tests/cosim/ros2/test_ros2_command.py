@@ -47,8 +47,8 @@ def test_one_command_starts_a_world_and_its_bridge(
     [
         ([], "name either an environment to start, or a running world with --join"),
         (["town", "--join", "x.sock"], "name either an environment to start, or a running world"),
-        (["--join", "x.sock", "--agents", "3"], "--agents: a bridge that joins makes no world"),
-        (["--join", "x.sock", "--pace", "1"], "--pace: a bridge that joins makes no world"),
+        (["--join", "x.sock", "--agents", "3"], "--agents: with --join, the world already runs"),
+        (["--join", "x.sock", "--pace", "1"], "--pace: with --join, the world already runs"),
         (["--join", "missing.sock"], "missing.sock"),
         (["grid4x4", "--vehicle", "car_999"], "no agent 'car_999'"),
         (["grid4x4", "--domain", "500"], "domain = 500: must be from 0 to 101"),
