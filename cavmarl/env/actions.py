@@ -51,7 +51,7 @@ class ActionDecoder:
             else np.full(shape, config.idle_choice, dtype=np.int64)
         )
         self._idle = self._last.copy()
-        # Has the full shape: NumPy takes four times as long to broadcast a pair.
+        # The scale has the full shape, because NumPy takes four times as long to broadcast a pair.
         self._scale = np.empty((*shape, 2))
         self._scale[:] = config.acceleration_mps2, config.steering_rad
         if commands is None:
@@ -256,7 +256,7 @@ class ActionDecoder:
         return None
 
     def _as_numbers(self, value: Any, name: str) -> NDArray[Any]:
-        """Return an array of a dtype that means an action; raise an error for others."""
+        """Return an array of a dtype allowed for actions; raise an error for any other dtype."""
         kind = (
             "floats (float32 or float64) in [-1, 1]"
             if self._continuous

@@ -107,8 +107,7 @@ class StepSession:
         """Begin an episode in the chosen worlds (W,).
 
         If `seed` is None, the first reset uses the seed of the session; a later reset begins the
-        next episodes of the last seed. Random numbers of the first world depend on its number,
-        `first_world`.
+        next episodes of the last seed. Random numbers of world w depend on `first_world` + w.
         """
         self._refuse_closed("reset()")
         if seed is not None or not self.is_ready:

@@ -70,15 +70,15 @@ class ConflictsSensor(NamedTuple):
     range_m: float
     walls: Walls  # walls that hide vehicles
     heard: bool  # whether vehicles known only from messages are included
-    told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of the vehicles in messages
-    indicators: bool  # whether others indicate their link over the next junction
-    indicators_m: float  # distance to the junction at which they start to; 0: any distance
+    told: NDArray[np.void]  # BODY (inbox,) scratch: current positions of the vehicles in messages
+    indicators: bool  # whether other vehicles indicate their link over the next junction
+    indicators_m: float  # distance to the junction within which they indicate it; 0: any
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
     heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
     others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
     indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
     foreseen: NDArray[np.int64]  # (capacity,) the `filling` for which each body was predicted
-    filling: NDArray[np.int64]  # (1,) how often the grid has been filled
+    filling: NDArray[np.int64]  # (1,) how many times the grid has been filled
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
@@ -402,7 +402,7 @@ def observe_conflicts(
 ) -> None:
     """Write nine to twelve numbers per vehicle, by rank; numbers of missing vehicles are 0.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `reports`: REPORT
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) current PHASE rows. `reports`: REPORT
     (N,) of vehicles in the agent's inbox; read only with `heard`. `tick`: the world's tick.
     """
     row = rows[i]
