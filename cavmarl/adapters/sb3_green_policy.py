@@ -96,7 +96,7 @@ class GreenPolicy(ActorCriticPolicy):
 
 
 class SharedNetwork:
-    """A controller of signals: the most likely green of one network for all of them.
+    """A controller that chooses each signal's most likely green by one shared network.
 
     Args:
         model: a model trained on the rows of `CavSb3SignalEnv` with `features="greens"`.

@@ -317,7 +317,7 @@ class ActionDecoder:
 
 
 def _nearest(values: tuple[float, ...], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of the values nearest to the wanted ones; the first one wins a tie."""
+    """Return the index of the value nearest to each wanted value; the first one on a tie."""
     away = np.abs(wanted[..., None] - np.array(values))
     found: NDArray[np.int64] = away.argmin(axis=-1)
     return found

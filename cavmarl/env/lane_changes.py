@@ -147,10 +147,10 @@ class LaneChanges:
     ) -> None:
         """Close a road, and open its contraflow lanes once no vehicle is on it.
 
-        If other roads that are being reversed lead to it, the road closes once they are empty.
+        If other roads that are being reversed lead to this road, it closes once they are empty.
 
         Raises:
-            ActionError: there is no such world or road, it is the last way out of others, it is
+            ActionError: there is no such world or road, the road is the last way out of others or
                 not one of `map.contraflow`, or `lanes` does not name all of its lanes.
             CapacityError, ConfigError: see `close`.
         """
@@ -184,7 +184,7 @@ class LaneChanges:
             self._waiting[world] = tuple(event for event in waiting if event != closing)
 
     def _turn_back(self, world: int, edge: str) -> None:
-        """Close the contraflow lanes of a road; it opens once no vehicle is on them."""
+        """Close the contraflow lanes of a road; the road opens once no vehicle is on them."""
         limit_mps, classes = self._now(world)
         classes[self._reversed.lanes(edge)] = 0
         self._reversed.begin(world, edge, RETURNING)

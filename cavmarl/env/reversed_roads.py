@@ -25,7 +25,7 @@ _STATE, _SINCE, _KEPT = range(3)
 _NOT_YET = -1  # the state begins in the next step
 
 # Minimum time between closing lanes and opening the lanes in the other direction. By then, vehicles
-# that could not stop before the closed lanes have entered them, so that they are not empty.
+# that could not stop before the closed lanes have entered them, so that the lanes are not empty.
 CLEAR_S = 10.0
 
 

@@ -20,7 +20,7 @@ VEHICLES = "vehicles"  # key of the vehicles' arrays; other keys are `RoadsideAg
 class RoadsideAgents(ABC):
     """S agents of one kind in W worlds, and their results.
 
-    All of them decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
+    All agents decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
     whatever their kind: a world has agents of signals or of limits.
 
     Args:

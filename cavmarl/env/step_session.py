@@ -60,7 +60,7 @@ class StepSession:
         overrides: signals that show the caller's states.
         lane_changes: lanes that the caller closes or slows down.
         controlled: the signals or limits that are controlled; None: there are none.
-        roadside: the same if agents control them, else None.
+        roadside: the signals or limits if agents control them, else None.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """

@@ -213,7 +213,7 @@ class _Run:
         self._losses_before, self._living = 0, line.nodes
 
     def execute(self) -> None:
-        """Do the run, and add its result to its line."""
+        """Perform the run, and add its result to the `FaultLine`."""
         line, machine = self._line, self._machine
         wrong = ""
         try:

@@ -119,7 +119,7 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> Element:
 
 
 def _mend_object(element: Element) -> None:
-    """Add the height of a crosswalk, and move its outline to its place since OpenDRIVE 1.5."""
+    """Add the height of a crosswalk, and move its outline to where OpenDRIVE 1.5 expects it."""
     element.attrib.setdefault("zOffset", "0")
     outlines = element.findall("outline")
     if outlines:

@@ -1,6 +1,6 @@
 """The kernel of the `conflicts` sensor: the vehicles that come closest to the ego path.
 
-All vehicles are assumed to keep their speed: the ego vehicle along its path, the others straight
+All vehicles are assumed to keep their speed: the ego vehicle along its path, others straight
 along their headings, because their plans are unknown. At a few future moments, the kernel computes
 the gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest
 and soonest comes first. The right of way depends on the lane of the other vehicle, whichever link

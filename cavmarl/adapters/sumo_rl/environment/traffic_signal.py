@@ -255,15 +255,15 @@ class TrafficSignal:
         return int(vehicles[self._out].sum()) - int(vehicles[self._in].sum())
 
     def get_lanes_density(self) -> list[float]:
-        """Return the vehicles on each incoming lane as a share of its room."""
+        """Return the vehicles on each incoming lane as a share of the lane's capacity."""
         return self._shares(self._in, VEHICLES)
 
     def get_lanes_queue(self) -> list[float]:
-        """Return the stopped vehicles on each incoming lane as a share of its room."""
+        """Return the stopped vehicles on each incoming lane as a share of the lane's capacity."""
         return self._shares(self._in, STANDING)
 
     def get_out_lanes_density(self) -> list[float]:
-        """Return the vehicles on each outgoing lane as a share of its room."""
+        """Return the vehicles on each outgoing lane as a share of the lane's capacity."""
         return self._shares(self._out, VEHICLES)
 
     def get_total_queued(self) -> int:
