@@ -30,15 +30,15 @@ class CavTaskClass(TaskClass):  # type: ignore[misc] # only installed in a separ
     all agents choose: vehicles have meta-actions, because BenchMARL trains either continuous or
     discrete actions.
 
-    In `respawn` worlds, the default, an agent gets a new vehicle when its vehicle has ended.
+    In `respawn` worlds, the default, an agent gets a new vehicle when its trip has ended.
     BenchMARL's losses have no mask: steps without a vehicle count, too, with an observation and a
     reward of 0. They are rare in `respawn` worlds, and frequent in `closed` and `open` worlds. For
     the same reason, set `clock.ctrl_dt_s` to `signals.decide_s` if only signals have agents, so
     that each step is a decision.
 
     Args:
-        name: name of the task. Unless `config` has `env`, it is the environment's name in upper
-            case, with `_` for `-`.
+        name: name of the task. Unless `config` has `env`, this must be the environment's name in
+            upper case, with `_` for `-`.
         config: keyword arguments of `CavTorchRLEnv`.
 
     Raises:

@@ -95,7 +95,7 @@ class CavEgoEnv(WithSpec, OwnWorlds, gymnasium.Env[Any, Any]):
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
         """Run one step with the vehicle's action."""
         observations, rewards, _, truncations, infos = self._env.step({EGO: action})
-        ended = bool(infos[EGO]["vehicle_done"])  # in `respawn` worlds, agents do not end
+        ended = bool(infos[EGO]["vehicle_done"])  # agents do not terminate in `respawn` worlds
         cut = truncations[EGO] and not ended
         return observations[EGO], rewards[EGO], ended, cut, self._info(infos[EGO])
 

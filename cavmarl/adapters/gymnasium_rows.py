@@ -37,8 +37,8 @@ class CavAgentRows(WithSpec, OwnWorlds, VectorEnv[Any, Any, Any]):
     Rows end individually (terminations), or all at the horizon (truncations).
     `infos["active"]` marks the rows that act next. Observations of the other rows are 0, and their
     actions are not read. With `NEXT_STEP` or `DISABLED`, a row that has just ended shows its last
-    observation. With `SAME_STEP`, that observation is in `infos["final_obs"]`, and its last infos
-    in `infos["final_info"]`. Infos also have every term by its name.
+    observation. With `SAME_STEP`, that observation is in `infos["final_obs"]`, and the row's last
+    infos are in `infos["final_info"]`. Infos also have every term by its name.
 
     With `DISABLED`, `reset(options={"reset_mask": …})` takes a mask of rows (num_envs,). A world
     that is over resets if any of its rows is chosen. A world that continues resets if all of its

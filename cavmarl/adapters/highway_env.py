@@ -150,7 +150,7 @@ class HighwayEnv(CavEgoEnv):
         return float((total - worst) / (best - worst)) if best > worst else float(total)
 
     def _lane_and_merging(self) -> tuple[float, float]:
-        """Return how far right the lane is, 0 to 1, and the sum of merging cars' speed deficits."""
+        """Return the lane, 0 (leftmost) to 1, and the sum of the merging cars' speed deficits."""
         network = self._env.network
         rows = self._env.worlds.simulation.vehicles(0)
         own = rows[rows["driver"] == DRIVER_AGENT]
@@ -321,7 +321,7 @@ def _map(task: HighwayTask, config: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _half(name: str, settings: Mapping[str, Any], usual: float) -> float:
-    """Return the upper limit of an action, which has the value 1."""
+    """Return the upper limit of an action's range, for which the action 1 stands."""
     low, high = settings.get(name, (-usual, usual))
     if low != -high or high <= 0.0:
         raise ConfigError(f"action.{name} = [{low}, {high}]: must be symmetric, like [-5, 5]")

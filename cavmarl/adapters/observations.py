@@ -29,7 +29,7 @@ def refuse_decided(keys: Iterable[str], *given: Mapping[str, Any] | None) -> Non
 class WithSpec:
     """Base of a view whose Gymnasium spec has the horizon of the environment.
 
-    The registered ids have no horizon, because Gymnasium would truncate longer episodes there.
+    The registered ids have no horizon, because Gymnasium would truncate longer episodes at it.
     """
 
     _spec: EnvSpec | None = None

@@ -54,14 +54,14 @@ class CavRllibEnv(OwnWorlds, MultiAgentEnv):  # type: ignore[misc] # only instal
     with the new agents.
 
     In `respawn` worlds an id gets one vehicle after another. `infos[agent]["vehicle_done"]` marks
-    the end of a vehicle, but RLlib's value estimates continue across it. Learning is therefore more
+    the end of a trip, but RLlib's value estimates continue across it. Learning is therefore more
     exact in `closed` and `open` worlds.
 
     Agents of signals act only when a decision is due: other steps have no observation,
     reward or info of signals. All signals have the same spaces, so that they can share a policy.
     The action space is `Discrete(G)`, where G is the largest number of choices of a signal. A
     choice that a signal does not have keeps its green. An observation has `action_mask` (G,) and
-    `observations` (D,), padded with 0. If no agent acts next, the world advances until one does.
+    `observations` (D,), padded with 0. The world advances until at least one agent is to act.
 
         PPOConfig().multi_agent(policies={"vehicles", "signals"}, policy_mapping_fn=policy_of)
 

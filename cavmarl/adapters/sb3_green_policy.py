@@ -1,6 +1,6 @@
 """`GreenPolicy`: a policy of stable-baselines3 that scores the greens of signals of any shape.
 
-`SharedNetwork` is a controller that uses it.
+`SharedNetwork` is a controller that uses a trained policy of this kind.
 
 Importing this module loads stable-baselines3 and torch; `import cavmarl` does not import it.
 """
@@ -74,7 +74,7 @@ class GreenNetwork(nn.Module):
         return found
 
     def _split(self, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the features (n, G, F) of greens, the other values (n, C), both (n, G, F + C)."""
+        """Return the features (n, G, F) of greens, shared values (n, C), both as (n, G, F + C)."""
         num_greens, size = self._shape
         greens = rows[:, : num_greens * size].reshape(-1, num_greens, size)
         shared = rows[:, num_greens * size :]
@@ -96,7 +96,7 @@ class GreenPolicy(ActorCriticPolicy):
 
 
 class SharedNetwork:
-    """A controller of signals: the most likely green of one network for all of them.
+    """A controller that chooses each signal's most likely green by one shared network.
 
     Args:
         model: a model trained on the rows of `CavSb3SignalEnv` with `features="greens"`.

@@ -33,9 +33,9 @@ class CavSb3SignalEnv(CavSb3VecEnv):
     """The S signals of W worlds as W · S environments that share one policy; row w · S + s.
 
     A step of a row lasts from one decision to the next, `signals.decide_s`. Observations are padded
-    with 0 to the longest one. All rows have as many actions as the signal with most greens; an
-    action beyond a signal's greens, or that its mask excludes, keeps the green. The mask of
-    each row is `action_mask` in its info, and `action_masks()` returns all of them.
+    with 0 to the longest one. All rows have as many actions as the signal with the most greens;
+    an action keeps the green if the signal has no such green or the mask excludes it. The mask of
+    each row is `action_mask` in its info, and `action_masks()` returns all masks.
 
     Agents of vehicles, if there are any, follow `drivers`.
 
@@ -184,7 +184,7 @@ class CavSb3SignalEnv(CavSb3VecEnv):
         return {"vehicles": self._drivers.act_batch(*self._seen)}
 
     def _signal_rows(self) -> NDArray[np.float32]:
-        """Return the present observations (W · S, D)."""
+        """Return the current observations (W · S, D)."""
         if self._features is None:
             found = self._agents.view.observations.copy()
         else:

@@ -30,7 +30,7 @@ try:
 except ModuleNotFoundError as error:
     raise missing(error.name, "train") from error
 
-DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step; it keeps arrays
+DECIDED = ("autoreset_mode", "copy")  # stable-baselines3 resets in the same step and keeps arrays
 ARRIVAL = TERMS.index("arrival")
 
 Indices = int | Iterable[int] | None

@@ -49,7 +49,7 @@ class CavTorchRLEnv(OwnWorlds, EnvBase):  # type: ignore[misc] # TorchRL is not 
     - `("vehicles", "action")`: (W, A, 2) within [-1, 1], or (W, A) meta-actions;
     - `("next", "vehicles", "reward")`: (W, A, 1);
     - `("next", "vehicles", "terminated")`, `"truncated"`, `"done"`: (W, A, 1) whether the agent's
-      vehicle ended, or the horizon ended its trip. Use these for value estimators;
+      trip ended, or the horizon ended it. Use these for value estimators;
     - `("next", "vehicles", "info", term)`: (W, A, 1) each term by its name.
 
     The group `signals` has the same entries with these differences:

@@ -51,7 +51,7 @@ class ActionDecoder:
             else np.full(shape, config.idle_choice, dtype=np.int64)
         )
         self._idle = self._last.copy()
-        # Has the full shape: NumPy takes four times as long to broadcast a pair.
+        # The scale has the full shape, because NumPy takes four times as long to broadcast a pair.
         self._scale = np.empty((*shape, 2))
         self._scale[:] = config.acceleration_mps2, config.steering_rad
         if commands is None:
@@ -256,7 +256,7 @@ class ActionDecoder:
         return None
 
     def _as_numbers(self, value: Any, name: str) -> NDArray[Any]:
-        """Return an array of a dtype that means an action; raise an error for others."""
+        """Return an array of a dtype allowed for actions; raise an error for any other dtype."""
         kind = (
             "floats (float32 or float64) in [-1, 1]"
             if self._continuous
@@ -317,7 +317,7 @@ class ActionDecoder:
 
 
 def _nearest(values: tuple[float, ...], wanted: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the indices of the values nearest to the wanted ones; the first one wins a tie."""
+    """Return the index of the value nearest to each wanted value; the first one on a tie."""
     away = np.abs(wanted[..., None] - np.array(values))
     found: NDArray[np.int64] = away.argmin(axis=-1)
     return found

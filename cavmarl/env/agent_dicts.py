@@ -15,7 +15,7 @@ Observation = NDArray[np.float32] | dict[str, NDArray[Any]]
 Listed = NDArray[np.intp] | slice
 """Rows of an array that belong to the agents in the episode."""
 
-# Keys of an agent's info after the terms.
+# Keys of an agent's info that follow the keys of the reward terms.
 _OF_VEHICLE = ("active", "vehicle_done", "vehicle_id")
 
 

@@ -26,7 +26,7 @@ def known_mode(mode: AutoresetMode | str) -> AutoresetMode:
 
 
 def present_mode(in_next_step: bool, disabled: bool) -> AutoresetMode:
-    """Return the mode of worlds that reset in the next step, or in the same step."""
+    """Return Gymnasium's mode for worlds that reset in the next or the same step, or never."""
     if disabled:
         return AutoresetMode.DISABLED
     return AutoresetMode.NEXT_STEP if in_next_step else AutoresetMode.SAME_STEP

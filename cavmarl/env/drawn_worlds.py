@@ -59,7 +59,7 @@ def check_rendering(
 
 
 def check_external_agents(config: EnvConfig, backend: BackendName) -> None:
-    """Raise a ConfigError if external agents cannot sense, as their worlds cannot be copied."""
+    """Raise a ConfigError if external agents need a copy of the worlds and there is none."""
     if config.population.external_agents and (obstacle := why_not_copied(config, backend)):
         raise ConfigError(
             f"population.external_agents with {obstacle}: such vehicles can only sense in the "
@@ -68,7 +68,7 @@ def check_external_agents(config: EnvConfig, backend: BackendName) -> None:
 
 
 def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
-    """Return the settings that keep this process from copying the worlds; else ""."""
+    """Return the settings that prevent this process from copying the worlds; "": none do."""
     if backend.is_local:
         return ""
     with_sumo = config.traffic.source != "native"
@@ -79,7 +79,7 @@ def why_not_copied(config: EnvConfig, backend: BackendName) -> str:
 
 
 def unguarded(worlds: SteppedWorlds) -> SteppedWorlds:
-    """Return the worlds that a time master guards, or the worlds themselves."""
+    """Return the worlds inside the wrapper of a time master; other worlds are returned as is."""
     found: SteppedWorlds = getattr(worlds, "guarded", worlds)
     return found
 
@@ -120,7 +120,7 @@ class WorldCopy:
 
 
 def vehicles_that_ended(arrays: StepArrays, world: int) -> NDArray[np.void]:
-    """Return ENDED: the agents whose vehicles ended in the last step of a world, and why."""
+    """Return ENDED: agents whose vehicles' trips ended in a world's last step, and why."""
     if not arrays.vehicle_done[world].any():
         return NONE_ENDED
     agents = np.flatnonzero(arrays.vehicle_done[world])

@@ -84,7 +84,7 @@ class ExternalAgents:
         """Raise the ActionError of an action that is not two numbers in [-1, 1]."""
         try:
             given = np.asarray(action)
-        except ValueError:  # lists of several lengths
+        except ValueError:  # nested lists of different lengths
             given = np.zeros(0)
         is_number = given.dtype.kind in "fiu" and given.shape == (2,)
         if not is_number or not (np.abs(given) <= 1.0).all():
@@ -114,7 +114,7 @@ class ExternalAgents:
             )
 
     def prepare(self) -> None:
-        """Note the poses before a step, after a copy of the environment."""
+        """Store the poses before the first step of a copied environment."""
         if self._sensing is None:
             self._sense_with(self._session.present()).rig.begin(self._scenes())
 
@@ -201,7 +201,7 @@ class _Sensing:
         self._rows = np.zeros((1, capacity), dtype=VEHICLE)
 
     def scene(self) -> SensedScene:
-        """Return the present scene, in which only observing external vehicles are agents."""
+        """Return the current scene, in which only observing external vehicles are agents."""
         simulation = self.simulation
         present = simulation.vehicles(0)
         count = len(present)

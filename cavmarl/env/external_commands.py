@@ -121,13 +121,13 @@ class ExternalCommands:
             world: number of the world.
 
         Returns:
-            The vehicle's slot, by which the other methods name it.
+            The vehicle's slot, to be passed to the other methods.
 
         Raises:
             ActionError: the place is outside of the map, or an argument is invalid.
             OccupiedPlaceError: another vehicle covers the place.
             CapacityError: the world already has `population.external` such vehicles.
-            ConfigError: `population.external` is 0; or it is to observe, and
+            ConfigError: `population.external` is 0; or `observes` is true, and
                 `population.external_agents` is false.
         """
         self._check_world(world)
@@ -177,7 +177,7 @@ class ExternalCommands:
     ) -> None:
         """Move a vehicle to a pose, which it reaches at the end of the next step.
 
-        A pose that is farther than a vehicle drives at 60 m/s is a jump: the vehicle leaves, and
+        If a vehicle at 60 m/s could not reach the pose, the move is a jump: the vehicle leaves, and
         enters at the pose with a new id.
 
         Args:
@@ -204,7 +204,7 @@ class ExternalCommands:
     def drive(self, slot: int, throttle_mps2: float, steering_rad: float, world: int = 0) -> None:
         """Drive a vehicle from the next step on, until the next command to it.
 
-        It moves as an agent's vehicle, within the limits of `action` and of its type.
+        It moves like an agent's vehicle, within the limits of `action` and of its type.
 
         Args:
             slot: result of `spawn`.
@@ -235,7 +235,7 @@ class ExternalCommands:
             told["kind"] = EXTERNAL_REMOVED
 
     def ids(self, world: int = 0) -> NDArray[np.int64]:
-        """Return the vehicle id (E,) of each slot; -1: no vehicle, or not before the next step.
+        """Return the vehicle id (E,) of each slot; -1: no vehicle, or it enters in the next step.
 
         Raises:
             ConfigError: `population.external` is 0.
@@ -245,7 +245,7 @@ class ExternalCommands:
         return ids
 
     def vehicles(self, world: int = 0) -> NDArray[np.void]:
-        """Return the present external vehicles, VEHICLE (n,); `order` is the slot of each.
+        """Return the current external vehicles, VEHICLE (n,); `order` is the slot of each.
 
         Raises:
             ConfigError: `population.external` is 0.
@@ -257,7 +257,7 @@ class ExternalCommands:
         return found
 
     def add_to(self, commands: Commands) -> Commands:
-        """Return the commands with the waiting ones, which are kept until `clear`."""
+        """Return the commands with the waiting commands added; these are kept until `clear`."""
         return replace(commands, external=self._commands.copy()) if self._most else commands
 
     def clear(self) -> None:

@@ -22,7 +22,7 @@ Asked = tuple[tuple[str, str], ...]
 
 
 class Insertions:
-    """Vehicles for W worlds, at most `population.insertions` in an episode of each.
+    """Vehicles to insert into W worlds: at most `population.insertions` per world and episode.
 
     Args:
         config: configuration of the worlds.
@@ -36,7 +36,7 @@ class Insertions:
         self._lanes = {name: k for k, name in enumerate(network.lane_ids)} if self._most else {}
         self._rows = np.zeros((num_worlds, self._most, 3))
         self._waiting = np.zeros(num_worlds, dtype=np.int64)
-        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, with waiting ones
+        self._used = np.zeros(num_worlds, dtype=np.int64)  # in the episode, waiting ones included
         self._last: list[Asked] = [()] * num_worlds  # insertions of the last step
 
     @property
@@ -116,7 +116,7 @@ class Insertions:
             self._waiting[:] = 0
 
     def _texts(self, world: int, count: int) -> Asked:
-        """Return the waiting insertions in words."""
+        """Return the waiting insertions as kind and text, for `WorldFrame.asked`."""
         ids = self._network.lane_ids
         rows = self._rows[world, :count].tolist()
         return tuple((INSERTED, f"{ids[int(lane)]} {place!r}") for _, lane, place in rows)

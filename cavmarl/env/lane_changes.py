@@ -36,7 +36,7 @@ Asked = tuple[tuple[str, str], ...]
 
 
 class LaneChanges:
-    """The lanes of W worlds that differ from the map, at most N = `map.changed_lanes` of each.
+    """The lanes that differ from the map: at most N = `map.changed_lanes` in each of W worlds.
 
     The changes stay until they are undone, or until the world is reset. The events of `map.events`
     apply to all worlds.
@@ -72,7 +72,7 @@ class LaneChanges:
 
     @property
     def memory(self) -> tuple[NDArray[Any], ...]:
-        """The changes that hold from the next step on, and the states of reversed roads."""
+        """The changes that apply from the next step on, and the states of reversed roads."""
         return self._told, self._reversed.states
 
     @memory.setter
@@ -99,7 +99,7 @@ class LaneChanges:
             edge: id of the road.
             lanes: indices of the lanes, from the kerb; None: all lanes.
             classes: bits of the vehicle classes that may not use them.
-            shuts_in: whether the road may be the last way out of others.
+            shuts_in: whether to close the road even if it is the last way out of other roads.
 
         Raises:
             ActionError: there is no such world, road or lane; or the road is the last way out.
@@ -117,7 +117,7 @@ class LaneChanges:
             self._reversed.keep_closed(world, edge, rows - first)
 
     def open(self, world: int, edge: str, lanes: Sequence[int] | None = None) -> None:
-        """Give lanes of a road the limits and permissions of the map; raises as `close`.
+        """Give lanes of a road the limits and permissions of the map; errors as for `close`.
 
         A reversed road gets its direction back, with all its lanes.
         """
@@ -147,10 +147,10 @@ class LaneChanges:
     ) -> None:
         """Close a road, and open its contraflow lanes once no vehicle is on it.
 
-        If other roads that are being reversed lead to it, the road closes once they are empty.
+        If other roads that are being reversed lead to this road, it closes once they are empty.
 
         Raises:
-            ActionError: there is no such world or road, it is the last way out of others, it is
+            ActionError: there is no such world or road, the road is the last way out of others or
                 not one of `map.contraflow`, or `lanes` does not name all of its lanes.
             CapacityError, ConfigError: see `close`.
         """
@@ -173,7 +173,7 @@ class LaneChanges:
             self._queue(world, road)
 
     def _queue(self, world: int, edge: str) -> None:
-        """Open a road that is to be reversed, until the reversed roads before it are empty."""
+        """Keep a road open that is to be reversed, until the reversed roads before it are empty."""
         limit_mps, classes = self._now(world)
         classes[self._rows(world, edge, None)] = 0
         closing = (CLOSED, edge)
@@ -184,14 +184,14 @@ class LaneChanges:
             self._waiting[world] = tuple(event for event in waiting if event != closing)
 
     def _turn_back(self, world: int, edge: str) -> None:
-        """Close the contraflow lanes of a road; it opens once no vehicle is on them."""
+        """Close the contraflow lanes of a road; the road opens once no vehicle is on them."""
         limit_mps, classes = self._now(world)
         classes[self._reversed.lanes(edge)] = 0
         self._reversed.begin(world, edge, RETURNING)
         self._tell(world, limit_mps, classes, (CLOSED, contraflow_of(edge)))
 
     def advance(self, ticks: NDArray[np.int64]) -> None:
-        """Apply the events of the next step, and open reversed roads that are empty.
+        """Apply the events of the next step, and continue to reverse or restore roads.
 
         `ticks`: (W,) of the worlds, before the step.
         """
@@ -298,7 +298,7 @@ class LaneChanges:
         return replace(commands, lane_changes=self._told.copy()) if self._most else commands
 
     def clear(self) -> None:
-        """Note the changes of the step; they stay."""
+        """Store the changes of the step for `last`; the lanes stay changed."""
         if self._most:
             self._last, self._waiting = self._waiting, [()] * len(self._waiting)
 
@@ -346,9 +346,9 @@ class LaneChanges:
         return first + np.unique(np.asarray(lanes, dtype=np.intp))
 
     def _now(self, world: int) -> tuple[NDArray[np.float64], NDArray[np.uint32]]:
-        """Return the limit in m/s (L,) and the classes (L,) each lane is closed to.
+        """Return the limit in m/s (L,) of each lane, and the classes (L,) that it is closed to.
 
-        Of contraflow lanes, return the classes that they are open to.
+        For contraflow lanes, return the classes that they are open to instead.
         """
         told = self._told[world]
         used = told[told[:, CHANGED] > 0.0]

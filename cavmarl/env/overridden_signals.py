@@ -23,7 +23,7 @@ class SignalOverrides:
     """The links in W worlds whose signals show states of the caller.
 
     At most N = `signals.overrides` links of a world can do so at the same time. Drivers, sensors,
-    messages and drawings see these states like those of a program. The programs continue to run.
+    messages and drawings see these states like states of a program. The programs continue to run.
 
     Args:
         config: configuration of the worlds.

@@ -47,9 +47,9 @@ def parallel_env(
 
     Args:
         env: name of an entry of `envs/`, a folder with an env.yaml, a map file, or a .sumocfg.
-        lenient: for libraries that act for absent agents or beyond the bounds. Values are clipped,
-            actions of absent agents are ignored, and a missing action repeats the agent's last one,
-            or 0. Sets action.out_of_range, .missing_action, .late_actions; traffic_stats() counts.
+        lenient: whether to clip values out of range, ignore actions of absent agents, and repeat an
+            agent's last action (or 0) if its action is missing, as some libraries need. Sets
+            action.out_of_range, .late_actions, .missing_action; traffic_stats() counts the cases.
         world: zones, zone_simulators, backend, workers, nodes, sensor_workers, agents, background,
             seed, max_cycles, sensors_of, render_mode, record and overrides, as `WorldArguments`
             describes them.
@@ -129,16 +129,16 @@ class CavEnv(WorldsEnvironment, ParallelEnv[str, Any, Any]):  # type: ignore[mis
         self._max_cycles = config.max_steps
         self._steps = 0
         self._rows: NDArray[np.intp]
-        self._listed: Listed  # indexes the same rows
+        self._listed: Listed  # the same rows as an index, a slice if possible
         self._list(np.zeros(0, dtype=np.intp))
         self.agents: list[str] = []
 
     @property
     def max_cycles(self) -> int:
-        """Steps until truncation. It can be set to fewer steps than the environment was made for.
+        """Steps until truncation; can be set from 1 to the number given to `parallel_env`.
 
         Raises:
-            ConfigError: it is set to a number outside that range.
+            ConfigError: the number is outside of this range.
         """
         return self._max_cycles
 

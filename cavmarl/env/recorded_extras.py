@@ -90,7 +90,7 @@ class RecordedExtras:
         state_hash: Callable[[int], str] | None = None,
     ) -> None:
         self._arrays = arrays
-        self._ticks = np.full(len(arrays.mask), -1, dtype=np.int64)  # of the last frames
+        self._ticks = np.full(len(arrays.mask), -1, dtype=np.int64)  # last frame
         self._step_ticks = config.clock.ticks_per_step
         self._state_hash = state_hash
         self.inputs = StepInputs()
@@ -203,7 +203,7 @@ class RecordedExtras:
     ) -> Rows:
         """Return a row of each agent that acted in the last step; `tick` None: the next tick.
 
-        The observations of agents and episodes that have ended are their last ones.
+        If a trip or the episode has ended, the row has the last observation before the end.
         """
         arrays = self._arrays
         agents = np.flatnonzero(arrays.acted[world])
@@ -244,7 +244,7 @@ class RecordedExtras:
 
 
 class _SentLog:
-    """Rows of each world, tick by tick, until they are taken; a repeated tick counts once."""
+    """A log of rows by world and tick, emptied by `take`; a repeated tick is logged once."""
 
     def __init__(self, dtype: np.dtype[Any]) -> None:
         self._dtype = dtype

@@ -13,7 +13,7 @@ from cavmarl.env.world_copies import OwnWorlds
 
 
 class CheckedActions(OwnWorlds, wrappers.OrderEnforcingWrapper):  # type: ignore[misc] # not typed
-    """The AEC form, which refuses a wrong action at once instead of in the common step.
+    """The AEC form, which refuses a wrong action at once instead of when all agents have acted.
 
     Args:
         world: the parallel environment.

@@ -15,17 +15,17 @@ from cavmarl.engine.world_views import WorldViews
 from cavmarl.roads.contraflow_ids import contraflow_of
 from cavmarl.roads.network import RoadNetwork
 
-# States of a road: as on the map; closed, to be reversed once it is empty; reversed; its
-# contraflow lanes are closed, and it opens once they are empty; still open, to be closed once the
+# States of a road. CLEARING: closed, to be reversed once it is empty. RETURNING: its contraflow
+# lanes are closed, and it opens once they are empty. QUEUED: still open, to be closed once the
 # reversed roads that lead to it are empty, so that their vehicles can leave.
 AS_ON_MAP, CLEARING, REVERSED_NOW, RETURNING, QUEUED = range(5)
 # Columns of `ReversedRoads.states`. KEPT: bits of the lanes that stay closed when a road returns;
-# of a road that is being cleared: whether vehicles may be on its contraflow lanes.
+# for a CLEARING road, whether vehicles may be on its contraflow lanes.
 _STATE, _SINCE, _KEPT = range(3)
-_NOT_YET = -1  # the order belongs to the next step
+_NOT_YET = -1  # the state begins in the next step
 
-# Least time between closing lanes and opening those in the other direction. Vehicles that cannot
-# stop before closed lanes are on them by then.
+# Minimum time between closing lanes and opening the lanes in the other direction. By then, vehicles
+# that could not stop before the closed lanes have entered them, so that the lanes are not empty.
 CLEAR_S = 10.0
 
 
@@ -96,9 +96,9 @@ class ReversedRoads:
         return np.concatenate(found) if found else np.zeros(0, dtype=np.intp)
 
     def to_queue(self, world: int) -> list[str]:
-        """Return the roads that are closed before the reversed roads that lead to them are empty.
+        """Return the closed roads to which other roads lead that are not yet ready to be reversed.
 
-        They have to open again, so that vehicles on the other roads can leave.
+        The closed roads have to open again, so that vehicles on the other roads can leave.
         """
         state = self.states[world, :, _STATE]
         waits = (self._before & ((state == QUEUED) | (state == CLEARING))).any(axis=1)

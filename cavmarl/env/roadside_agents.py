@@ -14,13 +14,13 @@ from cavmarl.core.errors import ActionError
 from cavmarl.parallel.worlds.step_arrays import StepArrays
 from cavmarl.signals.kernels.green_choices import GREEN, KEEP, REFUSED
 
-VEHICLES = "vehicles"  # key of the arrays of vehicles, beside those of a `RoadsideAgents.kind`
+VEHICLES = "vehicles"  # key of the vehicles' arrays; other keys are `RoadsideAgents.kind`
 
 
 class RoadsideAgents(ABC):
     """S agents of one kind in W worlds, and their results.
 
-    All of them decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
+    All agents decide at the same times. Their arrays in `StepArrays` begin with `signal_`,
     whatever their kind: a world has agents of signals or of limits.
 
     Args:
@@ -39,7 +39,7 @@ class RoadsideAgents(ABC):
     kind: ClassVar[str]  # key of the arrays of an environment, and section of the configuration
     prefix: ClassVar[str]  # prefix of these agents' ids, followed by the name
     terms: ClassVar[tuple[str, ...]]  # terms of the reward
-    choice: ClassVar[str]  # name of the present choice in infos
+    choice: ClassVar[str]  # name of the current choice in infos
 
     def __init__(
         self,
@@ -69,7 +69,7 @@ class RoadsideAgents(ABC):
 
     @abstractmethod
     def suggest(self) -> NDArray[np.int64]:
-        """Return the choices (W, S) without control; KEEP where no decision is due."""
+        """Return the default choices (W, S), as without agents; KEEP where no decision is due."""
 
     @abstractmethod
     def kept(self) -> NDArray[np.int64]:

@@ -60,7 +60,7 @@ class StepSession:
         overrides: signals that show the caller's states.
         lane_changes: lanes that the caller closes or slows down.
         controlled: the signals or limits that are controlled; None: there are none.
-        roadside: the same if agents control them, else None.
+        roadside: the signals or limits if agents control them, else None.
         is_ready: whether `reset` has been called.
         simulated_s: wall time of all steps of the worlds so far.
     """
@@ -107,8 +107,7 @@ class StepSession:
         """Begin an episode in the chosen worlds (W,).
 
         If `seed` is None, the first reset uses the seed of the session; a later reset begins the
-        next episodes of the last seed. Random numbers of the first world depend on its number,
-        `first_world`.
+        next episodes of the last seed. Random numbers of world w depend on `first_world` + w.
         """
         self._refuse_closed("reset()")
         if seed is not None or not self.is_ready:

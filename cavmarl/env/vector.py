@@ -190,7 +190,7 @@ class CavVectorEnv(WorldsEnvironment):
     def plans(self) -> tuple[Plan, ...]:
         """Assignments of worlds, or of each world's zones, to workers; empty without workers.
 
-        See docs/explanation/balance.md. If worlds or zones move, this is the present assignment.
+        See docs/explanation/balance.md. If worlds or zones move, this is the current assignment.
         """
         return self.worlds.plans
 
@@ -254,7 +254,7 @@ class CavVectorEnv(WorldsEnvironment):
                 False. With agents of signals, a dict: `vehicles`, and `signals` (W, S).
 
         Returns:
-            observations (W, A, D), rewards (W, A), terminations (W, A): the agent's vehicle ended;
+            observations (W, A, D), rewards (W, A), terminations (W, A): the vehicle's trip ended;
             truncations (W, A): the horizon of the episode or of the trip was reached; and infos:
             `mask` (W, A) agents that act next; `acted` (W, A) agents that acted in this step, so
             their rewards count; `terms` (W, A, T) in the order of `config.terms.TERMS`;
@@ -298,7 +298,7 @@ class CavVectorEnv(WorldsEnvironment):
             "mask": self._mask.copy(),
             "episode_over": over.copy(),
         }
-        terminations &= ~arrays.truncations  # the trip's own horizon does not terminate it
+        terminations &= ~arrays.truncations  # a trip that reaches its own horizon is truncated
         rewards, truncations = arrays.rewards.copy(), arrays.truncations.copy()
         roadside = session.roadside
         if roadside is None:
@@ -369,7 +369,7 @@ class CavVectorEnv(WorldsEnvironment):
         self._session.events.declare(world, agent, cause)
 
     def _final_observations(self, ended: NDArray[np.bool_]) -> Observations:
-        """Return the observations; in the worlds `ended` (W,), those before the reset."""
+        """Return the observations; for worlds in `ended` (W,), from before the reset."""
         found, arrays = self._final_vehicle_observations(ended), self.worlds.arrays
         roadside = self._session.roadside
         if roadside is None:
@@ -381,7 +381,7 @@ class CavVectorEnv(WorldsEnvironment):
         }
 
     def _final_vehicle_observations(self, ended: NDArray[np.bool_]) -> Observations:
-        """Return the observations; in the worlds `ended` (W,), those before the reset."""
+        """Return the observations of vehicles, as `_final_observations` does."""
         arrays = self.worlds.arrays
         if not self._senses:
             return with_rows(arrays.observations, arrays.final_observations, ended)
@@ -394,7 +394,7 @@ class CavVectorEnv(WorldsEnvironment):
     def frames(self) -> dict[str, SensorFrames]:
         """Return the samples of the last step of each sensor of `rig`, by sensor name.
 
-        See docs/reference/sensors.md. If an agent's vehicle ended in the step, these are its last
+        See docs/reference/sensors.md. If a vehicle's trip ended in the step, these are its last
         samples. If a world resets in the same step, these are the first samples of the new episode.
         With `copy=False`, the next step overwrites the arrays.
         """
@@ -402,9 +402,9 @@ class CavVectorEnv(WorldsEnvironment):
         return {name: sensor.copy() if self._copy else sensor for name, sensor in frames.items()}
 
     def final_frames(self) -> dict[str, SensorFrames]:
-        """Return the samples before the reset, for worlds where a vehicle or the episode ended.
+        """Return the samples before the reset, for worlds where a trip or the episode ended.
 
-        Like `frames`. For other worlds, the samples are older, or zeros.
+        The arrays are as in `frames`. Samples of other worlds are older, or zeros.
         """
         frames = self.worlds.arrays.final_frames
         return {name: sensor.copy() for name, sensor in frames.items()}
@@ -447,7 +447,7 @@ class CavVectorEnv(WorldsEnvironment):
         return {**self.worlds.traffic_stats(world), **self._session.decoder.tolerated(world)}
 
     def save_state(self) -> bytes:
-        """Return the state of the worlds, of actions and of the present results, as bytes.
+        """Return the state of the worlds, of actions and of the current results, as bytes.
 
         All later steps depend on this state alone.
 
@@ -461,8 +461,8 @@ class CavVectorEnv(WorldsEnvironment):
         """Restore a state that `save_state` returned. The number of zones and workers may differ.
 
         Raises:
-            ConfigError: the state is damaged, or of other worlds, of another number of worlds or of
-                another version.
+            ConfigError: the state is damaged, or belongs to other worlds, another number of worlds
+                or another version.
         """
         load_session(self._session, self._mask, saved)
 

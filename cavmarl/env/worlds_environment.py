@@ -148,8 +148,8 @@ class WorldsEnvironment(OwnWorlds):
     def insert_vehicle(self, lane: str, position_m: float, world: int = 0) -> None:
         """Let a car enter a world in the next step, or as soon as there is a safe gap.
 
-        The car counts in `population.insertions`. It gets a goal from the generator, and is then
-        one of the generator's vehicles.
+        The car counts towards `population.insertions`. It gets a goal from the generator, and is
+        then one of the generator's vehicles.
 
         Args:
             lane: id of a lane of a road.
@@ -176,19 +176,19 @@ class WorldsEnvironment(OwnWorlds):
         From the next step on, no vehicle enters the lanes, except vehicles that cannot stop in
         time. Vehicles on the lanes leave them. The vehicles of `population.reroute` take another
         route within a second. Vehicles without another route wait before the closed lanes, and
-        departures on them wait in the queue. Each lane counts in `map.changed_lanes`.
+        departures on them wait in the queue. Each lane counts towards `map.changed_lanes`.
 
         Args:
             edge: id of a road.
             lanes: indices of its lanes, from the kerb; None: all of them.
             world: number of the world.
-            shuts_in: whether the road may be the last way out of other roads.
-            contraflow: whether the road is reversed: its lanes open in the opposite direction after
-                10 s or more, as soon as no vehicle is on it. The lanes of both directions count.
+            shuts_in: whether to close the road even if it is the last way out of other roads.
+            contraflow: whether to reverse the road: its lanes open in the opposite direction after
+                10 s or more, as soon as no vehicle is on it. Lanes count in both directions.
 
         Raises:
-            ActionError: there is no such world, road or lane; the road is the last way out; or it
-                is to be reversed and is not in `map.contraflow`, or only with some lanes.
+            ActionError: there is no such world, road or lane; the road is the last way out; or
+                `contraflow` is set without all lanes of a road of `map.contraflow`.
             CapacityError: more than `map.changed_lanes` lanes would differ from the map.
             ConfigError: `map.changed_lanes` is 0.
         """
@@ -200,8 +200,8 @@ class WorldsEnvironment(OwnWorlds):
     def open_road(self, edge: str, lanes: Sequence[int] | None = None, world: int = 0) -> None:
         """Restore lanes of a closed, damaged or reversed road to their state on the map.
 
-        Vehicles that wait before them drive on from the next step on. A reversed road opens with
-        all its lanes, once its contraflow lanes are closed and empty.
+        Vehicles that wait for these lanes drive on from the next step on. A reversed road opens
+        with all its lanes, once its contraflow lanes are closed and empty.
 
         Args:
             edge: id of a road.
@@ -219,8 +219,8 @@ class WorldsEnvironment(OwnWorlds):
     ) -> None:
         """Lower the speed limit of lanes of a road, until it is opened or the episode is over.
 
-        From the next step on, drivers, sensors and rewards use the new limit. Each lane counts in
-        `map.changed_lanes`.
+        From the next step on, drivers, sensors and rewards use the new limit. Each lane counts
+        towards `map.changed_lanes`.
 
         Args:
             edge: id of a road.
@@ -237,7 +237,7 @@ class WorldsEnvironment(OwnWorlds):
         self._session.lane_changes.limit(world, edge, speed_mps, lanes)
 
     def closed_roads(self, world: int = 0) -> tuple[str, ...]:
-        """Return the ids of roads with a closed lane, including those that close in the next step.
+        """Return the ids of roads with a closed lane, including roads that close in the next step.
 
         Raises:
             ActionError: there is no such world.

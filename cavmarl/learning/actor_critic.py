@@ -85,7 +85,7 @@ class ActorCritic(nn.Module):
         return normal.clamp_(-MAX_DEVIATIONS, MAX_DEVIATIONS)
 
     def heads(self, seen: Tensor, states: Tensor | None = None) -> tuple[Tensor, Tensor]:
-        """Return `forward` and `value` for observations that are already `normal`."""
+        """Return the results of `forward` and `value` for observations already normalised."""
         if self.body is not None:
             seen = self.body(seen)
         judged = seen
@@ -122,7 +122,7 @@ class ActorCritic(nn.Module):
         return self.draw(self.forward(observations))
 
     def draw(self, output: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `sample` for an output of `forward`."""
+        """Return the result of `sample`, given the output of `forward`."""
         noise = torch.empty_like(output)
         if self.continuous:
             actions = output + noise.normal_() * self.log_std.exp()
@@ -136,7 +136,7 @@ class ActorCritic(nn.Module):
         return self.judge(self.forward(observations), actions)
 
     def judge(self, output: Tensor, actions: Tensor) -> tuple[Tensor, Tensor]:
-        """Return `evaluate` for an output of `forward`."""
+        """Return the result of `evaluate`, given the output of `forward`."""
         if self.continuous:
             entropy = (0.5 + 0.5 * LOG_2_PI + self.log_std).sum().expand(output.shape[0])
             return self._log_prob(output, actions), entropy

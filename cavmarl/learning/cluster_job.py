@@ -67,7 +67,7 @@ class TrainingJob:
         if not self._is_resumed and is_trained(Path(self.folder)):
             return self.folder
         global _child
-        # The program inherits that SIGUSR2 is blocked: batch systems send it to all processes.
+        # Block SIGUSR2 in the program, too, because batch systems send it to all processes.
         mask = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
         try:
             command = dying_with_parent(self.command())

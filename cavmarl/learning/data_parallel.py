@@ -58,10 +58,10 @@ class Ranks:
             dist.destroy_process_group()
 
     def share(self, option: str, count: int) -> int:
-        """Return the part of `count` things that each process has.
+        """Return the number of things per process if `count` things are divided equally.
 
         Raises:
-            ConfigError: the processes cannot have equal parts.
+            ConfigError: `count` is not a multiple of the number of processes.
         """
         if count % self.size:
             raise ConfigError(

@@ -49,7 +49,7 @@ def curve_row(
 
 
 class Trips:
-    """Returns and ends of the last `WINDOW` trips, and the present trips of (W, A) agents."""
+    """Returns and ends of the last `WINDOW` trips, and the current trips of (W, A) agents."""
 
     def __init__(self, num_envs: int, num_agents: int) -> None:
         self._sums = np.zeros((num_envs, num_agents, 2))  # return, red lights run

@@ -28,7 +28,7 @@ class Logger(Protocol):
     """Writes the metrics of each update of a run."""
 
     def write(self, row: Row) -> None:
-        """Write the metrics of an update; its position is the number `agent_steps`."""
+        """Write the metrics of an update; the x axis is `agent_steps`."""
         ...
 
     def flush(self) -> None:

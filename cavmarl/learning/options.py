@@ -37,8 +37,8 @@ def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None)
 
     `--config FILE` is a YAML file of the same settings; options take precedence.
 
-    `words`: arguments of the command line; None: this process's. `text`: its first line is shown
-    as the description of the program.
+    `words`: arguments of the command line; None: those of this process. `text`: its first line is
+    shown as the description of the program.
     """
     return settings_of(kind, given_options(kind, words, text))
 
@@ -46,7 +46,7 @@ def parse_settings(kind: type[S], words: Sequence[str] | None, text: str | None)
 def given_options(
     kind: type[DataclassInstance], words: Sequence[str] | None, text: str | None
 ) -> dict[str, Any]:
-    """Return only the given options, by name; `config` is a file. Arguments as above."""
+    """Return only the given options, by name; `config` is a file. See `parse_settings`."""
     parser = argparse.ArgumentParser(
         description=(text or "").partition("\n")[0], argument_default=argparse.SUPPRESS
     )
@@ -117,12 +117,12 @@ def check_device(name: str) -> None:
 def with_form_of(args: S, start: str) -> S:
     """Return settings with the network form of a driver: `hidden`, `shared`, `residual`.
 
-    `start`: its name or folder; empty: the settings are returned unchanged. Raises PolicyError: the
-    driver does not exist, or is not a trained driver.
+    `start`: the driver's name or folder; empty: the settings are returned unchanged. Raises
+    PolicyError: the driver does not exist, or is not a trained driver.
     """
     if not start:
         return args
-    from cavmarl.networks.network_files import read_network  # an extra, as above
+    from cavmarl.networks.network_files import read_network  # optional package
     from cavmarl.policies.loading import policy_files
 
     form = read_network(policy_files(start)[0].parent)[1]

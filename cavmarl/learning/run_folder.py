@@ -204,7 +204,7 @@ class RunFolder:
     def save(self, agent_steps: int, updates: int, parts: Parts) -> None:
         """Replace the checkpoint by a new one; all processes call this.
 
-        In each process other than the first, its own `parts` take precedence.
+        A process other than the first resumes with the shared parts, updated by its own `parts`.
 
         Raises:
             TrainingError: it cannot be written; the previous one is intact.
@@ -229,7 +229,7 @@ class RunFolder:
             write_checkpoint(self.path, state)
 
     def save_driver(self, network: ActorCritic, config: NetworkConfig) -> None:
-        """Write the present driver for evaluation, with the kinds of the maps of its training.
+        """Write the current driver for evaluation, with the kinds of the maps of its training.
 
         A run cannot be resumed from this file.
         """

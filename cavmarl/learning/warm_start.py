@@ -29,8 +29,8 @@ def begin_with(network: ActorCritic, config: NetworkConfig, folder: Path) -> int
     """Copy the weights of a driver into a network; return their number of training decisions.
 
     Observations that the driver does not have get the weight 0, so that the network first decides
-    like the driver. Observations that the run does not have are left out and logged: the network
-    first decides like the driver where they equal their mean.
+    like the driver. Observations that the run does not have are left out and logged. The network
+    then first decides as the driver does when these observations have their mean values.
 
     Args:
         network: the initialised network.

@@ -345,7 +345,7 @@ def walls_of(footprints: list[Footprint]) -> NDArray[np.void]:
 
 
 def points_inside(network: RoadNetwork, roofs: NDArray[np.float64]) -> NDArray[np.int64]:
-    """Return the rows of `network.points` inside convex parts (n, 4, 2), rims included."""
+    """Return the rows of `network.points` inside convex parts (n, 4, 2) or on their borders."""
     places = np.stack([network.points["x"], network.points["y"]], axis=1)
     is_inside = np.zeros(len(places), dtype=np.bool_)
     for roof in roofs:

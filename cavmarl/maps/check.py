@@ -54,8 +54,8 @@ class MapReport:
     junctions_without_right_of_way: tuple[str, ...]  # junctions where lanes meet without a rule
     signals_without_lanes: tuple[str, ...]  # traffic lights that control no lane
     lanes_never_green: tuple[str, ...]  # lanes whose signal never opens any movement
-    # signal programs (signal/program) that are simplified: programs with a choice between following
-    # phases, delay-based and NEMA programs run with their stated durations, and limits of single
+    # signal programs (signal/program) that are simplified: delay-based programs, NEMA programs and
+    # programs with several possible next phases run with their stated durations; limits of single
     # links are ignored
     programs_simplified: tuple[str, ...]
     signals_held: tuple[str, ...]  # signals that show red for 1,000 s or more in one phase

@@ -90,7 +90,7 @@ _EXACT = ("--precision=6", "--no-turnarounds", "--offset.disable-normalization")
 
 
 class _Contraflow:
-    """The elements that a network gets, as netconvert's plain XML, in the order of the roads."""
+    """The elements to add to a network, as netconvert's plain XML, in the order of the roads."""
 
     def __init__(self, document: NetDocument, roads: Sequence[str]) -> None:
         self._roads = {
@@ -123,7 +123,7 @@ class _Contraflow:
             yield Element("connection", dict(one.items()) | words)
 
     def _beside(self, name: str) -> str:
-        """Return the road that leads in the direction of contraflow lanes; else the road itself."""
+        """Return the map's own road in the direction of contraflow lanes; without one, `name`."""
         road = next(
             (edge for key, edge in self._reverses.items() if contraflow_of(key) == name), None
         )
@@ -186,7 +186,7 @@ def _is_for_cars(lane: Element) -> bool:
 
 
 def _reversed(road: Element) -> Element:
-    """Return the edge of the contraflow lanes of a road; its first lane is the innermost below."""
+    """Return a road's contraflow edge; the edge's first lane is the road's innermost lane."""
     lanes = [lane for lane in road.iter("lane") if _is_for_cars(lane)]
     shapes = [" ".join(reversed(lane.get("shape", "").split())) for lane in lanes]
     edge = Element(

@@ -244,7 +244,7 @@ def _shared_strips(network: RoadNetwork, document: NetDocument) -> Iterator[Defe
     for strip in strips_of(network, document):
         for one, other in strip.lanes:
             x, y = network.lane_polyline(one)[0, :2].tolist()
-            words = f"with {network.lane_ids[other]}; driven {strip.apart_m:.1f} m aside"
+            words = f"with {network.lane_ids[other]}; the reader moves it {strip.apart_m:.1f} m"
             yield Defect("opposite lanes on one strip", network.lane_ids[one], x, y, words)
 
 
@@ -295,7 +295,7 @@ def _to_rim(place: Points, rim: Points) -> float:
 def _buildings_on_roads(
     network: RoadNetwork, document: NetDocument, buildings: Path
 ) -> Iterator[Defect]:
-    """Find lanes inside buildings; tunnels, passages and covered roads lead through them."""
+    """Find lanes inside buildings, except tunnels, passages and covered roads."""
     # SUMO's polygons have no tags of ways.
     covered = {name for name, way in OsmRoads(buildings).ways.items() if way.is_covered}
     passages = {lane.id for lane in document.lanes if covered.intersection(lane.ways)}

@@ -93,7 +93,7 @@ _FAR_M = 100_000.0  # farther from the origin, the projection distorts lengths
 Origin = tuple[float, float]  # latitude and longitude, degrees
 Told = Callable[[str], None]
 
-STAGES = ("netconvert", "what the source says", "heights", "reading it back")
+STAGES = ("netconvert", "data of the source", "heights", "reading it back")
 
 
 def _silent(stage: str) -> None:
@@ -161,8 +161,8 @@ def build_network(
         told: called with each of `STAGES` as it begins.
 
     Raises:
-        ConfigError: `bbox` is empty, the origin is not on the earth or too far from the map, or the
-            source is a SUMO network and `side` is given, or a logged scene and an option is given.
+        ConfigError: `bbox` is empty; the origin is not on the earth or too far from the map; `side`
+            is given for a SUMO network; or any option is given for a logged scene.
         MapError: the source is broken, malicious or not a map; netconvert fails (its output is in
             the message); the result has no drivable lane; the heights cannot be used; the roads
             have no common traffic side; or the target cannot be written.

@@ -67,7 +67,7 @@ class Cures:
 def run_netconvert(
     arguments: Sequence[str], source: Path, timeout_s: float | None, cures: Cures = Cures()
 ) -> BuildLog:
-    """Run netconvert of the `eclipse-sumo` wheel, with `CAVMARL_MAX_NETCONVERT_BYTES` of memory.
+    """Run netconvert of the `eclipse-sumo` wheel; `CAVMARL_MAX_NETCONVERT_BYTES` limits its memory.
 
     `source`: the map file, for messages. `timeout_s`: time limit; None: `CAVMARL_MAX_NETCONVERT_S`,
     or 600 s. `cures`: advice for messages.

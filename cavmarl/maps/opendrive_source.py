@@ -22,7 +22,7 @@ NO_LIMIT_MPS = 142.0 / 3.6  # netconvert's value for `maxspeed=none` of OSM
 WALKING_MPS = 5.0 / 3.6  # lower limits are more likely a wrong unit
 MAX_GEOMETRY_M = 100_000
 LENGTH_LIMIT = "CAVMARL_MAX_GEOMETRY_M"  # environment variable that changes this limit
-LEAST_PART_M = 1.0  # netconvert makes an edge of each part of a road with its own limit
+LEAST_PART_M = 1.0  # netconvert makes a separate edge for each limit along a road
 
 _UNITS = {"m/s": 1.0, "km/h": 1.0 / 3.6, "kmh": 1.0 / 3.6, "kph": 1.0 / 3.6, "mph": 0.44704}
 # Lane types that vehicles drive on, with the speed of netconvert's type map in m/s.
@@ -155,7 +155,7 @@ class OpenDriveSource:
                 number += 1
 
     def _roads(self) -> Iterator[Element]:
-        """Yield the roads outside of junctions, where netconvert makes its own paths."""
+        """Yield the roads outside of junctions; in junctions, netconvert makes its own paths."""
         return (road for road in self.root.iter("road") if road.get("junction", "-1") == "-1")
 
     def _set_lane_types(self) -> None:
@@ -255,7 +255,7 @@ class OpenDriveSource:
         return None
 
     def _number(self, element: Element, key: str, endless: float = 0.0) -> float:
-        """Return a position or length in m; netconvert reports those that it cannot read.
+        """Return a position or length in m; 0 for invalid text, which netconvert reports.
 
         `endless`: returned for numbers that are not finite.
         """
@@ -296,7 +296,7 @@ def _negate(element: Element, key: str) -> None:
 def _parts(begin: float, end: float, of_road: Limits, of_lane: Limits) -> Limits:
     """Return the limits along a lane between two positions in m: the lane's own, else the road's.
 
-    Parts shorter than `LEAST_PART_M` at its ends belong to the adjacent parts.
+    Parts shorter than `LEAST_PART_M` at either end are merged into the adjacent parts.
     """
     at = {place for place, _ in (*of_road, *of_lane)}
     last = end - LEAST_PART_M

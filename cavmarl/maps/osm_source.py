@@ -62,7 +62,7 @@ def prepare_osm(path: Path, roads: OsmRoads, copy: Path, left_hand: bool) -> tup
 
 
 def _cuts(ways: dict[str, RoadWay]) -> dict[str, tuple[int, int]]:
-    """Return the nodes at which to cut ways with turn lanes: ahead and backward; 0: no cut.
+    """Return where to cut ways: node indices for forward and backward turn lanes; 0: no cut.
 
     Turn lanes lead to the junction at the end of their way. If the way is a dead end, they lead to
     the last junction before its end.
@@ -92,7 +92,7 @@ def _cut_ways(
     elements: dict[str, Element],
     cuts: dict[str, tuple[int, int]],
 ) -> None:
-    """Cut ways into up to three parts; the part with the turn lanes ahead keeps the name."""
+    """Cut ways into up to three parts; the part with forward turn lanes keeps the way's id."""
     free = max((int(name) for name in elements if name.lstrip("-").isdecimal()), default=0) + 1
     parts: dict[str, dict[str, list[str]]] = {}  # nodes of the parts of each way, by their names
     for name, (ahead, back) in cuts.items():

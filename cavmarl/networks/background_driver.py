@@ -24,7 +24,7 @@ from cavmarl.roads.road_kinds import RoadKind
 if TYPE_CHECKING:
     from cavmarl.networks.network_files import NetworkConfig
 
-MOST_STEPS = 3  # limit of the sensor `history`: the present step, and those of `MEMORY_FIELDS`
+MOST_STEPS = 3  # limit of the sensor `history`: the current step, and those of `MEMORY_FIELDS`
 
 
 @dataclass(frozen=True)

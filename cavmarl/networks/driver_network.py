@@ -195,5 +195,5 @@ def _add_perceptron(table: LayerTable, weights: Weights, config: NetworkConfig) 
 
 
 def _add_linear(table: LayerTable, weights: Weights, name: str, width: int) -> None:
-    """Add a linear layer; torch keeps its weights as (outputs, inputs), the kernel transposed."""
+    """Add a linear layer; the kernel's weights are torch's (outputs, inputs), transposed."""
     table.add(LINEAR, weights[f"{name}.weight"].T, weights[f"{name}.bias"], width=width)

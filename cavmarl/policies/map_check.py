@@ -1,4 +1,4 @@
-"""Checks whether a trained driver was trained on maps of the present kind."""
+"""Checks whether a trained driver was trained on maps of the environment's kind."""
 
 from __future__ import annotations
 

@@ -36,7 +36,7 @@ def export_onnx(policy: str | Path, path: Path) -> NetworkConfig:
     """Write a trained driver as an ONNX model and return its configuration.
 
     The input `observations` is float32 (N, D). The output is `actions` (N, 2) within [-1, 1], or,
-    of a driver with discrete actions, `logits` (N, choices). D includes the built-in driver's
+    for a driver with discrete actions, `logits` (N, choices). D includes the built-in driver's
     action if the driver corrects it.
 
     Raises:

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 IR_VERSION = 8
-OPSET = 17  # the first one with LayerNormalization
+OPSET = 17  # the first operator set with LayerNormalization
 FLOAT, INT64 = 1, 7  # TensorProto.DataType
 _VARINT, _BYTES, _FIXED32 = 0, 2, 5  # wire types of Protocol Buffers
 _ATTRIBUTE_FLOAT, _ATTRIBUTE_INT = 1, 2  # AttributeProto.AttributeType

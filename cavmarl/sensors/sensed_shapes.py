@@ -35,7 +35,8 @@ from cavmarl.sensors.observed import layout
 MOST_RAYS = 360
 MOST_POINTS = 2000
 MOST_PIXELS = 64_000
-GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")  # setting `units`: of the noise
+# Units of positions; `GnssConfig.units` has the units of the noise.
+GNSS_UNITS = ("° latitude", "° longitude", "m above the ellipsoid")
 
 Shape = dict[str, Any]
 Floats = NDArray[np.float64]
@@ -101,7 +102,7 @@ def _places(name: str, kind: str, places: Floats) -> Shape:
 
 
 def _flat(places: Floats) -> list[float]:
-    """Return a flat list of finite numbers, as JSON cannot hold nan or infinity."""
+    """Return a flat list of finite numbers, because JSON cannot hold nan or infinity."""
     numbers: list[float] = np.nan_to_num(np.round(places, 2)).ravel().tolist()
     return numbers
 

@@ -102,7 +102,7 @@ def with_agent_programs(network: RoadNetwork, config: SignalsConfig) -> RoadNetw
 def greens_of(
     network: RoadNetwork, signal: int, every: bool = False
 ) -> tuple[tuple[str, float], ...]:
-    """Return the greens of a signal's present program: letters, and duration in s.
+    """Return the greens of a signal's current program: letters, and duration in s.
 
     `every`: whether to apply the rule of `signals.greens = all`.
     """

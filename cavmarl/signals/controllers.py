@@ -1,7 +1,7 @@
 """Controllers of signals, which choose greens from what agents know about the lanes.
 
 Each controller is for W worlds and is stateless: the history of lanes is part of the worlds' state.
-Choices that the mask excludes are replaced by the present green.
+Choices that the mask excludes are replaced by the current green.
 """
 
 from __future__ import annotations
@@ -66,7 +66,7 @@ class ProgramController:
     """Uses the order and the durations of the greens in the map's programs."""
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Start the next green when the present green has lasted as long as in the program."""
+        """Start the next green when the current green has lasted as long as in the program."""
         return _by_durations(
             view, np.repeat(view.table.green_s[None], len(view.ticks), axis=0), 0.5 * view.dt
         )
@@ -105,7 +105,7 @@ class Actuated:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Start the next green if no detector of the present green was occupied during the gap."""
+        """Start the next green if no detector of the current green was occupied during the gap."""
         follows = np.empty(view.states.shape[:2], dtype=np.bool_)
         gap_ms = round(1e3 * view.config.max_gap_s)
         find_followers(
@@ -123,7 +123,7 @@ class Sotl:
     """
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the most demanded green, or keep the present green."""
+        """Choose the most demanded green, or keep the current green."""
         wanted = np.empty(view.states.shape[:2], dtype=np.int64)
         find_demanded(
             view.table.served,
@@ -142,7 +142,7 @@ class LongestQueue:
     """Chooses the green whose lanes have the most vehicles, like RESCO's controller "greedy"."""
 
     def choose(self, view: SignalView) -> NDArray[np.int64]:
-        """Choose the green with the most vehicles on its lanes; on a tie, the present green."""
+        """Choose the green with the most vehicles on its lanes; on a tie, the current green."""
         return _best(view, view.table.served)
 
 
@@ -204,7 +204,7 @@ def _best(view: SignalView, weights: LaneWeights) -> NDArray[np.int64]:
 def _by_durations(
     view: SignalView, green_s: NDArray[np.float64], early_s: float
 ) -> NDArray[np.int64]:
-    """Start the next green if the present green has lasted for its duration (W or 1, S, G).
+    """Start the next green if the current green has lasted for its duration (W or 1, S, G).
 
     `early_s`: how long before the end of the duration the next green may start.
     """
@@ -217,7 +217,7 @@ def _by_durations(
 
 
 def _keeps(view: SignalView) -> NDArray[np.bool_]:
-    """Return whether each present green (W, S) may stay."""
+    """Return whether each current green (W, S) may stay."""
     index = view.states[..., GREEN] if view.config.action == "next_phase" else 0
     index = np.broadcast_to(index, view.states.shape[:2])[..., None]
     found: NDArray[np.bool_] = np.take_along_axis(view.masks, index, axis=2)[..., 0]

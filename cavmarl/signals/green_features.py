@@ -19,9 +19,9 @@ from cavmarl.signals.signal_table import SignalTable
 
 # Features of each green, with scales; sums and maxima are over the lanes that the green opens.
 GREEN_FEATURES = (
-    "exists",  # 1; 0 beyond the signal's greens
+    "exists",  # 1 for a green of the signal, 0 for padding
     "allowed",  # whether it may be chosen now
-    "shown",  # whether it is the present green
+    "shown",  # whether it is the current green
     "vehicles",  # / 10
     "standing",  # / 10
     "slowed",  # sum of 1 - speed / desired speed, / 10
@@ -40,7 +40,7 @@ SIGNAL_FEATURES = (
     "standing",  # / 20
     "slowed",  # / 20
     "lasted",  # time since the last change, at most 120 s, / 60 s
-    "begun",  # the same, at most 20 s, / 20 s
+    "begun",  # time since the last change, at most 20 s, / 20 s
 )
 MOST = 5.0  # upper limit of all features
 _VEHICLE_M = 7.5  # length of a stopped vehicle with its gap
@@ -131,7 +131,7 @@ class GreenFeatures:
         return np.concatenate(row, axis=-1).astype(np.float32).clip(-MOST, MOST)
 
     def _allowed(self, view: SignalView) -> NDArray[np.bool_]:
-        """Return which greens (W, S, G) may be chosen; if none may, the present green."""
+        """Return which greens (W, S, G) may be chosen; if none may, the current green."""
         shown = np.arange(self.num_greens) == view.states[..., GREEN, None]
         some = view.masks.any(axis=2, keepdims=True)
         found: NDArray[np.bool_] = np.where(some, view.masks, shown)

@@ -148,7 +148,7 @@ class Bus:
                 box[name][chosen] = -1
 
     def exchange(self, side: int) -> None:
-        """Send the messages due in the present tick, and receive arriving messages.
+        """Send the messages due in the current tick, and receive arriving messages.
 
         Args:
             side: side of the zones' rows that holds the committed rows.

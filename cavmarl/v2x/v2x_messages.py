@@ -8,7 +8,7 @@ of degrees, ticks instead of milliseconds, no encoding rules, no certificates.
 | `CAM` | ETSI EN 302 637-2, cooperative awareness | state of the sending vehicle |
 | `DENM` | ETSI EN 302 637-3, decentralized notification | an event |
 | `CPM_OBJECT` | ETSI TS 103 324, collective perception | a vehicle that the sender sees |
-| `SPAT` | SAE J2735, signal phase and timing | the present phase of a signal |
+| `SPAT` | SAE J2735, signal phase and timing | the current phase of a signal |
 | `MAP` | SAE J2735, map data | one approach to a signal |
 
 All positions are centres of bodies, x east, y north, z up; headings are counter-clockwise from
@@ -113,7 +113,7 @@ SPAT = np.dtype(
         ("sender", "<i8"),
         ("tick", "<i8"),
         ("signal", "<i4"),  # SIGNAL row
-        ("phase", "<i4"),  # present PHASE row, with the letters of all links; −1 − row: overridden
+        ("phase", "<i4"),  # current PHASE row, with the letters of all links; −1 − row: overridden
         ("left_s", "<f8"),  # earliest remaining time of the phase, s
     ]
 )

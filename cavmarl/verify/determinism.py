@@ -34,7 +34,7 @@ MAX_STEPS = 10_000_000
 class FirstDifference(Difference):
     """The first difference of two processes."""
 
-    processes: tuple[int, int]  # the numbers of the processes; `tick` is from the first process
+    processes: tuple[int, int]  # indices of the two processes; `tick` is that of the first one
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ def verify_determinism(
     """Drive one world in three processes and compare everything after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the policy has the same seed.
+        env: see `make_vec`, also for the other keywords; `seed` also seeds the policy.
         policy: as in `load_policy`.
         steps: number of steps; episodes follow one another.
         progress: called after each step with its number and `steps`.

@@ -29,7 +29,7 @@ class Difference:
     # `vehicle`, the name of another array, or `hidden state`: hashed state that is in no array
     # (queue and random keys)
     what: str
-    vehicle: int | None  # least id of the vehicles that differ; None: no vehicle differs
+    vehicle: int | None  # lowest id of the vehicles that differ; None: no vehicle differs
     field: str  # first field of the vehicle that differs, or the place in the array
     values: tuple[Any, Any]  # its values in the two runs; None where a vehicle is missing
 

@@ -80,7 +80,7 @@ def verify_zones(
     """Compare divided worlds with undivided worlds after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords that are not explained here.
+        env: see `make_vec`, also for keywords that are not explained here.
         zones: numbers of zones; default: the number in the zone file, otherwise `ZONES`.
         steps: number of steps; episodes follow one another.
         layout: replaces zones.layout; the path of a zone file is relative to the working directory.

@@ -1,4 +1,4 @@
-"""A campaign of faults: its lines of runs, and their totals."""
+"""A campaign of faults: groups of runs (lines), and the totals of each group."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ class FaultLine:
     runs: int = 0  # number of runs
     deaths: int = 0  # number of processes that faults have ended
     lost: int = 0  # number of lost nodes
-    recoveries: int = 0  # number of rollbacks to a kept state
+    recoveries: int = 0  # number of rollbacks to an earlier state
     equal: int = 0  # runs that equalled the undivided world until the end
     ended: int = 0  # runs that ended with `WorkerDeathError`: a part of the state was lost
     injected: Counter[str] = field(default_factory=Counter)  # number of faults, by kind

@@ -66,7 +66,7 @@ class FaultyNetwork:
         self._is_closed = False
 
     def route(self, place: Place) -> Place:
-        """Return the place to call in order to reach `place` through this network."""
+        """Return the address of a new listener that forwards connections to the address `place`."""
         listener = socket.create_server((LOCAL, 0))
         self._listeners.append(listener)
         self._start(partial(self._accept, listener, place))

@@ -1,8 +1,8 @@
 """The program that `cavmarl verify determinism` starts three times: it steps one world on demand.
 
 Standard input has a job as one line of JSON, then one line per step: an empty line to continue, or
-the path of a file in which to save the state before the end. Standard output has the hashes after
-each step.
+the path of a file in which to save the state before the program ends. Standard output has the
+hashes after each step.
 """
 
 from __future__ import annotations

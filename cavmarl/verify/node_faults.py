@@ -58,7 +58,7 @@ def verify_node_faults(
     cuts or silences random connections at random times. Processes are killed or stopped.
 
     Args:
-        env: as in `make_vec`, like the other keywords.
+        env: see `make_vec`, also for the other keywords.
         nodes: numbers of nodes.
         faults: kinds of faults; `ANY` draws each fault from all kinds.
         seeds: number of runs for each number of nodes and kind of fault.

@@ -29,7 +29,7 @@ from cavmarl.verify.differences import DrivenRun, same_bytes
 from cavmarl.verify.fault_campaign import check_nodes
 
 FIRST_STEPS = 5  # steps without kills, to measure the duration of a step
-LATEST = 1.5  # latest time of a kill, in durations of a step, so some happen between two steps
+LATEST = 1.5  # latest time of a kill, in step durations; some kills happen between two steps
 
 
 @dataclass(frozen=True)
@@ -77,7 +77,7 @@ def verify_nodes(
     """Compare worlds over nodes with undivided worlds after each step.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the kills have the same seed.
+        env: see `make_vec`, also for the other keywords; `seed` also seeds the kills.
         nodes: numbers of nodes, one run each.
         kills: number of nodes killed by SIGKILL at random times in each run; at most all but one.
         zones: number of zones of each world; default: twice the largest number of nodes.
@@ -128,7 +128,7 @@ class ComparedWorlds:
         zones: int,
         worlds: int,
         policy: str | Path,
-        route: Route = straight,  # maps a place to the place that nodes call to reach it
+        route: Route = straight,  # maps an address to the address that nodes call to reach it
     ) -> None:
         self._nodes = nodes
         self._signalled: set[int] = set()  # processes that have received a signal

@@ -1,4 +1,4 @@
-"""Published numbers: for each line, numbers of a page, the command that repeats them, a tolerance.
+"""Published numbers. A line lists numbers of a page, the command to repeat them, and a tolerance.
 
 `docs/figures/lines.yaml` has the lines. The published values are read from the pages themselves:
 from prose by patterns in which `{}` stands for a number, from tables by row and column.
@@ -34,9 +34,9 @@ class PublishedLine:
         command: the command, as the page shows it.
         text: patterns of prose or of whole rows, in which `{}` stands for a number. Each occurs
             once in the page.
-        values: for each `{}`, an expression that finds the value in the command's JSON; empty: not
-            compared, so the number is a condition of the page or has a line with by_hand. With the
-            tolerance `range`, two numbers have one expression.
+        values: for each `{}`, an expression that finds the value in the command's JSON. An empty
+            expression means that the number is not compared: it is a condition of the page, or in a
+            line with by_hand. With the tolerance `range`, two numbers have one expression.
         table: beginning of the header row of a table.
         section: heading above the table; empty if the header row is unique in the page. Without
             text and table, the line has all numbers of this section that no other line has.

@@ -25,7 +25,7 @@ from cavmarl.verify.result_paths import as_number, numbers_at, value_at
 
 Verdict = Literal["same", "differs", "failed", "skipped", "by hand"]
 Say = Callable[[str], None]
-LEAST_S = 300.0  # a command may always take this long, even if `SLOWER` times its minutes is less
+LEAST_S = 300.0  # lower bound of a command's time limit, which is `SLOWER` times its minutes
 SLOWER = 10.0
 _WITH_JSON = ("cavmarl ", "python -m benchmarks")
 
@@ -151,7 +151,7 @@ class CommandRunner:
                 return json.loads(result.read_text("utf-8"))
             except (ValueError, RecursionError) as error:
                 raise EvaluationError(
-                    f"has written a result that is no JSON ({error}): {command}"
+                    f"has written a result that is not JSON ({error}): {command}"
                 ) from error
 
     def _words(self, command: str) -> list[str]:

@@ -24,7 +24,7 @@ JUMP_S = 0.3  # longest jump of a clock
 NODE_KINDS = (FrameKind.REPORT, FrameKind.MESSAGES, FrameKind.SHARE, FrameKind.KEEP)
 RECOVERY_KINDS = (FrameKind.SYNC, FrameKind.REPORT, FrameKind.GIVE, FrameKind.MISSED)
 CALLER_KINDS = (FrameKind.COMMAND, FrameKind.RECOVER)
-LATER_FRAMES = 4  # a process dies at one of its next frames of a kind, up to this number
+LATER_FRAMES = 4  # a process dies at one of this many next frames of a kind
 
 
 class Fault(StrEnum):
@@ -82,8 +82,8 @@ SEVERE_APART_S = (0.0, 1.0)
 SHORT_DELAY_S = 0.01
 SHORT_LAG_S = 0.005
 SHORT_JUMP_S = 0.002
-# If a report is late by this time, the caller sends a ping, whether its clock is fast or slow, and
-# the answer follows the report and arrives in time.
+# Delays of a report that make the caller send a ping, whether its clock is fast or slow. The answer
+# to the ping follows the report and still arrives in time.
 STALE_S = (1.28, 1.45)
 
 
@@ -346,7 +346,7 @@ class SimulatedFaults:
             self._change_next_frame(fault, end, SHORT_DELAY_S)
 
     def _hold_report(self, end: SimulatedSocket, data: bytes) -> None:
-        """Delay a report of a stale node, and count the late answer that follows it."""
+        """Delay a report of a node in `_stale`, and count the late answer that follows it."""
         machine, node = self._machine, end.owner
         if node not in self._stale or end.other is None or end.other.owner is not machine.caller:
             return
@@ -371,7 +371,7 @@ def counts_by_name(counts: Iterable[tuple[Fault, int]]) -> dict[str, int]:
     return {str(fault): found[fault] for fault in Fault if found.get(fault)}
 
 
-# The place of a change is drawn as a share of the frame, so that the length of a frame does not
+# The position of a change is drawn as a share of the frame, so that the length of a frame does not
 # affect further random numbers.
 
 

@@ -65,7 +65,7 @@ class SimulatedProcess:
         self.sockets: list[SimulatedSocket | SimulatedListener] = []
         self.on_send: Callable[[bytes], int | None] = lambda data: None
         self.failure: BaseException | None = None
-        self.newest_received = -1  # highest number of a received frame, in the order of sending
+        self.newest_received = -1  # highest number of a received frame; frames are numbered as sent
         self._machine = machine
 
     def clock_s(self) -> float:
@@ -89,7 +89,7 @@ class SimulatedMachine:
 
     Attributes:
         caller: the process of the thread that made the machine.
-        now_s: the present time.
+        now_s: the current time.
         before_send: called with a socket and a frame before the socket sends the frame.
         stuck: the reason why the processes cannot continue; empty if they can.
     """

@@ -157,7 +157,7 @@ def verify_simulated_nodes(
     The world, the number of nodes, the mix and the seed of the faults determine a run completely.
 
     Args:
-        env: as in `make_vec`, like the other keywords.
+        env: see `make_vec`, also for the other keywords.
         nodes: numbers of nodes.
         mixes: mixes of faults; keys of MIXES.
         seeds: number of runs for each number of nodes and mix.
@@ -213,7 +213,7 @@ class _Run:
         self._losses_before, self._living = 0, line.nodes
 
     def execute(self) -> None:
-        """Do the run, and add its result to its line."""
+        """Perform the run, and add its result to the `FaultLine`."""
         line, machine = self._line, self._machine
         wrong = ""
         try:

@@ -40,8 +40,8 @@ class Kill:
     cause: str  # cause of the death, according to the pool
     # from the signal (idle worker: from its next command) until the pool noticed the death
     noticed_ms: float
-    replaced_ms: float  # from that notice until the successor had received the command
-    recovered_ms: float  # from that notice until the successor had completed the command
+    replaced_ms: float  # from then until the successor had received the command
+    recovered_ms: float  # from the same moment until the successor had completed it
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def verify_kills(
     """Kill and stop workers at random times and compare everything with undisturbed worlds.
 
     Args:
-        env: as in `make_vec`, like the other keywords; the kills have the same seed.
+        env: see `make_vec`, also for the other keywords; `seed` also seeds the kills.
         kills: number of signals; three in four are SIGKILL, the others SIGSTOP.
         backend: where the worlds run, `processes:N`; default: `processes:2`.
         workers: short form: N for `processes:N`.

@@ -150,7 +150,7 @@ def test_a_failed_command_is_reported_with_the_reason(checkout: Path) -> None:
     assert "ended with exit code 1: out of paint" in found[0].reason
     assert "has no speed at its top" in found[1].reason
     assert "has written no result" in found[2].reason
-    assert "has written a result that is no JSON" in found[3].reason
+    assert "has written a result that is not JSON" in found[3].reason
 
 
 def test_names_of_files_in_a_command_are_replaced_by_paths(checkout: Path) -> None:

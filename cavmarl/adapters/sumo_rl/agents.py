@@ -23,7 +23,7 @@ class QLAgent:
 
     Attributes:
         q_table: action values of each state that the agent has visited.
-        state: present state.
+        state: current state.
         action: last action; None before the first one.
         acc_reward: sum of all rewards.
     """
@@ -49,7 +49,7 @@ class QLAgent:
         self._values(starting_state)
 
     def act(self) -> int:
-        """Choose an action for the present state."""
+        """Choose an action for the current state."""
         self.action = self.exploration.choose(self.q_table, self.state, self.action_space)
         return self.action
 

@@ -17,7 +17,7 @@ class EpsilonGreedy:
         decay: factor by which each choice reduces the probability.
 
     Attributes:
-        epsilon: present probability.
+        epsilon: current probability.
     """
 
     def __init__(

@@ -37,7 +37,7 @@ _LIGHT_HEIGHT_M, _LIGHT_SIZE_M = 5.0, 0.5  # a light is this far above the stop 
 
 
 def write_lanelet2(network: RoadNetwork, target: Path, is_local: bool = False) -> dict[str, int]:
-    """Write each lane as a lanelet; return the numbers of lanelets and rules, and those read back.
+    """Write each lane as a lanelet; return numbers of elements, written and as read back.
 
     Lanelets of lanes that lead into each other share end points, and lanelets of neighbours share a
     border, so that routes are connected. A link with a signal has a traffic light, whose id is
@@ -171,7 +171,7 @@ def _line_of(network: RoadNetwork, lane: int, side: int) -> str:
 def yields_to(network: RoadNetwork, link: int) -> NDArray[np.int32]:
     """Return the links to which a link gives way.
 
-    At a signal, a link gives way to another one if it has the minor green while that has green.
+    At a signal, a link gives way to a second link if it has minor green while the second has green.
     """
     links = network.links
     first, count = (int(links[name][link]) for name in ("first_conflict", "num_conflicts"))
@@ -221,7 +221,7 @@ def _add_rules(network: RoadNetwork, lanelets: list[Any], ids: Iterator[int]) ->
     def light(lane: int) -> Any:
         if lane not in lights:
             ends = [lanelets[lane].leftBound[-1], lanelets[lane].rightBound[-1]]
-            # from the lower left corner to the lower right corner, as its driver sees it
+            # from the lower left to the lower right corner, as seen by a driver on the lane
             points = [Point3d(next(ids), end.x, end.y, end.z + _LIGHT_HEIGHT_M) for end in ends]
             for point, end in zip(points, ends, strict=True):
                 for key in ("local_x", "local_y"):

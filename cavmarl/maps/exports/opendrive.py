@@ -38,8 +38,8 @@ def write_opendrive(
 ) -> RoundTrip:
     """Write a SUMO network as OpenDRIVE and read it back; call `told` at the start of each stage.
 
-    If netconvert reads back something else, the target is still written, and the result reports the
-    differences. With `for_carla`, the file is changed as `opendrive_carla.fit_to_carla` describes.
+    If netconvert reads back another network, the target is still written, and the result reports
+    the differences. With `for_carla`, `opendrive_carla.fit_to_carla` changes the file.
 
     Raises:
         MapError: netconvert refuses the network or its own export, or the target cannot be written.
@@ -119,7 +119,7 @@ def _mended(draft: Path, facts: Mapping[str, str]) -> Element:
 
 
 def _mend_object(element: Element) -> None:
-    """Add the height of a crosswalk, and move its outline to its place since OpenDRIVE 1.5."""
+    """Add the height of a crosswalk, and move its outline to where OpenDRIVE 1.5 expects it."""
     element.attrib.setdefault("zOffset", "0")
     outlines = element.findall("outline")
     if outlines:

@@ -1,8 +1,8 @@
 """Changes an OpenDRIVE export into a file that CARLA and its client programs can read.
 
 CARLA's programs look for traffic lights of one type, with one signal on each approach, and find the
-lights of a junction by its controllers. Snapshots have room for short ids of signals only; the name
-of a signal is the id that netconvert has given. CARLA 0.9.16 reads the header of OpenDRIVE 1.4.
+lights of a junction by its controllers. Snapshots have room for short signal ids only; the
+signal's name keeps netconvert's id. CARLA 0.9.16 reads the header of OpenDRIVE 1.4.
 """
 
 from __future__ import annotations
@@ -111,12 +111,12 @@ def _traffic_lights(signals: Element) -> Iterator[Element]:
 
 
 def _short_id(signal_id: str, number: int) -> str:
-    """Return an id that fits a snapshot; ids of joined junctions are long."""
+    """Return an id that fits into a snapshot; ids of signals at joined junctions are too long."""
     return signal_id if len(signal_id.encode()) <= MAX_ID_BYTES else f"light_{number}"
 
 
 def _widen(road: Element, signal: Element) -> None:
-    """Let a signal apply to all lanes of its direction; these have no other signal."""
+    """Let a signal apply to all lanes of its direction, which have no other signal."""
     signal.set("type", LIGHT_TYPE)
     signal.set("subtype", "-1")
     side = "right" if signal.get("orientation") == "+" else "left"
@@ -130,7 +130,7 @@ def _widen(road: Element, signal: Element) -> None:
 def _add_controller(
     road: Element, orientation: str, junctions: dict[str, Element], controller: str
 ) -> None:
-    """Name the controller of a signal in the junction of the signal."""
+    """Add the id of a signal's controller to the junction at the end of the signal's road."""
     link = road.find("link/" + ("successor" if orientation == "+" else "predecessor"))
     if link is None or link.get("elementType") != "junction" or not controller:
         return

@@ -20,7 +20,7 @@ _SEALED_M = 1e-3  # maximum gap between lanes that lead into each other
 _SAME_RAD = 1e-4  # 2 mm at the outermost lane of a wide road, 20 m from the reference line
 _PIVOT_M = 0.5  # a shorter line for a U-turn is moved to the other side of its lane
 _SAME_GRADE = 1e-6
-_PARTS = 64  # parts of a curve for its length, because some curves nearly have a cusp
+_PARTS = 64  # a length is the sum over this many parts: some curves nearly have a cusp
 _NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
 _U, _V = ("aU", "bU", "cU", "dU"), ("aV", "bV", "cV", "dV")
 

@@ -10,7 +10,7 @@ from cavmarl.core.errors import ConfigError, MapError, require
 from cavmarl.maps.fidelity.cloud_files import Cloud
 
 NEIGHBOURS = 8
-_SWAPPED = 0.4  # x and y are swapped if swapping them puts this share more points on the map
+_SWAPPED = 0.4  # x and y seem swapped if the swap raises the share on the map by more than this
 _VOXEL_BITS = 20  # bits of a voxel's index on an axis, without its sign
 
 
@@ -61,7 +61,7 @@ def neighbour_distances(points: Any, number: int, threads: int = 2) -> Any:
 def crop(cloud: Cloud, box_m: tuple[float, float, float, float], margin_m: float) -> Cloud:
     """Return the points within a box of the plane and a margin around it.
 
-    Raises MapError: no point is inside, or many more points would be inside if x and y are swapped.
+    Raises MapError: no point is inside, or far more points would be if x and y were swapped.
     """
     low = np.array(box_m[:2]) - margin_m
     high = np.array(box_m[2:]) + margin_m

@@ -14,7 +14,7 @@ from cavmarl.maps.heights.profile_graph import ProfileGraph
 from cavmarl.maps.net_document import DocumentLane, NetDocument, Points
 
 STEP_M = 1.0
-_BESIDE = 40  # adjacent places are searched this many places before and after the proportional one
+_BESIDE = 40  # adjacent places are searched within this many places of the proportional one
 _OFF_M = 0.01  # maximum error of written heights
 
 Rows = NDArray[np.int64]

@@ -64,8 +64,8 @@ def _parsed(path: Path, content: bytes) -> LoggedScene:
 def read_scene(path: str | Path) -> LoggedScene:
     """Read a scene file.
 
-    Raises MapError: the file cannot be read, is broken, names code, or is not a scene; or a track
-    or a lane is invalid.
+    Raises MapError: the file cannot be read, is broken, refers to code, or is not a scene; or a
+    track or a lane is invalid.
     """
     path = Path(path)
     if not is_scene_file(path.name):
@@ -382,7 +382,7 @@ def _list(value: Any, what: str) -> list[Any]:
 def _numbers(value: Any, what: str) -> Numbers:
     """Return an array; rows of lists have at most 3 numbers.
 
-    In a pickle, lists of shared lists could stand for any amount of memory.
+    In a pickle, nested lists that share elements could expand to any amount of memory.
     """
     try:
         if isinstance(value, list | tuple) and not all(map(_is_row, value)):

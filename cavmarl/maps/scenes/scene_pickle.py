@@ -2,8 +2,8 @@
 
 A pickle can call any function that it names, and set the state and the attributes of its objects.
 This reader knows a fixed list of names, and replaces NumPy's functions and types by versions that
-check arguments and states. Before that, it checks the operations: a place in the memo beyond their
-number, or a length beyond the content, could reserve any amount of memory.
+check arguments and states. Before that, it checks the operations. An index in the memo above the
+number of operations, or a length beyond the content, could reserve any amount of memory.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ _NONE = object()  # an argument that was not given
 
 
 class _ForbiddenError(pickle.UnpicklingError):
-    """The pickle names something that is not on the list, or changes it."""
+    """The pickle refers to a name that is not on the list, or changes an object of the list."""
 
 
 class _Function:

@@ -197,7 +197,7 @@ def _is_near(one: Numbers, other: Numbers) -> bool:
 
 
 def _inner_lanes(lanes: Sequence[_Lane], near: dict[int, set[int]]) -> set[int]:
-    """Return the lanes that become paths over junctions, those with most conflicts first."""
+    """Choose lanes as paths over junctions, one by one; those with most conflicts go first."""
     candidates = [
         k
         for k, lane in enumerate(lanes)

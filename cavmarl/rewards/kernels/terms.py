@@ -38,7 +38,7 @@ def _progress(row: np.void, step_s: float) -> float:
     """Return the progress towards the goal in m.
 
     After a wrong turn the new route may be much longer, so progress and loss are limited to twice
-    the distance at the present speed (at least 1 m/s).
+    the distance at the current speed (at least 1 m/s).
     """
     if row["step_to_go"] == math.inf:
         return 0.0  # before the step, no route led to the goal

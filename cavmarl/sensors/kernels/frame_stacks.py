@@ -27,7 +27,7 @@ def newest_frame(observation: NDArray[np.float32], stack: int) -> int:
 
 @kernel
 def shift_frames(observation: NDArray[np.float32], stack: int, kept_at: int, kept: int) -> None:
-    """Move all frames back by one and clear the newest, except `kept` numbers from `kept_at`."""
+    """Move all frames back by one. Clear the newest, except `kept` numbers from `kept_at` on."""
     newest = newest_frame(observation, stack)
     size = observation.size - newest
     for k in range(newest):

@@ -147,7 +147,7 @@ def observe_lidar_cells(
 ) -> None:
     """Write the distance and speed of each cell.
 
-    `out`: an observation, of which 2 · cells numbers are written, starting at `sensor.at`.
+    `out`: an observation; 2 · cells numbers are written, starting at `sensor.at`.
     """
     ego = rows[i]
     ego_cos = cosine(ego["heading"])

@@ -2,7 +2,7 @@
 
 The table shows vehicles within `PERCEPTION_M` and at most two ego lengths behind, ordered by
 distance along the ego lane, which is extended straight beyond its ends. The first row is the ego
-vehicle, in the world's frame in any case.
+vehicle, always in the world's frame.
 
 `vehicle_features` returns the numbers of highway-env's `Vehicle.to_dict`. Their frame is that of
 highway-env's pictures: x points right (east), y points down (south), and headings turn clockwise.

@@ -1,6 +1,6 @@
 """The kernel of the `conflicts` sensor: the vehicles that come closest to the ego path.
 
-All vehicles are assumed to keep their speed: the ego vehicle along its path, the others straight
+All vehicles are assumed to keep their speed: the ego vehicle along its path, others straight
 along their headings, because their plans are unknown. At a few future moments, the kernel computes
 the gap between the two bodies, as boxes along the ego axes. The vehicle whose approach is closest
 and soonest comes first. The right of way depends on the lane of the other vehicle, whichever link
@@ -70,15 +70,15 @@ class ConflictsSensor(NamedTuple):
     range_m: float
     walls: Walls  # walls that hide vehicles
     heard: bool  # whether vehicles known only from messages are included
-    told: NDArray[np.void]  # BODY (inbox,) scratch: present positions of the vehicles in messages
-    indicators: bool  # whether others indicate their link over the next junction
-    indicators_m: float  # distance to the junction at which they start to; 0: any distance
+    told: NDArray[np.void]  # BODY (inbox,) scratch: current positions of the vehicles in messages
+    indicators: bool  # whether other vehicles indicate their link over the next junction
+    indicators_m: float  # distance to the junction within which they indicate it; 0: any
     looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: predicted poses of the ego vehicle
     heard_looks: NDArray[np.float64]  # (NUM_LOOKS, 4) scratch: poses of a vehicle in a message
     others: NDArray[np.float64]  # (capacity, NUM_LOOKS, 4) scratch: poses of `Grid.bodies`
     indicated: NDArray[np.float64]  # (capacity,) indicated turn of each body: 1 left, -1 right
     foreseen: NDArray[np.int64]  # (capacity,) the `filling` for which each body was predicted
-    filling: NDArray[np.int64]  # (1,) how often the grid has been filled
+    filling: NDArray[np.int64]  # (1,) how many times the grid has been filled
     ranked: NDArray[np.void]  # RANKED (count,) scratch
 
 
@@ -402,7 +402,7 @@ def observe_conflicts(
 ) -> None:
     """Write nine to twelve numbers per vehicle, by rank; numbers of missing vehicles are 0.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `reports`: REPORT
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) current PHASE rows. `reports`: REPORT
     (N,) of vehicles in the agent's inbox; read only with `heard`. `tick`: the world's tick.
     """
     row = rows[i]

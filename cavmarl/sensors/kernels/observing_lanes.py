@@ -112,7 +112,7 @@ def _observe_gap(
 def _next_link(
     roads: RoadArrays, travel: TripTables, row: np.void, range_m: float
 ) -> tuple[int, float]:
-    """Return a vehicle's present or next link, or -1, and the distance to its stop line in m."""
+    """Return a vehicle's current or next link, or -1, and the distance to its stop line in m."""
     lane = row["lane"]
     here = roads.lanes[lane]
     if here["internal"]:
@@ -188,9 +188,9 @@ def observe_lanes(
 ) -> None:
     """Write gaps and relative speeds on the lanes around, and the first vehicle across the path.
 
-    `i`: row of the agent's vehicle. `phase`: (num_signals,) present PHASE rows. `sensors`: range
-    and position of the sensor; a range of 0 switches it off. `observation`: (D,), of which
-    `LANES_FEATURES` numbers are written; they must be 0 before.
+    `i`: row of the agent's vehicle. `phase`: (num_signals,) current PHASE rows. `sensors`: range
+    and position of the sensor; a range of 0 switches it off. `observation`: (D,);
+    `LANES_FEATURES` numbers are written, which must be 0 before.
     """
     range_m = sensors.lanes_range_m
     if range_m == 0.0:

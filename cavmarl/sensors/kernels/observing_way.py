@@ -31,7 +31,7 @@ from cavmarl.driving.kernels.lanes.route_following import next_step_of_plan
 from cavmarl.sensors.kernels.sense import SPEED_SCALE, gives_way_on, soonness, unit
 
 PLACE_FEATURES = 4  # number of features per point of the path
-LINE_FEATURES = 5  # the same per stop line; one more with timing, and one more with `OWN`
+LINE_FEATURES = 5  # number of features per stop line; timing and `OWN` add one each
 CURVATURE_SCALE = 0.2  # 1/m
 STOP_SIGNS = ("give_way", "own", "red")  # values of `sensors.way.stop_signs`
 GIVE_WAY, OWN, AS_RED = range(3)

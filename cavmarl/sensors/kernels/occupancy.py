@@ -1,8 +1,8 @@
 """highway-env's `OccupancyGridObservation`: layers of cells around a vehicle.
 
-A cell shows the vehicle whose centre lies in it; of several vehicles, the vehicle with the smallest
-id. Positions and velocities are relative to the ego vehicle, which is also in the grid. `on_road`
-marks the cells that contain a waypoint of a lane's centre line.
+A cell shows the vehicle whose centre lies in it, or the vehicle with the smallest id if there are
+several. Positions and velocities are relative to the ego vehicle, which is also in the grid.
+`on_road` marks the cells that contain a waypoint of a lane's centre line.
 """
 
 from __future__ import annotations

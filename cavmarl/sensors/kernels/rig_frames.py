@@ -178,7 +178,7 @@ NUM_COUNTS = 3  # fields of `Due` that change from tick to tick
 
 
 class Due(NamedTuple):
-    """The samples that a sensor must deliver in the present tick of each world."""
+    """The samples that a sensor must deliver in the current tick of each world."""
 
     num: NDArray[np.int64]  # (W,) number of samples
     first: NDArray[np.int64]  # (W,) index of the first sample since the reset

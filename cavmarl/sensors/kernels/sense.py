@@ -41,7 +41,7 @@ from cavmarl.sensors.kernels.observing_lanes import observe_lanes
 
 EGO_FEATURES = 13
 NEIGHBOR_FEATURES = 7
-SIGNAL_FEATURES = 6  # two more with the signal's timing, then one more with stop signs
+SIGNAL_FEATURES = 6  # the signal's timing adds two, then stop signs add one
 
 SPEED_SCALE = 40.0  # m/s
 ACCEL_SCALE = 10.0  # m/s²

@@ -28,7 +28,7 @@ C = TypeVar("C", bound=MountedConfig)
 
 
 class SensedScene(NamedTuple):
-    """The scene that the agents of one zone can sense in the present tick."""
+    """The scene that the agents of one zone can sense in the current tick."""
 
     roads: RoadArrays  # the whole map
     lane_grid: LaneGrid

@@ -84,7 +84,7 @@ class LaneBoundary(MountedSensor[LaneBoundaryConfig]):
 
 
 class Gnss(MountedSensor[GnssConfig]):
-    """The position of the antenna, with errors, converted to the earth by the map's projection.
+    """The position of the antenna, with errors, converted to WGS 84 by the map's projection.
 
     Attributes:
         geodesy: conversion between map and earth.
@@ -120,7 +120,7 @@ class Gnss(MountedSensor[GnssConfig]):
 
 
 class Collision(MountedSensor[CollisionConfig]):
-    """Event sensor: EVENT_* bits of the present tick, and the vehicle that was hit."""
+    """Event sensor: EVENT_* bits of the current tick, and the vehicle that was hit."""
 
     dtype = np.int64
     kernel = report_events

@@ -26,7 +26,7 @@ from cavmarl.sensors.registry import mount
 
 
 class Turn(NamedTuple):
-    """The work of one sensor in the present tick."""
+    """The work of one sensor in the current tick."""
 
     place: int  # position in the rig
     sensor: MountedSensor[Any]  # the sensor
@@ -104,7 +104,7 @@ class Rig:
         self._take(scenes, chosen)
 
     def end(self, scenes: Sequence[SensedScene]) -> None:
-        """Take the samples due in the present tick."""
+        """Take the samples due in the current tick."""
         ticks = scenes[0].worlds.ticks
         begins = (ticks - 1) % self._platform.ticks_per_step == 0
         if begins.any():

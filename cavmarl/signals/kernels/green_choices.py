@@ -15,7 +15,7 @@ from cavmarl.signals.kernels.controlled_signals import ControlledSignals, Signal
 
 # Columns of the state (W, S, HELD) of the signals that agents control.
 PREVIOUS = 0  # the green before the last change
-GREEN = 1  # the present green, or the next green during yellow and all-red
+GREEN = 1  # the current green, or the next green during yellow and all-red
 SINCE = 2  # tick of the last change
 REFUSED = 3  # number of choices in the episode that were not allowed
 HELD = 4
@@ -71,7 +71,7 @@ def show_greens(
     controllers: NDArray[np.void],  # CONTROLLER (W, num_controllers), updated
     signal_phase: NDArray[np.int32],  # (W, num_signals), updated
 ) -> None:
-    """Set the phases of the signals at the worlds' present ticks."""
+    """Set the phases of the signals at the worlds' current ticks."""
     for w in range(ticks.size):
         for s in range(controlled.row.size):
             state = held[w, s]

@@ -74,7 +74,7 @@ def find_followers(
     history: NDArray[np.int64],  # (W, N, HISTORY)
     follows: NDArray[np.bool_],  # (W, S) output
 ) -> None:
-    """Write whether vehicles follow each other over a detector of the present green."""
+    """Write whether vehicles follow each other over a detector of the current green."""
     most = (prolonging.first.size - 1) // follows.shape[1]
     for w in range(ticks.size):
         least_ms = ticks[w] * dt * 1e3 - gap_ms
@@ -97,10 +97,10 @@ def find_demanded(
     history: NDArray[np.int64],  # (W, N, HISTORY)
     wanted: NDArray[np.int64],  # (W, S) output
 ) -> None:
-    """Write the green that red lanes demand, or the present green.
+    """Write the green that red lanes demand, or the current green.
 
     A green is demanded if the vehicles on its red lanes have waited for `threshold` vehicle ticks.
-    The most demanded green is written; on a tie, the first green in cyclic order. The present green
+    The most demanded green is written; on a tie, the first green in cyclic order. The current green
     stays while 1 to `platoon` vehicles are near the line on its lanes, so that the change does not
     separate them from the vehicles ahead.
     """

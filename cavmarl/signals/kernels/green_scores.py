@@ -28,9 +28,9 @@ def choose_best(
 ) -> None:
     """Choose the allowed green with the highest score; on a tie, the first in cyclic order.
 
-    A green has priority if one of its lanes has been red before a stopped vehicle for at least
-    `longest_red`; of several such greens, the green of the longest red. With cyclic choices, the
-    next green starts if any other green ranks before the present green.
+    A green has priority if a stopped vehicle on one of its lanes has had red for at least
+    `longest_red`; among several such greens, the green with the longest red wins. With cyclic
+    choices, the next green starts if any other green ranks before the current green.
     """
     most = masks.shape[2]
     for w in range(decides.size):
@@ -42,7 +42,7 @@ def choose_best(
             keeps = masks[w, s, 0 if cyclic else green]
             best, best_red, best_score = -1, np.int64(0), np.int64(0)
             for k in range(num_greens[s]):
-                g = (green + k) % num_greens[s]  # the present green first
+                g = (green + k) % num_greens[s]  # the current green first
                 if not (keeps if k == 0 else masks[w, s, 1 if cyclic else g]):
                     continue
                 score = np.int64(0)

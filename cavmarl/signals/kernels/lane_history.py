@@ -1,4 +1,4 @@
-"""The history of lanes for controllers: detected vehicles, and red lights before vehicles.
+"""The history of lanes for controllers: detected vehicles, and how long vehicles have had red.
 
 All values are whole numbers. They depend only on the ticks and the counts, so every process that
 runs a part of a world computes the same values.
@@ -21,10 +21,10 @@ from cavmarl.signals.kernels.green_choices import GREEN
 from cavmarl.signals.kernels.lane_counts import STANDING, VEHICLES
 
 # Columns of the history (W, N, HISTORY) of lanes.
-RED_TICKS = 0  # ticks for which the lane has been red before a stopped vehicle, see `follow_lanes`
+RED_TICKS = 0  # ticks for which a stopped vehicle on the lane has had red, see `follow_lanes`
 RED_VEHICLE_TICKS = 1  # sum of these ticks over all vehicles on the lane, stopped or not
 DETECTED_MS = 2  # time since the reset at which the lane's detector was last occupied
-PASSED = 3  # number of vehicles that the detector has counted in the present interval
+PASSED = 3  # number of vehicles that the detector has counted in the current interval
 FLOW = 4  # number of vehicles that the detector counted in the last interval
 HISTORY = 5
 
@@ -75,7 +75,7 @@ def follow_lanes(
 ) -> None:
     """Add the time since the last decision to the lanes that are red, at each decision.
 
-    A lane is red unless the present green, or the next green during yellow and all-red, opens a
+    A lane is red unless the current green, or the next green during yellow and all-red, opens a
     movement from it. `RED_TICKS` restarts if no vehicle is stopped on the lane at a decision.
     """
     num_signals = controlled.row.size

@@ -93,7 +93,7 @@ def _cover(
     num_owned: NDArray[np.int64],
     w: int,
 ) -> None:
-    """Write which loops are covered in the present tick of a world."""
+    """Write which loops are covered in the current tick of a world."""
     loops.covered[:] = False
     for zone in range(rows.shape[0]):
         for i in range(num_owned[zone, w]):
@@ -136,7 +136,7 @@ def estimate_by_loops(
                 _read(loops.detected[w, n, which], tick, readings[w, n, which])
             between = max(between, 0) + entry[COUNT] - leaves[COUNT]
             if leaves[FREE_TICKS] >= loops.clear_ticks[n]:
-                between = min(between, entry[COUNT])  # earlier vehicles have left the stretch
+                between = min(between, entry[COUNT])  # earlier vehicles have passed the exit loop
             if _stands(loops, w, n, ENTRY, tick):
                 between = loops.room[n]
             vehicles = max(between, 0) + (leaves[FREE_TICKS] == 0)

@@ -36,7 +36,7 @@ def observe_signals(
 ) -> None:
     """Write the observations of the chosen worlds.
 
-    An observation has the present green in one-hot encoding; 1 if the green may end, else 0; the
+    An observation has the current green in one-hot encoding; 1 if the green may end, else 0; the
     density of each incoming lane; and the density of stopped vehicles on each incoming lane. The
     density is the number of vehicles divided by the capacity of the lane, at most 1.
     """

@@ -41,7 +41,7 @@ class SignalWorlds(NamedTuple):
     detected_s: NDArray[np.float64]  # (W, D)
     lanes: NDArray[np.void]  # LANE (V, L), see `Worlds`
     rows: NDArray[np.void]  # VEHICLE (2, k, W, C), see `ZoneState`
-    sides: NDArray[np.int64]  # (2,) the half of `rows` with the committed rows; an unused number
+    sides: NDArray[np.int64]  # (2,) index of the committed half of `rows`; second number unused
     num_owned: NDArray[np.int64]  # (k, W)
 
 
@@ -71,7 +71,7 @@ def begin_signal_step(
     outputs: SignalOutputs,
     choices: NDArray[np.int64],  # (W, S), see `choose_greens`
 ) -> None:
-    """Change the greens as chosen, and set the phases of the present tick."""
+    """Change the greens as chosen, and set the phases of the current tick."""
     choose_greens(
         rules.controlled, rules.durations, rules.cyclic, choices, worlds.ticks, outputs.states
     )
@@ -85,7 +85,7 @@ def end_signal_tick(
     outputs: SignalOutputs,
     chosen: NDArray[np.bool_],  # (W,) worlds in which a tick has ended
 ) -> None:
-    """Set the phases of the present tick, and count stopped and detected vehicles."""
+    """Set the phases of the current tick, and count stopped and detected vehicles."""
     _show(rules, worlds, outputs)
     rows = worlds.rows[worlds.sides[0]]
     count_standing(rows, worlds.num_owned, rules.controlled.lane_index, chosen)

@@ -1,8 +1,8 @@
 """The states of links in a SPAT report whose signal the caller has overridden.
 
-Such a report has the code −1 − PHASE row. Fields that SPAT reports do not use otherwise have 4 bits
-per link, by the index of the link's letter: 0, or 1 + the SIGNAL_* code. If these fields have no
-room for an index, the state of the overridden link is not sent.
+Such a report has the code −1 − PHASE row. The fields that other SPAT reports leave unused hold 4
+bits per link, by the index of the link's letter: 0, or 1 + the SIGNAL_* code. If these fields have
+no room for an index, the state of the overridden link is not sent.
 """
 
 from __future__ import annotations

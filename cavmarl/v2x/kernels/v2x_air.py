@@ -154,7 +154,7 @@ def hears(
 
 @inlined_kernel
 def band_of(distance_m: float) -> int:
-    """Return the band of a distance, by which packets are counted."""
+    """Return the index of the band in which a reception at this distance is counted."""
     return min(int(distance_m * BANDS_PER_M), NUM_BANDS - 1)
 
 
@@ -199,7 +199,7 @@ def _list_within(
     for j in range(first_row, last_row + 1):
         begin = cells.start[j * cells.num_x + first_column]
         end = cells.start[j * cells.num_x + last_column + 1]
-        # Here and below, write the place before the test, because branches would often be
+        # Here and below, write each entry before it is tested, because a branch would often be
         # mispredicted.
         for b in range(begin, end):
             dx = air.x[b] - x

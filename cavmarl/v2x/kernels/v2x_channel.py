@@ -106,7 +106,7 @@ def is_heard(
     """Return whether a packet within reach is received.
 
     `level`: from `busy_level`. `number`: from `draw`. `x`, `y`: position of the receiver, m.
-    `from_x`, `from_y`: position of the sender, m. `distance_m`: distance of both.
+    `from_x`, `from_y`: position of the sender, m. `distance_m`: distance between both.
     """
     if number >= chance_at(channel.clear[level], distance_m):
         return False

@@ -326,7 +326,7 @@ def exchange_messages(
     mail: Mail,
     scratch: V2xScratch,
 ) -> None:
-    """Send the messages due in the present tick of some worlds, and receive arriving messages.
+    """Send the messages due in the current tick of some worlds, and receive arriving messages.
 
     Args:
         sending: schedule of the stations.

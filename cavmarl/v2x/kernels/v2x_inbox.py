@@ -44,7 +44,7 @@ def find(box: NDArray[np.void], num: int, subject: int) -> int:
 def is_better(report: np.void, other: np.void) -> bool:
     """Return whether a report replaces another report of a subject: the newer report wins.
 
-    Among reports of one tick, the subject's own report wins, then that of the smallest sender.
+    Among reports of one tick, the subject's own report wins, then the lowest sender id.
     """
     if report["tick"] != other["tick"]:
         return bool(report["tick"] > other["tick"])

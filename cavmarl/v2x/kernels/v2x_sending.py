@@ -96,7 +96,7 @@ def phase_left_s(
     tick: int,
     sending: Sending,
 ) -> float:
-    """Return the remaining time of the present phase in s; if actuated, the shortest possible time.
+    """Return the remaining time of the current phase in s; if actuated, the shortest possible time.
 
     A chosen green ends at the first decision after its minimum, or later.
     """
@@ -166,7 +166,7 @@ def _write_vehicle(
 
 @kernel
 def _cause(row: np.void, sending: Sending) -> int:
-    """Return the most severe event of a vehicle that others should know."""
+    """Return the cause of the most severe event that a vehicle should report; 0: no event."""
     if row["hit"] >= 0:
         return CAUSE_COLLISION
     if row["accel"] <= -sending.hard_braking_mps2:

@@ -43,7 +43,7 @@ _IGNORED: Mapping[str, tuple[tuple[Any, ...], str]] = {
 class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
     """An environment with the arguments and results of sumo-rl 1.4.5.
 
-    With `single_agent`, a Gymnasium environment of the first signal. Else, `reset` returns
+    With `single_agent`, a Gymnasium environment of the first signal. Otherwise, `reset` returns
     observations by id, and `step` returns observations, rewards and dones by id, and one info. The
     arguments are also attributes.
 
@@ -62,7 +62,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
         yellow_time: duration of yellow in s, within `delta_time`.
         min_green: shortest duration of a green in s.
         max_green: only read with `enforce_max_green`.
-        enforce_max_green: whether an action that keeps a green for longer begins the next green.
+        enforce_max_green: whether the next green begins if an action would exceed `max_green`.
         single_agent: whether only the first signal has an agent; other signals keep their greens.
         reward_fn: a name in `TrafficSignal.reward_fns`, a function of a TrafficSignal, a list of
             these, or a mapping from the id of each signal.
@@ -211,7 +211,7 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
 
     @property
     def sim_step(self) -> float:
-        """Present time in s."""
+        """Current time in s."""
         passed_s = 0.0 if self._world is None else self._world.time_s
         return float(round(self.begin_time + passed_s, 6))
 
@@ -277,8 +277,8 @@ class SumoEnvironment(gymnasium.Env[Any, Any], EzPickle):
                 an action keeps its green.
 
         Returns:
-            Observations, rewards and dones by id, and infos; `dones["__all__"]` ends the episode.
-            With `single_agent`, as in Gymnasium.
+            Observations, rewards and dones by id, and infos; `dones["__all__"]`: episode over.
+            With `single_agent`, the results of a Gymnasium environment.
 
         Raises:
             ActionError: an id or an action is not possible; nothing has changed.

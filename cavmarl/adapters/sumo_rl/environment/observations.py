@@ -33,9 +33,9 @@ class ObservationFunction(ABC):
 
 
 class DefaultObservationFunction(ObservationFunction):
-    """The green as one value of 1 among zeros, whether it may end, and densities by lane.
+    """The green in one-hot encoding, whether it may end, and densities on incoming lanes.
 
-    First come the densities of all vehicles by incoming lane, then of stopped vehicles by lane.
+    First come the densities of all vehicles, then the densities of stopped vehicles.
     """
 
     def __call__(self) -> NDArray[np.float32]:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 from cavmarl.adapters.sumo_rl.environment.env import env, parallel_env
 from cavmarl.core.errors import ConfigError
 
-NETS = "SUMO_RL_NETS"  # variable of the environment: the folder of maps
+NETS = "SUMO_RL_NETS"  # environment variable with the folder of maps
 
 
 class _Scenario(NamedTuple):

@@ -207,7 +207,7 @@ class SignalWorld:
         return np.full(len(self.table.ids), KEEP, dtype=np.int64)
 
     def greens(self, signal: int) -> tuple[int, int, float]:
-        """Return a signal's previous and present green, and the time since the last change.
+        """Return a signal's previous and current green, and the time since the last change.
 
         Signals that follow their programs always have 0.
         """
@@ -229,7 +229,7 @@ class SignalWorld:
         return [*dict.fromkeys(lanes)]
 
     def num_phases(self, signal: str) -> int:
-        """Return the number of phases of a signal's present program."""
+        """Return the number of phases of a signal's current program."""
         row = self.network.signal_ids.index(signal)
         return int(self.network.programs[self.network.signals["program"][row]]["num_phases"])
 

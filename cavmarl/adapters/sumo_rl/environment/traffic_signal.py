@@ -145,7 +145,7 @@ class TrafficSignal:
 
     @property
     def green_phase(self) -> int:
-        """Index of the present green, or of the green that begins after yellow."""
+        """Index of the current green, or of the green that begins after yellow."""
         return self._world.greens(self._signal)[1]
 
     @property
@@ -189,7 +189,7 @@ class TrafficSignal:
         return spaces.Box(-np.inf, np.inf, (self.reward_dim,), np.float32)
 
     def choice(self, action: Any) -> int:
-        """Return the green that an action begins, if the present green may end.
+        """Return the green that an action begins, if the current green may end.
 
         Raises:
             ActionError: the action is not the index of a green.
@@ -255,15 +255,15 @@ class TrafficSignal:
         return int(vehicles[self._out].sum()) - int(vehicles[self._in].sum())
 
     def get_lanes_density(self) -> list[float]:
-        """Return the vehicles on each incoming lane as a share of its room."""
+        """Return the vehicles on each incoming lane as a share of the lane's capacity."""
         return self._shares(self._in, VEHICLES)
 
     def get_lanes_queue(self) -> list[float]:
-        """Return the stopped vehicles on each incoming lane as a share of its room."""
+        """Return the stopped vehicles on each incoming lane as a share of the lane's capacity."""
         return self._shares(self._in, STANDING)
 
     def get_out_lanes_density(self) -> list[float]:
-        """Return the vehicles on each outgoing lane as a share of its room."""
+        """Return the vehicles on each outgoing lane as a share of the lane's capacity."""
         return self._shares(self._out, VEHICLES)
 
     def get_total_queued(self) -> int:
