@@ -88,7 +88,7 @@ def test_a_kernel_with_other_types_or_sources_is_not_found(built_library: Path) 
 
 
 @compiled_only
-def test_calls_that_more_general_code_serves_are_not_compiled() -> None:
+def test_calls_are_not_compiled_if_more_general_code_serves_them() -> None:
     rows = np.zeros((4, 2))
     wide, narrow, other = (
         KernelCall(

@@ -197,7 +197,7 @@ def test_the_time_gap_is_one_second_or_three_seconds_if_a_car_is_an_agent(
 def test_a_foe_whose_trip_ends_before_its_line_is_ignored(
     blocks: Blocks, to_go_m: float, waits: bool
 ) -> None:
-    """The foe's centre is 52.5 m before its line. If `to_go` is 0, its way to go is unknown."""
+    """The foe's centre is 52.5 m before its line. `to_go` is 0 if its goal is unknown."""
     assert bool(blocks(4.5, "out", 50.0, to_go=to_go_m)) == waits
 
 
@@ -247,10 +247,10 @@ def test_a_vehicle_that_stands_a_metre_before_its_line_needs_no_longer_gap(block
 
 
 def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
-    """Return the smallest accepted distance of a merging foe to its line, and the own way, in m.
+    """Return the smallest accepted distance of a merging foe to its line, and the driven distance.
 
-    The own vehicle drives at its limit of 5 m/s, with its front 2.5 m before its line. Its way ends
-    when its rear has left the junction.
+    Both are in m. The own vehicle drives at its limit of 5 m/s, with its front 2.5 m before its
+    line. The driven distance ends when its rear has left the junction.
     """
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])

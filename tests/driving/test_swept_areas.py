@@ -307,7 +307,7 @@ def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
 def test_a_vehicle_behind_the_junction_waits_before_a_swept_area(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
 ) -> None:
-    """`front_m` and `bus_m` are the ways of the fronts of car and bus beyond the area's start."""
+    """`front_m` and `bus_m`: how far the fronts of car and bus are beyond the area's start."""
     meeting = BusAndCar(network)
     link, bus_link = int(meeting.sweep["foe"]), meeting.link
     row, sweeps = network.links[link], network.sweeps.copy()
