@@ -40,11 +40,11 @@ Verdict = Literal[
 class StrategyResult:
     """The results of one placement strategy; all values are means over traces."""
 
-    name: str  # of `STRATEGIES`, or `perfect` for arbitrarily divisible shards
+    name: str  # name in `STRATEGIES`, or `perfect` for arbitrarily divisible shards
     ratio: float  # time / time of the static placement
-    ratio95: Interval | None  # between traces; None: a single trace
+    ratio95: Interval | None  # 95 % interval between traces; None: a single trace
     beside_balanced: float  # time / time of `balanced`
-    beside_balanced95: Interval | None  # between traces; None: a single trace
+    beside_balanced95: Interval | None  # 95 % interval between traces; None: a single trace
     imbalance: float  # maximum / mean of the workers' ticks, mean over rounds
     moves: float  # moved shards per round
     handoffs: float  # vehicles per round that changed their zone because of a new cut

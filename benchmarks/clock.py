@@ -22,7 +22,7 @@ def measure(
     ] = 0.0,
     own_ticks: Annotated[
         Literal["obey", "refuse", "ignore"],
-        about("Master's reaction to such a tick; obey: the world ticks."),
+        about("How the master treats the follower's ticks; obey: the world ticks."),
     ] = "obey",
     pace: Annotated[
         float | None,

@@ -57,7 +57,7 @@ SIDES = (
 def measure(
     env: OptionalEnvironment = "grid4x4",
     agents: Annotated[int, about("Vehicles of a world.")] = 40,
-    worlds: Annotated[int, about("Worlds, each with other trips.")] = 8,
+    worlds: Annotated[int, about("Number of worlds; each has different trips.")] = 8,
     seconds: Annotated[int, about("Simulated time.")] = 900,
     decide_s: Annotated[float, about("Seconds between two decisions of a signal.")] = 5.0,
     loss: Annotated[

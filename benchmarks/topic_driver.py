@@ -2,10 +2,11 @@
 
     python -m benchmarks.topic_driver FOLDER --domain N
 
-It subscribes to the clock, odometry, traffic lights, predicted objects and the destination. It
-publishes `autoware_control_msgs/msg/Control` with the time of each clock message. From cavmarl, it
-uses the DDS node, the message types and path tracking. When the clock has no publisher any more, it
-prints one line of JSON: the number of steps for each reason of its acceleration.
+The program subscribes to the clock, odometry, traffic lights, predicted objects and the
+destination. It publishes `autoware_control_msgs/msg/Control` with the time of each clock message.
+From cavmarl, it uses the DDS node, the message types and path tracking. When the clock has no
+publisher any more, the program prints one line of JSON: the number of steps for each reason of its
+acceleration.
 """
 
 from __future__ import annotations

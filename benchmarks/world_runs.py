@@ -34,8 +34,8 @@ class WorldSeries:
     out: Path  # folder of the results
     count: int  # number of worlds
     first_seed: int  # first of consecutive seeds
-    seconds: int = 400  # simulated duration of both sides
-    dt_s: float = 0.1  # step length of both sides
+    seconds: int = 400  # simulated duration of both runs, in cavmarl and SUMO
+    dt_s: float = 0.1  # step length of both runs
     without: tuple[str, ...] = ()  # features to exclude
     maps: Path | None = None  # folder of maps to cut; None: those in SUMO's wheel
     cut_from: tuple[Path, ...] = field(default=(), init=False)

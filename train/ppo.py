@@ -5,9 +5,9 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
     torchrun --nproc-per-node 2 train/ppo.py --env merge
 
-The file has the settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
-which updates the network; `Run`, which alternates collecting and learning (Schulman et al. 2017; de
-Witt et al. 2020; docs/guides/train.md).
+`Args` has the settings, and `Batch` the decisions. `Collector` drives the worlds, `Learner` updates
+the network, and `Run` alternates collecting and learning (Schulman et al. 2017; de Witt et al.
+2020; docs/guides/train.md).
 """
 
 from __future__ import annotations

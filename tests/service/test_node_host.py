@@ -96,7 +96,7 @@ def test_the_end_of_a_job_is_reported_until_the_service_has_it(
 def test_a_refused_report_is_not_repeated_and_the_job_runs_again(
     service: LoopbackService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """After refusing the first report of a job, the service gives the job to the same node again."""
+    """After the first report of a job was refused, the same node gets the job again."""
     runs: list[str] = []
 
     def evaluates(*given: Any, **_: Any) -> None:
