@@ -1,4 +1,4 @@
-"""Time in which a standby takes over from a killed service, and lost acknowledged requests."""
+"""Time until a standby takes over from a killed service, and lost acknowledged requests."""
 
 from __future__ import annotations
 

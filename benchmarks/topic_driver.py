@@ -4,8 +4,8 @@
 
 The program subscribes to the clock, odometry, traffic lights, predicted objects and the
 destination. It publishes `autoware_control_msgs/msg/Control` with the time of each clock message.
-From cavmarl, it uses the DDS node, the message types and path tracking. When the clock has no
-publisher any more, the program prints one line of JSON: the number of steps for each reason of its
+From cavmarl, it uses the DDS node, the message types and path tracking. When the last publisher of
+the clock is gone, the program prints one line of JSON: the number of steps for each reason of its
 acceleration.
 """
 
@@ -59,7 +59,7 @@ class TopicDriver:
         self.reasons: Counter[str] = Counter()
 
     def run(self) -> None:
-        """Answer each clock message until the clock has no publisher any more."""
+        """Answer each clock message until the last publisher of the clock is gone."""
         silent_s, answered_ns, due_s = 0.0, -1, math.inf
         while answered_ns < 0 or silent_s < ENDS_S:
             began_s = time.monotonic()

@@ -1,4 +1,4 @@
-"""Training repeated with several seeds, and the resulting drivers compared with scripted ones.
+"""Training repeated with several seeds; the trained drivers are compared with scripted drivers.
 
     python train/five_seeds.py --config configs/train/merge.yaml
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1

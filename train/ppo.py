@@ -89,7 +89,9 @@ class Args:
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
     average: Annotated[float, "share of the driver's averaged weights that an update keeps"] = 0.0
-    max_gradient_norm: Annotated[float, "largest norm of a gradient; longer ones are clipped"] = 0.5
+    max_gradient_norm: Annotated[
+        float, "largest norm of a gradient; longer gradients are clipped"
+    ] = 0.5
     throttle_std: Annotated[float, "initial standard deviation of throttle; without --start"] = 0.3
     steering_std: Annotated[float, "initial standard deviation of steering; without --start"] = 0.1
     mappo: Annotated[bool, "let the critic see the state of the whole world"] = False

@@ -55,7 +55,7 @@ def copied_library(built_library: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def uncached(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Clear what this process has cached about kernels, before and after the test."""
+    """Clear the data about kernels that this process has cached, before and after the test."""
     for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch

@@ -1,4 +1,4 @@
-"""A node goes on while its service does not answer, and reports the ends of its jobs."""
+"""A node continues while its service does not answer, and reports the ends of its jobs."""
 
 from __future__ import annotations
 
