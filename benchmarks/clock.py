@@ -49,7 +49,7 @@ def _verdict(found: ClockDrift) -> str:
         return f"{event}; the master counted {found.counted}, and only the master ticked the world"
     return (
         f"{event}; the master noticed {found.drift_events} times that the world advanced without "
-        f"it, first {found.noticed_ticks} of its ticks after the first time"
+        f"it, for the first time {found.noticed_ticks} ticks after the follower's first own tick"
     )
 
 

@@ -122,7 +122,7 @@ def test_a_full_road_is_blocked_if_its_vehicles_wait_at_the_next_line(tmp_path: 
     assert not is_blocked(scene, WAITING)
     assert is_blocked(scene, MOVING, WAITING)
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
-    # These cars move on, but the own vehicle has to expect that it must yield at the next line.
+    # These cars move on, but the ego vehicle has to expect that it must yield at the next line.
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
 
 

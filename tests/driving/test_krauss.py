@@ -117,7 +117,7 @@ def ours(case: dict[str, float]) -> tuple[float, float]:
 def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
     """Return the cases and SUMO's results.
 
-    The own speed of each case is the safe speed, so that SUMO applies no other limit.
+    The speed of the follower in each case is the safe speed, so that SUMO applies no other limit.
     """
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     pytest.importorskip("sumo", reason="needs the extra 'sumo'")
