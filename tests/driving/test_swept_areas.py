@@ -286,7 +286,7 @@ def test_the_vehicle_that_has_to_brake_less_waits_if_neither_can_stop_in_time(
 def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
     network: RoadNetwork,
 ) -> None:
-    """The foe may stand behind a leader that waits for the car. If the car waits, all three wait."""
+    """A foe may stand behind a leader that waits for the car. If the car waits, all three wait."""
     meeting = BusAndCar(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["wait_s"][0] = 4.0
