@@ -164,7 +164,7 @@ def _network(
 
 
 def _vehicles(drivers: str, agents: int) -> Sequence[object]:
-    """Return the options of the training for its vehicles: built-in drivers follow `idm`."""
+    """Return the training's options for vehicles; `idm` means background vehicles."""
     if drivers == "idm":
         return ["--background", agents]
     settings = ",".join(f"{key}={json.dumps(value)}" for key, value in CONNECTED.items())

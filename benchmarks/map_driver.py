@@ -34,7 +34,7 @@ GREEN, AMBER = 3, 2
 class Seen(NamedTuple):
     """A perceived object."""
 
-    place: NDArray[np.float64]  # (2,) of its centre, m
+    place: NDArray[np.float64]  # (2,) position of its centre, m
     heading: float
     speed_mps: float
     length_m: float
@@ -142,7 +142,7 @@ class MapDriver:
     ) -> tuple[list[Piece], NDArray[np.float64], float]:
         """Return the lanelets and points of the route, and the vehicle's s on the first lanelet.
 
-        The points begin beside the vehicle; its lateral offset is reduced over some distance.
+        The points begin beside the vehicle, and approach the centres of the lanelets.
         """
         s0, off, _ = here.project(place)
         pieces, length_m = [Piece(here, 0.0)], here.length_m

@@ -37,7 +37,7 @@ CEILING_STEPS, CEILING_TURNS = 10, 7
 class Turn:
     """One run with its place in the order, and its result."""
 
-    repeat: int  # from 1
+    repeat: int  # number of the repetition, from 1
     place: int  # place in the order of all runs, from 1
     workers: int  # number of sensor workers
     run: SensorRun  # result

@@ -42,7 +42,7 @@ KINDS = {
 }
 CONTROL, CONTROL_KIND = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
 ENDS_S = 3.0  # ends after this time without a publisher of the clock
-MISSES_S = 5.0  # after this time, reports missing messages
+MISSES_S = 5.0  # the driver reports messages that are missing for this time
 
 
 class TopicDriver:

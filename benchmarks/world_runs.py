@@ -128,7 +128,7 @@ def run_world(job: WorldSeries, seed: int) -> Row:
     """Draw a world, run it here and in SUMO, and return its row."""
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
-    shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
+    shutil.rmtree(folder, ignore_errors=True)  # files of an interrupted run
     try:
         net, routes = make_files(draw, folder, job.seconds, job.cut_from)
         _write_commands(job, draw, folder)

@@ -34,7 +34,7 @@ from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import run_to_end
 
 PROGRAM = Path(__file__).with_name("signals_sb3.py")
-FIRST_SEED, NUM_RUNS, SECONDS = 1000, 5, 3600  # of the evaluation, as in `signals_sb3.py`
+FIRST_SEED, NUM_RUNS, SECONDS = 1000, 5, 3600  # evaluation, as in `signals_sb3.py`
 RANGE_M = 50.0
 # Number of parallel worlds in a training on each map; maps with more signals have fewer worlds.
 WORLDS = {
