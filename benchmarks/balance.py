@@ -29,7 +29,7 @@ from cavmarl.zones.partition.zone_file import named_zones
 
 ROUND_S = 10  # simulated seconds per recorded round
 BEFORE_S = 20  # simulated seconds before the first round
-AFTER_S = 1  # after the last round, so that no episode ends in it
+AFTER_S = 1  # simulated seconds after the last round, so that no episode ends in the last round
 
 
 def measure(

@@ -25,7 +25,7 @@ from cavmarl.evaluate.statistics import Interval, mean_interval
 __all__ = ["BalanceReplay", "StrategyResult", "Verdict", "replay_traces"]
 
 HANDOFF_S = 1e-4
-WARM_SHARE = 0.25  # share of rounds for learning; times count after them
+WARM_SHARE = 0.25  # share of rounds for learning; only times of later rounds count
 
 
 Verdict = Literal[
@@ -40,11 +40,11 @@ Verdict = Literal[
 class StrategyResult:
     """The results of one placement strategy; all values are means over traces."""
 
-    name: str  # of `STRATEGIES`, or `perfect` for arbitrarily divisible shards
+    name: str  # name in `STRATEGIES`, or `perfect` for arbitrarily divisible shards
     ratio: float  # time / time of the static placement
-    ratio95: Interval | None  # between traces; None: a single trace
+    ratio95: Interval | None  # 95 % interval between traces; None: a single trace
     beside_balanced: float  # time / time of `balanced`
-    beside_balanced95: Interval | None  # between traces; None: a single trace
+    beside_balanced95: Interval | None  # 95 % interval between traces; None: a single trace
     imbalance: float  # maximum / mean of the workers' ticks, mean over rounds
     moves: float  # moved shards per round
     handoffs: float  # vehicles per round that changed their zone because of a new cut
@@ -85,7 +85,9 @@ def replay_traces(traces: Sequence[LoadTrace], rule: BalanceRule) -> BalanceRepl
     rounds = len(first.rounds)
     warm = math.ceil(WARM_SHARE * rounds)
     if rounds < 4:
-        raise ConfigError(f"rounds = {rounds}: must be at least 4; the first ones are for learning")
+        raise ConfigError(
+            f"rounds = {rounds}: must be at least 4; the first rounds are for learning"
+        )
     totals = {name: [_replay(name, one, rule, warm) for one in traces]
               for name in (*STRATEGIES, "perfect")}  # fmt: skip
     static, balanced = (

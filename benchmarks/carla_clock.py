@@ -44,7 +44,7 @@ def measure(
     steps: Annotated[int, about("Ticks of the first client.")] = 5000,
     rogue: Annotated[float, about("Share of steps in which the second client also ticks.")] = 0.0,
     other_ticks: Annotated[
-        OtherTicks, about("What the server does with such a tick, as in `cavmarl carla`.")
+        OtherTicks, about("How the server treats the second client's ticks, as in `cavmarl carla`.")
     ] = "obey",
     sumo: Annotated[int, about("Number of vehicles that SUMO moves.", metavar="N")] = 0,
     csv_path: Annotated[Path | None, about_file("Write the table to this file.", "--csv")] = None,

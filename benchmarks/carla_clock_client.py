@@ -92,7 +92,7 @@ def main() -> None:
         seen.append(int(second.world.get_snapshot().frame))
     second.steps.put(None)
     while second.is_alive():
-        world.tick()  # for own ticks that wait
+        world.tick()  # ends waiting ticks of the second client
         second.join(0.002)
     settings.synchronous_mode, settings.fixed_delta_seconds = False, None
     world.apply_settings(settings)

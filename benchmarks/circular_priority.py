@@ -11,7 +11,7 @@ SIGNED = [ord(state) for state in "Mms"]  # link states: major, minor, stop sign
 
 
 def circular_priority(network: RoadNetwork) -> NDArray[np.int64]:
-    """Return the LINK rows that yield in a circle, or between two such circles.
+    """Return the LINK rows that yield in a circle, or lie between two such circles.
 
     Only junctions with priority signs count: at uncontrolled junctions, all-way stops and signals,
     drivers resolve the conflict in other ways.

@@ -22,7 +22,7 @@ def measure(
     ] = 0.0,
     own_ticks: Annotated[
         Literal["obey", "refuse", "ignore"],
-        about("Master's reaction to such a tick; obey: the world ticks."),
+        about("How the master treats the follower's ticks; obey: the world ticks."),
     ] = "obey",
     pace: Annotated[
         float | None,
@@ -49,7 +49,7 @@ def _verdict(found: ClockDrift) -> str:
         return f"{event}; the master counted {found.counted}, and only the master ticked the world"
     return (
         f"{event}; the master noticed {found.drift_events} times that the world advanced without "
-        f"it, first {found.noticed_ticks} of its ticks after the first time"
+        f"it, for the first time {found.noticed_ticks} ticks after the follower's first own tick"
     )
 
 

@@ -54,11 +54,11 @@ class ClockDrift:
     environment: str  # name of the environment
     dt_s: float  # seconds per tick; a step is one tick
     rogue: float  # share of steps in which the follower ticked on its own
-    answer: OwnTicks | OtherTicks  # the master's reaction to such ticks
+    answer: OwnTicks | OtherTicks  # the master's reaction to the follower's ticks
     pace: float | None  # simulated seconds per second of the master; None: unpaced
     rows: tuple[DriftRow, ...]  # at steps 100, 500, 1000, 5000, …, and the last one
     own_ticks: int  # number of the follower's own ticks, counted by the follower
-    counted: int  # this number, counted by the master
+    counted: int  # number of the follower's own ticks, counted by the master
     drift_events: int  # how often the master noticed that the world had advanced without its tick
     noticed_ticks: int | None  # ticks of the master until it first noticed; None: never
 

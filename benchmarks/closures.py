@@ -32,7 +32,7 @@ def measure(
     vehicles: Annotated[int, about("Vehicles of the demand.")] = 300,
     seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     close_s: Annotated[int, about("Second in which the roads close.")] = 60,
-    seeds: Annotated[str, about("Comma-separated seeds of both sides.")] = "1,2,3",
+    seeds: Annotated[str, about("Comma-separated seeds of cavmarl and SUMO.")] = "1,2,3",
     say: Say = silent,
 ) -> BenchmarkReport:
     """Compare arrivals and travel times with open and with closed roads."""

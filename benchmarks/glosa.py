@@ -122,7 +122,7 @@ def measure(
     policy: Annotated[
         list[str] | None, typer.Option("--policy", "-p", help="Policy of the agents; repeatable.")
     ] = None,
-    worlds: Annotated[int, about("Worlds, each with other trips.")] = 4,
+    worlds: Annotated[int, about("Number of worlds; each has different trips.")] = 4,
     seconds: Annotated[int, about("Simulated time.")] = 600,
     seed: Seed = 0,
     say: Say = silent,

@@ -57,7 +57,7 @@ SIDES = (
 def measure(
     env: OptionalEnvironment = "grid4x4",
     agents: Annotated[int, about("Vehicles of a world.")] = 40,
-    worlds: Annotated[int, about("Worlds, each with other trips.")] = 8,
+    worlds: Annotated[int, about("Number of worlds; each has different trips.")] = 8,
     seconds: Annotated[int, about("Simulated time.")] = 900,
     decide_s: Annotated[float, about("Seconds between two decisions of a signal.")] = 5.0,
     loss: Annotated[
@@ -164,7 +164,7 @@ def _network(
 
 
 def _vehicles(drivers: str, agents: int) -> Sequence[object]:
-    """Return the options of the training for its vehicles: built-in drivers follow `idm`."""
+    """Return the training's options for vehicles; `idm` means background vehicles."""
     if drivers == "idm":
         return ["--background", agents]
     settings = ",".join(f"{key}={json.dumps(value)}" for key, value in CONNECTED.items())

@@ -35,7 +35,7 @@ class LoadRound:
     agents: NDArray[np.bool_]  # (n,) whether an agent drives the vehicle
     vehicle_s: Floats  # (n,) cost of each vehicle, s per tick
     noise: Floats  # (k,) measured / true cost of each zone
-    snapshot: LoadSnapshot  # other load on workers
+    snapshot: LoadSnapshot  # load on workers by other programs
 
 
 @dataclass(frozen=True)

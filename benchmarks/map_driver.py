@@ -18,7 +18,7 @@ from benchmarks.vector_map import CHANGE_S, MapLanelet, VectorMap, wrapped
 from cavmarl.cosim.stack.stack import PurePursuit
 from cavmarl.cosim.stack.stack_types import EgoPose, Mission, Trajectory
 
-LENGTH_M, WIDTH_M, WHEELBASE_M = 5.0, 2.0, 5.0  # of the driven vehicle
+LENGTH_M, WIDTH_M, WHEELBASE_M = 5.0, 2.0, 5.0  # dimensions of the driven vehicle
 AHEAD_M = 90.0
 ACCEL, BRAKE, HARDEST = 1.5, 2.5, 6.0  # m/s²
 HEADWAY_S, GAP_M = 1.4, 2.5
@@ -34,7 +34,7 @@ GREEN, AMBER = 3, 2
 class Seen(NamedTuple):
     """A perceived object."""
 
-    place: NDArray[np.float64]  # (2,) of its centre, m
+    place: NDArray[np.float64]  # (2,) position of its centre, m
     heading: float
     speed_mps: float
     length_m: float
@@ -42,10 +42,10 @@ class Seen(NamedTuple):
 
 
 class Piece(NamedTuple):
-    """A lanelet of the way, with its position on the way."""
+    """A lanelet of the route, with its position along the route."""
 
     lanelet: MapLanelet
-    begin_m: float  # on the way
+    begin_m: float  # position of the start of the lanelet along the route
 
 
 class MapDriver:
@@ -123,7 +123,7 @@ class MapDriver:
         pose: EgoPose,
         objects: Sequence[Seen],
     ) -> tuple[MapLanelet, bool]:
-        """Return the lanelet to drive on, and whether only a lane change continues the way."""
+        """Return the lanelet to drive on, and whether only a lane change continues the route."""
         then = self._next(here)
         staying = math.inf if then is None else self._costs[then.id]
         staying += here.length_m / here.speed_mps
@@ -140,9 +140,9 @@ class MapDriver:
     def _way(
         self, here: MapLanelet, place: NDArray[np.float64], pose: EgoPose
     ) -> tuple[list[Piece], NDArray[np.float64], float]:
-        """Return the lanelets and points of the way, and the vehicle's s on the first lanelet.
+        """Return the lanelets and points of the route, and the vehicle's s on the first lanelet.
 
-        The points begin beside the vehicle; its lateral offset is reduced over some distance.
+        The points begin beside the vehicle, and approach the centres of the lanelets.
         """
         s0, off, _ = here.project(place)
         pieces, length_m = [Piece(here, 0.0)], here.length_m

@@ -40,7 +40,7 @@ class NodeSample:
 
 
 class Caches(NamedTuple):
-    """How many vehicles have rows that fit the caches, and how many cores share a cache."""
+    """The sizes of the caches, in rows of vehicles, and the number of cores that share a cache."""
 
     own: float  # cache of a core
     shared: float  # cache of all cores

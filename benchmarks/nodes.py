@@ -60,7 +60,7 @@ def measure(
     sides = [_Side(size, n, s) for size in sizes for s in (0.0, *added) for n in counts]
     sides += [
         _Side(size, 0, 0.0) for size in sizes
-    ]  # after the divided worlds, which load the maps
+    ]  # starts after the divided worlds, because these load the maps
     turns = _turns(sides, steps, repeats, realtime, say)
     samples = {side: _sample(side, turns[side]) for side in sorted(sides)}
     known = [s for s in samples.values() if s.nodes <= 2 and s.latency_s == 0.0]

@@ -33,7 +33,7 @@ TURNS = (2, 1, 3)  # offset of the arm for straight on, left and right
 
 def measure(
     kinds: Annotated[str, about("Comma-separated kinds of junction.")] = ",".join(FLOWS),
-    seeds: Annotated[str, about("Comma-separated seeds of trips and of both sides.")] = "1,2,3",
+    seeds: Annotated[str, about("Comma-separated seeds of the trips, cavmarl and SUMO.")] = "1,2,3",
     seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     say: Say = silent,
 ) -> BenchmarkReport:

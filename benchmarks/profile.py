@@ -31,8 +31,9 @@ def measure(
 ) -> BenchmarkReport:
     """Measure processor nanoseconds per vehicle and step, by phase.
 
-    A world with stopwatches and a world without run the same episodes in turn. The times of the
-    stopwatches and of the built-in driver in the agents' seats are measured and subtracted.
+    A world with stopwatches and a world without stopwatches run the same episodes in turn. The
+    times of the stopwatches and of the built-in driver in the agents' seats are measured and
+    subtracted.
     """
     check_range(steps=(steps, 1, 1_000_000), repeats=(repeats, 1, 1_000_000))
     overrides = parse_settings(settings)

@@ -1,4 +1,4 @@
-"""Times of mounted sensors, each alone and all of `ten_sensors`, on one core.
+"""Times of mounted sensors on one core: each sensor alone, and the whole rig `ten_sensors`.
 
 The sensors are due in every tick and sense the same seeded worlds in turn; times are processor
 times of this process.

@@ -39,7 +39,7 @@ COLUMNS: dict[str, tuple[str, str]] = {  # head of a column: (figure, format)
 
 def measure(
     maps: Annotated[Path, about("Folder of the maps outside the wheel.")] = Path("maps"),
-    seeds: Annotated[str, about("Comma-separated seeds of both sides.")] = "1,2,3",
+    seeds: Annotated[str, about("Comma-separated seeds of cavmarl and SUMO.")] = "1,2,3",
     seconds: Annotated[int, about("Simulated seconds per run.")] = 900,
     say: Say = silent,
 ) -> BenchmarkReport:

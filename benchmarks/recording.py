@@ -39,8 +39,8 @@ def measure(
 ) -> BenchmarkReport:
     """Measure ms per step of the same episodes with and without a recording.
 
-    Both wall time and processor time of the stepping thread are shown; the latter is not affected
-    by other programs.
+    Both wall time and processor time of the stepping thread are shown. Other programs do not affect
+    the processor time.
     """
     check_positive("--at-most", at_most)
     if not (vehicles >= 10 and steps >= 1 and turns >= 1):

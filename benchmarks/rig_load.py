@@ -110,7 +110,7 @@ def _evened(job: SensorJob, load_ms: float, say: Say) -> SensorJob:
     even = _changed(job, {"clock.ctrl_dt_s": dt_s})
     factors = dict.fromkeys(job.spec.overrides["rig"], 1.0)
     share_ms = load_ms / len(factors)
-    for grown in (False, True):  # low resolutions do not scale
+    for grown in (False, True):  # the costs of low resolutions do not scale
         even = _scaled_by(even, factors)
         found_ms, costs_ms = _tried(even, load_ms, say)
         if grown:  # other sensors take the rest

@@ -47,7 +47,7 @@ def measure(
     steps: Annotated[int, about("Steps of the world; a step is one tick.")] = 5000,
     rogue: Annotated[float, about("Share of steps in which the bridge also ticks.")] = 0.0,
     own_ticks: Annotated[
-        Literal["obey", "refuse", "ignore"], about("What the world does with such a tick.")
+        Literal["obey", "refuse", "ignore"], about("How the world treats the bridge's ticks.")
     ] = "obey",
     domain: Annotated[int, about("ROS_DOMAIN_ID.")] = 90,
     say: Say = silent,

@@ -2,7 +2,7 @@
 
     python ros2_clock_node.py
 
-The program needs `rclpy` and nothing of cavmarl. When the clock has no publisher any more, it
+The program needs `rclpy` and nothing of cavmarl. When the last publisher of the clock is gone, it
 prints one line of JSON: the received times of the clock, in ns.
 """
 

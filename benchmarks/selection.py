@@ -21,7 +21,7 @@ from cavmarl.bench.harness import BenchmarkReport, Say, check_range, silent
 from cavmarl.cli.output import Seed, about
 from cavmarl.evaluate.statistics import share_interval
 
-# Weights besides those of the paper: equal ones, each resource alone, and each pair.
+# Weights besides the paper's: equal weights, other ratios, pairs, and single resources.
 OTHER_WEIGHTS = (
     (1 / 3, 1 / 3, 1 / 3),
     (0.5, 0.25, 0.25),

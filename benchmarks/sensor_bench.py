@@ -37,7 +37,7 @@ CEILING_STEPS, CEILING_TURNS = 10, 7
 class Turn:
     """One run with its place in the order, and its result."""
 
-    repeat: int  # from 1
+    repeat: int  # number of the repetition, from 1
     place: int  # place in the order of all runs, from 1
     workers: int  # number of sensor workers
     run: SensorRun  # result
@@ -97,8 +97,8 @@ class SensorBench:
     def shares(self, workers: int) -> dict[str, Shares]:
         """Return both placements of all sensors of one vehicle, by their measured costs.
 
-        It assumes that all lines of a frame have equal costs. At run time, the division of frames
-        is corrected by measured costs.
+        The placements assume that all lines of a frame have equal costs. At run time, the division
+        of frames is corrected by measured costs.
         """
         costs_ms = self.costs_ms
         num_lines = [sensor["lines"] for sensor in self.turns[0].run.sensors]

@@ -40,7 +40,7 @@ class Measured:
     step_ms: float  # T, tick and sensors
     sd_within_run: float  # sample standard deviation of steps within a run, ms
     wait_ms: float  # part of T waiting for sensors
-    ci95_between_runs: Interval | None = None  # of T, from independent runs; None: too few runs
+    ci95_between_runs: Interval | None = None  # interval of T; None: too few independent runs
 
 
 @dataclass(frozen=True)

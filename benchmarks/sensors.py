@@ -45,7 +45,8 @@ def measure(
     at_least: Annotated[
         float | None,
         about(
-            "Exit with 1 if the second number is not this many times faster.", callback=check_bound
+            "Exit with 1 if the second number of workers is not this many times faster.",
+            callback=check_bound,
         ),
     ] = None,
     say: Say = silent,
@@ -79,7 +80,7 @@ def measure(
         notes=_notes(found, rows),
         facts=found.facts(),
         holds=found.is_same and is_kept(at_least, speedup),
-        caption="best: of those measured; SD: of the steps of a run",
+        caption="best: the fastest measured number of workers; SD: of the steps of a run",
         tables=(_sensors(found), _parts(found), _resources(found)),
     )
 

@@ -263,7 +263,7 @@ def _churn(store: Path, nodes: int, hours: float, rng: np.random.Generator) -> d
 
 
 def _started(store: Path, snapshot_events: int) -> tuple[float, Infrastructure]:
-    """Return the time in which a service reads its log, and its records."""
+    """Return the time that a service needs to read its log, and the records of the service."""
     began_s = time.perf_counter()
     log = EventLog(EventStore(store), snapshot_events=snapshot_events)
     took_s = time.perf_counter() - began_s

@@ -48,7 +48,7 @@ def measure(
     settings: Settings = None,
     say: Say = silent,
 ) -> BenchmarkReport:  # fmt: skip
-    """Measure a world in several numbers of zones, by phase; fail if the states differ."""
+    """Measure a world with several numbers of zones, by phase; fail if the states differ."""
     counts = numbers_of("--zones", zones)
     check_numbers(counts, after, repeats)
     if demand and (agents, background) != (None, None):

@@ -58,8 +58,8 @@ class Pair:
     plain_ns: float  # per tick, without a stopwatch
     timed_ns: float  # per tick with a stopwatch, minus the stopwatch's own time
     checked_ns: float | None  # per tick with the monitor; None: not measured
-    phases: dict[str, float]  # by the names of `PHASES`; their sum is `timed_ns`
-    calls: dict[str, float]  # by the names of the runtime's calls
+    phases: dict[str, float]  # times by the names of `PHASES`; their sum is `timed_ns`
+    calls: dict[str, float]  # times by the names of the runtime's calls
 
 
 class TwinWorlds:

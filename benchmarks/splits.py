@@ -81,7 +81,7 @@ def measure(
 
 
 def split_line(found: Sequence[tuple[int, float]]) -> int | None:
-    """Return the number of vehicles from which on every divided world was faster, if any."""
+    """Return the least number of vehicles from which all divided worlds were faster, or None."""
     line = None
     for vehicles, ratio in sorted(found, reverse=True):
         if ratio <= 1.0:

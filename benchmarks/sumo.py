@@ -43,7 +43,7 @@ def measure(
         list[Path], about("A .rou.xml, .add.xml or .sumocfg; may be repeated.", "--demand", "-d")
     ],
     source: Annotated[Source, about("Kind of coupling.")] = Source.TRAFFIC,
-    dt: Annotated[float, about("Step length of both sides, in seconds.")] = 0.1,
+    dt: Annotated[float, about("Step length of both simulations, in seconds.")] = 0.1,
     agents: Annotated[int, about("Number of agents.", min=1)] = 4,
     seed: Seed = 0,
     after: Annotated[int, about("Simulated seconds before the first turn.")] = 120,

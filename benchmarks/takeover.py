@@ -1,4 +1,4 @@
-"""Time in which a standby takes over from a killed service, and lost acknowledged requests."""
+"""Time until a standby takes over from a killed service, and lost acknowledged requests."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def _kill_and_wait(store: str, events: int) -> tuple[float, int]:
     try:
         urls = [_started(services, store, *options) for options in ((), ("--standby",))]
         assert services[1].stdout is not None
-        services[1].stdout.readline()  # printed after it has read the log
+        services[1].stdout.readline()  # the standby prints this line after it has read the log
         with Client(",".join(urls), secret) as client:
             known = [_add(client, k) for k in range(20)]
             services[0].kill()

@@ -2,10 +2,11 @@
 
     python -m benchmarks.topic_driver FOLDER --domain N
 
-It subscribes to the clock, odometry, traffic lights, predicted objects and the destination. It
-publishes `autoware_control_msgs/msg/Control` with the time of each clock message. From cavmarl, it
-uses the DDS node, the message types and path tracking. When the clock has no publisher any more, it
-prints one line of JSON: the number of steps for each reason of its acceleration.
+The program subscribes to the clock, odometry, traffic lights, predicted objects and the
+destination. It publishes `autoware_control_msgs/msg/Control` with the time of each clock message.
+From cavmarl, it uses the DDS node, the message types and path tracking. When the last publisher of
+the clock is gone, the program prints one line of JSON: the number of steps for each reason of its
+acceleration.
 """
 
 from __future__ import annotations
@@ -41,7 +42,7 @@ KINDS = {
 }
 CONTROL, CONTROL_KIND = "/control/command/control_cmd", "autoware_control_msgs/msg/Control"
 ENDS_S = 3.0  # ends after this time without a publisher of the clock
-MISSES_S = 5.0  # after this time, reports missing messages
+MISSES_S = 5.0  # the driver reports messages that are missing for this time
 
 
 class TopicDriver:
@@ -58,7 +59,7 @@ class TopicDriver:
         self.reasons: Counter[str] = Counter()
 
     def run(self) -> None:
-        """Answer each clock message until the clock has no publisher any more."""
+        """Answer each clock message until the last publisher of the clock is gone."""
         silent_s, answered_ns, due_s = 0.0, -1, math.inf
         while answered_ns < 0 or silent_s < ENDS_S:
             began_s = time.monotonic()

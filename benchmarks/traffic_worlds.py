@@ -29,7 +29,7 @@ def measure(
     worlds: Annotated[int, about("Number of worlds.")] = 100,
     first_seed: Annotated[int, about("Seed of the first world.")] = 0,
     seconds: Annotated[int, about("Simulated seconds of each world.")] = 900,
-    dt: Annotated[float, about("Step length of both sides, in seconds.")] = 0.1,
+    dt: Annotated[float, about("Step length of cavmarl and SUMO, in seconds.")] = 0.1,
     out: Annotated[Path, about("Folder of the results; existing rows are kept.")] = Path(
         "traffic_worlds"
     ),

@@ -29,11 +29,11 @@ class MapLanelet:
     centre: NDArray[np.float64]  # (n, 2) m, in driving direction
     along_m: NDArray[np.float64]  # (n,) distance of each point from the beginning
     speed_mps: float
-    is_turn: bool  # inside a junction
+    is_turn: bool  # whether the lanelet is inside a junction
     lights: tuple[int, ...]  # ids of its traffic lights
     before: list[MapLanelet] = field(default_factory=list)
     after: list[MapLanelet] = field(default_factory=list)
-    beside: list[MapLanelet] = field(default_factory=list)  # to which cars may change
+    beside: list[MapLanelet] = field(default_factory=list)  # lanelets to which cars may change
     yields_to: list[MapLanelet] = field(default_factory=list)
 
     @property

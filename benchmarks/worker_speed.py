@@ -179,7 +179,7 @@ class CoreCeiling:
 
     @property
     def ratio(self) -> float:
-        """Speedup of running all at once; median of the turns."""
+        """Speedup of running all programs at once; median of the turns."""
         return paired_ratio(self.alone_ms, self.together_ms)
 
     def facts(self) -> dict[str, Any]:
@@ -234,7 +234,7 @@ def measure_ceiling(
 
 
 def _turn(wires: list[Connection], steps: int) -> list[float]:
-    """Return ms per step of each program, all at once."""
+    """Run a turn of all programs at once; return ms per step of each program."""
     for wire in wires:
         wire.send(steps)
     return [_hear(wire) for wire in wires]

@@ -18,9 +18,10 @@ Drawn = TypeVar("Drawn")
 
 # Features of a draw with their probabilities; features can be excluded by name. Kinds of nets:
 KINDS = {"grid": 0.36, "spider": 0.2, "random": 0.29, "cut": 0.15}
-# nets with narrow places instead of `KINDS`, drawn with separate random numbers,
+# Nets with narrow places, used instead of `KINDS` and drawn with separate random numbers.
 NARROW = {"zipper": 0.05, "signal_pair": 0.05}
-# types of junctions (SUMO's names; zipper and unregulated define no right of way where ways cross),
+# Types of junctions, by SUMO's names. `zipper` and `unregulated` are left out, because they define
+# no right of way where paths cross.
 JUNCTIONS = {
     "priority": 0.26,
     "right_before_left": 0.16,
@@ -29,8 +30,8 @@ JUNCTIONS = {
     "traffic_light": 0.24,
     "traffic_light_right_on_red": 0.09,
 }
-SIGNALS = {"static": 0.5, "actuated": 0.3, "delay_based": 0.2}  # control of signals,
-SHARES = {  # and additional features of a net
+SIGNALS = {"static": 0.5, "actuated": 0.3, "delay_based": 0.2}  # control of signals
+SHARES = {  # additional features of a net
     "turn_lanes": 0.2,
     "joined": 0.12,
     "perturbed": 0.2,

@@ -65,7 +65,7 @@ class WorldProcess:
         words = [str(net), str(vehicles), str(nodes), repr(latency_s), str(int(is_realtime))]
         self._process: subprocess.Popen[Any] = start_python(
             ["-c", SERVES, *words],
-            env=huge_heap(),  # as nodes have
+            env=huge_heap(),  # nodes have a huge heap, too
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             text=True,

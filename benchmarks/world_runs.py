@@ -34,8 +34,8 @@ class WorldSeries:
     out: Path  # folder of the results
     count: int  # number of worlds
     first_seed: int  # first of consecutive seeds
-    seconds: int = 400  # simulated duration of both sides
-    dt_s: float = 0.1  # step length of both sides
+    seconds: int = 400  # simulated duration of both runs, in cavmarl and SUMO
+    dt_s: float = 0.1  # step length of both runs
     without: tuple[str, ...] = ()  # features to exclude
     maps: Path | None = None  # folder of maps to cut; None: those in SUMO's wheel
     cut_from: tuple[Path, ...] = field(default=(), init=False)
@@ -128,7 +128,7 @@ def run_world(job: WorldSeries, seed: int) -> Row:
     """Draw a world, run it here and in SUMO, and return its row."""
     draw = draw_world(seed, job.without)
     folder = world_folder(job.out, seed)
-    shutil.rmtree(folder, ignore_errors=True)  # of an interrupted run
+    shutil.rmtree(folder, ignore_errors=True)  # files of an interrupted run
     try:
         net, routes = make_files(draw, folder, job.seconds, job.cut_from)
         _write_commands(job, draw, folder)

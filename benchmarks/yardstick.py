@@ -296,7 +296,7 @@ class StandingVehicles:
         row = rows[i]
         others = rows[np.arange(len(rows)) != i]
         lane = self._vec.network.lanes[row["lane"]]
-        inside = bool(lane["internal"])  # where signals do not apply
+        inside = bool(lane["internal"])  # signals do not apply inside junctions
         step = self._vec.simulation.plans[row["goal"], row["lane"]]
         link = int(lane["link"] if inside else step["link"])
         along_x, along_y = math.cos(row["heading"]), math.sin(row["heading"])
@@ -314,7 +314,8 @@ class StandingVehicles:
         if ((others["lane"] == target["to_lane"]) & (others["s"] < NEAR_AHEAD_M)).any():
             return True
         conflicts = network.conflicts[target["first_conflict"] :][: target["num_conflicts"]]
-        crosses = np.isin(lanes["link"][others["lane"]], conflicts["foe"])  # only inside junctions
+        # Only lanes inside junctions have a link.
+        crosses = np.isin(lanes["link"][others["lane"]], conflicts["foe"])
         into = network.links["to_lane"][conflicts["foe"]]
         crosses |= np.isin(others["lane"], into) & (others["s"] < 0.5 * others["length"])
         first = network.links["from_lane"][conflicts["foe"][conflicts["must_yield"]]]

@@ -31,7 +31,7 @@ if TYPE_CHECKING:
 
 def pytest_addoption(parser: pytest.Parser) -> None:
     """Add the option `--turn` of `make rotation`."""
-    told = f"run only those slow tests that come up in this turn; each does in {TURNS} turns"
+    told = f"run only the slow tests of this turn; each slow test runs once in {TURNS} turns"
     parser.addoption("--turn", type=int, help=told)
 
 

@@ -133,7 +133,7 @@ def test_actions_for_unknown_agents_are_refused(stranger: Any) -> None:
 
 
 @pytest.mark.parametrize("actions", [None, [FINE] * 3, np.zeros((3, 2)), "car_0", 3])
-def test_actions_that_are_no_dict_are_refused(actions: Any) -> None:
+def test_actions_that_are_not_a_dict_are_refused(actions: Any) -> None:
     check_refused(make(), actions, ActionError, "dict")
 
 
@@ -391,7 +391,7 @@ def test_the_error_for_an_unknown_environment_lists_environments() -> None:
 
 
 @pytest.mark.parametrize("name", ["x" * 5000, "a\0b", "", "\ud800"])
-def test_names_that_are_no_valid_file_names_are_refused(name: str) -> None:
+def test_names_that_are_not_valid_file_names_are_refused(name: str) -> None:
     with pytest.raises(UnknownEnvironmentError):
         parallel_env(name)
     with pytest.raises(PolicyError):  # "" names the working directory

@@ -16,7 +16,7 @@ ROOT = Path(__file__).resolve().parents[1]
 def test_the_table_of_licences_has_each_installed_package() -> None:
     rows = list(licences())
     if not {"ray", "torchrl", "stable-baselines3"} <= {name for name, *_ in rows}:
-        pytest.skip("an installation of less than cavmarl[dev]: `make test` has all of it")
+        pytest.skip("parts of cavmarl[dev] are not installed: `make test` has all of them")
     lines = ["| package | needed by | licence |", "|---|---|---|"]
     lines += ["| {} |".format(" | ".join(row)) for row in rows]
     check_block(ROOT / "docs" / "reference" / "licences.md", "licences", "\n".join(lines))

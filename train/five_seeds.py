@@ -1,4 +1,4 @@
-"""Training repeated with several seeds, and the resulting drivers compared with scripted ones.
+"""Training repeated with several seeds; the trained drivers are compared with scripted drivers.
 
     python train/five_seeds.py --config configs/train/merge.yaml
     python train/five_seeds.py --config configs/train/tasks.yaml --env intersection exit --seeds 0 1
@@ -198,7 +198,7 @@ def interval_of(means: NDArray[np.float64], are_shares: bool) -> Interval | None
 def summarise(
     report: EvaluationReport, alone: EvaluationReport, args: Args
 ) -> dict[str, dict[str, Row]]:
-    """Return rows by driver and metric, with one driver for all trained ones and `idm` alone."""
+    """Return rows by driver and metric; `trained` has all seeds, and `alone` is `idm` alone."""
     trained = [report[f"seed_{seed}"] for seed in args.seeds]
     found: dict[str, dict[str, Row]] = {"trained": {}}
     for metric in METRICS:

@@ -64,9 +64,9 @@ class Args:
     learning_rate: Annotated[float, "learning rate of Adam, annealed to 0"] = 5e-4
     gamma: Annotated[float, "discount per decision"] = 0.98
     entropy: Annotated[float, "weight of the entropy in the loss"] = 0.005
-    imitate: Annotated[int, "decisions of a unit to imitate first, of the feedback controller"] = (
-        360
-    )
+    imitate: Annotated[
+        int, "decisions of the feedback controller that each unit imitates first"
+    ] = 360
     hidden: Annotated[int, "width of the two hidden layers"] = 32
     evaluations: Annotated[int, "worlds of the evaluation"] = 16
     runs: Annotated[str, "folder of all runs"] = "runs"

@@ -5,9 +5,9 @@
     python train/ppo.py --resume runs/merge_ippo_1 --total-agent-steps 8000000
     torchrun --nproc-per-node 2 train/ppo.py --env merge
 
-The file has the settings; `Batch`, the decisions; `Collector`, which drives worlds; `Learner`,
-which updates the network; `Run`, which alternates collecting and learning (Schulman et al. 2017; de
-Witt et al. 2020; docs/guides/train.md).
+`Args` has the settings, and `Batch` the decisions. `Collector` drives the worlds, `Learner` updates
+the network, and `Run` alternates collecting and learning (Schulman et al. 2017; de Witt et al.
+2020; docs/guides/train.md).
 """
 
 from __future__ import annotations
@@ -89,7 +89,9 @@ class Args:
     opponents: Annotated[str, "drivers of some seats, not learnt from; comma-separated"] = ""
     opponent_share: Annotated[float, "share of the seats of each opponent"] = 0.1
     average: Annotated[float, "share of the driver's averaged weights that an update keeps"] = 0.0
-    max_gradient_norm: Annotated[float, "largest norm of a gradient; longer ones are clipped"] = 0.5
+    max_gradient_norm: Annotated[
+        float, "largest norm of a gradient; longer gradients are clipped"
+    ] = 0.5
     throttle_std: Annotated[float, "initial standard deviation of throttle; without --start"] = 0.3
     steering_std: Annotated[float, "initial standard deviation of steering; without --start"] = 0.1
     mappo: Annotated[bool, "let the critic see the state of the whole world"] = False

@@ -6,8 +6,8 @@
 The first command trains on each map with each seed (`signals_sb3.py`, one training at a time), runs
 the scripted controllers in the same worlds, and writes all figures after each training or run. If
 the command is interrupted, run it again to continue. The second command prints the table. Trained
-networks have the 95 % interval of the mean over training seeds, scripted controllers that over
-evaluation runs.
+networks have the 95 % interval of the mean over training seeds, and scripted controllers have the
+95 % interval of the mean over evaluation runs.
 
 The maps are in the wheel of sumo-rl (`sumo_rl/nets/RESCO`). Their licences are non-commercial or
 the GPL, so the package does not contain them.
@@ -34,7 +34,7 @@ from cavmarl.learning.checkpoint import writing
 from cavmarl.learning.options import run_to_end
 
 PROGRAM = Path(__file__).with_name("signals_sb3.py")
-FIRST_SEED, NUM_RUNS, SECONDS = 1000, 5, 3600  # of the evaluation, as in `signals_sb3.py`
+FIRST_SEED, NUM_RUNS, SECONDS = 1000, 5, 3600  # evaluation, as in `signals_sb3.py`
 RANGE_M = 50.0
 # Number of parallel worlds in a training on each map; maps with more signals have fewer worlds.
 WORLDS = {

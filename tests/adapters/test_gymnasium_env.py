@@ -87,7 +87,7 @@ def test_the_spec_contains_the_horizon_and_makes_an_equal_environment() -> None:
 
 
 def test_infos_contain_the_keys_of_highway_env() -> None:
-    """In even episodes, the built-in driver drives; in odd ones, full throttle causes a contact."""
+    """Even episodes have the built-in driver; in odd episodes, full throttle causes a contact."""
     ends = {"crashed": 0, "is_success": 0}
     for seed in range(4):
         driven = seed % 2 == 0

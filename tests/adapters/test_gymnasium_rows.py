@@ -226,7 +226,7 @@ def test_rows_of_one_world_begin_an_episode_together() -> None:
         if over.any():
             seen, told = rows.reset(options={"reset_mask": over})
             assert not seen[over & ~told["active"]].any(), (
-                "a waiting row observes other values than 0"
+                "a waiting row observes values other than 0"
             )
             whole += bool(told["active"][over].all())
             waiting += bool((over & ~told["active"]).any())

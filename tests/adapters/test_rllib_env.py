@@ -46,10 +46,10 @@ def cluster() -> Iterator[None]:
 
 @pytest.mark.parametrize("mode", MODES)
 def test_rllib_gets_the_results_of_the_world(mode: str) -> None:
-    """Compare with PettingZoo's environment. RLlib's episodes may end earlier; then it resets."""
+    """Compare with PettingZoo's environment. If RLlib's episodes end earlier, RLlib resets."""
     from cavmarl.adapters.rllib_env import CavRllibEnv
 
-    # In the mode "open" with one agent, an agent enters when the trip of the last one has ended.
+    # In the mode "open" with one agent, an agent enters when the last agent's trip has ended.
     chosen = config(mode) | ({"agents": 1} if mode == "open" else {})
     env, twin = CavRllibEnv(chosen), parallel_env(**chosen)
     sampled = env.get_action_space("car_0")

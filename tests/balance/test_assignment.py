@@ -123,7 +123,7 @@ def test_neighboring_zones_are_assigned_to_the_same_worker() -> None:
     assert plan.imbalance == 1.0
     assert (
         plan.placement.cut_pairs <= 12
-    )  # 12 pairs for four rows; an assignment in turn would cut 24
+    )  # four rows cut 12 pairs; a round-robin assignment would cut 24
 
 
 @settings(deadline=None)

@@ -28,7 +28,7 @@ def test_the_table_of_the_paper_is_computed_from_raw_ticks() -> None:
     assert rows[-1].follower_s == pytest.approx(482.0)
 
 
-def test_rows_are_those_of_the_paper_or_the_last_step() -> None:
+def test_the_table_has_the_steps_of_the_paper_and_the_last_step() -> None:
     random = np.random.default_rng(0)
     master, follower = (np.cumsum(random.integers(1, 9, 1001)).tolist() for _ in range(2))
     for last, steps in ((100, [100]), (101, [100, 101]), (7, [7]), (1000, [100, 500, 1000])):

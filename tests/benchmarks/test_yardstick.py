@@ -1,4 +1,4 @@
-"""The benchmark `yardstick`: its counts, its bound, and the causes for which vehicles stand."""
+"""The benchmark `yardstick`: its counts, its bound, and the reasons why vehicles stand."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def test_the_bound_holds_on_a_correct_map() -> None:
     assert own["off_road"] == own["collision"] == own["stands"] == 0
 
 
-def test_labels_of_maps_are_file_names_or_paths_if_two_are_equal() -> None:
+def test_the_label_of_a_map_is_its_file_name_or_its_path_if_two_names_are_equal() -> None:
     here, there = "/some/long/folder/Town01.xodr", "/another/Town01.net.xml"
     assert yardstick.labels(["town", here]) == {"town": "town", here: "Town01"}
     assert yardstick.labels([here, there]) == {here: here, there: there}

@@ -109,7 +109,7 @@ def test_a_network_file_with_another_suffix_is_refused(tmp_path: Path, name: str
 
 
 @pytest.mark.parametrize("command", ["build", "check"])
-def test_the_error_for_a_file_that_is_no_map_names_the_suffixes_of_maps(
+def test_the_error_for_a_file_that_is_not_a_map_names_the_suffixes_of_maps(
     tmp_path: Path, command: str
 ) -> None:
     path = tmp_path / "README.md"

@@ -1,4 +1,4 @@
-"""Folders of drafts are removed at the end of their block, or after a kill by the next draft."""
+"""Draft folders are removed at the end of their block or, after a kill, by the next draft."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def copied_library(built_library: Path, tmp_path: Path) -> Path:
 
 @pytest.fixture
 def uncached(monkeypatch: pytest.MonkeyPatch) -> Iterator[pytest.MonkeyPatch]:
-    """Clear what this process has cached about kernels, before and after the test."""
+    """Clear the data about kernels that this process has cached, before and after the test."""
     for cached in (machine_code.kernel_source, machine_code.explain):
         cached.cache_clear()
     yield monkeypatch
@@ -88,7 +88,7 @@ def test_a_kernel_with_other_types_or_sources_is_not_found(built_library: Path) 
 
 
 @compiled_only
-def test_calls_that_more_general_code_serves_are_not_compiled() -> None:
+def test_calls_are_not_compiled_if_more_general_code_serves_them() -> None:
     rows = np.zeros((4, 2))
     wide, narrow, other = (
         KernelCall(

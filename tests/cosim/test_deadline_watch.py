@@ -1,4 +1,4 @@
-"""Deadlines of steps in real time: misses by phase."""
+"""Deadlines of steps in real time: missed deadlines are counted by phase."""
 
 from __future__ import annotations
 

@@ -194,7 +194,7 @@ def test_a_silent_follower_does_not_block_other_followers(address: Path, start: 
         assert hashes(world, 3) == reference(3, {"car_1": None})
 
 
-def test_a_follower_that_leaves_is_no_error(address: Path) -> None:
+def test_a_follower_may_leave_without_an_error(address: Path) -> None:
     with FollowedWorld(make_env(), address) as world:
         follower = join_world(world, ["car_0"])
         follower.leave()
@@ -278,7 +278,7 @@ def test_bad_controls_can_be_replaced_by_the_last_controls_and_counted(
 
 
 @pytest.mark.parametrize("own_ticks", ["refuse", "ignore"])
-def test_own_ticks_of_a_follower_do_not_change_the_world(
+def test_refused_or_ignored_ticks_of_a_follower_do_not_change_the_world(
     address: Path, start: Start, own_ticks: Any
 ) -> None:
     refused = []

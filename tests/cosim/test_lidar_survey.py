@@ -59,7 +59,7 @@ def test_an_echo_becomes_a_point_at_the_end_of_its_ray() -> None:
     assert len(lidar_points(lidar, scan, 7.0)) == 1
 
 
-def test_the_only_ray_of_a_lidar_points_straight_ahead() -> None:
+def test_the_ray_of_a_lidar_with_one_ray_points_straight_ahead() -> None:
     """Check the world (`lidar_fan`) and all programs that use its scans."""
     config = LidarRigConfig(rate_hz=10.0, rays=1, fov_deg=90.0)
     (ahead,) = lidar_fan(config).rays[:, 0]

@@ -1,4 +1,4 @@
-"""Recorded traces: files, playback by the code that handles clients, late and lost poses."""
+"""Recorded traces: their files, late and lost poses, and playback by the code for clients."""
 
 from __future__ import annotations
 

@@ -87,7 +87,9 @@ def test_without_messages_the_world_has_no_spat_sensor() -> None:
 
 
 @pytest.mark.parametrize("stage", ["told", "spat"])
-def test_a_signal_with_unknown_state_is_red_for_spat_and_ignored_for_told(stage: str) -> None:
+def test_a_signal_with_unknown_state_is_red_in_stage_spat_and_ignored_in_stage_told(
+    stage: str,
+) -> None:
     """Plan towards a signal with no known state.
 
     With the stage `spat`, the stack stops; with `told`, it follows the right of way.

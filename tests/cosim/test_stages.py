@@ -93,7 +93,7 @@ def test_the_control_stage_follows_a_bend_of_50_m_at_8_mps(
     assert max(off) < 0.6
 
 
-def test_gains_belong_to_the_type_of_the_vehicle() -> None:
+def test_control_gains_depend_on_the_type_of_the_vehicle() -> None:
     straight = Trajectory(np.array([[0.0, 0.0], [100.0, 0.0]]), -100.0)
     pose = EgoPose(0.0, 1.0, 0.0, 10.0)
     for vclass, gains in GAINS.items():
@@ -152,7 +152,7 @@ def test_localisation_corrects_a_reversed_heading() -> None:
     assert max(off[200:]) < 1.2
 
 
-def test_a_given_pose_is_used(grid: HdMap) -> None:
+def test_the_stack_starts_from_a_given_pose(grid: HdMap) -> None:
     env = cavmarl.parallel_env("grid4x4", agents=1, background=0, overrides={"rig": RIG})
     sensors = [sensor_of(v.name, v.settings) for v in welcome_to(env, [], 0).sensors]
     stack = Stack(vehicle_of(grid, sensors, TICK_S))
@@ -289,7 +289,7 @@ def test_echoes_become_an_object_with_a_velocity(grid: HdMap) -> None:
     assert stage.perceive({"roof": Scan(nothing)}, pose, 2.0) in ([], found)
 
 
-def test_the_only_ray_of_a_lidar_detects_an_object_ahead(grid: HdMap) -> None:
+def test_a_lidar_with_one_ray_detects_an_object_ahead(grid: HdMap) -> None:
     pose = pose_on(grid, lane_of(grid, 60.0), 10.0, 0.0)
     settings = {"fov_deg": 90.0, "range_m": 60.0}
     stage = LidarObjects([StackSensor("nose", "lidar", StackMount(0.0, 0.0, 0.0), settings)], grid)

@@ -100,12 +100,12 @@ def test_followers_change_no_trajectory(own_ticks: OwnTicks) -> None:
     ]
 
 
-def test_an_obeyed_tick_of_a_follower_is_detected_before_the_next_tick() -> None:
+def test_the_drift_after_an_obeyed_tick_of_a_follower_is_detected_before_the_next_tick() -> None:
     env = make()
     master = TimeMaster(env, own_ticks="obey", on_drift="record")
     master.reset(seed=0)
     follower = master.follow("rogue")
-    assert not follower.tick()  # a tick would repeat the last step; there is none
+    assert not follower.tick()  # a tick repeats the last step, but there is no step yet
     for step in range(10):
         master.step(env.suggest_actions())
         if step % 3 == 0:

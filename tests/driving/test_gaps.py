@@ -69,13 +69,13 @@ def blocks(network: RoadNetwork) -> Blocks:
         """Return HOLD_NONE if the foe does not block, or the reason to stop.
 
         Args:
-            own_s: Time until the own car is at `end`.
+            own_s: Time until the ego car is at `end`.
             end: "enter": its front enters the shared area; "line": its front is at its line; "out":
                 its rear leaves the junction.
             foe_m: Distance of the foe's front to its line. If negative, the foe is on the junction,
                 and -foe_m is the distance of its rear to the end of the shared area.
             wait_s: Waiting time of both cars.
-            own: Fields of the own row of VEHICLE.
+            own: Fields of the ego car's row of VEHICLE.
             near: Whether the paths come close in the shared area.
             travel: Tables with the vehicle types.
             foe_fields: Fields of the foe's row of VEHICLE.
@@ -197,7 +197,7 @@ def test_the_time_gap_is_one_second_or_three_seconds_if_a_car_is_an_agent(
 def test_a_foe_whose_trip_ends_before_its_line_is_ignored(
     blocks: Blocks, to_go_m: float, waits: bool
 ) -> None:
-    """The foe's centre is 52.5 m before its line. If `to_go` is 0, its way to go is unknown."""
+    """The foe's centre is 52.5 m before its line. `to_go` is 0 if its goal is unknown."""
     assert bool(blocks(4.5, "out", 50.0, to_go=to_go_m)) == waits
 
 
@@ -216,7 +216,7 @@ def test_a_crossing_driver_never_expects_foes_to_brake(
 ) -> None:
     over_s = (float(network.links["length_m"][FROM_SOUTH]) + 2.0 * HALF_M) / SPEED_MPS
     assert over_s == 1.5, "the path over the junction is not 10 m long"
-    # The own car has left the junction after 1.5 s, and the time gap is 1.0 s.
+    # The ego car has left the junction after 1.5 s, and the time gap is 1.0 s.
     assert blocks(over_s, "out", 24.8, wait_s)
     assert not blocks(over_s, "out", 25.2, wait_s)
 
@@ -247,10 +247,10 @@ def test_a_vehicle_that_stands_a_metre_before_its_line_needs_no_longer_gap(block
 
 
 def least_ahead(network: RoadNetwork, driver: int, wait_s: float, foe_mps: float) -> Any:
-    """Return the smallest accepted distance of a merging foe to its line, and the own way, in m.
+    """Return the smallest accepted distance of a merging foe to its line, and the driven distance.
 
-    The own vehicle drives at its limit of 5 m/s, with its front 2.5 m before its line. Its way ends
-    when its rear has left the junction.
+    Both are in m. The ego vehicle drives at its limit of 5 m/s, with its front 2.5 m before its
+    line. The driven distance ends when its rear has left the junction.
     """
     own = np.repeat(np.arange(len(network.links)), network.links["num_conflicts"])
     shared = next(k for k in np.flatnonzero(network.conflicts["merging"])
@@ -296,7 +296,7 @@ def test_a_driver_that_has_waited_merges_before_a_foe_that_brakes_gently(
     network: RoadNetwork, wait_s: float, brakes_m: float
 ) -> None:
     # The foe may have to brake from 10 to 5 m/s with 4.5 m/s² · waiting time / 180 s. It begins
-    # to brake in 0.3 s, when the own vehicle is 1 m before its line.
+    # to brake in 0.3 s, when the ego vehicle is 1 m before its line.
     least_m, _ = least_ahead(network, DRIVER_BACKGROUND, wait_s, 10.0)
     assert least_m == pytest.approx(brakes_m + 0.3 * 10.0, abs=0.1)
 

@@ -1,4 +1,4 @@
-"""Junctions are kept clear: no vehicle enters that would have to stop inside."""
+"""Junctions are kept clear: a vehicle that would have to stop inside does not enter."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_a_full_road_is_blocked_if_its_vehicles_wait_at_the_next_line(tmp_path: 
     assert not is_blocked(scene, WAITING)
     assert is_blocked(scene, MOVING, WAITING)
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 4.0, HOLD_SIGNAL))
-    # These cars move on, but the own vehicle has to expect that it must yield at the next line.
+    # These cars move on, but the ego vehicle has to expect that it must yield at the next line.
     assert is_blocked(scene, (4.0, 4.0, HOLD_NONE), (13.0, 8.0, HOLD_NONE))
 
 
@@ -140,7 +140,7 @@ def test_a_free_waiting_position_in_the_next_junction_counts_as_room(tmp_path: P
 
 
 def test_a_driver_follows_moving_vehicles_to_a_line_without_a_signal(tmp_path: Path) -> None:
-    """All vehicles yield at that line. As in SUMO, the driver does not enter if one waits there."""
+    """All vehicles yield at that line. As in SUMO, a waiting vehicle there keeps the driver out."""
     scene = ahead(tmp_path, SIGNAL_NONE, second="priority")
     turn = scene.network.links[scene.network.lanes[scene.left_turns_from]["first_link"]]
     assert chr(turn["state"]) == "m"

@@ -103,8 +103,8 @@ def ours(case: dict[str, float]) -> tuple[float, float]:
     """Return the safe speeds behind the leader and before a line, for SUMO's discrete motion.
 
     SUMO drives a whole step at the new speed. A braking vehicle therefore drives half a step less
-    far than in continuous time. So subtract half a step from the reaction time, and the leader's
-    way in half a step from the gap.
+    far than in continuous time. So subtract half a step from the reaction time, and the distance
+    that the leader drives in half a step from the gap.
     """
     gap = case["gap"] - 0.5 * DT * case["front"]
     follow = safe_speed(gap, case["front"], case["decel"], case["front_decel"], TAU - 0.5 * DT)
@@ -117,7 +117,7 @@ def ours(case: dict[str, float]) -> tuple[float, float]:
 def answers() -> list[tuple[dict[str, float], dict[str, float]]]:
     """Return the cases and SUMO's results.
 
-    The own speed of each case is the safe speed, so that SUMO applies no other limit.
+    The speed of the follower in each case is the safe speed, so that SUMO applies no other limit.
     """
     pytest.importorskip("libsumo", reason="needs the extra 'sumo'")
     pytest.importorskip("sumo", reason="needs the extra 'sumo'")

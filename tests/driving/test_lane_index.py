@@ -72,7 +72,7 @@ def nearest_behind(
     reach_m: float,
     view_m: float,
 ) -> tuple[int, float]:
-    """Return the nearest follower on any incoming lane; of equally near ones, the smallest id."""
+    """Return the nearest follower on any incoming lane; the smallest id breaks ties."""
     asked = range(max(1, int(roads.lanes[lane]["num_into"])))
     found = [behind_by(roads.arrays, room, lane, s, own_id, n, reach_m, view_m) for n in asked]
     return min(found, key=lambda one: (one[1], room.entries[one[0]]["id"]))
@@ -149,7 +149,7 @@ def test_searches_end_at_the_view_distance() -> None:
         assert (last_on(room, lane, 9, 15.0, view_m) >= 0) == sees
 
 
-def test_of_two_vehicles_at_the_same_place_the_larger_id_is_the_leader() -> None:
+def test_the_larger_id_of_two_vehicles_at_the_same_place_is_the_leader() -> None:
     roads = network("ring")
     rows = np.zeros(2, VEHICLE)
     rows["id"], rows["side_lane"], rows["s"] = [7, 3], -1, 10.0
@@ -160,7 +160,7 @@ def test_of_two_vehicles_at_the_same_place_the_larger_id_is_the_leader() -> None
     assert (seen(room, k)[0], distance) == (1, 0.0)
 
 
-def test_a_vehicle_that_stands_over_30_m_behind_on_an_incoming_lane_is_no_follower() -> None:
+def test_a_vehicle_that_stands_over_30_m_behind_on_an_incoming_lane_is_not_a_follower() -> None:
     roads = network("grid4x4")
     lane = int(np.flatnonzero(roads.lanes["internal"])[0])
     link = roads.links[roads.lanes["link"][lane]]

@@ -70,7 +70,7 @@ def test_the_controller_steers_straight_in_the_middle_of_a_lane_and_towards_it_e
     assert left > 0.0
 
 
-def test_a_target_lane_that_is_no_neighbour_is_treated_as_the_own_lane() -> None:
+def test_a_target_lane_that_is_not_a_neighbour_is_treated_as_the_own_lane() -> None:
     roads = network("merge")
     lane = roads.lane_ids.index("main_in_0")
     far = roads.lane_ids.index("main_out_1")

@@ -1,4 +1,4 @@
-"""Which approaching vehicles are registered at links, and which registered ones are ignored."""
+"""Registration of approaching vehicles at links, and registered vehicles that are ignored."""
 
 from __future__ import annotations
 

@@ -82,8 +82,8 @@ def test_no_stop_is_recorded_without_stop_signs(maps: dict[str, Path]) -> None:
 def test_a_vehicle_that_waits_close_before_a_stop_sign_has_stopped_at_the_sign(
     maps: dict[str, Path], stub: bool, to_line_m: float, wait_s: float, notes: bool
 ) -> None:
-    # The vehicle waits some metres before its line, because others sweep over the line. If `stub`,
-    # its lane is very short, and it waits on the preceding lane.
+    # The vehicle waits some metres before its line, because other vehicles sweep over the line. If
+    # `stub`, its lane is very short, and it waits on the preceding lane.
     roads = read_network(maps["allway_stop"])
     link = next(
         k

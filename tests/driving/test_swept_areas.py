@@ -220,7 +220,7 @@ def test_long_vehicles_wait_inside_before_swept_areas(network: RoadNetwork) -> N
 def test_a_car_approaches_a_bus_inside_at_least_as_cautiously_as_an_empty_junction(
     network: RoadNetwork,
 ) -> None:
-    """The bus sweeps an area beyond the waiting position. It may have left when the car arrives."""
+    """The bus sweeps an area beyond the waiting position, and may leave before the car arrives."""
     links, sweeps, conflicts = network.links, network.sweeps.copy(), network.conflicts.copy()
     owner = np.repeat(np.arange(len(links)), links["num_sweeps"])
     picked = (sweeps["own"] == CAR) & (sweeps["other"] == BUS)
@@ -286,7 +286,7 @@ def test_the_vehicle_that_has_to_brake_less_waits_if_neither_can_stop_in_time(
 def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
     network: RoadNetwork,
 ) -> None:
-    """The foe may stand behind a leader that waits for the car; then none of the three would go."""
+    """A foe may stand behind a leader that waits for the car. If the car waits, all three wait."""
     meeting = BusAndCar(network)
     enter_m, bus_enter_m = meeting.sweep["foe_enter_m"], meeting.sweep["enter_m"]
     meeting.rows["wait_s"][0] = 4.0
@@ -307,7 +307,7 @@ def test_a_foe_that_stands_before_the_area_without_a_reason_is_ignored(
 def test_a_vehicle_behind_the_junction_waits_before_a_swept_area(
     network: RoadNetwork, front_m: float, bus_m: float, brakes: bool
 ) -> None:
-    """`front_m` and `bus_m` are the ways of the fronts of car and bus beyond the area's start."""
+    """`front_m` and `bus_m`: how far the fronts of car and bus are beyond the area's start."""
     meeting = BusAndCar(network)
     link, bus_link = int(meeting.sweep["foe"]), meeting.link
     row, sweeps = network.links[link], network.sweeps.copy()

@@ -333,7 +333,7 @@ def test_the_gap_to_a_leader_turned_by_90_degrees_is_smaller_by_half_its_width(
 def test_a_vehicle_that_changes_lanes_near_the_line_is_listed_for_both_lanes(
     network: RoadNetwork, rest_m: float, announced: bool
 ) -> None:
-    """Otherwise, a bus in a U-turn from the lane that the vehicle leaves would sweep over it."""
+    """A bus in a U-turn from the lane that the vehicle leaves could otherwise sweep over it."""
     link, turn = beside(network)
     lane, left = (int(network.links["from_lane"][k]) for k in (link, turn))
     plan = np.zeros(len(network.lanes), PLAN)

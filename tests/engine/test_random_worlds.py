@@ -1,7 +1,7 @@
 """Worlds with random maps, populations, clocks and zones: divided worlds equal undivided ones.
 
 Agents take the actions of the built-in driver with noise, or random actions. With random actions,
-they leave their lanes, turn round, block other vehicles and drive against the traffic.
+they leave their lanes, turn around, block other vehicles and drive against the traffic.
 """
 
 from __future__ import annotations

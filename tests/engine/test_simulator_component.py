@@ -1,4 +1,4 @@
-"""Zones that other simulators run: an exact one changes no bit, a faulty one causes an error."""
+"""Zones that other simulators run: exact simulators change no bit, faulty ones cause an error."""
 
 from __future__ import annotations
 

@@ -84,7 +84,7 @@ def test_sensors_of_an_observing_vehicle_see_the_traffic_and_do_not_change_it() 
     assert states[0] == states[1]
 
 
-def test_samples_measure_the_distance_to_another_car_and_the_own_speed() -> None:
+def test_samples_measure_the_distance_to_another_car_and_the_speed_of_the_car_itself() -> None:
     """The centres of both cars are 12 m apart, so the rear of the car ahead is 9.5 m away."""
     rig = {"roof": RIG["roof"] | {"rate_hz": 20}, "wheels": {"type": "odometry", "rate_hz": 20}}
     with closing(ring(background=0, overrides={"rig": rig})) as env:

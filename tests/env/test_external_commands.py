@@ -162,7 +162,7 @@ def test_a_posed_vehicle_reaches_its_pose_at_the_end_of_the_step() -> None:
         assert (row_of(env, slot)["x"], row_of(env, slot)["y"]) == ahead
 
 
-def test_a_vehicle_that_jumps_gets_a_new_id_and_counts_as_no_trip() -> None:
+def test_a_vehicle_that_jumps_gets_a_new_id_and_is_not_counted_as_a_trip() -> None:
     with closing(ring()) as env:
         before = env.traffic_stats()
         slot = env.external.spawn(*place_on(env, 0))

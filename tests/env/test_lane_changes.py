@@ -147,7 +147,7 @@ def test_the_state_of_a_world_does_not_depend_on_the_process_that_runs_it() -> N
 
 
 def drive_past(reroute: str, steps: int = 400) -> tuple[dict[str, float], int, int]:
-    """Drive with closed roads and return what happened.
+    """Drive with closed roads; return statistics of the traffic.
 
     Returns:
         The traffic statistics, the number of steps after 10 s in which a vehicle entered a closed

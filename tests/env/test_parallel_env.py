@@ -41,7 +41,9 @@ def test_a_closed_world_starts_with_all_agents_and_no_agent_enters_later() -> No
     before = set(env.agents)
     while env.agents:
         _, _, terminations, truncations, _ = env.step(wild(env, rng))
-        assert set(terminations) == before, "other agents than those that acted get a result"
+        assert set(terminations) == before, (
+            "agents that did not act get a result, or acting agents get none"
+        )
         gone = {agent for agent in before if terminations[agent] or truncations[agent]}
         before -= gone
         assert set(env.agents) == before

@@ -99,12 +99,12 @@ def test_overrides_that_are_not_a_mapping_are_refused(overrides: object) -> None
         cavmarl.parallel_env("ring", overrides=overrides)
 
 
-def test_keys_of_overrides_that_are_no_text_are_refused() -> None:
+def test_keys_of_overrides_that_are_not_text_are_refused() -> None:
     with pytest.raises(cavmarl.ConfigError, match="3 is not a key"):
         cavmarl.parallel_env("ring", overrides={3: 3})
 
 
-def test_a_horizon_that_is_no_whole_number_of_steps_is_refused() -> None:
+def test_a_horizon_that_is_not_a_whole_number_of_steps_is_refused() -> None:
     with pytest.raises(cavmarl.ConfigError, match=r"horizon_s = 1\.04.*try 1$"):
         cavmarl.parallel_env("ring", overrides={"horizon_s": 1.04})
 

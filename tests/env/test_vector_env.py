@@ -268,7 +268,7 @@ def test_the_mask_marks_acting_agents(mode: str) -> None:
     for _ in range(100):
         mask = infos["mask"]
         assert not observations[~mask].any(), (
-            "an agent without a vehicle observes other values than 0"
+            "an agent without a vehicle observes values other than 0"
         )
         assert observations[mask].any(axis=-1).all()
         actions = wild(rng, vec)

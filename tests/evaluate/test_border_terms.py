@@ -17,7 +17,7 @@ HALVES = ZonePartition(
 )
 
 
-def test_the_edge_of_the_map_is_no_border() -> None:
+def test_the_edge_of_the_map_is_not_a_border() -> None:
     record = BorderTerms(HALVES, step_s=0.5)
     places = np.array([[[1.0, 1.0], [100.0 - NEAR_M, 50.0], [99.0, 99.0], [100.0, 5.0]]])
     terms = np.zeros((1, 4, len(TERMS)), dtype=np.float32)

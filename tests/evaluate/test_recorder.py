@@ -148,7 +148,7 @@ def test_a_trip_truncated_by_the_horizon_is_unfinished() -> None:
 
 
 @pytest.mark.parametrize("fault", ["red_light", "wrong_way"])
-def test_a_trip_that_breaks_a_rule_has_no_success(fault: str) -> None:
+def test_a_trip_that_breaks_a_rule_is_not_a_success(fault: str) -> None:
     worlds = Worlds()
     worlds.add(**{fault: (1.0, 0.0)})
     worlds.add(done=(True, True), arrival=(1.0, 1.0))
@@ -156,7 +156,7 @@ def test_a_trip_that_breaks_a_rule_has_no_success(fault: str) -> None:
     assert worlds.trips["success"].tolist() == [False, True]
 
 
-def test_a_trip_over_three_times_the_free_time_has_no_success() -> None:
+def test_a_trip_over_three_times_the_free_time_is_not_a_success() -> None:
     worlds = Worlds()
     worlds.add(delay=(STEP_S, STEP_S))
     worlds.add(delay=(STEP_S, STEP_S))

@@ -145,7 +145,7 @@ def reason_to_skip(processor: Processor) -> str:
 def compare(
     names: Iterable[str], tasks: tuple[str, ...], short: tuple[str, ...] = SHORT_TASKS
 ) -> int:
-    """Run tasks on processors, print what differs, and return the exit code.
+    """Run tasks on processors, print the differences, and return the exit code.
 
     Args:
         names: names in `PROCESSORS`.

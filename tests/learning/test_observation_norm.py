@@ -38,7 +38,7 @@ def test_the_scales_of_two_batches_are_those_of_all_observations() -> None:
     )
 
 
-def test_scales_of_a_start_driver_count_with_its_number_of_decisions(
+def test_scales_of_a_start_driver_are_weighted_by_its_number_of_decisions(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observer = network()

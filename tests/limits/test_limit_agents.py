@@ -47,7 +47,7 @@ def test_vehicles_obey_the_chosen_speed_limit() -> None:
             far = rows[lanes == vec.network.edge_ids.index("far")]
             fastest.append(far["speed"].max())
         assert max(fastest[10:18]) < 1.3 * 12.0
-        assert fastest[-1] > 24.0  # 40 m/s exceeds the limit of the map, which therefore holds
+        assert fastest[-1] > 24.0  # 40 m/s exceeds the limit of the map, so the map's limit applies
         assert fastest[-1] < 1.35 * 27.78
 
 

@@ -118,7 +118,7 @@ def test_buildings_on_roads_are_found(town: Path, tmp_path: Path) -> None:
         ("covered=yes", False),
     ],
 )
-def test_roads_through_buildings_are_no_defects(tmp_path: Path, tags: str, is_found: bool) -> None:
+def test_roads_through_buildings_are_not_defects(tmp_path: Path, tags: str, is_found: bool) -> None:
     words = "".join(f'<tag k="{k}" v="{v}"/>' for k, v in (one.split("=") for one in tags.split()))
     building = (
         '<node id="91" lat="48.0055" lon="10.9995"/><node id="92" lat="48.0055" lon="11.0005"/>'

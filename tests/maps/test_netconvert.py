@@ -149,7 +149,7 @@ def test_a_box_without_roads_is_refused(town: Path, tmp_path: Path) -> None:
         ('<!DOCTYPE o SYSTEM "http://example.org/x.dtd"><osm/>', "document type or entities"),
     ],
 )
-def test_useless_and_hostile_sources_are_refused(
+def test_unusable_and_hostile_sources_are_refused(
     tmp_path: Path, content: str, message: str
 ) -> None:
     path = tmp_path / "town.osm"

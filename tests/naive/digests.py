@@ -1,4 +1,4 @@
-"""Digests of rows, computed with integers of Python."""
+"""Digests of rows, computed with Python integers."""
 
 from __future__ import annotations
 

@@ -6,7 +6,7 @@ import math
 
 
 def not_zero(value: float) -> float:
-    """Return the number, moved to at least 0.01 m or m/s from zero."""
+    """Return the number, with its magnitude raised to at least 0.01 m or m/s."""
     return math.copysign(max(abs(value), 0.01), value if value != 0.0 else 1.0)
 
 

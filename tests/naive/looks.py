@@ -121,7 +121,7 @@ class Looks:
         return own
 
     def _along(self, view_m: float) -> Ways:
-        """Add what drivers see ahead and behind; return the distances to the lanes ahead."""
+        """Add the parts that drivers see ahead and behind; return distances to the lanes ahead."""
         starts: Ways = {}
         ends: Ways = {}
         for lane, (first, last) in self.own.items():

@@ -13,7 +13,7 @@ from tests.naive.zones import distance
 
 
 class Kept(NamedTuple):
-    """The position of a vehicle at the previous tick, and by how many ticks its row was late."""
+    """The position of a vehicle at the previous tick, and the lateness of its row in ticks."""
 
     x: float
     y: float

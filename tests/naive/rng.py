@@ -18,7 +18,7 @@ def philox4x32(counter: list[int], key: list[int]) -> list[int]:
 
 
 def random_bits(key: int, vehicle: int, tick: int, stream: int) -> int:
-    """Return the first two words, the first on top; counters are laid out as in `kernels.rng`."""
+    """Return words 0 (upper half) and 1; counters are laid out as in `kernels.rng`."""
     counter = [vehicle & MASK_32, tick & MASK_32, (vehicle >> 32) | (tick >> 32) << 16, stream]
     words = philox4x32(counter, [key & MASK_32, key >> 32])
     return words[0] << 32 | words[1]
@@ -36,7 +36,7 @@ def below(key: int, vehicle: int, tick: int, stream: int, n: int) -> int:
 
 
 def world_key(seed: int, world: int, episode: int) -> int:
-    """Return the first two words as one number, the second word on top."""
+    """Return the first two words as one number, with word 1 as the upper half."""
     bits = random_bits(seed, world, episode, 0)
     return (bits & MASK_32) << 32 | bits >> 32
 

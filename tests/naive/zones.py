@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 def owners(rects: NDArray[np.float64], x: float, y: float) -> list[int]:
-    """Return all zones whose half-open rectangle contains the point; one in a partition."""
+    """Return the zones whose half-open rectangle contains the point; one zone in a partition."""
     return [
         zone
         for zone, (min_x, min_y, max_x, max_y) in enumerate(rects.tolist())

@@ -64,7 +64,9 @@ class Monitor:
     def committed(self, world: int, store: Store) -> None:
         """Check I10: the digest of the committed world is the sum of the digests of the zones."""
         if world != store.world():
-            raise ProtocolError("I10: the committed world is not what the zones told of")
+            raise ProtocolError(
+                "I10: the committed world is not the world that the zones have reported"
+            )
 
     def _check_copies(self, directory: Directory, store: Store) -> None:
         if store.committed.keys() != directory.table.owners.keys():

@@ -1,7 +1,7 @@
 """A toy world for the protocol: vehicles on a torus with integer positions.
 
-The next state of a vehicle is a hash of its own state and of all states near it. If one state is
-computed from a wrong state, it and later states therefore differ from the undivided world.
+The next state of a vehicle is a hash of its own state and of all states near it. A state that
+is computed from a wrong state, and all later states, therefore differ from the undivided world.
 """
 
 from __future__ import annotations

@@ -22,7 +22,7 @@ SMALL: dict[str, Any] = {"agents": 3, "background": 12, "zones": 3, "steps": 6}
 HUGE = np.full(400, 1 << 40, dtype=np.int64).tobytes()
 GARBAGE = (b"[[[1]]]", b"\xff" * 64, b"[" * 99_999, HUGE)
 # Kind of a valid frame → kinds of forged frames that are sent before it or instead of it.
-# The keys are sent from a node to the caller, from the caller to a node, and between nodes.
+# Nodes send REPORT to the caller, the caller sends COMMAND to nodes, and nodes exchange SHARE.
 FORGED = {
     FrameKind.REPORT: (
         FrameKind.REPORT, FrameKind.SHARE, FrameKind.RESULT, FrameKind.PONG, FrameKind.NOT_MINE,
@@ -63,7 +63,7 @@ def forge(
 
 @pytest.mark.parametrize("carrier", FORGED)
 @pytest.mark.parametrize("data", GARBAGE, ids=lambda data: f"{data[:4]!r}x{len(data)}")
-def test_a_forged_frame_loses_at_most_its_sender_and_changes_no_result(
+def test_at_most_the_sender_of_a_forged_frame_is_lost_and_no_result_changes(
     monkeypatch: pytest.MonkeyPatch, carrier: FrameKind, data: bytes
 ) -> None:
     wrong = []

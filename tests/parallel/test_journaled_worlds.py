@@ -107,7 +107,7 @@ def test_a_replaced_worker_resumes_with_repartitioned_zones(make: Make, tmp_path
     assert run("killed", 1, kills=True) == alone
 
 
-def test_balancing_and_repartitioning_at_once_are_refused_with_a_journal(make: Make) -> None:
+def test_balancing_together_with_repartitioning_is_refused_with_a_journal(make: Make) -> None:
     overrides = {
         "zones.journal": "x.jsonl",
         "workers.balance_steps": 5,

@@ -121,7 +121,7 @@ def outside_address() -> str:
 def test_frames_between_machines_are_encrypted(
     make: Make, crowd: Crowd, key_file: Path, undivided_run: Any, is_elsewhere: bool
 ) -> None:
-    """A damaged frame loses its sender, and a replayed handshake is refused."""
+    """The sender of a damaged frame is lost, and a replayed handshake is refused."""
     address = outside_address() if is_elsewhere else "127.0.0.1"
     place = (address, free_port(address))
     wire = Proxy(place)
@@ -362,5 +362,5 @@ def test_zones_are_assigned_to_living_nodes_after_losses_and_joins() -> None:
     with pytest.raises(WorkerDeathError, match="zones 2; zones 3, 4") as caught:
         moves_of(first, first, lost=[1, 2], living=[0], state=1)
     assert "make the environment again" in str(caught.value)
-    assert "SIGKILL" not in str(caught.value)  # nothing shows that a process was killed
+    assert "SIGKILL" not in str(caught.value)  # there is no evidence that a process was killed
     assert json.dumps(again)  # nodes get the moves as JSON

@@ -212,7 +212,7 @@ def watch(links: Links) -> NodeWatch:
     return NodeWatch(links, set, lambda agent: [0, 1][agent])
 
 
-def test_a_bad_frame_loses_its_sender_and_not_its_receiver() -> None:
+def test_the_sender_of_a_bad_frame_is_lost_but_not_the_receiver() -> None:
     links, far = pair()
     with far:
         seen = watch(links)

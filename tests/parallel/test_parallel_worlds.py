@@ -57,7 +57,7 @@ def test_worlds_over_workers_equal_those_of_one_process(mode: str, kind: str, wo
     env.close()
 
 
-@pytest.mark.slow  # similar tests in every run: test_workers.py, test_split.py
+@pytest.mark.slow  # every run has similar tests: test_workers.py, test_split.py
 def test_dead_workers_change_no_result() -> None:
     whole = drive(parallel_env("grid4x4", **settings("open")))
     env = parallel_env("grid4x4", workers=2, **settings("open"))

@@ -1,4 +1,4 @@
-"""Shares of sensor workers are complete, and sharing by cost is not slower."""
+"""Shares of sensor workers are complete; sharing by cost is never slower than round-robin."""
 
 from __future__ import annotations
 

@@ -93,7 +93,7 @@ def test_rows_with_an_index_out_of_range_are_refused(make: Make) -> None:
             _check_refusal(vec, forge)
 
 
-def test_rows_whose_way_overflows_with_the_lane_are_refused(make: Make) -> None:
+def test_rows_whose_way_plus_lane_overflows_are_refused(make: Make) -> None:
     vec = _busy(make)
     rows = vec.network.edges[~vec.network.edges["internal"]]
     for edge in rows[:3]:
@@ -225,7 +225,7 @@ def test_invalid_counts_signals_and_owners_are_refused(make: Make, tmp_path: Pat
     assert controllers.size
     _check_refusal(vec, lambda state: state[place]["phase"].fill(MANY))
     now_ms = int(simulation.ticks()[0] * simulation.config.clock.sim_dt_s * 1e3)
-    # Without this check, the next tick would run all overdue checks of the controller one by one.
+    # If accepted, such a state would make the next tick run all overdue checks one by one.
     for name, value in (("next_ms", 0), ("next_ms", 1 << 40), ("since_ms", now_ms + 9_000)):
 
         def mistime(state: State, name: str = name, value: int = value) -> None:
@@ -346,7 +346,7 @@ def test_external_vehicles_that_do_not_match_their_slots_are_refused(make: Make)
         _worlds(vec).check(part)
 
 
-def test_wrong_greens_times_and_counts_of_signals_are_refused(make: Make) -> None:
+def test_signal_states_with_invalid_greens_times_or_counts_are_refused(make: Make) -> None:
     keys = {"signals.agents": "all", "signals.sensing": "loops"}
     vec = make("grid4x4", num_envs=2, zones=2, overrides=keys)
     vec.reset(seed=1)
@@ -404,7 +404,7 @@ def with_command(at: int, name: str, value: float) -> Forge:
     return forge
 
 
-def test_learned_drivers_that_follow_the_demand_file_are_refused(
+def test_vehicles_of_the_demand_file_with_a_learned_driver_are_refused(
     make: Make, tmp_path: Path
 ) -> None:
     vec = _with_demand(make, tmp_path, **{"traffic.model": "zoo:ring22_ippo"})
@@ -421,7 +421,7 @@ def test_learned_drivers_that_follow_the_demand_file_are_refused(
         _worlds(vec).load(_forged(_worlds(vec), forge))
 
 
-def test_messages_with_missing_reports_are_refused(make: Make) -> None:
+def test_counts_and_indices_of_messages_out_of_range_are_refused(make: Make) -> None:
     overrides = {"v2x.enabled": True}
     vec = make("grid4x4", agents=4, background=20, overrides=overrides)
     vec.reset(seed=1)

@@ -1,4 +1,4 @@
-"""A node keeps at most two states, and one when all replicas of the newest state have arrived."""
+"""A node keeps at most two states, and only one after all replicas of the newest have arrived."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ def test_older_states_are_deleted_when_all_replicas_of_the_newest_have_arrived()
     kept.receive(0, replica(4, THEIRS))  # the other node has already kept the next state
     kept.settle()
     assert (list(kept.own), list(kept.others[0])) == ([3], [3]), (
-        "state 3 is missing, to which nodes may have to return"
+        "state 3, to which nodes may have to return, is missing"
     )
     kept.await_replica(4, ZONES, saved)
     assert list(kept.others[0]) == [3, 4]

@@ -38,7 +38,7 @@ def test_a_process_that_waits_for_its_working_child_is_not_asleep() -> None:
     assert verdict("import os\nwhile os.getppid() > 1: sum(range(100_000))") is None
 
 
-def test_a_process_that_sleeps_like_its_child_is_asleep() -> None:
+def test_a_process_whose_child_also_sleeps_is_asleep() -> None:
     found = verdict("import time; time.sleep(8)")
     assert found is not None
     assert "asleep" in found

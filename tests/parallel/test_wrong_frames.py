@@ -117,7 +117,7 @@ def check(
     nodes: int = 3,
     **overrides: Any,
 ) -> None:
-    """Check that one wrong frame of a node loses only that node and changes no result.
+    """Check that only the node that sends a wrong frame is lost, and that no result changes.
 
     Args:
         patch: undoes the changes of the code after the test.
@@ -289,20 +289,22 @@ FORGED = [
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_a_forged_replica_loses_its_sender(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
+def test_the_sender_of_a_forged_replica_is_lost(monkeypatch: pytest.MonkeyPatch, name: str) -> None:
     """Set a field to a value that is out of range."""
     check(monkeypatch, FrameKind.KEEP, set_field(VEHICLE, name, ROW[name][-1]), REFUSED, after=1)
 
 
 @pytest.mark.slow  # all fields and values
 @pytest.mark.parametrize(("name", "value"), FORGED)
-def test_each_forged_replica_loses_its_sender(
+def test_the_sender_of_each_forged_replica_is_lost(
     monkeypatch: pytest.MonkeyPatch, name: str, value: float
 ) -> None:
     check(monkeypatch, FrameKind.KEEP, set_field(VEHICLE, name, value), REFUSED, after=1)
 
 
-def test_forged_arrays_of_a_replica_lose_their_sender(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_sender_of_a_replica_with_a_forged_array_is_lost(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     """Set all numbers of an array to the least value of their type."""
 
     def forge(n: int) -> Change:
@@ -321,7 +323,7 @@ def test_forged_arrays_of_a_replica_lose_their_sender(monkeypatch: pytest.Monkey
 
 
 @pytest.mark.parametrize("name", ["lane", "way", "goal"])
-def test_a_forged_state_of_zones_that_move_loses_its_sender(
+def test_the_sender_of_a_forged_state_of_moving_zones_is_lost(
     monkeypatch: pytest.MonkeyPatch, name: str
 ) -> None:
     """Node 1 is lost, and node 2 takes its zones. Node 2 then gives the zones to the new node 1."""
@@ -451,7 +453,9 @@ def test_the_sender_of_a_wrong_count_of_vehicles_is_lost(monkeypatch: pytest.Mon
     )  # fmt: skip
 
 
-def test_an_only_node_that_does_not_send_its_state_is_lost(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_only_node_is_lost_if_it_does_not_send_its_state(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     check(
         monkeypatch, FrameKind.KEEP, drop, "it has not sent state", after=1, sender=0, nodes=1
     )  # fmt: skip

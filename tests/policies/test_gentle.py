@@ -1,4 +1,4 @@
-"""`ring22`: one agent among 21 simulated human drivers, compared with 22 such drivers."""
+"""`ring22`: one agent among 21 simulated human drivers, compared with 22 human drivers."""
 
 from __future__ import annotations
 

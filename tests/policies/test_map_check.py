@@ -119,7 +119,7 @@ def test_each_untrained_kind_of_a_map_is_named_once(tmp_path: Path) -> None:
     assert "trained on maps without stop signs, but this map has some" in said[1]
 
 
-def test_a_driver_of_left_hand_traffic_needs_no_mirroring_there(
+def test_a_driver_trained_in_left_hand_traffic_is_not_mirrored_in_left_hand_traffic(
     tmp_path: Path, left_hand: Path
 ) -> None:
     pytest.importorskip("torch")

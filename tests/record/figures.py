@@ -90,7 +90,7 @@ def difference(name: str, first: EvaluationReport, second: EvaluationReport) -> 
 
 
 def number(value: float, decimals: int) -> str:
-    """Return a number as text; a positive number has two decimals where one would show 0.0."""
+    """Return a number as text; a positive number has two decimals if one decimal would show 0.0."""
     is_hidden = decimals == 1 and value > 0.0 and f"{value:.1f}" == "0.0"
     return f"{value:,.{2 if is_hidden else decimals}f}"
 

@@ -98,7 +98,7 @@ def test_ghosts_of_the_chosen_zone_have_a_rim(ring: RoadNetwork, car: Car) -> No
         assert color_at(frame, 6.0, 5.0) == palette.zone_color(3)
 
 
-def test_the_drawn_sight_of_a_zone_ends_with_its_halo() -> None:
+def test_the_line_around_the_area_that_a_zone_sees_is_at_the_end_of_its_halo() -> None:
     surface = blank((300, 300))
     surface.fill((255, 255, 255))
     draw_sight(surface, PINWHEEL, 3.0, 4, Viewport.fit(PINWHEEL.bounds, (300, 300)))

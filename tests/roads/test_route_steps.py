@@ -211,7 +211,7 @@ def test_trace_edges_returns_the_edges_of_the_fastest_way(name: str) -> None:
             if not ways:
                 assert number == 0
                 continue
-            # Of equally fast ways, the one with the fewest lane changes at its start is best.
+            # The best of equally fast ways has the fewest lane changes at its start.
             best = min(ways, key=lambda lanes: (_time_s(roads, lanes), plan[lanes[0]]["changes"]))
             driven = [
                 int(roads.lanes[lane]["edge"]) for lane in best if not roads.lanes[lane]["internal"]

@@ -105,7 +105,7 @@ def test_the_order_of_rows_does_not_matter() -> None:
         )
 
 
-def test_a_table_of_one_row_describes_the_own_vehicle() -> None:
+def test_a_table_of_one_row_describes_the_ego_vehicle() -> None:
     env = standing("highway-v0", 0)
     rows = highway.vehicles(env)
     alone = table(env, rows, 2, {}, vehicles_count=1, normalize=False)

@@ -161,7 +161,7 @@ def test_a_stack_contains_the_last_frames_and_begins_with_copies_of_the_first(mo
         for agent, frame in seen.items():
             if infos[agent]["vehicle_id"] < 0:
                 assert not held[agent].any(), (
-                    "an agent without a vehicle observes other values than 0"
+                    "an agent without a vehicle observes values other than 0"
                 )
                 continue
             if vehicle.get(agent) != infos[agent]["vehicle_id"]:

@@ -101,4 +101,6 @@ def test_the_grid_of_near_lanes_equals_the_grid_of_all_lanes(name: str) -> None:
             observe_occupancy(roads.arrays, lane_grid, rows, 0, highway.grid_of(rows), sensor, out)
             drawn.append(out)
         np.testing.assert_array_equal(*drawn)
-        assert drawn[0].reshape(11, 11)[4:7, 4:7].any(), "the own lane is not shown as road"
+        assert drawn[0].reshape(11, 11)[4:7, 4:7].any(), (
+            "the lane of the vehicle is not shown as road"
+        )

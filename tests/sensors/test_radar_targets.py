@@ -111,7 +111,7 @@ def test_radial_speeds_are_relative_and_positive_for_targets_that_move_away() ->
 
 
 @given(st.floats(-1.0, 1.0), st.floats(-2.0, 2.0), st.floats(-1.0, 1.0), st.floats(-0.5, 0.5))
-def test_radial_speeds_include_the_rotation_of_the_own_vehicle(
+def test_radial_speeds_include_the_rotation_of_the_ego_vehicle(
     yaw_rate: float, x: float, y: float, normal: float
 ) -> None:
     """The nearest point of a long wall lies in the direction of its normal."""

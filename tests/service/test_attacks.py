@@ -182,7 +182,7 @@ def test_the_token_of_a_state_is_refused_as_a_session_token(service: LoopbackSer
 
 @pytest.mark.parametrize("how", ["state", "result", "closed", "forgotten"])
 def test_content_is_kept_while_a_configuration_uses_it(fleet: Fleet, how: str) -> None:
-    """A node stores content with the bytes of a configuration, and its own reference then ends."""
+    """A node stores the bytes of a configuration as content; later, its own reference ends."""
     found = fleet.add_configuration(ConfigurationBody(environment="merge"))
     fleet.log.flush()
     content = fleet.log.content(found["hash"])

@@ -456,7 +456,7 @@ def test_jobs_are_placed_in_their_order(fleet: Fleet) -> None:
     assert [one.node for one in jobs] == ["a"] * 8 + [None] * 4
 
 
-def test_a_job_with_which_ten_nodes_were_lost_fails(fleet: Fleet) -> None:
+def test_a_job_fails_after_ten_nodes_were_lost_with_it(fleet: Fleet) -> None:
     job = fleet.open(job={"policies": ["idm"], "episodes": 1, "repeats": 1})
     for k in range(10):
         fleet.join(f"n{k}")

@@ -1,4 +1,4 @@
-"""A node goes on while its service does not answer, and reports the ends of its jobs."""
+"""A node continues while its service does not answer, and reports the ends of its jobs."""
 
 from __future__ import annotations
 
@@ -96,7 +96,7 @@ def test_the_end_of_a_job_is_reported_until_the_service_has_it(
 def test_a_refused_report_is_not_repeated_and_the_job_runs_again(
     service: LoopbackService, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The service gives a job to the same node again, whose first report it has refused."""
+    """After the first report of a job was refused, the same node gets the job again."""
     runs: list[str] = []
 
     def evaluates(*given: Any, **_: Any) -> None:

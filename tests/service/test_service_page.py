@@ -61,7 +61,7 @@ def test_the_commands_of_the_page_run(tmp_path: Path, monkeypatch: pytest.Monkey
     assert [json.loads(line)["kind"] for line in told][:2] == ["session.opened", "session.assigned"]
 
 
-@pytest.mark.slow  # in every run: test_sessions.py, with smaller worlds
+@pytest.mark.slow  # every run has test_sessions.py, with smaller worlds
 def test_the_example_of_the_page_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     block = re.search(r"```python\n(.*?)```", PAGE, re.DOTALL)

@@ -1,4 +1,4 @@
-"""Other commands of a session than reset and step: changes, frames, saved states, recordings."""
+"""Commands of a session other than reset and step: changes, frames, saved states, recordings."""
 
 from __future__ import annotations
 

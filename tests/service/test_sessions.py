@@ -1,7 +1,7 @@
 """Worlds and evaluations on nodes in separate processes; tests kill nodes and the service.
 
-Three nodes serve all tests, and their processor time counts for the last test. This test is in
-every run, because no cheaper test shows that sessions outlive their nodes.
+Three nodes serve all tests, and their processor time counts for the last test. The last test is
+in every run, because no cheaper test shows that sessions outlive their nodes.
 """
 
 from __future__ import annotations

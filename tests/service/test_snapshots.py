@@ -31,7 +31,7 @@ FIELDS = SealedSnapshot._fields
 
 
 def random_history(fleet: Fleet, random: Random, steps: int) -> None:
-    """Let a service have requests of all kinds, also refused ones, in a random order."""
+    """Send requests of all kinds, including refused requests, to a service in random order."""
     names = ["a", "b", "c", "d"]
     fleet.join(*names)
 
@@ -160,7 +160,7 @@ def test_content_that_loses_its_user_after_a_snapshot_is_deleted(tmp_path: Path)
     again.close()
 
 
-def test_a_snapshot_is_written_after_so_many_events_and_only_the_last_is_kept(
+def test_a_snapshot_is_written_after_ten_events_and_only_the_last_one_is_kept(
     tmp_path: Path,
 ) -> None:
     path = tmp_path / "store.sqlite"
@@ -184,7 +184,7 @@ def test_a_snapshot_is_written_after_so_many_events_and_only_the_last_is_kept(
 
 
 def make_store(path: Path) -> SealedSnapshot:
-    """Make a store with a snapshot that three events follow, and return the snapshot."""
+    """Make a store with a snapshot and three later events; return the snapshot."""
     fleet = Fleet(path)
     fleet.join("a")
     fleet.broker.save(fleet.open(), 1, b"state")
@@ -235,7 +235,7 @@ def test_a_changed_snapshot_is_refused(tmp_path: Path, name: str) -> None:
 
 
 def test_a_forged_snapshot_is_refused(tmp_path: Path) -> None:
-    """A forger has the records, but no key: it puts an own key into them and seals with it."""
+    """A forger without a key of the log adds its own key to the records and seals with this key."""
     path = tmp_path / "store.sqlite"
     good = make_store(path)
     records = records_of(good.content)
@@ -286,7 +286,7 @@ def test_a_snapshot_that_is_newer_than_the_log_is_refused(tmp_path: Path) -> Non
 
 
 @pytest.mark.parametrize("is_dropped", [True, False])
-def test_without_a_usable_snapshot_all_events_are_replayed_and_it_is_said(
+def test_without_a_usable_snapshot_all_events_are_replayed_and_the_reason_is_given(
     tmp_path: Path, is_dropped: bool
 ) -> None:
     path = tmp_path / "store.sqlite"
@@ -298,7 +298,7 @@ def test_without_a_usable_snapshot_all_events_are_replayed_and_it_is_said(
         why = "a snapshot" if is_dropped else "the snapshot, which is of another version"
         assert log.origin.startswith(f"without {why}")
         assert log.origin.endswith(f"{log.sequence} events replayed")
-        log.end()  # now there is one again
+        log.end()  # writes a new snapshot
     for log in reopened(path):
         assert log.origin == f"snapshot after event {log.sequence}, 0 later events replayed"
 

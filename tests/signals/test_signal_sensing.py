@@ -1,4 +1,4 @@
-"""What signal agents and controllers know of vehicles, for each value of `signals.sensing`."""
+"""Vehicle data that signal agents and controllers get, for each value of `signals.sensing`."""
 
 from __future__ import annotations
 
@@ -199,7 +199,7 @@ def test_a_camera_misses_vehicles_by_chance() -> None:
     everything, some = counted(0.0), counted(0.3)
     assert (some <= everything).all()
     assert some.sum() / everything.sum() == pytest.approx(0.7, abs=0.03)
-    # Misses are drawn anew for each decision.
+    # Misses are drawn independently for each decision.
     standing = (np.diff(everything, axis=0) == 0) & (everything[1:] > 0)
     assert 0.1 < (np.diff(some, axis=0)[standing] != 0).mean() < 0.9
     np.testing.assert_array_equal(some, counted(0.3))

@@ -22,7 +22,7 @@ def bent_street(
 ) -> Path:
     """Make a street with corners inside its middle edges `ab` and `ba`; the limit is 50 km/h.
 
-    Each leg but the last is followed by a corner. Cars turn around at the ends of the street.
+    A corner follows each leg except the last one. Cars turn around at the ends of the street.
     `attributes`: further attributes of all edges.
     """
     places, heading = [(0.0, 0.0)], 0.0

@@ -69,7 +69,7 @@ def tiny(env: str, folder: Path, **options: Any) -> Simulation:
 
 
 def real(name: str, maps: Path, **options: Any) -> Simulation:
-    """Make worlds with the own demand of Bologna or Mcity, and Bologna's signal programs."""
+    """Make worlds of Bologna or Mcity with their own demand, and with Bologna's signal programs."""
     folder = maps / "net" / {"bologna": "bologna_acosta", "mcity": "mcity"}[name]
     overrides = {"clock.sim_dt_s": 0.1, "clock.ctrl_dt_s": 0.5}
     if name == "mcity":

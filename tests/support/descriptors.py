@@ -10,7 +10,7 @@ from contextlib import contextmanager, suppress
 
 @contextmanager
 def without_descriptors() -> Iterator[None]:
-    """Let this process open no file and no socket within the block."""
+    """Prevent this process from opening files and sockets within the block."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     used = max(int(name) for name in os.listdir("/proc/self/fd"))
     filling = []

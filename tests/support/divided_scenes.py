@@ -23,7 +23,7 @@ TICK_S = 0.05
 # The vehicles of the demand file depart after the scene. They only define types and routes.
 LATE_S = 900
 CLOCK = {"clock.sim_dt_s": TICK_S, "clock.ctrl_dt_s": TICK_S, "horizon_s": 1000.0}
-# With few ticks, zones see only as far as bodies can touch, besides vehicles that drivers watch.
+# With few ticks, a zone sees only vehicles near enough to touch, and vehicles that drivers watch.
 CLOCK |= {"zones.approach_ticks": 2}
 
 

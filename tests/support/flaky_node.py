@@ -1,4 +1,4 @@
-"""A node in this process whose requests, or their answers, are lost where a test says so."""
+"""A node in this process; a test chooses which of its requests, or their answers, are lost."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ __all__ = ["FlakyLink", "make_host", "run_until"]
 
 
 class FlakyLink(NodeLink):
-    """The link of a node whose requests, or their answers, are lost where a test says so."""
+    """The link of a node; a test chooses which requests, or their answers, are lost."""
 
-    lost: list[str]  # words of requests that do not reach the service, once each
-    unanswered: list[str]  # words of requests whose answers are lost
+    lost: list[str]  # last parts of paths; each makes one request fail
+    unanswered: list[str]  # last parts of paths; each loses one answer
     asked: Counter[str]
 
     async def ask(self, method: str, path: str, **given: Any) -> Any:
@@ -49,7 +49,7 @@ def make_host(
 
 
 async def run_until(host: node_host._Host, is_over: Callable[[], bool]) -> None:
-    """Beat until a condition holds; fail if the node ends before."""
+    """Send heartbeats until a condition holds; fail if the node ends earlier."""
     beating = asyncio.create_task(node_host._beat_until_end(host))
     until_s = time.monotonic() + 30.0
     while not is_over():

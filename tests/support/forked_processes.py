@@ -103,7 +103,7 @@ class ForkedProcess:
 
 
 def start_forked(words: Sequence[str], env: Mapping[str, str] | None = None, **options: Any) -> Any:
-    """Start programs of cavmarl or of the tests as forks, others with `start_python`."""
+    """Start programs of cavmarl or the tests as forks, and other programs with `start_python`."""
     ours = words[0] == "-m" and words[1].startswith(("cavmarl.", "tests."))
     if ours or words == ["-c", PROGRAM] or words[0] == sumo_child.__file__:
         return ForkedProcess(words, env={**os.environ, **(env or {})}, **options)

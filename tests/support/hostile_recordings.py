@@ -53,7 +53,7 @@ def make_recording(path: Path, steps: int = 5) -> Path:
 
 @dataclass(frozen=True)
 class Use:
-    """Which parts of the package a test uses on a recording, besides the reader."""
+    """The parts of the package that a test uses on a recording, in addition to the reader."""
 
     pictures: bool = False
     page: bool = False

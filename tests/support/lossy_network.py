@@ -78,7 +78,7 @@ class FaultPlan:
     until_tick: int | None = None
 
     def of(self, kind: str, phase: int, tick: int = 0) -> Rates:
-        """Return the rates of a kind of message, by phase of sending and tick."""
+        """Return the fault rates of a kind of message that is sent in a phase of a tick."""
         if self.until is not None and phase >= self.until:
             return FAULTLESS
         if self.until_tick is not None and tick >= self.until_tick:
@@ -86,7 +86,7 @@ class FaultPlan:
         return self.rates.get(kind, self.otherwise)
 
     def chance(self, key: tuple[object, ...], question: str) -> float:
-        """Return a number in [0, 1) that depends on the seed, the message and the question."""
+        """Return a number in [0, 1) from the seed, the message's key and the decision to make."""
         text = repr((self.seed, key, question)).encode()
         return int.from_bytes(blake2b(text, digest_size=7).digest(), "little") / (1 << 56)
 

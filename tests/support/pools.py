@@ -81,7 +81,7 @@ def gone(pids: list[int], limit_s: float = 60.0) -> bool:
 
 
 def in_time(work: Callable[[], Any], limit_s: float = 20.0) -> Any:
-    """Return the result of `work`; raise TimeoutError after the limit."""
+    """Return the result of `work`; raise TimeoutError if it takes longer than the limit."""
 
     def give_up(*_: object) -> None:
         raise TimeoutError(f"not done after {limit_s:g} s")

@@ -119,8 +119,8 @@ class RawRequest:
     """A request as bytes on a socket.
 
     Attributes:
-        is_cut: whether the request may be incomplete. The client then closes its direction, so that
-            the server does not wait for more bytes.
+        is_cut: whether the request may be incomplete. The client then closes its sending
+            side, so that the server does not wait for more bytes.
     """
 
     method: str

@@ -85,8 +85,8 @@ def is_needed(path: Path, root: Path, expression: str, turn: int | None = None) 
     Args:
         path: path of the file.
         root: folder of the repository.
-        expression: argument of `-m`, such as `twin and not slow`. For expressions that do not begin
-            with a small tier, the answer is true.
+        expression: argument of `-m`, such as `twin and not slow`. Files are
+            excluded only if it begins with `alone`, `ray` or `twin`, or with `slow` in a turn.
         turn: turn of `make rotation`, in which only slow tests run.
     """
     if path.suffix != ".py" or not path.name.startswith("test_"):

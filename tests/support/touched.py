@@ -1,6 +1,6 @@
 """Run the unit tests that a change affects, the closest first (`make quick`).
 
-A test file is affected if it imports a changed module, directly or over other modules. A file is
+A test file is affected if it imports a changed module, directly or through other modules. A file is
 changed if it differs from the commit at which the branch left `main`, according to git.
 """
 

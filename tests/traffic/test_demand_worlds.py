@@ -70,7 +70,9 @@ def test_worlds_of_one_simulation_differ_and_equal_single_worlds(make: Make) -> 
         assert together.traffic_stats(world) == simulation.traffic_stats()
 
 
-def test_a_reset_with_the_seed_repeats_the_episode_and_without_a_seed_continues(make: Make) -> None:
+def test_a_reset_with_the_seed_repeats_the_episode_and_a_reset_without_a_seed_does_not(
+    make: Make,
+) -> None:
     simulation = make()
 
     def episode() -> list[str]:

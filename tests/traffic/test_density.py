@@ -23,8 +23,8 @@ from tests.support.driving import drive, start
 LOW, MEDIUM, HIGH = 25, 50, 100
 DENSITIES = (LOW, MEDIUM, HIGH)
 ZONES = 4
-# Least share of all vehicles in the fullest of the four zones. The imbalance, which is maximum
-# divided by mean, is then at least four times this share.
+# The fullest of the four zones has at least this share of all vehicles. The imbalance (maximum
+# divided by mean) is therefore at least four times this share.
 SHARE = 0.6
 APPROACH_TICKS = 100
 EPISODE = 600  # steps

@@ -102,7 +102,7 @@ def test_random_lanes_are_equally_likely_and_repeatable() -> None:
 
 
 @pytest.mark.parametrize("code", [codes.LANE_FREE, codes.LANE_ALLOWED])
-def test_lane_free_is_the_emptiest_lane_and_of_two_empty_lanes_the_right_one(code: int) -> None:
+def test_lane_free_is_the_emptiest_lane_or_the_rightmost_of_equally_empty_lanes(code: int) -> None:
     _, room = traffic((WEAVE[0], 20.0, 5.0), (WEAVE[0], 60.0, 5.0), (WEAVE[1], 40.0, 5.0))
     assert lane_of(code, room) == WEAVE[2]
     _, room = traffic((WEAVE[0], 20.0, 5.0))
@@ -111,7 +111,7 @@ def test_lane_free_is_the_emptiest_lane_and_of_two_empty_lanes_the_right_one(cod
 
 
 @pytest.mark.parametrize(("way_m", "counts"), [(2900.0, False), (3100.0, True)])
-def test_lane_best_treats_lanes_alike_that_serve_the_route_for_3_km(
+def test_lane_best_treats_all_lanes_that_serve_the_route_for_3_km_alike(
     way_m: float, counts: bool
 ) -> None:
     plan = PLAN.copy()
@@ -131,7 +131,7 @@ def test_lane_best_is_the_emptiest_lane_that_needs_no_lane_change() -> None:
     )
 
 
-def test_no_departure_enters_a_lane_without_a_way_to_its_goal() -> None:
+def test_no_departure_enters_a_lane_without_a_route_to_its_goal() -> None:
     nowhere = travel_by(make_plans(ROADS, [ROADS.edge_ids.index("ramp")]))
     _, room = traffic()
     for code in (codes.LANE_FIRST, codes.LANE_RANDOM, codes.LANE_FREE, codes.LANE_BEST):
@@ -169,7 +169,9 @@ def test_position_base_puts_the_rear_at_the_start() -> None:
 
 
 @pytest.mark.parametrize("wanted_mps", [0.0, 5.0, 10.0])
-def test_position_last_keeps_the_gap_to_stop_behind_the_last_vehicle(wanted_mps: float) -> None:
+def test_position_last_leaves_the_gap_that_is_needed_to_stop_behind_the_last_vehicle(
+    wanted_mps: float,
+) -> None:
     _, room = traffic((MAIN[0], 100.0, 6.0), (MAIN[0], 80.0, 3.0))
     words = {"pos_code": codes.POS_LAST, "speed_code": codes.SPEED_GIVEN, "speed": wanted_mps}
     decel = float(KIND["decel"])
@@ -360,7 +362,7 @@ def test_all_followers_are_checked_not_only_the_nearest() -> None:
 def test_a_vehicle_on_another_link_is_a_leader_while_its_rear_is_before_the_fork(
     rear_m: float, safe: bool
 ) -> None:
-    """The departure goes straight on. `rear_m` is the other rear beyond the stop line."""
+    """The departure goes straight on. `rear_m`: how far the other rear is past the line."""
     roads, plans = network("grid4x4"), travel("grid4x4")
     lane, link, other = _fork(roads)
     plan = np.zeros(len(roads.lanes), _PLAN)
@@ -389,7 +391,7 @@ def test_no_vehicle_enters_close_before_a_vehicle_that_turns_onto_another_lane(
     The other vehicle drives on another link from the same lane, at 10 m/s.
 
     Args:
-        to_start_m: Distance of the other front from the end of its link.
+        to_start_m: Distance of the other vehicle's front from the end of its link.
         fork_m: Length of the other link on which its path is near the straight link. The kernel
             adds 6 m for long vehicles.
     """

@@ -145,7 +145,7 @@ def test_drivers_that_react_follow_the_logged_way(scene: Path) -> None:
 
 
 def test_a_driver_that_reacts_stops_behind_a_standing_agent(scene: Path, tmp_path: Path) -> None:
-    """A replayed vehicle would drive through it."""
+    """A replayed vehicle would drive through the agent."""
     follower = scenario()
     follower["tracks"] = {
         "7": track(-60.0, -ASIDE_M, 10.0, 0.0),
@@ -235,7 +235,7 @@ def test_nodes_change_no_result(scene: Path) -> None:
         assert hashes(scene, overrides=overrides, zones=2, nodes=2, kill_at=(24,)) == whole
 
 
-def test_worlds_of_a_vectorized_environment_begin_new_episodes_equally_in_zones(
+def test_new_episodes_of_a_vectorized_environment_do_not_depend_on_zones(
     scene: Path,
 ) -> None:
     with closing(make_vec(scene, num_envs=3, overrides=REACTIVE)) as vec:
@@ -380,7 +380,7 @@ def test_an_agent_in_a_vehicle_that_overlaps_another_one_is_refused(tmp_path: Pa
         assert rows_of(env, DRIVER_AGENT)["x"] == pytest.approx([80.0], abs=1e-4)
 
 
-def test_the_log_decides_on_which_of_two_diverging_lanes_an_agent_is(tmp_path: Path) -> None:
+def test_the_goal_of_an_agent_is_on_the_diverging_lane_that_the_log_follows(tmp_path: Path) -> None:
     lines = lane_lines()
     line = np.concatenate([lines["tWN"], lines["outN"][1:]])[:, :2]
     steps = np.diff(line, axis=0)

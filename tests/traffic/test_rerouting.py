@@ -75,7 +75,7 @@ def test_vehicles_with_a_given_route_stay_in_the_jam(net: Path, tmp_path: Path) 
     assert simulation.traffic_stats().mean_delay_s > 45.0
 
 
-def test_a_closed_edge_is_driven_around_as_in_sumo(net: Path, tmp_path: Path) -> None:
+def test_vehicles_drive_around_a_closed_edge_as_in_sumo(net: Path, tmp_path: Path) -> None:
     files = cars() + ROUTES + SPARSE, rerouter(CLOSED)
     ours = passed(two_ways(net, tmp_path, *files), SECONDS)
     sumo = sumo_passed(net, write_demand(tmp_path, *files), tmp_path)
@@ -151,7 +151,9 @@ def test_shuffled_rows_give_the_same_bytes(net: Path, tmp_path: Path) -> None:
     assert tidy.traffic_stats().rerouted > 10
 
 
-def test_worlds_together_equal_single_worlds_and_resets_repeat(net: Path, tmp_path: Path) -> None:
+def test_joint_worlds_equal_single_worlds_and_a_reset_repeats_them(
+    net: Path, tmp_path: Path
+) -> None:
     together = jam(net, tmp_path, num_worlds=3)
     start(together, seed=9)
     hashes: list[str] = []

@@ -29,7 +29,7 @@ VARIANTS: tuple[tuple[str, Mapping[str, bool | float]], ...] = (
     *((name, {}) for name in NAMES),
     ("pedestrian_crossing", {"occluded": True}),
 )
-# Places with a road behind the first agent, which the randomly drawn places lack.
+# Places that have a road behind the first agent; the randomly drawn places have none.
 ROOMY = {"failed_u_turn": "A1B1_1", "pedestrian_crossing": "A1B1_0"}
 # Hashes of runs of the reference driver on grid4x4 with seed 0, without other traffic.
 GOLDEN = {
@@ -115,7 +115,7 @@ def test_idm_passes_and_never_yield_collides_on_a_real_map(
     assert played(name, "never_yield", seed, env=env, params=params).verdict == "collided"
 
 
-def test_between_two_lanes_of_a_bend_no_vehicle_is_off_the_road(shared_maps: Path) -> None:
+def test_no_vehicle_between_two_lanes_of_a_bend_is_off_the_road(shared_maps: Path) -> None:
     """The lanes at this place have a gap of millimetres between them, which counts as road."""
     env = shared_maps / "net/bologna_acosta/acosta_buslanes.net.xml"
     assert played("intersection_blockage", "idm", env=env, place="85_1").verdict == "passed"
@@ -176,7 +176,7 @@ def test_signals_that_fail_are_dark_from_then_on() -> None:
     assert shown[-1] == {"o", "O"}
 
 
-def test_the_seed_draws_the_place_and_the_name_of_the_place_repeats_the_run() -> None:
+def test_the_seed_draws_the_place_unless_a_place_is_given() -> None:
     places = {seed: played("pedestrian_crossing", "never_yield", seed).place for seed in range(4)}
     assert len(set(places.values())) > 1
     again = played("pedestrian_crossing", "never_yield", 0, place=places[3])

@@ -279,7 +279,7 @@ def test_each_worker_has_its_own_sumo(tmp_path: Path, source: str, zones: int) -
 @pytest.mark.parametrize("source", MODES)
 @pytest.mark.parametrize("zones", [1, 2])
 def test_a_successor_of_a_dead_worker_continues(tmp_path: Path, source: str, zones: int) -> None:
-    """SUMO repeats its run up to the tick. Workers also die right after that and after a reset."""
+    """SUMO repeats its run up to the tick. Workers also die after the repetition and a reset."""
     worlds = 2 if zones == 1 else 1
     made = {"num_envs": worlds, "agents": 3, "background": 2, "zones": zones, "max_cycles": 37,
             "overrides": settings(tiny_file(tmp_path), source)}  # fmt: skip

@@ -96,7 +96,7 @@ def test_a_route_that_does_not_fit_its_slot_is_dropped() -> None:
     assert way_to(roads, goal, lane, 2)[1] == 0
 
 
-def test_vehicles_request_routes_by_rising_id_when_due_or_at_a_rerouter() -> None:
+def test_vehicles_request_routes_in_order_of_ids_when_due_or_at_a_rerouter() -> None:
     roads = network("grid4x4")
     first, second = (int(roads.edges[edge]["first_lane"]) for edge in outside(roads)[:2])
     inside = int(np.flatnonzero(roads.lanes["internal"])[0])

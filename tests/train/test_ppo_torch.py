@@ -273,7 +273,7 @@ def test_a_run_with_start_begins_with_the_weights_of_that_driver(
     assert "--start runs/first: does not fit this run" in capsys.readouterr().err
 
 
-def test_a_run_that_observes_less_than_its_start_logs_the_number(
+def test_a_run_logs_how_many_numbers_of_its_start_driver_it_does_not_observe(
     ippo: ModuleType, here: Path, caplog: pytest.LogCaptureFixture
 ) -> None:
     short = [*TINY, "--total-agent-steps", "20"]

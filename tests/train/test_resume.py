@@ -1,6 +1,6 @@
 """Interrupted runs resume bit for bit, and do not overwrite or mix files of other runs.
 
-Starting a separate program takes 2 s, so only one test does that and kills it.
+Starting a separate program takes 2 s, so only one test starts such a program, and kills it.
 """
 
 from __future__ import annotations

@@ -142,7 +142,7 @@ def test_packets_of_the_largest_ids_are_dropped_beyond_the_capacity() -> None:
 
 
 def test_packets_beyond_the_capacity_of_the_channel_are_dropped() -> None:
-    # 60 packets of 300 bytes at 0.5 Mbit/s take 4.84 ms each: 290 ms, but only 100 ms are there.
+    # 60 packets of 300 bytes at 0.5 Mbit/s take 4.84 ms each: 290 ms, but 100 ms are available.
     world = StationWorld(1, channel__data_rate_mbps=0.5)
     world.put(np.random.default_rng(2).uniform(0.0, 300.0, (60, 2)))
     world.tick()
@@ -197,7 +197,7 @@ def test_the_inbox_of_an_agent_is_empty_for_a_new_vehicle() -> None:
     world.write(rows)
     world.tick()
     there = world.bus.mail.objects[0, 0]["sender"]
-    assert there[there >= 0].tolist() == [10]  # only 10 sends in this tick
+    assert there[there >= 0].tolist() == [10]  # only vehicle 10 sends in this tick
     world.write(rows[1:])
     world.tick()
     assert (world.bus.mail.objects[0, 0]["sender"] < 0).all()

@@ -270,10 +270,10 @@ def silence_connection(monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: in
         (FrameKind.GIVE, 1, "kill"),
     ],
 )
-def test_a_silent_connection_between_two_nodes_loses_one_of_them(
+def test_one_of_two_nodes_with_a_silent_connection_is_lost(
     monkeypatch: pytest.MonkeyPatch, kind: FrameKind, nth: int, mix: str
 ) -> None:
-    """All nodes answer the caller. Whichever frame is missing, one of the two must be lost."""
+    """All nodes answer the caller. For any missing frame, one of the two nodes must be lost."""
     seen = silence_connection(monkeypatch, kind, nth)
     keys: dict[str, Any] = {"agents": 12, "background": 20, "zones": 8, "steps": 24}
     found = verify_simulated_nodes(

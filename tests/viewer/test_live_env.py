@@ -133,7 +133,7 @@ def test_a_notebook_on_this_machine_can_embed_the_page(vec: CavVectorEnv) -> Non
 
 
 def test_watching_an_evaluation_does_not_change_it(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(CavVectorEnv, "watch", None)  # requests of the page use it
+    monkeypatch.setattr(CavVectorEnv, "watch", None)  # not needed with `looks_itself=False`
     keys: dict[str, Any] = {"agents": 2, "background": 2, "overrides": {"horizon_s": 5.0}}
     looks: list[int] = []
 

@@ -62,7 +62,7 @@ def test_a_paused_world_takes_at_most_ten_requested_steps(now: SimpleNamespace) 
         assert clock.wait_s(now.s) == 0.25
     now.s += 60.0
     assert clock.handle(PageRequest("play"))
-    assert steps_due(clock, now.s, 0.1) == 1, "steps of the pause were made up for"
+    assert steps_due(clock, now.s, 0.1) == 1, "the clock caught up on the time of the pause"
 
 
 def test_a_requested_step_pauses_a_running_world(now: SimpleNamespace) -> None:

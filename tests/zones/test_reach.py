@@ -70,7 +70,7 @@ def test_reach_includes_view_junctions_and_approaching_vehicles(name: str) -> No
     assert rest_m <= 40.0, "the halo covers the whole map"
 
 
-def test_reach_shrinks_if_drivers_check_stop_lines_from_nearer() -> None:
+def test_reach_shrinks_if_drivers_check_stop_lines_from_a_shorter_distance() -> None:
     near = travel("merge")._replace(see_m=100.0)
     shrunk = driving_reach_m(network("merge"), travel("merge")) - driving_reach_m(
         network("merge"), near
@@ -172,7 +172,7 @@ def test_no_vehicle_exceeds_the_distance_off_its_lane(
     assert furthest_m <= off_lane_m(roads, travel("merge"))
 
 
-def test_the_sight_of_a_zone_includes_vehicles_beside_seen_lanes(tmp_path: Path) -> None:
+def test_a_zone_also_sees_vehicles_beside_the_lanes_that_it_sees(tmp_path: Path) -> None:
     """`seen_m` is the look-ahead of drivers along lanes plus the distance of bodies to lanes."""
     path = netgenerate(
         tmp_path / "x.net.xml",

@@ -56,7 +56,7 @@ def test_a_configured_halo_adds_ghosts_and_changes_no_result(blocks: Path) -> No
     assert narrow.simulation.state_hash() == whole.simulation.state_hash()
 
 
-def test_the_sight_at_a_stop_line_is_half_a_body_and_the_clearance(
+def test_the_distance_seen_at_a_stop_line_is_half_a_body_plus_the_clearance(
     blocks: Path,
 ) -> None:
     simulation = driven(blocks).simulation

@@ -84,7 +84,7 @@ def random_rows(
 def expected_of(
     looks: NDArray[np.void], partition: ZonePartition, zone: int, others: list[np.void]
 ) -> list[int]:
-    """Return the ids of the vehicles of which a zone needs ghosts, by definition."""
+    """Return the ids of the vehicles whose ghosts a zone needs, by definition."""
     near = {int(row["id"]) for row in naive.within(partition.reaching[zone], SURE_M, others)}
     found = []
     for row in naive.within(partition.reaching[zone], SEEN_M, others):

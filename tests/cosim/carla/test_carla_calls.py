@@ -176,7 +176,9 @@ def test_a_batch_answers_each_command_in_order(session: CarlaSession, call: Call
     assert call("get_vehicle_light_state", car_0(session)) == [3]
 
 
-def test_settings_are_kept_and_impossible_steps_refused(session: CarlaSession, call: Call) -> None:
+def test_settings_are_kept_and_impossible_steps_are_refused(
+    session: CarlaSession, call: Call
+) -> None:
     rest = [True, 0.01, 10, 0.0, True, 3000.0, 2000.0, True]
     assert call("set_episode_settings", [True, False, [True, 0.1], *rest]) == session.frame
     assert call("get_episode_settings")[:3] == [True, False, [True, 0.1]]

@@ -278,7 +278,9 @@ def test_a_collision_is_in_the_report(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/a.log", "a/b", "", ".hidden", "a" * 101, "a\n"])
-def test_names_cannot_leave_the_folder(name: str, own_session: CarlaSession, folder: Path) -> None:
+def test_the_name_of_a_recording_cannot_lead_out_of_the_folder(
+    name: str, own_session: CarlaSession, folder: Path
+) -> None:
     call = calls_of(own_session)
     for method, *arguments in (
         ("start_recorder", False),

@@ -1,4 +1,4 @@
-"""Zones that CARLA servers run: the official client, in its own process, connects to our server."""
+"""Zones that CARLA servers run: the official client, in its own process, uses cavmarl's server."""
 
 from __future__ import annotations
 

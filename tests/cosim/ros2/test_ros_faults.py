@@ -59,7 +59,7 @@ def test_a_topic_with_another_type_is_logged_once_and_the_world_continues(
     assert report["steps"] == 21
 
 
-def test_equal_types_are_no_mismatch(types: RosTypes, domain: int, run_bridge: Run) -> None:
+def test_equal_types_are_not_a_mismatch(types: RosTypes, domain: int, run_bridge: Run) -> None:
     with Driver(types, domain, {"/car_0/imu": "sensor_msgs/msg/Imu"}):
         report, _ = run_bridge(RosOptions(domain=domain), 5)
     assert report["type_mismatches"] == []

@@ -70,7 +70,7 @@ def bodies(objects: Trajectories) -> list[Body]:
 
 
 def noisy(objects: Trajectories, random: Random, first: int) -> Trajectories:
-    """Return a rollout that equals the log before sample `first`, and the log with noise after."""
+    """Return a rollout: the log before sample `first`, and the log with noise from there on."""
     poses = objects.poses.copy()
     poses[:, first:] += random.normal(0.0, 0.3, poses[:, first:].shape) * (1.0, 1.0, 0.1)
     poses[..., 2] = (poses[..., 2] + math.pi) % (2.0 * math.pi) - math.pi

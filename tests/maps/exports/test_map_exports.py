@@ -132,7 +132,7 @@ def test_lanelets_are_connected_and_lie_on_their_lanes(town: Path, tmp_path: Pat
 
 
 def lanelet_ends(path: Path) -> dict[str, list[list[str | None]]]:
-    """Return by name the two points at the begin and the two points at the end of each lanelet."""
+    """Return the two points at the start and the two at the end of each lanelet, by name."""
     root = ElementTree.parse(path).getroot()
     ways = {way.get("id"): [nd.get("ref") for nd in way.iter("nd")] for way in root.iter("way")}
     found = {}

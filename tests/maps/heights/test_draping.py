@@ -68,7 +68,7 @@ def plane_of(path: Path) -> list[str]:
 def test_heights_equal_the_model_and_x_and_y_do_not_change(
     town: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The test switches rounding of corners off, because heights add points that change it."""
+    """This test does not round corners, because points that heights add would change the curves."""
     monkeypatch.setattr(reader, "round_corners", lambda *_: [])
     rolling = plane(0.02, 0.05)
     model = write_geotiff(

@@ -55,5 +55,5 @@ def test_points_of_a_lane_between_the_ends_of_a_bridge_have_its_level(
 def test_bridges_have_positive_and_tunnels_negative_levels(
     tags: dict[str, str], level: int
 ) -> None:
-    """A layer with the wrong sign, or one that is no number, is ignored."""
+    """A layer with the wrong sign is ignored, and so is a layer that is not a number."""
     assert RoadWay(tags=tags).level == level

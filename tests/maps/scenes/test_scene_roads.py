@@ -58,7 +58,7 @@ def test_lanes_begin_and_end_where_their_centre_lines_do(tmp_path: Path) -> None
         assert tuple(np.round(line[[0, -1], :2].ravel(), 2)) in ends
 
 
-def test_of_two_foes_exactly_one_yields(tmp_path: Path) -> None:
+def test_exactly_one_of_two_foes_yields(tmp_path: Path) -> None:
     network = network_of(read_scene(write_pickle(tmp_path)), tmp_path)
     yields = set()
     for link, row in enumerate(network.links):

@@ -1,4 +1,4 @@
-"""Invalid demand is refused with place and remedy; ignored parts are counted."""
+"""Invalid demand is refused with its place and a remedy; ignored parts are counted."""
 
 from __future__ import annotations
 

@@ -46,7 +46,7 @@ def world(net: Path, trips: str, on_bad_route: str = "error") -> cavmarl.CavEnv:
     return cavmarl.parallel_env(net, agents=1, background=0, seed=0, overrides=keys)
 
 
-def test_a_trip_turns_round_if_no_other_movement_exists(net: Path) -> None:
+def test_a_trip_makes_a_u_turn_if_no_other_movement_exists(net: Path) -> None:
     env = world(net, ROUND)
     env.reset()
     sides = []
@@ -60,7 +60,7 @@ def test_a_trip_turns_round_if_no_other_movement_exists(net: Path) -> None:
     assert env.traffic_stats()["contacts"] == env.traffic_stats()["removed"] == 0
 
 
-def test_a_trip_without_a_way_is_refused(net: Path) -> None:
+def test_a_trip_without_a_route_is_refused(net: Path) -> None:
     with pytest.raises(cavmarl.RouteError) as caught:
         world(net, ROUND + "\n" + LOST)
     for word in (
@@ -71,7 +71,7 @@ def test_a_trip_without_a_way_is_refused(net: Path) -> None:
         assert word in str(caught.value)
 
 
-def test_a_trip_without_a_way_can_be_skipped(net: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_trip_without_a_route_can_be_skipped(net: Path, caplog: pytest.LogCaptureFixture) -> None:
     with caplog.at_level(logging.WARNING):
         env = world(net, ROUND + LOST, on_bad_route="skip")
     assert env.simulation.demand is not None
