@@ -62,8 +62,8 @@ def submit_train(
     job_minutes: Annotated[
         int | None,
         about(
-            "Minutes after which a job is stopped and queued again, with slurm and local [default: a "
-            "day].",
+            "Minutes after which a job is stopped and queued again, with slurm and local [default: "
+            "a day].",
             metavar="MIN",
             min=1,
             panel=CLUSTER,
