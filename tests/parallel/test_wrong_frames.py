@@ -252,8 +252,8 @@ def read_arrays(data: bytes) -> list[NDArray[Any]]:
 @pytest.mark.parametrize(
     ("change", "words"),
     [
-        (replace_content(b""), "the state is one of other worlds"),
-        (lambda frame: frame._replace(data=frame.data[:-8]), "the state is one of other worlds"),
+        (replace_content(b""), "the state belongs to other worlds"),
+        (lambda frame: frame._replace(data=frame.data[:-8]), "the state belongs to other worlds"),
         (add_number(1), "it sends SHARE before an awaited frame"),
         (add_number(1 << 40), "it sends SHARE before an awaited frame"),
         (move_to_foreign_zone, "its state has vehicles of zones"),

@@ -88,7 +88,7 @@ class _World:
         return self.has_stepped and not (births or self.movers or is_watched)
 
     def write(self, output: Output) -> int:
-        """Write records; return the number of vehicles whose owner they change."""
+        """Write records; return the number of vehicles whose owner the records change."""
         if not output.records:
             return 0
         if self.journal is not None:
@@ -171,7 +171,7 @@ class NodeCoordinator:
         return [[world.directory.hosting(zone) for zone in zones] for world in self.worlds]
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Apply acknowledgements as soon as they come.
+        """Apply acknowledgements as soon as they arrive.
 
         Raises:
             MessageError: the frame has another message, or is about a zone of another node.

@@ -134,7 +134,7 @@ class NodeGroups(CommandedWorlds):
         return tuple(chain.from_iterable(group.transfers for group in self.groups))
 
     def node_loads(self) -> list[NodeLoad]:
-        """Return the load of each node since the previous call, in rising order."""
+        """Return the load of each node since the previous call, in ascending order of nodes."""
         found = self._run_jobs(NodeWorlds.node_loads, self.groups, _ignore)
         return [load._replace(node=k) for k, loads in enumerate(found) for load in loads]
 
@@ -197,8 +197,8 @@ class NodeGroups(CommandedWorlds):
         return bisect_right(self._bounds, world) - 1
 
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all nodes do a task; if it fails for a node, no worlds change."""
-        if task == Task.PACK:  # UNPACK does the whole move
+        """Run a task on all nodes; if the task fails on a node, no worlds change."""
+        if task == Task.PACK:  # UNPACK carries out the whole move
             return
         if task == Task.UNPACK:
             self._move(payload)
@@ -229,7 +229,7 @@ class NodeGroups(CommandedWorlds):
         undo: Callable[[Any], None],
         in_turn: bool = False,
     ) -> list[Found]:
-        """Do jobs in parallel, or one after the other; if one fails, undo the others."""
+        """Run jobs in parallel, or one after the other; if a job fails, undo the other jobs."""
         running: list[Future[Found]] = []
         try:
             for job in jobs:

@@ -91,7 +91,7 @@ class NodePeers(Peers):
         self._sent = generation << SHARE_BITS  # number of the last share
         self._is_stepping = False
         self._gate: DepartureQueue | None = None
-        self._leaving: Passing  # vehicles that pass `_gate`
+        self._leaving: Passing  # vehicles that leave through the departure queue `_gate`
         self.own: Array = np.zeros_like(simulation.outputs.present)
         self.stepped = self.own.copy()
         self.owner: NDArray[np.int32] = np.full(self.own.size, UNOWNED, dtype=np.int32)
@@ -109,7 +109,7 @@ class NodePeers(Peers):
             zoned.num_outer[zone, chosen] = -1
         for zone in range(len(zoned.num_rows)):
             for w in np.flatnonzero(chosen).tolist():
-                num = zoned.num_rows.item(zone, w)  # the first zone had the rows of all zones
+                num = zoned.num_rows.item(zone, w)  # the first zone had all vehicles
                 for array in (*zoned.rows[:, zone, w], *(each[zone, w] for each in self._of_rows)):
                     forget(array[num:])
         self._rerouted[chosen] = 0
@@ -196,7 +196,7 @@ class NodePeers(Peers):
                 _check_end(data, self._add_passing(departures, data, 0))
 
     def _passing(self, departures: DepartureQueue) -> list[Bytes]:
-        """Return the number of vehicles that pass the queue of each world, and their rows."""
+        """Return the number of vehicles in `departures.passing` of each world, and their rows."""
         counts = departures.num_passing.copy()
         rows = [departures.passing[w, :num] for w, num in enumerate(counts.tolist()) if num]
         return [counts.data, *map(_bytes, rows)]
@@ -311,7 +311,7 @@ class NodePeers(Peers):
                 array[self._foreign] = 0
 
     def _swap(self, pieces: Sequence[Bytes]) -> Iterator[tuple[int, memoryview]]:
-        """Send pieces to all other nodes, and yield theirs, in rising order."""
+        """Send pieces to all other nodes, and yield their pieces in ascending order of nodes."""
         self._sent += 1
         for to in self._others:
             self._links.send(to, _SHARE, self._sent, pieces)

@@ -115,7 +115,7 @@ class NodePool:
         self._links = Links(_nothing, system)
         self._refused: dict[int, int] = {}  # agent → node that has refused its action
         self._watch = NodeWatch(self._links, self._stopped, self._holder)
-        self._nodes: dict[int, JoiningNode] = {}  # living nodes
+        self._nodes: dict[int, JoiningNode] = {}  # live nodes
         self._present: set[int] = set()  # nodes that have sent a frame in this generation
         self._new: dict[int, tuple[str, int]] = {}  # new nodes → where other nodes can call
         self._lease_ticks, self._settings = lease_ticks(config), config.zones
@@ -204,7 +204,7 @@ class NodePool:
 
     @property
     def first(self) -> int:
-        """Number of the node that does the tasks of a single node."""
+        """Number of the node that carries out the tasks for a single node."""
         return self._living[0]
 
     @property
@@ -214,7 +214,7 @@ class NodePool:
 
     @property
     def machines(self) -> dict[int, tuple[str, int]]:
-        """Machine and process of each living node, by its number."""
+        """Machine and process of each live node, by its number."""
         return {number: (node.machine, node.pid) for number, node in self._nodes.items()}
 
     @property
@@ -234,7 +234,7 @@ class NodePool:
                 self._lost.remove(number)
 
     def _receive_all(self, kind: FrameKind) -> dict[int, NodeFrame]:
-        """Receive a frame of a kind from each living node, in rising order.
+        """Receive a frame of the given kind from each live node, in ascending order of nodes.
 
         Raises:
             LinkLostError: a node is lost, or has sent another kind.
@@ -310,7 +310,7 @@ class NodePool:
             raise
 
     def _insist(self, command: NodeCommand | None, read: Read[Found]) -> list[Found]:
-        """Carry out a command, if any; recover and try again until no node is lost meanwhile."""
+        """Carry out a command, if any; after each loss of a node, recover and try again."""
         while self._failed:
             number = self._failed.pop()
             self._lose(LinkLostError(number, MessageError("it has ended with an error")))
@@ -484,7 +484,7 @@ class NodePool:
         """Remove a lost node, and start another node in its place.
 
         Raises:
-            WorkerError: the node had not begun, and too many nodes were lost before they had begun.
+            WorkerError: too many nodes, including this node, were lost before they had begun work.
         """
         is_silent = isinstance(lost, SilentNodeError)
         lost = lost if is_silent else self._watch.most_missed(lost, self.generation)
@@ -507,9 +507,9 @@ class NodePool:
             raise WorkerError(why) from lost
 
     def _recover(self) -> None:
-        """Go back to the newest state of all nodes; living nodes take over zones of lost nodes.
+        """Go back to the newest state of all nodes; live nodes take over zones of lost nodes.
 
-        Zones whose home is another living node move to that node.
+        Zones whose home is another live node move to that node.
 
         Raises:
             LinkLostError: another node is lost.
@@ -534,7 +534,7 @@ class NodePool:
     def _moves(self) -> tuple[ZoneMoves, Bytes]:
         """Return the new zones of the nodes, and the replica of a state that only the caller has.
 
-        If the only node is lost, another one takes its place.
+        If the only node is lost, another node takes its place.
 
         Raises:
             WorkerDeathError: there is no replica of a lost node, or too many were lost.
@@ -597,14 +597,14 @@ class NodePool:
         """Wait for the reports of all nodes on a tick, and commit it.
 
         Returns:
-            the results that came with the reports; the result of the reporter comes first.
+            the results that were sent with the reports, the reporter's result first.
 
         Raises:
             LinkLostError: a node is lost, or has sent a bad report.
         """
         reports, results = {}, {}
         frames = self._receive_all(FrameKind.REPORT)
-        for number in sorted(frames, key=self.reporter.__ne__):  # the others in rising order
+        for number in sorted(frames, key=self.reporter.__ne__):  # then in ascending order
             with reading(number):
                 messages, of_worlds, more = read_report(frames[number].data, len(self._runs))
                 self.coordinator.check(number, messages, of_worlds)

@@ -29,7 +29,7 @@ class NodeSystem(Transport, Protocol):
     def worlds_of(
         self,
         message: Mapping[str, Any],
-        trouble: str,  # error text in case that files differ
+        trouble: str,  # error text if files differ
         num_worlds: int,
         in_next_step: bool,  # when new episodes start
     ) -> LocalWorlds:

@@ -242,7 +242,7 @@ class NodeWorlds(CommandedWorlds):
             self.perform(task, payload)
 
     def perform(self, task: Task, payload: Any = None) -> None:
-        """Let all nodes do a task, and write its outputs to `arrays`."""
+        """Run a task on all nodes, and write its outputs to `arrays`."""
         content = worlds_payload(payload) if task == Task.LOAD else payload
         results = self._run(task, content, self._readers.get(task, unread))
         arrays = self.arrays
@@ -259,7 +259,7 @@ class NodeWorlds(CommandedWorlds):
         """Do nothing: the pool has noted the new zones."""
 
     def _run(self, task: Task, payload: Any, read: Read[Found]) -> list[Found]:
-        """Let all nodes do a task; return what `read` returns for each result."""
+        """Run a task on all nodes; return what `read` returns for each result."""
         try:
             return self.pool.run(self._make_command(task, payload), read)
         except NetworkFailedError as failed:
@@ -320,7 +320,7 @@ class NodeWorlds(CommandedWorlds):
         states[...] = np.frombuffer(data, states.dtype).reshape(states.shape)
 
     def node_loads(self) -> list[NodeLoad]:
-        """Return the load of each node since the previous call, in rising order.
+        """Return the load of each node since the previous call, in ascending order of nodes.
 
         The load of a node that has replaced a lost node counts from the start of the new node.
         """

@@ -1,7 +1,7 @@
 """`StateReplicas`: kept states of the zones of a node, and of the previous node of the ring.
 
 From time to time, between two steps, each node keeps its state, and sends a replica to the next
-living node. When a node is lost, the next node takes over its zones, and all nodes go back to the
+live node. When a node is lost, the next node takes over its zones, and all nodes go back to the
 newest state that all of them have. They repeat the commands since then, which gives the same bytes.
 When zones move to another node, for example a new node, all nodes also go back to a kept state.
 """
@@ -51,7 +51,7 @@ class StateReplicas:
         self._is_settled = True  # whether no state was kept since `settle`
 
     def begin_anew(self, worlds: LocalWorlds, logs: Sequence[ToldLog]) -> None:
-        """Switch to other worlds; replicas stay, since their senders may have switched before."""
+        """Switch to other worlds; replicas stay, since their senders may already have switched."""
         self._worlds, self._logs = worlds, logs
         self.own.clear()
         self._given.clear()
@@ -67,7 +67,7 @@ class StateReplicas:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> list[Array]:
-        """Keep and return the present state, and send a replica to the next living node."""
+        """Keep and return the present state, and send a replica to the next live node."""
         saved = self._worlds.save()
         data = to_bytes(saved)
         _add(self.own, state, data)
@@ -102,9 +102,9 @@ class StateReplicas:
     def await_replica(
         self, state: int, zones: Sequence[Sequence[int]], like: Sequence[Array]
     ) -> None:
-        """Wait for the state of the previous living node, check it, and keep it.
+        """Wait for the state of the previous live node, check it, and keep it.
 
-        So a damaged state is detected while its sender is still alive.
+        The check detects a damaged state while its sender is still alive.
 
         Args:
             state: number of the state.
@@ -156,9 +156,9 @@ class StateReplicas:
         Later states are dropped: otherwise they would count as the newest ones.
 
         Raises:
-            LinkLostError: a donor has gone, or its state is damaged.
+            LinkLostError: a donor has disconnected, or its state is damaged.
             RecoveryOrderedError: the coordinator has ordered another recovery.
-            WorkerError: the state of a lost node is not here.
+            WorkerError: this node has no replica of the state of a lost node.
         """
         for states in (self.own, *self.others.values()):
             _drop_later(states, state)

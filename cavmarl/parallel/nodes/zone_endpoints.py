@@ -271,7 +271,7 @@ class ZoneEndpoints(OwnershipRuntime):
 
     def _complete(self, w: int) -> Iterable[Done]:
         gone, self._gone[w] = self._gone[w], {}
-        if gone and self._births[w]:  # a vehicle that comes and goes within a lease has no record
+        if gone and self._births[w]:  # vehicles that enter and leave in a lease have no record
             born = {vehicle for vehicle, _ in self._births[w]} & gone.keys()
             self._births[w] = [birth for birth in self._births[w] if birth[0] not in born]
             gone = {vehicle: reason for vehicle, reason in gone.items() if vehicle not in born}
@@ -279,7 +279,7 @@ class ZoneEndpoints(OwnershipRuntime):
         kept: dict[int, int] = {}
         for vehicle, reason in gone.items():
             zone = next((z for z, e in self._endpoints[w].items() if vehicle in e.owned), None)
-            if zone is None:  # the vehicle was born during the lease
+            if zone is None:  # the vehicle entered during the lease
                 kept[vehicle] = reason
             else:
                 left.setdefault(zone, []).append(Removed(vehicle, reason))
@@ -292,7 +292,7 @@ class ZoneEndpoints(OwnershipRuntime):
         """Offer vehicles that have crossed a border to the zones in which they are.
 
         Returns:
-            movers of the report, and whether vehicles without a record have also crossed a border.
+            `Report.movers`, and whether vehicles without a record have also crossed a border.
         """
         division, endpoints = self._division, self._endpoints[w]
         check_all, self._stirred[w] = self._stirred[w] or began, False
@@ -316,7 +316,7 @@ class ZoneEndpoints(OwnershipRuntime):
         return movers, is_late
 
     def receive(self, number: int, frame: NodeFrame) -> None:
-        """Apply messages of another node as soon as they come."""
+        """Apply messages of another node as soon as they arrive."""
         messages = unpacked(frame.data)
         check_indices("world", (w for w, _ in messages), len(self._endpoints))
         for w, message in messages:
@@ -350,7 +350,7 @@ class ZoneEndpoints(OwnershipRuntime):
         endpoint = self._endpoints[w][zone]
         if isinstance(message, Prepare):
             if message.episode == endpoint.episode + 1:
-                self._early.append((number, w, message))  # the other node received its lease first
+                self._early.append((number, w, message))  # the sender received its lease first
                 return
             self._sources |= {(w, offer.vehicle): number for offer in message.entries}
         elif isinstance(message, Abort):
@@ -473,7 +473,7 @@ class ZoneEndpoints(OwnershipRuntime):
             at += kept.nbytes
 
     def receive_agent(self, number: int, frame: NodeFrame) -> None:
-        """Keep the state of an agent from another node until its vehicle comes."""
+        """Keep the state of an agent from another node until its vehicle arrives."""
         w, _ = _LENGTH.unpack_from(frame.data)
         vehicle = int(np.frombuffer(frame.data, np.int64, 1, _LENGTH.size)[0])
         check_indices("world", [w], len(self._endpoints))

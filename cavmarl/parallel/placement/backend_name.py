@@ -58,7 +58,7 @@ class BackendName:
         return self.address == MPI
 
     def is_split(self, num_worlds: int) -> bool:
-        """Return whether processes or nodes share the zones of worlds, being more than worlds."""
+        """Return whether processes or nodes outnumber the worlds, and so share their zones."""
         return self.count is not None and self.count > num_worlds
 
 

@@ -92,11 +92,11 @@ class CommandedWorlds(ABC):
 
     @abstractmethod
     def _send(self, task: Task, payload: Any, commits: bool) -> None:
-        """Let all workers or nodes do a task, and write its outputs to `arrays`."""
+        """Run a task on all workers or nodes, and write its outputs to `arrays`."""
 
     @abstractmethod
     def _ask(self, task: Task, world: int, payload: Any) -> Any:
-        """Let the worker or node of a world do a task, and return its answer."""
+        """Run a task on the worker or node of a world, and return its answer."""
 
     def __reduce__(self) -> tuple[Any, ...]:
         raise copy_error()

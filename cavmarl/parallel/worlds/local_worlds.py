@@ -360,7 +360,7 @@ class LocalWorlds:
         self.load(self.read_worlds(saved))
 
     def read_worlds(self, saved: Sequence[bytes]) -> list[NDArray[Any]]:
-        """Convert what `save_worlds` returned to what `load` expects; errors as `load_worlds`."""
+        """Convert what `save_worlds` returned to what `load` expects. Errors: see `load_worlds`."""
         zones = self.world.partition.count
         like = self.share_of(0)
         shares = [from_bytes(one, [*like[:-zones], like[-1]]) for one in saved]
