@@ -158,7 +158,7 @@ class Steppable(Protocol):
 
 
 class ClockEvent(NamedTuple):
-    """A fault of the time."""
+    """An attempt of another caller to advance the world, successful or not."""
 
     tick: int  # the master's tick at detection
     # `own_tick`: a follower tried to tick; `drift`: a world was advanced without its master

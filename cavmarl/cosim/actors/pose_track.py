@@ -1,4 +1,4 @@
-"""`PoseTrack`: poses with a rate of their own, and the pose that follows from them at any time.
+"""`PoseTrack`: poses of a body, received at any rate, and the extrapolated pose at any time.
 
 Poses arrive at 10 to 100 Hz, and the world steps at another rate. For the end of a step, the track
 extrapolates the newest pose with the motion of the last two poses: the velocity turns with the

@@ -156,7 +156,7 @@ class ActorTable:
         return self._next
 
     def skip_to(self, number: int) -> None:
-        """Give the next actors this number or higher ones."""
+        """Number the next actors from this number on, or from a higher number."""
         self._next = max(self._next, number)
 
     @property
@@ -192,7 +192,7 @@ class ActorTable:
         return actor
 
     def remove(self, number: int) -> list[CarlaActor]:
-        """Remove an actor and those attached to it; return them."""
+        """Remove an actor and all actors attached to it; return the removed actors."""
         actor = self.actors.pop(number, None)
         if actor is None:
             return []
@@ -284,7 +284,7 @@ class ActorTable:
                 yield actor
 
     def take(self, world: HostedWorld) -> list[CarlaActor]:
-        """Take over the present state of a world; return the actors that have gone."""
+        """Take over the present state of a world; return the removed actors."""
         rows = world.rows
         gone: list[CarlaActor] = []
         if not np.array_equal(rows["id"], self._ids):
@@ -347,7 +347,7 @@ class ActorTable:
         ids = world.external.ids()
         for actor in [one for one in self.actors.values() if one.slot >= 0]:
             vehicle = ids.get(actor.slot, -1)
-            if actor.vehicle != vehicle:  # it has entered, or has jumped
+            if actor.vehicle != vehicle:  # the vehicle has entered, or has a new id after a jump
                 self._by_vehicle.pop(actor.vehicle, None)
                 actor.vehicle = vehicle
                 if vehicle >= 0:

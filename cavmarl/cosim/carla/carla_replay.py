@@ -70,7 +70,7 @@ class CarlaRecording:
 
     @property
     def started(self) -> str:
-        """Date and time of its start."""
+        """Date and time at which the recording started."""
         return str(self._recording.manifest.get("started", "unknown"))
 
     def check_map(self, network: RoadNetwork, name: str) -> None:

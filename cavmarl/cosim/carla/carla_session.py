@@ -89,10 +89,10 @@ class CarlaSession:
         streams: where snapshots and sensor frames are sent.
         limits: limits of what clients may demand.
         step_s: length of a step of the first world.
-        other_ticks: what happens in a synchronous world if a client ticks that is not the time
-            master: the client that has ticked first, until it disconnects. `obey`: the world
-            advances, as in CARLA. `refuse`: the client gets an error. `follow`: the client waits
-            for the next tick of the master.
+        other_ticks: what happens in a synchronous world if a client other than the time master
+            ticks. The time master is the client that ticked first, until it disconnects. `obey`:
+            the world advances, as in CARLA. `refuse`: the client gets an error. `follow`: the
+            client waits for the next tick of the master.
         recordings: folder of the recordings that clients make; None: they can make none.
 
     Attributes:
@@ -276,7 +276,7 @@ class CarlaSession:
     ) -> CarlaActor:
         """Add an actor; `pose` is relative to the parent, if there is one.
 
-        Raises CallRefused: there is no such blueprint, parent or room.
+        Raises CallRefused: there is no such blueprint or parent, or there are too many actors.
         """
         blueprint = BLUEPRINTS.get(type_id)
         if blueprint is None:
@@ -345,5 +345,5 @@ class CarlaSession:
         self.source.close()
 
     def forget(self, actor: CarlaActor) -> None:
-        """End the sensor of an actor that has gone."""
+        """End the sensor of an actor that has been removed."""
         self.sensors.remove(actor)

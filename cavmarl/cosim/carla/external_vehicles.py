@@ -243,7 +243,7 @@ class ExternalVehicles:
             east, north = (one.velocity or self._velocity_of(slot))[:2]
             ahead, aside = east * cos - north * sin, -east * sin - north * cos
             if control is None and one.vtype != WALKER:
-                self.controls[slot] = CarlaControl()  # it keeps rolling
+                self.controls[slot] = CarlaControl()  # the vehicle keeps rolling
         if one.spin is not None:
             turn = -one.spin * step_s
         one.velocity = one.spin = None

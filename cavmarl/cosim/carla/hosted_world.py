@@ -263,7 +263,7 @@ class GivenWorld:
 class LoadedWorlds:
     """The source of a server that loads environments by name.
 
-    `spec`: the first world, whose options hold whenever a client loads its map.
+    `spec`: the first world; its options also apply whenever a client loads its map again.
     """
 
     def __init__(self, spec: WorldSpec) -> None:

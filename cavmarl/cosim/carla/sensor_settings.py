@@ -68,7 +68,7 @@ class SensorContext:
         return -1 if parent is None else parent.vehicle
 
     def hidden_carrier_of(self, actor: CarlaActor) -> int:
-        """Return the carrier of a camera that is in or above its body, which hides it, or -1."""
+        """Return the vehicle that a camera hides because it is in or above its body, or -1."""
         parent = self.session.actors.actors.get(actor.parent)
         if parent is None or actor.local is None:
             return -1
@@ -84,7 +84,7 @@ class SensorContext:
         return found
 
     def tagged(self, tags: NDArray[np.uint8], vehicles: NDArray[np.int64]) -> NDArray[np.uint8]:
-        """Return tags (n,) of vehicles' ids, of which some are props."""
+        """Return tags (n,) of vehicles' ids, with `PROP_TAG` for props."""
         props = self.session.actors.props
         if not props.size:
             return tags

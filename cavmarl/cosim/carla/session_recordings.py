@@ -32,7 +32,7 @@ class SessionRecordings:
         self._factor = 1.0
 
     def start(self, name: str) -> Path:
-        """Begin a recording; raises as `CarlaRecorder.start`."""
+        """Begin a recording. Raises the errors of `CarlaRecorder.start`."""
         self.refuse_in_replay()
         return self._recorder.start(self._session, self._key, name)
 

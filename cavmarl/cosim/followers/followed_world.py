@@ -1,6 +1,6 @@
 """`FollowedWorld`: a world whose time a master advances and whose agents followers drive.
 
-A cycle is that of Algorithm 1 of the co-simulation paper: the queued controls take effect, the
+The cycle is Algorithm 1 of the co-simulation paper: the queued controls take effect, the
 world ticks, sensors deliver the frame of t + Δt, each follower computes u from it, and u is queued
 for the next cycle. The cycle ends when every follower has answered. So a slow follower delays the
 world, and no frame is skipped.

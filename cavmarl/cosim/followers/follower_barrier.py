@@ -1,4 +1,4 @@
-"""`Barrier` sends every follower its snapshot and waits for the controls of all."""
+"""`Barrier` sends each follower a snapshot and waits for the controls of all followers."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class Barrier:
     """Sends snapshots and waits for the followers' answers.
 
     `timeout_s`: maximum time for all of them together, by the wall clock. `bad_controls`:
-    `error`: a follower that sends invalid controls fails; `hold`: the vehicle's last ones are used.
+    `error`: a follower that sends invalid controls fails; `hold`: the last valid controls are used.
     """
 
     def __init__(

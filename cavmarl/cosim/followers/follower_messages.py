@@ -93,7 +93,7 @@ class Hello:
     name: StrictStr
     # agents to drive; none: it only follows the clock
     vehicles: list[StrictStr] = field(default_factory=list)
-    secret: StrictStr = ""  # of the world, if it listens at a port
+    secret: StrictStr = ""  # secret of the world, if the world listens at a port
     truth: StrictBool = False  # whether its snapshots are to contain all vehicles of the world
     actors: list[ActorRequest] = field(default_factory=list)  # actors that it brings
     # whether the world waits for its answers; if not, it sends poses and controls at any time
@@ -224,7 +224,7 @@ class Control:
 
     frame: StrictInt  # frame of the snapshot
     # by vehicle or actor. Vehicles: two numbers in [-1, 1], or the number of a meta-action. Actors
-    # that are moved by controls: two numbers in [-1, 1]; without new ones, the last ones are kept
+    # that are moved by controls: two numbers in [-1, 1]; the last controls are kept until new ones
     controls: dict[StrictStr, list[StrictFloat] | StrictInt]
     poses: dict[StrictStr, list[PoseView]] = field(default_factory=dict)  # as in `Poses`
 
