@@ -38,7 +38,7 @@ class DeadlineWatch:
         self.misses: dict[str, int] = {}
         self.worst_wall_s = 0.0
         self._now = now
-        self._limit: float | None = None  # of the present step, by the wall clock
+        self._limit: float | None = None  # deadline of the present step, by the wall clock
         self._phase = WORLD
         self._is_missed = False
 

@@ -83,7 +83,7 @@ class OwnerChanges:
         return place
 
     def give_up(self, w: int, zone: int, vehicle: int) -> None:
-        """Give a vehicle up to a zone of another process. Its row here becomes a ghost."""
+        """Hand a vehicle over to a zone of another process. Its row here becomes a ghost."""
         if not self._give_up(vehicle, zone, 0, self._division.zoned, self._division.side, w):
             raise ConfigError(f"zone {zone} does not own vehicle {vehicle}")
 

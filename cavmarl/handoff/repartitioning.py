@@ -1,7 +1,7 @@
 """`Repartitioner`: new zones for running worlds whose vehicles are unevenly distributed.
 
 Repartitioning is off by default. The zones change between two ticks. In the next tick, each vehicle
-outside of its owner's new zone is handed over as at any border. So the results do not change.
+outside of its owner's new zone is handed over, as at any border. So the results do not change.
 """
 
 from __future__ import annotations

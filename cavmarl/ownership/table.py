@@ -122,7 +122,7 @@ class Table:
             counts[zone] -= 1
             moves.append((vehicle, zone, epoch, False))
         # If there are more moves than vehicles, `tallies` counts all vehicles and ignores the
-        # moves. One surplus move is kept as a mark: every new vehicle also adds a move.
+        # moves. One surplus move is kept as a mark, since new vehicles also add moves.
         del moves[len(owners) + 1 :]
         self.tick = tick
 

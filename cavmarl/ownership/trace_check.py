@@ -251,7 +251,7 @@ class TraceChecker:
     def _ack(self, message: Ack) -> None:
         process = (message.zone, message.incarnation)
         if self._incarnations.get(message.zone) != message.incarnation:
-            return  # from a replaced process; the trace has no further messages of that process
+            return  # sent by a replaced process, whose further messages the trace does not have
         for vehicle, epoch, digest in message.entries:
             holding = (*process, vehicle, epoch, digest)
             known = holding in self._holdings.get(message.tick, ())

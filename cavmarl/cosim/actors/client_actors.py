@@ -69,7 +69,7 @@ class ClientActor:
     order: ActorOrder
     track: PoseTrack
     slot: int = -1
-    controls: tuple[float, float] | None = None  # of the next step, in [-1, 1]
+    controls: tuple[float, float] | None = None  # controls of the next step, in [-1, 1]
 
     @property
     def name(self) -> str:

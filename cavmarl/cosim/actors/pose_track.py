@@ -27,12 +27,12 @@ class PoseSample(NamedTuple):
     """A measured pose of a body."""
 
     stamp_s: float  # simulated time since the reset
-    x: float  # of its centre, m
+    x: float  # position of the body's centre, m
     y: float
     heading: float  # rad, counter-clockwise from east
-    z: float | None = None  # height of the ground below its centre, m; None: the lane's
+    z: float | None = None  # height of the ground below the centre, m; None: the lane's height
     pitch: float | None = None  # rad, positive uphill; None: the slope of the lane
-    speed: float | None = None  # m/s along the heading; None: follows from the move
+    speed: float | None = None  # m/s along the heading; None: computed from the motion
 
 
 @dataclass

@@ -409,7 +409,7 @@ class ActorTable:
         states["turn"][:, 1] = -np.degrees(heading)
         states["velocity"] = ahead * speed[:, None]
         states["spin"][:, 2] = -np.degrees(rows["yaw_rate"])
-        turning = speed * rows["yaw_rate"]  # to the left
+        turning = speed * rows["yaw_rate"]  # acceleration to the left
         states["acceleration"] = ahead * accel[:, None] - aside * turning[:, None]
         states["throttle"] = np.clip(accel / THROTTLE_MPS2, 0.0, 1.0)
         states["brake"] = np.clip(-accel / BRAKE_MPS2, 0.0, 1.0)

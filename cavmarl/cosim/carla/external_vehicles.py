@@ -41,7 +41,7 @@ _FASTEST_BACKWARD_MPS = 10.0
 class ExternalBody(NamedTuple):
     """A vehicle, walker or static prop to spawn."""
 
-    type_id: str  # of its blueprint
+    type_id: str  # id of the blueprint
     base_type: str  # see `Blueprint.base_type`; a prop is a stopped vehicle
     pose: CarlaPose
     size_m: tuple[float, float, float]  # length, width, height

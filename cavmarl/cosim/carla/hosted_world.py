@@ -59,7 +59,7 @@ class EndedVehicle(NamedTuple):
 
     agent: int
     events: int  # EVENT_* bits: why it has left
-    was_driven: bool  # by a client
+    was_driven: bool  # whether a client drove the vehicle
 
     @property
     def has_collided(self) -> bool:

@@ -28,7 +28,7 @@ class SessionRecordings:
         self._session = session
         self._recorder = CarlaRecorder(folder, session.limits.max_recorded)
         self._key = secrets.token_hex(8)  # no other session has it
-        self._live: _LiveActors | None = None  # during a replay
+        self._live: _LiveActors | None = None  # the actors of the world during a replay
         self._factor = 1.0
 
     def start(self, name: str) -> Path:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from cavmarl.config.action import ActionConfig
 
 FULL_STEER_RAD = math.radians(70.0)  # angle of the front wheels at steer = 1
-WHEELBASE_SHARE = 0.6  # of the length of CARLA's vehicles; agents' axles can be farther apart
+WHEELBASE_SHARE = 0.6  # wheelbase / length of CARLA's vehicles; agents' axles can be farther apart
 THROTTLE_MPS2 = 4.5  # acceleration at throttle = 1
 BRAKE_MPS2 = 8.0  # deceleration at brake = 1
 _ROLLING_MPS2 = 0.2  # deceleration without throttle, and its increase per m/s

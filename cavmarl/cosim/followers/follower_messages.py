@@ -74,8 +74,8 @@ class ActorRequest:
     x: StrictFloat  # centre, in m
     y: StrictFloat
     heading: StrictFloat  # rad, counter-clockwise from east
-    z: StrictFloat | None = None  # height of the ground below the centre, in m; none: of the lane
-    # body: length, width and height in m; empty: of the type
+    z: StrictFloat | None = None  # height of the ground below the centre, in m; none: the lane's
+    # body: length, width and height in m; empty: size of the type
     size_m: list[StrictFloat] = field(default_factory=list)
     speed: StrictFloat = 0.0  # at the start, in m/s
     moved_by: StrictStr = "poses"  # or `controls`, `nothing`
@@ -186,7 +186,7 @@ class FollowerSnapshot:
 
     frame: StrictInt  # consecutive number
     episode: StrictInt  # increases with each reset
-    tick: StrictInt  # of the world, since its reset
+    tick: StrictInt  # tick of the world, since its reset
     time_s: StrictFloat  # tick · dt_s, simulated time
     is_over: StrictBool  # whether the episode has ended; then no controls are due
     # the follower's vehicles in the world, which have to be driven

@@ -108,7 +108,7 @@ class SnapshotTime(NamedTuple):
 
     frame: int  # consecutive number
     episode: int  # increases with each reset
-    tick: int  # of the world, since its reset
+    tick: int  # tick of the world, since its reset
     is_over: bool  # whether the episode has ended
 
 

@@ -33,7 +33,7 @@ POINT = np.dtype(
     ]
 )
 TARGET = np.dtype([("x", "<f4"), ("y", "<f4"), ("z", "<f4"), ("radial_speed", "<f4")])
-_DATATYPES = {"u1": 2, "u2": 4, "f4": 7}  # of `sensor_msgs/msg/PointField`
+_DATATYPES = {"u1": 2, "u2": 4, "f4": 7}  # codes of `sensor_msgs/msg/PointField`
 _OPTICAL = {"x": -0.5, "y": 0.5, "z": -0.5, "w": 0.5}  # z forward, x right, y down
 
 

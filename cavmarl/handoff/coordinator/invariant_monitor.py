@@ -44,7 +44,7 @@ class Departed(NamedTuple):
     """A vehicle that has left the world since the last tick."""
 
     vehicle: int
-    zone: int  # its last owner
+    zone: int  # the vehicle's last owner
     epoch: int
 
 

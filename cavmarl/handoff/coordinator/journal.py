@@ -236,7 +236,7 @@ class Journal:
 
     def _lock(self) -> None:
         """Lock the file against other writers while it is open."""
-        if sys.platform == "win32":  # has no fcntl
+        if sys.platform == "win32":  # Windows has no fcntl
             return
         try:
             fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)

@@ -125,7 +125,7 @@ class MessageCoordinator(Coordinator):
             self._endpoints[zone] = Endpoint(directory.hosting(zone), self._limits)
 
     def _worker_of(self, zone: int) -> int:
-        """Return the worker of a zone in the records: 0 is cavmarl, 1 + zone its simulator."""
+        """Return the worker of a zone in the records: 0 for cavmarl, 1 + zone for a simulator."""
         return 1 + zone if zone in self._gate.zones and zone not in self._returned else 0
 
     def save(self) -> None:

@@ -142,7 +142,7 @@ class Zone:
         id_of = _signal_ids(self._map.to_opendrive())
         self._lights = {name: lights[one] for name, one in id_of.items() if one in lights}
         self._shown: dict[str, str] = {}
-        self._world.freeze_all_traffic_lights(True)  # their own programs do not run
+        self._world.freeze_all_traffic_lights(True)  # stop the signals' own programs
         library = self._world.get_blueprint_library().filter("vehicle.*")
         self._blueprints = sorted(library, key=lambda one: str(one.id))
 
@@ -163,7 +163,7 @@ class Zone:
         )
         if on_road < SEEN_LANES * len(places):
             raise ValueError(
-                f"its map {self._map.name} is another one: {len(places) - on_road} of "
+                f"its map {self._map.name} is wrong: {len(places) - on_road} of "
                 f"{len(places)} places on lanes are beside its roads; load the map of this world "
                 "(cavmarl map export NAME --carla --opendrive FILE)"
             )
@@ -232,7 +232,7 @@ class Zone:
         return (fitting or self._blueprints)[0]
 
     def drop(self, vehicles: Sequence[int]) -> None:
-        """Give up vehicles. Vehicles that remain visible become ghosts in `show`."""
+        """Release vehicles. Vehicles that remain visible become ghosts in `show`."""
         for vehicle in vehicles:
             car = self._cars[vehicle]
             car.is_owned = False

@@ -33,7 +33,7 @@ from cavmarl.parallel.network.encryption import (
 )
 
 MAGIC = b"cavW"
-VERSION = 1  # of this handshake
+VERSION = 1  # version of this handshake
 NONCE = 16  # bytes of a random number
 PROOF = 32  # bytes of an HMAC
 SECRET = 32  # bytes

@@ -76,7 +76,7 @@ class NodeFrame(NamedTuple):
     """A received frame."""
 
     kind: FrameKind
-    number: int  # its meaning depends on the kind
+    number: int  # a number whose meaning depends on the kind
     data: memoryview
 
     def is_of(self, generation: int, is_known: bool) -> bool:

@@ -113,7 +113,7 @@ class NodeCoordinator:
         runs: Sequence[bytes],  # run of each world
         node_of: Sequence[int],  # zone → node
         limits: Limits,
-        links: Links,  # to all nodes
+        links: Links,  # connections to all nodes
         journals: Sequence[Journal | None],  # journal of each world
         is_checked: bool = False,  # whether to compare rows of vehicles with the records
     ) -> None:
@@ -196,7 +196,7 @@ class NodeCoordinator:
         self,
         number: int,  # number of a node
         messages: Sequence[tuple[int, Message]],
-        reports: Sequence[Report] = (),  # one for each world, or none at all
+        reports: Sequence[Report] = (),  # one report for each world, or no reports
     ) -> None:
         """Check messages of a node.
 

@@ -60,7 +60,7 @@ class NodeGroups(CommandedWorlds):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         backend: BackendName,  # n nodes, from 1 to W
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         *,
         route: Route = straight,  # maps a place to the place that nodes of this machine call
         system: NodeSystem = MACHINE,

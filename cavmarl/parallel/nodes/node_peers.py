@@ -54,7 +54,7 @@ class NodePeers(Peers):
     def __init__(
         self,
         simulation: Simulation,
-        links: Links,  # to all other nodes
+        links: Links,  # connections to all other nodes
         zones: Sequence[Sequence[int]],  # zones of each node
         number: int,  # number of this node
         generation: int = 0,  # number of changes of nodes

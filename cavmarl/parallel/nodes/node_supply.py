@@ -43,7 +43,7 @@ class NodeSupply:
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W of all pools
         backend: BackendName,
-        in_next_step: bool,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool,  # whether new episodes start a step later; see `SteppedWorlds`
         *,
         by_worlds: bool = False,  # whether each node hosts worlds of its own
         route: Route = straight,  # maps a place to the place to call instead

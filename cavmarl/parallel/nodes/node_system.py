@@ -31,7 +31,7 @@ class NodeSystem(Transport, Protocol):
         message: Mapping[str, Any],
         trouble: str,  # error text if files differ
         num_worlds: int,
-        in_next_step: bool,  # when new episodes start
+        in_next_step: bool,  # whether new episodes start a step later
     ) -> LocalWorlds:
         """Make the worlds of a message."""
         ...

@@ -87,7 +87,7 @@ class ZoneEndpoints(OwnershipRuntime):
         node_of: Sequence[int],  # zone → node
         hostings: Sequence[Sequence[Hosting]],  # hostings of these zones, by worlds
         limits: Limits,
-        links: Links,  # to the coordinator and to all other nodes
+        links: Links,  # connections to the coordinator and to all other nodes
         carried: Sequence[NDArray[Any]],  # (W, A, …) actions and state of agents
         checks: IndexCheck,  # checks offered vehicles
         # output: world, vehicle and zone of each offer that was answered in the present or the

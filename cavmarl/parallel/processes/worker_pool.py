@@ -137,7 +137,7 @@ class Pool:
         expected_s = self._lasted.get(task, 0.0)
         sleeps = expected_s > LONG_WORK_S
         if workers == self._all:
-            self._processes.keep_apart()  # by the cores of the last command
+            self._processes.keep_apart()  # uses the cores of the last command
         self._processes.order(workers, head, self._stale, mail, sleeps)
         self._await(workers, mail, expected_s, sleeps)
         self._lasted[task] = time.monotonic() - self._ordered_s

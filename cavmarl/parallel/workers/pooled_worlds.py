@@ -48,7 +48,7 @@ class PooledWorlds(CommandedWorlds):
         base_dir: Path,  # folder of relative paths
         num_worlds: int,  # W
         workers: int,  # m, from 1 to W times the zones of a world; more than W divide the worlds
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         program: str | None = None,  # module that the processes run; None: `job_factory`
     ) -> None:
         self.world = world

@@ -47,7 +47,7 @@ class LocalWorlds:
         num_worlds: int,  # W
         arrays: StepArrays | None = None,  # arrays to write; None: make new arrays
         warm: bool = False,  # whether to load all kernels now
-        in_next_step: bool = False,  # when new episodes start; see `SteppedWorlds`
+        in_next_step: bool = False,  # whether new episodes start a step later; see `SteppedWorlds`
         zeros: Zeros = huge_zeros,  # makes the arrays that shards write
         like: LocalWorlds | None = None,  # worlds of the same environment, whose tables are shared
         runs: Sequence[OpenRun] | None = None,  # see `Simulation`

@@ -35,7 +35,7 @@ COMMITTED, NEXT = 0, 1  # items of `Members.sides`
 class Members(NamedTuple):
     """The zones in which a call runs a phase."""
 
-    numbers: NDArray[np.int64]  # (n,) the numbers of the zones, rising
+    numbers: NDArray[np.int64]  # (n,) the numbers of the zones, ascending
     frames: NDArray[np.void]  # FRAME (n,) of the spatial index of each zone
     sides: NDArray[np.int64]  # (2,) the halves of `ZoneState.rows` with committed and next rows
     zones: ZoneArrays  # the partition

@@ -42,9 +42,9 @@ CHANGE = np.dtype(
         ("epoch", np.int64),  # epoch of the new ownership
         ("place", np.int64),  # the vehicle's row at the target
         ("approached", np.int64),  # first tick in which the vehicle was near
-        ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick,
-        ("switch_depth_m", np.float64),  # at the change of owner,
-        ("release_depth_m", np.float64),  # and one tick later; NaN: the vehicle has left the world
+        ("prepare_depth_m", np.float64),  # distance outside of the source's zone in that tick
+        ("switch_depth_m", np.float64),  # the same distance at the change of owner
+        ("release_depth_m", np.float64),  # the same one tick later; NaN: the vehicle has left
         # duration since the first approach; until the tick ends, clock time of the first approach
         ("ms", np.float64),
     ],
@@ -77,7 +77,7 @@ class BorderRecords(NamedTuple):
     num_near: NDArray[np.int64]  # (W,) number of entries of `near`
     num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
-    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two lists that take turns
+    coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two alternating lists
     turn: NDArray[np.int64]  # (W,) index of the present list; the other is the previous tick's
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
     known: NDArray[np.int64]  # (W,) entries of the present list that were in the previous list
@@ -172,8 +172,8 @@ def hand_over(
     """Give every vehicle beyond its zone's hysteresis to the zone that contains it.
 
     Returns:
-        The number of changes, which are at the end of `book.changes` by rising ids. If a change
-        fails: NOT_OWNED or NOT_SEEN, and the failed change follows the other changes.
+        The number of changes, which are at the end of `book.changes` in ascending order of ids. If
+        a change fails: NOT_OWNED or NOT_SEEN, and the failed change follows the other changes.
     """
     if check_all:
         look(zones, borders, zoned, side, w, True, num_newborn, book)
