@@ -38,7 +38,7 @@ class DeadlineWatch:
         self.misses: dict[str, int] = {}
         self.worst_wall_s = 0.0
         self._now = now
-        self._limit: float | None = None  # deadline of the present step, by the wall clock
+        self._limit: float | None = None  # deadline of the current step, by the wall clock
         self._phase = WORLD
         self._is_missed = False
 
@@ -58,7 +58,7 @@ class DeadlineWatch:
         self._phase = phase
 
     def end(self) -> None:
-        """End the present step, if there is one."""
+        """End the current step, if there is one."""
         if self._limit is None:
             return
         self.note("")

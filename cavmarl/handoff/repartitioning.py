@@ -31,7 +31,7 @@ class Repartition(NamedTuple):
 def propose_cut(
     network: RoadNetwork,
     division: ZonedShards,  # has the vehicles of all zones
-    partition: ZonePartition,  # the present zones
+    partition: ZonePartition,  # the current zones
     tolerance: float,  # required decrease of the imbalance
 ) -> Proposal | None:
     """Return zones with a better balance of vehicles; None if the gain is within the tolerance."""

@@ -51,7 +51,7 @@ class Table:
         self.hosts = dict.fromkeys(sorted(zones), (-1, 0))
         self.states = dict.fromkeys(self.hosts, State.UNHOSTED)  # zone → UNHOSTED, HOSTED or FENCED
         self.seen = SeenIds()  # vehicle ids that have been used in the episode
-        self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the present tick
+        self.repeats: Counter[int] = Counter()  # zone → number of new hosts in the current tick
         self.plan: OwnershipPlan | None = None  # plan of the tick in progress, if any
         self.counts = dict.fromkeys(self.hosts, 0)
         self._tallies = dict.fromkeys(self.hosts, OwnedTally())

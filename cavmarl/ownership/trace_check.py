@@ -1,9 +1,9 @@
 """Check of a trace by the rules of docs/explanation/ownership.md, without the protocol's code.
 
-The check accepts the traces of correct runs. It refuses a trace in which a vehicle has two owners
-or none, a switch begins although its target does not have the exact state (PREPARE < ACK < SWITCH <
-CONFIRM < RELEASE), a message is sent before its record is logged, or a tick is committed that a
-present host has not computed.
+The check accepts the traces of correct runs. It refuses a trace if a vehicle has two owners or
+none; if a switch begins before its target has the exact state (PREPARE < ACK < SWITCH < CONFIRM <
+RELEASE); if a message is sent before its record is logged; or if a tick is committed before the
+current hosts have computed it.
 
 The cost of a tick grows with its changes: vehicles that keep their owner are not visited.
 """

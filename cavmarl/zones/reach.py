@@ -26,8 +26,8 @@ def driving_reach_m(network: RoadNetwork, travel: TripTables) -> float:
 
     A driver looks `view_m` ahead. On a junction, or with a stop line within `see_m`, it also
     considers vehicles that approach the junction and vehicles after it. Vehicles approach if they
-    are within `APPROACH_M` of the end of a lane that leads to the junction or is on it, or within
-    `MERGES_M` where vehicles turn into a lane. After the junction, the limit is `EXIT_LOOK_M`.
+    are within `APPROACH_M` of the end of a lane that leads to the junction or is on it; where
+    vehicles turn into a lane, the limit is `MERGES_M`. After the junction, it is `EXIT_LOOK_M`.
     """
     longest_m = float(network.links["length_m"].max(initial=0.0))
     junction_m = max(travel.see_m, longest_m)

@@ -75,7 +75,7 @@ class CarlaActor:
 
     Attributes:
         attributes: values by name; kinds are those of the blueprint.
-        pose: the present pose; for vehicles and walkers, see `ActorTable.pose_of`.
+        pose: the current pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.
         centre, half_m: the bounding box in the actor's frame.
         vehicle: id of the row of a vehicle or walker; -1: none.
@@ -284,7 +284,7 @@ class ActorTable:
                 yield actor
 
     def take(self, world: HostedWorld) -> list[CarlaActor]:
-        """Take over the present state of a world; return the removed actors."""
+        """Take over the current state of a world; return the removed actors."""
         rows = world.rows
         gone: list[CarlaActor] = []
         if not np.array_equal(rows["id"], self._ids):
@@ -425,7 +425,7 @@ class ActorTable:
         self._write_walkers(ahead, speed)
 
     def _write_lanes(self, world: HostedWorld, rows: NDArray[np.void]) -> None:
-        """Write the present speed limit and the traffic light of each vehicle's lane."""
+        """Write the current speed limit and the traffic light of each vehicle's lane."""
         states, lanes = self.vehicle_states, world.present_lanes
         lane = rows["lane"]
         states["speed_limit"] = 3.6 * lanes["speed_mps"][lane]

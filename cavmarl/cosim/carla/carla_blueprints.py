@@ -12,7 +12,7 @@ from typing import Any, Literal
 
 from cavmarl.sensors.kernels.panorama import BICYCLE, BUS, CAR, MOTORCYCLE, PEDESTRIAN, TRAM, TRUCK
 
-WALKER, PROP = "pedestrian", "prop"  # values of `Blueprint.base_type` beside CARLA's
+WALKER, PROP = "pedestrian", "prop"  # values of `Blueprint.base_type` in addition to CARLA's
 
 Kind = Literal["bool", "int", "float", "string", "colour"]
 

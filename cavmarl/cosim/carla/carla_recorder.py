@@ -208,7 +208,7 @@ class CarlaRecorder:
         return path
 
     def take(self, session: CarlaSession, ended: Sequence[EndedVehicle] = ()) -> None:
-        """Record the present state of the world, if a recording has begun.
+        """Record the current state of the world, if a recording has begun.
 
         `ended`: the agents' vehicles that have left in this tick.
         """

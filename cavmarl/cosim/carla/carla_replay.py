@@ -133,7 +133,7 @@ class CarlaReplay:
         capacity: largest number of vehicles of the world.
 
     Attributes:
-        rows: VEHICLE (n,) at the present time of the replay.
+        rows: VEHICLE (n,) at the current time of the replay.
         signals: the signals at this time, see `Worlds.signal_phase`.
         is_over: whether the end has been reached.
         factor: recorded time per simulated time.

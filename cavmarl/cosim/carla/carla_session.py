@@ -195,7 +195,7 @@ class CarlaSession:
             self._send(self.sensors.last_collisions(actor))
 
     def publish(self) -> None:
-        """Send the snapshot of the present frame, then the frames of sensors."""
+        """Send the snapshot of the current frame, then the frames of sensors."""
         keep = self.settings.synchronous
         if self.streams.is_wanted(EPISODE_STREAM):
             self.streams.send(EPISODE_STREAM, *self._snapshot(), keep)
@@ -203,7 +203,7 @@ class CarlaSession:
         self._send(self.sensors.sense())
 
     def _snapshot(self) -> tuple[bytes, bytes]:
-        """Return the head and the body of the snapshot of the present frame.
+        """Return the head and the body of the snapshot of the current frame.
 
         A client also gets it when it begins to listen: in a synchronous world, it would otherwise
         wait for a frame that was sent before its connection was open.

@@ -204,7 +204,7 @@ class WorldSource(Protocol):
         """Return a world at the start of an episode.
 
         Args:
-            name: name of a map; empty: the present map.
+            name: name of a map; empty: the current map.
             step_s: length of a step.
 
         Raises CavmarlError: there is no such map, or the world cannot have such steps.

@@ -56,7 +56,7 @@ class SensorContext:
 
     @property
     def surroundings(self) -> Surroundings:
-        """The view of the present world."""
+        """The view of the current world."""
         world = self.session.world
         if self._surroundings is None or self._surroundings.world is not world:
             self._surroundings = Surroundings(world)

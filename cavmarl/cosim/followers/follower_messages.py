@@ -120,7 +120,7 @@ class Welcome:
     environment: StrictStr  # name and version
     map_hash: StrictStr  # hash of the roads' source; a stack needs the same map
     vehicles: list[StrictStr]  # agents assigned to the follower
-    tick: StrictInt  # the master's present tick
+    tick: StrictInt  # the master's current tick
     dt_s: StrictFloat
     ticks_per_step: StrictInt  # ticks from one snapshot to the next
     # ticks by which the vehicle delays controls after the start of their step
@@ -236,7 +236,7 @@ class Ticked:
 
     done: StrictBool  # whether the world has advanced
     refused: StrictStr  # reason of a refusal; empty if not refused
-    tick: StrictInt  # present tick of the world, since its reset
+    tick: StrictInt  # current tick of the world, since its reset
 
 
 @with_config(_CLOSED)

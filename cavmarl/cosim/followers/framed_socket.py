@@ -1,8 +1,8 @@
 """`FramedSocket`: frames over a connection.
 
-A frame is a head of fixed size, a payload (mostly a few numbers, encoded as the dialect defines)
-and data (bytes of arrays, whose shapes both ends know). A frame contains numbers and text, never
-code.
+A frame has three parts: a head of fixed size; a payload, mostly a few numbers, encoded as the
+dialect defines; and data, the bytes of arrays whose shapes both ends know. A frame contains numbers
+and text, never code.
 
     head    magic, version, kind, order, bytes of the payload, bytes of the data,
             checksum of the data, checksum of the head and the payload

@@ -85,7 +85,7 @@ class RosClock:
         self.now_ns = self._begin_ns + tick * self._dt_ns
 
     def ns_of(self, stamp_s: float) -> int:
-        """Return the time of a sample of the present episode."""
+        """Return the time of a sample of the current episode."""
         return self._begin_ns + round(1e9 * stamp_s)
 
 
@@ -340,12 +340,12 @@ class WorldTopics:
                     "vehicle with the profile autoware, and other names of sensors"
                 )
             self.kinds |= vehicle.kinds
-        self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its present transforms
+        self._mounted: dict[str, float] = {}  # vehicle → wheelbase of its current transforms
         self._begun: dict[str, tuple[int, VehicleView]] = {}  # vehicle → episode, its description
         self._rows = np.zeros((0, len(TRUTH)))
 
     def clock_message(self) -> RosMessage:
-        """Return the message of the present time."""
+        """Return the message of the current time."""
         now_ns = self.clock.now_ns
         return RosMessage(CLOCK, self.kinds[CLOCK], now_ns, {"clock": time_of(now_ns)})
 

@@ -101,7 +101,7 @@ class LaneRoute:
     def _change_lane(
         self, here: OnLane, pose: EgoPose, plan: NDArray[np.void], obstacles: Sequence[Obstacle]
     ) -> OnLane:
-        """Return the lane beside the present one if the route needs it and there is room."""
+        """Return the lane beside the current one if the route needs it and there is room."""
         change = int(plan["change"][here.lane])
         row = self._network.lanes[here.lane]
         if change == 0 or row["internal"]:

@@ -52,7 +52,7 @@ R = TypeVar("R")
 class Gains(NamedTuple):
     """The control parameters of a vehicle class."""
 
-    lookahead_s: float  # lookahead of the steering, as time at the present speed
+    lookahead_s: float  # lookahead of the steering, as time at the current speed
     least_lookahead_m: float  # minimum lookahead
     accel_mps2: float  # maximum acceleration
     brake_mps2: float  # maximum braking, positive

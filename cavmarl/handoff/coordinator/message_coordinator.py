@@ -1,9 +1,9 @@
 """`MessageCoordinator`: the coordinator of a world in which other simulators run some zones.
 
 All zones are in this process, but another simulator can refuse a vehicle, be late or die. So each
-zone has an endpoint of the ownership protocol, and all messages are sent: a vehicle that has
-crossed a border is offered with its state (PREPARE), its new zone accepts or refuses it (ACK,
-NACK), the coordinator decides (BEGIN, STEP), and both zones confirm and release it (DONE, COMMIT).
+zone has an endpoint of the ownership protocol, and all messages are sent. A vehicle that has
+crossed a border is offered with its state (PREPARE). Its new zone accepts or refuses it (ACK,
+NACK). The coordinator decides (BEGIN, STEP). Both zones confirm and release it (DONE, COMMIT).
 """
 
 from __future__ import annotations

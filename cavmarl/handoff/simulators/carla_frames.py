@@ -75,7 +75,7 @@ def check_option(options: Mapping[str, str]) -> None:
 
 
 def check_rig(zone: int, options: Mapping[str, str], rig: Mapping[str, MountedConfig]) -> None:
-    """If the samples of a rig are to come from CARLA, check that its sensors can take them.
+    """Check that CARLA's sensors can take the samples of a rig, if they are to take them.
 
     Raises:
         ConfigError: the rig has a sensor of the surroundings without frames of CARLA, a

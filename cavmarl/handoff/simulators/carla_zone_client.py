@@ -164,7 +164,7 @@ class Zone:
         if on_road < SEEN_LANES * len(places):
             raise ValueError(
                 f"its map {self._map.name} is wrong: {len(places) - on_road} of "
-                f"{len(places)} places on lanes are beside its roads; load the map of this world "
+                f"{len(places)} places on lanes are off its roads; load the map of this world "
                 "(cavmarl map export NAME --carla --opendrive FILE)"
             )
 

@@ -62,7 +62,7 @@ def collapse_heap() -> None:
     """Merge the heap of this process into huge pages if the system has free ones.
 
     Forked processes then share fewer pages. The system reports the death of a process only after it
-    has released all pages of the process, so fewer pages mean that deaths are noticed sooner.
+    has released all pages of the process. With fewer pages, deaths are noticed sooner.
     """
     with open("/proc/self/maps", encoding="utf-8") as maps:
         heaps = [line.split()[0] for line in maps if line.rstrip().endswith("[heap]")]

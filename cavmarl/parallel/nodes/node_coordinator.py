@@ -57,7 +57,7 @@ class _World:
         self.movers: list[tuple[int, int]] = []
         self.births: list[Birth] = []
         self.answered: set[tuple[int, int]] = set()
-        self.has_stepped = False  # whether each zone has received a STEP in the present episode
+        self.has_stepped = False  # whether each zone has received a STEP in the current episode
         self.has_begun = False  # whether the first reset is done; before, rows have no episode
         self.on_record = OwnersOnRecord(zones, limits) if is_checked else None
 
@@ -182,7 +182,7 @@ class NodeCoordinator:
             self._take(w, message)
 
     def _take(self, w: int, message: Message) -> None:
-        """Apply a message of a node. Raises MessageError: it does not fit the present tick."""
+        """Apply a message of a node. Raises MessageError: it does not match the tick."""
         dropped = self.worlds[w].directory.dropped
         before = dropped.total()
         self._apply(w, message)
@@ -320,7 +320,7 @@ class NodeCoordinator:
             raise LinkLostError(node, MessageError(str(error))) from error
 
     def _commit(self, world: _World) -> None:
-        """Commit a tick of a world. Raises LinkLostError: the DONE of a node does not fit."""
+        """Commit a tick of a world. Raises LinkLostError: the DONE of a node is wrong."""
         try:
             world.write(world.directory.commit(dict.fromkeys(range(len(self._node_of)), 0)))
         except ZonesError as error:

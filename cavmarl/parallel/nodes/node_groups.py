@@ -1,4 +1,4 @@
-"""`NodeGroups`: worlds over nodes, where each node hosts whole worlds."""
+"""`NodeGroups`: worlds distributed over nodes; each node hosts whole worlds."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Found = TypeVar("Found")
 
 
 class NodeGroups(CommandedWorlds):
-    """W worlds over n nodes, where each node hosts all zones of its worlds.
+    """W worlds distributed over n nodes; each node hosts all zones of its worlds.
 
     Each node has a coordinator and a thread of its own, so all nodes carry out a command at once.
     This process keeps the state of the worlds of each node: if a node is lost, another one resumes
@@ -250,7 +250,7 @@ class NodeGroups(CommandedWorlds):
 
 
 def check_groups(world: World) -> None:
-    """Raise ConfigError for settings that whole worlds over nodes do not support."""
+    """Raise ConfigError for settings that whole worlds on nodes do not support."""
     config = world.config
     if config.workers.monitor_cpu:
         raise ConfigError(

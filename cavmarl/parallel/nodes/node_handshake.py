@@ -11,7 +11,7 @@ from cavmarl.parallel.nodes.peer_faults import LinkLostError
 
 LOOK_MS = 50.0  # time between checks that the awaited nodes are still alive
 ANSWER_S = 5.0  # time for a node to answer a call
-_MOST = 1 << 16  # limit of node numbers; generations are sent modulo this
+_MOST = 1 << 16  # limit of node numbers; generations are sent modulo this limit
 
 
 def caller_number(number: int, generation: int) -> int:

@@ -319,7 +319,7 @@ class NodePeers(Peers):
             yield number, self._share_of(number)
 
     def _share_of(self, number: int) -> memoryview:
-        """Receive the present share of another node.
+        """Receive the current share of another node.
 
         Raises:
             RecoveryOrderedError: the other node has already received an order to recover.

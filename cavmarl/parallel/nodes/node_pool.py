@@ -81,7 +81,7 @@ class NodePool:
     """
 
     owner: NDArray[np.int32]
-    _performed: NodeCommand | None = None  # the present command
+    _performed: NodeCommand | None = None  # the current command
     _exchanged = 0  # number of answers of a network simulator that nodes have received for it
 
     def __init__(
@@ -105,7 +105,7 @@ class NodePool:
         self._lost: list[int] = []
         self._failed: set[int] = set()  # nodes that have ended with an error of their own
         self._is_torn = False
-        self._successions = 0  # losses of the only node in the present command
+        self._successions = 0  # losses of the only node in the current command
         self._max_retries = config.workers.max_retries
         self.losses = self.recoveries = self.replacements = self.redirected = 0
         self._timeout_s, self._pid = config.workers.timeout_s, os.getpid()

@@ -276,7 +276,7 @@ class NodeProgram:
     def _report_missed(self, lost: LinkLostError) -> None:
         """Tell the coordinator that a node cannot be reached, or has sent a bad frame.
 
-        If a frame of the coordinator does not fit, the state of this node is wrong.
+        If a frame of the coordinator seems wrong, the state of this node is wrong.
         """
         is_coordinator = lost.peer == COORDINATOR
         if is_coordinator and (not lost.fault or self._number < 0):

@@ -72,7 +72,7 @@ class WorldShare(NamedTuple):
 
 
 class NodeWorlds(CommandedWorlds):
-    """W worlds over n nodes, which share the zones of each world.
+    """W worlds distributed over n nodes, which share the zones of each world.
 
     Attributes:
         pool: the nodes.
@@ -380,7 +380,7 @@ class NodeWorlds(CommandedWorlds):
 
     @property
     def partition(self) -> ZonePartition:
-        """The present zones, which repartitioning changes."""
+        """The current zones, which repartitioning changes."""
         return read_zones(self.pool.partition)
 
     def _pids(self) -> dict[int, int]:
@@ -457,7 +457,7 @@ def _read_links(number: int, data: memoryview) -> tuple[int, list[dict[str, Any]
 
 
 def check_nodes(world: World, nodes: int) -> None:
-    """Raise ConfigError for settings that worlds over nodes do not support."""
+    """Raise ConfigError for settings that worlds on nodes do not support."""
     config, count = world.config, world.partition.count
     if not 1 <= nodes <= count:
         raise ConfigError(

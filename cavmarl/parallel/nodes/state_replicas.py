@@ -67,7 +67,7 @@ class StateReplicas:
                 del states[old]
 
     def keep(self, state: int, living: Sequence[int]) -> list[Array]:
-        """Keep and return the present state, and send a replica to the next live node."""
+        """Keep and return the current state, and send a replica to the next live node."""
         saved = self._worlds.save()
         data = to_bytes(saved)
         _add(self.own, state, data)

@@ -1,9 +1,9 @@
 """`ZoneEndpoints`: the zones of a node as endpoints of the ownership protocol.
 
 When a vehicle has crossed a border, its owner (the source) sends a PREPARE to the node of the zone
-in which the vehicle is. That node acknowledges the offer to the coordinator and to the source. The
-coordinator decides, and the next STEP of both zones contains the decision. Until then, the source
-keeps the vehicle.
+that contains the vehicle. That node acknowledges the offer to the coordinator and to the source.
+The coordinator decides, and the next STEP of both zones contains the decision. Until then, the
+source keeps the vehicle.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ _LENGTH = struct.Struct("<II")
 class Report(NamedTuple):
     """Data about a tick of a world for the coordinator, in addition to DONE."""
 
-    # vehicle, zone in which it is, digest of its state in hex
+    # vehicle, zone that contains it, digest of its state in hex
     movers: list[tuple[int, int, str]]
     births: list[tuple[int, int]]  # vehicle, first owner
     began: bool  # whether an episode has started after the tick
@@ -111,7 +111,7 @@ class ZoneEndpoints(OwnershipRuntime):
         # world, vehicle → node that has offered it last
         self._sources: dict[tuple[int, int], int] = {}
         self._division, self._checks = division, checks
-        self._answered, self._num_answered = answered, 0  # `_num_answered` before the present lease
+        self._answered, self._num_answered = answered, 0  # `_num_answered` before the current lease
         answered.clear()
         self._zones = frozenset(zones)
         self._node_of = node_of
@@ -221,7 +221,7 @@ class ZoneEndpoints(OwnershipRuntime):
             self._stirred[w] = True
 
     def go_on(self, saved: Sequence[SavedOwnership] | None) -> None:
-        """Start ownership again, with the vehicles in their present zones."""
+        """Start ownership again, with the vehicles in their current zones."""
         self.reset(np.ones(len(self._stirred), dtype=np.bool_))
 
     def in_flight(self, w: int) -> list[TransferInFlight]:
@@ -289,7 +289,7 @@ class ZoneEndpoints(OwnershipRuntime):
                 yield endpoint.complete(0, left.get(zone, ()))
 
     def _offer(self, w: int, began: bool) -> tuple[list[tuple[int, int, str]], bool]:
-        """Offer vehicles that have crossed a border to the zones in which they are.
+        """Offer vehicles that have crossed a border to the zones that contain them.
 
         Returns:
             `Report.movers`, and whether vehicles without a record have also crossed a border.
@@ -344,7 +344,7 @@ class ZoneEndpoints(OwnershipRuntime):
         """Apply a message of another node.
 
         Raises:
-            MessageError: the message does not fit the present tick.
+            MessageError: the message does not match the current tick.
         """
         (zone,) = self._zones.intersection(message.destinations())
         endpoint = self._endpoints[w][zone]

@@ -100,7 +100,7 @@ class Pool:
 
         Raises:
             WorkerDeathError: too many processes died during the task; the pool is closed.
-            WorkerFailureError: a worker raised an exception; the state is that before the task.
+            WorkerFailureError: a worker raised an exception; the state is as before the task.
         """
         return self._command(self._all, task, payload, commits)
 

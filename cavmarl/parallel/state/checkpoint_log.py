@@ -76,7 +76,7 @@ class CheckpointLog:
         self.is_prepared = False
 
     def prepare(self, state: Arrays, logs: Sequence[ToldLog] = ()) -> None:
-        """Write the present state to the other image, with which the log can restart."""
+        """Write the current state to the other image, with which the log can restart."""
         image = 1 - self.place.item(0)
         self._images[image].write(state)
         for kept, log in zip(self._logs[image], logs, strict=True):

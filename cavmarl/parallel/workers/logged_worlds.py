@@ -85,7 +85,7 @@ class LoggedWorlds(WorkerWorlds):
         return self._log.is_full or self._repeat_s > MAX_REPEAT_S
 
     def _restart_log(self, is_prepared: bool = False) -> None:
-        """Let the log start with the present state, whose image may have been written already."""
+        """Let the log start with the current state, whose image may have been written already."""
         if not is_prepared:
             self._log.prepare(self.worlds.save(), self._sumo_logs)
         self._log.begin()

@@ -33,7 +33,7 @@ PROGRAM = "cavmarl.parallel.workers.job_factory"
 
 
 class PooledWorlds(CommandedWorlds):
-    """W worlds over m worker processes.
+    """W worlds distributed over m worker processes.
 
     Raises:
         ConfigError: a setting that worlds in worker processes do not support.

@@ -6,8 +6,8 @@ it on its own zones, and continues when the members have run it on theirs. Betwe
 handles departures, signals and ownership alone.
 
 All arrays that shards write are shared memory (`shared_huge_pages`), and each row has one writer at
-a time. Between phases a member keeps scratch memory only. A phase depends on the arrays and on the
-leader's line of words, and on nothing else.
+a time. Between phases, a member keeps scratch memory only. A phase depends only on the arrays and
+on the leader's line of words.
 """
 
 from __future__ import annotations

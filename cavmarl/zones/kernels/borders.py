@@ -50,7 +50,7 @@ def find_near(
     """Find owned vehicles that have crossed a border or are near one.
 
     A vehicle has crossed a border if it is farther than the hysteresis outside of its owner's zone.
-    It is near a zone if it would have crossed into that zone after `ahead_s` at its present
+    It is near a zone if it would have crossed into that zone after `ahead_s` at its current
     velocity.
     """
     found = 0
@@ -122,7 +122,7 @@ def _note(
 @kernel
 def pass_on(
     vehicle: int,
-    source: int,  # the present owner
+    source: int,  # the current owner
     row: int,  # the vehicle's probable row in the source zone
     target: int,  # the next owner
     epoch: int,  # epoch of the new ownership

@@ -25,7 +25,7 @@ COMING = np.dtype(
     [
         ("vehicle", np.int64),
         ("target", np.int64),  # zone that the vehicle approaches
-        ("epoch", np.int64),  # epoch of the present ownership
+        ("epoch", np.int64),  # epoch of the current ownership
         ("tick", np.int64),  # first tick in which the vehicle was near
         ("depth_m", np.float64),  # distance outside of its owner's zone in that tick, see NEAR
         ("ms", np.float64),  # clock time of that tick
@@ -78,9 +78,9 @@ class BorderRecords(NamedTuple):
     num_crossed: NDArray[np.int64]  # (W,) number of vehicles in `near` that have crossed
     owned: NDArray[np.int64]  # (W,) number of vehicles when `near` was made
     coming: NDArray[np.void]  # COMING (W, 2, 2 C) near and not crossed; two alternating lists
-    turn: NDArray[np.int64]  # (W,) index of the present list; the other is the previous tick's
+    turn: NDArray[np.int64]  # (W,) index of the current list; the other is the previous tick's
     num_coming: NDArray[np.int64]  # (W, 2) number of entries of both lists
-    known: NDArray[np.int64]  # (W,) entries of the present list that were in the previous list
+    known: NDArray[np.int64]  # (W,) entries of the current list that were in the previous list
     acknowledged: NDArray[np.int64]  # (W,) sum of the entries of `coming` in all earlier ticks
     aborted: NDArray[np.int64]  # (W,) number of vehicles that have turned away or left
     tick: NDArray[np.int64]  # (W,) tick of the rows in which `near` was found
@@ -219,7 +219,7 @@ def _is_newborn(book: BorderRecords, w: int, num_newborn: int, vehicle: int) -> 
 
 @inlined_kernel
 def _renew(zoned: ZoneState, side: int, w: int, book: BorderRecords) -> None:
-    """Write the present list in `coming`; vehicles of the previous list keep their approach."""
+    """Write the current list in `coming`; vehicles of the previous list keep their approach."""
     turn = book.turn[w]
     before = book.coming[w, 1 - turn]
     now = book.coming[w, turn]

@@ -6,7 +6,7 @@ cuts find the cell of a position. They only compare the coordinates with stored 
 processes agree, even for positions on a border.
 
 Ghosts depend on a vehicle's position: a zone receives a ghost of the vehicle if the vehicle is
-within the zone's halo and a driver of the zone may consider it, even if the zone does not touch the
+within the zone's halo and a driver of the zone may consider it. The zone need not touch the
 vehicle's own zone (decision 012).
 """
 
