@@ -54,7 +54,7 @@ class Balancer:
         """Make the next plan: place lost shards, and move a few other shards if that saves time.
 
         Raises:
-            NoAdmissibleWorkerError: a worker is lost, and all others are excluded.
+            NoAdmissibleWorkerError: a worker is lost, and all other workers are excluded.
             ConfigError: there are more workers than shards, or a cost is invalid.
         """
         before = self.plan

@@ -49,7 +49,7 @@ class DeadlineWatch:
         self.note(WORLD)
 
     def note(self, phase: str) -> None:
-        """Note that a phase begins, and with it the end of the previous one."""
+        """Note that a phase begins, and that the previous phase has ended."""
         if self._limit is None:
             return
         if not self._is_missed and self._now() > self._limit:

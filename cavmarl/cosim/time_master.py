@@ -39,7 +39,7 @@ class Pacer(Protocol):
 
 
 class Unpaced:
-    """Begins each step as soon as the previous one has ended."""
+    """Begins each step as soon as the previous step has ended."""
 
     def wait(self, elapsed_s: float) -> None:
         """Return at once."""
@@ -50,7 +50,7 @@ class Lateness:
     """The delay of steps, by the wall clock."""
 
     steps: int  # number of steps
-    # number of steps that began after they were due, because earlier ones took too long
+    # number of steps that began after they were due, because earlier steps took too long
     late: int
     mean_wall_s: float  # mean delay of all steps
     worst_wall_s: float  # maximum delay

@@ -129,7 +129,7 @@ class ZonedShards:
         for w in range(self.num_worlds):
             self._forget_offers(w)
         self._exchange(self._shards[0].worlds.rows, 0, self.num_worlds)
-        book.tick[:] = tick  # the rows are still those of this tick
+        book.tick[:] = tick  # the rows still belong to this tick
 
     def divide(self, partition: ZonePartition) -> None:
         """Set the zones. The caller must then set owners and ghosts."""

@@ -46,7 +46,7 @@ SILENCE = Output()
 
 
 class ZonesError(ProtocolError):
-    """Zones have sent no DONE, or a wrong one.
+    """Zones have sent no DONE, or a wrong DONE.
 
     Attributes:
         zones: the zones at fault.
@@ -163,7 +163,7 @@ class Directory:
 
     def begin(
         self,
-        # (vehicle, zone that contains it) of all vehicles, and no others, that are outside of their
+        # (vehicle, zone that contains it) of exactly the vehicles that are outside of their
         # owner's zone by more than the hysteresis
         movers: Iterable[tuple[int, int]],
         births: Iterable[Birth] = (),

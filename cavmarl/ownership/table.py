@@ -92,8 +92,8 @@ class Table:
     ) -> None:
         """Reach a later tick at once, as a BEGIN and a COMMIT with the same contents would.
 
-        The calling coordinator must have checked the changes, and must have them in its log, if
-        there is one.
+        The calling coordinator must have checked the changes, and must have written them to
+        its log, if any.
         """
         if self.plan is not None or self.deferred:
             raise ProtocolError(f"tick {self.tick + 1} is in progress; commit it first")

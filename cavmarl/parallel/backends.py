@@ -101,7 +101,7 @@ def _check_simulators(world: World, num_worlds: int, backend: BackendName) -> No
     """Check that the processes of a backend can run zones in other simulators.
 
     Raises:
-        ConfigError: the backend does not support a setting of such zones, or servers are missing.
+        ConfigError: the backend does not support a setting of these zones, or servers are missing.
     """
     config = world.config
     check_servers(hosted_zones(config.zones.simulators, world.partition.count), num_worlds)

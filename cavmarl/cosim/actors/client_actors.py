@@ -178,7 +178,7 @@ class ClientActors:
 
         Args:
             actor: an actor that is moved by controls.
-            controls: throttle and steering in [-1, 1], scaled as those of agents.
+            controls: throttle and steering in [-1, 1], scaled as the controls of agents.
 
         Raises:
             ActionError: the actor is not moved by controls, or the controls are not two numbers.

@@ -256,7 +256,7 @@ class SensorSuite:
     def last_collisions(self, actor: CarlaActor) -> Iterator[tuple[int, CarlaActor, int, bytes]]:
         """Yield frames of a vehicle that leaves the world after a collision; see `sense`.
 
-        The other vehicle is the nearest one.
+        The other vehicle is taken to be the nearest vehicle.
         """
         session = self._context.session
         states = session.actors.vehicle_states

@@ -74,7 +74,7 @@ class CarlaActor:
     """One actor.
 
     Attributes:
-        attributes: values by name; kinds are those of the blueprint.
+        attributes: values by name; kinds as in the blueprint.
         pose: the current pose; for vehicles and walkers, see `ActorTable.pose_of`.
         local: pose relative to the parent.
         centre, half_m: the bounding box in the actor's frame.

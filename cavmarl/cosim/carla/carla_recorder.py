@@ -40,7 +40,7 @@ _NOWHERE = CarlaPose(0.0, 0.0, 0.0)
 
 @dataclass(frozen=True)
 class RecordedActor:
-    """A vehicle, walker or prop of a recording; its fields are those of `CarlaActor`."""
+    """A vehicle, walker or prop of a recording; fields as in `CarlaActor`."""
 
     vehicle: int
     number: int

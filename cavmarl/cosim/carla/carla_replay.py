@@ -1,4 +1,4 @@
-"""`CarlaReplay`: the states of a recording, shown to clients instead of those of the world."""
+"""`CarlaReplay`: the states of a recording, shown to clients instead of the states of the world."""
 
 from __future__ import annotations
 
@@ -203,7 +203,7 @@ class CarlaReplay:
 
 
 def nearest_to(row: int, rows: NDArray[np.void]) -> int:
-    """Return the id of the vehicle that is nearest to the one of a row; -1: there is no other."""
+    """Return the id of the vehicle nearest to the vehicle of a row; -1: no other vehicle."""
     apart_m = np.hypot(rows["x"] - rows["x"][row], rows["y"] - rows["y"][row])
     apart_m[row] = np.inf
     nearest = int(apart_m.argmin())

@@ -149,7 +149,7 @@ class CarlaServer:
         host: address to listen at.
         client: version of the clients.
         limits: limits of what clients may demand.
-        step_s: length of a step before a client has set one.
+        step_s: length of a step until a client sets it.
         other_ticks, recordings: see `CarlaSession`.
 
     Attributes:

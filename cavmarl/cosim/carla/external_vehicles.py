@@ -33,7 +33,7 @@ from cavmarl.env.parallel import CavEnv
 
 MASS_KG = 1845.0  # mass that clients read in the physics of each vehicle
 _OCCUPIED = "Spawn failed because of collision at spawn position"  # CARLA's text
-_VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all others are cars
+_VTYPE_OF_BASE = {"truck": "truck", "bus": "bus", WALKER: WALKER}  # all other types are cars
 _FASTEST_MPS = MAX_SPEED_MPS - 0.5  # a faster move to a pose is a jump
 _FASTEST_BACKWARD_MPS = 10.0
 

@@ -132,7 +132,7 @@ class HostedWorld:
         return lanes
 
     def step(self, actions: Mapping[str, Any] | None = None) -> list[EndedVehicle]:
-        """Advance the world by one step, or begin the next episode if this one is over.
+        """Advance the world by one step, or begin the next episode if the episode is over.
 
         `actions`: actions of agents that no client drives; None: actions of the built-in driver.
 

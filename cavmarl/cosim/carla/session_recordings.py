@@ -117,7 +117,7 @@ class SessionRecordings:
         return replay
 
     def set_replay_factor(self, factor: float) -> None:
-        """Set the recorded time per simulated time, of this replay and of later ones."""
+        """Set the recorded time per simulated time, for this replay and later replays."""
         self._factor = factor
         replay = self._session.world.replay
         if replay is not None:

@@ -176,7 +176,7 @@ class FollowedWorld:
             FollowerLostError: a follower has not answered in time, or has ended; it is dropped. The
                 world has advanced by one step, and the next call continues from there.
             FollowerError: a follower's messages are invalid, or its controls cannot be carried out;
-                the consequences are those of a FollowerLostError.
+                the consequences are as for a FollowerLostError.
             ActionError, CapacityError, ConfigError: the world refuses a body of a trace.
             ClockError: another caller has advanced the world.
         """
@@ -321,7 +321,7 @@ class FollowedWorld:
         """Send snapshots of the world and queue the followers' controls.
 
         Raises FollowerError: the error of the first follower, in their order, with which the world
-        cannot continue; the controls of the others are queued anyway.
+        cannot continue; the controls of the other followers are queued anyway.
         """
         if self._episode < 0 or not seats:
             return
@@ -334,7 +334,7 @@ class FollowedWorld:
     def _hear_others(self) -> None:
         """Receive messages of the followers for which the world does not wait.
 
-        Raises FollowerError: the messages of one of them are invalid.
+        Raises FollowerError: the messages of a follower are invalid.
         """
         others = [seat for seat in self._seats if not seat.waits]
         if others:

@@ -51,7 +51,7 @@ class FollowerSeat:
     bad: int = 0  # number of invalid controls of a vehicle
     wait_wall_s: float = 0.0  # time that the world has waited for it, by the wall clock
     slowest: int = 0  # number of steps in which it was the last to answer
-    unseen: int = 0  # number of snapshots not sent, because the follower has not read earlier ones
+    unseen: int = 0  # number of snapshots not sent, because earlier snapshots were unread
 
     @property
     def rank(self) -> tuple[float, str]:

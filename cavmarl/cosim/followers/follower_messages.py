@@ -1,7 +1,7 @@
 """The messages between a world and its followers; docs/guides/cosimulation.md specifies them.
 
-A frame is that of `framed_socket`: a head, a payload in msgpack, and the bytes of arrays. A payload
-is data and never code. Each payload is one of these classes, as a map of its fields. A payload with
+A frame of `framed_socket` has a head, a payload in msgpack, and the bytes of arrays. A payload is
+data and never code: an instance of one of these classes, as a map of its fields. A payload with
 other fields, or with values of other types, is refused.
 """
 
@@ -191,7 +191,7 @@ class FollowerSnapshot:
     is_over: StrictBool  # whether the episode has ended; then no controls are due
     # the follower's vehicles in the world, which have to be driven
     vehicles: dict[StrictStr, VehicleView]
-    arrays: list[ArrayView]  # new samples of their sensors, and of those of the actors
+    arrays: list[ArrayView]  # new samples of the sensors of vehicles and actors
     actors: dict[StrictStr, ActorView] = field(default_factory=dict)  # actors by name
 
 

@@ -92,7 +92,7 @@ class FramedSocket:
         Raises:
             EOFError: the other end has closed the connection.
             OSError: the connection is lost, or nothing arrives in time.
-            MessageError: the frame is damaged, or is not one of the dialect.
+            MessageError: the frame is damaged, or is not a frame of the dialect.
         """
         dialect = self._dialect
         raw = self._read(HEAD_BYTES)
@@ -106,7 +106,7 @@ class FramedSocket:
 
     def take(
         self,
-        arrays: Sequence[Array],  # contiguous; they are filled one after the other
+        arrays: Sequence[Array],  # contiguous arrays, filled one after the other
     ) -> None:
         """Read the data of the received frame into arrays.
 

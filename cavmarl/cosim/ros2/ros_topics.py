@@ -142,8 +142,8 @@ class VehicleTopics:
         motion: its motion as far as it is known without the true state.
 
     Raises:
-        ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have one
-            topic.
+        ConfigError: `names` has a sensor that the vehicle does not have, or two sensors have the
+            same topic.
     """
 
     def __init__(
@@ -404,7 +404,7 @@ class WorldTopics:
         return self._begun | found
 
     def _mounts(self, view: FollowerView) -> list[Fields]:
-        """Return the transforms of all vehicles' sensors, if those of a vehicle have changed."""
+        """Return the transforms of all vehicles' sensors, if any transform has changed."""
         present = view.snapshot.vehicles.items()
         known = self._mounted | {name: seen.wheelbase_m for name, seen in present}
         if known == self._mounted:

@@ -134,7 +134,7 @@ def _pixels(
 ) -> NDArray[np.uint8]:
     """Return the classes of the pixels that points (n, 3) of the vehicle's frame project to.
 
-    `covered_m`: by column, the depth beyond which a point may be hidden behind another one.
+    `covered_m`: by column, the depth beyond which a point may be hidden behind another point.
     """
     ahead_m, column, row = _projected(camera, points)
     height, width = picture.shape

@@ -57,7 +57,7 @@ class LidarObjects:
         self._last: list[Obstacle] = []
 
     def perceive(self, readings: Readings, pose: EgoPose, time_s: float) -> list[Obstacle]:
-        """Return objects on the road; without a new scan, those of the last scan."""
+        """Return objects on the road; without a new scan, the objects of the last scan."""
         echoes = []
         for lidar in self._lidars:
             samples = readings.get(lidar.name)

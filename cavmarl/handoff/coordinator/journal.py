@@ -175,7 +175,7 @@ class Journal:
         A process may continue the file of another process that has stopped writing.
 
         Raises:
-            JournalError: the journal has no such earlier end.
+            JournalError: the journal has no line that ends there.
         """
         chain = place.chain()
         try:

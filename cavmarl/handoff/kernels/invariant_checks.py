@@ -258,7 +258,7 @@ def _match(
     moved: int,
     finding: np.void,
 ) -> None:
-    """Search vehicles that are new in their row among the vehicles missing from theirs."""
+    """Search vehicles that are new in their row among the vehicles missing from their row."""
     table = strays.table
     entered = 0
     for n in range(moved):

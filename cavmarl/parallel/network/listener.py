@@ -129,7 +129,7 @@ class Listener:
     def __init__(
         self,
         address: str,
-        secret: bytes | None = None,  # known to the callers; None: a random one
+        secret: bytes | None = None,  # known to the callers; None: a random secret
         port: int = 0,  # 0: the system chooses
     ) -> None:
         self.secret = secrets.token_bytes(SECRET) if secret is None else secret
@@ -291,7 +291,7 @@ def _prove(connection: socket.socket, place: tuple[str, int], secret: bytes, num
             (version,) = _VERSION.unpack(received)[1:]
             raise MessageError(
                 f"the process at {place[0]}:{place[1]} has version {version} of the handshake, "
-                f"this one has {VERSION}: install the same cavmarl on all machines"
+                f"this process has {VERSION}: install the same cavmarl on all machines"
             )
         if not more:
             raise EOFError(f"the process at {place} has ended the connection")

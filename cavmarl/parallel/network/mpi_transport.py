@@ -55,7 +55,7 @@ class _Notice(IntEnum):
     OPEN = 0  # number of the caller, for the listener; number of the caller's end
     ACCEPT = 1  # number of the listener's end; number of the caller's end
     CLOSE = 2  # unused; number of the receiver's end
-    GONE = 3  # both unused; the process of the sender ends
+    GONE = 3  # two unused numbers; the process of the sender ends
 
 
 class MpiConnection:

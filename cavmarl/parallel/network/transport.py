@@ -97,7 +97,7 @@ class Transport(Protocol):
     def open(
         self,
         place: Place,
-        secret: bytes,  # known to both ends
+        secret: bytes,  # known to both processes
         number: int,  # sent to the listener
         answer_s: float | None,  # time for the listener to answer; None: unlimited
     ) -> Connection:

@@ -80,7 +80,7 @@ class NodeFrame(NamedTuple):
     data: memoryview
 
     def is_of(self, generation: int, is_known: bool) -> bool:
-        """Return whether the frame is of this generation of nodes, and not of an earlier one.
+        """Return whether the frame is of this generation of nodes, not of an earlier generation.
 
         `is_known`: whether its sender has sent a frame of this generation before.
 

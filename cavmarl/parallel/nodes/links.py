@@ -221,7 +221,7 @@ class Links:
         self._links[number].frames.appendleft(frame)
 
     def pump(self, timeout_ms: float | None, looks: int = 0) -> None:
-        """Send and receive on all ready connections; wait up to `timeout_ms` until one is ready.
+        """Send and receive on ready connections; wait up to `timeout_ms` for a ready connection.
 
         Poll `looks` times before the process sleeps.
         """

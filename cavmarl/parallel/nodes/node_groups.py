@@ -47,7 +47,7 @@ class NodeGroups(CommandedWorlds):
         groups: the worlds of each node.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than worlds.
+        ConfigError: a setting is not supported, or there are more nodes than worlds.
         MissingExtraError: Ray is not installed.
         WorkerError: a node cannot be started.
     """

@@ -76,7 +76,7 @@ class NodePool:
         redirected: number of actions that were refused by a node and forwarded to the owner.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than zones.
+        ConfigError: a setting is not supported, or there are more nodes than zones.
         WorkerError: a node cannot be started.
     """
 
@@ -466,7 +466,7 @@ class NodePool:
         """Forward actions that a node has refused to their owners.
 
         Raises:
-            MessageError: the agents or owners are unknown, or the node had no such actions.
+            MessageError: the agents or owners are unknown, or the node did not have their actions.
         """
         found = read_refusal(frame.data, self.owner.size, {*self._living} - {number})
         if (self.owner[found[0]] != number).any():

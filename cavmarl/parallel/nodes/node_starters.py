@@ -261,7 +261,7 @@ def read_key(path: Path) -> bytes:
     """Read a key from a file that only this user can read.
 
     Raises:
-        ConfigError: the file cannot be read, is too short, or others can read it.
+        ConfigError: the file cannot be read, is too short, or other users can read it.
     """
     make = "make one: (umask 077; openssl rand -hex 32 > FILE), the same file on all machines"
     try:

@@ -79,7 +79,7 @@ class NodeSupply:
         return self.count - len(self._begun) + SPARES
 
     def look(self) -> bool:
-        """Serve joining nodes; return whether one is ready."""
+        """Serve joining nodes; return whether a node is ready."""
         with self._lock:
             self.joining_nodes.look(0.0)
             self._restart_dropped()  # a node that cannot be restarted stays lost

@@ -79,7 +79,7 @@ class NodeWorlds(CommandedWorlds):
         repartitions: past changes of the zones.
 
     Raises:
-        ConfigError: a setting that such worlds do not support, or more nodes than zones.
+        ConfigError: a setting is not supported, or there are more nodes than zones.
         WorkerError: a node cannot be started.
     """
 

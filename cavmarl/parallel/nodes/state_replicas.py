@@ -34,7 +34,7 @@ class StateReplicas:
 
     Attributes:
         own: states of this node, by their numbers.
-        others: node → states that it has sent, by their numbers.
+        others: node → states that the node has sent, by their numbers.
     """
 
     def __init__(
@@ -57,7 +57,7 @@ class StateReplicas:
         self._given.clear()
 
     def settle(self) -> None:
-        """Drop older states, since the newest one has arrived at all nodes."""
+        """Drop older states, since the newest state has arrived at all nodes."""
         if self._is_settled:
             return
         self._is_settled = True
@@ -153,7 +153,7 @@ class StateReplicas:
     ) -> None:
         """Resume from a kept state.
 
-        Later states are dropped: otherwise they would count as the newest ones.
+        Later states are dropped; otherwise they would count as the newest states.
 
         Raises:
             LinkLostError: a donor has disconnected, or its state is damaged.

@@ -71,7 +71,7 @@ def read_backend(
     """Return the backend that the arguments name; they have to agree.
 
     Args:
-        backend: one of `FORMS`; None: as the short forms say, or else local.
+        backend: one of `FORMS`; None: as in the short forms, by default `local`.
         workers: short form: N for `processes:N`, 0 for `local`.
         nodes: short form: N for `nodes:N`.
         registered: names of registered backends.

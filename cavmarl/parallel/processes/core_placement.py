@@ -37,7 +37,7 @@ def keep_apart(
     pids: Sequence[int],  # ids of processes that work at the same time
     cores: Sequence[int],  # core where each process was seen; -1: unknown
 ) -> None:
-    """Keep each process off the cores of the others, if two of them shared a core."""
+    """Keep each process off the cores of the other processes, if two processes shared a core."""
     if len(set(cores)) == len(cores) or UNKNOWN in cores:
         return
     usable = usable_cores()

@@ -115,7 +115,7 @@ def _refuse_threads() -> None:
     threads = len(os.listdir("/proc/self/task"))
     if threads > 1:
         names = [thread.name for thread in threading.enumerate()]
-        raise RuntimeError(f"the fork server has {threads} threads, those of Python are {names}")
+        raise RuntimeError(f"the fork server has {threads} threads; Python's threads are {names}")
 
 
 def _read(fd: int, size: int) -> Any:

@@ -198,7 +198,7 @@ class Pool:
         self._note_done(first, pending)
 
     def _note_done(self, first: int, pending: list[int]) -> None:
-        """Set `done_s` in those of `deaths[first:]` whose successors have just finished."""
+        """Set `done_s` in each entry of `deaths[first:]` whose successor has just finished."""
         for death in self.deaths[first:]:
             if death.worker not in pending and isnan(death.done_s):
                 death.done_s = time.monotonic()

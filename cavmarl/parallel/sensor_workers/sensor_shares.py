@@ -134,7 +134,7 @@ def divide(shares: Shares, costs: LineCosts) -> Shares:
             home == taker and other[:3] == unit[:3]
             for other, home in zip(units, homes, strict=True)
         ):
-            break  # the taker already writes a range of these frames, and can write only one
+            break  # the taker already writes a range of these frames, and can write only one range
         before = costs.part(unit.sensor, 0, unit.end)
         within = costs.part(unit.sensor, unit.begin, unit.end)
         line = costs.line_at(unit.sensor, before - within * wanted_s / cost_s)

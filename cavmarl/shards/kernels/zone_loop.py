@@ -97,7 +97,7 @@ def grid_of(members: Members, n: int) -> Grid:
     )
 
 
-# Arguments that `for_each_zone` passes to parameters of these names; callers pass all others.
+# `for_each_zone` passes arguments for parameters of these names; callers pass all other arguments.
 _OF_ZONE = {
     "worlds": "worlds",
     "rows": "worlds.rows",

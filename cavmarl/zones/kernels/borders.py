@@ -47,7 +47,7 @@ def find_near(
     # NEAR (2 C,) is written, in the order of zones and rows; a crossing precedes an approach
     out: NDArray[np.void],
 ) -> int:  # number of entries
-    """Find owned vehicles that have crossed a border or are near one.
+    """Find owned vehicles that have crossed a border or are near a border.
 
     A vehicle has crossed a border if it is farther than the hysteresis outside of its owner's zone.
     It is near a zone if it would have crossed into that zone after `ahead_s` at its current

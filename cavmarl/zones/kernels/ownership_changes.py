@@ -1,6 +1,6 @@
 """Approaches to borders, and changes of owner, if one process has all zones.
 
-`BorderRecords` stores both. Vehicles near a border are recorded at the end of a tick, together with
+`BorderRecords` stores them. Vehicles near a border are recorded at the end of a tick, together with
 the exchange of ghosts. In most ticks no vehicle has crossed, so the next tick has nothing to do.
 """
 
@@ -199,7 +199,7 @@ def _follow_swap(
 ) -> None:
     """Update the row of a vehicle that has moved into the row of a vehicle that left its zone.
 
-    Both have changed their zone in this tick. Without this, `release` would search all rows.
+    Both vehicles left their zone in this tick. Without the update, `release` would search all rows.
     """
     last = zoned.num_owned[near["source"], w]
     newest = book.num_changes[w] - 1
